@@ -1,0 +1,50 @@
+# One command each on a fresh machine: every target makes .venv and installs what it needs.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
+PORT ?= 14550
+COURSE ?= 7
+DURATION ?= 60
+POLICY ?= scripted:square
+
+.PHONY: fly test lint bench clean
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) --editable '.[sitl,screen,dev]'
+	touch $@
+
+# The peers live apart: MAVProxy brings the OpenCV build with a GUI, which shadows the headless one.
+.venv-peers/installed: constraints.txt
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		MAVProxy mavsdk
+	touch $@
+
+fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy flying it over UDP
+	@mkdir -p out
+	@$(BIN)/python -m sitl --connect udpout:127.0.0.1:$(PORT) --camera shm:fpv-$(PORT) \
+		--course $(COURSE) --report out/fc.json & sitl=$$!; \
+	trap 'kill $$sitl 2>/dev/null' EXIT; \
+	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --dual-rate --policy $(POLICY) \
+		--camera shm:fpv-$(PORT) --mode ALT_HOLD --arm --duration $(DURATION) \
+		--rerun out/flight.rrd --report out/report.json; status=$$?; \
+	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
+	echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \
+	exit $$status
+
+lint: $(VENV)/installed  ## format, lint, types, import direction
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint .venv-peers/installed  ## all of lint, then every test
+	$(BIN)/pytest
+
+bench: $(VENV)/installed  ## what the two loops reach on this machine, by policy
+	$(BIN)/python -m benchmarks.flight
+
+clean:  ## forget the environments and outputs
+	rm -rf $(VENV) .venv-peers out

@@ -1,0 +1,275 @@
+"""Composition root: builds one flight from its config, starts it, and stops it in reverse order."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+
+import cv2
+from rich.console import Console
+from rich.text import Text
+
+from mavbridge.action_loop import ActionLoop, ActionSettings
+from mavbridge.camera.open import open_camera
+from mavbridge.clock import NS_PER_S, Clock, MonotonicClock
+from mavbridge.config import STATUS_HZ, FlyConfig, Limits, period_ns
+from mavbridge.errors import PeerError, UserError
+from mavbridge.feature_cache import FeatureCache
+from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.transport import make_transport
+from mavbridge.observers import FanOut, ObserverThread
+from mavbridge.ports import Camera, TickSink
+from mavbridge.records import Release
+from mavbridge.rerun_view import RerunView
+from mavbridge.safety import Engagement
+from mavbridge.smoothing import Smoothing, StickSmoother
+from mavbridge.state import Freshness
+from mavbridge.terminal import FlightScreen
+from mavbridge.timing import FlightTiming, ObserverDrops, TimingReport, report_json
+from mavbridge.vision_loop import VisionLoop
+from mavbridge.workers import HungError, Worker
+from policy.contract import Executable
+from policy.loading import load_policy
+
+RERUN_CAPACITY = 1000
+"""Ticks that may wait for the viewer: ten seconds at 100 Hz."""
+JOIN_S = 2.0
+HANG_NS = NS_PER_S
+"""Silence of the action loop after which the flight is ended for it."""
+SMOOTHING_PERIODS = 3
+"""Longest step, in action periods, that the smoothing integrates over after a stall."""
+
+
+def fly(config: FlyConfig) -> int:
+    """Run one flight to its end; returns the exit status.
+
+    Raises:
+        MavbridgeError: for whatever a person can have caused.
+    """
+    clock = MonotonicClock()
+    console = Console(stderr=True)
+    cv2.setNumThreads(1)  # two loops share two cores: no pool of helpers under either
+    executable = _load_policy(config, clock, console)
+    with stop_on_signals() as stop:
+        flight: _Flight | None = None
+        try:
+            with ExitStack() as stack:
+                flight = _Flight(config, clock, console, executable, stack)
+                flight.run(stop)
+        finally:
+            if flight is not None:
+                flight.finish()
+    return 0
+
+
+def _load_policy(config: FlyConfig, clock: Clock, console: Console) -> Executable:
+    wanted = config.policy
+    sys.path.append(str(Path.cwd()))  # a person's own module:Class lies where they work
+    loaded = load_policy(
+        wanted.policy,
+        checkpoint=wanted.checkpoint,
+        allow_untrained=wanted.allow_untrained,
+        device=wanted.device,
+        dual_rate=wanted.dual_rate,
+        num_diffusion_steps=wanted.num_diffusion_steps,
+        image_size=wanted.image_size,
+        seed=wanted.seed,
+        now_s=lambda: clock.now_ns() / NS_PER_S,
+    )
+    for note in loaded.notes:
+        console.print(Text(note, style="yellow"))
+    return loaded.executable
+
+
+class _Flight:
+    """Everything of one flight; what is opened goes on the exit stack at once."""
+
+    def __init__(
+        self,
+        config: FlyConfig,
+        clock: Clock,
+        console: Console,
+        executable: Executable,
+        stack: ExitStack,
+    ) -> None:
+        self._config = config
+        self._clock = clock
+        self._console = console
+        self._executable = executable
+        self._stack = stack
+        self._is_dual = executable.dual_rate
+        rates = config.rates
+        self._action_hz = rates.action_rate if self._is_dual else rates.rate
+        self._vision_hz = rates.visual_rate if self._is_dual else rates.rate
+        self._timing = FlightTiming(action_hz=self._action_hz, vision_hz=self._vision_hz)
+        self._screen = FlightScreen(
+            console,
+            action_hz=self._action_hz,
+            vision_hz=self._vision_hz,
+            readonly=config.link.readonly,
+        )
+        self._link = self._open_link()
+        self._viewer = self._open_viewer()
+        camera = self._open_camera()
+        sinks: list[TickSink] = [self._timing, self._screen]
+        if self._viewer is not None:
+            sinks.append(self._viewer)
+        self._sink = FanOut(sinks)
+        cache = FeatureCache()
+        self._vision = self._make_vision(camera, cache)
+        self._action = self._make_action(cache)
+
+    def _open_viewer(self) -> ObserverThread | None:
+        if self._config.rerun == "off":
+            return None
+        view = RerunView(self._config.rerun, action_hz=self._action_hz, vision_hz=self._vision_hz)
+        viewer = ObserverThread("mavbridge-rerun", view, capacity=RERUN_CAPACITY)
+        self._stack.callback(viewer.close, JOIN_S)
+        return viewer
+
+    def _open_camera(self) -> Camera:
+        camera = open_camera(
+            self._config.camera.source,
+            image_size=self._executable.contract.image_height,
+            clock=self._clock,
+        )
+        self._stack.callback(camera.close)
+        return camera
+
+    def _open_link(self) -> MavlinkLink:
+        config = self._config.link
+        transport = make_transport(config.connect, self._clock)
+        link = MavlinkLink(transport, self._clock, config, state_hz=self._action_hz)
+        self._stack.callback(link.close)
+        return link
+
+    def _make_vision(self, camera: Camera, cache: FeatureCache) -> VisionLoop:
+        return VisionLoop(
+            camera=camera,
+            encode=self._executable.encode,
+            cache=cache,
+            sink=self._sink,
+            clock=self._clock,
+            period_ns=period_ns(self._vision_hz),
+        )
+
+    def _make_action(self, cache: FeatureCache) -> ActionLoop:
+        config, contract = self._config, self._executable.contract
+        action_period_ns = period_ns(self._action_hz)
+        smoothing = Smoothing(
+            max_slew_per_s=config.limits.max_slew,
+            tau_s=config.limits.tau,
+            max_dt_s=SMOOTHING_PERIODS * action_period_ns / NS_PER_S,
+        )
+        return ActionLoop(
+            clock=self._clock,
+            link=self._link,
+            cache=cache,
+            act=self._executable.act,
+            smoother=StickSmoother(smoothing),
+            engagement=Engagement(
+                wanted_mode=config.mode, arm=config.arm, readonly=config.link.readonly
+            ),
+            sink=self._sink,
+            settings=ActionSettings(
+                period_ns=action_period_ns,
+                state_frame=contract.state_frame,
+                chunk_dt_s=contract.chunk_dt_s,
+                history_len=contract.history_len,
+                history_dt_s=contract.history_dt_s,
+                freshness=_freshness(config.limits),
+                max_feature_age_ns=round(config.limits.max_feature_age * NS_PER_S),
+                lead_s=config.limits.tau,
+                mode=config.mode,
+                duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
+            ),
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Fly until the action loop ends, the camera dies, or somebody says stop."""
+        vision = Worker("mavbridge-vision", self._vision.run)
+        action = Worker("mavbridge-action", self._action.run)
+        # Joined in reverse: the sticks go back before anything that feeds them is taken away.
+        self._stack.callback(vision.join, JOIN_S)
+        self._stack.callback(self._end, action)
+        vision.start()
+        action.start()
+        with self._screen.live():
+            while action.is_alive and vision.is_alive and not stop.is_set():
+                self._screen.refresh()
+                self._watch(action)
+                stop.wait(1 / STATUS_HZ)
+
+    def _watch(self, action: Worker) -> None:
+        """End the flight when the action loop hangs: its last sticks must not stay."""
+        idle_ns = self._clock.now_ns() - self._action.alive_ns
+        if action.is_alive and idle_ns > HANG_NS:
+            raise PeerError(
+                f"the action loop has hung for {idle_ns / NS_PER_S:.1f} s: the policy is too slow "
+                "for this machine, or stuck"
+            )
+
+    def _end(self, action: Worker) -> None:
+        try:
+            action.join(JOIN_S)
+        except HungError:
+            # It is inside the policy, not the link: the sticks can and must be given back here.
+            self._link.send(Release("the action loop hangs"))
+            self._link.hand_back()
+            raise
+
+    def finish(self) -> None:
+        """Say how it went."""
+        report = self._report()
+        self._screen.show_report(report)
+        if self._config.report is not None:
+            _write_report(self._config, report)
+
+    def _report(self) -> TimingReport:
+        drops = ObserverDrops(rerun=self._viewer.dropped if self._viewer else None, recorder=None)
+        return self._timing.report(
+            mode="dual" if self._is_dual else "single",
+            engine=self._executable.engine,
+            policy=self._executable.name,
+            autopilot=self._link.autopilot,
+            link=self._link.stats(),
+            observer_drops=drops,
+        )
+
+
+def _freshness(limits: Limits) -> Freshness:
+    return Freshness(
+        attitude_ns=round(limits.max_attitude_age * NS_PER_S),
+        velocity_ns=round(limits.max_velocity_age * NS_PER_S),
+    )
+
+
+def _write_report(config: FlyConfig, report: TimingReport) -> None:
+    if config.report is None:
+        return
+    try:
+        config.report.parent.mkdir(parents=True, exist_ok=True)
+        config.report.write_text(report_json(report))
+    except OSError as error:
+        raise UserError(f"cannot write --report {config.report}: {error.strerror}") from error
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[threading.Event]:
+    """SIGINT and SIGTERM set the event; the flight ends in order, however often they come."""
+    stop = threading.Event()
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    previous = {
+        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,57 @@
+"""From the text after ``--camera`` to an open camera."""
+
+from functools import partial
+from pathlib import Path
+
+from mavbridge.camera.capture import DeviceSource, StreamSource
+from mavbridge.camera.grabber import Grabber
+from mavbridge.camera.shared_memory import SharedMemoryCamera
+from mavbridge.camera.video_file import VideoFileCamera
+from mavbridge.clock import Clock
+from mavbridge.errors import UserError
+from mavbridge.ports import Camera
+
+STREAM_SCHEMES = ("rtsp://", "udp://", "tcp://", "http://", "https://")
+FORMS = (
+    "a device (0, /dev/video0), a stream (rtsp://, udp://, tcp://, http://, https://), "
+    "a video file, shm:NAME or screen:WINDOW TITLE (screen: alone = the whole screen)"
+)
+
+
+def open_camera(spec: str, *, image_size: int, clock: Clock) -> Camera:
+    """Open the source that ``spec`` names.
+
+    ``image_size`` is the side of the policy's square image in pixels: a device is asked for a mode
+    that covers it. All other sources deliver the size that they have.
+
+    Raises:
+        UserError: ``spec`` is no known form, names no file, or needs a package that is absent.
+        CameraError: the source cannot be opened.
+    """
+    kind, _, rest = spec.partition(":")
+    if kind == "shm":
+        return SharedMemoryCamera(rest, clock=clock)
+    if kind == "screen":
+        return _open_screen(rest, clock)
+    if spec.startswith(STREAM_SCHEMES):
+        return Grabber(partial(StreamSource, spec, clock=clock), clock=clock)
+    if spec.isdecimal() or spec.startswith("/dev/video"):
+        device = int(spec) if spec.isdecimal() else Path(spec)
+        opener = partial(DeviceSource, device, image_size=image_size, clock=clock)
+        return Grabber(opener, clock=clock)
+    path = Path(spec)
+    if not path.is_file():
+        raise UserError(f"--camera {spec!r}: no such file, and no other source; want {FORMS}")
+    return VideoFileCamera(path, clock=clock)
+
+
+def _open_screen(title: str, clock: Clock) -> Camera:
+    try:
+        from mavbridge.camera.screen import ScreenCamera
+    except ModuleNotFoundError as error:
+        if error.name != "mss":
+            raise
+        raise UserError(
+            "--camera screen: needs the package mss: pip install 'mavbridge[screen]'"
+        ) from error
+    return ScreenCamera(title, clock=clock)

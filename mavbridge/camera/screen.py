@@ -1,0 +1,106 @@
+"""A window, or the whole screen, as a camera: for simulators that only show their view."""
+
+from collections.abc import Sequence
+
+import cv2
+import mss
+import numpy as np
+from mss.exception import ScreenShotError
+
+from mavbridge.camera.x11 import Region, Window, X11Screen
+from mavbridge.clock import NS_PER_S, Clock
+from mavbridge.errors import CameraError, MavbridgeError, UserError
+from mavbridge.records import Frame
+
+INTERVAL_NS = NS_PER_S // 60
+"""Screens change no faster, and a capture costs milliseconds."""
+
+
+class ScreenCamera:
+    """Captures what is on the screen where the window is, whatever may lie over it.
+
+    Captures in ``read``, so that a frame is as old as the capture takes; a screen has no frames of
+    its own that could be dropped. A window may move and change its size.
+    """
+
+    def __init__(self, title: str, *, clock: Clock) -> None:
+        """Find the window; an empty title stands for the whole screen.
+
+        Raises:
+            UserError: no window has this title, or several do.
+            CameraError: there is no screen.
+        """
+        self._clock = clock
+        self._title = title
+        self._windows: X11Screen | None = None
+        try:
+            self._screen = mss.MSS()
+        except ScreenShotError as error:
+            raise CameraError(f"there is no screen to capture: {error}") from error
+        if title:
+            try:
+                self._windows = X11Screen()
+                self._window = choose_window(self._windows.windows(), title)
+            except MavbridgeError:
+                self.close()
+                raise
+        self._frame_count = 0
+        self._next_ns = clock.now_ns()
+
+    @property
+    def dropped_frames(self) -> int:
+        """None ever."""
+        return 0
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        """See `mavbridge.ports.Camera`; at most 60 frames a second."""
+        deadline_ns = self._clock.now_ns() + timeout_ns
+        self._clock.sleep_until_ns(min(self._next_ns, deadline_ns))
+        if self._next_ns > deadline_ns:
+            return None
+        captured_ns = self._clock.now_ns()
+        region = self._region()
+        try:
+            bgra = np.asarray(self._screen.grab(region._asdict()))
+        except ScreenShotError as error:
+            raise CameraError(f"the screen cannot be captured: {error}") from error
+        rgb = np.asarray(cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGB), dtype=np.uint8)
+        rgb.flags.writeable = False
+        self._frame_count += 1
+        self._next_ns = captured_ns + INTERVAL_NS
+        return Frame(frame_id=self._frame_count, captured_ns=captured_ns, rgb=rgb)
+
+    def close(self) -> None:
+        """Disconnect from the display."""
+        self._screen.close()
+        if self._windows is not None:
+            self._windows.close()
+
+    def _region(self) -> Region:
+        if self._windows is None:
+            everything = self._screen.monitors[0]
+            return Region(**{side: everything[side] for side in Region._fields})
+        region = self._windows.region(self._window.id)
+        if region is None:
+            raise CameraError(f"the window {self._title!r} has been closed, hidden or moved away")
+        return region
+
+
+def choose_window(windows: Sequence[Window], title: str) -> Window:
+    """The window of this title, or else the only one whose title contains it, in any case.
+
+    Window managers may give a frame the title of the window inside it, so of equal titles the last
+    is taken: the innermost, topmost one.
+
+    Raises:
+        UserError: none or several; lists what there is.
+    """
+    exact = [window for window in windows if window.title == title]
+    similar = [window for window in windows if title.casefold() in window.title.casefold()]
+    matches = exact or similar
+    if len({window.title for window in matches}) == 1:
+        return matches[-1]
+    problem = "several windows have" if matches else "no window has"
+    titles = sorted({window.title for window in matches or windows})
+    listing = ", ".join(map(repr, titles)) or "none with a title"
+    raise UserError(f"--camera screen: {problem} {title!r} in the title; there are: {listing}")

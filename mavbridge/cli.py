@@ -1,0 +1,43 @@
+"""The command line: every flag is a field of a config dataclass."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+from cyclopts.config import Toml
+
+import mavbridge
+from mavbridge.config import FlyConfig
+from mavbridge.errors import UserError
+
+cli = App(
+    name="mavbridge",
+    help="Fly an ArduPilot or PX4 vehicle with a vision policy.",
+    version=mavbridge.__version__,
+)
+
+
+@cli.default
+def fly(config: FlyConfig | None = None) -> int:
+    """Fly. Nothing is armed and no mode is changed unless asked."""
+    from mavbridge.app import fly as run_flight  # torch and OpenCV: not for --help
+
+    return run_flight(FlyConfig() if config is None else config)
+
+
+@cli.meta.default
+def with_config(
+    *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
+    config: Path | None = None,
+) -> int:
+    """Read the settings file, then the command line on top of it.
+
+    Args:
+        tokens: the rest of the command line.
+        config: TOML file with flags as keys; flags given on the command line win.
+    """
+    if config is not None and not config.is_file():
+        raise UserError(f"--config {config}: no such file")
+    cli.config = [] if config is None else [Toml(config, use_commands_as_keys=False)]
+    status: int | None = cli(tokens)
+    return status or 0

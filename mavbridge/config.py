@@ -1,0 +1,187 @@
+"""Everything that can be set, as frozen dataclasses, and the only place that holds a rate in Hz.
+
+The command line and the TOML file are both read into ``FlyConfig``: a field is a flag, its
+docstring is the help text, an unknown key is an error.
+"""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from mavbridge.clock import NS_PER_S
+from mavbridge.errors import UserError
+
+Output = Literal["rc-override", "manual-control"]
+
+HEARTBEAT_HZ = 1.0
+"""MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
+RC_CHANNELS_HZ = 20.0
+"""RC_CHANNELS for the echo check and the pilot's sticks; the check needs 10 Hz or more."""
+TIMESYNC_HZ = 2.0
+"""TIMESYNC requests; the minimum-delay filter wants a few a second."""
+STATUS_HZ = 5.0
+"""Terminal refresh."""
+
+
+def period_ns(rate_hz: float) -> int:
+    """Period of a rate in integer nanoseconds."""
+    return round(NS_PER_S / rate_hz)
+
+
+def _check(name: str, value: float, low: float, high: float, unit: str) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        raise UserError(f"--{name} must be between {low:g} and {high:g} {unit}, got {value:g}")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Rates:
+    """Loop rates in Hz."""
+
+    visual_rate: float = 30.0
+    """Most frames a second through the image encoder (dual rate)."""
+    action_rate: float = 100.0
+    """Commands a second (dual rate)."""
+    rate: float = 30.0
+    """Commands a second in single-rate mode, each with its own image."""
+
+    def __post_init__(self) -> None:
+        """Refuse rates that no autopilot serves."""
+        _check("visual-rate", self.visual_rate, 0.5, 240, "Hz")
+        _check("action-rate", self.action_rate, 5, 500, "Hz")
+        _check("rate", self.rate, 5, 500, "Hz")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """How old an input may be, and how fast a stick may move. Beyond it: released to the pilot."""
+
+    max_attitude_age: float = 0.1
+    """Oldest attitude and body rates to act on, in seconds."""
+    max_velocity_age: float = 0.25
+    """Oldest velocity and acceleration to act on, in seconds."""
+    max_feature_age: float = 0.3
+    """Oldest image feature to act on, in seconds since exposure."""
+    tau: float = 0.05
+    """Time constant of the stick low-pass, in seconds; 0 = off."""
+    max_slew: float = 8.0
+    """Fastest stick movement, in full deflections a second; 0 = no limit."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that would switch a limit off by accident."""
+        for name in ("max_attitude_age", "max_velocity_age", "max_feature_age"):
+            _check(name.replace("_", "-"), getattr(self, name), 0.01, 5, "s")
+        _check("tau", self.tau, 0, 2, "s")
+        _check("max-slew", self.max_slew, 0, 1000, "1/s")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class LinkConfig:
+    """The vehicle and how to reach it."""
+
+    connect: str = ""
+    """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD."""
+    source_system: int = 255
+    """Our MAVLink system id; ArduPilot obeys overrides from its MAV_GCS_SYSID (255) only."""
+    target_system: int = 0
+    """System id of the vehicle to fly; 0 = the only one on the link."""
+    connect_timeout: float = 30.0
+    """Seconds to wait for the vehicle's first heartbeat."""
+    output: Output = "rc-override"
+    """RC_CHANNELS_OVERRIDE (ArduPilot) or MANUAL_CONTROL (PX4)."""
+    readonly: bool = False
+    """Run everything, send no stick, mode or arm command."""
+
+    def __post_init__(self) -> None:
+        """Refuse ids that MAVLink has no room for."""
+        _check("source-system", self.source_system, 1, 255, "")
+        _check("target-system", self.target_system, 0, 254, "")
+        _check("connect-timeout", self.connect_timeout, 0.1, 3600, "s")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class PolicyConfig:
+    """What flies."""
+
+    policy: str = "toge"
+    """toge[:small|medium|large[:BACKBONE]], resnet-unet, scripted[:hover|square|circle|yaw],
+    or your own package.module:Class."""
+    checkpoint: Path | None = None
+    """Weights: .safetensors with the contract in its header, or .pt."""
+    dual_rate: bool = False
+    """Encode images in their own thread and sample actions faster from the cached feature."""
+    num_diffusion_steps: int = 10
+    """DDIM steps of the action head."""
+    allow_untrained: bool = False
+    """Fly TOGE with seeded random weights: for timing and bring-up only."""
+    image_size: int | None = None
+    """Pixels a side into the encoder; by default what the policy's contract says (224)."""
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1, mps."""
+    seed: int = 0
+    """Seed of random weights and of the flight's initial diffusion noise."""
+
+    def __post_init__(self) -> None:
+        """Refuse what the scheduler and encoders cannot serve."""
+        _check("num-diffusion-steps", self.num_diffusion_steps, 1, 100, "steps")
+        if self.image_size is not None:
+            _check("image-size", self.image_size, 32, 1024, "pixels")
+        _check("seed", self.seed, 0, 2**63 - 1, "")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """Where the images come from."""
+
+    camera: str = "0"
+    """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
+    screen:WINDOW TITLE."""
+    window_name: str | None = None
+    """Same as --camera "screen:WINDOW TITLE"."""
+
+    @property
+    def source(self) -> str:
+        """The one camera spec that both flags end in."""
+        return self.camera if self.window_name is None else f"screen:{self.window_name}"
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class FlyConfig:
+    """One flight."""
+
+    link: LinkConfig = field(default_factory=LinkConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    rates: Rates = field(default_factory=Rates)
+    limits: Limits = field(default_factory=Limits)
+    mode: str | None = None
+    """Flight mode to ask for before flying, e.g. ALT_HOLD; by default the mode is left alone."""
+    arm: bool = False
+    """Arm the vehicle when everything is ready; by default arming is left to the pilot."""
+    duration: float | None = None
+    """Seconds to fly once engaged; by default until Ctrl-C."""
+    rerun: Annotated[str, Parameter(help="spawn, connect[=URL], FILE.rrd, or off.")] = "off"
+    report: Path | None = None
+    """Write the timing report here as JSON."""
+
+    def __post_init__(self) -> None:
+        """Refuse no vehicle at all, and contradictions."""
+        if not self.link.connect:
+            raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
+        if self.duration is not None:
+            _check("duration", self.duration, 0.1, 86400, "s")
+        if self.link.readonly and (self.arm or self.mode is not None):
+            raise UserError("--readonly sends nothing, so it cannot be used with --arm or --mode")
+
+    @property
+    def tick_hz(self) -> float:
+        """Rate of the action loop in the chosen mode."""
+        return self.rates.action_rate if self.policy.dual_rate else self.rates.rate

@@ -1,0 +1,270 @@
+"""Bytes <-> records, with no socket and no clock; the wire's sentinels and last refusals."""
+
+import math
+from collections.abc import Callable, Iterator
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.mavlink.calibration import RcCalibration
+from mavbridge.mavlink.messages import (
+    Attitude,
+    AutopilotVersion,
+    Body,
+    CommandAck,
+    Heartbeat,
+    Incoming,
+    LocalVelocity,
+    ParamValue,
+    RcChannels,
+    Source,
+    SpecificForce,
+    StatusText,
+    Timesync,
+)
+from mavbridge.records import Sticks
+
+MG_TO_MPS2 = 9.80665e-3
+"""Milli-g to m/s^2, standard gravity."""
+
+RELEASE_US = 0
+"""RC_CHANNELS_OVERRIDE ch 1-8: give the channel back to the receiver."""
+IGNORE_US = 65535
+"""RC_CHANNELS_OVERRIDE ch 1-8: leave the channel as it is. Not a release."""
+
+_HIGHRES_ACCEL_FIELDS = 0b111
+"""fields_updated bits of xacc, yacc, zacc."""
+
+
+class CommandRefusedError(Exception):
+    """A stick command that must not reach a wire. Always a bug upstream of the codec."""
+
+
+class Codec:
+    """One MAVLink 2 endpoint without I/O: owns the parser state and the sending sequence."""
+
+    def __init__(self, *, source_system: int, source_component: int) -> None:
+        self.source = Source(source_system, source_component)
+        self._mav = dialect.MAVLink(None, srcSystem=source_system, srcComponent=source_component)
+        self._mav.robust_parsing = True
+        self.bad_data_count = 0
+
+    def decode(self, data: bytes) -> Iterator[Incoming]:
+        """Messages completed by these bytes; corrupt bytes and unusable values are counted."""
+        for message in self._mav.parse_buffer(data) or ():
+            name = message.get_type()
+            if name == "BAD_DATA":
+                self.bad_data_count += 1
+                continue
+            reader = _READERS.get(name)
+            try:
+                body = None if reader is None else reader(message)
+            except _UnusableError:
+                self.bad_data_count += 1
+                continue
+            source = Source(message.get_srcSystem(), message.get_srcComponent())
+            yield Incoming(source, message.get_seq(), name, body)
+
+    def _pack(self, message: dialect.MAVLink_message) -> bytes:
+        data: bytes = message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return data
+
+    def encode_heartbeat(self) -> bytes:
+        """HEARTBEAT of an onboard controller, which no vehicle takes for a pilot's station."""
+        return self._pack(
+            self._mav.heartbeat_encode(
+                dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+                dialect.MAV_AUTOPILOT_INVALID,
+                0,
+                0,
+                dialect.MAV_STATE_ACTIVE,
+            )
+        )
+
+    def encode_override(self, target: Source, sticks: Sticks, calibration: RcCalibration) -> bytes:
+        """RC_CHANNELS_OVERRIDE holding the four stick channels, the others ignored.
+
+        Raises:
+            CommandRefusedError: a stick that is not finite or not in [-1, 1], or PWM out of range.
+        """
+        _refuse_bad_sticks(sticks)
+        channels_us = [IGNORE_US] * 8
+        for channel, value_us in zip(
+            calibration.channels, calibration.to_pwm_us(sticks), strict=True
+        ):
+            if not channel.min_us <= value_us <= channel.max_us:
+                raise CommandRefusedError(
+                    f"{value_us} us on channel {channel.number} is outside "
+                    f"{channel.min_us}..{channel.max_us}"
+                )
+            channels_us[channel.number - 1] = value_us
+        return self._pack(self._mav.rc_channels_override_encode(*target, *channels_us))
+
+    def encode_release(self, target: Source, calibration: RcCalibration) -> bytes:
+        """RC_CHANNELS_OVERRIDE that gives the four stick channels back."""
+        channels_us = [IGNORE_US] * 8
+        for channel in calibration.channels:
+            channels_us[channel.number - 1] = RELEASE_US
+        return self._pack(self._mav.rc_channels_override_encode(*target, *channels_us))
+
+    def encode_manual_control(self, target_system: int, sticks: Sticks) -> bytes:
+        """MANUAL_CONTROL: x forward, y right, r nose right in -1000..1000, z up in 0..1000.
+
+        Raises:
+            CommandRefusedError: a stick that is not finite or not in [-1, 1].
+        """
+        _refuse_bad_sticks(sticks)
+        x, y, r = (round(1000 * value) for value in (sticks.pitch, sticks.roll, sticks.yaw))
+        z = round(500 * (sticks.throttle + 1))
+        return self._pack(self._mav.manual_control_encode(target_system, x, y, z, r, 0))
+
+    def encode_command(self, target: Source, command: int, *params: float) -> bytes:
+        """COMMAND_LONG with up to seven parameters."""
+        padded = (*params, *(0.0,) * (7 - len(params)))
+        return self._pack(self._mav.command_long_encode(*target, command, 0, *padded))
+
+    def encode_param_read(self, target: Source, name: str) -> bytes:
+        """PARAM_REQUEST_READ by name."""
+        return self._pack(self._mav.param_request_read_encode(*target, name.encode(), -1))
+
+    def encode_timesync(self, ts1: int) -> bytes:
+        """TIMESYNC request."""
+        return self._pack(self._mav.timesync_encode(0, ts1))
+
+    def encode_stream_request(self, target: Source, stream: int, rate_hz: int) -> bytes:
+        """REQUEST_DATA_STREAM, for vehicles that know no message intervals."""
+        return self._pack(self._mav.request_data_stream_encode(*target, stream, rate_hz, 1))
+
+
+def manual_control_sticks(sticks: Sticks) -> Sticks:
+    """Sticks as MANUAL_CONTROL's integers can express them."""
+    return Sticks(
+        throttle=round(500 * (sticks.throttle + 1)) / 500 - 1,
+        yaw=round(1000 * sticks.yaw) / 1000,
+        pitch=round(1000 * sticks.pitch) / 1000,
+        roll=round(1000 * sticks.roll) / 1000,
+    )
+
+
+def _refuse_bad_sticks(sticks: Sticks) -> None:
+    for name, value in zip(sticks._fields, sticks, strict=True):
+        if not -1.0 <= value <= 1.0:  # also false for NaN
+            raise CommandRefusedError(f"{name} stick {value!r} is not in [-1, 1]")
+
+
+class _UnusableError(Exception):
+    """A well-formed message whose values mean nothing."""
+
+
+def _finite(*values: float) -> None:
+    if not all(map(math.isfinite, values)):
+        raise _UnusableError
+
+
+def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
+    return Heartbeat(
+        vehicle_type=m.type,
+        autopilot=m.autopilot,
+        base_mode=m.base_mode,
+        custom_mode=m.custom_mode,
+        system_status=m.system_status,
+    )
+
+
+def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body:
+    q = (m.q1, m.q2, m.q3, m.q4)
+    rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
+    _finite(*q, *rate)
+    if not 0.9 < math.hypot(*q) < 1.1:
+        raise _UnusableError
+    return Attitude(
+        is_quaternion=True, boot_ms=m.time_boot_ms, ned_from_body_wxyz=q, rate_body_radps=rate
+    )
+
+
+def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
+    rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
+    _finite(m.roll, m.pitch, m.yaw, *rate)
+    return Attitude(
+        is_quaternion=False,
+        boot_ms=m.time_boot_ms,
+        ned_from_body_wxyz=quaternion_from_euler(m.roll, m.pitch, m.yaw),
+        rate_body_radps=rate,
+    )
+
+
+def quaternion_from_euler(
+    roll_rad: float, pitch_rad: float, yaw_rad: float
+) -> tuple[float, float, float, float]:
+    """ned_from_body quaternion (w, x, y, z) of MAVLink's intrinsic Z-Y-X Euler angles."""
+    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:
+    _finite(m.vx, m.vy, m.vz)
+    return LocalVelocity(velocity_ned_mps=(m.vx, m.vy, m.vz))
+
+
+def _highres_imu(m: dialect.MAVLink_highres_imu_message) -> Body:
+    _finite(m.xacc, m.yacc, m.zacc)
+    if m.fields_updated & _HIGHRES_ACCEL_FIELDS != _HIGHRES_ACCEL_FIELDS:
+        raise _UnusableError
+    return SpecificForce(source=m.get_type(), specific_force_body_mps2=(m.xacc, m.yacc, m.zacc))
+
+
+def _milli_g_imu(m: dialect.MAVLink_scaled_imu_message) -> Body:
+    x, y, z = (value * MG_TO_MPS2 for value in (m.xacc, m.yacc, m.zacc))
+    return SpecificForce(source=m.get_type(), specific_force_body_mps2=(x, y, z))
+
+
+def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
+    values = (getattr(m, f"chan{number}_raw") for number in range(1, 19))
+    return RcChannels(channels_us=tuple(values)[: m.chancount or 18])
+
+
+def _command_ack(m: dialect.MAVLink_command_ack_message) -> Body:
+    return CommandAck(command=m.command, result=m.result)
+
+
+def _param_value(m: dialect.MAVLink_param_value_message) -> Body:
+    _finite(m.param_value)
+    return ParamValue(name=m.param_id, value=m.param_value)
+
+
+def _statustext(m: dialect.MAVLink_statustext_message) -> Body:
+    return StatusText(text=m.text)
+
+
+def _timesync(m: dialect.MAVLink_timesync_message) -> Body:
+    return Timesync(tc1=m.tc1, ts1=m.ts1)
+
+
+def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
+    v = m.flight_sw_version
+    return AutopilotVersion(version=f"{v >> 24 & 255}.{v >> 16 & 255}.{v >> 8 & 255}")
+
+
+_READERS: dict[str, Callable[[dialect.MAVLink_message], Body]] = {
+    "HEARTBEAT": _heartbeat,
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "ATTITUDE": _attitude,
+    "LOCAL_POSITION_NED": _local_position,
+    "HIGHRES_IMU": _highres_imu,
+    "SCALED_IMU": _milli_g_imu,
+    "SCALED_IMU2": _milli_g_imu,
+    "RAW_IMU": _milli_g_imu,
+    "RC_CHANNELS": _rc_channels,
+    "COMMAND_ACK": _command_ack,
+    "PARAM_VALUE": _param_value,
+    "STATUSTEXT": _statustext,
+    "TIMESYNC": _timesync,
+    "AUTOPILOT_VERSION": _autopilot_version,
+}

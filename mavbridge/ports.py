@@ -1,0 +1,62 @@
+"""The few Protocols that the loops need."""
+
+from typing import Protocol
+
+from mavbridge.records import Decision, Event, Frame, LinkSnapshot, Sticks
+
+
+class Camera(Protocol):
+    """A video source; opened by its constructor, used by one thread."""
+
+    @property
+    def dropped_frames(self) -> int:
+        """Frames that the source delivered and nobody read, since it was opened."""
+        ...
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        """Newest frame that was not returned before; None if none comes within the timeout.
+
+        Raises:
+            CameraError: the source has died and will not come back by itself.
+        """
+        ...
+
+    def close(self) -> None:
+        """Free the source; joins its thread. May be called twice."""
+        ...
+
+
+class Link(Protocol):
+    """The vehicle's end of the action loop; used by the action loop's thread alone."""
+
+    def poll(self) -> LinkSnapshot:
+        """Take in all that has arrived, do the housekeeping that is due; never blocks."""
+        ...
+
+    def send(self, decision: Decision) -> Sticks | None:
+        """Put the decision on the wire; returns the sticks that really left, None on release."""
+        ...
+
+    def hand_back(self) -> None:
+        """Finish giving the sticks back; takes up to half a second, at the end of a flight."""
+        ...
+
+    def set_mode(self, mode: str) -> None:
+        """Ask for a flight mode (rate-limited; the next heartbeat tells)."""
+        ...
+
+    def arm(self) -> None:
+        """Ask to arm (rate-limited; the next heartbeat tells)."""
+        ...
+
+    def close(self) -> None:
+        """Free the socket or port."""
+        ...
+
+
+class TickSink(Protocol):
+    """Where ticks go; must never block and never raise."""
+
+    def emit(self, event: Event) -> None:
+        """Take the event, or drop and count it."""
+        ...

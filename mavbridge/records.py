@@ -1,0 +1,216 @@
+"""What travels between the parts: frozen values, units and frames in the names.
+
+Stamps are nanoseconds of the injected clock, taken where the thing happened (exposure, datagram
+arrival). Arrays are read-only once they are published here.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray: TypeAlias = NDArray[np.float32]
+ImageArray: TypeAlias = NDArray[np.uint8]
+
+
+class Sticks(NamedTuple):
+    """Stick positions in [-1, 1], in the order of the action vector.
+
+    +throttle = up (0 is mid-stick), +yaw = nose right, +pitch = stick forward = nose down,
+    +roll = right.
+    """
+
+    throttle: float
+    yaw: float
+    pitch: float
+    roll: float
+
+
+NEUTRAL = Sticks(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
+IDLE = Sticks(throttle=-1.0, yaw=0.0, pitch=0.0, roll=0.0)
+"""Throttle at the bottom, the rest centred: what arming demands."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """Hold the vehicle's sticks here."""
+
+    sticks: Sticks
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Do not touch the sticks: they belong to the pilot. ``reason`` is shown to a person."""
+
+    reason: str
+
+
+Decision: TypeAlias = Command | Release
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frame:
+    """One camera image."""
+
+    frame_id: int
+    captured_ns: int
+    """Exposure, or failing that, arrival."""
+    rgb: ImageArray
+    """[H, W, 3] uint8, RGB, read-only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeatureFrame:
+    """What the slow path hands to the fast one: a value and the times that give its age."""
+
+    frame_id: int
+    captured_ns: int
+    ready_ns: int
+    value: FloatArray
+    """Dual rate: feature [1, F]. Single rate: preprocessed image [1, 3, H, W]. Read-only."""
+
+    def age_ns(self, now_ns: int) -> int:
+        """Time since exposure."""
+        return now_ns - self.captured_ns
+
+
+class Reading(NamedTuple):
+    """One measurement of the vehicle as it came in."""
+
+    arrived_ns: int
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Telemetry:
+    """Newest reading of each quantity, in MAVLink's frames (NED world, FRD body); None = never."""
+
+    ned_from_body_wxyz: Reading | None = None
+    rate_body_radps: Reading | None = None
+    velocity_ned_mps: Reading | None = None
+    specific_force_body_mps2: Reading | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleStatus:
+    """What the vehicle says of itself."""
+
+    system_id: int
+    autopilot: str
+    """"ardupilot", "px4" or "generic"."""
+    mode: str
+    armed: bool
+    heartbeat_ns: int
+    rc_sticks: Sticks | None = None
+    """Sticks that the vehicle acts on (RC_CHANNELS through its calibration)."""
+    rc_channels_us: tuple[int, ...] = ()
+    rc_arrived_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSnapshot:
+    """All that the link knows at one tick."""
+
+    telemetry: Telemetry
+    status: VehicleStatus | None
+    problem: str | None
+    """Why sticks may not be sent (no heartbeat, handshake, override switch, no echo), or None."""
+    echo_confirmed: bool = False
+    """The vehicle was seen to act on our sticks, or its output has no echo to check."""
+    texts: tuple[str, ...] = ()
+    """Status texts of the vehicle and warnings of the link since the last snapshot."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleState:
+    """The 13-D state of the contract and the arrival of each of its parts."""
+
+    values: FloatArray
+    """[13] float32: velocity m/s, attitude quaternion wxyz, body rates rad/s, specific force m/s^2,
+    in the frame of the contract. Read-only."""
+    attitude_ns: int
+    rate_ns: int
+    velocity_ns: int
+    specific_force_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StickTrace:
+    """One action on its way from the policy to the wire."""
+
+    raw: Sticks
+    clipped: Sticks
+    slewed: Sticks
+    smoothed: Sticks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tick:
+    """One pass of the action loop, complete enough to explain it afterwards."""
+
+    index: int
+    due_ns: int
+    woke_ns: int
+    missed_slots: int
+    """Slots skipped just before this one."""
+    predict_ns: int | None
+    """Duration of the policy's part; None when it did not run."""
+    sent_ns: int
+    """After the datagram was handed to the kernel."""
+    feature_frame_id: int | None
+    feature_captured_ns: int | None
+    state: VehicleState | None
+    trace: StickTrace | None
+    sent: Sticks | None
+    """What left, after rounding to PWM; None when released or read-only."""
+    release_reason: str | None
+    mode: str | None
+    armed: bool
+    rc_channels_us: tuple[int, ...]
+    rc_sticks: Sticks | None
+    texts: tuple[str, ...] = ()
+    """What the vehicle and the link had to say since the last tick."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VisionTick:
+    """One frame through the vision loop."""
+
+    frame_id: int
+    captured_ns: int
+    started_ns: int
+    ready_ns: int
+    dropped_frames: int
+    """By the source, since it was opened."""
+    rgb: ImageArray
+    """[H, W, 3] uint8, read-only: what the policy saw, before resizing."""
+
+
+Event: TypeAlias = Tick | VisionTick
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Percentiles:
+    """Distribution of a measured quantity; the unit is in the name of what holds it."""
+
+    p50: float
+    p99: float
+    p999: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkStats:
+    """What the link counted over one flight; None = not measured."""
+
+    messages_per_s: tuple[tuple[str, float], ...]
+    """Mean arrival rate by MAVLink message name."""
+    lost_fraction: float | None
+    """Lost over expected messages, by the vehicle's sequence numbers."""
+    rtt_ms: Percentiles | None
+    """Round trips of our own TIMESYNC requests."""
+    sent_overrides: int
+    """Stick messages handed to the kernel; releases not counted."""
+    echo_confirmed: bool | None
+    """The vehicle showed our sticks in RC_CHANNELS; None = no stick was sent."""

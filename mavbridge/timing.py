@@ -1,0 +1,326 @@
+"""Ticks in, percentiles out: what a flight's report says of its timing. Pure, constant memory."""
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from mavbridge.clock import NS_PER_MS, NS_PER_S
+from mavbridge.records import Event, LinkStats, Percentiles, Tick, VisionTick
+
+_SUB_BITS = 7
+"""128 bins an octave: a bin is at most 1/128 = 0.8 % wide."""
+_SUB_BINS = 1 << _SUB_BITS
+_LARGEST_NS = (1 << 42) - 1
+"""73 minutes; longer values share the last bin."""
+_BINS = (43 - _SUB_BITS) * _SUB_BINS
+
+MAX_RELEASES = 1000
+"""Release transitions kept in a report; the rest is counted."""
+
+
+class Histogram:
+    """Distribution of durations in constant memory: percentiles within 0.4 %, exact extremes.
+
+    Bins are linear within an octave and doubled from one to the next, which takes a shift instead
+    of a logarithm (G. Tene, HdrHistogram). One thread adds; another may read at any time.
+    """
+
+    def __init__(self) -> None:
+        self._counts = [0] * _BINS
+        self.count = 0
+        self.min_ns: int | None = None
+        self.max_ns: int | None = None
+
+    def add(self, value_ns: int) -> None:
+        """Count one duration; what is below zero falls in the first bin."""
+        clamped = 0 if value_ns < 0 else min(value_ns, _LARGEST_NS)
+        shift = clamped.bit_length() - (_SUB_BITS + 1)
+        if shift < 0:
+            shift = 0
+        self._counts[(shift << _SUB_BITS) + (clamped >> shift)] += 1
+        if self.min_ns is None or self.max_ns is None:
+            self.min_ns = self.max_ns = value_ns
+        elif value_ns > self.max_ns:
+            self.max_ns = value_ns
+        elif value_ns < self.min_ns:
+            self.min_ns = value_ns
+        self.count += 1
+
+    def quantile_ns(self, fraction: float) -> float | None:
+        """Nearest-rank quantile: the middle of its bin, never beyond the extremes; None if empty.
+
+        Args:
+            fraction: in (0, 1].
+        """
+        if self.min_ns is None or self.max_ns is None:
+            return None
+        rank = fraction * sum(self._counts)
+        seen = 0
+        for index, count in enumerate(self._counts):
+            seen += count
+            if count and seen >= rank:
+                return min(max(_bin_middle(index), self.min_ns), self.max_ns)
+        return self.max_ns
+
+    def percentiles_ms(self) -> Percentiles | None:
+        """p50, p99, p99.9 and the exact maximum in milliseconds; None if empty."""
+        p50, p99, p999 = (self.quantile_ns(fraction) for fraction in (0.5, 0.99, 0.999))
+        if p50 is None or p99 is None or p999 is None or self.max_ns is None:
+            return None
+        return Percentiles(p50=_ms(p50), p99=_ms(p99), p999=_ms(p999), max=_ms(self.max_ns))
+
+
+def _bin_middle(index: int) -> float:
+    octave = index >> _SUB_BITS
+    shift = max(octave - 1, 0)
+    low = (index - (shift << _SUB_BITS)) << shift
+    return low + ((1 << shift) - 1) / 2
+
+
+def _ms(value_ns: float) -> float:
+    """Milliseconds, to the microsecond."""
+    return round(value_ns / NS_PER_MS, 3)
+
+
+Mode = Literal["dual", "single"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionReport:
+    """The action loop over one flight; None = not measured."""
+
+    target_hz: float
+    rate_hz: float | None
+    ticks: int
+    missed_slots: int
+    period_ms: Percentiles | None
+    """Wake to wake."""
+    jitter_ms: Percentiles | None
+    """|period - target period|; a stall of n slots shows as one jitter of n periods."""
+    predict_ms: Percentiles | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VisionReport:
+    """The vision loop over one flight; None = not measured."""
+
+    target_hz: float
+    rate_hz: float | None
+    frames: int
+    dropped_frames: int
+    """By the source, since the first frame of the flight."""
+    encode_ms: Percentiles | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReleaseEvent:
+    """The sticks went back to the pilot, or the reason why they stay there changed."""
+
+    t_s: float
+    """Since the first tick."""
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObserverDrops:
+    """Events that observers missed; None = not running."""
+
+    rerun: int | None
+    recorder: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimingReport:
+    """What a flight was like; None = not measured."""
+
+    duration_s: float
+    mode: Mode
+    engine: str
+    policy: str
+    autopilot: str | None
+    action: ActionReport
+    vision: VisionReport
+    feature_age_ms: Percentiles | None
+    """Since exposure, at the send, of the feature behind each action."""
+    state_age_ms: Percentiles | None
+    """Since arrival, at the send, of the attitude behind each action."""
+    state_to_wire_ms: Percentiles | None
+    """Arrival of an attitude to the departure of the first sticks made from it."""
+    link: LinkStats | None
+    releases: tuple[ReleaseEvent, ...]
+    """The first ``MAX_RELEASES``."""
+    release_count: int
+    observer_drops: ObserverDrops
+
+
+class FlightTiming:
+    """A ``TickSink`` that counts a flight.
+
+    Cheap enough for the loops' own threads: one thread emits ticks, another may emit vision ticks,
+    and they share nothing.
+    """
+
+    def __init__(self, *, action_hz: float, vision_hz: float) -> None:
+        self._action = _ActionCounts(action_hz)
+        self._vision = _VisionCounts(vision_hz)
+
+    def emit(self, event: Event) -> None:
+        """Count the event."""
+        if isinstance(event, Tick):
+            self._action.add(event)
+        else:
+            self._vision.add(event)
+
+    def report(
+        self,
+        *,
+        mode: Mode,
+        engine: str,
+        policy: str,
+        autopilot: str | None,
+        link: LinkStats | None,
+        observer_drops: ObserverDrops,
+    ) -> TimingReport:
+        """All that was counted so far; exact once the loops have stopped."""
+        action = self._action
+        return TimingReport(
+            duration_s=round(action.span.duration_s, 3),
+            mode=mode,
+            engine=engine,
+            policy=policy,
+            autopilot=autopilot,
+            action=action.report(),
+            vision=self._vision.report(),
+            feature_age_ms=action.feature_age.percentiles_ms(),
+            state_age_ms=action.state_age.percentiles_ms(),
+            state_to_wire_ms=action.state_to_wire.percentiles_ms(),
+            link=link,
+            releases=tuple(action.releases),
+            release_count=action.release_count,
+            observer_drops=observer_drops,
+        )
+
+
+class _Span:
+    """First and last of a series of stamps, and how many."""
+
+    def __init__(self) -> None:
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self.count = 0
+
+    def add(self, stamp_ns: int) -> int | None:
+        """Time since the previous stamp; None for the first."""
+        since_ns = None if self.last_ns is None else stamp_ns - self.last_ns
+        if self.first_ns is None:
+            self.first_ns = stamp_ns
+        self.last_ns = stamp_ns
+        self.count += 1
+        return since_ns
+
+    @property
+    def duration_s(self) -> float:
+        if self.first_ns is None or self.last_ns is None:
+            return 0.0
+        return (self.last_ns - self.first_ns) / NS_PER_S
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Intervals per second; None before there is one."""
+        duration_s = self.duration_s
+        return round((self.count - 1) / duration_s, 3) if duration_s > 0 else None
+
+
+class _ActionCounts:
+    """The action thread's half of ``FlightTiming``."""
+
+    def __init__(self, target_hz: float) -> None:
+        self._target_hz = target_hz
+        self._target_period_ns = round(NS_PER_S / target_hz)
+        self._missed_slots = 0
+        self._period, self._jitter, self._predict = Histogram(), Histogram(), Histogram()
+        self._last_reason: str | None = None
+        self._last_attitude_ns: int | None = None
+        self.span = _Span()
+        self.feature_age, self.state_age = Histogram(), Histogram()
+        self.state_to_wire = Histogram()
+        self.releases: list[ReleaseEvent] = []
+        self.release_count = 0
+
+    def add(self, tick: Tick) -> None:
+        period_ns = self.span.add(tick.woke_ns)
+        if period_ns is not None:
+            self._period.add(period_ns)
+            self._jitter.add(abs(period_ns - self._target_period_ns))
+        self._missed_slots += tick.missed_slots
+        if tick.predict_ns is not None:
+            self._predict.add(tick.predict_ns)
+        if tick.trace is not None:
+            self._add_ages(tick)
+        if tick.release_reason != self._last_reason:
+            self._last_reason = tick.release_reason
+            if tick.release_reason is not None:
+                self._add_release(tick.woke_ns, tick.release_reason)
+
+    def _add_ages(self, tick: Tick) -> None:
+        if tick.feature_captured_ns is not None:
+            self.feature_age.add(tick.sent_ns - tick.feature_captured_ns)
+        if tick.state is None:
+            return
+        age_ns = tick.sent_ns - tick.state.attitude_ns
+        self.state_age.add(age_ns)
+        if tick.sent is not None and tick.state.attitude_ns != self._last_attitude_ns:
+            self._last_attitude_ns = tick.state.attitude_ns
+            self.state_to_wire.add(age_ns)
+
+    def _add_release(self, woke_ns: int, reason: str) -> None:
+        self.release_count += 1
+        if len(self.releases) < MAX_RELEASES and self.span.first_ns is not None:
+            t_s = (woke_ns - self.span.first_ns) / NS_PER_S
+            self.releases.append(ReleaseEvent(t_s=round(t_s, 3), reason=reason))
+
+    def report(self) -> ActionReport:
+        return ActionReport(
+            target_hz=self._target_hz,
+            rate_hz=self.span.rate_hz,
+            ticks=self.span.count,
+            missed_slots=self._missed_slots,
+            period_ms=self._period.percentiles_ms(),
+            jitter_ms=self._jitter.percentiles_ms(),
+            predict_ms=self._predict.percentiles_ms(),
+        )
+
+
+class _VisionCounts:
+    """The vision thread's half of ``FlightTiming``."""
+
+    def __init__(self, target_hz: float) -> None:
+        self._target_hz = target_hz
+        self._span = _Span()
+        self._encode = Histogram()
+        self._dropped_before: int | None = None
+        self._dropped_frames = 0
+
+    def add(self, vision: VisionTick) -> None:
+        self._span.add(vision.started_ns)
+        self._encode.add(vision.ready_ns - vision.started_ns)
+        if self._dropped_before is None:
+            self._dropped_before = vision.dropped_frames
+        self._dropped_frames = vision.dropped_frames - self._dropped_before
+
+    def report(self) -> VisionReport:
+        return VisionReport(
+            target_hz=self._target_hz,
+            rate_hz=self._span.rate_hz,
+            frames=self._span.count,
+            dropped_frames=self._dropped_frames,
+            encode_ms=self._encode.percentiles_ms(),
+        )
+
+
+def report_json(report: TimingReport) -> str:
+    """The report as JSON, keys in the order of the dataclasses; null = not measured."""
+    document = asdict(report)
+    if report.link is not None:
+        document["link"]["messages_per_s"] = dict(report.link.messages_per_s)
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"

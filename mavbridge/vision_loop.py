@@ -1,0 +1,90 @@
+"""The slow path: newest frame -> encoder -> cache, in a thread of its own."""
+
+import threading
+from collections.abc import Callable
+
+from mavbridge.clock import NS_PER_MS, Clock
+from mavbridge.feature_cache import FeatureCache
+from mavbridge.ports import Camera, TickSink
+from mavbridge.records import FeatureFrame, FloatArray, Frame, ImageArray, VisionTick
+
+READ_TIMEOUT_NS = 100 * NS_PER_MS
+"""How often a starving loop looks at the stop flag."""
+
+
+class VisionLoop:
+    """Encodes frames as they come, at most at the visual rate, and publishes the result.
+
+    It is driven by the camera, not by a grid: a frame is used when it arrives. Frames that come
+    faster than the visual rate are passed over, with a quarter of a period of tolerance for the
+    camera's own jitter.
+    """
+
+    def __init__(
+        self,
+        *,
+        camera: Camera,
+        encode: Callable[[ImageArray], FloatArray],
+        cache: FeatureCache,
+        sink: TickSink,
+        clock: Clock,
+        period_ns: int,
+    ) -> None:
+        self._camera = camera
+        self._encode = encode
+        self._cache = cache
+        self._sink = sink
+        self._clock = clock
+        self._period_ns = period_ns
+        self._due_ns: int | None = None
+
+    def run(self, stop: threading.Event) -> None:
+        """Encode until told to stop.
+
+        Raises:
+            CameraError: the camera has died.
+        """
+        while not stop.is_set():
+            self.step()
+
+    def step(self) -> None:
+        """Wait a moment for one frame and take it through.
+
+        Raises:
+            CameraError: the camera has died.
+        """
+        frame = self._camera.read(READ_TIMEOUT_NS)
+        if frame is None or not self._is_due(frame):
+            return
+        started_ns = self._clock.now_ns()
+        value = self._encode(frame.rgb)
+        value.setflags(write=False)
+        ready_ns = self._clock.now_ns()
+        self._cache.publish(
+            FeatureFrame(
+                frame_id=frame.frame_id,
+                captured_ns=frame.captured_ns,
+                ready_ns=ready_ns,
+                value=value,
+            )
+        )
+        self._sink.emit(
+            VisionTick(
+                frame_id=frame.frame_id,
+                captured_ns=frame.captured_ns,
+                started_ns=started_ns,
+                ready_ns=ready_ns,
+                dropped_frames=self._camera.dropped_frames,
+                rgb=frame.rgb,
+            )
+        )
+
+    def _is_due(self, frame: Frame) -> bool:
+        if self._due_ns is None:
+            self._due_ns = frame.captured_ns
+        if frame.captured_ns < self._due_ns - self._period_ns // 4:
+            return False
+        # Keep the grid through jitter; after a gap start a new one.
+        self._due_ns = max(self._due_ns, frame.captured_ns - self._period_ns // 2)
+        self._due_ns += self._period_ns
+        return True

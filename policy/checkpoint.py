@@ -1,0 +1,251 @@
+"""Weights on disk: the only module of the flight path that touches files.
+
+``.safetensors`` holds the contract and the architecture in its header, so the file alone says what
+it is. ``.pt`` and ``.pth`` hold weights; they are read without executing pickles, and what they do
+not say is taken from the caller.
+"""
+
+import json
+import pickle
+import struct
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from policy.contract import Contract, PolicyError
+from policy.diffusion import NoiseSchedule
+from policy.resnet_unet import ResnetUnet, ResnetUnetConfig
+from policy.toge import Toge, TogeConfig
+
+BuiltinPolicy: TypeAlias = Toge | ResnetUnet
+BuiltinConfig: TypeAlias = TogeConfig | ResnetUnetConfig
+
+CONTRACT_KEY = "contract"
+ARCHITECTURE_KEY = "architecture"
+HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
+SUFFIXES = (".safetensors", ".pt", ".pth")
+
+_DAMAGED = (
+    *(OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError),
+    *(AssertionError, ArithmeticError, MemoryError, struct.error),
+)
+"""What torch.load raises on flipped bytes: its reader interprets them before it checks them."""
+
+
+class CheckpointError(PolicyError):
+    """A checkpoint that cannot be read, or does not fit; the message says what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Contents:
+    """What a file held; None where it does not say."""
+
+    state: dict[str, Tensor]
+    contract: str | None
+    architecture: str | None
+
+
+def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
+    """The network of ``config``, with random weights of torch's global generator."""
+    return Toge(config) if isinstance(config, TogeConfig) else ResnetUnet(config)
+
+
+def save_checkpoint(path: Path, policy: BuiltinPolicy) -> None:
+    """Write weights, contract and architecture as safetensors; replaces ``path`` at once or not.
+
+    Raises:
+        CheckpointError: weights that are not finite, or a path that cannot be written.
+    """
+    if path.suffix != ".safetensors":
+        raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
+    state = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
+    _require_finite(path, state)
+    header = {
+        CONTRACT_KEY: policy.contract.to_json(),
+        ARCHITECTURE_KEY: _architecture_to_json(policy.config),
+    }
+    partial = path.with_name(path.name + ".partial")
+    try:
+        save_file(state, partial, metadata=header)
+        partial.replace(path)
+    except (OSError, SafetensorError) as error:
+        partial.unlink(missing_ok=True)
+        raise CheckpointError(f"cannot write {path}: {error}") from error
+
+
+def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
+    """Read a checkpoint into the network that it was made for, on the CPU, in eval mode.
+
+    Args:
+        path: a ``.safetensors``, ``.pt`` or ``.pth`` file.
+        fallback: the policy asked for; its kind must be the file's, and its values serve for what
+            a ``.pt`` does not say.
+
+    Raises:
+        CheckpointError: missing, corrupt, of another policy or contract version, not finite.
+    """
+    contents = _read(path)
+    _require_finite(path, contents.state)
+    try:
+        policy = build_policy(_config_of(contents, fallback))
+    except PolicyError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    _require_fit(path, policy, contents.state)
+    policy.load_state_dict(contents.state)
+    return policy.eval()
+
+
+def _config_of(contents: _Contents, fallback: BuiltinConfig) -> BuiltinConfig:
+    contract = fallback.contract
+    try:
+        if contents.contract is not None:
+            contract = Contract.from_json(contents.contract)
+        if contents.architecture is None:
+            return replace(fallback, contract=contract)
+        config = _architecture_from_json(contents.architecture, contract)
+    except RecursionError as error:
+        raise CheckpointError("the header is not JSON that any build of ours wrote") from error
+    if type(config) is not type(fallback):
+        raise CheckpointError(
+            f"it holds a {_kind(config)!r} policy, not a {_kind(fallback)!r} one: "
+            f"ask for it with --policy {_kind(config)}"
+        )
+    return config
+
+
+def _kind(config: BuiltinConfig) -> str:
+    return "toge" if isinstance(config, TogeConfig) else "resnet-unet"
+
+
+def _architecture_to_json(config: BuiltinConfig) -> str:
+    data = {name: value for name, value in asdict(config).items() if name != "contract"}
+    return json.dumps({"policy": _kind(config), **data}, sort_keys=True)
+
+
+def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
+    try:
+        data: Any = json.loads(text)
+        kind = data.pop("policy")
+        schedule = NoiseSchedule(**data.pop("schedule"))
+        if kind == "toge":
+            return TogeConfig(contract=contract, schedule=schedule, **data)
+        if kind == "resnet-unet":
+            return ResnetUnetConfig(contract=contract, schedule=schedule, **data)
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"malformed architecture {text[:200]!r} ({error}): export the checkpoint again"
+        ) from error
+    raise CheckpointError(f"policy {kind!r} is unknown; this build knows 'toge', 'resnet-unet'")
+
+
+def _read(path: Path) -> _Contents:
+    if path.suffix not in SUFFIXES:
+        raise CheckpointError(f"{path}: not a checkpoint; use one of {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        near = sorted(p.name for p in path.parent.glob("*") if p.suffix in SUFFIXES)
+        there = f"its folder holds {near}" if near else "its folder holds no checkpoint"
+        raise CheckpointError(f"{path}: no such file; {there}")
+    return _read_safetensors(path) if path.suffix == ".safetensors" else _read_torch(path)
+
+
+def _read_safetensors(path: Path) -> _Contents:
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(
+            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
+        ) from error
+    for key in HEADER_KEYS:
+        if key not in header:
+            raise CheckpointError(
+                f"{path}: no {key!r} in the header (it holds {sorted(header)}), so it was not "
+                "written by this project; load the weights as .pt and save them with "
+                "policy.checkpoint.save_checkpoint"
+            )
+    return _Contents(
+        state=state, contract=header[CONTRACT_KEY], architecture=header[ARCHITECTURE_KEY]
+    )
+
+
+def _read_torch(path: Path) -> _Contents:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of file formats; what matters is refused below
+            loaded: object = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(
+            f"{path}: refused. It is damaged, or a pickle that holds more than tensors, and "
+            "loading that could run any program. Save only model.state_dict() where it was trained"
+        ) from error
+    except _DAMAGED as error:
+        reason = str(error).partition("\n")[0] or "empty file"
+        raise CheckpointError(
+            f"{path}: not a readable torch file ({reason}); it may be cut short: copy it again"
+        ) from error
+    if not isinstance(loaded, dict):
+        raise CheckpointError(
+            f"{path}: holds a {type(loaded).__name__}, not a dict of weights; "
+            "save model.state_dict()"
+        )
+    return _Contents(
+        state=_weights(path, loaded),
+        contract=_text_or_none(path, loaded, CONTRACT_KEY),
+        architecture=_text_or_none(path, loaded, ARCHITECTURE_KEY),
+    )
+
+
+def _weights(path: Path, loaded: dict[Any, Any]) -> dict[str, Tensor]:
+    """The state dict in what torch.load returned: under a usual key, or the dict itself."""
+    state = {name: value for name, value in loaded.items() if name not in HEADER_KEYS}
+    for key in ("model_state_dict", "state_dict"):
+        if isinstance(loaded.get(key), dict):
+            state = loaded[key]
+            break
+    if state and all(isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()):
+        return state
+    raise CheckpointError(
+        f"{path}: no weights found; it must hold 'model_state_dict' or 'state_dict', or be a state "
+        f"dict itself, and holds {sorted(map(str, loaded))[:8]}"
+    )
+
+
+def _text_or_none(path: Path, loaded: dict[Any, Any], key: str) -> str | None:
+    value = loaded.get(key)
+    if value is None or isinstance(value, str):
+        return value
+    raise CheckpointError(f"{path}: {key!r} must be JSON text, got {type(value).__name__}")
+
+
+def _require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
+    bad = [name for name, value in state.items() if not torch.isfinite(value).all()]
+    if bad:
+        raise CheckpointError(
+            f"{path}: {len(bad)} tensors hold NaN or infinity, the first is {bad[0]!r}: "
+            "training diverged; take an earlier checkpoint"
+        )
+
+
+def _require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor]) -> None:
+    """Name the first few weights that do not fit; torch's own message lists hundreds."""
+    wanted = {name: list(value.shape) for name, value in policy.state_dict().items()}
+    problems = [f"missing {name!r}" for name in wanted if name not in state]
+    problems += [f"unexpected {name!r}" for name in state if name not in wanted]
+    problems += [
+        f"{name!r} is {list(state[name].shape)}, must be {shape}"
+        for name, shape in wanted.items()
+        if name in state and list(state[name].shape) != shape
+    ]
+    if problems:
+        raise CheckpointError(
+            f"{path}: does not fit this policy in {len(problems)} places: "
+            f"{'; '.join(problems[:4])}. Choose the size and backbone that it was trained with"
+        )

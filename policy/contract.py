@@ -1,0 +1,194 @@
+"""What goes into a policy and what comes out: names, order, frame, shapes, times.
+
+This is the only module of ``policy`` that the loops see; it imports numpy alone. A checkpoint
+carries its ``Contract`` in the header, and the bridge refuses one that it cannot keep.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+CONTRACT_VERSION = 1
+
+STATE_NAMES = (
+    *("vx_mps", "vy_mps", "vz_mps"),
+    *("qw", "qx", "qy", "qz"),
+    *("wx_radps", "wy_radps", "wz_radps"),
+    *("ax_mps2", "ay_mps2", "az_mps2"),
+)
+"""World velocity, world_from_body quaternion (unit, qw >= 0), body rates, body specific force."""
+STATE_DIM = len(STATE_NAMES)
+VELOCITY, QUATERNION, RATE, SPECIFIC_FORCE = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
+
+ACTION_NAMES = ("throttle", "yaw", "pitch", "roll")
+"""Sticks in [-1, 1]: up, nose right, stick forward (nose down), right; 0 = centred."""
+ACTION_DIM = len(ACTION_NAMES)
+
+IMAGENET_MEAN_RGB = (0.485, 0.456, 0.406)
+IMAGENET_STD_RGB = (0.229, 0.224, 0.225)
+
+FloatArray = NDArray[np.float32]
+StateFrame = Literal["ned_frd", "enu_flu"]
+Arrays = Literal["numpy", "torch"]
+
+
+class PolicyError(ValueError):
+    """A policy, contract or checkpoint that cannot be used; the message says what to do."""
+
+
+class ContractError(PolicyError):
+    """A contract that is malformed or that the bridge cannot keep."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contract:
+    """The interface of one policy.
+
+    Times are seconds, never ticks: one checkpoint behaves the same at 50, 100 or 250 Hz.
+
+    Raises:
+        ContractError: a field is out of its range.
+    """
+
+    state_frame: StateFrame = "ned_frd"
+    """World and body axes of the state: MAVLink's NED/FRD or ROS's ENU/FLU."""
+    image_height: int = 224
+    image_width: int = 224
+    image_mean_rgb: tuple[float, float, float] = IMAGENET_MEAN_RGB
+    image_std_rgb: tuple[float, float, float] = IMAGENET_STD_RGB
+    feature_dim: int = 0
+    """F of encode_visual's [B, F]; 0 where there is no fast path."""
+    horizon: int = 16
+    """Actions in a chunk."""
+    chunk_dt_s: float = 0.05
+    """Time between the actions of a chunk; action 0 acts at the time of the state."""
+    history_len: int = 4
+    """K past actions, oldest first, as they were sent."""
+    history_dt_s: float = 0.05
+    """Time between them; the newest is history_dt_s before the state."""
+    arrays: Arrays = "torch"
+    """What the policy takes and returns."""
+    version: int = CONTRACT_VERSION
+
+    def __post_init__(self) -> None:
+        """Refuse what no runtime could serve."""
+        if self.version != CONTRACT_VERSION:
+            raise ContractError(
+                f"contract version {self.version} is not supported; this build reads version "
+                f"{CONTRACT_VERSION}: export the checkpoint again"
+            )
+        if self.state_frame not in ("ned_frd", "enu_flu"):
+            raise ContractError(
+                f"state_frame {self.state_frame!r} is unknown; use 'ned_frd' or 'enu_flu'"
+            )
+        if self.arrays not in ("numpy", "torch"):
+            raise ContractError(f"arrays {self.arrays!r} is unknown; use 'numpy' or 'torch'")
+        for name, low, high in (
+            ("image_height", 16, 4096),
+            ("image_width", 16, 4096),
+            ("feature_dim", 0, 65536),
+            ("horizon", 1, 1024),
+            ("history_len", 1, 1024),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, int) or not low <= value <= high:
+                raise ContractError(f"{name} must be an integer in {low}..{high}, got {value!r}")
+        for name in ("chunk_dt_s", "history_dt_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and 0 < value <= 1):
+                raise ContractError(f"{name} must be in (0, 1] seconds, got {value!r}")
+        if not all(map(math.isfinite, (*self.image_mean_rgb, *self.image_std_rgb))):
+            raise ContractError("image_mean_rgb and image_std_rgb must be finite numbers")
+        if min(self.image_std_rgb) <= 0:
+            raise ContractError(f"image_std_rgb must be positive, got {self.image_std_rgb}")
+
+    def to_json(self) -> str:
+        """Header form of a checkpoint."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Contract":
+        """Read the header form; an unknown or missing-type key is refused.
+
+        Raises:
+            ContractError: not JSON, unknown keys, or values out of range.
+        """
+        try:
+            data: Any = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ContractError(f"the contract in the checkpoint is not JSON: {error}") from error
+        if not isinstance(data, dict):
+            raise ContractError("the contract in the checkpoint is not a JSON object")
+        known = {field.name for field in fields(cls)}
+        if unknown := sorted(set(data) - known):
+            raise ContractError(f"unknown contract keys {unknown}; known are {sorted(known)}")
+        for name in ("image_mean_rgb", "image_std_rgb"):
+            if name in data:
+                data[name] = _rgb(name, data[name])
+        try:
+            return cls(**data)
+        except TypeError as error:
+            raise ContractError(f"malformed contract: {error}") from error
+
+
+def _rgb(name: str, value: object) -> tuple[float, float, float]:
+    if isinstance(value, list) and len(value) == 3:
+        numbers = [float(number) for number in value if isinstance(number, int | float)]
+        if len(numbers) == 3:
+            return numbers[0], numbers[1], numbers[2]
+    raise ContractError(f"{name} must be three numbers, got {value!r}")
+
+
+@runtime_checkable
+class SingleRatePolicy(Protocol):
+    """The least that flies: image, state and history in, a chunk out.
+
+    Shapes, float32: image [B, 3, H, W] normalised by the contract, state [B, 13] in SI units,
+    action_history [B, K, 4]; returns [B, horizon, 4] sticks in [-1, 1]. Arrays are numpy or torch,
+    as ``contract.arrays`` says. Any class with these members will do; nothing is inherited.
+    """
+
+    contract: Contract
+
+    def predict(self, image: Any, state: Any, action_history: Any, num_diffusion_steps: int) -> Any:
+        """Encode the image and sample one chunk."""
+        ...
+
+
+@runtime_checkable
+class DualRatePolicy(SingleRatePolicy, Protocol):
+    """A policy whose image path can run slower than its action path."""
+
+    def encode_visual(self, image: Any) -> Any:
+        """Image [B, 3, H, W] -> feature [B, F]."""
+        ...
+
+    def predict_fast(
+        self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
+    ) -> Any:
+        """Cached feature [B, F], newest state and history -> chunk [B, horizon, 4]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Executable:
+    """A policy ready to run on one engine, numpy in and numpy out, as the loops call it.
+
+    ``encode`` runs in the vision thread, ``act`` in the action thread. Without a fast path
+    ``encode`` only preprocesses and ``act`` does the rest.
+    """
+
+    contract: Contract
+    name: str
+    engine: str
+    dual_rate: bool
+    encode: Callable[[NDArray[np.uint8]], FloatArray]
+    """RGB [any height, any width, 3] -> feature [1, F]; in single-rate mode -> the preprocessed
+    image [1, 3, H, W]."""
+    act: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+    """(encode's value, state [1, 13], history [1, K, 4]) -> chunk [1, horizon, 4]."""

@@ -1,0 +1,102 @@
+"""What turns the state, the history of actions and the visual feature into one condition vector."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, PolicyError
+from policy.preprocess import STATE_SCALE
+
+HEADS = 4
+
+
+def require_shape(name: str, array: Tensor, *shape: int) -> None:
+    """Refuse ``array`` unless it is [B, *shape].
+
+    Raises:
+        PolicyError: it is not.
+    """
+    if array.ndim != len(shape) + 1 or tuple(array.shape[1:]) != shape:
+        wanted = ", ".join(["B", *map(str, shape)])
+        raise PolicyError(f"{name} must be [{wanted}], got {list(array.shape)}")
+
+
+class StateEncoder(nn.Module):
+    """State [B, 13] in SI units -> token [B, dim]."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(STATE_DIM, dim), nn.SiLU(), nn.Linear(dim, dim))
+        self._scale: Tensor
+        self.register_buffer("_scale", torch.tensor(STATE_SCALE), persistent=False)
+
+    def normalise(self, state: Tensor) -> Tensor:
+        """Each dimension over its scale; of q and -q, the same attitude, the one with w >= 0."""
+        quaternion = state[:, QUATERNION]
+        flipped = torch.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+        before, after = state[:, : QUATERNION.start], state[:, QUATERNION.stop :]
+        return torch.cat([before, flipped, after], dim=1) / self._scale
+
+    def forward(self, state: Tensor) -> Tensor:
+        """State [B, 13] -> token [B, dim]."""
+        token: Tensor = self.mlp(self.normalise(state))
+        return token
+
+
+class AttentionBlock(nn.Module):
+    """Self-attention and an MLP, each behind a norm and around a shortcut; [B, T, dim] -> same."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.qkv, self.project = nn.Linear(dim, 3 * dim), nn.Linear(dim, dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, 2 * dim), nn.SiLU(), nn.Linear(2 * dim, dim))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens that have looked at each other."""
+        batch, count, dim = tokens.shape
+        qkv = self.qkv(self.norm1(tokens)).reshape(batch, count, 3, HEADS, dim // HEADS)
+        query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)
+        attended = F.scaled_dot_product_attention(query, key, value)
+        tokens = tokens + self.project(attended.transpose(1, 2).reshape(batch, count, dim))
+        out: Tensor = tokens + self.mlp(self.norm2(tokens))
+        return out
+
+
+class HistoryEncoder(nn.Module):
+    """Past actions [B, K, 4], oldest first -> tokens [B, K, dim] that have looked at each other."""
+
+    def __init__(self, dim: int, history_len: int) -> None:
+        super().__init__()
+        self.embed = nn.Linear(ACTION_DIM, dim)
+        self.position = nn.Parameter(0.02 * torch.randn(1, history_len, dim))
+        self.attention = AttentionBlock(dim)
+
+    def forward(self, action_history: Tensor) -> Tensor:
+        """Past actions [B, K, 4] -> tokens [B, K, dim]."""
+        tokens: Tensor = self.attention(self.embed(action_history) + self.position)
+        return tokens
+
+
+class Fusion(nn.Module):
+    """Visual token, state token and, where there is one, the history -> condition [B, dim].
+
+    All tokens attend to each other; the condition is read from the two that are always there, so
+    the same weights serve with and without history.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.modality = nn.Parameter(0.02 * torch.randn(3, dim))
+        self.attention = AttentionBlock(dim)
+        self.norm = nn.LayerNorm(2 * dim)
+        self.project = nn.Linear(2 * dim, dim)
+
+    def forward(self, visual: Tensor, state: Tensor, history: Tensor | None) -> Tensor:
+        """Tokens [B, dim], [B, dim], [B, K, dim] or None -> condition [B, dim]."""
+        tokens = torch.stack([visual, state], dim=1) + self.modality[:2]
+        if history is not None:
+            tokens = torch.cat([tokens, history + self.modality[2]], dim=1)
+        fused = self.attention(tokens)[:, :2].flatten(1)
+        condition: Tensor = self.project(self.norm(fused))
+        return condition

@@ -1,0 +1,38 @@
+"""Policies that compute in numpy are called as they are."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from policy.contract import Executable, FloatArray, PolicyError, SingleRatePolicy
+from policy.engines.executable import make_executable
+
+NAME = "numpy"
+
+
+def make_numpy_executable(
+    policy: SingleRatePolicy, *, name: str, num_diffusion_steps: int, dual_rate: bool
+) -> Executable:
+    """Wrap a numpy policy for the loops; tried once.
+
+    Raises:
+        PolicyError: no fast path where one was asked for, or it failed on a dummy sample.
+    """
+
+    def run(method: Callable[..., Any], *arrays: FloatArray) -> FloatArray:
+        result = method(*arrays)
+        if not isinstance(result, np.ndarray):
+            raise PolicyError(
+                f"{name} returned {type(result).__name__}; its contract says numpy arrays"
+            )
+        return np.asarray(result, np.float32)
+
+    return make_executable(
+        policy,
+        run,
+        name=name,
+        engine=NAME,
+        num_diffusion_steps=num_diffusion_steps,
+        dual_rate=dual_rate,
+    )

@@ -1,0 +1,249 @@
+"""From what a user wrote (``--policy``, ``--checkpoint``) to an executable, or a clear refusal.
+
+    toge[:SIZE][:BACKBONE]   TOGE, e.g. toge, toge:medium, toge:small:resnet18
+    resnet-unet[:SIZE]       ResNet-UNet, single-rate
+    scripted[:PROGRAM]       a fixed program, e.g. scripted:square
+    package.module:Class     any class that keeps contract.SingleRatePolicy or DualRatePolicy
+
+torch is imported only where a policy needs it.
+"""
+
+import importlib
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from policy.contract import Contract, DualRatePolicy, Executable, PolicyError, SingleRatePolicy
+from policy.scripted import ScriptedPolicy
+
+if TYPE_CHECKING:
+    from policy.checkpoint import BuiltinConfig, BuiltinPolicy
+
+_FORMS = "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM] or package.module:Class"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedPolicy:
+    """A policy that may fly, and what a person should know of it."""
+
+    executable: Executable
+    notes: tuple[str, ...]
+    """Lines to show before take-off."""
+
+
+def load_policy(
+    spec: str,
+    *,
+    checkpoint: Path | None,
+    allow_untrained: bool,
+    device: str,
+    dual_rate: bool,
+    num_diffusion_steps: int,
+    image_size: int | None,
+    seed: int,
+    now_s: Callable[[], float],
+) -> LoadedPolicy:
+    """Find, build, load and try the policy that ``spec`` names.
+
+    Args:
+        spec: one of the forms in the module's docstring.
+        checkpoint: weights; a user's class gets it as ``Class(checkpoint=path)``.
+        allow_untrained: whether seeded random weights will do where there is no checkpoint.
+        device: torch's name of where to run: cpu, cuda, cuda:0, mps.
+        dual_rate: asked for; a policy without a fast path is made single-rate, with a note.
+        num_diffusion_steps: denoising steps of every sample.
+        image_size: height and width that the policy takes; None leaves it to the contract.
+        seed: of untrained weights and of the flight's initial noise.
+        now_s: monotonic seconds, for scripted programs.
+
+    Raises:
+        PolicyError: with what was wrong, what was available and what to do.
+    """
+    kind, *options = spec.split(":")
+    policy: SingleRatePolicy
+    if kind == "scripted":
+        policy = _scripted(options, checkpoint, image_size, now_s)
+        notes = [f"{spec}: flies a fixed program, the camera is not looked at"]
+    elif kind in ("toge", "resnet-unet"):
+        config = _config(kind, options, image_size)
+        if checkpoint is not None:
+            policy, notes = _trained(config, options, checkpoint, seed)
+        elif allow_untrained:
+            policy, notes = _untrained(config, seed)
+        else:
+            raise PolicyError(
+                f"{kind} needs trained weights: give --checkpoint FILE, or --allow-untrained for "
+                "seeded random ones (timing and bring-up), or fly --policy scripted"
+            )
+    else:
+        policy = _user_class(spec, checkpoint)
+        notes = [f"{spec}: a class of yours"]
+    _require_image_size(policy.contract, image_size)
+    if dual_rate and not isinstance(policy, DualRatePolicy):
+        dual_rate = False
+        notes.append(
+            f"warning: {spec} has no fast path (encode_visual and predict_fast), so it flies in "
+            "single-rate mode, the whole network for every action"
+        )
+    return LoadedPolicy(
+        executable=_executable(spec, policy, device, dual_rate, num_diffusion_steps),
+        notes=tuple(notes),
+    )
+
+
+def _executable(
+    name: str, policy: SingleRatePolicy, device: str, dual_rate: bool, num_diffusion_steps: int
+) -> Executable:
+    """The engine that takes the policy's kind of arrays."""
+    if policy.contract.arrays == "numpy":
+        from policy.engines.direct import make_numpy_executable
+
+        return make_numpy_executable(
+            policy, name=name, num_diffusion_steps=num_diffusion_steps, dual_rate=dual_rate
+        )
+    from policy.engines.torch_eager import make_torch_executable
+
+    _require_device(device)
+    return make_torch_executable(
+        policy,
+        name=name,
+        device=device,
+        num_diffusion_steps=num_diffusion_steps,
+        dual_rate=dual_rate,
+    )
+
+
+def _scripted(
+    options: list[str],
+    checkpoint: Path | None,
+    image_size: int | None,
+    now_s: Callable[[], float],
+) -> ScriptedPolicy:
+    if checkpoint is not None:
+        raise PolicyError(f"scripted policies have no weights: leave out --checkpoint {checkpoint}")
+    program = ":".join(options) or "hover"
+    return ScriptedPolicy(program, now_s, contract=_contract(image_size))
+
+
+def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinConfig":
+    """What the spec asks for; a checkpoint that says more overrules it."""
+    from policy.action_head import SIZE_NAMES
+    from policy.backbones import BACKBONE_NAMES
+    from policy.resnet_unet import ResnetUnetConfig
+    from policy.toge import TogeConfig
+
+    rest: list[Any] = list(options)
+    chosen_size: Any = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
+    contract = _contract(image_size)
+    if kind == "toge" and len(rest) <= 1:
+        if rest and rest[0] not in BACKBONE_NAMES:
+            raise PolicyError(
+                f"--policy toge:{':'.join(options)}: {rest[0]!r} is neither a size "
+                f"({', '.join(SIZE_NAMES)}) nor an encoder ({', '.join(BACKBONE_NAMES)})"
+            )
+        backbone = rest[0] if rest else TogeConfig.backbone
+        return TogeConfig(size=chosen_size, backbone=backbone, contract=contract)
+    if rest:
+        raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {_FORMS}")
+    return ResnetUnetConfig(size=chosen_size, contract=contract)
+
+
+def _trained(
+    config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
+) -> tuple["BuiltinPolicy", list[str]]:
+    from policy.checkpoint import load_checkpoint
+
+    policy = load_checkpoint(checkpoint, fallback=config)
+    parts = (policy.config.size, getattr(policy.config, "backbone", "resnet18"))
+    if contradicted := [option for option in options if option not in parts]:
+        raise PolicyError(
+            f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
+        )
+    policy.reset(seed)
+    return policy, [f"weights of {checkpoint} ({', '.join(parts)})"]
+
+
+def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
+    import torch
+
+    from policy.checkpoint import build_policy
+
+    with torch.random.fork_rng(devices=[]):  # the process's own random stream stays as it was
+        torch.manual_seed(seed)
+        policy = build_policy(config).eval()
+    policy.reset(seed)
+    note = f"untrained: seeded random weights (seed {seed}); for timing and bring-up only"
+    return policy, [note]
+
+
+def _user_class(spec: str, checkpoint: Path | None) -> SingleRatePolicy:
+    module_name, _, class_name = spec.partition(":")
+    names = (*module_name.split("."), class_name)
+    if not all(name.isidentifier() for name in names):
+        raise PolicyError(f"policy {spec!r} is unknown; write {_FORMS}")
+    try:
+        module = importlib.import_module(module_name)
+    except (ImportError, SyntaxError) as error:
+        raise PolicyError(
+            f"--policy {spec}: cannot import {module_name} ({error}); put its folder on PYTHONPATH "
+            f"or install it, or write {_FORMS}"
+        ) from error
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type):
+        classes = sorted(name for name, value in vars(module).items() if isinstance(value, type))
+        raise PolicyError(f"--policy {spec}: no class {class_name} there; it has {classes}")
+    return _instance(spec, found, checkpoint)
+
+
+def _instance(spec: str, found: type, checkpoint: Path | None) -> SingleRatePolicy:
+    arguments: dict[str, Path] = {} if checkpoint is None else {"checkpoint": checkpoint}
+    try:
+        inspect.signature(found).bind(**arguments)
+    except (TypeError, ValueError) as error:
+        call = "Class()" if checkpoint is None else "Class(checkpoint=path)"
+        raise PolicyError(f"--policy {spec}: cannot be made with {call}: {error}") from error
+    policy: object = found(**arguments)
+    contract = getattr(policy, "contract", None)
+    if not isinstance(policy, SingleRatePolicy) or not isinstance(contract, Contract):
+        raise PolicyError(
+            f"--policy {spec}: a policy needs a member contract (a policy.contract.Contract) and "
+            "predict(image, state, action_history, num_diffusion_steps); for the dual-rate mode "
+            "also encode_visual(image) and predict_fast(feature, state, action_history, "
+            f"num_diffusion_steps). Missing or wrong here: {_lacking(policy)}"
+        )
+    if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
+        raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")
+    return policy
+
+
+def _lacking(policy: object) -> list[str]:
+    lacking = [] if isinstance(getattr(policy, "contract", None), Contract) else ["contract"]
+    return lacking + ([] if hasattr(policy, "predict") else ["predict"])
+
+
+def _contract(image_size: int | None) -> Contract:
+    if image_size is None:
+        return Contract()
+    return Contract(image_height=image_size, image_width=image_size)
+
+
+def _require_image_size(contract: Contract, image_size: int | None) -> None:
+    height, width = contract.image_height, contract.image_width
+    if image_size is not None and (height, width) != (image_size, image_size):
+        raise PolicyError(
+            f"--image-size {image_size} contradicts the policy's contract, which takes "
+            f"{height}x{width}: leave the flag out"
+        )
+
+
+def _require_device(device: str) -> None:
+    import torch
+
+    available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+    if torch.backends.mps.is_available():
+        available.append("mps")
+    wanted = "cuda:0" if device == "cuda" else device
+    if wanted not in available:
+        raise PolicyError(f"device {device!r} is not available; this machine has {available}")

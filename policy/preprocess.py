@@ -1,0 +1,68 @@
+"""From a camera image and a vehicle state to what a net takes: one copy for training and flight.
+
+The image is normalised here, before the net, by the checkpoint's contract. The state is normalised
+inside the nets (``encoders.StateEncoder``) with the constants of this module, so that a checkpoint
+takes SI units. No torch: the scripted policies pass through here too.
+"""
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from policy.contract import Contract, FloatArray, PolicyError
+
+STATE_SCALE = (
+    *(5.0, 5.0, 5.0),  # m/s: a brisk pace through gates
+    *(1.0, 1.0, 1.0, 1.0),  # a unit quaternion
+    *(3.0, 3.0, 3.0),  # rad/s: about ArduPilot's default yaw and roll rates at full stick
+    *(9.80665, 9.80665, 9.80665),  # m/s^2: standard gravity
+)
+"""Each dimension of the state is divided by this; typical flight then lies within [-1, 1].
+
+Fixed, not taken from data: every checkpoint shares it, and a sensor that is off by a unit shows.
+"""
+
+
+def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:
+    """Resize and normalise one image.
+
+    Args:
+        rgb: [H, W, 3] uint8, RGB, any size.
+        contract: gives the size that the net takes, and its mean and standard deviation.
+
+    Returns:
+        [1, 3, image_height, image_width] float32, ``(rgb / 255 - mean) / std``.
+
+    Raises:
+        PolicyError: the array is not an RGB uint8 image.
+    """
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
+        raise PolicyError(
+            f"an image must be uint8 [height, width, 3] in RGB, got {rgb.dtype} {list(rgb.shape)}: "
+            "convert it in the camera source"
+        )
+    height, width = contract.image_height, contract.image_width
+    if rgb.shape[:2] != (height, width):
+        shrinks = rgb.shape[0] > height or rgb.shape[1] > width
+        # Area averaging does not alias when shrinking; it is nearest-neighbour when enlarging.
+        interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        resized = cv2.resize(
+            np.ascontiguousarray(rgb), (width, height), interpolation=interpolation
+        )
+    else:
+        resized = rgb
+    scale, offset = _scale_offset(contract)
+    planes = np.empty((1, 3, height, width), np.float32)
+    for channel in range(3):
+        np.multiply(resized[..., channel], scale[channel], out=planes[0, channel])
+        planes[0, channel] += offset[channel]
+    return planes
+
+
+@lru_cache(maxsize=8)
+def _scale_offset(contract: Contract) -> tuple[FloatArray, FloatArray]:
+    mean = np.asarray(contract.image_mean_rgb)
+    std = np.asarray(contract.image_std_rgb)
+    return (1.0 / (255.0 * std)).astype(np.float32), (-mean / std).astype(np.float32)

@@ -1,0 +1,104 @@
+"""ResNet-18 and ResNet-50 (He et al. 2016) with torchvision's parameter names.
+
+ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
+"""
+
+from torch import Tensor, nn
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions around a shortcut."""
+
+    expansion = 1
+
+    def __init__(self, channels_in: int, width: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels_in, width, 3, stride=stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.downsample = _shortcut(channels_in, width, stride)
+        self.relu = nn.ReLU(inplace=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C_in, H, W] -> [B, width, H/stride, W/stride]."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        hidden = self.relu(self.bn1(self.conv1(x)))
+        out: Tensor = self.relu(self.bn2(self.conv2(hidden)) + shortcut)
+        return out
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1 convolutions around a shortcut."""
+
+    expansion = 4
+
+    def __init__(self, channels_in: int, width: int, stride: int) -> None:
+        super().__init__()
+        channels_out = width * self.expansion
+        self.conv1 = nn.Conv2d(channels_in, width, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, stride=stride, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, channels_out, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(channels_out)
+        self.downsample = _shortcut(channels_in, channels_out, stride)
+        self.relu = nn.ReLU(inplace=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C_in, H, W] -> [B, 4 * width, H/stride, W/stride]."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        hidden = self.relu(self.bn1(self.conv1(x)))
+        hidden = self.relu(self.bn2(self.conv2(hidden)))
+        out: Tensor = self.relu(self.bn3(self.conv3(hidden)) + shortcut)
+        return out
+
+
+class ResNet(nn.Module):
+    """Image [B, 3, H, W] -> pooled feature [B, out_dim]; torchvision's ``fc`` is left out."""
+
+    classifier_keys = ("fc.weight", "fc.bias")
+
+    def __init__(
+        self, block: type[BasicBlock] | type[Bottleneck], depths: tuple[int, int, int, int]
+    ) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.relu = nn.ReLU(inplace=True)
+        self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        wide = block.expansion
+        self.layer1 = _layer(block, 64, 64, depths[0], stride=1)
+        self.layer2 = _layer(block, 64 * wide, 128, depths[1], stride=2)
+        self.layer3 = _layer(block, 128 * wide, 256, depths[2], stride=2)
+        self.layer4 = _layer(block, 256 * wide, 512, depths[3], stride=2)
+        self.out_dim = 512 * wide
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Pooled feature [B, out_dim]."""
+        x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
+        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
+        pooled: Tensor = x.mean(dim=(2, 3))
+        return pooled
+
+
+def _layer(
+    block: type[BasicBlock] | type[Bottleneck],
+    channels_in: int,
+    width: int,
+    depth: int,
+    *,
+    stride: int,
+) -> nn.Sequential:
+    first = block(channels_in, width, stride)
+    rest = [block(width * block.expansion, width, 1) for _ in range(depth - 1)]
+    return nn.Sequential(first, *rest)
+
+
+def _shortcut(channels_in: int, channels_out: int, stride: int) -> nn.Sequential | None:
+    if stride == 1 and channels_in == channels_out:
+        return None
+    return nn.Sequential(
+        nn.Conv2d(channels_in, channels_out, 1, stride=stride, bias=False),
+        nn.BatchNorm2d(channels_out),
+    )

@@ -1,0 +1,139 @@
+"""TOGE, the dual-rate vision policy: a slow image path, a fast action path, one condition.
+
+    image --backbone, projection--> feature --.
+    state [B, 13] ----------------------------+--attention--> condition --diffusion head--> chunk
+    action history [B, K, 4] --attention------'
+
+Everything left of the feature runs at the camera's rate, the rest at the action rate.
+"""
+
+from dataclasses import dataclass, field, replace
+
+from torch import Tensor, nn
+
+from policy.action_head import DiffusionHead, Size, size_dims
+from policy.backbones import BACKBONE_NAMES, BackboneName, build_backbone
+from policy.contract import ACTION_DIM, STATE_DIM, Contract, ContractError, PolicyError
+from policy.diffusion import NoiseSchedule
+from policy.encoders import Fusion, HistoryEncoder, StateEncoder, require_shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class TogeConfig:
+    """All that fixes TOGE's architecture.
+
+    Raises:
+        PolicyError: a value is unknown, or the contract is not one that this size can keep.
+    """
+
+    size: Size = "small"
+    backbone: BackboneName = "efficientnet_b3"
+    contract: Contract = field(default_factory=Contract)
+    """``feature_dim`` 0 stands for the size's own."""
+    schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
+
+    def __post_init__(self) -> None:
+        """Refuse a contract of another network."""
+        if self.backbone not in BACKBONE_NAMES:
+            raise PolicyError(
+                f"backbone {self.backbone!r} is unknown; use one of {list(BACKBONE_NAMES)}"
+            )
+        feature_dim = size_dims(self.size).base_dim
+        if self.contract.feature_dim not in (0, feature_dim):
+            raise ContractError(
+                f"the contract says feature_dim {self.contract.feature_dim}, but TOGE "
+                f"{self.size} has {feature_dim}: choose the size that the checkpoint was made with"
+            )
+        if self.contract.arrays != "torch":
+            raise ContractError(
+                f"TOGE takes torch arrays, the contract says {self.contract.arrays}"
+            )
+
+
+class Toge(nn.Module):
+    """The policy protocol of ``contract.DualRatePolicy``, on torch tensors.
+
+    Images are normalised by ``preprocess.image_to_input``, states are in SI units.
+    """
+
+    def __init__(self, config: TogeConfig) -> None:
+        super().__init__()
+        dim = size_dims(config.size).base_dim
+        self.contract = replace(config.contract, feature_dim=dim)
+        self.config = replace(config, contract=self.contract)
+        self.backbone = build_backbone(config.backbone)
+        # The norm gives every backbone the same scale beside the other tokens.
+        self.visual_projection = nn.Sequential(
+            nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
+        )
+        self.state_encoder = StateEncoder(dim)
+        self.history_encoder = HistoryEncoder(dim, self.contract.history_len)
+        self.fusion = Fusion(dim)
+        self.head = DiffusionHead(config.size, self.contract, config.schedule)
+
+    def reset(self, seed: int) -> None:
+        """Start a flight: fixes the initial noise of all samples to come."""
+        self.head.reset(seed)
+
+    def encode_visual(self, image: Tensor) -> Tensor:
+        """Image [B, 3, H, W] -> feature [B, F]: the slow path.
+
+        Raises:
+            PolicyError: the image is not of the contract's size.
+        """
+        require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
+        feature: Tensor = self.visual_projection(self.backbone(image))
+        return feature
+
+    def encode_and_fuse(
+        self, feature: Tensor, state: Tensor, action_history: Tensor | None
+    ) -> Tensor:
+        """Feature [B, F], state [B, 13], history [B, K, 4] or None -> condition [B, C].
+
+        Raises:
+            PolicyError: a shape is not the contract's.
+        """
+        require_shape("feature", feature, self.contract.feature_dim)
+        require_shape("state", state, STATE_DIM)
+        history = None
+        if action_history is not None:
+            require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
+            history = self.history_encoder(action_history)
+        condition: Tensor = self.fusion(feature, self.state_encoder(state), history)
+        return condition
+
+    def encode_observation(
+        self, image: Tensor, state: Tensor, action_history: Tensor | None
+    ) -> Tensor:
+        """``encode_visual`` and ``encode_and_fuse`` in sequence -> condition [B, C]."""
+        return self.encode_and_fuse(self.encode_visual(image), state, action_history)
+
+    def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
+        """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
+        return self.head.denoise(noisy, timestep, condition)
+
+    def predict_fast(
+        self,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor | None,
+        num_diffusion_steps: int = 10,
+    ) -> Tensor:
+        """Cached feature, newest state and history -> chunk [B, horizon, 4] in [-1, 1].
+
+        Raises:
+            PolicyError: a shape is not the contract's, or the steps are not 1..100.
+        """
+        condition = self.encode_and_fuse(feature, state, action_history)
+        return self.head.sample(condition, num_diffusion_steps)
+
+    def predict(
+        self,
+        image: Tensor,
+        state: Tensor,
+        action_history: Tensor | None,
+        num_diffusion_steps: int = 10,
+    ) -> Tensor:
+        """The image is encoded once, then as ``predict_fast``: bit for bit the same chunk."""
+        feature = self.encode_visual(image)
+        return self.predict_fast(feature, state, action_history, num_diffusion_steps)

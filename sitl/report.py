@@ -1,0 +1,204 @@
+"""What happened, measured on the vehicle's side of the wire, for ``--report fc.json``.
+
+All times are seconds since the vehicle's start (``t_s``). Keys:
+
+    duration_s           simulated time
+    overrides            RC_CHANNELS_OVERRIDE let in that drove at least one of channels 1-8:
+      count, first_t_s, last_t_s
+      rate_hz            (count - 1) / (last - first); null for fewer than two
+      gap_ms             {p50, p99, max} between consecutive overrides with no release in between;
+                         null for none. Arrival is the kernel's stamp where it gives one.
+    releases             {count, t_s: [...]}: messages that only release (zeros, the rest ignored);
+                         at most the first 100 times are listed
+    manual_control       {count}
+    refused_messages     let in but holding NaN or infinity where a number is needed
+    bad_frames           garbage, truncated or corrupt frames
+    armed_s              time armed
+    max_altitude_m       above the start
+    distance_m           flown over ground and through the air, along the path
+    crashed              hit the ground faster than 3.5 m/s or tilted by more than 45 degrees
+    impact_speed_mps     of the hardest touch; 0.0 if it never left the ground
+    gates                {total, passed: [{index, t_s}, ...]} or null without a course
+    modes                [{t_s, mode}, ...] from the first
+    statustexts          [{t_s, text}, ...]; at most the first 200
+    final                {mode, armed, landed, position_ned_m, velocity_ned_mps, roll_pitch_yaw_deg}
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sitl.autopilot import Autopilot
+from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.course import Course, GateCounter
+from sitl.rotation import cos_tilt, to_euler
+
+CRASH_SPEED_MPS = 3.5
+"""ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash."""
+CRASH_TILT_COS = math.cos(math.radians(45.0))
+MAX_RELEASE_TIMES = 100
+MAX_TEXTS = 200
+PATH_PERIOD_NS = NS_PER_S // 20
+"""Path length is summed at 20 Hz: fine enough for turns, coarse enough not to add up vibration."""
+
+
+class FlightLog:
+    """Collects one run; ``boot_ns`` of the first boot is its time zero."""
+
+    def __init__(self, start_ns: int, course: Course | None) -> None:
+        self.refused_messages = 0
+        self._start_ns = start_ns
+        self._gates_total = len(course.gates) if course else 0
+        self._gates = GateCounter(course) if course else None
+        self._overrides = _OverrideStats()
+        self._release_times_s: list[float] = []
+        self._releases = 0
+        self._manual_controls = 0
+        self.texts: list[dict[str, float | str]] = []
+        """What the vehicle has said: ``t_s`` and ``text``."""
+        self._modes: list[dict[str, float | str]] = []
+        self._armed_ns = 0
+        self._last_ns = start_ns
+        self._max_altitude_m = 0.0
+        self._distance_m = 0.0
+        self._path_due_ns = start_ns
+        self._path_point = (0.0, 0.0, 0.0)
+        self._was_touching = True
+        self._speed_mps = 0.0
+        self._impact_mps = 0.0
+        self.crashed = False
+
+    def on_override(self, arrived_ns: int) -> None:
+        """An RC_CHANNELS_OVERRIDE that drives at least one stick."""
+        self._overrides.add(arrived_ns)
+
+    def on_release(self, arrived_ns: int) -> None:
+        """An RC_CHANNELS_OVERRIDE that only gives sticks back."""
+        self._overrides.interrupt()
+        self._releases += 1
+        if len(self._release_times_s) < MAX_RELEASE_TIMES:
+            self._release_times_s.append(self._t_s(arrived_ns))
+
+    def on_manual_control(self) -> None:
+        """An accepted MANUAL_CONTROL."""
+        self._manual_controls += 1
+
+    def on_text(self, now_ns: int, text: str) -> None:
+        """The vehicle said something."""
+        if len(self.texts) < MAX_TEXTS:
+            self.texts.append({"t_s": self._t_s(now_ns), "text": text})
+
+    def on_step(self, ap: Autopilot) -> None:
+        """One control step has passed."""
+        if not self._modes or self._modes[-1]["mode"] != ap.mode.name:
+            self._modes.append({"t_s": self._t_s(ap.now_ns), "mode": ap.mode.name})
+        if ap.armed:
+            self._armed_ns += ap.now_ns - self._last_ns
+        self._last_ns = ap.now_ns
+        body = ap.truth
+        self._max_altitude_m = max(self._max_altitude_m, -body.position_ned_m[2])
+        if ap.now_ns >= self._path_due_ns:
+            self._path_due_ns = ap.now_ns + PATH_PERIOD_NS
+            self._distance_m += math.dist(body.position_ned_m, self._path_point)
+            self._path_point = body.position_ned_m
+        if self._gates is not None:
+            self._gates.update(body.position_ned_m, self._t_s(ap.now_ns))
+        if body.touching and not self._was_touching:
+            self._impact_mps = max(self._impact_mps, self._speed_mps)
+            tilted = cos_tilt(body.ned_from_body_wxyz) < CRASH_TILT_COS
+            self.crashed = self.crashed or tilted or self._speed_mps > CRASH_SPEED_MPS
+        self._was_touching = body.touching
+        self._speed_mps = math.hypot(*body.velocity_ned_mps)
+
+    def summary(self, ap: Autopilot, bad_frames: int) -> dict[str, Any]:
+        """The report, ready for JSON."""
+        body = ap.truth
+        angles = to_euler(body.ned_from_body_wxyz)
+        return {
+            "duration_s": self._t_s(ap.now_ns),
+            "overrides": self._overrides.summary(self._start_ns),
+            "releases": {"count": self._releases, "t_s": self._release_times_s},
+            "manual_control": {"count": self._manual_controls},
+            "refused_messages": self.refused_messages,
+            "bad_frames": bad_frames,
+            "armed_s": self._armed_ns / NS_PER_S,
+            "max_altitude_m": self._max_altitude_m,
+            "distance_m": self._distance_m,
+            "crashed": self.crashed,
+            "impact_speed_mps": self._impact_mps,
+            "gates": self._gates_summary(),
+            "modes": self._modes,
+            "statustexts": self.texts,
+            "final": {
+                "mode": ap.mode.name,
+                "armed": ap.armed,
+                "landed": ap.landed,
+                "position_ned_m": body.position_ned_m,
+                "velocity_ned_mps": body.velocity_ned_mps,
+                "roll_pitch_yaw_deg": [math.degrees(angle) for angle in angles],
+            },
+        }
+
+    def _gates_summary(self) -> dict[str, Any] | None:
+        if self._gates is None:
+            return None
+        passed = [{"index": gate.index, "t_s": gate.t_s} for gate in self._gates.passed]
+        return {"total": self._gates_total, "passed": passed}
+
+    def _t_s(self, now_ns: int) -> float:
+        return (now_ns - self._start_ns) / NS_PER_S
+
+
+class _OverrideStats:
+    """Arrival times of overrides; gaps are kept as float32, 4 bytes each, so an hour is 1.4 MB."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._first_ns = self._last_ns = 0
+        self._engaged = False
+        self._gaps_ms = np.empty(1024, dtype=np.float32)
+        self._gap_count = 0
+
+    def add(self, arrived_ns: int) -> None:
+        """One more."""
+        if self._count == 0:
+            self._first_ns = arrived_ns
+        elif self._engaged:
+            self._add_gap((arrived_ns - self._last_ns) / NS_PER_MS)
+        self._count += 1
+        self._last_ns = arrived_ns
+        self._engaged = True
+
+    def interrupt(self) -> None:
+        """A release: the time to the next override is no gap."""
+        self._engaged = False
+
+    def _add_gap(self, gap_ms: float) -> None:
+        if self._gap_count == len(self._gaps_ms):
+            self._gaps_ms = np.concatenate([self._gaps_ms, np.empty_like(self._gaps_ms)])
+        self._gaps_ms[self._gap_count] = gap_ms
+        self._gap_count += 1
+
+    def summary(self, start_ns: int) -> dict[str, Any]:
+        """The ``overrides`` block."""
+        span_s = (self._last_ns - self._first_ns) / NS_PER_S
+        gaps = self._gaps_ms[: self._gap_count]
+        percentiles = np.percentile(gaps, (50, 99, 100)).tolist() if len(gaps) else None
+        some = self._count > 0
+        return {
+            "count": self._count,
+            "first_t_s": (self._first_ns - start_ns) / NS_PER_S if some else None,
+            "last_t_s": (self._last_ns - start_ns) / NS_PER_S if some else None,
+            "rate_hz": (self._count - 1) / span_s if span_s > 0.0 else None,
+            "gap_ms": dict(zip(("p50", "p99", "max"), percentiles, strict=True))
+            if percentiles
+            else None,
+        }
+
+
+def write_report(path: Path, summary: dict[str, Any]) -> None:
+    """Write the report as JSON."""
+    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

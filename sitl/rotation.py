@@ -1,0 +1,99 @@
+"""Attitude arithmetic on plain floats: at these sizes several times cheaper than arrays.
+
+Quaternions are unit, w first, and named by the frames that they join: ``ned_from_body`` rotates
+body (FRD) vectors into NED. Euler angles are yaw, then pitch, then roll (aerospace order).
+"""
+
+import math
+from typing import TypeAlias
+
+Vec3: TypeAlias = tuple[float, float, float]
+Quat: TypeAlias = tuple[float, float, float, float]
+
+IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
+
+
+def multiply(a: Quat, b: Quat) -> Quat:
+    """Hamilton product."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def conjugate(q: Quat) -> Quat:
+    """Inverse rotation."""
+    w, x, y, z = q
+    return (w, -x, -y, -z)
+
+
+def rotate(q: Quat, v: Vec3) -> Vec3:
+    """The vector in the frame on the left of the quaternion's name."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx = 2.0 * (y * vz - z * vy)
+    ty = 2.0 * (z * vx - x * vz)
+    tz = 2.0 * (x * vy - y * vx)
+    return (
+        vx + w * tx + y * tz - z * ty,
+        vy + w * ty + z * tx - x * tz,
+        vz + w * tz + x * ty - y * tx,
+    )
+
+
+def from_euler(roll: float, pitch: float, yaw: float) -> Quat:
+    """Unit quaternion of the angles, radians."""
+    cr, sr = math.cos(roll / 2.0), math.sin(roll / 2.0)
+    cp, sp = math.cos(pitch / 2.0), math.sin(pitch / 2.0)
+    cy, sy = math.cos(yaw / 2.0), math.sin(yaw / 2.0)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def to_euler(q: Quat) -> Vec3:
+    """Roll, pitch, yaw in radians; pitch within +-pi/2."""
+    w, x, y, z = q
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return roll, pitch, yaw
+
+
+def rotation_vector(q: Quat) -> Vec3:
+    """Axis times angle of the shorter way round, radians."""
+    w, x, y, z = q
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, w) / sine
+    return (x * scale, y * scale, z * scale)
+
+
+def integrate(q: Quat, rate_body_radps: Vec3, dt_s: float) -> Quat:
+    """The attitude after turning at a constant body rate; renormalised."""
+    wx, wy, wz = rate_body_radps
+    rate = math.sqrt(wx * wx + wy * wy + wz * wz)
+    half = 0.5 * rate * dt_s
+    scale = 0.5 * dt_s if half < 1e-9 else math.sin(half) / rate
+    w, x, y, z = multiply(q, (math.cos(half), wx * scale, wy * scale, wz * scale))
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    return (w / norm, x / norm, y / norm, z / norm)
+
+
+def cos_tilt(q: Quat) -> float:
+    """Cosine of the angle between body down and NED down: 1 level, 0 on its side."""
+    _, x, y, _ = q
+    return 1.0 - 2.0 * (x * x + y * y)
+
+
+def wrap_pi(angle: float) -> float:
+    """The angle in [-pi, pi]."""
+    return math.remainder(angle, 2.0 * math.pi)

@@ -1,0 +1,114 @@
+"""Writer of frames in shared memory: docs/shm_camera.md is the format."""
+
+import mmap
+import os
+import struct
+import tempfile
+import threading
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.errors import UsageError
+
+MAGIC = b"MBSHM\0\0\1"
+HEADER_BYTES = 64
+SLOT_HEADER_BYTES = 32
+CHANNELS = 3
+SLOTS = 4
+LIVE, CLOSED = 1, 2
+NEWEST, STATE = 3, 4
+"""Places of the header's fields, in units of 8 bytes."""
+SEQ, FRAME_ID, CAPTURED_NS = 0, 1, 2
+"""Places of a slot's fields, in units of 8 bytes."""
+
+
+class FramePublisher:
+    """Publishes RGB frames of one size under a name; used by one thread."""
+
+    def __init__(self, name: str, width: int, height: int) -> None:
+        if min(width, height) < 1:
+            raise UsageError(f"a frame needs at least one pixel, got {width}x{height}")
+        self._path = _shm_path(name)
+        self._shape = (height, width, CHANNELS)
+        stride = -(-(SLOT_HEADER_BYTES + width * height * CHANNELS) // 64) * 64
+        self._map, self._inode = _create(self._path, width, height, HEADER_BYTES + SLOTS * stride)
+        self._header = np.frombuffer(self._map, np.int64, HEADER_BYTES // 8)
+        self._slots = [
+            _Slot(self._map, HEADER_BYTES + k * stride, self._shape) for k in range(SLOTS)
+        ]
+        self._frame_id = 0
+        self._barrier = threading.Lock()
+
+    def publish(self, rgb: NDArray[np.uint8], captured_ns: int) -> None:
+        """Copy a frame [height, width, 3] uint8 and make it the newest.
+
+        Raises:
+            ValueError: another shape or type than announced, or closed before.
+        """
+        if rgb.shape != self._shape or rgb.dtype != np.uint8:
+            raise ValueError(f"want uint8 {self._shape}, got {rgb.dtype} {rgb.shape}")
+        if not self._slots:
+            raise ValueError("publish after close")
+        self._frame_id += 1
+        slot = self._slots[self._frame_id % SLOTS]
+        slot.fields[SEQ] += 1
+        self._in_order()
+        slot.fields[FRAME_ID] = self._frame_id
+        slot.fields[CAPTURED_NS] = captured_ns
+        slot.pixels[:] = rgb
+        self._in_order()
+        slot.fields[SEQ] += 1
+        self._in_order()
+        self._header[NEWEST] = self._frame_id
+
+    def close(self) -> None:
+        """Tell the readers, and remove the name unless another writer has taken it over."""
+        if not self._slots:
+            return
+        self._header[STATE] = CLOSED
+        if self._path.exists() and self._path.stat().st_ino == self._inode:
+            self._path.unlink()
+        self._slots = []
+        self._header = np.empty(0, np.int64)
+        self._map.close()
+
+    def _in_order(self) -> None:
+        """Memory barrier: the stores before it are seen before those after it.
+
+        Python has none by name; taking and freeing a lock is one on every platform (POSIX 4.12).
+        """
+        with self._barrier:
+            pass
+
+
+class _Slot:
+    """Views of one slot."""
+
+    def __init__(self, buffer: mmap.mmap, offset: int, shape: tuple[int, int, int]) -> None:
+        size = shape[0] * shape[1] * shape[2]
+        self.fields = np.frombuffer(buffer, np.int64, SLOT_HEADER_BYTES // 8, offset)
+        self.pixels = np.frombuffer(buffer, np.uint8, size, offset + SLOT_HEADER_BYTES).reshape(
+            shape
+        )
+
+
+def _shm_path(name: str) -> Path:
+    if not name or "/" in name or name.startswith("."):
+        raise UsageError(f"shm:{name}: want a name such as fpv, without '/' or a leading '.'")
+    folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
+    return (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
+
+
+def _create(path: Path, width: int, height: int, size: int) -> tuple[mmap.mmap, int]:
+    """Lay the file out under another name, then give it its own: no reader sees half a header."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    with draft.open("w+b") as file:
+        file.truncate(size)
+        file.write(MAGIC + struct.pack("<IIIIQQ", width, height, CHANNELS, SLOTS, 0, LIVE))
+        file.flush()
+        mapped = mmap.mmap(file.fileno(), size)
+        inode = os.fstat(file.fileno()).st_ino
+    draft.replace(path)
+    return mapped, inode

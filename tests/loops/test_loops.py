@@ -1,0 +1,336 @@
+"""Both loops on virtual time: each has its own clock; a feature is seen once it is ready."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from fakes import START_NS, FakeClock, FakeLink, ListSink, ScriptedCamera, level_telemetry
+from mavbridge.action_loop import NEUTRAL_TICKS, ActionLoop, ActionSettings
+from mavbridge.clock import NS_PER_MS, NS_PER_S, Pacer
+from mavbridge.feature_cache import FeatureCache
+from mavbridge.records import (
+    IDLE,
+    NEUTRAL,
+    Command,
+    FeatureFrame,
+    FloatArray,
+    ImageArray,
+    Release,
+    Sticks,
+)
+from mavbridge.safety import Engagement
+from mavbridge.smoothing import Smoothing, StickSmoother
+from mavbridge.state import Freshness
+from mavbridge.vision_loop import VisionLoop
+
+MS = NS_PER_MS
+FRAME_NS = NS_PER_S // 30
+SETTINGS = ActionSettings(
+    period_ns=10 * MS,
+    state_frame="ned_frd",
+    chunk_dt_s=0.05,
+    history_len=4,
+    history_dt_s=0.05,
+    freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
+    max_feature_age_ns=300 * MS,
+    lead_s=0.0,
+    mode=None,
+    duration_ns=None,
+)
+
+NO_SMOOTHING = Smoothing(max_slew_per_s=0.0, tau_s=0.0, max_dt_s=0.03)
+
+
+class TimedCache(FeatureCache):
+    """Two loops in one thread: the reader sees what was ready by its own time."""
+
+    def __init__(self, reader: FakeClock) -> None:
+        super().__init__()
+        self._reader = reader
+        self.frames: list[FeatureFrame] = []
+
+    def publish(self, frame: FeatureFrame) -> None:
+        self.frames.append(frame)
+
+    def latest(self) -> FeatureFrame | None:
+        ready = [frame for frame in self.frames if frame.ready_ns <= self._reader.now_ns()]
+        return ready[-1] if ready else None
+
+
+@dataclass
+class Rig:
+    """A bridge of fakes; the policy's durations and outputs are functions of the tick."""
+
+    settings: ActionSettings = SETTINGS
+    frames_ns: list[int] = field(
+        default_factory=lambda: [START_NS + k * FRAME_NS for k in range(400)]
+    )
+    encode_ns: int = 25 * MS
+    act_ns: Callable[[int], int] = lambda tick: 3 * MS
+    chunk: Callable[[int], FloatArray] = lambda tick: np.full((1, 16, 4), 0.25, np.float32)
+    smoothing: Smoothing = NO_SMOOTHING
+    engagement: Engagement = field(
+        default_factory=lambda: Engagement(wanted_mode=None, arm=False, readonly=False)
+    )
+    visual_period_ns: int = FRAME_NS
+    oversleep_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self.clock = FakeClock(oversleep_ns=self.oversleep_ns)
+        self.vision_clock = FakeClock()
+        self.link = FakeLink(self.clock)
+        self.sink = ListSink()
+        self.cache = TimedCache(self.clock)
+        self.camera = ScriptedCamera(self.vision_clock, self.frames_ns)
+        self.histories: list[FloatArray] = []
+        self.vision = VisionLoop(
+            camera=self.camera,
+            encode=self._encode,
+            cache=self.cache,
+            sink=self.sink,
+            clock=self.vision_clock,
+            period_ns=self.visual_period_ns,
+        )
+        self.action = ActionLoop(
+            clock=self.clock,
+            link=self.link,
+            cache=self.cache,
+            act=self._act,
+            smoother=StickSmoother(self.smoothing),
+            engagement=self.engagement,
+            sink=self.sink,
+            settings=self.settings,
+        )
+        self._pacer = Pacer(self.clock, period_ns=self.settings.period_ns)
+
+    def _encode(self, rgb: ImageArray) -> FloatArray:
+        self.vision_clock.advance_ns(self.encode_ns)
+        return np.zeros((1, 8), dtype=np.float32)
+
+    def _act(self, feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        tick = len(self.histories)
+        self.histories.append(history)
+        self.clock.advance_ns(self.act_ns(tick))
+        return self.chunk(tick)
+
+    def fly(self, duration_s: float) -> "Rig":
+        until_ns = self.clock.now_ns() + round(duration_s * NS_PER_S)
+        while self.clock.now_ns() < until_ns:
+            while self.vision_clock.now_ns() <= self.clock.now_ns() + self.settings.period_ns:
+                self.vision.step()
+            self.action.step(self._pacer.wait())
+        return self
+
+    @property
+    def releases(self) -> list[str | None]:
+        """Reasons in order, without repeats."""
+        reasons = [tick.release_reason for tick in self.sink.ticks]
+        return [r for k, r in enumerate(reasons) if k == 0 or r != reasons[k - 1]]
+
+
+def test_thirty_hertz_vision_feeds_a_hundred_hertz_of_actions() -> None:
+    rig = Rig().fly(10.0)
+    ticks = rig.sink.ticks
+    assert len(ticks) == 1001  # both ends of ten seconds
+    assert sum(tick.missed_slots for tick in ticks) == 0
+    assert 299 <= len(rig.sink.visions) <= 301
+    flown = [tick for tick in ticks if tick.sent is not None]
+    assert len(flown) == 1001 - 3  # the first feature is ready after 25 ms
+    uses = [sum(t.feature_frame_id == k for t in flown) for k in range(10, 200)]
+    assert set(uses) == {3, 4}
+    ages_ms = [(t.sent_ns - t.feature_captured_ns) / MS for t in flown if t.feature_captured_ns]
+    assert min(ages_ms) >= 25 + 3
+    assert max(ages_ms) <= 25 + 33.4 + 10 + 3
+
+
+def test_a_stall_is_skipped_counted_and_not_made_up_for() -> None:
+    rig = Rig(act_ns=lambda tick: 53 * MS if tick == 100 else 3 * MS).fly(3.0)
+    sent_ns = np.array([tick.sent_ns for tick in rig.sink.ticks])
+    assert sum(tick.missed_slots for tick in rig.sink.ticks) == 5
+    assert np.diff(sent_ns).max() >= 53 * MS
+    assert np.diff(sent_ns)[5:].min() >= 7.5 * MS
+    assert all((tick.due_ns - START_NS) % (10 * MS) == 0 for tick in rig.sink.ticks)
+
+
+def test_oversleep_delays_ticks_and_loses_none() -> None:
+    rig = Rig(oversleep_ns=MS).fly(5.0)
+    assert sum(tick.missed_slots for tick in rig.sink.ticks) == 0
+    assert len(rig.sink.ticks) == 501
+
+
+def test_a_camera_that_stops_releases_and_one_that_returns_flies_again() -> None:
+    times = [START_NS + k * FRAME_NS for k in range(300)]
+    gap = [t for t in times if not 1 * NS_PER_S < t - START_NS < 2 * NS_PER_S]
+    rig = Rig(frames_ns=gap).fly(4.0)
+    stale = "the image feature is older than 300 ms"
+    assert rig.releases == ["no image feature yet", None, stale, None]
+    last = [t for t in rig.sink.ticks if t.release_reason is None and t.sent_ns < 2.02e9 + START_NS]
+    assert last[-1].feature_captured_ns is not None
+    assert last[-1].woke_ns - last[-1].feature_captured_ns <= 300 * MS
+    assert all(t.sent is None for t in rig.sink.ticks if t.release_reason is not None)
+
+
+def test_stale_and_missing_states_release() -> None:
+    rig = Rig()
+
+    def poll(link: FakeLink) -> None:
+        elapsed_ns = link.clock.now_ns() - START_NS
+        link.telemetry_age_ns = 101 * MS if NS_PER_S <= elapsed_ns < 2 * NS_PER_S else 2 * MS
+        good = level_telemetry(link.clock.now_ns())
+        without_velocity = replace(good, velocity_ned_mps=None)
+        link.telemetry = without_velocity if elapsed_ns >= 3 * NS_PER_S else None
+
+    rig.link.on_poll = poll
+    rig.fly(4.0)
+    assert rig.releases == [
+        "no image feature yet",
+        None,
+        "attitude is older than 100 ms",
+        None,
+        "no velocity from the vehicle yet",
+    ]
+
+
+def test_a_policy_that_returns_nan_never_moves_a_stick() -> None:
+    def chunk(tick: int) -> FloatArray:
+        out = np.full((1, 16, 4), 0.25, np.float32)
+        out[0, 9, 1] = np.nan if 50 <= tick < 60 else 0.0
+        return out
+
+    rig = Rig(chunk=chunk).fly(2.0)
+    reason = "the policy returned a value that is not finite"
+    assert rig.releases == ["no image feature yet", None, reason, None]
+    assert sum(tick.release_reason == reason for tick in rig.sink.ticks) == 10
+
+
+def test_history_is_what_was_sent_not_what_was_wished() -> None:
+    rig = Rig()
+    rounded = Sticks(0.2, 0.2, 0.2, 0.2)
+    send = rig.link.send
+    rig.link.send = lambda decision: rounded if send(decision) else None  # type: ignore[method-assign]
+    rig.fly(1.0)
+    assert rig.histories[0] == pytest.approx(0.0)  # nothing was sent before the first action
+    assert rig.histories[-1] == pytest.approx(0.2)
+    assert rig.sink.ticks[-1].trace is not None
+    assert rig.sink.ticks[-1].trace.smoothed.roll == pytest.approx(0.25)
+
+
+def test_the_policy_takes_over_from_where_the_sticks_are() -> None:
+    slow = Smoothing(max_slew_per_s=1.0, tau_s=0.0, max_dt_s=0.03)
+    rig = Rig(smoothing=slow)
+    rig.link.rc_sticks = Sticks(0.6, 0.0, -0.3, 0.0)
+    rig.fly(0.1)
+    first = next(tick for tick in rig.sink.ticks if tick.sent is not None)
+    assert first.sent == rig.link.rc_sticks
+
+
+def test_the_chunk_is_sampled_at_the_time_it_acts() -> None:
+    def ramp(tick: int) -> FloatArray:
+        return np.arange(16, dtype=np.float32)[None, :, None].repeat(4, axis=2) * 0.05
+
+    rig = Rig(settings=replace(SETTINGS, lead_s=0.05), chunk=ramp).fly(0.2)
+    # state 2 ms old at the tick, 3 ms of inference, 50 ms of lead on a ramp of 1/s
+    assert rig.sink.ticks[-1].trace is not None
+    assert rig.sink.ticks[-1].trace.raw.roll == pytest.approx(0.055, abs=1e-6)
+
+
+def test_a_faster_camera_is_thinned_to_the_visual_rate() -> None:
+    wobble = [0, 3, -3, 2, -2]
+    frames = [START_NS + k * NS_PER_S // 60 + wobble[k % 5] * MS for k in range(600)]
+    rig = Rig(frames_ns=frames, encode_ns=5 * MS).fly(9.0)
+    assert 268 <= len(rig.sink.visions) <= 272
+    assert rig.camera.dropped_frames == 0  # passed over is not dropped
+
+
+def test_an_encoder_too_slow_for_the_camera_takes_the_newest_frame() -> None:
+    rig = Rig(encode_ns=100 * MS).fly(9.0)
+    visions = rig.sink.visions
+    assert 88 <= len(visions) <= 91
+    assert visions[-1].dropped_frames == pytest.approx(2 * len(visions), abs=8)
+    waits_ms = [(v.started_ns - v.captured_ns) / MS for v in visions]
+    assert max(waits_ms) <= 33.4
+
+
+# --- how a flight ends
+
+
+def run(rig: Rig, stop: threading.Event | None = None) -> list[object]:
+    """Run the action loop on its own; returns what it decided in its last words."""
+    rig.cache.publish(
+        FeatureFrame(
+            frame_id=1,
+            captured_ns=START_NS,
+            ready_ns=START_NS,
+            value=np.zeros((1, 8), dtype=np.float32),
+        )
+    )
+    rig.action.run(stop or threading.Event())
+    return [decision for _, decision in rig.link.decisions]
+
+
+LAST_WORDS = [Command(sticks=NEUTRAL)] * NEUTRAL_TICKS + [Release("the flight is over")]
+
+
+def test_a_flight_ends_after_its_duration_neutral_then_released() -> None:
+    rig = Rig(settings=replace(SETTINGS, duration_ns=192 * MS))
+    decisions = run(rig)
+    assert decisions[-6:] == LAST_WORDS
+    assert len(rig.histories) == 20
+    assert rig.link.hand_backs == 1
+
+
+def test_duration_counts_from_the_first_tick_of_flight() -> None:
+    rig = Rig(settings=replace(SETTINGS, duration_ns=192 * MS))
+    rig.link.armed = False
+
+    def arm_late(link: FakeLink) -> None:
+        link.armed = link.clock.now_ns() >= START_NS + 100 * MS
+
+    rig.link.on_poll = arm_late
+    run(rig)
+    assert len(rig.histories) == 20
+
+
+def test_an_exception_in_the_policy_gives_the_sticks_back_and_is_not_swallowed() -> None:
+    def explode(tick: int) -> FloatArray:
+        if tick == 5:
+            raise RuntimeError("bad weights")
+        return np.zeros((1, 16, 4), dtype=np.float32)
+
+    rig = Rig(chunk=explode)
+    with pytest.raises(RuntimeError, match="bad weights"):
+        run(rig)
+    assert [decision for _, decision in rig.link.decisions][-6:] == LAST_WORDS
+    assert rig.link.hand_backs == 1
+
+
+def test_sticks_that_are_the_pilots_are_not_touched_on_the_way_out() -> None:
+    stop = threading.Event()
+    rig = Rig()
+    rig.link.armed = False
+    rig.link.on_poll = lambda link: stop.set() if link.clock.now_ns() > START_NS + 90 * MS else None
+    decisions = run(rig, stop)
+    assert all(isinstance(decision, Release) for decision in decisions)
+
+
+def test_arming_goes_through_idle_and_asks_once_a_tick() -> None:
+    rig = Rig(
+        engagement=Engagement(wanted_mode="ALT_HOLD", arm=True, readonly=False),
+        settings=replace(SETTINGS, mode="ALT_HOLD", duration_ns=42 * MS),
+    )
+    rig.link.armed = False
+    rig.link.mode = "STABILIZE"
+
+    def obey(link: FakeLink) -> None:
+        if "mode ALT_HOLD" in link.asked:
+            link.mode = "ALT_HOLD"
+        link.armed = "arm" in link.asked
+
+    rig.link.on_poll = obey
+    decisions = run(rig)
+    assert decisions[:2] == [Command(sticks=IDLE)] * 2
+    assert rig.link.asked == ["mode ALT_HOLD", "arm"]
+    assert len(rig.histories) == 5

@@ -1,0 +1,130 @@
+"""What a user can get wrong: one clear error each, never a traceback."""
+
+import socket
+from pathlib import Path
+
+import pytest
+from stand import free_udp_port
+
+from mavbridge.__main__ import main
+
+pytestmark = pytest.mark.system
+
+
+def run(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
+    """Exit status and all output, on one line."""
+    with pytest.raises(SystemExit) as exit_info:
+        main(flags)
+    captured = capsys.readouterr()
+    text = " ".join((captured.out + captured.err).replace("│", " ").split())
+    assert "Traceback" not in text
+    assert isinstance(exit_info.value.code, int)
+    return exit_info.value.code, text
+
+
+def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    status, text = run(capsys, "--help")
+    assert status == 0
+    flags = """--connect --policy --checkpoint --dual-rate --visual-rate --action-rate --rate
+        --num-diffusion-steps --allow-untrained --camera --window-name --image-size --device --tau
+        --max-slew --output --readonly --source-system --mode --arm --duration --rerun --report
+        --config"""
+    missing = [flag for flag in flags.split() if flag not in text]
+    assert missing == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        ([], "--connect"),
+        (["--connect", "udp:127.0.0.1:1", "--fly-high"], "Unknown option: --fly-high"),
+        (["--connect", "udp:127.0.0.1:1", "--action-rate", "fast"], "--action-rate"),
+        (["--connect", "udp:127.0.0.1:1", "--action-rate", "0"], "between 5 and 500 Hz"),
+        (["--connect", "udp:127.0.0.1:1", "--num-diffusion-steps", "0"], "between 1 and 100"),
+        (["--connect", "udp:127.0.0.1:1", "--readonly", "--arm"], "--readonly sends nothing"),
+        (["--connect", "udp:127.0.0.1:1", "--config", "none.toml"], "none.toml"),
+        (["--connect", "udp:127.0.0.1:1"], "--allow-untrained"),
+        (["--connect", "udp:127.0.0.1:1", "--policy", "tog"], "tog"),
+        (["--connect", "udp:127.0.0.1:1", "--policy", "nowhere.at_all:Policy"], "nowhere"),
+        (["--connect", "udp:127.0.0.1:1", "--policy", "pathlib:Path"], "predict"),
+        (["--connect", "udp:127.0.0.1:1", "--policy", "scripted:loop"], "square"),
+        (["--connect", "udp:127.0.0.1:1", "--checkpoint", "no.safetensors"], "no.safetensors"),
+        (
+            ["--connect", "udp:127.0.0.1:1", "--policy", "toge:huge", "--allow-untrained"],
+            "small",
+        ),
+        (["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--camera", "no.mp4"], "no.mp4"),
+        (
+            ["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--rerun", "flight.txt"],
+            ".rrd",
+        ),
+        (
+            ["--connect", "bluetooth", "--policy", "scripted", "--camera", "shm:unused"],
+            "HOST:PORT",
+        ),
+    ],
+)
+def test_a_bad_flag_is_one_clear_error(
+    flags: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, text = run(capsys, *flags)
+    assert status != 0
+    assert told in text
+
+
+def test_an_unknown_config_key_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "flight.toml"
+    path.write_text('connect = "udp:127.0.0.1:1"\nvisual-rat = 30\n')
+    status, text = run(capsys, "--config", str(path))
+    assert status != 0
+    assert "visual-rat" in text
+
+
+def test_a_corrupt_checkpoint_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(b"these are no weights")
+    status, text = run(capsys, "--connect", "udp:127.0.0.1:1", "--checkpoint", str(path))
+    assert status == 1
+    assert "weights.safetensors" in text
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Half a second of grey frames."""
+    import cv2
+    import numpy as np
+
+    path = tmp_path / "grey.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30, (64, 64))
+    for _ in range(15):
+        writer.write(np.full((64, 64, 3), 90, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_port_in_use(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        connect = f"udp:127.0.0.1:{other.getsockname()[1]}"
+        flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
+        status, text = run(capsys, *flags)
+    assert status == 1
+    assert "another program listens there" in text
+
+
+def test_no_heartbeat(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    connect = f"udp:127.0.0.1:{free_udp_port()}"
+    flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
+    status, text = run(capsys, *flags, "--connect-timeout", "0.2")
+    assert status == 1
+    assert "heard nothing" in text
+
+
+def test_a_camera_that_ends(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    connect = f"udp:127.0.0.1:{free_udp_port()}"
+    flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
+    status, text = run(capsys, *flags)
+    assert status == 1
+    assert "ended after 15 frames" in text

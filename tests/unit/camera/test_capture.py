@@ -1,0 +1,187 @@
+import http.server
+import os
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fakes import START_NS, FakeClock
+from mavbridge.camera import capture
+from mavbridge.camera.capture import DeviceSource, StreamSource, device_mode, exposure_ns
+from mavbridge.camera.grabber import Grabber
+from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.errors import CameraError
+
+NOW_NS = 1_000 * NS_PER_S
+
+
+@pytest.mark.parametrize(
+    ("driver_ms", "captured_ns"),
+    [
+        pytest.param(999_990.0, NOW_NS - 10 * NS_PER_MS, id="10 ms ago on our clock"),
+        pytest.param(1_000_000.0, NOW_NS, id="now"),
+        pytest.param(999_000.0, NOW_NS - NS_PER_S, id="as old as it may be"),
+        pytest.param(998_999.0, NOW_NS, id="too old"),
+        pytest.param(1_000_000.1, NOW_NS, id="from the future"),
+        pytest.param(0.0, NOW_NS, id="no stamp"),
+        pytest.param(-1.0, NOW_NS, id="not supported"),
+        pytest.param(1.7e12, NOW_NS, id="wall clock"),
+    ],
+)
+def test_the_drivers_stamp_is_taken_if_it_can_be_one(driver_ms, captured_ns):
+    assert exposure_ns(driver_ms, NOW_NS) == captured_ns
+
+
+@pytest.mark.parametrize(
+    ("image_size", "mode"),
+    [(224, (640, 480)), (480, (640, 480)), (481, (1280, 720)), (4000, (1920, 1080))],
+)
+def test_the_smallest_mode_that_covers_the_image(image_size, mode):
+    assert device_mode(image_size) == mode
+
+
+class FakeDevice:
+    """Stands in for cv2.VideoCapture on a machine without a camera."""
+
+    def __init__(self, *opened_with):
+        self.opened_with = opened_with
+        self.settings = {}
+        self.frames = 1
+
+    def isOpened(self):
+        return True
+
+    def set(self, property_id, value):
+        self.settings[property_id] = value
+
+    def get(self, property_id):
+        assert property_id == cv2.CAP_PROP_POS_MSEC
+        return START_NS / NS_PER_MS - 7
+
+    def grab(self):
+        self.frames -= 1
+        return self.frames >= 0
+
+    def retrieve(self):
+        return True, np.array([[[1, 2, 3]]], np.uint8)
+
+    def release(self):
+        self.settings.clear()
+
+
+def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", FakeDevice)
+    source = DeviceSource(Path("/dev/video7"), image_size=300, clock=FakeClock())
+    assert source._capture.opened_with == ("/dev/video7", cv2.CAP_V4L2)
+    assert source._capture.settings == {
+        cv2.CAP_PROP_FRAME_WIDTH: 640,
+        cv2.CAP_PROP_FRAME_HEIGHT: 480,
+    }
+    image = source.next_image()
+    assert image.captured_ns == START_NS - 7 * NS_PER_MS
+    assert image.rgb.tolist() == [[[3, 2, 1]]]
+    with pytest.raises(CameraError, match="unplugged"):
+        source.next_image()
+    source.close()
+
+
+@pytest.mark.parametrize("device", [999, Path("/dev/video999")])
+def test_a_device_that_is_not_there_says_what_is(device):
+    with pytest.raises(CameraError, match=r"999 cannot be opened; (no /dev/video|present: )"):
+        DeviceSource(device, image_size=224, clock=FakeClock())
+
+
+class MjpegHandler(http.server.BaseHTTPRequestHandler):
+    """Serves one red frame over and over until the server is told to hang up."""
+
+    def do_GET(self):
+        _, jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), (0, 0, 200), np.uint8))
+        part = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % jpeg.size
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.end_headers()
+        while not self.server.hang_up.wait(0.01):
+            self.wfile.write(part + jpeg.tobytes() + b"\r\n")
+
+    def log_message(self, *_):
+        pass
+
+    def handle_one_request(self):
+        try:
+            super().handle_one_request()
+        except (BrokenPipeError, ConnectionResetError):
+            self.close_connection = True
+
+
+@pytest.fixture
+def mjpeg_server():
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), MjpegHandler)
+    server.hang_up = threading.Event()
+    thread = threading.Thread(target=server.serve_forever, name="test-mjpeg", daemon=True)
+    thread.start()
+    yield server
+    server.hang_up.set()
+    server.shutdown()
+    thread.join(5)
+    server.server_close()
+
+
+@pytest.mark.system
+def test_a_stream_over_http_flows_and_its_end_is_noticed(mjpeg_server, monkeypatch):
+    monkeypatch.delenv(capture.FFMPEG_OPTIONS_VARIABLE, raising=False)
+    clock = MonotonicClock()
+    url = f"http://127.0.0.1:{mjpeg_server.server_address[1]}/video.mjpg"
+    sources = [lambda: StreamSource(url, clock=clock)]
+
+    def open_once():
+        if not sources:
+            raise CameraError("the test allows one connection")
+        return sources.pop()()
+
+    before_ns = clock.now_ns()
+    camera = Grabber(open_once, clock=clock, reopen_delays_s=(0.0,))
+    assert capture.FFMPEG_OPTIONS_VARIABLE not in os.environ
+    frame = camera.read(10 * NS_PER_S)
+    assert before_ns < frame.captured_ns <= clock.now_ns()
+    assert frame.rgb.shape == (48, 64, 3)
+    assert frame.rgb[..., 0].mean() == pytest.approx(200, abs=5)
+    mjpeg_server.hang_up.set()
+    with pytest.raises(CameraError, match="one connection"):
+        read_until_it_ends(camera)
+    camera.close()
+
+
+def read_until_it_ends(camera):
+    while camera.read(10 * NS_PER_S) is not None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("set_by_user", "seen"), [(None, capture.LOW_LATENCY_OPTIONS), ("timeout;1", "timeout;1")]
+)
+def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
+    monkeypatch, set_by_user, seen
+):
+    monkeypatch.delenv(capture.FFMPEG_OPTIONS_VARIABLE, raising=False)
+    if set_by_user is not None:
+        monkeypatch.setenv(capture.FFMPEG_OPTIONS_VARIABLE, set_by_user)
+    options = []
+
+    def open_capture(*arguments):
+        options.append(os.environ[capture.FFMPEG_OPTIONS_VARIABLE])
+        return FakeDevice(*arguments)
+
+    monkeypatch.setattr(cv2, "VideoCapture", open_capture)
+    source = StreamSource("udp://0.0.0.0:5600", clock=FakeClock())
+    assert options == [seen]
+    assert os.environ.get(capture.FFMPEG_OPTIONS_VARIABLE) == set_by_user
+    assert source.next_image().captured_ns == START_NS
+    with pytest.raises(CameraError, match="ended, or was silent"):
+        source.next_image()
+
+
+def test_a_stream_that_nobody_sends_is_refused():
+    with pytest.raises(CameraError, match="cannot be opened within 5 s"):
+        StreamSource("tcp://127.0.0.1:9", clock=FakeClock())

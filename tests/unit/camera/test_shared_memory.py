@@ -1,0 +1,353 @@
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fakes import START_NS, FakeClock
+from mavbridge.camera import shared_memory
+from mavbridge.camera.shared_memory import SharedMemoryCamera
+from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.errors import CameraError, UserError
+from sitl.shm import FramePublisher
+
+pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
+
+WIDTH, HEIGHT = 8, 5
+STRIDE = 192
+"""32 + 8 * 5 * 3 = 152, rounded up to 64."""
+
+
+def header(*, width=WIDTH, height=HEIGHT, channels=3, slots=4, magic=b"MBSHM\0\0\1"):
+    return magic + struct.pack("<IIIIQQ", width, height, channels, slots, 0, 1)
+
+
+class HandWriter:
+    """A writer independent of the simulator's; a test can stop it between any two fields."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        draft = path.with_suffix(".draft")
+        draft.write_bytes(header().ljust(64 + 4 * STRIDE, b"\0"))
+        draft.replace(path)
+        self._file = path.open("r+b", buffering=0)
+
+    def put(self, offset, layout, *values):
+        self._file.seek(offset)
+        self._file.write(struct.pack(layout, *values))
+
+    def begin(self, frame_id, captured_ns, grey):
+        """Half a frame: the sequence number is left odd."""
+        start = 64 + frame_id % 4 * STRIDE
+        self.put(start, "<QQq", 2 * frame_id + 1, frame_id, captured_ns)
+        self.put(start + 32, f"{WIDTH * HEIGHT * 3}s", bytes([grey]) * (WIDTH * HEIGHT * 3))
+
+    def finish(self, frame_id):
+        self.put(64 + frame_id % 4 * STRIDE, "<Q", 2 * frame_id + 2)
+
+    def announce(self, frame_id):
+        self.put(24, "<Q", frame_id)
+
+    def publish(self, frame_id, captured_ns, grey=0):
+        self.begin(frame_id, captured_ns, grey)
+        self.finish(frame_id)
+        self.announce(frame_id)
+
+    def set_closed(self):
+        self.put(32, "<Q", 2)
+
+    def close(self):
+        self._file.close()
+
+
+@pytest.fixture
+def path():
+    path = Path("/dev/shm", f"mb-test-reader-{os.getpid()}")
+    yield path
+    path.unlink(missing_ok=True)
+
+
+@pytest.fixture
+def writer(path):
+    writer = HandWriter(path)
+    yield writer
+    writer.close()
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+@pytest.fixture
+def camera(writer, clock):
+    camera = SharedMemoryCamera(writer.path.name, clock=clock)
+    yield camera
+    camera.close()
+
+
+class HookedClock(FakeClock):
+    """Calls back in each sleep: what another process would do meanwhile."""
+
+    def __init__(self):
+        super().__init__()
+        self.on_sleep = lambda: None
+
+    def sleep_until_ns(self, deadline_ns):
+        super().sleep_until_ns(deadline_ns)
+        self.on_sleep()
+
+
+def test_a_frame_comes_with_its_stamp_and_cannot_be_written(camera, writer):
+    writer.publish(1, START_NS - 5 * NS_PER_MS, grey=77)
+    frame = camera.read(0)
+    assert frame is not None
+    assert (frame.frame_id, frame.captured_ns) == (1, START_NS - 5 * NS_PER_MS)
+    assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
+    assert frame.rgb.dtype == np.uint8
+    assert set(frame.rgb.ravel().tolist()) == {77}
+    assert not frame.rgb.flags.writeable
+
+
+def test_a_frame_is_given_once(camera, writer, clock):
+    writer.publish(1, START_NS)
+    assert camera.read(0) is not None
+    assert camera.read(30 * NS_PER_MS) is None
+    assert clock.now_ns() == START_NS + 30 * NS_PER_MS
+
+
+def test_the_newest_frame_wins_and_the_skipped_are_counted(camera, writer):
+    for frame_id in range(1, 7):
+        writer.publish(frame_id, START_NS + frame_id, grey=frame_id)
+    frame = camera.read(0)
+    assert frame is not None
+    assert frame.frame_id == 6
+    assert camera.dropped_frames == 5
+
+
+def test_frames_from_before_the_opening_are_not_counted(writer, clock):
+    for frame_id in range(1, 101):
+        writer.publish(frame_id, START_NS)
+    camera = SharedMemoryCamera(writer.path.name, clock=clock)
+    frame = camera.read(0)
+    assert frame is not None
+    assert frame.frame_id == 100
+    assert camera.dropped_frames == 0
+    camera.close()
+
+
+def test_a_frame_copy_survives_the_writer_and_the_camera(camera, writer):
+    writer.publish(1, START_NS, grey=9)
+    frame = camera.read(0)
+    assert frame is not None
+    writer.publish(5, START_NS, grey=200)
+    camera.close()
+    assert set(frame.rgb.ravel().tolist()) == {9}
+
+
+def test_a_half_written_frame_is_waited_for(writer):
+    clock = HookedClock()
+    camera = SharedMemoryCamera(writer.path.name, clock=clock)
+    writer.begin(1, START_NS, grey=3)
+    writer.announce(1)
+    assert camera.read(0) is None
+    clock.on_sleep = lambda: writer.finish(1)
+    frame = camera.read(10 * NS_PER_MS)
+    assert frame is not None
+    assert frame.frame_id == 1
+    camera.close()
+
+
+def test_a_lapped_copy_is_thrown_away_and_the_newer_frame_taken(writer, clock, monkeypatch):
+    """The writer comes round to the slot while its pixels are being copied."""
+    camera = SharedMemoryCamera(writer.path.name, clock=clock)
+    writer.publish(1, START_NS, grey=1)
+    laps = iter([lambda: writer.publish(5, START_NS + 5, grey=5)])
+    in_order = shared_memory._Segment._in_order
+
+    def interrupted(segment):
+        in_order(segment)
+        if barriers.pop(0) == "after copy":
+            next(laps, lambda: None)()
+
+    barriers = ["newest", "before copy", "after copy", *["later"] * 3]
+    monkeypatch.setattr(shared_memory._Segment, "_in_order", interrupted)
+    frame = camera.read(0)
+    assert frame is not None
+    assert (frame.frame_id, frame.captured_ns, frame.rgb[0, 0, 0]) == (5, START_NS + 5, 5)
+    camera.close()
+
+
+def test_a_writer_that_falls_silent_is_dead_after_two_seconds(camera, writer, clock):
+    writer.publish(1, START_NS)
+    camera.read(0)
+    clock.advance_ns(2 * NS_PER_S - 1)
+    assert camera.read(0) is None
+    clock.advance_ns(1)
+    with pytest.raises(CameraError, match=f"{writer.path.name}: no new frame for 2 s"):
+        camera.read(0)
+
+
+def test_a_writer_that_closed_is_named_as_the_cause(camera, writer, clock):
+    writer.publish(1, START_NS)
+    camera.read(0)
+    writer.set_closed()
+    writer.path.unlink()
+    with pytest.raises(CameraError, match="closed"):
+        camera.read(3 * NS_PER_S)
+    assert clock.now_ns() <= START_NS + 2 * NS_PER_S + NS_PER_MS
+
+
+def test_a_segment_without_frames_has_ten_seconds(camera, clock):
+    assert camera.read(9 * NS_PER_S) is None
+    with pytest.raises(CameraError, match="no new frame"):
+        camera.read(2 * NS_PER_S)
+
+
+@pytest.mark.parametrize("age_s", [-3, 3, 1e9])
+def test_stamps_of_another_clock_are_refused(camera, writer, age_s):
+    writer.publish(1, START_NS - round(age_s * NS_PER_S))
+    assert camera.read(0) is None
+    with pytest.raises(CameraError, match="CLOCK_MONOTONIC"):
+        camera.read(11 * NS_PER_S)
+
+
+def test_a_writer_that_starts_again_is_followed_and_ids_keep_rising(writer):
+    clock = HookedClock()
+    camera = SharedMemoryCamera(writer.path.name, clock=clock)
+    for frame_id in (1, 2, 3):
+        writer.publish(frame_id, START_NS)
+    assert camera.read(0) is not None
+    successors = []
+
+    def restart():
+        if not successors:
+            successors.append(HandWriter(writer.path))
+            successors[0].publish(1, clock.now_ns(), grey=42)
+
+    clock.on_sleep = restart
+    frame = camera.read(NS_PER_S)
+    assert frame is not None
+    assert frame.frame_id == 4
+    assert frame.rgb[0, 0, 0] == 42
+    successors[0].close()
+    camera.close()
+
+
+def test_a_name_that_appears_late_is_waited_for(path):
+    clock = HookedClock()
+    writers = []
+
+    def start_after_nine_seconds():
+        if clock.now_ns() - START_NS >= 9 * NS_PER_S and not writers:
+            writers.append(HandWriter(path))
+
+    clock.on_sleep = start_after_nine_seconds
+    SharedMemoryCamera(path.name, clock=clock).close()
+    assert writers
+    writers[0].close()
+
+
+def test_a_name_that_never_appears_says_what_to_start_and_what_is_there(writer, clock):
+    with pytest.raises(CameraError, match="python -m sitl --camera shm:nobody") as caught:
+        SharedMemoryCamera("nobody", clock=clock)
+    assert writer.path.name in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        pytest.param(b"", "wrong magic", id="empty"),
+        pytest.param(header(magic=b"MBSHM\0\0\2").ljust(832, b"\0"), "wrong magic", id="version"),
+        pytest.param(header(channels=4).ljust(832, b"\0"), "4 channels", id="channels"),
+        pytest.param(header(slots=2).ljust(832, b"\0"), "2 slots", id="slots"),
+        pytest.param(header(width=0).ljust(832, b"\0"), "impossible", id="no width"),
+        pytest.param(header(height=1 << 31).ljust(832, b"\0"), "impossible", id="height"),
+        pytest.param(header().ljust(64 + 4 * STRIDE - 1, b"\0"), "take 832 bytes", id="short"),
+        pytest.param(header().ljust(64 + 4 * STRIDE + 1, b"\0"), "it has 833", id="long"),
+    ],
+)
+def test_a_file_in_another_format_is_refused(path, clock, content, complaint):
+    path.write_bytes(content)
+    with pytest.raises(CameraError, match=complaint):
+        SharedMemoryCamera(path.name, clock=clock)
+
+
+def test_a_folder_is_refused(path, clock):
+    path.mkdir()
+    with pytest.raises(CameraError, match="cannot be opened"):
+        SharedMemoryCamera(path.name, clock=clock)
+    path.rmdir()
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "..", ".x"])
+def test_impossible_names_are_refused(name, clock):
+    with pytest.raises(UserError, match="want a name such as"):
+        SharedMemoryCamera(name, clock=clock)
+
+
+def test_close_twice_leaves_the_segment_alone(camera, writer):
+    camera.close()
+    camera.close()
+    assert writer.path.exists()
+
+
+def test_the_simulators_writer_is_understood(path, clock):
+    publisher = FramePublisher(path.name, WIDTH, HEIGHT)
+    camera = SharedMemoryCamera(path.name, clock=clock)
+    image = np.arange(HEIGHT * WIDTH * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
+    publisher.publish(image, captured_ns=START_NS - 1)
+    frame = camera.read(0)
+    assert frame is not None
+    assert (frame.frame_id, frame.captured_ns) == (1, START_NS - 1)
+    np.testing.assert_array_equal(frame.rgb, image)
+    publisher.close()
+    with pytest.raises(CameraError, match="closed"):
+        camera.read(3 * NS_PER_S)
+    camera.close()
+
+
+SOLID_FRAMES = """
+import sys, time
+import numpy as np
+from sitl.shm import FramePublisher
+publisher = FramePublisher(sys.argv[1], 320, 240)
+print("ready", flush=True)
+sys.stdin.readline()
+for frame_id in range(1, 4001):
+    publisher.publish(np.full((240, 320, 3), frame_id % 251, np.uint8), time.monotonic_ns())
+publisher.close()
+"""
+
+
+@pytest.mark.system
+def test_no_torn_frame_from_a_writer_at_full_speed(path):
+    """Another process publishes as fast as it can; each frame read must be of one colour."""
+    with subprocess.Popen(
+        [sys.executable, "-c", SOLID_FRAMES, path.name],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as writer:
+        assert writer.stdout.readline() == "ready\n"
+        camera = SharedMemoryCamera(path.name, clock=MonotonicClock())
+        writer.stdin.write("go\n")
+        writer.stdin.flush()
+        frames = read_until(4000, camera)
+        camera.close()
+    assert writer.returncode == 0
+    assert len(frames) > 1
+    assert all(low == high == frame_id % 251 for frame_id, low, high in frames)
+
+
+def read_until(last_id, camera):
+    """(frame_id, least, greatest value) of each frame that was seen."""
+    seen = []
+    while not seen or seen[-1][0] < last_id:
+        frame = camera.read(10 * NS_PER_S)
+        assert frame is not None
+        seen.append((frame.frame_id, frame.rgb.min(), frame.rgb.max()))
+    return seen

@@ -1,0 +1,141 @@
+import cv2
+import numpy as np
+import pytest
+
+from fakes import START_NS, FakeClock
+from mavbridge.camera.video_file import VideoFileCamera
+from mavbridge.clock import NS_PER_MS, NS_PER_S
+from mavbridge.errors import CameraError
+
+FPS = 20
+FRAMES = 10
+PERIOD_NS = NS_PER_S // FPS
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """Ten frames, 50 ms apart, each redder than the one before."""
+    path = tmp_path_factory.mktemp("video") / "red.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (64, 48))
+    for index in range(FRAMES):
+        writer.write(np.full((48, 64, 3), (0, 0, 20 * index), np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+@pytest.fixture
+def camera(video, clock):
+    camera = VideoFileCamera(video, clock=clock)
+    yield camera
+    camera.close()
+
+
+def redness(frame):
+    return frame.rgb[..., 0].mean()
+
+
+def test_it_is_paced_by_its_stamps(camera, clock):
+    for index in range(FRAMES):
+        frame = camera.read(NS_PER_S)
+        assert frame.frame_id == index + 1
+        assert frame.captured_ns == pytest.approx(START_NS + index * PERIOD_NS, abs=NS_PER_MS)
+        assert clock.now_ns() == frame.captured_ns
+        assert redness(frame) == pytest.approx(20 * index, abs=8)
+        assert frame.rgb[..., 2].max() < 30
+    assert camera.dropped_frames == 0
+
+
+def test_frames_are_rgb_uint8_and_cannot_be_written(camera):
+    frame = camera.read(0)
+    assert frame.rgb.shape == (48, 64, 3)
+    assert frame.rgb.dtype == np.uint8
+    assert not frame.rgb.flags.writeable
+
+
+def test_it_starts_with_the_first_read(camera, clock):
+    clock.advance_ns(5 * NS_PER_S)
+    assert camera.read(0).frame_id == 1
+
+
+def test_a_frame_that_is_not_due_yet_is_waited_for_up_to_the_timeout(camera, clock):
+    camera.read(0)
+    assert camera.read(20 * NS_PER_MS) is None
+    assert clock.now_ns() == START_NS + 20 * NS_PER_MS
+    assert camera.read(40 * NS_PER_MS).frame_id == 2
+
+
+def test_a_slow_reader_gets_the_newest_and_the_others_are_counted(camera, clock):
+    camera.read(0)
+    clock.advance_ns(4 * PERIOD_NS + NS_PER_MS)
+    frame = camera.read(0)
+    assert frame.frame_id == 5
+    assert redness(frame) == pytest.approx(80, abs=8)
+    assert camera.dropped_frames == 3
+
+
+def test_its_end_is_an_error_after_the_last_frame(camera, clock):
+    camera.read(0)
+    clock.advance_ns(NS_PER_S)
+    assert camera.read(0).frame_id == FRAMES
+    with pytest.raises(CameraError, match="video ended after 10 frames"):
+        camera.read(0)
+
+
+def test_a_file_that_is_no_video_is_refused(tmp_path, clock):
+    path = tmp_path / "notes.mp4"
+    path.write_text("not a video")
+    with pytest.raises(CameraError, match="no video that can be decoded"):
+        VideoFileCamera(path, clock=clock)
+
+
+class StampedCapture:
+    """A capture whose stamps are given, -1 for a frame that cannot be decoded."""
+
+    def __init__(self, fps, stamps_ms):
+        self._fps = fps
+        self._stamps_ms = list(stamps_ms)
+        self._stamp_ms = 0.0
+
+    def get(self, property_id):
+        return self._fps if property_id == cv2.CAP_PROP_FPS else self._stamp_ms
+
+    def grab(self):
+        if not self._stamps_ms:
+            return False
+        self._stamp_ms = self._stamps_ms.pop(0)
+        return True
+
+    def retrieve(self):
+        return self._stamp_ms >= 0, np.zeros((2, 2, 3), np.uint8)
+
+    def release(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("fps", "stamps_ms", "due_ms"),
+    [
+        pytest.param(20, [0, 0, 0], [0, 50, 100], id="no stamps"),
+        pytest.param(0, [0, 0], [0, 33.333333], id="no stamps, no rate"),
+        pytest.param(float("nan"), [0, 0], [0, 33.333333], id="rate is not a number"),
+        pytest.param(20, [0, 80, 40], [0, 80, 130], id="a stamp that goes back"),
+        pytest.param(20, [0, 10, 300], [0, 10, 300], id="a variable rate"),
+    ],
+)
+def test_stamps(monkeypatch, tmp_path, clock, fps, stamps_ms, due_ms):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: StampedCapture(fps, stamps_ms))
+    camera = VideoFileCamera(tmp_path, clock=clock)
+    stamps_ns = [camera.read(NS_PER_S).captured_ns - START_NS for _ in due_ms]
+    assert stamps_ns == pytest.approx([NS_PER_MS * due for due in due_ms], abs=10)
+
+
+def test_a_frame_that_cannot_be_decoded_is_an_error(monkeypatch, tmp_path, clock):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: StampedCapture(20, [0, -1]))
+    camera = VideoFileCamera(tmp_path, clock=clock)
+    with pytest.raises(CameraError, match="cannot be decoded"):
+        camera.read(0)

@@ -1,0 +1,219 @@
+from math import nan, pi, sqrt
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+from test_calibration import ARDUPILOT
+from wire import WireEnd
+
+from mavbridge.mavlink.codec import Codec, CommandRefusedError, manual_control_sticks
+from mavbridge.mavlink.messages import (
+    Attitude,
+    AutopilotVersion,
+    Body,
+    CommandAck,
+    Heartbeat,
+    LocalVelocity,
+    ParamValue,
+    RcChannels,
+    Source,
+    SpecificForce,
+    StatusText,
+    Timesync,
+)
+from mavbridge.records import IDLE, NEUTRAL, Sticks
+
+TARGET = Source(1, 1)
+m = dialect.MAVLink(None)
+
+
+def codec() -> Codec:
+    return Codec(source_system=255, source_component=191)
+
+
+def attitude(q: tuple[float, ...], rate: tuple[float, ...], *, quaternion: bool) -> Attitude:
+    return Attitude(is_quaternion=quaternion, boot_ms=7, ned_from_body_wxyz=q, rate_body_radps=rate)
+
+
+R = sqrt(0.5)
+CASES: list[tuple[dialect.MAVLink_message, Body]] = [
+    (
+        m.heartbeat_encode(2, 3, 0x81, 2, 4),
+        Heartbeat(vehicle_type=2, autopilot=3, base_mode=0x81, custom_mode=2, system_status=4),
+    ),
+    (
+        m.attitude_quaternion_encode(7, 0.5, 0.5, -0.5, 0.5, 1, 2, 3),
+        attitude((0.5, 0.5, -0.5, 0.5), (1, 2, 3), quaternion=True),
+    ),
+    # Euler angles of one axis each, and yaw 90 after pitch 90: (R,0,0,R)*(R,0,R,0)
+    (
+        m.attitude_encode(7, pi / 2, 0, 0, 1, 2, 3),
+        attitude((R, R, 0, 0), (1, 2, 3), quaternion=False),
+    ),
+    (
+        m.attitude_encode(7, 0, pi / 2, 0, 0, 0, 0),
+        attitude((R, 0, R, 0), (0, 0, 0), quaternion=False),
+    ),
+    (
+        m.attitude_encode(7, 0, pi / 2, pi / 2, 0, 0, 0),
+        attitude((0.5, -0.5, 0.5, 0.5), (0, 0, 0), quaternion=False),
+    ),
+    (
+        m.local_position_ned_encode(7, 9, 9, 9, 1.5, -2.5, 0.25),
+        LocalVelocity(velocity_ned_mps=(1.5, -2.5, 0.25)),
+    ),
+    (
+        m.highres_imu_encode(7, 1, 2, -9.75, *[0.5] * 10, 8191),
+        SpecificForce(source="HIGHRES_IMU", specific_force_body_mps2=(1, 2, -9.75)),
+    ),
+    (
+        m.raw_imu_encode(7, 1000, 0, -1001, *[0] * 6),
+        SpecificForce(source="RAW_IMU", specific_force_body_mps2=(9.80665, 0, -9.81645665)),
+    ),
+    (
+        m.scaled_imu2_encode(7, 0, -500, 0, *[0] * 6),
+        SpecificForce(source="SCALED_IMU2", specific_force_body_mps2=(0, -4.903325, 0)),
+    ),
+    (
+        m.rc_channels_encode(7, 8, *range(1001, 1009), *[0] * 10, 255),
+        RcChannels(channels_us=tuple(range(1001, 1009))),
+    ),
+    (m.command_ack_encode(511, 3), CommandAck(command=511, result=3)),
+    (
+        m.param_value_encode(b"RC1_MIN", 1100.0, 9, 100, 5),
+        ParamValue(name="RC1_MIN", value=1100.0),
+    ),
+    (m.statustext_encode(4, b"PreArm: no"), StatusText(text="PreArm: no")),
+    (m.timesync_encode(5, -6), Timesync(tc1=5, ts1=-6)),
+    (
+        m.autopilot_version_encode(0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 0),
+        AutopilotVersion(version="4.7.1"),
+    ),
+]
+
+
+def flat(body: Any) -> list[Any]:
+    """Fields of a record with tuples opened, so that floats can be compared approximately."""
+    out: list[Any] = []
+    for name in body.__slots__:
+        value = getattr(body, name)
+        out.extend(value if isinstance(value, tuple) else [value])
+    return out
+
+
+@pytest.mark.parametrize(("message", "body"), CASES, ids=lambda case: type(case).__name__)
+@pytest.mark.parametrize("chunking", ["whole", "byte by byte", "with a tail"])
+def test_each_message_is_read_however_it_is_cut(
+    message: dialect.MAVLink_message, body: Body, chunking: str
+) -> None:
+    data = WireEnd().pack(message)
+    chunks = {
+        "whole": [data],
+        "byte by byte": [data[k : k + 1] for k in range(len(data))],
+        "with a tail": [data + b"\xfd\x09"],
+    }[chunking]
+    ours = codec()
+    (incoming,) = [message for chunk in chunks for message in ours.decode(chunk)]
+    assert incoming.source == Source(1, 1)
+    assert type(incoming.body) is type(body)
+    for got, wanted in zip(flat(incoming.body), flat(body), strict=True):
+        assert got == (pytest.approx(wanted, abs=1e-6) if isinstance(wanted, float) else wanted)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        m.attitude_quaternion_encode(7, nan, 0, 0, 0, 0, 0, 0),
+        m.attitude_quaternion_encode(7, 0, 0, 0, 0, 0, 0, 0),
+        m.attitude_quaternion_encode(7, 1, 0, 0, 0, nan, 0, 0),
+        m.attitude_encode(7, 0, float("inf"), 0, 0, 0, 0),
+        m.local_position_ned_encode(7, 0, 0, 0, 0, nan, 0),
+        m.highres_imu_encode(7, nan, 0, 0, *[0.5] * 10, 8191),
+        m.highres_imu_encode(7, 0, 0, 0, *[0.5] * 10, 0b111000),  # says it has no accelerometer
+        m.param_value_encode(b"RC1_MIN", nan, 9, 100, 5),
+    ],
+)
+def test_values_that_mean_nothing_are_counted_and_dropped(
+    message: dialect.MAVLink_message,
+) -> None:
+    ours = codec()
+    assert list(ours.decode(WireEnd().pack(message))) == []
+    assert ours.bad_data_count == 1
+
+
+def test_a_message_nobody_needs_is_passed_on_for_counting() -> None:
+    (incoming,) = codec().decode(WireEnd().pack(m.system_time_encode(1, 2)))
+    assert (incoming.name, incoming.body) == ("SYSTEM_TIME", None)
+
+
+@given(st.binary(max_size=300), st.integers(0, 20))
+def test_garbage_and_truncated_data_never_raise_and_never_silence_the_link(
+    garbage: bytes, cut: int
+) -> None:
+    ours, vehicle = codec(), WireEnd()
+    beat = vehicle.heartbeat()
+    list(ours.decode(garbage))
+    list(ours.decode(beat[:-cut] if cut else beat))
+    # A fake header may swallow the longest packet that it can announce, not more.
+    seen = [message for _ in range(40) for message in ours.decode(vehicle.heartbeat())]
+    assert any(isinstance(message.body, Heartbeat) for message in seen)
+
+
+def sent(data: bytes) -> dialect.MAVLink_message:
+    (message,) = WireEnd().read(data)
+    return message
+
+
+def test_override_holds_the_stick_channels_and_ignores_the_rest() -> None:
+    message = sent(codec().encode_override(TARGET, Sticks(0.5, 0.25, 0.5, -0.25), ARDUPILOT))
+    channels = [getattr(message, f"chan{k}_raw") for k in range(1, 19)]
+    assert channels == [1400, 1300, 1700, 1600, *[65535] * 4, *[0] * 10]
+    assert (message.target_system, message.target_component) == (1, 1)
+    assert (message.get_srcSystem(), message.get_srcComponent()) == (255, 191)
+
+
+def test_release_is_zero_on_the_stick_channels_alone() -> None:
+    message = sent(codec().encode_release(TARGET, ARDUPILOT))
+    channels = [getattr(message, f"chan{k}_raw") for k in range(1, 19)]
+    assert channels == [0, 0, 0, 0, *[65535] * 4, *[0] * 10]
+
+
+@pytest.mark.parametrize(
+    ("sticks", "xyzr"),
+    [
+        (NEUTRAL, (0, 0, 500, 0)),
+        (IDLE, (0, 0, 0, 0)),
+        (Sticks(1, 0.25, 0.5, -1), (500, -1000, 1000, 250)),
+    ],
+)
+def test_manual_control(sticks: Sticks, xyzr: tuple[int, ...]) -> None:
+    message = sent(codec().encode_manual_control(1, sticks))
+    assert (message.x, message.y, message.z, message.r) == xyzr
+    assert manual_control_sticks(sticks) == sticks
+
+
+@pytest.mark.parametrize("bad", [nan, 1.0001, -1.0001, float("inf")])
+@pytest.mark.parametrize("axis", range(4))
+def test_a_stick_out_of_range_never_becomes_a_message(bad: float, axis: int) -> None:
+    values = [0.0] * 4
+    values[axis] = bad
+    with pytest.raises(CommandRefusedError, match="not in"):
+        codec().encode_override(TARGET, Sticks(*values), ARDUPILOT)
+    with pytest.raises(CommandRefusedError, match="not in"):
+        codec().encode_manual_control(1, Sticks(*values))
+
+
+def test_sequence_numbers_have_no_gaps() -> None:
+    ours, reader = codec(), WireEnd()
+    data = b"".join(ours.encode_heartbeat() for _ in range(300))
+    assert [message.get_seq() for message in reader.read(data)] == [k % 256 for k in range(300)]
+
+
+def test_the_heartbeat_is_an_onboard_controller_without_autopilot() -> None:
+    message = sent(codec().encode_heartbeat())
+    assert (message.type, message.autopilot) == (
+        dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+        dialect.MAV_AUTOPILOT_INVALID,
+    )

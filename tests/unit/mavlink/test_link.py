@@ -1,0 +1,333 @@
+"""The link against a vehicle made of bytes, on a virtual clock."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+from test_parts import CALIBRATION
+from wire import WireEnd
+
+from fakes import FakeClock
+from mavbridge.clock import NS_PER_MS, NS_PER_S
+from mavbridge.config import LinkConfig
+from mavbridge.errors import PeerError
+from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.transport import Address, Chunk, TransportDownError
+from mavbridge.records import IDLE, Command, LinkSnapshot, Release, Sticks
+
+MS = NS_PER_MS
+PARAMS = CALIBRATION | {"MAV_GCS_SYSID": 255.0, "RC_OVERRIDE_TIME": 3.0}
+
+
+class Vehicle:
+    """Both ends' wire, and a vehicle that answers what a handshake asks."""
+
+    def __init__(self, clock: FakeClock) -> None:
+        self.clock = clock
+        self.end = WireEnd()
+        self.inbox: list[Chunk] = []
+        self.received: list[Any] = []
+        self.params = dict(PARAMS)
+        self.mode, self.armed = 2, False
+        self.channels = [1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500]
+        self.obeys = True
+        self.is_down = False
+        self.opened = 0
+        self.boot_ns = clock.now_ns()
+        self.beats = True
+
+    # transport
+
+    def open(self) -> None:
+        self.opened += 1
+        if self.is_down:
+            raise TransportDownError("tcp: refused")
+
+    def drain(self) -> Iterator[Chunk]:
+        if self.is_down:
+            raise TransportDownError("tcp: gone")
+        chunks, self.inbox = self.inbox, []
+        yield from chunks
+
+    def answer_to(self, sender: Address | None) -> None: ...
+
+    def send(self, data: bytes) -> None:
+        for message in self.end.read(data):
+            self.received.append(message)
+            self.answer(message)
+
+    def close(self) -> None: ...
+
+    # vehicle
+
+    def put(self, message: dialect.MAVLink_message) -> None:
+        self.inbox.append(Chunk(self.end.pack(message), self.clock.now_ns(), ("127.0.0.1", 1)))
+
+    def answer(self, message: Any) -> None:
+        mav = self.end.mav
+        match message.get_type():
+            case "PARAM_REQUEST_READ" if message.param_id in self.params:
+                value = self.params[message.param_id]
+                self.put(mav.param_value_encode(message.param_id.encode(), value, 9, 99, 0))
+            case "COMMAND_LONG":
+                self.put(mav.command_ack_encode(message.command, 0))
+            case "RC_CHANNELS_OVERRIDE" if self.obeys:
+                for k in range(8):
+                    value = getattr(message, f"chan{k + 1}_raw")
+                    if value not in (0, 65535):
+                        self.channels[k] = value
+
+    def tick(self, tick: int) -> None:
+        mav, ms = self.end.mav, (self.clock.now_ns() - self.boot_ns) // MS
+        if tick % 100 == 0 and self.beats:
+            self.inbox.append(
+                Chunk(
+                    self.end.heartbeat(mode=self.mode, armed=self.armed),
+                    self.clock.now_ns(),
+                    ("127.0.0.1", 1),
+                )
+            )
+        self.put(mav.attitude_quaternion_encode(ms, 1, 0, 0, 0, 0, 0, 0))
+        self.put(mav.local_position_ned_encode(ms, 0, 0, 0, 0, 0, 0))
+        self.put(mav.highres_imu_encode(ms, 0, 0, -9.81, *[0.0] * 10, 8191))
+        if tick % 5 == 0:
+            self.put(mav.rc_channels_encode(ms, 8, *self.channels, *[0] * 10, 255))
+
+    def names(self) -> list[str]:
+        return [message.get_type() for message in self.received]
+
+
+class Bench:
+    """Ticks both at 100 Hz."""
+
+    def __init__(self, **config: Any) -> None:
+        self.clock = FakeClock()
+        self.vehicle = Vehicle(self.clock)
+        self.link = MavlinkLink(
+            self.vehicle,
+            self.clock,
+            LinkConfig(connect="memory", **config),
+            state_hz=100.0,
+        )
+        self.ticks = 0
+        self.texts: list[str] = []
+
+    def run(self, duration_s: float, decision: Command | Release | None = None) -> LinkSnapshot:
+        for _ in range(round(duration_s * 100)):
+            self.vehicle.tick(self.ticks)
+            self.ticks += 1
+            snapshot = self.link.poll()
+            self.texts += snapshot.texts
+            if decision is not None:
+                self.link.send(decision)
+            self.clock.advance_ns(10 * MS)
+        return snapshot
+
+    def overrides(self) -> list[list[int]]:
+        return [
+            [getattr(message, f"chan{k}_raw") for k in range(1, 9)]
+            for message in self.vehicle.received
+            if message.get_type() == "RC_CHANNELS_OVERRIDE"
+        ]
+
+
+IDLE_US = [1500, 1500, 1100, 1500, 65535, 65535, 65535, 65535]
+RELEASE_US = [0, 0, 0, 0, 65535, 65535, 65535, 65535]
+
+
+def test_from_first_heartbeat_to_ready() -> None:
+    bench = Bench()
+    assert bench.run(1.0).problem == "waiting for the vehicle's heartbeat"
+    snapshot = bench.run(9.0)
+    assert snapshot.problem is None
+    assert not snapshot.echo_confirmed
+    assert snapshot.status is not None
+    assert (snapshot.status.mode, snapshot.status.armed) == ("ALT_HOLD", False)
+    assert snapshot.status.rc_channels_us[:4] == (1500, 1500, 1000, 1500)
+    assert bench.overrides() == []
+    intervals = {
+        int(message.param1): int(message.param2)
+        for message in bench.vehicle.received
+        if message.get_type() == "COMMAND_LONG" and message.command == 511
+    }
+    assert intervals == {31: 10000, 32: 10000, 105: 10000, 65: 50000}
+    assert any("RC_OVERRIDE_TIME is 3" in text for text in bench.texts)
+
+
+def test_we_beat_once_a_second_and_only_while_polled() -> None:
+    bench = Bench()
+    bench.run(5.0)
+    assert bench.vehicle.names().count("HEARTBEAT") == 5
+    bench.clock.advance_ns(10 * NS_PER_S)
+    assert bench.vehicle.names().count("HEARTBEAT") == 5
+
+
+def test_commands_are_echoed_and_confirmed() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    snapshot = bench.run(0.2, Command(sticks=IDLE))
+    assert snapshot.echo_confirmed
+    assert snapshot.problem is None
+    assert bench.overrides()[-1] == IDLE_US
+    assert bench.link.send(Command(sticks=Sticks(0.0, 0.0, 0.001, 0.5))) == Sticks(0, 0, 0, 0.5)
+    assert bench.link.stats().echo_confirmed is True
+
+
+@pytest.mark.parametrize(
+    ("params", "told"),
+    [
+        ({"MAV_GCS_SYSID": 42.0}, "--source-system 42"),
+        ({"RC_OPTIONS": 2.0}, "RC_OPTIONS bit 1"),
+        ({}, "another station may be overriding"),
+    ],
+)
+def test_a_vehicle_that_does_not_obey_is_told_with_the_reason(
+    params: dict[str, float], told: str
+) -> None:
+    bench = Bench()
+    bench.vehicle.params |= params
+    bench.vehicle.obeys = False
+    bench.run(8.0)
+    assert bench.run(0.9, Command(sticks=IDLE)).problem is None
+    problem = bench.run(0.3, Command(sticks=IDLE)).problem
+    assert problem is not None
+    assert "does not act on our sticks" in problem
+    assert told in problem
+
+
+def test_release_is_said_ten_times_and_then_the_wire_is_silent() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.run(0.2, Command(sticks=IDLE))
+    bench.run(3.0, Release("pilot"))
+    assert bench.overrides()[20:] == [RELEASE_US] * 10
+    bench.run(1.0, Command(sticks=IDLE))
+    count = len(bench.overrides())
+    bench.link.send(Release("end"))
+    bench.link.hand_back()
+    assert bench.overrides()[count:] == [RELEASE_US] * 10
+    assert bench.link.stats().sent_overrides == 120
+
+
+def test_nothing_is_released_that_was_never_taken() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.run(1.0, Release("disarmed"))
+    bench.link.hand_back()
+    assert bench.overrides() == []
+
+
+def test_readonly_sends_no_stick() -> None:
+    bench = Bench(readonly=True)
+    bench.run(8.0)
+    bench.run(1.0, Command(sticks=IDLE))
+    bench.link.hand_back()
+    assert bench.overrides() == []
+
+
+def test_the_override_switch_decides() -> None:
+    bench = Bench()
+    bench.vehicle.params["RC7_OPTION"] = 46.0
+    bench.vehicle.channels[6] = 1000
+    assert bench.run(9.0).problem == "the override switch (RC7) is off"
+    bench.vehicle.channels[6] = 2000
+    assert bench.run(0.1).problem is None
+
+
+def test_a_silent_vehicle_is_lost_after_three_beats_and_found_again() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.vehicle.beats = False
+    assert bench.run(1.9).problem is None  # the last beat was a second before
+    assert bench.run(0.3).problem == "the vehicle's heartbeat is lost"
+    bench.vehicle.beats = True
+    assert bench.run(1.0).problem is None
+
+
+def test_a_lost_connection_is_opened_again_once_a_second() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.vehicle.is_down = True
+    bench.run(3.05)
+    assert bench.vehicle.opened == 1 + 3
+    bench.vehicle.is_down = False
+    assert bench.run(2.0).problem is None
+    assert any("link lost" in text for text in bench.texts)
+
+
+def test_a_reboot_starts_the_handshake_again() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    reads = bench.vehicle.names().count("PARAM_REQUEST_READ")
+    bench.vehicle.boot_ns = bench.clock.now_ns()
+    assert bench.run(0.05).problem is not None
+    assert bench.run(5.0).problem is None
+    assert bench.vehicle.names().count("PARAM_REQUEST_READ") == 2 * reads
+    assert any("rebooted" in text for text in bench.texts)
+
+
+def test_mode_and_arm_are_asked_once_a_second_and_refusals_are_told() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    for _ in range(150):
+        bench.link.set_mode("ACRO")
+        bench.link.arm()
+        bench.run(0.01)
+    commands = [
+        (message.command, message.param1, message.param2)
+        for message in bench.vehicle.received
+        if message.get_type() == "COMMAND_LONG" and message.command in (176, 400)
+    ]
+    assert sorted(commands) == [(176, 1, 1), (176, 1, 1), (400, 1, 0), (400, 1, 0)]
+    bench.vehicle.put(bench.vehicle.end.mav.command_ack_encode(400, dialect.MAV_RESULT_FAILED))
+    bench.vehicle.put(bench.vehicle.end.mav.statustext_encode(2, b"Arm: Throttle too high"))
+    bench.run(0.01)
+    assert "the vehicle answered COMPONENT_ARM_DISARM with FAILED" in bench.texts
+    assert "vehicle: Arm: Throttle too high" in bench.texts
+
+
+def test_nobody_there_is_an_error_with_advice() -> None:
+    bench = Bench(connect_timeout=2.0)
+    bench.vehicle.beats = False
+    with pytest.raises(PeerError, match="no vehicle on memory after 2 s: heard nothing"):
+        bench.run(3.0)
+
+
+def test_other_systems_on_the_link_are_not_listened_to() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    stranger = WireEnd(system=9)
+    bench.vehicle.inbox.append(
+        Chunk(stranger.pack(stranger.mav.attitude_encode(0, 1, 1, 1, 1, 1, 1)), 0, None)
+    )
+    snapshot = bench.run(0.01)
+    assert snapshot.telemetry.rate_body_radps is not None
+    assert snapshot.telemetry.rate_body_radps.values == (0, 0, 0)
+
+
+def px4_bench(**config: Any) -> Bench:
+    bench = Bench(**config)
+    beat = bench.vehicle.end.heartbeat
+    bench.vehicle.end.heartbeat = (  # type: ignore[method-assign]
+        lambda **options: beat(**(options | {"autopilot": 12, "mode": 2 << 16}))
+    )
+    return bench
+
+
+def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
+    bench = px4_bench(output="manual-control")
+    snapshot = bench.run(8.0)
+    assert snapshot.problem is None
+    assert snapshot.echo_confirmed
+    assert snapshot.status is not None
+    assert snapshot.status.mode == "ALTCTL"
+    bench.run(0.1, Command(sticks=IDLE))
+    bench.run(0.1, Release("pilot"))
+    assert bench.vehicle.names().count("MANUAL_CONTROL") == 10
+    assert bench.overrides() == []
+
+
+def test_px4_with_rc_override_is_refused() -> None:
+    with pytest.raises(PeerError, match="--output manual-control"):
+        px4_bench().run(3.0)

@@ -1,0 +1,163 @@
+"""Transports on loopback. A datagram on loopback is there when its send returns: nothing waits."""
+
+import os
+import pty
+import socket
+from pathlib import Path
+
+import pytest
+
+from fakes import FakeClock
+from mavbridge.clock import MonotonicClock
+from mavbridge.errors import UserError
+from mavbridge.mavlink.transport import (
+    SerialTransport,
+    TcpTransport,
+    Transport,
+    TransportDownError,
+    UdpTransport,
+    make_transport,
+)
+
+
+def free_port(kind: int = socket.SOCK_DGRAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@pytest.mark.parametrize(
+    ("spec", "kind"),
+    [
+        ("udp:127.0.0.1:14550", UdpTransport),
+        ("udpin:0.0.0.0:14550", UdpTransport),
+        ("udpout:localhost:14550", UdpTransport),
+        ("127.0.0.1:14550", UdpTransport),
+        ("tcp:127.0.0.1:5760", TcpTransport),
+        ("/dev/ttyACM0,921600", SerialTransport),
+        ("/dev/ttyACM0", SerialTransport),
+    ],
+)
+def test_connection_strings(spec: str, kind: type) -> None:
+    assert isinstance(make_transport(spec, FakeClock()), kind)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        "",
+        "udp:",
+        "udp:host",
+        "udp:host:0",
+        "udp:host:99999",
+        "tcp:1:x",
+        "bluetooth",
+        "/dev/ttyS0,fast",
+        "ws:a:b:c",
+    ],
+)
+def test_a_string_that_is_none_of_them_is_refused_with_the_forms(spec: str) -> None:
+    with pytest.raises(UserError, match="HOST:PORT"):
+        make_transport(spec, FakeClock())
+
+
+def test_udp_listens_answers_whom_it_is_told_and_stamps_arrival() -> None:
+    port, clock = free_port(), MonotonicClock()
+    ours = make_transport(f"udp:127.0.0.1:{port}", clock)
+    ours.open()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind(("127.0.0.1", 0))
+        before_ns = clock.now_ns()
+        vehicle.sendto(b"one", ("127.0.0.1", port))
+        vehicle.sendto(b"two", ("127.0.0.1", port))
+        after_ns = clock.now_ns()
+        first, second = ours.drain()
+        assert (first.data, second.data) == (b"one", b"two")
+        # The kernel stamps with another clock: a millisecond for reading the two apart.
+        assert before_ns - 1_000_000 <= first.arrived_ns <= second.arrived_ns
+        assert second.arrived_ns <= after_ns + 1_000_000
+        assert list(ours.drain()) == []
+        ours.send(b"to nobody yet")
+        ours.answer_to(first.sender)
+        ours.send(b"hello")
+        assert vehicle.recv(100) == b"hello"
+    ours.close()
+    ours.close()
+
+
+def test_a_port_in_use_is_the_users_error() -> None:
+    port = free_port()
+    first = make_transport(f"udp:127.0.0.1:{port}", FakeClock())
+    first.open()
+    with pytest.raises(UserError, match=f"{port}.*stop it, or choose another port"):
+        make_transport(f"udpin:127.0.0.1:{port}", FakeClock()).open()
+    first.close()
+
+
+def test_udp_to_nobody_is_no_error() -> None:
+    ours = make_transport(f"udpout:127.0.0.1:{free_port()}", FakeClock())
+    ours.open()
+    for _ in range(3):
+        ours.send(b"anyone?")
+        assert list(ours.drain()) == []
+    ours.close()
+
+
+def drain_until(transport: Transport, wanted: bytes, clock: MonotonicClock) -> bytes:
+    """TCP needs its handshake: look again until the bytes are there, for two seconds at most."""
+    deadline_ns, data = clock.now_ns() + 2_000_000_000, b""
+    while data != wanted and clock.now_ns() < deadline_ns:
+        data += b"".join(chunk.data for chunk in transport.drain())
+    return data
+
+
+def test_tcp_connects_talks_and_notices_the_end() -> None:
+    clock = MonotonicClock()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ours = make_transport(f"tcp:127.0.0.1:{server.getsockname()[1]}", clock)
+        ours.open()
+        vehicle, _ = server.accept()
+        with vehicle:
+            vehicle.sendall(b"hello")
+            assert drain_until(ours, b"hello", clock) == b"hello"
+            ours.send(b"answer")
+            assert vehicle.recv(100) == b"answer"
+        with pytest.raises(TransportDownError, match="closed the connection"):
+            drain_until(ours, b"more", clock)
+    ours.close()
+
+
+def test_tcp_refused_can_be_tried_again() -> None:
+    clock = MonotonicClock()
+    ours = make_transport(f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}", clock)
+
+    def connect() -> None:  # the refusal may come at once, or with the first look
+        ours.open()
+        drain_until(ours, b"x", clock)
+
+    for _ in range(2):
+        with pytest.raises(TransportDownError, match="ECONNREFUSED"):
+            connect()
+        ours.close()
+
+
+def test_serial_reads_and_writes_and_notices_the_end() -> None:
+    clock = MonotonicClock()
+    ours_fd, theirs_fd = pty.openpty()
+    name = os.ttyname(theirs_fd)
+    ours = SerialTransport(name, 115200, clock)
+    ours.open()
+    os.write(ours_fd, b"hello")
+    assert drain_until(ours, b"hello", clock) == b"hello"
+    ours.send(b"answer")
+    assert os.read(ours_fd, 100) == b"answer"
+    ours.close()
+    os.close(theirs_fd)
+    os.close(ours_fd)
+
+
+def test_a_serial_port_that_does_not_exist(tmp_path: Path) -> None:
+    ours = SerialTransport(str(tmp_path / "ttyNONE"), 115200, FakeClock())
+    with pytest.raises(TransportDownError, match="ttyNONE"):
+        ours.open()

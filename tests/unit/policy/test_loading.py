@@ -1,0 +1,245 @@
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from policy.checkpoint import build_policy, save_checkpoint
+from policy.contract import Contract, PolicyError
+from policy.loading import LoadedPolicy, load_policy
+from policy.resnet_unet import ResnetUnetConfig
+from policy.toge import Toge
+
+RGB = np.full((48, 64, 3), 90, np.uint8)
+STATE = np.eye(1, 13, 3, dtype=np.float32)
+HISTORY = np.zeros((1, 4, 4), np.float32)
+
+
+def load(spec: str, **changes: Any) -> LoadedPolicy:
+    arguments: dict[str, Any] = {
+        "checkpoint": None,
+        "allow_untrained": False,
+        "device": "cpu",
+        "dual_rate": True,
+        "num_diffusion_steps": 2,
+        "image_size": None,
+        "seed": 0,
+        "now_s": lambda: 0.0,
+    }
+    return load_policy(spec, **{**arguments, **changes})
+
+
+def act(loaded: LoadedPolicy) -> np.ndarray:
+    executable = loaded.executable
+    return executable.act(executable.encode(RGB), STATE, HISTORY)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(small_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("loading") / "toge.safetensors"
+    save_checkpoint(path, small_toge)
+    return path
+
+
+@pytest.mark.parametrize("spec", ["scripted", "scripted:hover", "scripted:square"])
+def test_scripted_flies_dual_rate_without_weights(spec: str) -> None:
+    loaded = load(spec, image_size=64)
+    assert loaded.executable.dual_rate
+    assert loaded.executable.contract.image_height == 64
+    assert act(loaded).shape == (1, 16, 4)
+
+
+def test_scripted_does_not_import_torch() -> None:
+    program = (
+        "import sys; from policy.loading import load_policy; load_policy('scripted:square', "
+        "checkpoint=None, allow_untrained=False, device='cpu', dual_rate=True, "
+        "num_diffusion_steps=1, image_size=None, seed=0, now_s=lambda: 0.0); "
+        "sys.exit('torch' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", program], timeout=60, check=False)
+    assert result.returncode == 0
+
+
+def test_untrained_weights_are_seeded_and_said() -> None:
+    torch_state = torch.random.get_rng_state()
+    first, again, other = (
+        load("toge:small:resnet18", allow_untrained=True, image_size=32, seed=seed)
+        for seed in (3, 3, 4)
+    )
+    assert "untrained: seeded random weights (seed 3)" in first.notes[0]
+    np.testing.assert_array_equal(act(first), act(again))
+    assert not np.array_equal(act(first), act(other))
+    assert torch.equal(torch.random.get_rng_state(), torch_state)
+
+
+def test_untrained_needs_permission() -> None:
+    with pytest.raises(PolicyError, match="--allow-untrained"):
+        load("toge")
+
+
+@pytest.mark.parametrize("spec", ["toge", "toge:small", "toge:small:resnet18", "toge:resnet18"])
+def test_a_checkpoint_decides_what_is_built(spec: str, checkpoint: Path, small_toge: Toge) -> None:
+    loaded = load(spec, checkpoint=checkpoint)
+    assert loaded.executable.contract == small_toge.contract
+    assert loaded.executable.dual_rate
+    assert "(small, resnet18)" in loaded.notes[0]
+
+
+@pytest.mark.parametrize("spec", ["toge:medium", "toge:efficientnet_b3"])
+def test_a_spec_that_contradicts_the_checkpoint_is_refused(spec: str, checkpoint: Path) -> None:
+    with pytest.raises(PolicyError, match="holds small:resnet18"):
+        load(spec, checkpoint=checkpoint)
+
+
+def test_an_image_size_that_contradicts_the_checkpoint_is_refused(checkpoint: Path) -> None:
+    assert load("toge", checkpoint=checkpoint, image_size=32).executable.dual_rate
+    with pytest.raises(PolicyError, match="--image-size 224 contradicts"):
+        load("toge", checkpoint=checkpoint, image_size=224)
+
+
+def test_the_seed_sets_the_noise_of_the_flight(tmp_path: Path, small_toge: Toge) -> None:
+    path = tmp_path / "a.pt"
+    torch.save(small_toge.state_dict(), path)
+    chunks = [
+        act(load("toge:small:resnet18", checkpoint=path, image_size=32, seed=seed))
+        for seed in (0, 0, 1)
+    ]
+    np.testing.assert_array_equal(chunks[0], chunks[1])
+    assert not np.array_equal(chunks[0], chunks[2])
+
+
+def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_path: Path) -> None:
+    contract = Contract(image_height=32, image_width=32)
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, build_policy(ResnetUnetConfig(contract=contract)))
+    asked, not_asked = (
+        load("resnet-unet", checkpoint=path, dual_rate=dual_rate) for dual_rate in (True, False)
+    )
+    assert not asked.executable.dual_rate
+    assert [note for note in asked.notes if note.startswith("warning")] == [
+        "warning: resnet-unet has no fast path (encode_visual and predict_fast), so it flies in "
+        "single-rate mode, the whole network for every action"
+    ]
+    assert not any(note.startswith("warning") for note in not_asked.notes)
+    assert act(asked).shape == (1, 16, 4)
+
+
+@pytest.mark.parametrize(
+    ("spec", "changes", "message"),
+    [
+        ("vla", {}, "package.module:Class"),
+        ("", {}, "package.module:Class"),
+        ("..toge:Toge", {}, "package.module:Class"),
+        ("scripted:loop", {}, "square"),
+        ("scripted", {"checkpoint": Path("a.pt")}, "no weights"),
+        ("toge:huge", {"allow_untrained": True}, "neither a size"),
+        ("toge:small:vgg16", {"allow_untrained": True}, "efficientnet_b3"),
+        ("toge:small:resnet18:x", {"allow_untrained": True}, "does not take 'resnet18:x'"),
+        ("resnet-unet:resnet50", {"allow_untrained": True}, "does not take 'resnet50'"),
+        ("toge", {"checkpoint": Path("absent.safetensors")}, "no such file"),
+        ("toge:resnet18", {"allow_untrained": True, "image_size": 1}, "image_height"),
+        ("resnet-unet", {"allow_untrained": True, "device": "tpu"}, "this machine has"),
+        ("resnet-unet", {"allow_untrained": True, "device": "cuda:99"}, "this machine has"),
+        ("resnet-unet", {"allow_untrained": True, "num_diffusion_steps": 101}, r"1\.\.100"),
+        ("no_such_module:Policy", {}, "cannot import no_such_module"),
+        ("policy.contract:Nothing", {}, "no class Nothing"),
+        ("policy.contract:STATE_DIM", {}, "no class STATE_DIM"),
+    ],
+)
+def test_refusals_say_what_to_do(spec: str, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(PolicyError, match=message):
+        load(spec, **changes)
+
+
+USER_CLASSES = """
+import numpy as np
+from policy.contract import Contract
+
+
+class Single:
+    contract = Contract(arrays="numpy", image_height=32, image_width=32)
+
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        return np.full((1, 16, 4), num_diffusion_steps / 10, np.float32)
+
+
+class Dual(Single):
+    contract = Contract(arrays="numpy", image_height=32, image_width=32, feature_dim=5)
+
+    def __init__(self, checkpoint=None):
+        self.checkpoint = checkpoint
+
+    def encode_visual(self, image):
+        return np.zeros((1, 5), np.float32)
+
+    def predict_fast(self, feature, state, action_history, num_diffusion_steps):
+        return np.full((1, 16, 4), 0.0 if self.checkpoint is None else 0.5, np.float32)
+
+
+class NoContract:
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        return None
+
+
+class NoPredict:
+    contract = Contract()
+
+
+class NoFeatureDim(Dual):
+    contract = Contract(arrays="numpy")
+
+
+class NeedsMore:
+    def __init__(self, weights):
+        pass
+"""
+
+
+@pytest.fixture
+def user_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    (tmp_path / "my_user_policies.py").write_text(USER_CLASSES)
+    (tmp_path / "my_broken_policies.py").write_text("def (:\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_user_policies", raising=False)
+    return "my_user_policies"
+
+
+def test_a_class_of_the_users_flies(user_module: str) -> None:
+    single, dual, trained = (
+        load(f"{user_module}:Single"),
+        load(f"{user_module}:Dual"),
+        load(f"{user_module}:Dual", checkpoint=Path("weights.bin")),
+    )
+    assert not single.executable.dual_rate
+    assert any(note.startswith("warning") for note in single.notes)
+    assert dual.executable.dual_rate
+    assert [float(act(loaded).max()) for loaded in (single, dual, trained)] == pytest.approx(
+        [0.2, 0.0, 0.5]
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("NoContract", {}, r"Missing or wrong here: \['contract'\]"),
+        ("NoPredict", {}, r"Missing or wrong here: \['predict'\]"),
+        ("NoFeatureDim", {}, "needs feature_dim"),
+        ("NeedsMore", {}, r"cannot be made with Class\(\)"),
+        ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),
+        ("Single", {"image_size": 64}, "takes 32x32"),
+        ("Other", {}, "'Dual'"),
+    ],
+)
+def test_a_class_that_will_not_do_is_refused(
+    user_module: str, name: str, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(PolicyError, match=message):
+        load(f"{user_module}:{name}", **changes)
+
+
+def test_a_module_with_a_syntax_error_is_refused(user_module: str) -> None:
+    with pytest.raises(PolicyError, match="cannot import my_broken_policies"):
+        load("my_broken_policies:Policy")

@@ -1,0 +1,77 @@
+"""A pilot for the autopilot without its wire: sticks by override, time by steps."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from sitl.autopilot import STEP_NS, Autopilot, VehicleConfig
+from sitl.clock import NS_PER_S
+from sitl.modes import Mode
+from sitl.params import Params
+from sitl.rotation import to_euler
+
+STEPS_PER_STICK_UPDATE = 8
+
+
+class Pilot:
+    """Holds the sticks of one autopilot at 50 Hz."""
+
+    def __init__(self, config: VehicleConfig) -> None:
+        self.ap = Autopilot(Params(), config, boot_ns=0)
+
+    def hold(
+        self,
+        seconds: float,
+        *,
+        roll: int = 1500,
+        pitch: int = 1500,
+        thr: int = 1500,
+        yaw: int = 1500,
+        watch: Callable[[Autopilot], None] = lambda ap: None,
+    ) -> None:
+        """Hold these sticks; ``watch`` sees every step."""
+        for index in range(round(seconds * NS_PER_S / STEP_NS)):
+            if index % STEPS_PER_STICK_UPDATE == 0:
+                self.ap.rc.override([roll, pitch, thr, yaw, *[65535] * 4], self.ap.now_ns)
+            self.ap.step()
+            watch(self.ap)
+
+    def silence(self, seconds: float) -> None:
+        """Send nothing."""
+        for _ in range(round(seconds * NS_PER_S / STEP_NS)):
+            self.ap.step()
+
+    def take_off(self, height_m: float = 5.0, mode: Mode = Mode.ALT_HOLD) -> None:
+        """Arm in ALT_HOLD, climb, level off, change the mode."""
+        self.hold(3.5, thr=1000)
+        assert self.ap.set_mode(Mode.ALT_HOLD)
+        assert self.ap.arm(force=False), self.texts()
+        while self.height_m < height_m:
+            self.hold(0.1, thr=2000)
+        self.hold(3.0)
+        assert self.ap.set_mode(mode)
+        self.ap.texts.clear()
+
+    @property
+    def height_m(self) -> float:
+        return -self.ap.truth.position_ned_m[2]
+
+    def angles_deg(self) -> list[float]:
+        return [math.degrees(angle) for angle in to_euler(self.ap.truth.ned_from_body_wxyz)]
+
+    def texts(self) -> list[str]:
+        """What was said since the last call."""
+        said = [text.text for text in self.ap.texts]
+        self.ap.texts.clear()
+        return said
+
+
+@pytest.fixture
+def pilot() -> Pilot:
+    return Pilot(VehicleConfig())
+
+
+@pytest.fixture
+def pilot_without_receiver() -> Pilot:
+    return Pilot(VehicleConfig(receiver=False))

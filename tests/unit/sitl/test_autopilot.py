@@ -1,0 +1,272 @@
+"""Flying the simulated body through every mode, and what happens when pilot or ground are lost."""
+
+import math
+
+import pytest
+
+from sitl.modes import Mode
+
+
+def test_alt_hold_holds_the_height_within_30_cm(pilot):
+    pilot.take_off()
+    start_m = pilot.height_m
+    heights_m = []
+
+    pilot.hold(20.0, watch=lambda ap: heights_m.append(-ap.truth.position_ned_m[2]))
+
+    assert max(abs(height - start_m) for height in heights_m) < 0.3
+
+
+def test_alt_hold_keeps_its_height_while_leaning(pilot):
+    pilot.take_off()
+    start_m = pilot.height_m
+
+    pilot.hold(3.0, pitch=1000)
+
+    assert pilot.angles_deg()[1] == pytest.approx(-30.0, abs=0.5)
+    assert pilot.height_m == pytest.approx(start_m, abs=0.3)
+    assert pilot.ap.truth.velocity_ned_mps[0] > 5.0
+
+
+def test_a_roll_step_acts_within_the_measured_time(pilot):
+    pilot.take_off()
+    samples = []
+
+    pilot.hold(0.5, roll=1700, watch=lambda ap: samples.append((ap.now_ns, pilot.angles_deg()[0])))
+
+    first_ns = samples[0][0]
+    reached = next(stamp_ns for stamp_ns, roll_deg in samples if roll_deg >= 2.0)
+    assert 0.06 <= (reached - first_ns) / 1e9 <= 0.126
+
+
+def test_yaw_turns_at_the_commanded_rate_and_stays_level(pilot):
+    pilot.take_off()
+    pilot.hold(2.5, yaw=1700)
+    roll, pitch, _ = pilot.angles_deg()
+
+    assert math.degrees(pilot.ap.truth.rate_body_radps[2]) == pytest.approx(75.9, abs=1.0)
+    assert (roll, pitch) == pytest.approx((0.0, 0.0), abs=0.5)
+
+
+def test_stabilize_hovers_at_mid_stick_and_climbs_above(pilot):
+    pilot.take_off(mode=Mode.STABILIZE)
+    pilot.hold(1.0)
+    drift_mps = pilot.ap.truth.velocity_ned_mps[2]
+    pilot.hold(2.0, thr=1600)
+
+    assert abs(drift_mps) < 0.1
+    assert 2.5 < -pilot.ap.truth.velocity_ned_mps[2] < 4.5
+
+
+def test_acro_turns_at_about_12_degrees_a_second_for_a_small_stick(pilot):
+    pilot.take_off(height_m=10.0, mode=Mode.ACRO)
+    rates_degps = []
+
+    pilot.hold(
+        1.0,
+        roll=1550,
+        watch=lambda ap: rates_degps.append(math.degrees(ap.truth.rate_body_radps[0])),
+    )
+
+    assert sum(rates_degps) / len(rates_degps) == pytest.approx(12.0, abs=3.0)
+
+
+def test_acro_trainer_limits_the_lean_and_without_it_there_is_none(pilot):
+    pilot.take_off(height_m=15.0, mode=Mode.ACRO)
+    leans_deg = []
+    pilot.hold(1.5, roll=2000, watch=lambda ap: leans_deg.append(abs(pilot.angles_deg()[0])))
+    assert max(leans_deg) < 40.0
+
+    pilot.ap.params.set("ACRO_TRAINER", 0.0)
+    leans_deg.clear()
+    pilot.hold(1.0, roll=2000, watch=lambda ap: leans_deg.append(abs(pilot.angles_deg()[0])))
+    assert max(leans_deg) > 150.0
+
+
+def test_land_comes_down_gently_and_disarms_itself(pilot):
+    pilot.take_off()
+    assert pilot.ap.set_mode(Mode.LAND)
+    touch_speeds = []
+
+    def watch(ap):
+        if not ap.truth.touching:
+            touch_speeds.append(ap.truth.velocity_ned_mps[2])
+
+    pilot.hold(20.0, watch=watch)
+
+    assert not pilot.ap.armed
+    assert pilot.ap.landed
+    assert touch_speeds[-1] < 0.8
+    assert "Disarming motors" in pilot.texts()
+
+
+def test_rtl_comes_home_and_lands(pilot):
+    pilot.ap.params.set("RTL_ALT", 500.0)
+    pilot.take_off(height_m=4.0)
+    pilot.hold(4.0, pitch=1200)
+    assert pilot.ap.truth.position_ned_m[0] > 5.0
+    assert pilot.ap.set_mode(Mode.RTL)
+
+    pilot.hold(40.0)
+
+    north, east, _ = pilot.ap.truth.position_ned_m
+    assert math.hypot(north, east) < 1.5
+    assert not pilot.ap.armed
+
+
+def test_full_throttle_down_in_alt_hold_lands_and_disarms_after_the_delay(pilot):
+    pilot.take_off(height_m=3.0)
+    pilot.hold(5.0, thr=1000)
+    assert pilot.ap.armed
+    assert pilot.ap.landed
+
+    pilot.hold(10.0, thr=1000)
+
+    assert not pilot.ap.armed
+
+
+def test_a_landed_vehicle_takes_off_again(pilot):
+    pilot.take_off(height_m=2.0)
+    pilot.hold(4.0, thr=1000)
+    assert pilot.ap.landed
+
+    pilot.hold(3.0, thr=1800)
+
+    assert pilot.height_m > 1.0
+
+
+def test_a_tipped_vehicle_stops_its_motors(pilot):
+    pilot.ap.params.set("ACRO_TRAINER", 0.0)
+    pilot.take_off(height_m=3.0, mode=Mode.ACRO)
+
+    pilot.hold(4.0, roll=1900, thr=1200)
+
+    assert "Crash: Disarming" in pilot.texts()
+    assert not pilot.ap.armed
+
+
+def test_arming_waits_for_the_estimator(pilot):
+    pilot.hold(2.0, thr=1000)
+    assert not pilot.ap.arm(force=False)
+    assert pilot.texts() == ["Arm: AHRS: EKF3 not started"]
+
+    pilot.hold(1.1, thr=1000)
+    assert pilot.ap.arm(force=False)
+
+
+def test_forced_arming_skips_the_checks(pilot):
+    assert pilot.ap.arm(force=True)
+
+
+@pytest.mark.parametrize("mode", [Mode.LAND, Mode.RTL])
+def test_automatic_modes_cannot_be_armed(pilot, mode):
+    pilot.hold(6.0, thr=1000)
+    pilot.ap.set_mode(mode)
+
+    assert not pilot.ap.arm(force=False)
+    assert pilot.texts() == [f"Arm: {mode.name} mode not armable"]
+
+
+def test_rtl_needs_a_position(pilot):
+    pilot.hold(4.0, thr=1000)
+
+    assert not pilot.ap.set_mode(Mode.RTL)
+    assert pilot.texts() == ["Mode change to RTL failed: requires position"]
+
+
+def test_radio_failsafe_without_position_lands(pilot_without_receiver):
+    pilot = pilot_without_receiver
+    pilot.hold(3.2, thr=1000)
+    pilot.ap.set_mode(Mode.ALT_HOLD)
+    assert pilot.ap.arm(force=False)
+    pilot.hold(0.7, thr=2000)
+    pilot.silence(1.05)
+
+    assert pilot.ap.mode is Mode.LAND
+
+
+@pytest.mark.parametrize(("choice", "mode"), [(0, Mode.ALT_HOLD), (1, Mode.RTL), (3, Mode.LAND)])
+def test_fs_thr_enable_chooses_the_action(pilot_without_receiver, choice, mode):
+    pilot = pilot_without_receiver
+    pilot.ap.params.set("FS_THR_ENABLE", float(choice))
+    pilot.take_off()
+
+    pilot.silence(1.5)
+
+    assert pilot.ap.mode is mode
+
+
+def test_radio_failsafe_on_the_ground_disarms(pilot_without_receiver):
+    pilot = pilot_without_receiver
+    pilot.hold(3.5, thr=1000)
+    assert pilot.ap.arm(force=False)
+
+    pilot.silence(1.5)
+
+    assert not pilot.ap.armed
+    assert "Radio Failsafe - Disarming" in pilot.texts()
+
+
+def test_a_throttle_below_fs_thr_value_is_a_radio_failsafe_after_three_reads(pilot):
+    pilot.take_off()
+
+    pilot.hold(0.01, thr=950)
+    assert not pilot.ap.radio_failsafe.active
+    pilot.hold(0.1, thr=950)
+
+    assert pilot.ap.mode is Mode.RTL
+    pilot.hold(0.2)
+    assert pilot.texts() == ["Radio Failsafe", "Radio Failsafe Cleared"]
+
+
+def test_with_a_receiver_silence_gives_the_sticks_back_after_three_seconds(pilot):
+    pilot.take_off()
+    pilot.hold(0.5, roll=1600)
+    pilot.silence(2.9)
+    held_deg = pilot.angles_deg()[0]
+    pilot.silence(2.0)
+
+    assert held_deg == pytest.approx(5.0, abs=0.2)
+    assert pilot.ap.truth.velocity_ned_mps[2] > 1.5
+    assert pilot.ap.mode is Mode.ALT_HOLD
+    assert pilot.texts() == []
+
+
+def test_gcs_failsafe_drops_overrides_and_leaves_the_pilot_in_control(pilot):
+    pilot.ap.params.set("FS_GCS_ENABLE", 1.0)
+    pilot.ap.params.set("RC_OVERRIDE_TIME", -1.0)
+    pilot.take_off()
+    pilot.ap.gcs_failsafe.seen(pilot.ap.now_ns)
+    pilot.hold(0.1, roll=1600)
+    pilot.silence(4.8)
+    assert pilot.ap.rc.channels_us[0] == 1600
+
+    pilot.silence(0.7)
+
+    assert pilot.texts() == ["GCS Failsafe - Continuing Pilot Control"]
+    assert pilot.ap.mode is Mode.ALT_HOLD
+    assert pilot.ap.rc.channels_us[0] == 1500
+    pilot.ap.gcs_failsafe.seen(pilot.ap.now_ns)
+    pilot.silence(0.5)
+    assert pilot.texts() == ["GCS Failsafe Cleared"]
+
+
+@pytest.mark.parametrize(("choice", "mode"), [(1, Mode.RTL), (5, Mode.LAND)])
+def test_gcs_failsafe_can_end_the_flight(pilot, choice, mode):
+    pilot.ap.params.set("FS_GCS_ENABLE", float(choice))
+    pilot.ap.params.set("FS_OPTIONS", 0.0)
+    pilot.take_off()
+    pilot.ap.gcs_failsafe.seen(pilot.ap.now_ns)
+
+    pilot.silence(5.5)
+
+    assert pilot.ap.mode is mode
+
+
+def test_two_runs_are_identical(pilot, pilot_without_receiver):
+    other = type(pilot)(pilot.ap.config)
+    for one in (pilot, other):
+        one.take_off()
+        one.hold(1.0, roll=1650, yaw=1400)
+
+    assert pilot.ap.truth == other.ap.truth

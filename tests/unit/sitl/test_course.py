@@ -1,0 +1,138 @@
+import json
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sitl.course import (
+    ALTITUDE_M,
+    CLIMB_M,
+    FIRST_LEG_M,
+    GATE_COUNT,
+    LEG_M,
+    TURN_RAD,
+    Course,
+    Gate,
+    GateCounter,
+    course_to_json,
+    make_course,
+)
+from sitl.errors import UsageError
+
+NORTH_GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.0, index=0)
+EAST_GATE = Gate(center_ned_m=(20.0, 5.0, -2.0), yaw_rad=math.pi / 2, size_m=2.0, index=1)
+COURSE = Course(seed=0, gates=(NORTH_GATE, EAST_GATE))
+
+
+def fly(counter: GateCounter, *positions, start_s=0.0):
+    for second, position in enumerate(positions):
+        counter.update(position, start_s + second)
+    return [passed.index for passed in counter.passed]
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "passed"),
+    [
+        pytest.param((9, 0, -2), (11, 0, -2), [0], id="through the middle"),
+        pytest.param((9, 0, -2), (10, 0, -2), [0], id="ends in the plane"),
+        pytest.param(
+            (10, 0, -2), (11, 0, -2), [], id="starts in the plane: counted by the step before"
+        ),
+        pytest.param((11, 0, -2), (9, 0, -2), [], id="wrong direction"),
+        pytest.param((8, 0, -2), (9.5, 0, -2), [], id="does not reach the plane"),
+        pytest.param((9, 1, -3), (11, 1, -3), [0], id="exact corner, up and right"),
+        pytest.param((9, -1, -1), (11, -1, -1), [0], id="exact corner, down and left"),
+        pytest.param((9, 1.001, -2), (11, 1.001, -2), [], id="right of it"),
+        pytest.param((9, 0, -3.001), (11, 0, -3.001), [], id="above it"),
+        pytest.param((9, 0, -0.999), (11, 0, -0.999), [], id="below it"),
+        pytest.param((9, 3, -2), (11, -3, -2), [0], id="slanted, inside in the plane"),
+        pytest.param((9, 0, -2), (11, 2.1, -2), [], id="slanted, outside in the plane"),
+        pytest.param((19, 5, -2), (21, 5, -2), [], id="along the plane of the next but one"),
+        pytest.param((20, 4, -2), (20, 6, -2), [], id="second gate before the first"),
+        pytest.param((9, 0, math.nan), (11, 0, -2), [], id="not a position"),
+    ],
+)
+def test_one_step(start, end, passed):
+    assert fly(GateCounter(COURSE), start, end) == passed
+
+
+def test_gates_count_in_order_with_interpolated_times():
+    counter = GateCounter(COURSE)
+    fly(counter, (0, 0, -2), (16, 0, -2), (20, 4, -2), (20, 8, -2))
+    assert [(passed.index, passed.t_s) for passed in counter.passed] == [(0, 0.625), (1, 2.25)]
+
+
+def test_a_gate_flown_around_stays_the_next_one():
+    counter = GateCounter(COURSE)
+    assert fly(counter, (9, 4, -2), (11, 4, -2), (20, 4, -2), (20, 6, -2)) == []
+    assert fly(counter, (9, 0, -2), (11, 0, -2), start_s=10) == [0]
+
+
+def test_one_long_step_passes_several_gates_in_order_only():
+    gates = [
+        Gate(center_ned_m=(north, 0.0, -2.0), yaw_rad=0.0, size_m=2.0, index=index)
+        for index, north in enumerate((10.0, 20.0, 15.0))
+    ]
+    counter = GateCounter(Course(seed=0, gates=tuple(gates)))
+    assert fly(counter, (0, 0, -2), (30, 0, -2)) == [0, 1]
+
+
+def test_nothing_counts_after_the_last_gate():
+    counter = GateCounter(Course(seed=0, gates=(NORTH_GATE,)))
+    assert fly(counter, (9, 0, -2), (11, 0, -2), (9, 5, -2), (9, 0, -2), (11, 0, -2)) == [0]
+
+
+@given(st.integers(0, 2**32))
+def test_every_course_is_flyable(seed):
+    gates = make_course(seed).gates
+    assert [gate.index for gate in gates] == list(range(GATE_COUNT))
+    north, east, down = gates[0].center_ned_m
+    assert (north, east) == (FIRST_LEG_M, 0.0)
+    assert 2.0 <= -down <= 3.0
+    for here, there in pairwise(gates):
+        delta = [b - a for a, b in zip(here.center_ned_m, there.center_ned_m, strict=True)]
+        assert LEG_M[0] - 1e-9 <= math.hypot(delta[0], delta[1]) <= LEG_M[1] + 1e-9
+        assert abs(delta[2]) <= CLIMB_M
+        heading_rad = math.atan2(delta[1], delta[0])
+        for gate in (here, there):
+            off_rad = math.remainder(gate.yaw_rad - heading_rad, math.tau)
+            assert abs(off_rad) <= TURN_RAD / 2 + 1e-9
+    for gate in gates:
+        assert ALTITUDE_M[0] <= -gate.center_ned_m[2] <= ALTITUDE_M[1]
+
+
+@given(st.integers(0, 2**32))
+def test_flying_centre_to_centre_passes_every_gate(seed):
+    course = make_course(seed)
+    counter = GateCounter(course)
+    last = course.gates[-1]
+    beyond = (
+        last.center_ned_m[0] + math.cos(last.yaw_rad),
+        last.center_ned_m[1] + math.sin(last.yaw_rad),
+        last.center_ned_m[2],
+    )
+    centers = [gate.center_ned_m for gate in course.gates]
+    assert fly(counter, (0.0, 0.0, -2.0), *centers, beyond) == list(range(GATE_COUNT))
+
+
+def test_the_seed_decides():
+    assert make_course(7) == make_course(7)
+    assert make_course(7) != make_course(8)
+
+
+def test_a_negative_seed_is_refused():
+    with pytest.raises(UsageError, match="non-negative"):
+        make_course(-1)
+
+
+def test_json_holds_all_that_the_course_does():
+    course = make_course(7)
+    read = json.loads(course_to_json(course))
+    assert read["seed"] == 7
+    assert "NED" in read["frame"]
+    gates = [
+        Gate(**{**gate, "center_ned_m": tuple(gate["center_ned_m"])}) for gate in read["gates"]
+    ]
+    assert tuple(gates) == course.gates

@@ -1,0 +1,126 @@
+"""The rigid body against hand-computed physics, and the one conversion between frames."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sitl import rotation
+from sitl.dynamics import (
+    GRAVITY_MPS2,
+    MASS_KG,
+    MAX_MOTOR_THRUST_N,
+    MOTOR_LAG_S,
+    PHYSICS_STEP_NS,
+    Quadrotor,
+)
+
+HOVER = MASS_KG * GRAVITY_MPS2 / (4.0 * MAX_MOTOR_THRUST_N)
+STEPS_PER_S = 1_000_000_000 // PHYSICS_STEP_NS
+
+
+def fly(commands, seconds, state=None, quad=None):
+    quad = quad or Quadrotor()
+    return quad.step(state or quad.at_rest(), commands, round(seconds * STEPS_PER_S))
+
+
+def test_it_rests_on_the_ground_and_feels_one_g_upwards():
+    body = fly((0.0,) * 4, 1.0).body
+
+    assert body.touching
+    assert body.position_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+    assert body.specific_force_body_mps2 == pytest.approx((0.0, 0.0, -GRAVITY_MPS2), abs=0.01)
+
+
+def test_motors_follow_with_a_first_order_lag():
+    body = fly((1.0,) * 4, MOTOR_LAG_S).body
+
+    assert body.motors == pytest.approx([1.0 - math.exp(-1.0)] * 4, rel=0.03)
+
+
+def test_thrust_lifts_against_gravity():
+    state = fly((2.0 * HOVER,) * 4, 0.5)
+    up_mps = -state.body.velocity_ned_mps[2]
+
+    assert up_mps == pytest.approx(GRAVITY_MPS2 * (0.5 - 2.0 * MOTOR_LAG_S), rel=0.1)
+    assert not state.body.touching
+
+
+def test_free_fall_feels_nothing_and_drag_limits_speed():
+    quad = Quadrotor()
+    high = fly((1.0,) * 4, 8.0, quad=quad)
+    falling = fly((0.0,) * 4, 5.0, state=high, quad=quad)
+    slow = fly((0.0,) * 4, 0.5, state=high, quad=quad).body
+
+    assert abs(slow.specific_force_body_mps2[2]) < GRAVITY_MPS2
+    assert falling.body.velocity_ned_mps[2] < 0.9 * GRAVITY_MPS2 * 5.0
+
+
+@pytest.mark.parametrize(
+    ("commands", "axis", "sign"),
+    [
+        ((0.4, 0.5, 0.5, 0.4), 0, 1.0),  # more thrust left: rolls right
+        ((0.5, 0.4, 0.5, 0.4), 1, 1.0),  # more thrust in front: nose up
+        ((0.5, 0.5, 0.4, 0.4), 2, 1.0),  # more on the anticlockwise pair: nose right
+        ((0.5, 0.4, 0.4, 0.5), 0, -1.0),
+    ],
+)
+def test_motor_order_and_signs(commands, axis, sign):
+    quad = Quadrotor()
+    flying = fly((0.5,) * 4, 1.0, quad=quad)
+
+    rates = fly(commands, 0.1, state=flying, quad=quad).body.rate_body_radps
+
+    assert sign * rates[axis] > 0.05
+    assert all(abs(rate) < 1e-3 for other, rate in enumerate(rates) if other != axis)
+
+
+def test_a_roll_to_the_right_drifts_east_when_heading_north():
+    quad = Quadrotor()
+    state = fly((0.5,) * 4, 1.0, quad=quad)
+    state = fly((0.45, 0.55, 0.55, 0.45), 0.1, state=state, quad=quad)
+    state = fly((0.5,) * 4, 0.3, state=state, quad=quad)
+
+    roll, _, _ = rotation.to_euler(state.body.ned_from_body_wxyz)
+    assert roll > 0.05
+    assert state.body.velocity_ned_mps[1] > 0.1
+    assert state.body.velocity_ned_mps[0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_step_depends_on_its_arguments_alone():
+    quad = Quadrotor()
+    start = fly((0.5, 0.6, 0.5, 0.6), 0.7, quad=quad)
+
+    first = quad.step(start, (0.4, 0.5, 0.6, 0.5), 80)
+    quad.step(quad.at_rest(), (1.0,) * 4, 400)
+    again = quad.step(start, (0.4, 0.5, 0.6, 0.5), 80)
+
+    assert first.body == again.body
+
+
+angle = st.floats(-3.1, 3.1)
+pitch = st.floats(-1.5, 1.5)
+
+
+@given(roll=angle, pitch=pitch, yaw=angle)
+def test_euler_angles_survive_the_quaternion(roll, pitch, yaw):
+    again = rotation.to_euler(rotation.from_euler(roll, pitch, yaw))
+
+    assert again == pytest.approx((roll, pitch, yaw), abs=1e-6)
+
+
+@given(roll=angle, pitch=pitch, yaw=angle)
+def test_rotating_there_and_back_changes_nothing(roll, pitch, yaw):
+    q = rotation.from_euler(roll, pitch, yaw)
+
+    back = rotation.rotate(rotation.conjugate(q), rotation.rotate(q, (1.0, -2.0, 3.0)))
+
+    assert back == pytest.approx((1.0, -2.0, 3.0), abs=1e-9)
+
+
+def test_integrating_a_rate_turns_by_rate_times_time():
+    q = rotation.integrate(rotation.IDENTITY, (0.0, 0.0, 0.5), 1.0)
+
+    assert rotation.to_euler(q) == pytest.approx((0.0, 0.0, 0.5))
+    assert rotation.rotation_vector(q) == pytest.approx((0.0, 0.0, 0.5))

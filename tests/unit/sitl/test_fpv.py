@@ -1,0 +1,200 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sitl import scenery
+from sitl.camera import NEAR_M, TILT_UP_RAD, FpvRenderer, clip_near
+from sitl.course import Course, Gate, make_course
+from sitl.errors import UsageError
+from sitl.rotation import IDENTITY, from_euler
+
+SIZE_PX = 201
+FOCAL_PX = SIZE_PX / 2
+MIDDLE_PX = (SIZE_PX - 1) / 2
+COURSE = Course(
+    seed=0, gates=(Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0),)
+)
+ORANGE = np.array(scenery.FRONT_RGB[0])
+LEVEL_CAMERA = from_euler(0.0, -TILT_UP_RAD, 0.0)
+"""Body pitch that makes the optical axis horizontal."""
+
+
+def is_orange(image):
+    """Hue of the first gate, in light or shadow, hazed or not."""
+    red, green, blue = np.moveaxis(image.astype(int), -1, 0)
+    return (red > green + 50) & (green > blue + 20)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return FpvRenderer(COURSE, SIZE_PX, SIZE_PX)
+
+
+def test_the_gate_appears_where_the_pinhole_says(renderer):
+    """Eye 6 m before the front face, level: outer half side 1.2 + 0.32 m, inner 1.2 m."""
+    image = renderer.render((10.0 - scenery.DEPTH_M / 2 - 6.0, 0.0, -2.0), LEVEL_CAMERA)
+    outer_px = FOCAL_PX * (1.2 + scenery.BAR_M) / 6.0
+    inner_px = FOCAL_PX * 1.2 / 6.0
+    column = is_orange(image)[round(MIDDLE_PX)]
+    left, right = np.flatnonzero(column)[[0, -1]]
+    assert left == pytest.approx(MIDDLE_PX - outer_px, abs=1)
+    assert right == pytest.approx(MIDDLE_PX + outer_px, abs=1)
+    below = np.flatnonzero(is_orange(image)[:, round(MIDDLE_PX)])
+    assert below[-1] == pytest.approx(MIDDLE_PX + outer_px, abs=1)
+    front = np.abs(image[round(MIDDLE_PX)] - image[round(MIDDLE_PX), left + 2].astype(int)).sum(-1)
+    bar = np.flatnonzero(front < 6)
+    assert bar[bar < MIDDLE_PX][-1] == pytest.approx(MIDDLE_PX - inner_px, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("position", "attitude", "centre_px"),
+    [
+        pytest.param((4.0, 0.0, -2.0), LEVEL_CAMERA, (0.0, 0.0), id="straight ahead"),
+        pytest.param((4.0, -3.0, -2.0), LEVEL_CAMERA, (3 / 6, 0.0), id="eye left, gate right"),
+        pytest.param((4.0, 0.0, -4.0), LEVEL_CAMERA, (0.0, 2 / 6), id="eye high, gate low"),
+        pytest.param(
+            (4.0, 0.0, -2.0), IDENTITY, (0.0, math.tan(TILT_UP_RAD)), id="level body, tilted camera"
+        ),
+        pytest.param(
+            (4.0, 0.0, -2.0),
+            from_euler(0.0, -TILT_UP_RAD, 0.3),
+            (-math.tan(0.3), 0.0),
+            id="nose right, gate left",
+        ),
+    ],
+)
+def test_projection_of_the_gate_centre(renderer, position, attitude, centre_px):
+    """Offsets in units of the focal length, by hand; right and down positive."""
+    rows, columns = np.nonzero(is_orange(renderer.render(position, attitude)))
+    middle = ((columns.min() + columns.max()) / 2, (rows.min() + rows.max()) / 2)
+    wanted = [MIDDLE_PX + FOCAL_PX * offset for offset in centre_px]
+    assert middle == pytest.approx(wanted, abs=3.0)
+
+
+def test_rolling_right_tilts_the_horizon_to_the_left(renderer):
+    image = renderer.render((-50.0, 0.0, -2.0), from_euler(0.4, -TILT_UP_RAD, 0.0)).astype(int)
+    is_sky = image[..., 2] > image[..., 1] + 5
+    assert is_sky[:, 5].sum() > is_sky[:, -5].sum() + FOCAL_PX / 2
+
+
+def test_a_gate_is_grey_from_behind(renderer):
+    image = renderer.render((16.0, 0.0, -2.0), from_euler(0.0, -TILT_UP_RAD, math.pi))
+    front = renderer.render((4.0, 0.0, -2.0), LEVEL_CAMERA)
+    assert is_orange(image).sum() < 0.4 * is_orange(front).sum()
+
+
+def test_the_nearer_gate_hides_the_farther_one():
+    """Eye at north 1: the left bar of the orange gate stands right behind that of the red one."""
+    near_m, far_m = (north - scenery.DEPTH_M / 2 - 1.0 for north in (6.0, 14.0))
+    bar_m = 1.2 + scenery.BAR_M / 2
+    far_east_m = bar_m - bar_m * far_m / near_m
+    places = [(14.0, far_east_m, -2.0), (6.0, 0.0, -2.0)]
+    gates = [
+        Gate(center_ned_m=center, yaw_rad=0.0, size_m=2.4, index=index)
+        for index, center in enumerate(places)
+    ]
+    renderer = FpvRenderer(Course(seed=0, gates=tuple(gates)), SIZE_PX, SIZE_PX)
+    image = renderer.render((1.0, 0.0, -2.0), LEVEL_CAMERA)
+    column = round(MIDDLE_PX - FOCAL_PX * bar_m / near_m)
+    red, green, _ = image[round(MIDDLE_PX), column].astype(int)
+    assert red > 3 * green
+
+
+def test_a_wall_that_reaches_behind_the_eye_is_cut_where_it_should_be(renderer):
+    """In the opening, 0.3 m from its right wall, nose 0.5 rad right: the wall's far edge is at
+    (x, z) = (0.3 cos - 0.12 sin, 0.3 sin + 0.12 cos), its near edge behind the near plane."""
+    edge = (0.3 * math.cos(0.5) - 0.12 * math.sin(0.5)) / (
+        0.3 * math.sin(0.5) + 0.12 * math.cos(0.5)
+    )
+    image = renderer.render((10.0, 0.9, -2.0), from_euler(0.0, -TILT_UP_RAD, 0.5))
+    row = is_orange(image)[round(MIDDLE_PX)]
+    assert np.flatnonzero(row)[0] == pytest.approx(MIDDLE_PX + FOCAL_PX * edge, abs=1.5)
+    assert row[np.flatnonzero(row)[0] :].all()
+
+
+def test_grid_lines_lie_where_the_pinhole_says(renderer):
+    """Lines every 2 m from 1 m on; 2 m up, level: a point d ahead is 2 / d below the middle."""
+    brightness = renderer.render((-32.0, 0.0, -2.0), LEVEL_CAMERA).sum(axis=2).astype(int)
+    rows = [round(MIDDLE_PX + FOCAL_PX * 2 / ahead_m) for ahead_m in (4.4, 2.3)]
+    line_px = rows[0] + brightness[rows[0] : rows[1], round(MIDDLE_PX)].argmax()
+    assert line_px == pytest.approx(MIDDLE_PX + FOCAL_PX * 2 / 3, abs=1.5)
+    columns = [round(MIDDLE_PX + FOCAL_PX * right_m / 4) for right_m in (0.2, 1.8)]
+    row = round(MIDDLE_PX + FOCAL_PX * 2 / 4)
+    line_px = columns[0] + brightness[row, columns[0] : columns[1]].argmax()
+    assert line_px == pytest.approx(MIDDLE_PX + FOCAL_PX * 1 / 4, abs=1.5)
+
+
+def test_the_ground_moves_with_the_vehicle_and_repeats_with_its_tile(renderer):
+    here = renderer.render((-50.0, 0.0, -2.0), LEVEL_CAMERA)
+    step = renderer.render((-49.7, 0.0, -2.0), LEVEL_CAMERA)
+    tile = renderer.render((-50.0, scenery.GROUND_TILE_M, -2.0), LEVEL_CAMERA)
+    ground = slice(SIZE_PX * 2 // 3, None)
+    assert np.abs(here[ground].astype(int) - step[ground]).mean() > 3
+    assert np.abs(here[ground].astype(int) - tile[ground]).mean() < 0.5
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.tuples(*[st.floats(-14.0, 14.0)] * 2, st.floats(-8.0, 1.0)),
+    st.tuples(*[st.floats(-math.pi, math.pi)] * 3),
+)
+def test_any_pose_gives_a_picture(position, angles):
+    course = make_course(7)
+    near_gate = tuple(p + c for p, c in zip(position, course.gates[1].center_ned_m, strict=True))
+    image = FpvRenderer(course, 64, 48).render(near_gate, from_euler(*angles))
+    assert image.shape == (48, 64, 3)
+    assert image.dtype == np.uint8
+
+
+def test_flying_through_a_gate_never_fills_the_picture(renderer):
+    """The gate's bars stay outside the opening however near they are to the image plane."""
+    for north_m in np.linspace(9.0, 11.0, 81):
+        image = renderer.render((north_m, 0.0, -2.0), LEVEL_CAMERA)
+        assert not is_orange(image)[80:120, 80:120].any()
+    assert not is_orange(image).any()
+
+
+@pytest.mark.parametrize(
+    ("depths_m", "corners"),
+    [
+        ((1.0, 1.0, 1.0, 1.0), 4),
+        ((1.0, 1.0, 1.0, -1.0), 5),
+        ((1.0, 1.0, -1.0, -1.0), 4),
+        ((1.0, -1.0, -1.0, -1.0), 3),
+        ((NEAR_M, 1.0, 1.0, NEAR_M), 4),
+    ],
+)
+def test_clipping_keeps_what_is_in_front(depths_m, corners):
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    clipped = clip_near(np.column_stack([square, depths_m]))
+    assert len(clipped) == corners
+    assert (clipped[:, 2] >= NEAR_M - 1e-12).all()
+
+
+def test_clipping_cuts_edges_where_they_meet_the_plane():
+    clipped = clip_near(
+        np.array([[0.0, 0.0, NEAR_M - 1], [0.0, 0.0, NEAR_M + 1], [4.0, 0.0, NEAR_M + 1]])
+    )
+    np.testing.assert_allclose(
+        clipped, [[0, 0, NEAR_M], [0, 0, NEAR_M + 1], [4, 0, NEAR_M + 1], [2, 0, NEAR_M]]
+    )
+
+
+def test_every_face_is_flat_and_its_normal_stands_on_it():
+    faces = scenery.gate_faces(make_course(3))
+    for corners, normal in zip(faces.corners_ned_m, faces.normals_ned, strict=True):
+        np.testing.assert_allclose((corners - corners[0]) @ normal, 0, atol=1e-9)
+
+
+def test_the_picture_is_the_same_every_time():
+    pose = ((3.0, 0.5, -2.0), from_euler(0.1, -0.1, 0.05))
+    first = FpvRenderer(make_course(7), 96, 64).render(*pose)
+    np.testing.assert_array_equal(first, FpvRenderer(make_course(7), 96, 64).render(*pose))
+
+
+def test_a_tiny_picture_is_refused():
+    with pytest.raises(UsageError, match="16x16"):
+        FpvRenderer(COURSE, 8, 8)

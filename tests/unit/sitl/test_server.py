@@ -1,0 +1,414 @@
+"""The MAVLink edge on bytes: streams, parameters, refusals, garbage, faults."""
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.faults import FaultyLink, LinkFaults, Reboot, SensorFreeze, VehicleFaults
+from sitl.messages import BUILDERS
+from sitl.streams import Streams
+from sitl.vehicle import Vehicle
+
+STEP_NS = 2_500_000
+
+
+class Station:
+    """The far ends of a vehicle's links."""
+
+    def __init__(self, links=1):
+        self.vehicle = Vehicle(links=links, boot_ns=0)
+        self.now_ns = 0
+        self._parsers = [mav.MAVLink(None) for _ in range(links)]
+        self._sender = mav.MAVLink(None, srcSystem=255, srcComponent=190)
+
+    def pack(self, message, system_id=255):
+        self._sender.srcSystem = system_id
+        return message.pack(self._sender)
+
+    def send(self, message, link=0, system_id=255):
+        self.vehicle.receive(link, self.pack(message, system_id), self.now_ns)
+
+    def run(self, seconds, link=0):
+        received = []
+        for _ in range(round(seconds * NS_PER_S / STEP_NS)):
+            self.now_ns += STEP_NS
+            self.vehicle.step(self.now_ns)
+            received += self._parsers[link].parse_buffer(self.vehicle.take_outgoing(link)) or []
+        return received
+
+    def interval(self, message_id, rate_hz, link=0):
+        self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz, link=link)
+
+    def command(self, number, *params, link=0):
+        padded = (*params, *[0.0] * (7 - len(params)))
+        self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *padded), link=link)
+        acks = named(self.run(0.01, link), "COMMAND_ACK")
+        return acks[-1].result if acks else None
+
+
+def named(messages, name):
+    return [message for message in messages if message.get_type() == name]
+
+
+@pytest.fixture
+def station():
+    return Station()
+
+
+def test_only_heartbeats_and_timesync_come_unasked(station):
+    messages = station.run(10.5)
+
+    assert {m.get_type() for m in messages} == {"HEARTBEAT", "TIMESYNC"}
+    assert len(named(messages, "HEARTBEAT")) == 10
+    (request,) = named(messages, "TIMESYNC")
+    assert request.tc1 == 0
+    assert request.ts1 == 10 * NS_PER_S + 1
+
+
+def test_sequence_numbers_have_no_gaps(station):
+    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 200)
+    sequence = [m.get_seq() for m in station.run(2.0)]
+
+    assert all((b - a) % 256 == 1 for a, b in pairwise(sequence))
+
+
+def test_intervals_belong_to_the_link_they_came_on():
+    station = Station(links=2)
+    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100, link=1)
+
+    assert not named(station.run(0.5, link=0), "ATTITUDE")
+    assert len(named(station.run(0.5, link=1), "ATTITUDE")) >= 49
+
+
+def test_texts_go_to_all_links():
+    station = Station(links=2)
+    station.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196, link=0)
+
+    (text,) = named(station.run(0.1, link=1), "STATUSTEXT")
+    assert text.text == "Arming motors"
+
+
+@pytest.mark.parametrize("message_id", sorted(BUILDERS))
+def test_every_message_packs_and_says_when_it_was_sent(station, message_id):
+    station.run(6.0)
+    station.interval(message_id, 50)
+
+    name = mav.mavlink_map[message_id].msgname
+    messages = named(station.run(0.2), name)
+
+    silent = (mav.MAVLINK_MSG_ID_RC_CHANNELS_RAW, mav.MAVLINK_MSG_ID_OPTICAL_FLOW)
+    assert bool(messages) != (message_id in silent)
+    for message in messages:
+        stamp_ms = getattr(message, "time_boot_ms", station.now_ns // NS_PER_MS)
+        assert stamp_ms == pytest.approx(station.now_ns / NS_PER_MS, abs=250)
+
+
+@pytest.mark.parametrize(
+    "message_id", [mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT]
+)
+def test_positions_are_withheld_until_the_estimator_has_one(station, message_id):
+    station.interval(message_id, 50)
+    name = mav.mavlink_map[message_id].msgname
+
+    assert not named(station.run(4.9), name)
+    assert named(station.run(0.2), name)
+
+
+def test_imu_units_and_oddities(station):
+    for message_id in (mav.MAVLINK_MSG_ID_RAW_IMU, mav.MAVLINK_MSG_ID_HIGHRES_IMU):
+        station.interval(message_id, 100)
+    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+    messages = station.run(1.0)
+    raw = named(messages, "RAW_IMU")[-1]
+    highres = named(messages, "HIGHRES_IMU")[-1]
+    attitude = named(messages, "ATTITUDE")[-1]
+
+    assert (raw.zacc, raw.xgyro) == (-1000, 3)
+    assert highres.zacc == pytest.approx(-9.81, abs=0.01)
+    assert highres.xgyro - attitude.rollspeed == pytest.approx(0.003, abs=1e-6)
+    assert highres.xmag > 1e5
+    assert (highres.fields_updated, highres.id) == (8191, 0)
+
+
+def test_streams_slow_down_while_parameters_are_sent(station):
+    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 200)
+    station.run(0.1)
+    station.send(mav.MAVLink_param_request_list_message(1, 1))
+
+    messages = station.run(0.2)
+    afterwards = station.run(1.0)
+
+    assert named(messages, "PARAM_VALUE")
+    assert len(named(messages, "ATTITUDE")) <= 12
+    assert len(named(afterwards[-200:], "ATTITUDE")) > 150
+
+
+def test_param_read_by_index_and_name_and_unknown(station):
+    station.send(mav.MAVLink_param_request_read_message(1, 1, b"", 0))
+    station.send(mav.MAVLink_param_request_read_message(1, 1, b"NO_SUCH", -1))
+    station.send(mav.MAVLink_param_request_read_message(1, 1, b"", 9999))
+
+    (value,) = named(station.run(0.1), "PARAM_VALUE")
+    assert value.param_id == station.vehicle.params.names[0]
+
+
+def test_nan_in_a_message_is_refused_and_counted(station):
+    station.send(mav.MAVLink_param_set_message(1, 1, b"RC_OVERRIDE_TIME", math.nan, 9))
+
+    assert not named(station.run(0.1), "PARAM_VALUE")
+    assert station.vehicle.params["RC_OVERRIDE_TIME"] == 3.0
+    assert station.vehicle.log.refused_messages == 1
+
+
+@pytest.mark.parametrize(
+    ("number", "params", "result"),
+    [
+        (mav.MAV_CMD_SET_MESSAGE_INTERVAL, (30, math.nan), mav.MAV_RESULT_DENIED),
+        (mav.MAV_CMD_SET_MESSAGE_INTERVAL, (30, 10_000, math.nan), mav.MAV_RESULT_DENIED),
+        (mav.MAV_CMD_DO_SET_MODE, (1, math.nan), mav.MAV_RESULT_DENIED),
+        (mav.MAV_CMD_DO_SET_MODE, (0, 2), mav.MAV_RESULT_DENIED),
+        (mav.MAV_CMD_DO_SET_MODE, (1, 77), mav.MAV_RESULT_FAILED),
+        (mav.MAV_CMD_COMPONENT_ARM_DISARM, (math.nan,), mav.MAV_RESULT_UNSUPPORTED),
+        (mav.MAV_CMD_GET_MESSAGE_INTERVAL, (70_000,), mav.MAV_RESULT_DENIED),
+        (mav.MAV_CMD_REQUEST_MESSAGE, (148,), mav.MAV_RESULT_ACCEPTED),
+        (mav.MAV_CMD_REQUEST_MESSAGE, (331,), mav.MAV_RESULT_FAILED),
+        (mav.MAV_CMD_GET_HOME_POSITION, (math.nan,) * 7, mav.MAV_RESULT_ACCEPTED),
+        (mav.MAV_CMD_NAV_LAND, (math.nan,) * 7, mav.MAV_RESULT_ACCEPTED),
+        (mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (3,), mav.MAV_RESULT_UNSUPPORTED),
+        (mav.MAV_CMD_NAV_TAKEOFF, (), mav.MAV_RESULT_UNSUPPORTED),
+    ],
+)
+def test_command_results(station, number, params, result):
+    assert station.command(number, *params) == result
+
+
+def test_message_interval_on_request_message(station):
+    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+    station.send(
+        mav.MAVLink_command_long_message(
+            1, 1, mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL, 30, *[0] * 5
+        )
+    )
+
+    (interval,) = named(station.run(0.01), "MESSAGE_INTERVAL")
+    assert (interval.message_id, interval.interval_us) == (30, 10_000)
+
+
+def test_set_mode_message_and_its_ack(station):
+    station.send(mav.MAVLink_set_mode_message(1, 1, 2))
+
+    (ack,) = named(station.run(0.01), "COMMAND_ACK")
+    assert (ack.command, ack.result) == (mav.MAVLINK_MSG_ID_SET_MODE, mav.MAV_RESULT_ACCEPTED)
+
+
+def test_uploads_of_missions_are_unsupported(station):
+    station.send(mav.MAVLink_mission_count_message(1, 1, 3))
+    station.send(mav.MAVLink_mission_clear_all_message(1, 1))
+
+    acks = named(station.run(0.01), "MISSION_ACK")
+    assert [ack.type for ack in acks] == [mav.MAV_MISSION_UNSUPPORTED] * 2
+
+
+def test_ping_is_answered_to_its_sender(station):
+    station.send(mav.MAVLink_ping_message(123, 7, 0, 0))
+
+    (ping,) = named(station.run(0.01), "PING")
+    assert (ping.time_usec, ping.seq, ping.target_system) == (123, 7, 255)
+
+
+def test_the_gcs_only_option_silences_everybody_else(station):
+    station.vehicle.params.set("MAV_OPTIONS", 1.0)
+    for system_id, answers in ((42, 0), (255, 1), (1, 1)):
+        station.send(mav.MAVLink_timesync_message(0, 5), system_id=system_id)
+        assert len(named(station.run(0.01), "TIMESYNC")) == answers
+
+
+def test_overrides_of_a_gcs_range_are_let_in(station):
+    station.vehicle.params.set("MAV_GCS_SYSID", 240.0)
+    station.vehicle.params.set("MAV_GCS_SYSID_HI", 250.0)
+    for system_id, roll_us in ((239, 1601), (245, 1602), (251, 1603)):
+        override = mav.MAVLink_rc_channels_override_message(1, 1, roll_us, *[65535] * 7)
+        station.send(override, system_id=system_id)
+    station.run(0.05)
+
+    assert station.vehicle.ap.rc.channels_us[0] == 1602
+
+
+def test_mavlink_1_framing_is_understood(station):
+    v1 = mav.MAVLink_rc_channels_override_message(1, 1, 1611, *[65535] * 7)
+    sender = mav.MAVLink(None, srcSystem=255)
+    station.vehicle.receive(0, v1.pack(sender, force_mavlink1=True), 0)
+    station.run(0.05)
+
+    assert station.vehicle.ap.rc.channels_us[0] == 1611
+
+
+def test_reboot_is_refused_when_armed_and_else_restarts_the_clock(station):
+    station.run(2.0)
+    station.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196)
+    reboot = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+    assert station.command(reboot, 1) == mav.MAV_RESULT_FAILED
+    station.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0)
+    assert station.command(reboot, 1) == mav.MAV_RESULT_ACCEPTED
+
+    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+    attitude = named(station.run(0.1), "ATTITUDE")[-1]
+    assert attitude.time_boot_ms < 500
+
+
+def test_prearm_health_waits_for_the_estimator_but_not_for_the_sticks(station):
+    def healthy():
+        station.send(mav.MAVLink_command_long_message(1, 1, 512, 0, 1, *[0] * 6))
+        status = named(station.run(0.01), "SYS_STATUS")[-1]
+        return bool(status.onboard_control_sensors_health & mav.MAV_SYS_STATUS_PREARM_CHECK)
+
+    station.run(1.0)
+    assert not healthy()
+    station.run(2.5)
+    station.send(mav.MAVLink_rc_channels_override_message(1, 1, 1700, 1500, 1700, *[65535] * 5))
+    station.run(0.1)
+    assert healthy()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.binary(max_size=300), max_size=8))
+def test_garbage_never_raises_and_a_good_frame_still_gets_through(chunks):
+    vehicle = Vehicle(links=1, boot_ns=0)
+    for chunk in chunks:
+        vehicle.receive(0, chunk, 0)
+    ping = mav.MAVLink_timesync_message(0, 77).pack(mav.MAVLink(None, srcSystem=255))
+    for _ in range(30):  # an open frame of garbage may swallow up to 280 bytes
+        vehicle.receive(0, ping, 0)
+
+    answers = mav.MAVLink(None).parse_buffer(vehicle.take_outgoing(0)) or []
+    assert any(m.get_type() == "TIMESYNC" and m.ts1 == 77 for m in answers)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.sampled_from(sorted(mav.mavlink_map)),
+    st.binary(min_size=0, max_size=255),
+)
+def test_any_payload_of_any_known_message_is_survived(message_id, payload):
+    station = Station()
+    message = mav.MAVLink_message(message_id, mav.mavlink_map[message_id].msgname)
+    message._crc_extra = mav.mavlink_map[message_id].crc_extra
+    frame = message._pack(
+        mav.MAVLink(None, srcSystem=255), mav.mavlink_map[message_id].crc_extra, payload
+    )
+
+    station.vehicle.receive(0, bytes(frame), 0)
+    station.run(0.01)
+
+
+def test_truncated_frames_are_counted(station):
+    frame = station.pack(mav.MAVLink_timesync_message(0, 1))
+    corrupt = frame[:-1] + bytes([frame[-1] ^ 0xFF])
+    station.vehicle.receive(0, corrupt, 0)
+
+    assert station.vehicle.bad_frames == 1
+
+
+def test_a_host_stall_advances_physics_but_sends_no_burst(station):
+    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+    station.run(0.1)
+    station.now_ns += NS_PER_S // 2
+
+    burst = named(station.run(0.0025), "ATTITUDE")
+
+    assert len(burst) == 1
+    assert burst[0].time_boot_ms == pytest.approx(station.now_ns / NS_PER_MS, abs=3)
+
+
+def test_an_eleventh_interval_joins_the_nearest_of_ten():
+    streams = Streams(range(100), 0)
+    for index in range(9):
+        streams.set_interval(10 + index, (10 + index) * 1000, loop_hz=400.0, now_ns=0)
+
+    streams.set_interval(50, 142_000, loop_hz=400.0, now_ns=0)
+
+    assert streams.interval_us(50) == 18_000
+    assert streams.interval_us(10) == 10_000
+
+
+@pytest.mark.parametrize(
+    ("loop_hz", "shortest_us"), [(400, 3000), (300, 4000), (200, 6000), (100, 12000), (50, 25000)]
+)
+def test_the_cap_follows_the_loop_rate(loop_hz, shortest_us):
+    streams = Streams([30], 0)
+
+    assert streams.set_interval(30, shortest_us, loop_hz=loop_hz, now_ns=0) is None
+    assert "too fast" in streams.set_interval(30, shortest_us - 1000, loop_hz=loop_hz, now_ns=0)
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=200), st.integers(3, 50))
+def test_streams_never_send_faster_than_asked(gaps_ms, interval_ms):
+    streams = Streams([30], 0)
+    streams.set_interval(30, interval_ms * 1000, loop_hz=400.0, now_ns=0)
+    now_ms, sent = 0, 0
+    for gap_ms in gaps_ms:
+        now_ms += gap_ms
+        sent += len(streams.due(now_ms * NS_PER_MS, 1))
+
+    assert sent <= now_ms // interval_ms
+
+
+def test_link_faults_are_the_same_for_the_same_seed():
+    def survivors(seed):
+        link = FaultyLink(LinkFaults(loss=0.2, duplicate=0.1, corrupt=0.1, reorder=0.1), seed)
+        for index in range(500):
+            link.send(bytes([index % 256] * 10), index * NS_PER_MS)
+        return link.receive(NS_PER_S)
+
+    assert survivors(1) == survivors(1)
+    assert survivors(1) != survivors(2)
+    assert 380 < len(survivors(1)) < 500
+
+
+def test_link_faults_delay_and_reorder():
+    link = FaultyLink(LinkFaults(delay_ms=10.0), seed=0)
+    link.send(b"a", 0)
+
+    assert link.receive(9 * NS_PER_MS) == []
+    assert link.receive(10 * NS_PER_MS) == [b"a"]
+
+    late = FaultyLink(LinkFaults(reorder=0.5, reorder_ms=20.0), seed=3)
+    for index in range(50):
+        late.send(bytes([index]), index * NS_PER_MS)
+    order = [packet[0] for packet in late.receive(NS_PER_S)]
+    assert sorted(order) == list(range(50))
+    assert order != sorted(order)
+
+
+def test_corrupted_frames_are_counted_and_the_rest_gets_through(station):
+    link = FaultyLink(LinkFaults(corrupt=0.3), seed=5)
+    for index in range(100):
+        override = mav.MAVLink_rc_channels_override_message(1, 1, 1600, *[65535] * 7)
+        link.send(station.pack(override), index * 10 * NS_PER_MS)
+    for packet in link.receive(2 * NS_PER_S):
+        station.vehicle.receive(0, packet, station.now_ns)
+    station.run(0.01)
+
+    summary = station.vehicle.log.summary(station.vehicle.ap, station.vehicle.bad_frames)
+    assert summary["bad_frames"] >= 10
+    assert 50 <= summary["overrides"]["count"] <= 90
+    assert station.vehicle.ap.rc.channels_us[0] == 1600
+
+
+def test_vehicle_faults_follow_their_script(station):
+    faults = VehicleFaults([SensorFreeze(start_s=1.0, end_s=2.0), Reboot(at_s=3.0)], 0)
+    frozen_s, uptime_s = [], []
+    while station.now_ns < 4 * NS_PER_S:
+        faults.apply(station.vehicle, station.now_ns)
+        station.run(0.05)
+        uptime_s.append(station.vehicle.ap.uptime_ns / NS_PER_S)
+        if station.vehicle.ap.sensors_frozen:
+            frozen_s.append(station.now_ns / NS_PER_S)
+
+    assert (frozen_s[0], frozen_s[-1]) == pytest.approx((1.05, 2.0), abs=0.06)
+    assert uptime_s[-1] == pytest.approx(1.0, abs=0.06)

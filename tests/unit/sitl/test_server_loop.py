@@ -1,0 +1,303 @@
+"""The real-time loop on a fake clock, the report, and the command line's refusals."""
+
+import json
+import math
+import os
+import signal
+import socket
+import threading
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.__main__ import main
+from sitl.app import RunOptions, filming, fly, stop_on_signal
+from sitl.autopilot import STEP_NS, VehicleConfig
+from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from sitl.course import make_course
+from sitl.modes import Mode
+from sitl.report import FlightLog, write_report
+from sitl.transport import Received
+from sitl.vehicle import Vehicle
+
+
+class FakeClock:
+    """Time that passes only by sleeping, with one stall to order."""
+
+    def __init__(self, stall_at_ns=None, stall_ns=0):
+        self.time_ns = 0
+        self.sleeps_ns = []
+        self._stall_at_ns, self._stall_ns = stall_at_ns, stall_ns
+
+    def now_ns(self):
+        return self.time_ns
+
+    def sleep_until_ns(self, deadline_ns):
+        self.sleeps_ns.append(deadline_ns)
+        self.time_ns = max(self.time_ns, deadline_ns)
+        if self._stall_at_ns is not None and self.time_ns >= self._stall_at_ns:
+            self.time_ns += self._stall_ns
+            self._stall_at_ns = None
+
+
+class FakeTransport:
+    """Scripted arrivals, recorded departures."""
+
+    def __init__(self, clock, arrivals=()):
+        self._clock = clock
+        self._arrivals = list(arrivals)
+        self.sent = []
+
+    def drain(self):
+        while self._arrivals and self._arrivals[0].arrived_ns <= self._clock.now_ns():
+            yield self._arrivals.pop(0)
+
+    def send(self, data):
+        if data:
+            self.sent.append((self._clock.now_ns(), data))
+
+    def close(self):
+        pass
+
+
+def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
+    clock = FakeClock()
+    vehicle = Vehicle(links=1, boot_ns=0)
+
+    fly(vehicle, [FakeTransport(clock)], clock, threading.Event(), end_ns=NS_PER_S)
+
+    assert clock.sleeps_ns == [STEP_NS * n for n in range(1, 401)]
+    assert vehicle.ap.now_ns == NS_PER_S - STEP_NS
+
+
+def test_after_a_stall_it_catches_up_without_a_burst():
+    clock = FakeClock(stall_at_ns=NS_PER_S, stall_ns=300 * NS_PER_MS + 1)
+    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle.server.links[0].set_interval(mav.MAVLINK_MSG_ID_ATTITUDE, 10_000)
+    transport = FakeTransport(clock)
+
+    fly(vehicle, [transport], clock, threading.Event(), end_ns=2 * NS_PER_S)
+
+    sent_ns = [stamp_ns for stamp_ns, _ in transport.sent]
+    after_ns = [stamp_ns for stamp_ns in sent_ns if stamp_ns > NS_PER_S]
+    assert min(b - a for a, b in pairwise(sent_ns)) >= STEP_NS
+    assert after_ns[0] == pytest.approx(1.3 * NS_PER_S, abs=10)
+    assert after_ns[1] - after_ns[0] <= 10 * NS_PER_MS
+    assert vehicle.ap.now_ns == 2 * NS_PER_S - STEP_NS
+
+
+def test_the_loop_takes_in_bytes_and_says_who_came(capsys):
+    clock = FakeClock()
+    vehicle = Vehicle(links=1, boot_ns=0)
+    frame = mav.MAVLink_command_long_message(1, 1, 176, 0, 1, int(Mode.ALT_HOLD), *[0] * 5)
+    arrivals = [Received(frame.pack(mav.MAVLink(None, srcSystem=255)), 50 * NS_PER_MS)]
+
+    fly(vehicle, [FakeTransport(clock, arrivals)], clock, threading.Event(), end_ns=NS_PER_S)
+
+    assert capsys.readouterr().err == "sitl: link 0 connected\nsitl: mode ALT_HOLD\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_loop_and_handlers_come_back(number):
+    before = signal.getsignal(number)
+    with stop_on_signal() as stop:
+        os.kill(os.getpid(), number)
+        assert stop.wait(5.0)
+        fly(Vehicle(links=0, boot_ns=0), [], FakeClock(), stop, end_ns=None)
+
+    assert signal.getsignal(number) is before
+
+
+def logged(arrivals_ms, releases_ms=()):
+    log = FlightLog(0, None)
+    events = [(ms, log.on_override) for ms in arrivals_ms]
+    events += [(ms, log.on_release) for ms in releases_ms]
+    for ms, happens in sorted(events, key=lambda event: event[0]):
+        happens(ms * NS_PER_MS)
+    return log.summary(Vehicle(links=1, boot_ns=0).ap, 0)
+
+
+def test_override_rate_and_gaps():
+    overrides = logged([*range(1000, 2000, 10), 2020])["overrides"]
+
+    assert overrides["count"] == 101
+    assert (overrides["first_t_s"], overrides["last_t_s"]) == (1.0, 2.02)
+    assert overrides["rate_hz"] == pytest.approx(100 / 1.02)
+    assert overrides["gap_ms"] == {"p50": 10.0, "p99": pytest.approx(10.2), "max": 30.0}
+
+
+def test_a_release_is_no_gap():
+    summary = logged([0, 10, 20, 5000, 5010], releases_ms=[30, 40])
+
+    assert summary["overrides"]["gap_ms"]["max"] == 10.0
+    assert summary["releases"] == {"count": 2, "t_s": [0.03, 0.04]}
+
+
+def test_a_report_without_overrides_holds_nulls_not_zeros():
+    overrides = logged([])["overrides"]
+
+    assert overrides == {
+        "count": 0,
+        "first_t_s": None,
+        "last_t_s": None,
+        "rate_hz": None,
+        "gap_ms": None,
+    }
+
+
+def test_releases_and_foreign_overrides_on_the_wire_are_told_apart():
+    vehicle = Vehicle(links=1, boot_ns=0)
+    sender = mav.MAVLink(None, srcSystem=255)
+    for primary in ([1500] * 8, [1500, 0, *[65535] * 6], [0] * 8, [0, *[65535] * 7], [65535] * 8):
+        frame = mav.MAVLink_rc_channels_override_message(1, 1, *primary).pack(sender)
+        vehicle.receive(0, frame, 0)
+    sender.srcSystem = 42
+    vehicle.receive(0, mav.MAVLink_rc_channels_override_message(1, 1, *[0] * 8).pack(sender), 0)
+
+    summary = vehicle.log.summary(vehicle.ap, 0)
+    assert summary["overrides"]["count"] == 2
+    assert summary["releases"]["count"] == 2
+
+
+def flown(pilot, course=None):
+    log = FlightLog(0, course)
+    return log, lambda ap: log.on_step(ap)
+
+
+def test_a_soft_flight_is_no_crash_and_is_measured(pilot):
+    log, watch = flown(pilot)
+    pilot.take_off(height_m=3.0)
+    pilot.hold(1.0, pitch=1400, watch=watch)
+    pilot.hold(1.0, pitch=1600, watch=watch)
+    pilot.hold(6.0, thr=1000, watch=watch)
+
+    summary = log.summary(pilot.ap, 0)
+    north, east, _ = summary["final"]["position_ned_m"]
+    assert not summary["crashed"]
+    assert 1.5 < summary["impact_speed_mps"] < 3.5
+    assert summary["distance_m"] > math.hypot(north, east) > 0.5
+    assert summary["max_altitude_m"] > 3.0
+    assert not summary["final"]["armed"] or summary["armed_s"] > 8.0
+
+
+def test_falling_out_of_the_sky_is_a_crash(pilot):
+    log, watch = flown(pilot)
+    pilot.take_off(height_m=5.0)
+    pilot.ap.disarm(force=True)
+    pilot.hold(3.0, watch=watch)
+
+    summary = log.summary(pilot.ap, 0)
+    assert summary["crashed"]
+    assert summary["impact_speed_mps"] > 5.0
+
+
+def test_modes_and_gates_are_logged(pilot):
+    log, watch = flown(pilot, make_course(7))
+    pilot.hold(1.0, thr=1000, watch=watch)
+    pilot.ap.set_mode(Mode.ALT_HOLD)
+    pilot.hold(1.0, thr=1000, watch=watch)
+
+    summary = log.summary(pilot.ap, 0)
+    assert [entry["mode"] for entry in summary["modes"]] == ["STABILIZE", "ALT_HOLD"]
+    assert summary["modes"][1]["t_s"] == pytest.approx(1.0, abs=0.01)
+    assert summary["gates"] == {"total": len(make_course(7).gates), "passed": []}
+
+
+def test_the_report_is_json(tmp_path, pilot):
+    path = tmp_path / "fc.json"
+    log = FlightLog(0, make_course(1))
+    log.on_text(5, "hello")
+
+    write_report(path, log.summary(pilot.ap, 3))
+
+    written = json.loads(path.read_text())
+    assert written["bad_frames"] == 3
+    assert written["statustexts"] == [{"t_s": 5e-9, "text": "hello"}]
+
+
+def test_a_short_run_writes_its_report(tmp_path):
+    path = tmp_path / "fc.json"
+
+    code = main(["--connect", "udpout:127.0.0.1:9", "--duration", "0.05", "--report", str(path)])
+
+    assert code == 0
+    assert json.loads(path.read_text())["duration_s"] > 0.0
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--bogus"],
+        ["--connect"],
+        ["--connect", "udpout:127.0.0.1:9", "--duration", "-1"],
+        ["--connect", "udpout:127.0.0.1:9", "--fps", "nan"],
+        ["--connect", "udpout:127.0.0.1:9", "--camera", "fpv"],
+        ["--connect", "udpout:127.0.0.1:9", "--course", "x"],
+        ["--connect", "udpout:127.0.0.1:9", "--image-size", "5"],
+        ["camera"],
+        ["teleport"],
+    ],
+)
+def test_bad_flags_exit_with_two(argv, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        main(argv)
+
+    assert exit_info.value.code == 2
+    assert "error" in capsys.readouterr().err
+
+
+def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"udpin:127.0.0.1:{taken.getsockname()[1]}"
+        requests = [
+            [],
+            ["--connect", "foo:1"],
+            ["--connect", url],
+            ["--connect", "udpout:127.0.0.1:9", "--report", str(tmp_path / "no" / "fc.json")],
+            ["camera", "--follow", "udp:127.0.0.1:9"],
+        ]
+        for argv in requests:
+            assert main(argv) == 2
+            error = capsys.readouterr().err
+            assert error.startswith("sitl: error: ")
+            assert error.count("\n") == 1
+
+
+def test_the_camera_publishes_while_its_context_lasts():
+    name = f"sitl-test-{os.getpid()}"
+    options = RunOptions(
+        connect=(),
+        shm_name=name,
+        course_seed=7,
+        image_size=32,
+        fps=200.0,
+        report=None,
+        duration_s=None,
+        vehicle=VehicleConfig(),
+    )
+    course = make_course(7)
+    vehicle = Vehicle(links=0, boot_ns=0, course=course)
+    clock = MonotonicClock()
+    deadline_ns = clock.now_ns() + 10 * NS_PER_S
+    with filming(options, name, course, vehicle, clock):
+        path = Path("/dev/shm") / name
+        frame_id = 0
+        while frame_id < 3 and clock.now_ns() < deadline_ns:
+            clock.sleep_until_ns(clock.now_ns() + NS_PER_MS)
+            frame_id = int.from_bytes(path.read_bytes()[24:32], "little")
+
+    assert frame_id >= 3
+    assert not path.exists()
+    assert not any(thread.name == "sitl-camera" for thread in threading.enumerate())
+
+
+def test_the_course_is_printed_both_ways(capsys):
+    assert main(["course", "--course", "7", "--json"]) == 0
+    as_json = json.loads(capsys.readouterr().out)
+    assert main(["course", "--course", "7"]) == 0
+    as_table = capsys.readouterr().out
+
+    assert len(as_json["gates"]) == len(as_table.splitlines()) - 1

@@ -1,0 +1,165 @@
+"""Real sockets on loopback, without waiting: what was sent is there when the kernel says so."""
+
+import socket
+from contextlib import closing
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.clock import NS_PER_S, MonotonicClock
+from sitl.errors import UsageError
+from sitl.transport import MAX_PEERS, open_transport, split_frames
+
+DEADLINE_S = 5.0
+UNREAD_NS = 80_000_000
+"""How long a datagram waits in the socket, so that its arrival and its reading differ."""
+
+
+def free_port(kind=socket.SOCK_DGRAM):
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def drain_until(transport, count):
+    """At least ``count`` reads, by a deadline."""
+    clock = MonotonicClock()
+    end_ns = clock.now_ns() + round(DEADLINE_S * NS_PER_S)
+    received = []
+    while len(received) < count and clock.now_ns() < end_ns:
+        received += transport.drain()
+    return received
+
+
+def udp_client():
+    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    client.bind(("127.0.0.1", 0))
+    client.settimeout(DEADLINE_S)
+    return client
+
+
+FRAME = mav.MAVLink_timesync_message(0, 1).pack(mav.MAVLink(None))
+
+
+def test_udpout_sends_first_and_hears_the_answer():
+    with udp_client() as ground:
+        url = f"udpout:127.0.0.1:{ground.getsockname()[1]}"
+        with closing(open_transport(url, MonotonicClock())) as link:
+            link.send(FRAME)
+            data, address = ground.recvfrom(2048)
+            ground.sendto(b"answer", address)
+            (received,) = drain_until(link, 1)
+
+    assert data == FRAME
+    assert received.data == b"answer"
+
+
+def test_arrival_is_stamped_when_it_came_not_when_it_was_read():
+    clock = MonotonicClock()
+    with udp_client() as ground:
+        url = f"udpin:127.0.0.1:{free_port()}"
+        with closing(open_transport(url, clock)) as link:
+            address = ("127.0.0.1", int(url.rpartition(":")[2]))
+            before_ns = clock.now_ns()
+            ground.sendto(b"a", address)
+            sent_ns = clock.now_ns()
+            clock.sleep_until_ns(sent_ns + UNREAD_NS)
+            (received,) = drain_until(link, 1)
+
+    margin_ns = UNREAD_NS // 2  # two clocks are read in turn when the stamp is converted
+    assert before_ns - margin_ns <= received.arrived_ns <= sent_ns + margin_ns
+
+
+def test_udpin_answers_everybody_it_has_heard_and_forgets_the_oldest():
+    port = free_port()
+    grounds = [udp_client() for _ in range(MAX_PEERS + 1)]
+    with closing(open_transport(f"udpin:127.0.0.1:{port}", MonotonicClock())) as link:
+        link.send(FRAME)
+        for ground in grounds:
+            ground.sendto(b"hello", ("127.0.0.1", port))
+            drain_until(link, 1)
+        link.send(FRAME)
+
+        assert all(ground.recv(2048) == FRAME for ground in grounds[1:])
+        grounds[0].setblocking(False)
+        with pytest.raises(BlockingIOError):
+            grounds[0].recv(2048)
+    for ground in grounds:
+        ground.close()
+
+
+def test_udpout_survives_a_ground_station_that_is_not_there():
+    url = f"udpout:127.0.0.1:{free_port()}"
+    with closing(open_transport(url, MonotonicClock())) as link:
+        for _ in range(3):
+            link.send(FRAME)
+            assert list(link.drain()) == []
+
+
+def test_tcp_clients_come_and_go():
+    port = free_port(socket.SOCK_STREAM)
+    with closing(open_transport(f"tcpin:127.0.0.1:{port}", MonotonicClock())) as link:
+        for greeting in (b"first", b"second"):
+            with socket.create_connection(("127.0.0.1", port), DEADLINE_S) as client:
+                client.sendall(greeting)
+                (received,) = drain_until(link, 1)
+                assert received.data == greeting
+                link.send(FRAME)
+                assert client.recv(2048) == FRAME
+
+
+def test_a_tcp_client_that_does_not_read_is_cut_off():
+    port = free_port(socket.SOCK_STREAM)
+    with (
+        closing(open_transport(f"tcpin:127.0.0.1:{port}", MonotonicClock())) as link,
+        socket.create_connection(("127.0.0.1", port), DEADLINE_S) as client,
+    ):
+        client.sendall(b"x")
+        drain_until(link, 1)
+        for _ in range(200):
+            link.send(FRAME * 10_000)
+
+        client.sendall(b"still here")
+        assert list(link.drain()) == []
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "",
+        "udp:1",
+        "foo:127.0.0.1:1",
+        "udpin:127.0.0.1",
+        "udpin:127.0.0.1:x",
+        "udpin::14550",
+        "udpin:127.0.0.1:0",
+        "udpin:127.0.0.1:65536",
+    ],
+)
+def test_bad_names_are_refused(url):
+    with pytest.raises(UsageError, match="--connect"):
+        open_transport(url, MonotonicClock())
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+def test_a_taken_port_is_refused(kind):
+    clock = MonotonicClock()
+    port = free_port(socket.SOCK_DGRAM if kind == "udpin" else socket.SOCK_STREAM)
+    with (
+        closing(open_transport(f"{kind}:127.0.0.1:{port}", clock)),
+        pytest.raises(UsageError, match="already in use"),
+    ):
+        open_transport(f"{kind}:127.0.0.1:{port}", clock)
+
+
+def test_frames_are_never_split_across_datagrams():
+    sender = mav.MAVLink(None)
+    frames = [mav.MAVLink_timesync_message(0, n).pack(sender) for n in range(100)]
+    frames.append(mav.MAVLink_timesync_message(0, 5).pack(sender, force_mavlink1=True))
+
+    datagrams = list(split_frames(b"".join(frames), 200))
+
+    assert b"".join(datagrams) == b"".join(frames)
+    assert all(len(datagram) <= 200 for datagram in datagrams)
+    assert all(datagram[0] in (0xFD, 0xFE) for datagram in datagrams)
+    assert len(datagrams) < len(frames) / 3

@@ -1,0 +1,104 @@
+"""The writer against docs/shm_camera.md, read here with struct and nothing of the reader's code."""
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sitl.errors import UsageError
+from sitl.shm import FramePublisher
+
+WIDTH, HEIGHT = 10, 6
+STRIDE = 256
+"""32 + 10 * 6 * 3 = 212, rounded up to 64."""
+
+pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
+
+
+@pytest.fixture
+def name():
+    return f"mb-test-writer-{os.getpid()}"
+
+
+@pytest.fixture
+def publisher(name):
+    publisher = FramePublisher(name, WIDTH, HEIGHT)
+    yield publisher
+    publisher.close()
+
+
+def raw(name):
+    return Path("/dev/shm", name).read_bytes()
+
+
+def grey(value):
+    return np.full((HEIGHT, WIDTH, 3), value, np.uint8)
+
+
+def test_layout_before_the_first_frame(publisher, name):
+    data = raw(name)
+    assert len(data) == 64 + 4 * STRIDE
+    assert struct.unpack_from("<8sIIIIQQ", data) == (b"MBSHM\0\0\1", WIDTH, HEIGHT, 3, 4, 0, 1)
+
+
+def test_frames_go_round_the_slots(publisher, name):
+    for frame_id in range(1, 7):
+        publisher.publish(grey(frame_id), captured_ns=1000 + frame_id)
+    data = raw(name)
+    assert struct.unpack_from("<Q", data, 24) == (6,)
+    for frame_id in (3, 4, 5, 6):
+        start = 64 + frame_id % 4 * STRIDE
+        seq, stored_id, captured_ns = struct.unpack_from("<QQq", data, start)
+        assert seq % 2 == 0
+        assert (stored_id, captured_ns) == (frame_id, 1000 + frame_id)
+        assert set(data[start + 32 : start + 32 + WIDTH * HEIGHT * 3]) == {frame_id}
+
+
+def test_rows_columns_and_channels_are_in_order(publisher, name):
+    image = np.arange(HEIGHT * WIDTH * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
+    publisher.publish(image, captured_ns=1)
+    start = 64 + STRIDE + 32
+    assert raw(name)[start : start + image.size] == image.tobytes()
+
+
+def test_close_tells_the_readers_and_removes_the_name(name):
+    publisher = FramePublisher(name, WIDTH, HEIGHT)
+    with Path("/dev/shm", name).open("rb") as kept:
+        publisher.close()
+        publisher.close()
+        assert struct.unpack_from("<Q", kept.read(), 32) == (2,)
+    assert not Path("/dev/shm", name).exists()
+    with pytest.raises(ValueError, match="after close"):
+        publisher.publish(grey(0), captured_ns=1)
+
+
+def test_a_second_writer_takes_the_name_over_and_keeps_it(name):
+    first = FramePublisher(name, WIDTH, HEIGHT)
+    second = FramePublisher(name, 2 * WIDTH, HEIGHT)
+    first.publish(grey(1), captured_ns=1)
+    first.close()
+    assert struct.unpack_from("<8xII", raw(name)) == (2 * WIDTH, HEIGHT)
+    second.close()
+    assert not Path("/dev/shm", name).exists()
+
+
+@pytest.mark.parametrize("bad_name", ["", "a/b", "../x", ".hidden"])
+def test_impossible_names_are_refused(bad_name):
+    with pytest.raises(UsageError, match="want a name such as"):
+        FramePublisher(bad_name, WIDTH, HEIGHT)
+
+
+def test_a_frame_without_pixels_is_refused(name):
+    with pytest.raises(UsageError, match="at least one pixel"):
+        FramePublisher(name, 0, HEIGHT)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.zeros((HEIGHT, WIDTH, 4), np.uint8), np.zeros((HEIGHT, WIDTH, 3), np.float32)],
+)
+def test_a_frame_of_another_kind_is_refused(publisher, image):
+    with pytest.raises(ValueError, match="want uint8"):
+        publisher.publish(image, captured_ns=1)
