@@ -172,6 +172,17 @@ class Tick:
     texts: tuple[str, ...] = ()
     """What the vehicle and the link had to say since the last tick."""
 
+    @property
+    def activity(self) -> str:
+        """Who has the sticks, for a person."""
+        if self.release_reason is not None:
+            return f"RELEASED: {self.release_reason}"
+        if self.trace is None:
+            return "PREPARING: sticks idle"
+        if self.sent is None:
+            return "READ-ONLY: the policy runs, nothing is sent"
+        return "FLYING: the policy has the sticks"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VisionTick:

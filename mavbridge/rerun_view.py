@@ -124,7 +124,9 @@ def flight_blueprint() -> rrb.Blueprint:
     )
     sticks = rrb.Vertical(
         *(
-            _time_series(f"Stick: {axis} [-1, 1]", plot, legend=plot is STICKS[0])
+            _time_series(
+                f"Stick: {axis}", plot, legend=plot is STICKS[0], value_range=(-1.05, 1.05)
+            )
             for axis, plot in zip(Sticks._fields, STICKS, strict=True)
         ),
         row_shares=[4, 3, 3, 3],  # the first has the legend of all
@@ -136,11 +138,17 @@ def flight_blueprint() -> rrb.Blueprint:
     )
 
 
-def _time_series(name: str, *plots: _Plot, legend: bool = True) -> rrb.TimeSeriesView:
+def _time_series(
+    name: str,
+    *plots: _Plot,
+    legend: bool = True,
+    value_range: tuple[float, float] | None = None,
+) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         name=name,
         contents=[f"/{plot.path}" for plot in plots],
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        axis_y=None if value_range is None else rrb.ScalarAxis(range=value_range),
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
     )
 
@@ -164,7 +172,7 @@ class RerunView:
     """
 
     def __init__(self, target: str, *, action_hz: float, vision_hz: float) -> None:
-        """Open the target.
+        """Check the target; every call that can block is left to ``consume`` and ``close``.
 
         Args:
             target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
@@ -177,25 +185,19 @@ class RerunView:
         self._target = prepare_target(target)
         rr.unregister_shutdown()  # its atexit hook waits for ever for a viewer that stalls
         self._recording = rr.RecordingStream("mavbridge", recording_id=uuid4())
-        if isinstance(self._target, RrdFile):
-            self._recording.save(self._target.path, default_blueprint=flight_blueprint())
-        else:
-            self._recording.connect_grpc(self._target.url, default_blueprint=flight_blueprint())
-        for plot in PLOTS:
-            self._recording.log(plot.path, _style(plot), static=True, strict=True)
-        self._is_started = False
-        self._origin_ns = 0
+        self._is_open = False
         self._action_periods = _Periods(action_hz)
         self._vision_periods = _Periods(vision_hz)
+        self._origin_ns: int | None = None
         self._last_tick: Tick | None = None
         self._missed_slots = 0
 
     def consume(self, batch: Sequence[Event]) -> None:
         """Send one batch; blocks while the viewer does not keep up."""
+        self._open()
         ticks = [event for event in batch if isinstance(event, Tick)]
         visions = [event for event in batch if isinstance(event, VisionTick)]
-        if not self._is_started:
-            self._is_started = True
+        if self._origin_ns is None:
             self._origin_ns = ticks[0].woke_ns if ticks else visions[0].captured_ns
         if visions:
             self._send_visions(visions, ticks)
@@ -210,11 +212,24 @@ class RerunView:
         Raises:
             MavbridgeError: the viewer is gone.
         """
+        self._open()
         try:
             self._recording.flush()
         except RuntimeError as error:
             raise MavbridgeError(f"the viewer did not take the whole flight: {error}") from error
         self._recording.disconnect()
+
+    def _open(self) -> None:
+        if self._is_open:
+            return
+        self._is_open = True
+        blueprint = flight_blueprint()
+        if isinstance(self._target, RrdFile):
+            self._recording.save(self._target.path, default_blueprint=blueprint)
+        else:
+            self._recording.connect_grpc(self._target.url, default_blueprint=blueprint)
+        for plot in PLOTS:
+            self._recording.log(plot.path, _style(plot), static=True, strict=True)
 
     def _send_ticks(self, ticks: list[Tick]) -> None:
         woke_ns = [tick.woke_ns for tick in ticks]
@@ -280,9 +295,9 @@ class RerunView:
         return [known[max(position - 1, 0)].index for position in after]
 
     def _index(self, stamps_ns: list[int], tick_indexes: list[int]) -> list[rr.TimeColumn]:
-        since_ns = (np.array(stamps_ns) - self._origin_ns).astype("timedelta64[ns]")
+        since_ns = np.array(stamps_ns) - (self._origin_ns or 0)
         return [
-            rr.TimeColumn("time", duration=since_ns),
+            rr.TimeColumn("time", duration=since_ns.astype("timedelta64[ns]")),
             rr.TimeColumn("tick", sequence=tick_indexes),
         ]
 
@@ -345,15 +360,17 @@ class _Change:
 
 def _changes(before: Tick | None, now: Tick) -> Iterator[_Change]:
     """What a person should know of this tick and did not know before."""
-    if before is None or before.release_reason != now.release_reason:
+    if before is None or before.activity != now.activity:
         if now.release_reason is None:
-            yield _Change("FLYING: the policy has the sticks", color=_GREEN)
+            yield _Change(now.activity, color=_GREEN if now.trace else _WHITE)
         else:
-            yield _Change(f"RELEASED: {now.release_reason}", "WARN", _ORANGE)
+            yield _Change(now.activity, "WARN", _ORANGE)
     if now.mode is not None and (before is None or before.mode != now.mode):
         yield _Change(f"mode {now.mode}")
     if before is None or before.armed != now.armed:
         yield _Change("armed" if now.armed else "disarmed")
+    for text in now.texts:
+        yield _Change(text)
 
 
 def _jpeg(rgb: ImageArray) -> bytes:

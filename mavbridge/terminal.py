@@ -18,6 +18,8 @@ RATE_WINDOW_S = 1.0
 PLAIN_PERIOD_S = 5.0
 """Between lines where there is no terminal to redraw one in."""
 RELEASES_SHOWN = 3
+MAX_NEWS = 100
+"""Lines that may wait for the next refresh; the oldest give way."""
 _NOT_MEASURED = "-"
 _STYLE_GOOD, _STYLE_POOR, _STYLE_BAD = "green", "yellow", "red"
 
@@ -88,7 +90,7 @@ class StatusLine:
             return Text(f"RELEASED: {tick.release_reason}", style="bold yellow")
         if self._readonly:
             return Text("READ-ONLY", style="bold cyan")
-        return Text("FLYING", style="bold green")
+        return Text("FLYING" if tick.trace else "PREPARING", style="bold green")
 
 
 class FlightScreen:
@@ -104,10 +106,18 @@ class FlightScreen:
         self._status = StatusLine(action_hz=action_hz, vision_hz=vision_hz, readonly=readonly)
         self._live = Live(console=console, auto_refresh=False, transient=True)
         self._refreshes = 0
+        self._news: deque[str] = deque(maxlen=MAX_NEWS)
+        self._activity: str | None = None
 
     def emit(self, event: Event) -> None:
-        """Remember the event."""
+        """Remember the event, and what in it is news to a person."""
         self._status.emit(event)
+        if not isinstance(event, Tick):
+            return
+        self._news.extend(event.texts)
+        if event.activity != self._activity:
+            self._activity = event.activity
+            self._news.append(event.activity)
 
     @contextmanager
     def live(self) -> Iterator[None]:
@@ -119,10 +129,11 @@ class FlightScreen:
             yield
 
     def refresh(self) -> None:
-        """Redraw the line; to be called at ``STATUS_HZ``.
+        """Print the news and redraw the line; to be called at ``STATUS_HZ``.
 
         Without a terminal: print it every ``PLAIN_PERIOD_S``.
         """
+        self._print_news()
         line = self._status.render()
         self._refreshes += 1
         if self._console.is_terminal:
@@ -130,8 +141,13 @@ class FlightScreen:
         elif self._refreshes % round(PLAIN_PERIOD_S * STATUS_HZ) == 0:
             self._console.print(line, soft_wrap=True)
 
+    def _print_news(self) -> None:
+        while self._news:
+            self._console.print(Text(self._news.popleft()), soft_wrap=True)
+
     def show_report(self, report: TimingReport) -> None:
-        """Print the table and the verdicts."""
+        """Print the last news, the table and the verdicts."""
+        self._print_news()
         self._console.print(timing_table(report))
         for verdict in verdicts(report):
             self._console.print(verdict)

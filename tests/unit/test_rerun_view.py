@@ -238,3 +238,9 @@ def test_a_viewer_that_stalls_cannot_keep_the_process_alive() -> None:
             check=True,
         )
     assert flight.stdout == "did not finish within 0.2 s\n"
+
+
+def test_a_flight_without_an_event_is_still_a_readable_file(rrd: Path) -> None:
+    seen = show(rrd)
+    assert set(seen.columns) == set()
+    assert len(seen.reader.blueprints()) == 1

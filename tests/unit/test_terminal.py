@@ -143,10 +143,30 @@ def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
         screen.emit(make_tick(0))
         for _ in range(2 * round(PLAIN_PERIOD_S * STATUS_HZ)):
             screen.refresh()
-    lines = out.getvalue().splitlines()
+    news, *lines = out.getvalue().splitlines()
+    assert news == "FLYING: the policy has the sticks"
     assert len(lines) == 2
     assert lines[0].startswith("FLYING  ALT_HOLD armed")
     assert lines[0].endswith("missed 0")  # not cut at 80 columns: it goes to a file
+
+
+def test_news_is_printed_once_in_order() -> None:
+    out = io.StringIO()
+    screen = FlightScreen(Console(file=out, width=80), action_hz=100, vision_hz=30, readonly=False)
+    screen.emit(make_released_tick(0, reason="no [bold] state", texts=("vehicle: Arming motors",)))
+    screen.emit(make_released_tick(1, reason="no [bold] state"))
+    screen.emit(make_tick(2, trace=None))
+    screen.emit(make_tick(3))
+    screen.emit(make_tick(4, sent=None))
+    for _ in range(2):
+        screen.refresh()
+    assert out.getvalue().splitlines() == [
+        "vehicle: Arming motors",
+        "RELEASED: no [bold] state",
+        "PREPARING: sticks idle",
+        "FLYING: the policy has the sticks",
+        "READ-ONLY: the policy runs, nothing is sent",
+    ]
 
 
 def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
