@@ -39,7 +39,6 @@ RC_FRESH_NS = NS_PER_S // 2
 class ActionSettings:
     """What the loop needs to know of the contract and the limits."""
 
-    period_ns: int
     state_frame: StateFrame
     chunk_dt_s: float
     history_len: int
@@ -79,8 +78,10 @@ class ActionLoop:
         engagement: Engagement,
         sink: TickSink,
         settings: ActionSettings,
+        pacer: Pacer,
     ) -> None:
         self._clock = clock
+        self._pacer = pacer
         self._link = link
         self._cache = cache
         self._act = act
@@ -89,7 +90,6 @@ class ActionLoop:
         self._sink = sink
         self._settings = settings
         self._history = SentHistory(length=settings.history_len, dt_s=settings.history_dt_s)
-        self._pacer = Pacer(clock, period_ns=settings.period_ns)
         self._is_flying = False
         self._has_commanded = False
         self.alive_ns = clock.now_ns()

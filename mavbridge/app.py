@@ -14,7 +14,7 @@ from rich.text import Text
 
 from mavbridge.action_loop import ActionLoop, ActionSettings
 from mavbridge.camera.open import open_camera
-from mavbridge.clock import NS_PER_S, Clock, MonotonicClock
+from mavbridge.clock import NS_PER_S, Clock, GridPacer, MonotonicClock, Pacer
 from mavbridge.config import STATUS_HZ, FlyConfig, Limits, period_ns
 from mavbridge.errors import PeerError, UserError
 from mavbridge.feature_cache import FeatureCache
@@ -27,6 +27,7 @@ from mavbridge.rerun_view import RerunView
 from mavbridge.safety import Engagement
 from mavbridge.smoothing import Smoothing, StickSmoother
 from mavbridge.state import Freshness
+from mavbridge.state_pacer import StatePacer
 from mavbridge.terminal import FlightScreen
 from mavbridge.timing import FlightTiming, ObserverDrops, TimingReport, report_json
 from mavbridge.vision_loop import VisionLoop
@@ -164,8 +165,14 @@ class _Flight:
             tau_s=config.limits.tau,
             max_dt_s=SMOOTHING_PERIODS * action_period_ns / NS_PER_S,
         )
+        pacer: Pacer
+        if config.rates.pace == "state":
+            pacer = StatePacer(self._clock, self._link, period_ns=action_period_ns)
+        else:
+            pacer = GridPacer(self._clock, period_ns=action_period_ns)
         return ActionLoop(
             clock=self._clock,
+            pacer=pacer,
             link=self._link,
             cache=cache,
             act=self._executable.act,
@@ -175,7 +182,6 @@ class _Flight:
             ),
             sink=self._sink,
             settings=ActionSettings(
-                period_ns=action_period_ns,
                 state_frame=contract.state_frame,
                 chunk_dt_s=contract.chunk_dt_s,
                 history_len=contract.history_len,

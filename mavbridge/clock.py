@@ -44,7 +44,15 @@ class Slot:
     """Slots skipped between the previous one and this one."""
 
 
-class Pacer:
+class Pacer(Protocol):
+    """Says when the next tick is."""
+
+    def wait(self) -> Slot:
+        """Sleep until the next tick."""
+        ...
+
+
+class GridPacer:
     """An absolute grid of slots, ``origin + index * period``.
 
     A slot missed by more than a quarter of the period is skipped and counted, never made up for:

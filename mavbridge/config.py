@@ -15,6 +15,7 @@ from mavbridge.clock import NS_PER_S
 from mavbridge.errors import UserError
 
 Output = Literal["rc-override", "manual-control"]
+Pace = Literal["clock", "state"]
 
 HEARTBEAT_HZ = 1.0
 """MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
@@ -47,6 +48,9 @@ class Rates:
     """Commands a second (dual rate)."""
     rate: float = 30.0
     """Commands a second in single-rate mode, each with its own image."""
+    pace: Pace = "clock"
+    """clock: ticks on a fixed grid. state: a tick on each fresh attitude message, by the clock when
+    none comes."""
 
     def __post_init__(self) -> None:
         """Refuse rates that no autopilot serves."""

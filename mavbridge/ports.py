@@ -33,6 +33,13 @@ class Link(Protocol):
         """Take in all that has arrived, do the housekeeping that is due; never blocks."""
         ...
 
+    def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
+        """Take in what arrives until an attitude newer than that has come, or until the time.
+
+        Returns the arrival of the newest attitude, 0 before the first.
+        """
+        ...
+
     def send(self, decision: Decision) -> Sticks | None:
         """Put the decision on the wire; returns the sticks that really left, None on release."""
         ...

@@ -113,6 +113,8 @@ class FakeLink:
     asked: list[str] = field(default_factory=list)
     on_poll: Callable[["FakeLink"], None] | None = None
     hand_backs: int = 0
+    attitudes_ns: list[int] = field(default_factory=list)
+    """Arrivals, for a loop that is paced by them."""
 
     def poll(self) -> LinkSnapshot:
         if self.on_poll is not None:
@@ -134,6 +136,11 @@ class FakeLink:
             problem=self.problem,
             echo_confirmed=self.echo_confirmed,
         )
+
+    def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
+        arrivals = (t for t in self.attitudes_ns if t > newer_than_ns)
+        self.clock.sleep_until_ns(min(next(arrivals, until_ns), until_ns))
+        return max((t for t in self.attitudes_ns if t <= self.clock.now_ns()), default=0)
 
     def send(self, decision: Decision) -> Sticks | None:
         self.decisions.append((self.clock.now_ns(), decision))

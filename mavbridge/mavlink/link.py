@@ -104,6 +104,21 @@ class MavlinkLink:
         except TransportDownError as error:
             self._lose(str(error), now_ns)
 
+    def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
+        """Take in what arrives until an attitude newer than that has come, or until the time."""
+        while (now_ns := self._clock.now_ns()) < until_ns:
+            self._drain(now_ns)
+            if self._attitude_ns() > newer_than_ns:
+                break
+            if self._reopen_ns is not None:
+                self._clock.sleep_until_ns(until_ns)
+            else:
+                self._transport.wait(until_ns)
+        return self._attitude_ns()
+
+    def _attitude_ns(self) -> int:
+        return self._telemetry.attitude_ns if self._peer is not None else 0
+
     def _lose(self, reason: str, now_ns: int) -> None:
         self._transport.close()
         self._reopen_ns = now_ns + _REOPEN_NS

@@ -30,6 +30,11 @@ class TelemetryJoiner:
                 Reading(arrived_ns, message.rate_body_radps),
             )
 
+    @property
+    def attitude_ns(self) -> int:
+        """Arrival of the newest attitude; 0 before the first."""
+        return self._attitude[1].arrived_ns if self._attitude else 0
+
     def velocity(self, message: LocalVelocity, arrived_ns: int) -> None:
         """Take velocity."""
         self._velocity = Reading(arrived_ns, message.velocity_ned_mps)

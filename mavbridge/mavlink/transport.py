@@ -1,6 +1,7 @@
 """Bytes in and out of a socket or serial port, never blocking, with the kernel's arrival stamps."""
 
 import errno
+import select
 import socket
 import struct
 import sys
@@ -31,6 +32,18 @@ class Chunk(NamedTuple):
     sender: Address | None
 
 
+def _wait_readable(
+    source: socket.socket | serial.Serial | None, clock: Clock, until_ns: int
+) -> None:
+    timeout_ns = until_ns - clock.now_ns()
+    if timeout_ns <= 0:
+        return
+    if source is None:
+        clock.sleep_until_ns(until_ns)
+        return
+    select.select([source], [], [], timeout_ns / NS_PER_S)
+
+
 class TransportDownError(Exception):
     """The far end or the port is gone; closing and opening again may help."""
 
@@ -49,6 +62,10 @@ class Transport(Protocol):
 
     def drain(self) -> Iterator[Chunk]:
         """Everything that has arrived. Raises TransportDownError when the link is lost."""
+        ...
+
+    def wait(self, until_ns: int) -> None:
+        """Return when something can be drained, or at the time."""
         ...
 
     def answer_to(self, sender: Address | None) -> None:
@@ -121,6 +138,10 @@ class UdpTransport:
                 return now_ns - min(max(queued_ns, 0), NS_PER_S)
         return now_ns
 
+    def wait(self, until_ns: int) -> None:
+        """Return when something has arrived, or at the time."""
+        _wait_readable(self._socket, self._clock, until_ns)
+
     def answer_to(self, sender: Address | None) -> None:
         """Send to this peer from now on, if we listen."""
         if self._listen:
@@ -191,6 +212,10 @@ class TcpTransport:
             self._connected = True
             yield Chunk(data, self._clock.now_ns(), None)
 
+    def wait(self, until_ns: int) -> None:
+        """Return when something has arrived, or at the time."""
+        _wait_readable(self._socket, self._clock, until_ns)
+
     def answer_to(self, sender: Address | None) -> None:
         """One connection has one peer."""
 
@@ -247,6 +272,10 @@ class SerialTransport:
             raise TransportDownError(f"serial {self._device}: {error}") from error
         if data:
             yield Chunk(data, self._clock.now_ns(), None)
+
+    def wait(self, until_ns: int) -> None:
+        """Return when something has arrived, or at the time."""
+        _wait_readable(self._port, self._clock, until_ns)
 
     def answer_to(self, sender: Address | None) -> None:
         """One port has one peer."""

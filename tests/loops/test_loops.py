@@ -9,7 +9,7 @@ import pytest
 
 from fakes import START_NS, FakeClock, FakeLink, ListSink, ScriptedCamera, level_telemetry
 from mavbridge.action_loop import NEUTRAL_TICKS, ActionLoop, ActionSettings
-from mavbridge.clock import NS_PER_MS, NS_PER_S, Pacer
+from mavbridge.clock import NS_PER_MS, NS_PER_S, GridPacer
 from mavbridge.feature_cache import FeatureCache
 from mavbridge.records import (
     IDLE,
@@ -29,7 +29,6 @@ from mavbridge.vision_loop import VisionLoop
 MS = NS_PER_MS
 FRAME_NS = NS_PER_S // 30
 SETTINGS = ActionSettings(
-    period_ns=10 * MS,
     state_frame="ned_frd",
     chunk_dt_s=0.05,
     history_len=4,
@@ -65,6 +64,7 @@ class Rig:
     """A bridge of fakes; the policy's durations and outputs are functions of the tick."""
 
     settings: ActionSettings = SETTINGS
+    period_ns: int = 10 * MS
     frames_ns: list[int] = field(
         default_factory=lambda: [START_NS + k * FRAME_NS for k in range(400)]
     )
@@ -85,6 +85,7 @@ class Rig:
         self.sink = ListSink()
         self.cache = TimedCache(self.clock)
         self.camera = ScriptedCamera(self.vision_clock, self.frames_ns)
+        self.pacer = GridPacer(self.clock, period_ns=self.period_ns)
         self.histories: list[FloatArray] = []
         self.vision = VisionLoop(
             camera=self.camera,
@@ -103,8 +104,8 @@ class Rig:
             engagement=self.engagement,
             sink=self.sink,
             settings=self.settings,
+            pacer=self.pacer,
         )
-        self._pacer = Pacer(self.clock, period_ns=self.settings.period_ns)
 
     def _encode(self, rgb: ImageArray) -> FloatArray:
         self.vision_clock.advance_ns(self.encode_ns)
@@ -119,9 +120,9 @@ class Rig:
     def fly(self, duration_s: float) -> "Rig":
         until_ns = self.clock.now_ns() + round(duration_s * NS_PER_S)
         while self.clock.now_ns() < until_ns:
-            while self.vision_clock.now_ns() <= self.clock.now_ns() + self.settings.period_ns:
+            while self.vision_clock.now_ns() <= self.clock.now_ns() + self.period_ns:
                 self.vision.step()
-            self.action.step(self._pacer.wait())
+            self.action.step(self.pacer.wait())
         return self
 
     @property

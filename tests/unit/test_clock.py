@@ -1,14 +1,14 @@
 import pytest
 
 from fakes import FakeClock
-from mavbridge.clock import NS_PER_MS, Pacer
+from mavbridge.clock import NS_PER_MS, GridPacer
 
 PERIOD_NS = 10 * NS_PER_MS
 
 
 def run(clock: FakeClock, work_ns: list[int]) -> list[tuple[int, int, int]]:
     """(index, woke since start in ms, missed) of one slot per entry of work."""
-    pacer = Pacer(clock, period_ns=PERIOD_NS)
+    pacer = GridPacer(clock, period_ns=PERIOD_NS)
     start_ns = clock.now_ns()
     slots = []
     for work in work_ns:
@@ -52,4 +52,4 @@ def test_every_slot_is_either_met_or_counted_as_missed() -> None:
 
 def test_a_period_must_be_positive() -> None:
     with pytest.raises(ValueError, match="positive"):
-        Pacer(FakeClock(), period_ns=0)
+        GridPacer(FakeClock(), period_ns=0)

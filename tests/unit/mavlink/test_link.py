@@ -50,6 +50,13 @@ class Vehicle:
         chunks, self.inbox = self.inbox, []
         yield from chunks
 
+    def wait(self, until_ns: int) -> None:
+        """The next message comes 3 ms from now, or after the wait."""
+        arrival_ns = self.clock.now_ns() + 3 * MS
+        self.clock.sleep_until_ns(min(arrival_ns, until_ns))
+        if arrival_ns <= until_ns and self.beats:
+            self.tick(1)
+
     def answer_to(self, sender: Address | None) -> None: ...
 
     def send(self, data: bytes) -> None:
@@ -292,6 +299,24 @@ def test_nobody_there_is_an_error_with_advice() -> None:
     bench.vehicle.beats = False
     with pytest.raises(PeerError, match="no vehicle on memory after 2 s: heard nothing"):
         bench.run(3.0)
+
+
+def test_it_waits_for_the_attitude_and_no_longer() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    now_ns = bench.clock.now_ns()
+    newest_ns = bench.link.wait_for_attitude(newer_than_ns=now_ns, until_ns=now_ns + 10 * MS)
+    assert newest_ns == bench.clock.now_ns() == now_ns + 3 * MS
+    newest_ns = bench.link.wait_for_attitude(
+        newer_than_ns=now_ns + 5 * MS, until_ns=now_ns + 12 * MS
+    )
+    assert newest_ns == bench.clock.now_ns() == now_ns + 6 * MS
+    bench.vehicle.beats = False
+    bench.link.wait_for_attitude(newer_than_ns=now_ns + 7 * MS, until_ns=now_ns + 12 * MS)
+    assert bench.clock.now_ns() == now_ns + 12 * MS
+    bench.vehicle.is_down = True
+    bench.link.wait_for_attitude(newer_than_ns=now_ns + 13 * MS, until_ns=now_ns + 20 * MS)
+    assert bench.clock.now_ns() == now_ns + 20 * MS
 
 
 def test_other_systems_on_the_link_are_not_listened_to() -> None:
