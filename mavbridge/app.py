@@ -3,7 +3,7 @@
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -22,6 +22,7 @@ from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport import make_transport
 from mavbridge.observers import FanOut, ObserverThread
 from mavbridge.ports import Camera, TickSink
+from mavbridge.realtime import settle_process, settle_thread
 from mavbridge.records import Release
 from mavbridge.rerun_view import RerunView
 from mavbridge.safety import Engagement
@@ -31,6 +32,7 @@ from mavbridge.state_pacer import StatePacer
 from mavbridge.terminal import FlightScreen
 from mavbridge.timing import FlightTiming, ObserverDrops, TimingReport, report_json
 from mavbridge.vision_loop import VisionLoop
+from mavbridge.vision_rate import AdaptiveRate
 from mavbridge.workers import HungError, Worker
 from policy.contract import Executable
 from policy.loading import load_policy
@@ -104,7 +106,8 @@ class _Flight:
         self._is_dual = executable.dual_rate
         rates = config.rates
         self._action_hz = rates.action_rate if self._is_dual else rates.rate
-        self._vision_hz = rates.visual_rate if self._is_dual else rates.rate
+        self._vision_limits_hz = rates.visual_limits_hz if self._is_dual else (rates.rate,) * 2
+        self._vision_hz = self._vision_limits_hz[1]
         self._timing = FlightTiming(action_hz=self._action_hz, vision_hz=self._vision_hz)
         self._screen = FlightScreen(
             console,
@@ -118,9 +121,12 @@ class _Flight:
         sinks: list[TickSink] = [self._timing, self._screen]
         if self._viewer is not None:
             sinks.append(self._viewer)
-        self._sink = FanOut(sinks)
         cache = FeatureCache()
-        self._vision = self._make_vision(camera, cache)
+        look = AdaptiveRate(min_hz=self._vision_limits_hz[0], max_hz=self._vision_hz)
+        if look.is_adaptive:
+            sinks.append(look)
+        self._sink = FanOut(sinks)
+        self._vision = self._make_vision(camera, cache, look)
         self._action = self._make_action(cache)
 
     def _open_viewer(self) -> ObserverThread | None:
@@ -147,14 +153,14 @@ class _Flight:
         self._stack.callback(link.close)
         return link
 
-    def _make_vision(self, camera: Camera, cache: FeatureCache) -> VisionLoop:
+    def _make_vision(self, camera: Camera, cache: FeatureCache, look: AdaptiveRate) -> VisionLoop:
         return VisionLoop(
             camera=camera,
             encode=self._executable.encode,
             cache=cache,
             sink=self._sink,
             clock=self._clock,
-            period_ns=period_ns(self._vision_hz),
+            period_ns=look.period_ns,
         )
 
     def _make_action(self, cache: FeatureCache) -> ActionLoop:
@@ -196,8 +202,13 @@ class _Flight:
 
     def run(self, stop: threading.Event) -> None:
         """Fly until the action loop ends, the camera dies, or somebody says stop."""
-        vision = Worker("mavbridge-vision", self._vision.run)
-        action = Worker("mavbridge-action", self._action.run)
+        rates = self._config.rates
+        vision = Worker("mavbridge-vision", self._scheduled(self._vision.run, cpu=rates.vision_cpu))
+        action = Worker(
+            "mavbridge-action",
+            self._scheduled(self._action.run, realtime=rates.realtime, cpu=rates.action_cpu),
+        )
+        settle_process()
         # Joined in reverse: the sticks go back before anything that feeds them is taken away.
         self._stack.callback(vision.join, JOIN_S)
         self._stack.callback(self._end, action)
@@ -208,6 +219,19 @@ class _Flight:
                 self._screen.refresh()
                 self._watch(action)
                 stop.wait(1 / STATUS_HZ)
+
+    def _scheduled(
+        self, run: Callable[[threading.Event], None], *, realtime: bool = False, cpu: int | None
+    ) -> Callable[[threading.Event], None]:
+        """The same, on a thread that first asks for its place."""
+
+        def run_settled(stop: threading.Event) -> None:
+            refusal = settle_thread(realtime=realtime, cpu=cpu)
+            if refusal is not None:
+                self._screen.tell(refusal)
+            run(stop)
+
+        return run_settled
 
     def _watch(self, action: Worker) -> None:
         """End the flight when the action loop hangs: its last sticks must not stay."""

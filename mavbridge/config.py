@@ -23,6 +23,8 @@ RC_CHANNELS_HZ = 20.0
 """RC_CHANNELS for the echo check and the pilot's sticks; the check needs 10 Hz or more."""
 TIMESYNC_HZ = 2.0
 """TIMESYNC requests; the minimum-delay filter wants a few a second."""
+AUTO_VISUAL_HZ = (10.0, 60.0)
+"""Limits of --visual-rate auto where none are given."""
 STATUS_HZ = 5.0
 """Terminal refresh."""
 
@@ -42,21 +44,46 @@ def _check(name: str, value: float, low: float, high: float, unit: str) -> None:
 class Rates:
     """Loop rates in Hz."""
 
-    visual_rate: float = 30.0
-    """Most frames a second through the image encoder (dual rate)."""
+    visual_rate: float | str = 30.0
+    """Most frames a second through the image encoder (dual rate); auto[:MIN:MAX] looks more often
+    when the vehicle turns or the image changes."""
     action_rate: float = 100.0
     """Commands a second (dual rate)."""
     rate: float = 30.0
     """Commands a second in single-rate mode, each with its own image."""
+    realtime: bool = False
+    """Ask for real-time scheduling of the action loop (SCHED_FIFO)."""
+    action_cpu: int | None = None
+    """Run the action loop on this CPU alone."""
+    vision_cpu: int | None = None
+    """Run the vision loop on this CPU alone."""
     pace: Pace = "clock"
     """clock: ticks on a fixed grid. state: a tick on each fresh attitude message, by the clock when
     none comes."""
 
     def __post_init__(self) -> None:
         """Refuse rates that no autopilot serves."""
-        _check("visual-rate", self.visual_rate, 0.5, 240, "Hz")
+        low_hz, high_hz = self.visual_limits_hz
+        _check("visual-rate", low_hz, 0.5, high_hz, "Hz")
+        _check("visual-rate", high_hz, low_hz, 240, "Hz")
         _check("action-rate", self.action_rate, 5, 500, "Hz")
         _check("rate", self.rate, 5, 500, "Hz")
+
+    @property
+    def visual_limits_hz(self) -> tuple[float, float]:
+        """Least and most frames a second; equal where the rate is fixed."""
+        if isinstance(self.visual_rate, float | int):
+            return self.visual_rate, self.visual_rate
+        kind, *limits = self.visual_rate.split(":")
+        try:
+            low_hz, high_hz = map(float, limits) if limits else AUTO_VISUAL_HZ
+        except ValueError:
+            low_hz, high_hz = math.nan, math.nan
+        if kind != "auto" or math.isnan(low_hz) or math.isnan(high_hz):
+            raise UserError(
+                f"--visual-rate {self.visual_rate} is neither a rate in Hz nor auto[:MIN:MAX]"
+            )
+        return low_hz, high_hz
 
 
 @Parameter(name="*")

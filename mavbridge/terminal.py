@@ -119,6 +119,10 @@ class FlightScreen:
             self._activity = event.activity
             self._news.append(event.activity)
 
+    def tell(self, text: str) -> None:
+        """Show a line with the next refresh; for any thread."""
+        self._news.append(text)
+
     @contextmanager
     def live(self) -> Iterator[None]:
         """Show the status line, where there is a terminal, until the end of the block."""

@@ -28,7 +28,7 @@ class VisionLoop:
         cache: FeatureCache,
         sink: TickSink,
         clock: Clock,
-        period_ns: int,
+        period_ns: Callable[[], int],
     ) -> None:
         self._camera = camera
         self._encode = encode
@@ -36,7 +36,8 @@ class VisionLoop:
         self._sink = sink
         self._clock = clock
         self._period_ns = period_ns
-        self._due_ns: int | None = None
+        self._used_ns: int | None = None
+        """Slot of the last frame that was used."""
 
     def run(self, stop: threading.Event) -> None:
         """Encode until told to stop.
@@ -80,11 +81,13 @@ class VisionLoop:
         )
 
     def _is_due(self, frame: Frame) -> bool:
-        if self._due_ns is None:
-            self._due_ns = frame.captured_ns
-        if frame.captured_ns < self._due_ns - self._period_ns // 4:
+        if self._used_ns is None:
+            self._used_ns = frame.captured_ns
+            return True
+        period_ns = self._period_ns()
+        due_ns = self._used_ns + period_ns
+        if frame.captured_ns < due_ns - period_ns // 4:
             return False
         # Keep the grid through jitter; after a gap start a new one.
-        self._due_ns = max(self._due_ns, frame.captured_ns - self._period_ns // 2)
-        self._due_ns += self._period_ns
+        self._used_ns = max(due_ns, frame.captured_ns - period_ns // 2)
         return True

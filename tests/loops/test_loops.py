@@ -93,7 +93,7 @@ class Rig:
             cache=self.cache,
             sink=self.sink,
             clock=self.vision_clock,
-            period_ns=self.visual_period_ns,
+            period_ns=lambda: self.visual_period_ns,
         )
         self.action = ActionLoop(
             clock=self.clock,
