@@ -1,5 +1,6 @@
 """Entry point: expected errors are one message and status 1; anything else is our bug."""
 
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -15,8 +16,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; by default that of the process."""
     try:
         sys.exit(cli.meta(arguments))
+    except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
     except (MavbridgeError, PolicyError) as error:
-        console = Console(stderr=True, highlight=False)
+        console = Console(stderr=True, highlight=False, emoji=False)
         console.print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(1)
 

@@ -29,8 +29,9 @@ from mavbridge.state import Freshness, StateFrame, build_state
 Act = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """(feature or image, state [1, 13], history [1, K, 4]) -> chunk [1, horizon, 4]."""
 
-NEUTRAL_TICKS = 5
-"""Neutral commands before the sticks are given back at the end of a flight."""
+NEUTRAL_NS = 50 * NS_PER_MS
+"""How long the sticks are neutral before they are given back at the end of a flight."""
+NEUTRAL_SPACING_NS = 10 * NS_PER_MS
 RC_FRESH_NS = NS_PER_S // 2
 """Oldest RC_CHANNELS that still tells where the sticks are."""
 
@@ -148,14 +149,14 @@ class ActionLoop:
             raise RuntimeError("engaged without inputs: the engagement must not allow this")
         started_ns = self._clock.now_ns()
         history = self._history.resample(step.now_ns)
-        chunk = self._act(step.feature.value, step.state.values[None], history)[0]
+        chunk = self._act(step.feature.value, step.state.values[None], history)
         done_ns = self._clock.now_ns()
         step.predict_ns = done_ns - started_ns
         if (refusal := check_chunk(chunk)) is not None:
             self._is_flying = False
             return refusal
         at_s = (done_ns - step.state.attitude_ns) / NS_PER_S + self._settings.lead_s
-        raw = sample_chunk(chunk, chunk_dt_s=self._settings.chunk_dt_s, at_s=at_s)
+        raw = sample_chunk(chunk[0], chunk_dt_s=self._settings.chunk_dt_s, at_s=at_s)
         step.trace = self._smoother.step(raw, done_ns)
         return Command(sticks=step.trace.smoothed)
 
@@ -173,10 +174,12 @@ class ActionLoop:
 
     def _hand_back(self) -> None:
         """Neutral, if we held the sticks, then release."""
-        if self._has_commanded:
-            for _ in range(NEUTRAL_TICKS):
-                self._link.send(Command(sticks=NEUTRAL))
-                self._pacer.wait()
+        self.alive_ns = self._clock.now_ns()
+        until_ns = self.alive_ns + NEUTRAL_NS
+        while self._has_commanded and self.alive_ns < until_ns:
+            self._link.send(Command(sticks=NEUTRAL))
+            self._clock.sleep_until_ns(self.alive_ns + NEUTRAL_SPACING_NS)
+            self.alive_ns = self._clock.now_ns()
         self._link.send(Release("the flight is over"))
         self._link.hand_back()
 
@@ -189,6 +192,7 @@ def _facts(step: _Step, problem: Release | None) -> Facts:
         input_problem=None if problem is None else problem.reason,
         mode=status.mode if status else None,
         armed=status is not None and status.armed,
+        is_overruled=step.snapshot.is_overruled,
         echo_confirmed=step.snapshot.echo_confirmed,
     )
 

@@ -15,7 +15,7 @@ from rich.text import Text
 from mavbridge.action_loop import ActionLoop, ActionSettings
 from mavbridge.camera.open import open_camera
 from mavbridge.clock import NS_PER_S, Clock, GridPacer, MonotonicClock, Pacer
-from mavbridge.config import STATUS_HZ, FlyConfig, Limits, period_ns
+from mavbridge.config import STATE_HZ, STATUS_HZ, FlyConfig, Limits, period_ns
 from mavbridge.errors import PeerError, UserError
 from mavbridge.feature_cache import FeatureCache
 from mavbridge.mavlink.link import MavlinkLink
@@ -23,7 +23,6 @@ from mavbridge.mavlink.transport import make_transport
 from mavbridge.observers import FanOut, ObserverThread
 from mavbridge.ports import Camera, TickSink
 from mavbridge.realtime import settle_process, settle_thread
-from mavbridge.records import Release
 from mavbridge.rerun_view import RerunView
 from mavbridge.safety import Engagement
 from mavbridge.smoothing import Smoothing, StickSmoother
@@ -42,8 +41,6 @@ RERUN_CAPACITY = 1000
 JOIN_S = 2.0
 HANG_NS = NS_PER_S
 """Silence of the action loop after which the flight is ended for it."""
-SMOOTHING_PERIODS = 3
-"""Longest step, in action periods, that the smoothing integrates over after a stall."""
 
 
 def fly(config: FlyConfig) -> int:
@@ -52,19 +49,24 @@ def fly(config: FlyConfig) -> int:
     Raises:
         MavbridgeError: for whatever a person can have caused.
     """
+    _check_report(config)
     clock = MonotonicClock()
-    console = Console(stderr=True)
+    console = Console(stderr=True, emoji=False)
+    cv2.utils.logging.setLogLevel(
+        cv2.utils.logging.LOG_LEVEL_SILENT
+    )  # its complaints about a camera come before, and instead of, ours
     cv2.setNumThreads(1)  # two loops share two cores: no pool of helpers under either
     executable = _load_policy(config, clock, console)
-    with stop_on_signals() as stop:
-        flight: _Flight | None = None
-        try:
-            with ExitStack() as stack:
-                flight = _Flight(config, clock, console, executable, stack)
-                flight.run(stop)
-        finally:
-            if flight is not None:
-                flight.finish()
+    flight: _Flight | None = None
+    try:
+        with ExitStack() as stack:
+            flight = _Flight(config, clock, console, executable, stack)
+            # Only now: until a stick can have been taken, a signal may simply end the process.
+            stop = stack.enter_context(stop_on_signals())
+            flight.run(stop)
+    finally:
+        if flight is not None:
+            flight.finish()
     return 0
 
 
@@ -104,6 +106,7 @@ class _Flight:
         self._executable = executable
         self._stack = stack
         self._is_dual = executable.dual_rate
+        self._has_hung = False
         rates = config.rates
         self._action_hz = rates.action_rate if self._is_dual else rates.rate
         self._vision_limits_hz = rates.visual_limits_hz if self._is_dual else (rates.rate,) * 2
@@ -149,7 +152,7 @@ class _Flight:
     def _open_link(self) -> MavlinkLink:
         config = self._config.link
         transport = make_transport(config.connect, self._clock)
-        link = MavlinkLink(transport, self._clock, config, state_hz=self._action_hz)
+        link = MavlinkLink(transport, self._clock, config, state_hz=max(self._action_hz, STATE_HZ))
         self._stack.callback(link.close)
         return link
 
@@ -166,11 +169,7 @@ class _Flight:
     def _make_action(self, cache: FeatureCache) -> ActionLoop:
         config, contract = self._config, self._executable.contract
         action_period_ns = period_ns(self._action_hz)
-        smoothing = Smoothing(
-            max_slew_per_s=config.limits.max_slew,
-            tau_s=config.limits.tau,
-            max_dt_s=SMOOTHING_PERIODS * action_period_ns / NS_PER_S,
-        )
+        smoothing = Smoothing(max_slew_per_s=config.limits.max_slew, tau_s=config.limits.tau)
         pacer: Pacer
         if config.rates.pace == "state":
             pacer = StatePacer(self._clock, self._link, period_ns=action_period_ns)
@@ -237,6 +236,8 @@ class _Flight:
         """End the flight when the action loop hangs: its last sticks must not stay."""
         idle_ns = self._clock.now_ns() - self._action.alive_ns
         if action.is_alive and idle_ns > HANG_NS:
+            self._link.seize()
+            self._has_hung = True
             raise PeerError(
                 f"the action loop has hung for {idle_ns / NS_PER_S:.1f} s: the policy is too slow "
                 "for this machine, or stuck"
@@ -246,17 +247,16 @@ class _Flight:
         try:
             action.join(JOIN_S)
         except HungError:
-            # It is inside the policy, not the link: the sticks can and must be given back here.
-            self._link.send(Release("the action loop hangs"))
-            self._link.hand_back()
-            raise
+            self._link.seize()
+            if not self._has_hung:  # else that is being told already
+                raise
 
     def finish(self) -> None:
         """Say how it went."""
         report = self._report()
         self._screen.show_report(report)
         if self._config.report is not None:
-            _write_report(self._config, report)
+            self._config.report.write_text(report_json(report))
 
     def _report(self) -> TimingReport:
         drops = ObserverDrops(rerun=self._viewer.dropped if self._viewer else None, recorder=None)
@@ -277,26 +277,30 @@ def _freshness(limits: Limits) -> Freshness:
     )
 
 
-def _write_report(config: FlyConfig, report: TimingReport) -> None:
+def _check_report(config: FlyConfig) -> None:
+    """Before the flight, not after it."""
     if config.report is None:
         return
     try:
         config.report.parent.mkdir(parents=True, exist_ok=True)
-        config.report.write_text(report_json(report))
+        config.report.open("a").close()
     except OSError as error:
         raise UserError(f"cannot write --report {config.report}: {error.strerror}") from error
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """SIGINT and SIGTERM set the event; the flight ends in order, however often they come."""
+    """Signals that end a process set the event; the flight ends in order, however many come."""
     stop = threading.Event()
 
     def on_signal(_number: int, _frame: FrameType | None) -> None:
         stop.set()
 
+    # SIGHUP: the terminal, or the connection to this computer, is gone.
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     previous = {
-        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+        number: signal.signal(number, on_signal)
+        for number in (getattr(signal, name) for name in names)
     }
     try:
         yield stop

@@ -1,5 +1,6 @@
 """The command line: every flag is a field of a config dataclass."""
 
+import tomllib
 from pathlib import Path
 from typing import Annotated
 
@@ -17,12 +18,15 @@ cli = App(
 )
 
 
+@cli.command(name="fly")
 @cli.default
 def fly(config: FlyConfig | None = None) -> int:
     """Fly. Nothing is armed and no mode is changed unless asked."""
+    if config is None or not config.link.connect:
+        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
     from mavbridge.app import fly as run_flight  # torch and OpenCV: not for --help
 
-    return run_flight(FlyConfig() if config is None else config)
+    return run_flight(config)
 
 
 @cli.meta.default
@@ -36,8 +40,17 @@ def with_config(
         tokens: the rest of the command line.
         config: TOML file with flags as keys; flags given on the command line win.
     """
-    if config is not None and not config.is_file():
-        raise UserError(f"--config {config}: no such file")
+    if config is not None:
+        _check_toml(config)
     cli.config = [] if config is None else [Toml(config, use_commands_as_keys=False)]
     status: int | None = cli(tokens)
     return status or 0
+
+
+def _check_toml(path: Path) -> None:
+    try:
+        tomllib.loads(path.read_text())
+    except OSError as error:
+        raise UserError(f"--config {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"--config {path} is not TOML: {error}") from error

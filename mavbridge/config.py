@@ -25,6 +25,8 @@ TIMESYNC_HZ = 2.0
 """TIMESYNC requests; the minimum-delay filter wants a few a second."""
 AUTO_VISUAL_HZ = (10.0, 60.0)
 """Limits of --visual-rate auto where none are given."""
+STATE_HZ = 50.0
+"""Least rate of telemetry to ask for, however slow the actions are: ages are limits in seconds."""
 STATUS_HZ = 5.0
 """Terminal refresh."""
 
@@ -36,7 +38,8 @@ def period_ns(rate_hz: float) -> int:
 
 def _check(name: str, value: float, low: float, high: float, unit: str) -> None:
     if not (math.isfinite(value) and low <= value <= high):
-        raise UserError(f"--{name} must be between {low:g} and {high:g} {unit}, got {value:g}")
+        limits = f"{low:g} and {high:g} {unit}".rstrip()
+        raise UserError(f"--{name} must be between {limits}, got {value:g}")
 
 
 @Parameter(name="*")
@@ -50,7 +53,7 @@ class Rates:
     action_rate: float = 100.0
     """Commands a second (dual rate)."""
     rate: float = 30.0
-    """Commands a second in single-rate mode, each with its own image."""
+    """Commands a second in single-rate mode, each with the newest image."""
     realtime: bool = False
     """Ask for real-time scheduling of the action loop (SCHED_FIFO)."""
     action_cpu: int | None = None
@@ -66,8 +69,8 @@ class Rates:
         low_hz, high_hz = self.visual_limits_hz
         _check("visual-rate", low_hz, 0.5, high_hz, "Hz")
         _check("visual-rate", high_hz, low_hz, 240, "Hz")
-        _check("action-rate", self.action_rate, 5, 500, "Hz")
-        _check("rate", self.rate, 5, 500, "Hz")
+        _check("action-rate", self.action_rate, 10, 500, "Hz")
+        _check("rate", self.rate, 10, 500, "Hz")
 
     @property
     def visual_limits_hz(self) -> tuple[float, float]:
@@ -204,9 +207,7 @@ class FlyConfig:
     """Write the timing report here as JSON."""
 
     def __post_init__(self) -> None:
-        """Refuse no vehicle at all, and contradictions."""
-        if not self.link.connect:
-            raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
+        """Refuse contradictions."""
         if self.duration is not None:
             _check("duration", self.duration, 0.1, 86400, "s")
         if self.link.readonly and (self.arm or self.mode is not None):

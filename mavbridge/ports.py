@@ -48,6 +48,10 @@ class Link(Protocol):
         """Finish giving the sticks back; takes up to half a second, at the end of a flight."""
         ...
 
+    def seize(self) -> None:
+        """From any thread: give the sticks back now, and let nothing else leave any more."""
+        ...
+
     def set_mode(self, mode: str) -> None:
         """Ask for a flight mode (rate-limited; the next heartbeat tells)."""
         ...

@@ -116,6 +116,8 @@ class LinkSnapshot:
     status: VehicleStatus | None
     problem: str | None
     """Why sticks may not be sent (no heartbeat, handshake, override switch, no echo), or None."""
+    is_overruled: bool = False
+    """The vehicle does not act on the sticks that we send: somebody else holds them."""
     echo_confirmed: bool = False
     """The vehicle was seen to act on our sticks, or its output has no echo to check."""
     texts: tuple[str, ...] = ()
@@ -225,3 +227,7 @@ class LinkStats:
     """Stick messages handed to the kernel; releases not counted."""
     echo_confirmed: bool | None
     """The vehicle showed our sticks in RC_CHANNELS; None = no stick was sent."""
+    unusable_packets: int = 0
+    """Corrupt, cut off, or holding NaN."""
+    vehicle_clock_offset_ns: int | None = None
+    """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""

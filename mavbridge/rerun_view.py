@@ -18,7 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from mavbridge.clock import NS_PER_MS
+from mavbridge.clock import NS_PER_MS, NS_PER_S
 from mavbridge.errors import MavbridgeError
 from mavbridge.records import Event, ImageArray, Sticks, Tick, VisionTick
 from mavbridge.rerun_target import RrdFile, prepare_target
@@ -98,7 +98,8 @@ RC = _Plot(
         )
     ),
 )
-_EVENT_COLUMNS = rrb.TextLogColumns(timeline_columns=["time"], text_log_columns=["Body"])
+_EVENT_COLUMNS = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
+"""The viewer's own time column is too narrow to read: the text starts with the time."""
 PLOTS = (
     *(AGE, ACTION_PERIOD, VISION_PERIOD, ACTION_JITTER, VISION_JITTER),
     *(PREDICT, ENCODE, MISSED, DROPPED, *STICKS, RC),
@@ -279,7 +280,7 @@ class RerunView:
             EVENTS,
             self._index([t.woke_ns for t, _ in changes], [t.index for t, _ in changes]),
             rr.TextLog.columns(
-                text=[change.text for _, change in changes],
+                text=[f"{self._since_s(tick):6.2f} s  {change.text}" for tick, change in changes],
                 level=[change.level for _, change in changes],
                 color=[change.color for _, change in changes],
             ),
@@ -300,6 +301,9 @@ class RerunView:
             rr.TimeColumn("time", duration=since_ns.astype("timedelta64[ns]")),
             rr.TimeColumn("tick", sequence=tick_indexes),
         ]
+
+    def _since_s(self, tick: Tick) -> float:
+        return (tick.woke_ns - (self._origin_ns or 0)) / NS_PER_S
 
     def _send(self, plot: _Plot, index: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         columns = rr.Scalars.columns(scalars=values.reshape(-1, len(plot.series)))

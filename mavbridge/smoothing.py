@@ -15,8 +15,9 @@ class Smoothing:
     """Largest stick movement in 1/s (full scale is 2); 0 = no limit."""
     tau_s: float
     """Time constant of the first-order low-pass; 0 = off."""
-    max_dt_s: float
-    """Longest step to integrate over: after a stall the sticks do not jump."""
+    max_dt_s: float = 0.15
+    """Longest step to integrate over: after a stall the sticks do not jump. In seconds, like the
+    rest, and longer than the longest period."""
 
 
 class StickSmoother:

@@ -87,10 +87,12 @@ Mode = Literal["dual", "single"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionReport:
-    """The action loop over one flight; None = not measured."""
+    """The action loop while the policy flew; None = not measured."""
 
     target_hz: float
     rate_hz: float | None
+    flying_s: float
+    """How long that was; the rest of the flight is waiting, preparing and releases."""
     ticks: int
     missed_slots: int
     period_ms: Percentiles | None
@@ -238,6 +240,9 @@ class _ActionCounts:
         self._target_hz = target_hz
         self._target_period_ns = round(NS_PER_S / target_hz)
         self._missed_slots = 0
+        self._flown_ticks = 0
+        self._flown_ns: int | None = None
+        self._flying_ns = 0
         self._period, self._jitter, self._predict = Histogram(), Histogram(), Histogram()
         self._last_reason: str | None = None
         self._last_attitude_ns: int | None = None
@@ -248,19 +253,30 @@ class _ActionCounts:
         self.release_count = 0
 
     def add(self, tick: Tick) -> None:
-        period_ns = self.span.add(tick.woke_ns)
-        if period_ns is not None:
-            self._period.add(period_ns)
-            self._jitter.add(abs(period_ns - self._target_period_ns))
-        self._missed_slots += tick.missed_slots
+        self.span.add(tick.woke_ns)
         if tick.predict_ns is not None:
             self._predict.add(tick.predict_ns)
-        if tick.trace is not None:
+        if tick.trace is None:
+            self._flown_ns = None
+        else:
+            self._add_period(tick)
             self._add_ages(tick)
         if tick.release_reason != self._last_reason:
             self._last_reason = tick.release_reason
             if tick.release_reason is not None:
                 self._add_release(tick.woke_ns, tick.release_reason)
+
+    def _add_period(self, tick: Tick) -> None:
+        """Only between two ticks of flight: a released loop has nothing to compute."""
+        self._flown_ticks += 1
+        last_ns, self._flown_ns = self._flown_ns, tick.woke_ns
+        if last_ns is None:
+            return
+        period_ns = tick.woke_ns - last_ns
+        self._period.add(period_ns)
+        self._jitter.add(abs(period_ns - self._target_period_ns))
+        self._missed_slots += tick.missed_slots
+        self._flying_ns += period_ns
 
     def _add_ages(self, tick: Tick) -> None:
         if tick.feature_captured_ns is not None:
@@ -282,8 +298,13 @@ class _ActionCounts:
     def report(self) -> ActionReport:
         return ActionReport(
             target_hz=self._target_hz,
-            rate_hz=self.span.rate_hz,
-            ticks=self.span.count,
+            rate_hz=(
+                round(self._period.count * NS_PER_S / self._flying_ns, 3)
+                if self._flying_ns
+                else None
+            ),
+            flying_s=round(self._flying_ns / NS_PER_S, 3),
+            ticks=self._flown_ticks,
             missed_slots=self._missed_slots,
             period_ms=self._period.percentiles_ms(),
             jitter_ms=self._jitter.percentiles_ms(),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from mavbridge.clock import NS_PER_MS, Clock
 from mavbridge.feature_cache import FeatureCache
 from mavbridge.ports import Camera, TickSink
-from mavbridge.records import FeatureFrame, FloatArray, Frame, ImageArray, VisionTick
+from mavbridge.records import FeatureFrame, FloatArray, ImageArray, VisionTick
 
 READ_TIMEOUT_NS = 100 * NS_PER_MS
 """How often a starving loop looks at the stop flag."""
@@ -55,16 +55,20 @@ class VisionLoop:
             CameraError: the camera has died.
         """
         frame = self._camera.read(READ_TIMEOUT_NS)
-        if frame is None or not self._is_due(frame):
-            return
         started_ns = self._clock.now_ns()
+        if frame is None:
+            return
+        # A stamp from the future would make the feature look fresh for too long.
+        captured_ns = min(frame.captured_ns, started_ns)
+        if not self._is_due(captured_ns):
+            return
         value = self._encode(frame.rgb)
         value.setflags(write=False)
         ready_ns = self._clock.now_ns()
         self._cache.publish(
             FeatureFrame(
                 frame_id=frame.frame_id,
-                captured_ns=frame.captured_ns,
+                captured_ns=captured_ns,
                 ready_ns=ready_ns,
                 value=value,
             )
@@ -72,7 +76,7 @@ class VisionLoop:
         self._sink.emit(
             VisionTick(
                 frame_id=frame.frame_id,
-                captured_ns=frame.captured_ns,
+                captured_ns=captured_ns,
                 started_ns=started_ns,
                 ready_ns=ready_ns,
                 dropped_frames=self._camera.dropped_frames,
@@ -80,14 +84,14 @@ class VisionLoop:
             )
         )
 
-    def _is_due(self, frame: Frame) -> bool:
+    def _is_due(self, captured_ns: int) -> bool:
         if self._used_ns is None:
-            self._used_ns = frame.captured_ns
+            self._used_ns = captured_ns
             return True
         period_ns = self._period_ns()
         due_ns = self._used_ns + period_ns
-        if frame.captured_ns < due_ns - period_ns // 4:
+        if captured_ns < due_ns - period_ns // 4:
             return False
         # Keep the grid through jitter; after a gap start a new one.
-        self._used_ns = max(due_ns, frame.captured_ns - period_ns // 2)
+        self._used_ns = max(due_ns, captured_ns - period_ns // 2)
         return True

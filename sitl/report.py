@@ -77,7 +77,7 @@ class FlightLog:
 
     def on_release(self, arrived_ns: int) -> None:
         """An RC_CHANNELS_OVERRIDE that only gives sticks back."""
-        self._overrides.interrupt()
+        self._overrides.interrupt(arrived_ns)
         self._releases += 1
         if len(self._release_times_s) < MAX_RELEASE_TIMES:
             self._release_times_s.append(self._t_s(arrived_ns))
@@ -172,8 +172,10 @@ class _OverrideStats:
         self._last_ns = arrived_ns
         self._engaged = True
 
-    def interrupt(self) -> None:
-        """A release: the time to the next override is no gap."""
+    def interrupt(self, arrived_ns: int) -> None:
+        """A release: the time up to it is a gap, sticks were held; the time after it is none."""
+        if self._engaged:
+            self._add_gap((arrived_ns - self._last_ns) / NS_PER_MS)
         self._engaged = False
 
     def _add_gap(self, gap_ms: float) -> None:

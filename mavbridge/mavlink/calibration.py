@@ -1,8 +1,12 @@
 """Sticks <-> PWM with the vehicle's own radio calibration: the one table of signs and channels."""
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from mavbridge.records import Sticks
+
+Pwm: TypeAlias = tuple[int, int, int, int]
+"""Throttle, yaw, pitch, roll in us."""
 
 PWM_SIGN = Sticks(throttle=1.0, yaw=1.0, pitch=-1.0, roll=1.0)
 """ArduPilot: stick forward (+pitch, nose down) is PWM below trim; the others rise with it."""
@@ -62,6 +66,11 @@ class RcCalibration:
         numbers = [channel.number for channel in self.channels]
         if len(set(numbers)) != 4:
             raise ValueError(f"RCMAP_* puts two sticks on one channel: {numbers}")
+        if self.throttle_floor_us >= self.throttle.max_us:
+            raise ValueError(
+                f"FS_THR_VALUE leaves no throttle below RC{self.throttle.number}_MAX "
+                f"{self.throttle.max_us}"
+            )
 
     @property
     def channels(self) -> tuple[RcChannel, RcChannel, RcChannel, RcChannel]:
@@ -74,7 +83,7 @@ class RcCalibration:
         middle_us = (throttle.min_us + throttle.max_us) / 2
         return middle_us, yaw.trim_us, pitch.trim_us, roll.trim_us
 
-    def to_pwm_us(self, sticks: Sticks) -> tuple[int, int, int, int]:
+    def to_pwm_us(self, sticks: Sticks) -> Pwm:
         """PWM of throttle, yaw, pitch, roll, inside the calibrated range."""
         throttle, yaw, pitch, roll = (
             channel.to_us(stick * sign, centre_us=centre_us)
@@ -84,7 +93,7 @@ class RcCalibration:
         )
         return max(throttle, self.throttle_floor_us), yaw, pitch, roll
 
-    def to_sticks(self, pwm_us: tuple[int, int, int, int]) -> Sticks:
+    def to_sticks(self, pwm_us: Pwm) -> Sticks:
         """Sticks that these PWM values stand for."""
         return Sticks(
             *(

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.mavlink.calibration import RcCalibration
+from mavbridge.mavlink.calibration import Pwm, RcCalibration
 from mavbridge.mavlink.messages import (
     Attitude,
     AutopilotVersion,
@@ -31,6 +31,12 @@ RELEASE_US = 0
 IGNORE_US = 65535
 """RC_CHANNELS_OVERRIDE ch 1-8: leave the channel as it is. Not a release."""
 
+PWM_LIMITS_US = (800, 2200)
+"""What a radio can send: whatever the vehicle's calibration says, nothing else leaves here."""
+
+_PACKET_STARTS = (b"\xfd", b"\xfe")
+"""MAVLink 2 and 1."""
+
 _HIGHRES_ACCEL_FIELDS = 0b111
 """fields_updated bits of xacc, yacc, zacc."""
 
@@ -47,6 +53,24 @@ class Codec:
         self._mav = dialect.MAVLink(None, srcSystem=source_system, srcComponent=source_component)
         self._mav.robust_parsing = True
         self.bad_data_count = 0
+
+    def forget_partial(self) -> None:
+        """Drop an unfinished packet: the next bytes do not continue it."""
+        self._mav.buf = bytearray()
+        self._mav.buf_index = 0
+
+    def decode_datagram(self, data: bytes) -> Iterator[Incoming]:
+        """Messages of one datagram, which nearly always starts with a packet.
+
+        What was left of an earlier one then was cut off, and must not swallow this one. A datagram
+        that starts otherwise may be the next piece of a serial stream that somebody cut at will.
+        """
+        if data[:1] in _PACKET_STARTS:
+            self.forget_partial()
+        elif not self._mav.buf_len():
+            self.bad_data_count += 1
+            return
+        yield from self.decode(data)
 
     def decode(self, data: bytes) -> Iterator[Incoming]:
         """Messages completed by these bytes; corrupt bytes and unusable values are counted."""
@@ -81,23 +105,24 @@ class Codec:
             )
         )
 
-    def encode_override(self, target: Source, sticks: Sticks, calibration: RcCalibration) -> bytes:
+    def encode_override(self, target: Source, pwm_us: Pwm, calibration: RcCalibration) -> bytes:
         """RC_CHANNELS_OVERRIDE holding the four stick channels, the others ignored.
 
+        Args:
+            target: the vehicle.
+            pwm_us: throttle, yaw, pitch, roll, from ``pwm_of``.
+            calibration: which channels they are.
+
         Raises:
-            CommandRefusedError: a stick that is not finite or not in [-1, 1], or PWM out of range.
+            CommandRefusedError: a value that no radio sends, or a throttle that is a failsafe.
         """
-        _refuse_bad_sticks(sticks)
         channels_us = [IGNORE_US] * 8
-        for channel, value_us in zip(
-            calibration.channels, calibration.to_pwm_us(sticks), strict=True
-        ):
-            if not channel.min_us <= value_us <= channel.max_us:
-                raise CommandRefusedError(
-                    f"{value_us} us on channel {channel.number} is outside "
-                    f"{channel.min_us}..{channel.max_us}"
-                )
+        for channel, value_us in zip(calibration.channels, pwm_us, strict=True):
+            if not PWM_LIMITS_US[0] <= value_us <= PWM_LIMITS_US[1]:
+                raise CommandRefusedError(f"{value_us} us on channel {channel.number}")
             channels_us[channel.number - 1] = value_us
+        if pwm_us[0] < calibration.throttle_floor_us:
+            raise CommandRefusedError(f"throttle {pwm_us[0]} us is a radio failsafe")
         return self._pack(self._mav.rc_channels_override_encode(*target, *channels_us))
 
     def encode_release(self, target: Source, calibration: RcCalibration) -> bytes:
@@ -136,6 +161,16 @@ class Codec:
         return self._pack(self._mav.request_data_stream_encode(*target, stream, rate_hz, 1))
 
 
+def pwm_of(sticks: Sticks, calibration: RcCalibration) -> Pwm:
+    """PWM of throttle, yaw, pitch, roll in us.
+
+    Raises:
+        CommandRefusedError: a stick that is not finite or not in [-1, 1].
+    """
+    _refuse_bad_sticks(sticks)
+    return calibration.to_pwm_us(sticks)
+
+
 def manual_control_sticks(sticks: Sticks) -> Sticks:
     """Sticks as MANUAL_CONTROL's integers can express them."""
     return Sticks(
@@ -167,7 +202,6 @@ def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
         autopilot=m.autopilot,
         base_mode=m.base_mode,
         custom_mode=m.custom_mode,
-        system_status=m.system_status,
     )
 
 
@@ -231,7 +265,8 @@ def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
 
 
 def _command_ack(m: dialect.MAVLink_command_ack_message) -> Body:
-    return CommandAck(command=m.command, result=m.result)
+    target = Source(m.target_system, m.target_component)
+    return CommandAck(command=m.command, result=m.result, target=target)
 
 
 def _param_value(m: dialect.MAVLink_param_value_message) -> Body:

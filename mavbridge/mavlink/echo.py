@@ -3,12 +3,13 @@
 from collections import deque
 
 from mavbridge.clock import NS_PER_S
+from mavbridge.mavlink.calibration import Pwm
 
 ECHO_DEADLINE_NS = NS_PER_S
 """An override shows up in RC_CHANNELS within some 14 ms; a second leaves room for a slow link."""
+NUDGE_US = 4
+"""Off centre on the roll channel, inside every usual dead zone (20 us), until the echo is seen."""
 _RETRY_NS = 3 * NS_PER_S
-
-Pwm = tuple[int, int, int, int]
 
 
 class EchoCheck:
@@ -30,6 +31,17 @@ class EchoCheck:
         """The vehicle acts on our sticks."""
         return self.confirmed_ns is not None
 
+    def distinct(self, pwm_us: Pwm) -> Pwm:
+        """The same, or, until confirmed, nudged apart from what the vehicle showed before.
+
+        Sticks at rest look the same whoever holds them; without this, a vehicle that ignores us
+        would pass the check.
+        """
+        if self.confirmed or pwm_us != self._baseline:
+            return pwm_us
+        throttle, yaw, pitch, roll = pwm_us
+        return throttle, yaw, pitch, roll + NUDGE_US
+
     def sent(self, pwm_us: Pwm, now_ns: int) -> None:
         """Note an override that left."""
         if self._since_ns is None:
@@ -49,9 +61,7 @@ class EchoCheck:
         if self._since_ns is None:
             self._baseline = pwm_us
             return
-        # A receiver that rests exactly where we hold the sticks cannot be told apart from us;
-        # after half a second of agreement there is nothing to tell.
-        is_telling = pwm_us != self._baseline or now_ns - self._since_ns >= ECHO_DEADLINE_NS // 2
+        is_telling = self.confirmed or pwm_us != self._baseline
         if is_telling and any(pwm_us == past for _, past in self._sent):
             self.confirmed_ns = now_ns
             self._failed_ns = None

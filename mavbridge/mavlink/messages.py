@@ -19,7 +19,6 @@ class Heartbeat:
     autopilot: int
     base_mode: int
     custom_mode: int
-    system_status: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +59,8 @@ class CommandAck:
 
     command: int
     result: int
+    target: Source
+    """Whose command was answered; zeros where the vehicle does not say."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

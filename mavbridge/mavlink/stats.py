@@ -37,7 +37,9 @@ class LinkCounters:
         if round_trip_ns is not None:
             self._round_trips.add(round_trip_ns)
 
-    def stats(self, *, echo_confirmed: bool | None) -> LinkStats:
+    def stats(
+        self, *, echo_confirmed: bool | None, unusable_packets: int, clock_offset_ns: int | None
+    ) -> LinkStats:
         """The totals so far."""
         received = self._by_name.total()
         span_ns = self._last_ns - (self._first_ns or 0)
@@ -51,4 +53,6 @@ class LinkCounters:
             rtt_ms=self._round_trips.percentiles_ms(),
             sent_overrides=self.sent,
             echo_confirmed=echo_confirmed if self.sent else None,
+            unusable_packets=unusable_packets,
+            vehicle_clock_offset_ns=clock_offset_ns,
         )

@@ -1,12 +1,13 @@
 """Bytes in and out of a socket or serial port, never blocking, with the kernel's arrival stamps."""
 
 import errno
+import os
 import select
 import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple, Protocol, TypeAlias
 
 import serial
@@ -16,8 +17,8 @@ from mavbridge.errors import UserError
 
 Address: TypeAlias = tuple[str, int]
 
-MAX_CHUNKS_PER_DRAIN = 2000
-"""Bound of one drain: a flood must not keep the action loop from its next slot."""
+TCP_SILENCE_NS = 5 * NS_PER_S
+"""A vehicle beats at 1 Hz: a connection this quiet is dead, whatever the kernel believes."""
 _CHUNK_BYTES = 65536
 _SO_TIMESTAMPNS = 35
 """asm-generic/socket.h; Python's socket module does not name it."""
@@ -30,18 +31,7 @@ class Chunk(NamedTuple):
     data: bytes
     arrived_ns: int
     sender: Address | None
-
-
-def _wait_readable(
-    source: socket.socket | serial.Serial | None, clock: Clock, until_ns: int
-) -> None:
-    timeout_ns = until_ns - clock.now_ns()
-    if timeout_ns <= 0:
-        return
-    if source is None:
-        clock.sleep_until_ns(until_ns)
-        return
-    select.select([source], [], [], timeout_ns / NS_PER_S)
+    """Of a datagram; None on a stream, which has one far end."""
 
 
 class TransportDownError(Exception):
@@ -72,8 +62,12 @@ class Transport(Protocol):
         """From now on send to this peer (no effect where there is only one)."""
         ...
 
-    def send(self, data: bytes) -> None:
-        """Hand one packet to the kernel; dropped while nobody is there to get it."""
+    def send(self, data: bytes) -> bool:
+        """Hand one packet to the kernel, whole; False: dropped, since it cannot go now.
+
+        Raises:
+            TransportDownError: the link is lost.
+        """
         ...
 
     def close(self) -> None:
@@ -81,14 +75,35 @@ class Transport(Protocol):
         ...
 
 
+def _wait_readable(
+    source: socket.socket | serial.Serial | None, clock: Clock, until_ns: int
+) -> None:
+    timeout_ns = until_ns - clock.now_ns()
+    if timeout_ns <= 0:
+        return
+    if source is None:
+        clock.sleep_until_ns(until_ns)
+        return
+    select.select([source], [], [], timeout_ns / NS_PER_S)
+
+
+def _resolve(address: Address) -> Address:
+    """Once, at the start: a resolver may block, and must not do so in flight."""
+    host, port = address
+    try:
+        return socket.gethostbyname(host), port
+    except OSError as error:
+        raise UserError(f"cannot find host {host!r}: {error.strerror}") from error
+
+
 class UdpTransport:
     """UDP, listening (``udp:``, ``udpin:``) or calling (``udpout:``)."""
 
     def __init__(self, address: Address, clock: Clock, *, listen: bool) -> None:
-        self._address = address
+        self._address = _resolve(address)
         self._clock = clock
         self._listen = listen
-        self._peer: Address | None = None if listen else address
+        self._peer: Address | None = None if listen else self._address
         self._socket: socket.socket | None = None
 
     def open(self) -> None:
@@ -97,12 +112,13 @@ class UdpTransport:
         udp.setblocking(False)
         if sys.platform == "linux":
             udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        if self._listen:
+            self._bind(udp)
+        self._socket = udp
+
+    def _bind(self, udp: socket.socket) -> None:
         try:
-            if self._listen:
-                udp.bind(self._address)
-            self._peer = (
-                None if self._listen else (socket.gethostbyname(self._address[0]), self._address[1])
-            )
+            udp.bind(self._address)
         except OSError as error:
             udp.close()
             host, port = self._address
@@ -112,19 +128,16 @@ class UdpTransport:
                 else "check the address"
             )
             raise UserError(f"cannot use udp {host}:{port}: {error.strerror}; {hint}") from error
-        self._socket = udp
 
     def drain(self) -> Iterator[Chunk]:
         """Datagrams with the kernel's arrival stamp where it gives one."""
-        if self._socket is None:
-            return
-        for _ in range(MAX_CHUNKS_PER_DRAIN):
+        while self._socket is not None:
             try:
                 data, control, _, sender = self._socket.recvmsg(_CHUNK_BYTES, 64)
             except BlockingIOError:
                 return
-            except ConnectionError:
-                continue  # an ICMP answer to an earlier send: nobody listens there yet
+            except OSError:
+                continue  # the network's answer to an earlier send: nobody is there yet
             yield Chunk(data, self._arrival_ns(control), sender)
 
     def _arrival_ns(self, control: list[tuple[int, int, bytes]]) -> int:
@@ -147,16 +160,15 @@ class UdpTransport:
         if self._listen:
             self._peer = sender
 
-    def send(self, data: bytes) -> None:
-        """Send one datagram to the peer, if there is one."""
+    def send(self, data: bytes) -> bool:
+        """Send one datagram to the peer, if there is one and it can be reached now."""
         if self._socket is None or self._peer is None:
-            return
+            return False
         try:
             self._socket.sendto(data, self._peer)
-        except (BlockingIOError, ConnectionError):
-            return  # a full buffer or an absent peer loses a datagram, as UDP may
-        except OSError as error:
-            raise TransportDownError(f"udp: {error.strerror}") from error
+        except OSError:
+            return False  # full buffer, no route, nobody there: UDP loses a datagram and goes on
+        return True
 
     def close(self) -> None:
         """Close the socket."""
@@ -165,15 +177,35 @@ class UdpTransport:
             self._socket = None
 
 
+class _Outbox:
+    """Whole packets into a stream that may take a part: the rest of one goes before the next."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def put(self, data: bytes, write: Callable[[bytes], int]) -> bool:
+        """Write the packet, or drop it whole; raises what ``write`` raises."""
+        try:
+            if self._rest:
+                self._rest = self._rest[write(self._rest) :]
+                if self._rest:
+                    return False
+            self._rest = data[write(data) :]
+        except BlockingIOError:
+            return False
+        return True
+
+
 class TcpTransport:
     """TCP client (``tcp:``); connects in the background of ``drain``."""
 
     def __init__(self, address: Address, clock: Clock) -> None:
-        self._address = address
+        self._address = _resolve(address)
         self._clock = clock
         self._socket: socket.socket | None = None
-        self._connected = False
-        self._unsent = b""
+        self._is_connected = False
+        self._heard_ns = 0
+        self._outbox = _Outbox()
 
     def open(self) -> None:
         """Begin to connect; ``drain`` finds out how it went."""
@@ -183,34 +215,35 @@ class TcpTransport:
         try:
             code = tcp.connect_ex(self._address)
         except OSError as error:
-            tcp.close()
-            raise UserError(f"cannot resolve {self._address[0]}: {error.strerror}") from error
+            code = error.errno or errno.EIO
         if code not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
             tcp.close()
             raise TransportDownError(self._explain(code))
-        self._socket, self._connected, self._unsent = tcp, False, b""
+        self._socket, self._is_connected, self._outbox = tcp, False, _Outbox()
+        self._heard_ns = self._clock.now_ns()
 
-    def _explain(self, code: int) -> str:
+    def _explain(self, code: int | None) -> str:
         host, port = self._address
-        return f"tcp {host}:{port}: {errno.errorcode.get(code, code)}"
+        return f"tcp {host}:{port}: {errno.errorcode.get(code or 0, code)}"
 
     def drain(self) -> Iterator[Chunk]:
-        """Bytes received so far; loss of the connection is an error."""
-        for _ in range(MAX_CHUNKS_PER_DRAIN):
-            if self._socket is None:
-                return
+        """Bytes received so far; loss of the connection, or of the far end, is an error."""
+        while self._socket is not None:
             try:
                 data = self._socket.recv(_CHUNK_BYTES)
             except BlockingIOError:
-                return
+                break
             except OSError as error:
-                if not self._connected and error.errno == errno.ENOTCONN:
-                    return
-                raise TransportDownError(self._explain(error.errno or 0)) from error
+                if not self._is_connected and error.errno == errno.ENOTCONN:
+                    break
+                raise TransportDownError(self._explain(error.errno)) from error
             if not data:
                 raise TransportDownError("tcp: the vehicle closed the connection")
-            self._connected = True
-            yield Chunk(data, self._clock.now_ns(), None)
+            self._is_connected = True
+            self._heard_ns = self._clock.now_ns()
+            yield Chunk(data, self._heard_ns, None)
+        if self._socket is not None and self._clock.now_ns() - self._heard_ns > TCP_SILENCE_NS:
+            raise TransportDownError(f"tcp: silent for {TCP_SILENCE_NS // NS_PER_S} s")
 
     def wait(self, until_ns: int) -> None:
         """Return when something has arrived, or at the time."""
@@ -219,25 +252,16 @@ class TcpTransport:
     def answer_to(self, sender: Address | None) -> None:
         """One connection has one peer."""
 
-    def send(self, data: bytes) -> None:
-        """Send; a packet is cut at a full buffer only to be finished first next time."""
+    def send(self, data: bytes) -> bool:
+        """Send one packet whole."""
         if self._socket is None:
-            return
-        pending = self._unsent or data
+            return False
         try:
-            sent = self._socket.send(pending)
-            if self._unsent:  # the older packet first; the newer one is dropped if that is not all
-                self._unsent = pending[sent:]
-                if self._unsent:
-                    return
-                pending, sent = data, self._socket.send(data)
-            self._unsent = pending[sent:]
-        except BlockingIOError:
-            return
+            return self._outbox.put(data, self._socket.send)
         except OSError as error:
             if error.errno in (errno.ENOTCONN, errno.EINPROGRESS):
-                return
-            raise TransportDownError(self._explain(error.errno or 0)) from error
+                return False
+            raise TransportDownError(self._explain(error.errno)) from error
 
     def close(self) -> None:
         """Close the connection."""
@@ -254,13 +278,22 @@ class SerialTransport:
         self._baud = baud
         self._clock = clock
         self._port: serial.Serial | None = None
+        self._was_open = False
+        self._outbox = _Outbox()
 
     def open(self) -> None:
-        """Open the port for non-blocking use."""
+        """Open the port for non-blocking use, and for nobody else."""
         try:
-            self._port = serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
-        except (serial.SerialException, ValueError) as error:
-            raise TransportDownError(f"serial {self._device}: {error}") from error
+            self._port = serial.Serial(self._device, self._baud, timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            if self._was_open:
+                raise TransportDownError(f"serial {self._device}: {error}") from error
+            raise UserError(
+                f"cannot open {self._device} at {self._baud} baud: {error}; check the name, that "
+                "no other program uses it, and that you may (group dialout)"
+            ) from error
+        self._was_open = True
+        self._outbox = _Outbox()
 
     def drain(self) -> Iterator[Chunk]:
         """Bytes received so far."""
@@ -268,7 +301,7 @@ class SerialTransport:
             return
         try:
             data = self._port.read(_CHUNK_BYTES)
-        except (serial.SerialException, OSError) as error:
+        except OSError as error:
             raise TransportDownError(f"serial {self._device}: {error}") from error
         if data:
             yield Chunk(data, self._clock.now_ns(), None)
@@ -280,15 +313,17 @@ class SerialTransport:
     def answer_to(self, sender: Address | None) -> None:
         """One port has one peer."""
 
-    def send(self, data: bytes) -> None:
-        """Queue one packet; dropped when the port's buffer is full."""
+    def send(self, data: bytes) -> bool:
+        """Queue one packet whole.
+
+        Past pyserial, whose write spins without end on a full buffer.
+        """
         if self._port is None:
-            return
+            return False
+        descriptor = self._port.fileno()
         try:
-            self._port.write(data)
-        except serial.SerialTimeoutException:
-            return
-        except (serial.SerialException, OSError) as error:
+            return self._outbox.put(data, lambda part: os.write(descriptor, part))
+        except OSError as error:
             raise TransportDownError(f"serial {self._device}: {error}") from error
 
     def close(self) -> None:
@@ -305,7 +340,7 @@ def make_transport(spec: str, clock: Clock) -> Transport:
     """The transport that a connection string asks for (pymavlink's forms), not opened yet.
 
     Raises:
-        UserError: the string is none of them.
+        UserError: the string is none of them, or names a host that does not exist.
     """
     kind, _, rest = spec.partition(":")
     if kind in ("udp", "udpin", "udpout"):

@@ -3,12 +3,13 @@
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from fakes import START_NS, FakeClock, FakeLink, ListSink, ScriptedCamera, level_telemetry
-from mavbridge.action_loop import NEUTRAL_TICKS, ActionLoop, ActionSettings
+from mavbridge.action_loop import NEUTRAL_NS, NEUTRAL_SPACING_NS, ActionLoop, ActionSettings
 from mavbridge.clock import NS_PER_MS, NS_PER_S, GridPacer
 from mavbridge.feature_cache import FeatureCache
 from mavbridge.records import (
@@ -17,6 +18,7 @@ from mavbridge.records import (
     Command,
     FeatureFrame,
     FloatArray,
+    Frame,
     ImageArray,
     Release,
     Sticks,
@@ -40,6 +42,7 @@ SETTINGS = ActionSettings(
     duration_ns=None,
 )
 
+BACK = "inputs are back: making sure that they stay"
 NO_SMOOTHING = Smoothing(max_slew_per_s=0.0, tau_s=0.0, max_dt_s=0.03)
 
 
@@ -167,7 +170,7 @@ def test_a_camera_that_stops_releases_and_one_that_returns_flies_again() -> None
     gap = [t for t in times if not 1 * NS_PER_S < t - START_NS < 2 * NS_PER_S]
     rig = Rig(frames_ns=gap).fly(4.0)
     stale = "the image feature is older than 300 ms"
-    assert rig.releases == ["no image feature yet", None, stale, None]
+    assert rig.releases == ["no image feature yet", None, stale, BACK, None]
     last = [t for t in rig.sink.ticks if t.release_reason is None and t.sent_ns < 2.02e9 + START_NS]
     assert last[-1].feature_captured_ns is not None
     assert last[-1].woke_ns - last[-1].feature_captured_ns <= 300 * MS
@@ -190,6 +193,7 @@ def test_stale_and_missing_states_release() -> None:
         "no image feature yet",
         None,
         "attitude is older than 100 ms",
+        BACK,
         None,
         "no velocity from the vehicle yet",
     ]
@@ -205,6 +209,44 @@ def test_a_policy_that_returns_nan_never_moves_a_stick() -> None:
     reason = "the policy returned a value that is not finite"
     assert rig.releases == ["no image feature yet", None, reason, None]
     assert sum(tick.release_reason == reason for tick in rig.sink.ticks) == 10
+
+
+def test_inputs_that_flicker_do_not_toss_the_sticks_to_and_fro() -> None:
+    rig = Rig()
+
+    def poll(link: FakeLink) -> None:
+        tick = (link.clock.now_ns() - START_NS) // (10 * MS)
+        link.telemetry_age_ns = 101 * MS if 100 <= tick < 300 and tick % 20 == 0 else 2 * MS
+
+    rig.link.on_poll = poll
+    rig.fly(5.0)
+    hands = [decision for _, decision in rig.link.decisions]
+    changes = sum(isinstance(a, Command) != isinstance(b, Command) for a, b in pairwise(hands))
+    assert changes == 3  # takes off, gives back once, takes back once
+
+
+def test_a_chunk_of_another_shape_never_moves_a_stick() -> None:
+    rig = Rig(chunk=lambda tick: np.zeros((16, 4), np.float32)).fly(0.5)
+    assert rig.releases[-1] == "the policy returned [16, 4] instead of [1, horizon, 4]"
+    assert all(isinstance(decision, Release) for _, decision in rig.link.decisions)
+
+
+def test_a_frame_from_the_future_is_as_fresh_as_now_and_no_fresher() -> None:
+    times = [START_NS + k * FRAME_NS for k in range(300)]
+    rig = Rig(frames_ns=times)
+    read = rig.camera.read
+
+    def read_ahead(timeout_ns: int) -> Frame | None:
+        frame = read(timeout_ns)
+        if frame is not None and frame.frame_id == 30:
+            return replace(frame, captured_ns=frame.captured_ns + 5 * NS_PER_S)
+        return frame
+
+    rig.camera.read = read_ahead  # type: ignore[method-assign]
+    rig.fly(3.0)
+    assert [v.frame_id for v in rig.sink.visions[28:33]] == [29, 30, 31, 32, 33]
+    ages_ns = [t.sent_ns - t.feature_captured_ns for t in rig.sink.ticks if t.feature_captured_ns]
+    assert min(ages_ns) > 0
 
 
 def test_history_is_what_was_sent_not_what_was_wished() -> None:
@@ -272,7 +314,9 @@ def run(rig: Rig, stop: threading.Event | None = None) -> list[object]:
     return [decision for _, decision in rig.link.decisions]
 
 
-LAST_WORDS = [Command(sticks=NEUTRAL)] * NEUTRAL_TICKS + [Release("the flight is over")]
+LAST_WORDS = [Command(sticks=NEUTRAL)] * (NEUTRAL_NS // NEUTRAL_SPACING_NS) + [
+    Release("the flight is over")
+]
 
 
 def test_a_flight_ends_after_its_duration_neutral_then_released() -> None:

@@ -11,7 +11,7 @@ from mavbridge.clock import NS_PER_S
 from mavbridge.records import NEUTRAL, Sticks
 from mavbridge.smoothing import Smoothing, StickSmoother
 
-SETTINGS = Smoothing(max_slew_per_s=8.0, tau_s=0.05, max_dt_s=0.2)
+SETTINGS = Smoothing(max_slew_per_s=8.0, tau_s=0.05)
 DURATION_S = 2.0
 
 
@@ -121,6 +121,16 @@ def test_a_reset_starts_from_the_given_sticks_and_a_stall_does_not_jump() -> Non
     assert smoother.step(NEUTRAL, 10**9).smoothed == start
     after_stall = smoother.step(Sticks(-1.0, 0.0, 0.0, 1.0), 4 * 10**9).smoothed
     assert after_stall == pytest.approx((0.4 - 0.24, 0.0, 0.0, -0.2 + 0.24))
+
+
+@pytest.mark.parametrize("rate_hz", [10, 16, 50, 100, 200])
+def test_the_slew_is_the_same_for_a_policy_that_cannot_keep_up(rate_hz: int) -> None:
+    smoother = StickSmoother(Smoothing(max_slew_per_s=2.0, tau_s=0.0))
+    smoother.reset(NEUTRAL)
+    full = Sticks(1.0, 0.0, 0.0, 0.0)
+    for tick in range(round(0.4 * rate_hz) + 1):
+        out = smoother.step(full, tick * NS_PER_S // rate_hz).smoothed.throttle
+    assert out == pytest.approx(2.0 * round(0.4 * rate_hz) / rate_hz)
 
 
 def test_stages_can_be_switched_off() -> None:

@@ -92,6 +92,9 @@ class Flight:
         self._connect = f"udp:127.0.0.1:{bridge_port}"
         self._shm = shm
         self._bridge: subprocess.Popen[str] | None = None
+        self._lines: list[str] = []
+        self._news = threading.Condition()
+        self._reader = threading.Thread(target=self._read, name="reader")
 
     def start(self, *flags: str) -> None:
         command = [sys.executable, "-m", "mavbridge", "--connect", self._connect]
@@ -103,6 +106,22 @@ class Flight:
             text=True,
             env=os.environ | {"PYTHONPATH": str(Path(__file__).parent), "COLUMNS": "200"},
         )
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._bridge is not None
+        assert self._bridge.stdout is not None
+        for line in self._bridge.stdout:
+            with self._news:
+                self._lines.append(line)
+                self._news.notify_all()
+
+    def wait_for(self, text: str) -> bool:
+        """The bridge has said this."""
+        with self._news:
+            return self._news.wait_for(
+                lambda: any(text in line for line in self._lines), timeout=TIMEOUT_S
+            )
 
     def kill(self, number: signal.Signals) -> None:
         assert self._bridge is not None
@@ -112,12 +131,15 @@ class Flight:
         """Exit status and everything that the bridge printed."""
         assert self._bridge is not None
         try:
-            output, _ = self._bridge.communicate(timeout=TIMEOUT_S)
+            self._bridge.wait(TIMEOUT_S)
         finally:
             if self._bridge.poll() is None:
                 self._bridge.kill()
                 self._bridge.wait()
-        return self._bridge.returncode, output
+            self._reader.join(TIMEOUT_S)
+            if self._bridge.stdout is not None:
+                self._bridge.stdout.close()
+        return self._bridge.returncode, "".join(self._lines)
 
     def report(self) -> Any:
         return json.loads((self.folder / "report.json").read_text())

@@ -39,7 +39,7 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         ([], "--connect"),
         (["--connect", "udp:127.0.0.1:1", "--fly-high"], "Unknown option: --fly-high"),
         (["--connect", "udp:127.0.0.1:1", "--action-rate", "fast"], "--action-rate"),
-        (["--connect", "udp:127.0.0.1:1", "--action-rate", "0"], "between 5 and 500 Hz"),
+        (["--connect", "udp:127.0.0.1:1", "--action-rate", "0"], "between 10 and 500 Hz"),
         (["--connect", "udp:127.0.0.1:1", "--num-diffusion-steps", "0"], "between 1 and 100"),
         (["--connect", "udp:127.0.0.1:1", "--readonly", "--arm"], "--readonly sends nothing"),
         (["--connect", "udp:127.0.0.1:1", "--config", "none.toml"], "none.toml"),

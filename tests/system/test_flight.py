@@ -39,7 +39,7 @@ def test_takes_off_holds_altitude_and_hands_back(tmp_path: Path) -> None:
     assert "Arming motors" in output
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_hands_the_sticks_back(tmp_path: Path, number: signal.Signals) -> None:
     with flight(tmp_path) as flown:
         flown.start(*FLY, "--policy", "scripted:hover")
@@ -54,23 +54,34 @@ def test_a_signal_hands_the_sticks_back(tmp_path: Path, number: signal.Signals) 
 
 def test_an_exception_in_the_policy_hands_the_sticks_back(tmp_path: Path) -> None:
     with flight(tmp_path) as flown:
-        flown.start(*FLY, "--policy", "exploding:Exploding")
+        flown.start(*FLY, "--policy", "user_policies:Exploding")
         status, output = flown.end()
     assert status == 1
     assert_handed_back(flown)
-    assert "the user's policy is broken" in output
+    assert "RuntimeError: the user's policy is broken" in output
+    assert "user_policies.py" in output  # where, for the person who wrote it
+    assert "Traceback" not in output
+
+
+def test_a_policy_that_hangs_loses_the_sticks_for_good(tmp_path: Path) -> None:
+    with flight(tmp_path) as flown:
+        flown.start(*FLY, "--policy", "user_policies:Hanging")
+        status, output = flown.end()
+    assert status == 1
+    assert "the action loop has hung" in output
+    overrides = flown.relay.overrides
+    assert overrides[-10:] == [RELEASE] * 10
+    assert RELEASE not in overrides[:-10]  # and the sticks of the thread that came back stayed here
 
 
 def test_without_arm_and_mode_nothing_is_sent(tmp_path: Path) -> None:
     with flight(tmp_path) as flown:
         flown.start("--dual-rate", "--policy", "scripted:hover")
-        # It will not fly by itself; end it once it had every chance to.
-        assert not flown.relay.has_flown.wait(12)
+        assert flown.wait_for("disarmed: arm the vehicle, or start with --arm")
         flown.kill(signal.SIGINT)
         status, output = flown.end()
     assert status == 0, output
     assert flown.relay.overrides == []
-    assert "disarmed: arm the vehicle, or start with --arm" in output
     assert [entry["mode"] for entry in flown.vehicle_report()["modes"]] == ["STABILIZE"]
 
 

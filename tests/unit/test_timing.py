@@ -147,7 +147,18 @@ def test_ages_of_what_was_not_flown_are_not_counted() -> None:
     assert report.state_age_ms is None
     assert report.state_to_wire_ms is None
     assert report.action.predict_ms is None
-    assert report.action.period_ms == all_equal(10.0)
+    assert report.action.period_ms is None
+    assert report.action.rate_hz is None
+
+
+def test_a_loop_that_waits_fast_and_flies_slowly_is_reported_slow() -> None:
+    waiting = [make_released_tick(index) for index in range(500)]
+    flying = [make_tick(500 + 5 * index, missed_slots=4) for index in range(11)]
+    action = timed(*waiting, *flying, *(make_released_tick(600 + k) for k in range(9))).action
+    assert action.rate_hz == 20.0
+    assert action.flying_s == 0.5
+    assert (action.ticks, action.missed_slots) == (11, 40)
+    assert action.period_ms == all_equal(50.0)
 
 
 def test_readonly_has_ages_but_nothing_on_the_wire() -> None:
@@ -230,13 +241,15 @@ def test_json_has_the_keys_of_the_report_in_order() -> None:
         *("release_count", "observer_drops"),
     ]
     assert list(document["action"]) == [
-        *("target_hz", "rate_hz", "ticks", "missed_slots"),
+        *("target_hz", "rate_hz", "flying_s", "ticks", "missed_slots"),
         *("period_ms", "jitter_ms", "predict_ms"),
     ]
     vision_keys = ["target_hz", "rate_hz", "frames", "dropped_frames", "encode_ms"]
     assert list(document["vision"]) == vision_keys
     assert list(document["feature_age_ms"]) == ["p50", "p99", "p999", "max"]
     assert document["link"] == {
+        "unusable_packets": 0,
+        "vehicle_clock_offset_ns": None,
         "messages_per_s": {"ATTITUDE_QUATERNION": 99.9, "RC_CHANNELS": 20.0},
         "lost_fraction": 0.001,
         "rtt_ms": None,

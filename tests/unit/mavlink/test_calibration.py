@@ -72,6 +72,17 @@ def test_an_unusable_calibration_is_refused(arguments: dict[str, int], message: 
         RcChannel(**arguments)  # type: ignore[arg-type]
 
 
+def test_a_failsafe_above_the_whole_throttle_is_refused() -> None:
+    with pytest.raises(ValueError, match="FS_THR_VALUE"):
+        RcCalibration(
+            throttle=ARDUPILOT.throttle,
+            yaw=ARDUPILOT.yaw,
+            pitch=ARDUPILOT.pitch,
+            roll=ARDUPILOT.roll,
+            throttle_floor_us=1900,
+        )
+
+
 def test_two_sticks_on_one_channel_are_refused() -> None:
     with pytest.raises(ValueError, match="two sticks on one channel"):
         RcCalibration(

@@ -32,7 +32,11 @@ class Vehicle:
         self.mode, self.armed = 2, False
         self.channels = [1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500]
         self.obeys = True
+        self.shows_rc = True
         self.is_down = False
+        self.is_deaf = False
+        self.address = ("127.0.0.1", 1)
+        self.answered_to: Address | None = None
         self.opened = 0
         self.boot_ns = clock.now_ns()
         self.beats = True
@@ -57,19 +61,23 @@ class Vehicle:
         if arrival_ns <= until_ns and self.beats:
             self.tick(1)
 
-    def answer_to(self, sender: Address | None) -> None: ...
+    def answer_to(self, sender: Address | None) -> None:
+        self.answered_to = sender
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
+        if self.is_down or self.is_deaf:
+            return False
         for message in self.end.read(data):
             self.received.append(message)
             self.answer(message)
+        return True
 
     def close(self) -> None: ...
 
     # vehicle
 
     def put(self, message: dialect.MAVLink_message) -> None:
-        self.inbox.append(Chunk(self.end.pack(message), self.clock.now_ns(), ("127.0.0.1", 1)))
+        self.inbox.append(Chunk(self.end.pack(message), self.clock.now_ns(), self.address))
 
     def answer(self, message: Any) -> None:
         mav = self.end.mav
@@ -92,13 +100,13 @@ class Vehicle:
                 Chunk(
                     self.end.heartbeat(mode=self.mode, armed=self.armed),
                     self.clock.now_ns(),
-                    ("127.0.0.1", 1),
+                    self.address,
                 )
             )
         self.put(mav.attitude_quaternion_encode(ms, 1, 0, 0, 0, 0, 0, 0))
         self.put(mav.local_position_ned_encode(ms, 0, 0, 0, 0, 0, 0))
         self.put(mav.highres_imu_encode(ms, 0, 0, -9.81, *[0.0] * 10, 8191))
-        if tick % 5 == 0:
+        if tick % 5 == 0 and self.shows_rc:
             self.put(mav.rc_channels_encode(ms, 8, *self.channels, *[0] * 10, 255))
 
     def names(self) -> list[str]:
@@ -186,21 +194,40 @@ def test_commands_are_echoed_and_confirmed() -> None:
     [
         ({"MAV_GCS_SYSID": 42.0}, "--source-system 42"),
         ({"RC_OPTIONS": 2.0}, "RC_OPTIONS bit 1"),
-        ({}, "another station may be overriding"),
+        ({"RC_OVERRIDE_TIME": 0.0}, "RC_OVERRIDE_TIME is 0"),
     ],
 )
-def test_a_vehicle_that_does_not_obey_is_told_with_the_reason(
+def test_a_vehicle_that_would_not_obey_is_told_before_a_stick_is_sent(
     params: dict[str, float], told: str
 ) -> None:
     bench = Bench()
     bench.vehicle.params |= params
+    problem = bench.run(8.0).problem
+    assert problem is not None
+    assert "would not act on our sticks" in problem
+    assert told in problem
+
+
+@pytest.mark.parametrize("resting_throttle_us", [1000, 1100])
+def test_a_vehicle_that_does_not_obey_is_noticed(resting_throttle_us: int) -> None:
+    bench = Bench()
+    bench.vehicle.channels[2] = resting_throttle_us  # 1100: just where IDLE is
     bench.vehicle.obeys = False
     bench.run(8.0)
     assert bench.run(0.9, Command(sticks=IDLE)).problem is None
-    problem = bench.run(0.3, Command(sticks=IDLE)).problem
-    assert problem is not None
-    assert "does not act on our sticks" in problem
-    assert told in problem
+    snapshot = bench.run(0.3, Command(sticks=IDLE))
+    assert "another station may be overriding" in (snapshot.problem or "")
+    assert snapshot.is_overruled
+    assert not snapshot.echo_confirmed
+    assert bench.link.stats().echo_confirmed is False
+
+
+def test_without_rc_channels_there_is_nothing_to_check_against() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.vehicle.shows_rc = False
+    bench.vehicle.obeys = False
+    assert "no RC_CHANNELS" in (bench.run(1.3, Command(sticks=IDLE)).problem or "")
 
 
 def test_release_is_said_ten_times_and_then_the_wire_is_silent() -> None:
@@ -215,6 +242,42 @@ def test_release_is_said_ten_times_and_then_the_wire_is_silent() -> None:
     bench.link.hand_back()
     assert bench.overrides()[count:] == [RELEASE_US] * 10
     assert bench.link.stats().sent_overrides == 120
+
+
+def test_releases_that_could_not_leave_are_said_later() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.run(0.2, Command(sticks=IDLE))
+    bench.vehicle.is_deaf = True
+    bench.run(1.0, Release("pilot"))
+    assert RELEASE_US not in bench.overrides()
+    bench.vehicle.is_deaf = False
+    bench.run(1.0, Release("pilot"))
+    assert bench.overrides()[20:] == [RELEASE_US] * 10
+
+
+def test_what_did_not_leave_was_not_sent() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.run(0.2, Command(sticks=IDLE))
+    bench.vehicle.is_deaf = True
+    assert bench.link.send(Command(sticks=IDLE)) is None
+    bench.vehicle.is_down = True
+    assert bench.run(0.1).problem == "the link is down"
+    assert bench.link.send(Command(sticks=IDLE)) is None
+    assert bench.link.stats().sent_overrides == 20
+
+
+def test_once_seized_only_releases_leave() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.run(0.2, Command(sticks=IDLE))
+    bench.link.seize()
+    assert bench.overrides()[20:] == [RELEASE_US] * 10
+    count = len(bench.vehicle.received)
+    bench.run(1.0, Command(sticks=IDLE))  # the owner has come back
+    bench.link.hand_back()
+    assert len(bench.vehicle.received) == count
 
 
 def test_nothing_is_released_that_was_never_taken() -> None:
@@ -263,6 +326,40 @@ def test_a_lost_connection_is_opened_again_once_a_second() -> None:
     assert any("link lost" in text for text in bench.texts)
 
 
+def test_after_reconnecting_the_same_peer_is_answered() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.vehicle.is_down = True
+    bench.run(0.5)
+    bench.vehicle.is_down, bench.vehicle.answered_to = False, None
+    bench.run(2.0)
+    assert bench.vehicle.answered_to == ("127.0.0.1", 1)
+
+
+def test_a_vehicle_that_comes_back_from_another_port_is_followed() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.vehicle.address = ("127.0.0.1", 2)
+    assert bench.run(2.2).problem is not None
+    assert bench.vehicle.answered_to == ("127.0.0.1", 2)
+    assert bench.run(5.0).problem is None
+    assert any("now speaks from" in text for text in bench.texts)
+
+
+def test_one_old_stamp_is_no_reboot_and_costs_no_release() -> None:
+    bench = Bench()
+    bench.run(8.0)
+    bench.run(0.2, Command(sticks=IDLE))
+    mav = bench.vehicle.end.mav
+    bench.vehicle.put(mav.attitude_quaternion_encode(3, 1, 0, 0, 0, 0, 0, 0))
+    assert bench.run(0.2, Command(sticks=IDLE)).problem is None
+    assert not any("rebooted" in text for text in bench.texts)
+    bench.vehicle.boot_ns = bench.clock.now_ns()
+    assert bench.run(0.05).problem is not None
+    bench.link.hand_back()
+    assert bench.overrides()[-10:] == [RELEASE_US] * 10
+
+
 def test_a_reboot_starts_the_handshake_again() -> None:
     bench = Bench()
     bench.run(8.0)
@@ -301,6 +398,10 @@ def test_nobody_there_is_an_error_with_advice() -> None:
         bench.run(3.0)
 
 
+def test_a_vehicle_heard_in_time_is_not_given_up_while_it_settles() -> None:
+    assert Bench(connect_timeout=0.1).run(8.0).problem is None
+
+
 def test_it_waits_for_the_attitude_and_no_longer() -> None:
     bench = Bench()
     bench.run(8.0)
@@ -324,7 +425,11 @@ def test_other_systems_on_the_link_are_not_listened_to() -> None:
     bench.run(8.0)
     stranger = WireEnd(system=9)
     bench.vehicle.inbox.append(
-        Chunk(stranger.pack(stranger.mav.attitude_encode(0, 1, 1, 1, 1, 1, 1)), 0, None)
+        Chunk(
+            stranger.pack(stranger.mav.attitude_encode(0, 1, 1, 1, 1, 1, 1)),
+            0,
+            bench.vehicle.address,
+        )
     )
     snapshot = bench.run(0.01)
     assert snapshot.telemetry.rate_body_radps is not None
@@ -351,6 +456,27 @@ def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
     bench.run(0.1, Release("pilot"))
     assert bench.vehicle.names().count("MANUAL_CONTROL") == 10
     assert bench.overrides() == []
+
+
+def test_ardupilot_with_manual_control_is_refused() -> None:
+    with pytest.raises(PeerError, match="--output rc-override"):
+        Bench(output="manual-control").run(3.0)
+
+
+def test_acks_for_others_do_not_steer_us() -> None:
+    bench = Bench()
+    bench.run(2.0)
+    for _ in range(6):
+        denied = dialect.MAV_RESULT_DENIED
+        bench.vehicle.put(bench.vehicle.end.mav.command_ack_encode(511, denied, 0, 0, 250, 190))
+        bench.run(0.01)
+    bench.run(6.0)
+    intervals = [
+        int(message.param1)
+        for message in bench.vehicle.received
+        if message.get_type() == "COMMAND_LONG" and message.command == 511
+    ]
+    assert intervals == [31, 32, 105, 65]
 
 
 def test_px4_with_rc_override_is_refused() -> None:

@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.clock import NS_PER_MS, NS_PER_S
 from mavbridge.errors import PeerError, UserError
 from mavbridge.mavlink import params, streams
-from mavbridge.mavlink.echo import EchoCheck
+from mavbridge.mavlink.echo import NUDGE_US, EchoCheck
 from mavbridge.mavlink.messages import (
     Attitude,
     CommandAck,
@@ -27,9 +27,7 @@ S = NS_PER_S
 
 
 def beat(vehicle_type: int = 2, autopilot: int = 3) -> Heartbeat:
-    return Heartbeat(
-        vehicle_type=vehicle_type, autopilot=autopilot, base_mode=1, custom_mode=0, system_status=3
-    )
+    return Heartbeat(vehicle_type=vehicle_type, autopilot=autopilot, base_mode=1, custom_mode=0)
 
 
 # --- roster
@@ -58,9 +56,30 @@ def test_two_vehicles_need_a_choice() -> None:
     assert chosen.choose(9 * S) is None
     assert "--target-system" in chosen.describe()
     chosen.hear(Source(7, 1), beat(autopilot=12), None, S)
-    peer = chosen.choose(S)
+    peer = chosen.choose(3 * S)
     assert peer is not None
     assert peer.autopilot == "px4"
+
+
+def test_two_vehicles_of_one_id_cannot_be_told_apart() -> None:
+    roster = Roster(target_system=1)
+    roster.hear(Source(1, 1), beat(), ("host", 5), 0)
+    roster.hear(Source(1, 1), beat(), ("host", 6), S)
+    with pytest.raises(PeerError, match=r"system 1 .*5.*6.*another id"):
+        roster.choose(2 * S)
+
+
+def test_a_vehicle_that_speaks_from_a_new_address_has_moved() -> None:
+    roster = Roster(target_system=0)
+    roster.hear(Source(1, 1), beat(), ("host", 5), 0)
+    old = roster.choose(2 * S)
+    assert old is not None
+    roster.hear(Source(1, 1), beat(), ("host", 6), 2 * S)
+    assert roster.moved(old, 5 * S // 2) is None  # it was heard at both just now
+    roster.hear(Source(1, 1), beat(), ("host", 6), 4 * S)
+    moved = roster.moved(old, 4 * S)
+    assert moved is not None
+    assert moved.address == ("host", 6)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +214,7 @@ def test_the_override_switch_is_found() -> None:
 
 
 def ack(result: int, command: int = dialect.MAV_CMD_SET_MESSAGE_INTERVAL) -> CommandAck:
-    return CommandAck(command=command, result=result)
+    return CommandAck(command=command, result=result, target=Source(0, 0))
 
 
 def ids(request: object) -> tuple[float, float]:
@@ -281,6 +300,7 @@ def test_the_fastest_exchange_sets_the_offset() -> None:
 # --- echo
 
 A, B, C = (1100, 1500, 1500, 1500), (1500, 1500, 1500, 1500), (1000, 1500, 1500, 1500)
+"""Throttle, yaw, pitch, roll in us."""
 
 
 def test_an_override_that_shows_up_is_confirmed() -> None:
@@ -315,14 +335,22 @@ def test_an_echo_that_stops_in_flight_is_noticed() -> None:
     assert echo.failed(3 * S)
 
 
-def test_a_receiver_that_rests_where_we_hold_the_sticks_is_no_failure() -> None:
+def test_sticks_at_rest_are_nudged_until_they_are_seen() -> None:
     echo = EchoCheck()
-    echo.received(A, 0)
-    for k in range(100):
-        echo.sent(A, S + k * 10 * NS_PER_MS)
-        echo.received(A, S + k * 10 * NS_PER_MS)
+    echo.received(A, 0)  # the receiver rests where we will hold the sticks
+    for k in range(50):
+        nudged = echo.distinct(A)
+        assert nudged == (1100, 1500, 1500, 1500 + NUDGE_US)
+        echo.sent(nudged, S + k * 10 * NS_PER_MS)
+        echo.received(A, S + k * 10 * NS_PER_MS)  # a vehicle that ignores us shows no nudge
+    assert not echo.confirmed
+    assert echo.failed(S + S + 1)
+    echo.received(nudged, 2 * S)
     assert echo.confirmed
-    assert not echo.failed(2 * S)
+    assert echo.distinct(A) == A
+    echo.sent(A, 2 * S)
+    echo.received(A, 2 * S + 1)
+    assert not echo.failed(3 * S)
 
 
 # --- telemetry and counters
@@ -361,16 +389,20 @@ def test_a_worse_message_never_overwrites_a_better_live_one() -> None:
 
 def test_losses_are_gaps_in_the_sequence() -> None:
     counters = LinkCounters()
-    assert counters.stats(echo_confirmed=None).lost_fraction is None
+    assert (
+        counters.stats(echo_confirmed=None, unusable_packets=0, clock_offset_ns=None).lost_fraction
+        is None
+    )
     for k, sequence in enumerate((254, 255, 0, 2, 3)):  # one lost, and a wrap that is none
         counters.receive("ATTITUDE", sequence, k * S)
     counters.new_sequence()
     counters.receive("HEARTBEAT", 99, 10 * S)
     counters.round_trip(None)
     counters.round_trip(2 * NS_PER_MS)
-    stats = counters.stats(echo_confirmed=True)
+    stats = counters.stats(echo_confirmed=True, unusable_packets=3, clock_offset_ns=-5)
     assert stats.lost_fraction == pytest.approx(1 / 7)
     assert stats.messages_per_s == (("ATTITUDE", 0.5), ("HEARTBEAT", 0.1))
     assert stats.rtt_ms is not None
     assert stats.rtt_ms.p50 == pytest.approx(2.0, rel=0.01)
+    assert (stats.unusable_packets, stats.vehicle_clock_offset_ns) == (3, -5)
     assert stats.echo_confirmed is None  # nothing was sent: there was nothing to confirm

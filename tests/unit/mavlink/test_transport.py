@@ -1,8 +1,11 @@
 """Transports on loopback. A datagram on loopback is there when its send returns: nothing waits."""
 
+import errno
 import os
 import pty
+import select
 import socket
+import tty
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,7 @@ from fakes import FakeClock
 from mavbridge.clock import MonotonicClock
 from mavbridge.errors import UserError
 from mavbridge.mavlink.transport import (
+    TCP_SILENCE_NS,
     SerialTransport,
     TcpTransport,
     Transport,
@@ -157,7 +161,54 @@ def test_serial_reads_and_writes_and_notices_the_end() -> None:
     os.close(ours_fd)
 
 
-def test_a_serial_port_that_does_not_exist(tmp_path: Path) -> None:
+def test_a_serial_port_that_does_not_exist_is_the_users_error(tmp_path: Path) -> None:
     ours = SerialTransport(str(tmp_path / "ttyNONE"), 115200, FakeClock())
-    with pytest.raises(TransportDownError, match="ttyNONE"):
+    with pytest.raises(UserError, match=r"ttyNONE.*dialout"):
         ours.open()
+
+
+def test_a_serial_port_that_nobody_reads_drops_whole_packets_and_never_blocks() -> None:
+    ours_fd, theirs_fd = pty.openpty()
+    tty.setraw(theirs_fd)
+    ours = SerialTransport(os.ttyname(theirs_fd), 115200, MonotonicClock())
+    ours.open()
+    packet = bytes(range(100)) * 3
+    taken = sum(ours.send(packet) for _ in range(1000))
+    assert 0 < taken < 1000
+    received = b""
+    while select.select([ours_fd], [], [], 0)[0]:
+        received += os.read(ours_fd, 65536)
+        ours.send(b"")  # finishes the packet that was cut
+    assert received == packet * (len(received) // len(packet))
+    ours.close()
+    os.close(theirs_fd)
+    os.close(ours_fd)
+
+
+def test_udp_survives_a_network_that_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Away:
+        def sendto(self, *_: object) -> None:
+            raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    ours = UdpTransport(("127.0.0.1", 9), FakeClock(), listen=False)
+    monkeypatch.setattr(ours, "_socket", Away())
+    assert ours.send(b"x") is False
+
+
+def test_a_silent_tcp_connection_is_taken_for_dead() -> None:
+    clock = FakeClock()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ours = make_transport(f"tcp:127.0.0.1:{server.getsockname()[1]}", clock)
+        ours.open()
+        vehicle, _ = server.accept()
+        with vehicle:
+            assert list(ours.drain()) == []
+            clock.advance_ns(TCP_SILENCE_NS + 1)
+            with pytest.raises(TransportDownError, match="silent for 5 s"):
+                list(ours.drain())
+        ours.close()
+
+
+def test_a_host_that_does_not_exist_is_the_users_error() -> None:
+    with pytest.raises(UserError, match="cannot find host"):
+        make_transport("tcp:no.such.host.invalid:5760", FakeClock())
