@@ -82,12 +82,14 @@ class StatusLine:
         line.append(f"  feature {_age(tick.sent_ns, tick.feature_captured_ns)}")
         line.append(f"  state {_age(tick.sent_ns, attitude_ns)}")
         line.append(f"  missed {self._missed_slots}")
+        if tick.release_reason is not None:  # last: it may be long, and is cut first
+            line.append(f"  {tick.release_reason}", style="yellow")
         line.no_wrap, line.overflow = True, "ellipsis"
         return line
 
     def _state(self, tick: Tick) -> Text:
         if tick.release_reason is not None:
-            return Text(f"RELEASED: {tick.release_reason}", style="bold yellow")
+            return Text("RELEASED", style="bold yellow")
         if self._readonly:
             return Text("READ-ONLY", style="bold cyan")
         return Text("FLYING" if tick.trace else "PREPARING", style="bold green")
@@ -154,7 +156,7 @@ class FlightScreen:
         self._print_news()
         self._console.print(timing_table(report))
         for verdict in verdicts(report):
-            self._console.print(verdict)
+            self._console.print(verdict, soft_wrap=not self._console.is_terminal)
 
 
 def timing_table(report: TimingReport) -> Table:
