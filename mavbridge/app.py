@@ -51,18 +51,33 @@ def fly(config: FlyConfig) -> int:
     """
     clock = MonotonicClock()
     console = Console(stderr=True)
+    fly_executable(config, _load_policy(config, clock, console), clock=clock, console=console)
+    return 0
+
+
+def fly_executable(
+    config: FlyConfig,
+    executable: Executable,
+    *,
+    clock: Clock,
+    console: Console,
+    sinks: tuple[TickSink, ...] = (),
+) -> None:
+    """Run one flight of a policy that is loaded already; ``sinks`` see every tick.
+
+    Raises:
+        MavbridgeError: for whatever a person can have caused.
+    """
     cv2.setNumThreads(1)  # two loops share two cores: no pool of helpers under either
-    executable = _load_policy(config, clock, console)
     with stop_on_signals() as stop:
         flight: _Flight | None = None
         try:
             with ExitStack() as stack:
-                flight = _Flight(config, clock, console, executable, stack)
+                flight = _Flight(config, clock, console, executable, sinks, stack)
                 flight.run(stop)
         finally:
             if flight is not None:
                 flight.finish()
-    return 0
 
 
 def _load_policy(config: FlyConfig, clock: Clock, console: Console) -> Executable:
@@ -93,6 +108,7 @@ class _Flight:
         clock: Clock,
         console: Console,
         executable: Executable,
+        sinks: tuple[TickSink, ...],
         stack: ExitStack,
     ) -> None:
         self._config = config
@@ -114,10 +130,10 @@ class _Flight:
         self._link = self._open_link()
         self._viewer = self._open_viewer()
         camera = self._open_camera()
-        sinks: list[TickSink] = [self._timing, self._screen]
+        own: list[TickSink] = [self._timing, self._screen]
         if self._viewer is not None:
-            sinks.append(self._viewer)
-        self._sink = FanOut(sinks)
+            own.append(self._viewer)
+        self._sink = FanOut([*own, *sinks])
         cache = FeatureCache()
         self._vision = self._make_vision(camera, cache)
         self._action = self._make_action(cache)
