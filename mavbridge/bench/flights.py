@@ -16,6 +16,8 @@ ACTION_HZ, VISION_HZ = 100.0, 30.0
 RATES_HZ = (25.0, 50.0, 100.0, 150.0, 200.0, 250.0, 300.0, 400.0, 500.0)
 """Tried in the search for the highest; the last is the most that the bridge takes."""
 MAX_MISSED_FRACTION = 0.001
+NEARLY_KEPT_FRACTION = 0.05
+"""Half a second of ten: what a stall can do."""
 STARTING_S = 90.0
 """Most that a process may take beside its flight: imports, compiling an engine, arming."""
 
@@ -67,33 +69,41 @@ def top_rate(
     """The highest action rate that one engine keeps up with beside 30 Hz vision."""
     trials: list[RateTrial] = []
 
-    def passes(action_hz: float) -> bool:
+    def missed_fraction(action_hz: float) -> float:
         flight = fly(OURS, engine=engine, action_hz=action_hz, duration_s=duration_s)
         trial = RateTrial(
-            engine=engine,
             action_hz=action_hz,
             missed_fraction=round(flight.missed_fraction, 5),
             vision_hz=flight.vision_hz,
         )
         trials.append(trial)
         say(f"{engine} at {action_hz:g} Hz: {trial.missed_fraction:.2%} missed")
-        return trial.missed_fraction < MAX_MISSED_FRACTION
+        return trial.missed_fraction
 
-    action_hz = highest_passing(rates_hz, passes)
+    action_hz = highest_rate(rates_hz, missed_fraction)
     return TopRate(engine=engine, action_hz=action_hz, trials=tuple(trials))
 
 
-def highest_passing(rates_hz: Sequence[float], passes: Callable[[float], bool]) -> float | None:
-    """Bisect rates that rise for the highest that passes; None if even the lowest does not.
+def highest_rate(
+    rates_hz: Sequence[float], missed_fraction: Callable[[float], float]
+) -> float | None:
+    """Bisect rising rates for the highest that is kept; None if even the lowest is not.
 
-    A rate that fails is given a second chance: one stall of a shared host in ten seconds is more
-    missed slots than are allowed. A rate that passes twice by luck is not thinkable at 0.1 %.
+    A rate that is nearly kept is tried once more: a single stall of a shared host in ten seconds
+    is more missed slots than are allowed.
     """
-    low, high = 0, len(rates_hz)  # below low all pass, from high on all fail
+    low, high = 0, len(rates_hz)  # below low all are kept, from high on none
     while low < high:
         middle = (low + high) // 2
-        if passes(rates_hz[middle]) or passes(rates_hz[middle]):
+        if _is_kept(rates_hz[middle], missed_fraction):
             low = middle + 1
         else:
             high = middle
     return rates_hz[low - 1] if low else None
+
+
+def _is_kept(rate_hz: float, missed_fraction: Callable[[float], float]) -> bool:
+    missed = missed_fraction(rate_hz)
+    if MAX_MISSED_FRACTION <= missed < NEARLY_KEPT_FRACTION:
+        missed = missed_fraction(rate_hz)
+    return missed < MAX_MISSED_FRACTION

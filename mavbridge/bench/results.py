@@ -96,7 +96,6 @@ class Flight:
 class RateTrial:
     """One flight of the search for the highest action rate."""
 
-    engine: str
     action_hz: float
     missed_fraction: float
     vision_hz: float | None
