@@ -67,7 +67,6 @@ class LinkPeer:
         self._wanted = attitudes
         self._clock = MonotonicClock()
         self._transport = UdpTransport(("127.0.0.1", port), self._clock, listen=False)
-        self._transport.open()
         self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=1)
         self._mav.robust_parsing = True
         self._start_ns = self._clock.now_ns()
@@ -85,6 +84,13 @@ class LinkPeer:
         Raises:
             TimeoutError: nobody answered.
         """
+        self._transport.open()
+        try:
+            self._run()
+        finally:
+            self._transport.close()
+
+    def _run(self) -> None:
         half_ns = round(NS_PER_S / ATTITUDE_HZ / 2)
         index = 0
         due_ns = self._clock.now_ns()
@@ -99,7 +105,6 @@ class LinkPeer:
             index += 1
             self._watch()
         self._take_answers()
-        self._transport.close()
 
     def _watch(self) -> None:
         if self._is_counting:
