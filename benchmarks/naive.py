@@ -233,6 +233,7 @@ class NaiveRunner:
             state_to_wire_ms=self._state_to_wire.percentiles_ms(),
             cpu_cores=round(self._cpu_ns / NS_PER_S / duration_s, 3),
             stolen_ms=since_ms(self._stolen_ns, stolen_ns()),
+            missed_by_cause=None,
         )
 
 

@@ -16,6 +16,7 @@ from mavbridge.bench import engines
 from mavbridge.bench.flights import OURS_NAME
 from mavbridge.bench.meter import FlightMeter
 from mavbridge.bench.results import Flight, to_json
+from mavbridge.bench.witness import GcWatch, Witness, read_counters
 from mavbridge.clock import NS_PER_S, MonotonicClock
 from mavbridge.config import (
     CameraConfig,
@@ -24,6 +25,7 @@ from mavbridge.config import (
     LinkConfig,
     PolicyConfig,
     Rates,
+    period_ns,
 )
 from mavbridge.timing import TimingReport
 from policy.contract import Executable, FloatArray
@@ -40,12 +42,20 @@ def main() -> None:
     clock = MonotonicClock()
     executable = level_climb(engines.load(engines.FLIGHT_POLICY, args.engine))
     meter = FlightMeter(action_hz=args.action_hz, vision_hz=args.vision_hz)
-    fly_executable(
-        _config(args), executable, clock=clock, console=Console(stderr=True), sinks=(meter,)
-    )
+    with GcWatch(clock) as collector:
+        witness = Witness(
+            period_ns=period_ns(args.action_hz), read=lambda: read_counters(collector.total_ns)
+        )
+        fly_executable(
+            _config(args),
+            executable,
+            clock=clock,
+            console=Console(stderr=True),
+            sinks=(meter, witness),
+        )
     meter.end()
     report = meter.report(engine=executable.engine, policy=executable.name, link=None)
-    args.out.write_text(to_json(_flight(args, report, meter)))
+    args.out.write_text(to_json(_flight(args, report, meter, witness)))
 
 
 def arguments(description: str | None) -> argparse.Namespace:
@@ -85,7 +95,9 @@ def _config(args: argparse.Namespace) -> FlyConfig:
     )
 
 
-def _flight(args: argparse.Namespace, report: TimingReport, meter: FlightMeter) -> Flight:
+def _flight(
+    args: argparse.Namespace, report: TimingReport, meter: FlightMeter, witness: Witness
+) -> Flight:
     action, vision = report.action, report.vision
     return Flight(
         runner=OURS_NAME,
@@ -103,6 +115,7 @@ def _flight(args: argparse.Namespace, report: TimingReport, meter: FlightMeter) 
         state_to_wire_ms=report.state_to_wire_ms,
         cpu_cores=round(meter.cpu_ns / (report.duration_s * NS_PER_S), 3),
         stolen_ms=meter.stolen_ms,
+        missed_by_cause=witness.missed_by_cause,
     )
 
 

@@ -83,6 +83,8 @@ class Flight:
     """Processor time of the bridge's process over elapsed time."""
     stolen_ms: float | None
     """Processor time that the host took from this machine meanwhile; None = not known."""
+    missed_by_cause: Mapping[str, int] | None
+    """Missed slots by ``attribution.Cause``; None = this runner is not watched."""
     vehicle: Vehicle | None = None
 
     @property

@@ -54,6 +54,7 @@ _FLIGHT_ROWS: tuple[tuple[str, Callable[[Flight], str]], ...] = (
     ("actions, Hz", lambda f: f"{number(f.action_hz, 1)} of {f.asked_action_hz:g}"),
     ("images, Hz", lambda f: f"{number(f.vision_hz, 1)} of {f.asked_vision_hz:g}"),
     ("missed slots", lambda f: f"{f.missed_slots} ({f.missed_fraction:.2%})"),
+    ("of these because of", lambda f: _causes(f)),
     ("action period, ms", lambda f: spread(f.period_ms)),
     ("sample one chunk, ms", lambda f: spread(f.predict_ms)),
     ("encode one image, ms", lambda f: spread(f.encode_ms)),
@@ -79,6 +80,13 @@ def flight_table(flights: Iterable[Flight]) -> Table:
     for name, cell in _FLIGHT_ROWS:
         table.add_row(name, *(cell(flight) for flight in flights))
     return table
+
+
+def _causes(flight: Flight) -> str:
+    causes = flight.missed_by_cause
+    if causes is None:
+        return "-"
+    return ", ".join(f"{cause} {slots}" for cause, slots in causes.items()) or "none"
 
 
 def _gaps(flight: Flight) -> str:

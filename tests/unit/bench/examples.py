@@ -37,6 +37,7 @@ def make_flight(
         state_to_wire_ms=all_equal(wire_ms),
         cpu_cores=cores,
         stolen_ms=None,
+        missed_by_cause={"inference": 9, "host": 3} if runner == "mavbridge" else None,
         vehicle=Vehicle(override_hz=99.0, gap_p50_ms=10.0, gap_p99_ms=11.0, gap_max_ms=12.0),
     )
 
