@@ -4,6 +4,9 @@ Eager torch as it comes, the whole sampler at every step, one thread for images 
 with a lock around what they share, ``time.sleep(period - elapsed)``, and pymavlink's own connection
 read once a step. The weights, the camera and the vehicle are those of the measured flight.
 
+Reading one attitude a step is what makes it fall behind: a step that is slower than the stream
+leaves the rest in the socket, and the next step acts on what is oldest there.
+
 It arms nothing, so the vehicle stays on the ground; its sticks are sent and counted all the same.
 """
 

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 
 from mavbridge.bench.processes import end, free_udp_port, running, wait
 from mavbridge.bench.results import Flight, RateTrial, TopRate, Vehicle, flight_from_json
+from mavbridge.errors import UserError
 
 OURS = "mavbridge.bench.flight_process"
 NAIVE = "benchmarks.naive"
@@ -33,7 +34,7 @@ def fly(module: str, *, engine: str, action_hz: float, duration_s: float) -> Fli
     with TemporaryDirectory(prefix="mavbridge-bench-") as name:
         folder = Path(name)
         vehicle_report, figures = folder / "vehicle.json", folder / "figures.json"
-        log = folder / "runner.log"
+        log, vehicle_log = folder / "runner.log", folder / "vehicle.log"
         vehicle_command = (
             *(sys.executable, "-m", "sitl", "--camera", camera),
             *("--connect", f"udpout:127.0.0.1:{port}", "--report", str(vehicle_report)),
@@ -44,11 +45,16 @@ def fly(module: str, *, engine: str, action_hz: float, duration_s: float) -> Fli
             *("--action-hz", str(action_hz), "--vision-hz", str(VISION_HZ)),
             *("--out", str(figures)),
         )
-        with running(*vehicle_command, log=folder / "vehicle.log") as vehicle:
-            with running(*runner_command, log=log) as runner:
-                wait(runner, f"python -m {module}", log, duration_s + STARTING_S)
+        with running(*vehicle_command, log=vehicle_log) as vehicle:
+            try:
+                with running(*runner_command, log=log) as runner:
+                    wait(runner, f"python -m {module}", log, duration_s + STARTING_S)
+            except UserError:
+                if vehicle.poll() is not None:  # then the runner's words are not the reason
+                    wait(vehicle, "python -m sitl", vehicle_log, STARTING_S)
+                raise
             end(vehicle)
-            wait(vehicle, "python -m sitl", folder / "vehicle.log", STARTING_S)
+            wait(vehicle, "python -m sitl", vehicle_log, STARTING_S)
         return flight_from_json(figures.read_text(), _vehicle(vehicle_report))
 
 

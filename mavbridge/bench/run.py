@@ -34,6 +34,8 @@ class _Plan:
     attitudes: int
 
 
+INTERRUPTED = 130
+"""What shells report of a program ended by Ctrl-C."""
 PIPED_WIDTH = 120
 """Columns of the tables where there is no terminal to ask."""
 FULL = _Plan(
@@ -55,7 +57,7 @@ QUICK = _Plan(
 
 
 def bench(config: BenchConfig) -> int:
-    """Run everything that the config asks for; 1 if the budget is exceeded.
+    """Run everything that the config asks for; 1 if the budget is exceeded, 130 if interrupted.
 
     Raises:
         MavbridgeError: for whatever a person can have caused.
@@ -70,7 +72,11 @@ def bench(config: BenchConfig) -> int:
     console = Console()
     if not console.is_terminal:
         console.width = PIPED_WIDTH
-    result = measure(QUICK if config.quick else FULL, is_quick=config.quick, say=_sayer())
+    try:
+        result = measure(QUICK if config.quick else FULL, is_quick=config.quick, say=_sayer())
+    except KeyboardInterrupt:
+        console.print("interrupted: nothing is written")
+        return INTERRUPTED
     print_result(result, console)
     if config.json is not None:
         config.json.write_text(to_json(result))
