@@ -12,7 +12,7 @@ POLICY ?= scripted:square
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable '.[sitl,screen,dev]'
+	$(PIP) --editable '.[sitl,screen,bench,dev]'
 	touch $@
 
 # The peers live apart: MAVProxy brings the OpenCV build with a GUI, which shadows the headless one.
@@ -43,8 +43,9 @@ lint: $(VENV)/installed  ## format, lint, types, import direction
 test: lint .venv-peers/installed  ## all of lint, then every test
 	$(BIN)/pytest
 
-bench: $(VENV)/installed  ## what the two loops reach on this machine, by policy
-	$(BIN)/python -m benchmarks.flight
+bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link on this machine, and the peers beside us
+	@mkdir -p out
+	$(BIN)/mavbridge bench --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
 
 clean:  ## forget the environments and outputs
 	rm -rf $(VENV) .venv-peers out

@@ -52,22 +52,36 @@ def fly(config: FlyConfig) -> int:
     _check_report(config)
     clock = MonotonicClock()
     console = Console(stderr=True, emoji=False)
-    cv2.utils.logging.setLogLevel(
-        cv2.utils.logging.LOG_LEVEL_SILENT
-    )  # its complaints about a camera come before, and instead of, ours
+    fly_executable(config, _load_policy(config, clock, console), clock=clock, console=console)
+    return 0
+
+
+def fly_executable(
+    config: FlyConfig,
+    executable: Executable,
+    *,
+    clock: Clock,
+    console: Console,
+    sinks: tuple[TickSink, ...] = (),
+) -> None:
+    """Run one flight of a policy that is loaded already; ``sinks`` see every tick.
+
+    Raises:
+        MavbridgeError: for whatever a person can have caused.
+    """
+    # OpenCV's complaints about a camera come before, and instead of, ours.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)  # two loops share two cores: no pool of helpers under either
-    executable = _load_policy(config, clock, console)
     flight: _Flight | None = None
     try:
         with ExitStack() as stack:
-            flight = _Flight(config, clock, console, executable, stack)
+            flight = _Flight(config, clock, console, executable, sinks, stack)
             # Only now: until a stick can have been taken, a signal may simply end the process.
             stop = stack.enter_context(stop_on_signals())
             flight.run(stop)
     finally:
         if flight is not None:
             flight.finish()
-    return 0
 
 
 def _load_policy(config: FlyConfig, clock: Clock, console: Console) -> Executable:
@@ -98,6 +112,7 @@ class _Flight:
         clock: Clock,
         console: Console,
         executable: Executable,
+        sinks: tuple[TickSink, ...],
         stack: ExitStack,
     ) -> None:
         self._config = config
@@ -121,14 +136,14 @@ class _Flight:
         self._link = self._open_link()
         self._viewer = self._open_viewer()
         camera = self._open_camera()
-        sinks: list[TickSink] = [self._timing, self._screen]
+        own: list[TickSink] = [self._timing, self._screen]
         if self._viewer is not None:
-            sinks.append(self._viewer)
+            own.append(self._viewer)
         cache = FeatureCache()
         look = AdaptiveRate(min_hz=self._vision_limits_hz[0], max_hz=self._vision_hz)
         if look.is_adaptive:
-            sinks.append(look)
-        self._sink = FanOut(sinks)
+            own.append(look)
+        self._sink = FanOut([*own, *sinks])
         self._vision = self._make_vision(camera, cache, look)
         self._action = self._make_action(cache)
 

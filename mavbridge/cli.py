@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
-from mavbridge.config import FlyConfig
+from mavbridge.config import BenchConfig, FlyConfig
 from mavbridge.errors import UserError
 
 cli = App(
@@ -27,6 +27,14 @@ def fly(config: FlyConfig | None = None) -> int:
     from mavbridge.app import fly as run_flight  # torch and OpenCV: not for --help
 
     return run_flight(config)
+
+
+@cli.command
+def bench(config: BenchConfig | None = None) -> int:
+    """Measure this machine: engines, loops against a simulated vehicle, the link, the peers."""
+    from mavbridge.bench.run import bench as run_bench  # torch: not for --help
+
+    return run_bench(BenchConfig() if config is None else config)
 
 
 @cli.meta.default

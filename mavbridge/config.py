@@ -217,3 +217,18 @@ class FlyConfig:
     def tick_hz(self) -> float:
         """Rate of the action loop in the chosen mode."""
         return self.rates.action_rate if self.policy.dual_rate else self.rates.rate
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class BenchConfig:
+    """One benchmark run."""
+
+    quick: bool = False
+    """A minute or two instead of nearly ten: figures to look at, not to quote."""
+    json: Path | None = None
+    """Write all figures here as JSON."""
+    plot: Path | None = None
+    """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
+    check: Path | None = None
+    """Compare with this budget of ratios, and exit with 1 if something got worse."""

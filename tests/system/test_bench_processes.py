@@ -1,0 +1,51 @@
+import sys
+from pathlib import Path
+
+import pytest
+
+from mavbridge.bench import processes
+from mavbridge.bench.processes import end, require_source_tree, running, wait
+from mavbridge.errors import UserError
+
+pytestmark = pytest.mark.system
+FOR_EVER = "import threading; print('here', flush=True); threading.Event().wait()"
+DEAF = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); " + FOR_EVER
+
+
+def test_a_process_that_failed_is_quoted(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with (
+        running(sys.executable, "-c", "print('boom'); exit(3)", log=log) as process,
+        pytest.raises(UserError, match="the runner failed with status 3: boom"),
+    ):
+        wait(process, "the runner", log, 30)
+
+
+def test_a_process_that_does_not_end_is_ended(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with (
+        running(sys.executable, "-c", FOR_EVER, log=log) as process,
+        pytest.raises(UserError, match="has not ended"),
+    ):
+        wait(process, "the runner", log, 0.1)
+    assert process.poll() is not None
+
+
+def test_a_process_that_will_not_end_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "END_TIMEOUT_S", 0.5)
+    log = tmp_path / "log"
+    with running(sys.executable, "-c", DEAF, log=log) as process:
+        while b"here" not in log.read_bytes():
+            assert process.poll() is None
+    assert process.poll() is not None
+    end(process)  # once more is harmless
+
+
+def test_outside_the_source_tree_it_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "SOURCE_TREE", tmp_path)
+    with pytest.raises(UserError, match="source tree"):
+        require_source_tree()
