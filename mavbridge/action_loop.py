@@ -26,8 +26,9 @@ from mavbridge.safety import Ask, Engagement, Facts, Hold, check_chunk
 from mavbridge.smoothing import StickSmoother
 from mavbridge.state import Freshness, StateFrame, build_state
 
-Act = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""(feature or image, state [1, 13], history [1, K, 4]) -> chunk [1, horizon, 4]."""
+Act = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
+"""(encoded image, state [1, 13], history [1, K, 4], seconds since the state of the last chunk or
+None to start afresh) -> chunk [1, horizon, 4]."""
 
 NEUTRAL_NS = 50 * NS_PER_MS
 """How long the sticks are neutral before they are given back at the end of a flight."""
@@ -93,6 +94,7 @@ class ActionLoop:
         self._history = SentHistory(length=settings.history_len, dt_s=settings.history_dt_s)
         self._is_flying = False
         self._has_commanded = False
+        self._chunk_state_ns: int | None = None
         self.alive_ns = clock.now_ns()
         """When the last tick ended; read by the watchdog of another thread."""
 
@@ -134,6 +136,7 @@ class ActionLoop:
             return directive.sticks
         if not was_flying:
             self._smoother.reset(_current_sticks(step))
+            self._chunk_state_ns = None
         return self._fly(step)
 
     def _feature_problem(self, step: _Step) -> Release | None:
@@ -149,7 +152,8 @@ class ActionLoop:
             raise RuntimeError("engaged without inputs: the engagement must not allow this")
         started_ns = self._clock.now_ns()
         history = self._history.resample(step.now_ns)
-        chunk = self._act(step.feature.value, step.state.values[None], history)
+        elapsed_s = self._elapsed_s(step.state)
+        chunk = self._act(step.feature.value, step.state.values[None], history, elapsed_s)
         done_ns = self._clock.now_ns()
         step.predict_ns = done_ns - started_ns
         if (refusal := check_chunk(chunk)) is not None:
@@ -159,6 +163,11 @@ class ActionLoop:
         raw = sample_chunk(chunk[0], chunk_dt_s=self._settings.chunk_dt_s, at_s=at_s)
         step.trace = self._smoother.step(raw, done_ns)
         return Command(sticks=step.trace.smoothed)
+
+    def _elapsed_s(self, state: VehicleState) -> float | None:
+        """Time from the state of the last chunk to this one, which becomes the last."""
+        last_ns, self._chunk_state_ns = self._chunk_state_ns, state.attitude_ns
+        return None if last_ns is None else (state.attitude_ns - last_ns) / NS_PER_S
 
     def _ask(self, ask: Ask | None) -> None:
         if ask == "mode" and self._settings.mode is not None:

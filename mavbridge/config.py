@@ -14,6 +14,7 @@ from cyclopts import Parameter
 from mavbridge.clock import NS_PER_S
 from mavbridge.errors import UserError
 
+Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 Output = Literal["rc-override", "manual-control"]
 Pace = Literal["clock", "state"]
 
@@ -152,18 +153,29 @@ class PolicyConfig:
     """Encode images in their own thread and sample actions faster from the cached feature."""
     num_diffusion_steps: int = 10
     """DDIM steps of the action head."""
+    head_steps: int | None = None
+    """DDIM steps from the last chunk, moved to now (dual rate, toge); by default every solve has
+    all steps, from noise."""
     allow_untrained: bool = False
     """Fly TOGE with seeded random weights: for timing and bring-up only."""
     image_size: int | None = None
     """Pixels a side into the encoder; by default what the policy's contract says (224)."""
+    engine: Engine = "auto"
+    """What runs the network; auto takes the fastest that computes what torch computes."""
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:1, mps."""
+    vision_device: str | None = None
+    """Device of the image encoder, if it is another one."""
+    action_device: str | None = None
+    """Device of the action head, if it is another one."""
     seed: int = 0
     """Seed of random weights and of the flight's initial diffusion noise."""
 
     def __post_init__(self) -> None:
         """Refuse what the scheduler and encoders cannot serve."""
         _check("num-diffusion-steps", self.num_diffusion_steps, 1, 100, "steps")
+        if self.head_steps is not None:
+            _check("head-steps", self.head_steps, 1, self.num_diffusion_steps, "steps")
         if self.image_size is not None:
             _check("image-size", self.image_size, 32, 1024, "pixels")
         _check("seed", self.seed, 0, 2**63 - 1, "")

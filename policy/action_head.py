@@ -1,5 +1,6 @@
 """The diffusion action head: a condition vector in, a chunk of stick positions out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -7,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract, PolicyError
-from policy.diffusion import NoiseSchedule, ddim_solve
+from policy.diffusion import DdimStep, NoiseSchedule, ddim_solve
 from policy.unet1d import UNet1d, UNet1dConfig
 
 Size = Literal["small", "medium", "large"]
@@ -63,6 +64,9 @@ class DiffusionHead(nn.Module):
                 widths=dims.widths,
             )
         )
+        self._timesteps: Tensor
+        timesteps = torch.arange(schedule.num_train_timesteps)
+        self.register_buffer("_timesteps", timesteps, persistent=False)
         self.initial_noise: Tensor
         noise = torch.empty(1, contract.horizon, ACTION_DIM)
         self.register_buffer("initial_noise", noise, persistent=False)
@@ -86,7 +90,24 @@ class DiffusionHead(nn.Module):
             PolicyError: the number of steps is not one that the schedule has.
         """
         steps = self.schedule.ddim_steps(num_diffusion_steps)
-        timesteps = torch.tensor([step.timestep for step in steps], device=condition.device)
+        noise = self.initial_noise.expand(condition.shape[0], -1, -1)
+        return self._solve(condition, noise, steps)
+
+    def refine(
+        self, condition: Tensor, guess: Tensor, num_diffusion_steps: int, head_steps: int
+    ) -> Tensor:
+        """``guess`` [B, horizon, 4], noised as far as the last ``head_steps`` denoise -> chunk.
+
+        Raises:
+            PolicyError: the schedule lacks that many steps.
+        """
+        steps = self.schedule.last_steps(num_diffusion_steps, head_steps)
+        noisy = steps[0].signal * guess + steps[0].noise * self.initial_noise
+        return self._solve(condition, noisy, steps)
+
+    def _solve(self, condition: Tensor, noisy: Tensor, steps: Sequence[DdimStep]) -> Tensor:
+        # Picked on the device: a capture of a CUDA graph allows no copy from the host.
+        timesteps = torch.stack([self._timesteps[step.timestep] for step in steps])
         # Both shares of FiLM are outside the loop; row i belongs to step i.
         film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)
         film_of_condition = self.unet.film_of_condition(condition)
@@ -95,5 +116,4 @@ class DiffusionHead(nn.Module):
             prediction: Tensor = self.unet(noisy, film_of_step[index] + film_of_condition)
             return prediction
 
-        noise = self.initial_noise.expand(condition.shape[0], -1, -1)
-        return ddim_solve(self.schedule, steps, denoise, noise)
+        return ddim_solve(self.schedule, steps, denoise, noisy)

@@ -1,10 +1,12 @@
 """Weights on disk: the only module of the flight path that touches files.
 
 ``.safetensors`` holds the contract and the architecture in its header, so the file alone says what
-it is. ``.pt`` and ``.pth`` hold weights; they are read without executing pickles, and what they do
-not say is taken from the caller.
+it is. It also holds a test vector, inputs and the chunks that plain torch made of them where it was
+saved: weights that no longer make them are refused. ``.pt`` and ``.pth`` hold weights; they are
+read without executing pickles, and what they do not say is taken from the caller.
 """
 
+import copy
 import json
 import pickle
 import struct
@@ -14,13 +16,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from policy.contract import Contract, PolicyError
+from policy.contract import Contract, FloatArray, PolicyError
 from policy.diffusion import NoiseSchedule
+from policy.parity import Probe, disagreement, make_probe
+from policy.preprocess import image_to_input
 from policy.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.toge import Toge, TogeConfig
 
@@ -30,6 +35,10 @@ BuiltinConfig: TypeAlias = TogeConfig | ResnetUnetConfig
 CONTRACT_KEY = "contract"
 ARCHITECTURE_KEY = "architecture"
 HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
+VECTOR_PREFIX = "test_vector."
+VECTOR_NAMES = ("rgb", "state", "history", "chunks")
+VECTOR_STEPS = 10
+"""Denoising steps of a test vector, or all if the schedule has fewer; its noise is reset(0)'s."""
 SUFFIXES = (".safetensors", ".pt", ".pth")
 
 _DAMAGED = (
@@ -48,6 +57,8 @@ class _Contents:
     """What a file held; None where it does not say."""
 
     state: dict[str, Tensor]
+    vector: dict[str, Tensor]
+    """Empty, or the test vector by ``VECTOR_NAMES``."""
     contract: str | None
     architecture: str | None
 
@@ -58,7 +69,7 @@ def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
 
 
 def save_checkpoint(path: Path, policy: BuiltinPolicy) -> None:
-    """Write weights, contract and architecture as safetensors; replaces ``path`` at once or not.
+    """Write weights, contract, architecture and a test vector; replaces ``path`` at once or not.
 
     Raises:
         CheckpointError: weights that are not finite, or a path that cannot be written.
@@ -67,6 +78,8 @@ def save_checkpoint(path: Path, policy: BuiltinPolicy) -> None:
         raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
     state = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
     _require_finite(path, state)
+    for name, value in _make_vector(policy).items():
+        state[VECTOR_PREFIX + name] = value
     header = {
         CONTRACT_KEY: policy.contract.to_json(),
         ARCHITECTURE_KEY: _architecture_to_json(policy.config),
@@ -89,7 +102,8 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
             a ``.pt`` does not say.
 
     Raises:
-        CheckpointError: missing, corrupt, of another policy or contract version, not finite.
+        CheckpointError: missing, corrupt, of another policy or contract version, not finite, or
+            it no longer makes the chunks of its test vector.
     """
     contents = _read(path)
     _require_finite(path, contents.state)
@@ -99,7 +113,44 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
         raise CheckpointError(f"{path}: {error}") from error
     _require_fit(path, policy, contents.state)
     policy.load_state_dict(contents.state)
-    return policy.eval()
+    policy.eval()
+    if contents.vector:
+        _require_reproduced(path, policy, contents.vector)
+    return policy
+
+
+def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
+    """Inputs and what plain torch in float32 on a CPU makes of them."""
+    reference = copy.deepcopy(policy).cpu().eval()
+    probe = make_probe(policy.contract)
+    arrays = (probe.rgb, probe.state, probe.history, _chunks(reference, probe))
+    return {name: torch.from_numpy(array) for name, array in zip(VECTOR_NAMES, arrays, strict=True)}
+
+
+@torch.inference_mode()
+def _chunks(policy: BuiltinPolicy, probe: Probe) -> FloatArray:
+    policy.reset(0)
+    images = np.concatenate([image_to_input(rgb, policy.contract) for rgb in probe.rgb])
+    steps = min(VECTOR_STEPS, policy.config.schedule.num_train_timesteps)
+    image, state, history = map(torch.from_numpy, (images, probe.state, probe.history))
+    chunks: FloatArray = policy.predict(image, state, history, steps).numpy()
+    return chunks
+
+
+def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Tensor]) -> None:
+    damaged = f"{path}: its test vector is damaged"
+    if set(vector) != set(VECTOR_NAMES):
+        raise CheckpointError(f"{damaged}: it must hold {list(VECTOR_NAMES)}, not {sorted(vector)}")
+    rgb, state, history, chunks = (vector[name].numpy() for name in VECTOR_NAMES)
+    try:
+        made = _chunks(policy, Probe(rgb=rgb, state=state, history=history))
+    except (PolicyError, RuntimeError, ValueError) as error:
+        raise CheckpointError(f"{damaged}: {error}; copy the file again") from error
+    if (reason := disagreement(chunks, made)) is not None:
+        raise CheckpointError(
+            f"{path}: these weights do not make the sticks that they made where they were saved: "
+            f"{reason}. The file is damaged, or of another version: copy or export it again"
+        )
 
 
 def _config_of(contents: _Contents, fallback: BuiltinConfig) -> BuiltinConfig:
@@ -171,8 +222,17 @@ def _read_safetensors(path: Path) -> _Contents:
                 "written by this project; load the weights as .pt and save them with "
                 "policy.checkpoint.save_checkpoint"
             )
+    vector = {
+        name.removeprefix(VECTOR_PREFIX): state.pop(name)
+        for name in list(state)
+        if name.startswith(VECTOR_PREFIX)
+    }
+    _require_finite(path, vector)
     return _Contents(
-        state=state, contract=header[CONTRACT_KEY], architecture=header[ARCHITECTURE_KEY]
+        state=state,
+        vector=vector,
+        contract=header[CONTRACT_KEY],
+        architecture=header[ARCHITECTURE_KEY],
     )
 
 
@@ -198,6 +258,7 @@ def _read_torch(path: Path) -> _Contents:
         )
     return _Contents(
         state=_weights(path, loaded),
+        vector={},
         contract=_text_or_none(path, loaded, CONTRACT_KEY),
         architecture=_text_or_none(path, loaded, ARCHITECTURE_KEY),
     )

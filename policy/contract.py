@@ -175,6 +175,23 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
         ...
 
 
+@runtime_checkable
+class WarmStartPolicy(DualRatePolicy, Protocol):
+    """A policy that can improve a guess of the chunk in fewer steps than a sample takes."""
+
+    def refine_fast(
+        self,
+        feature: Any,
+        state: Any,
+        action_history: Any,
+        guess: Any,
+        num_diffusion_steps: int,
+        head_steps: int,
+    ) -> Any:
+        """As ``predict_fast``, by its last ``head_steps`` from ``guess`` [B, horizon, 4]."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Executable:
     """A policy ready to run on one engine, numpy in and numpy out, as the loops call it.
@@ -188,7 +205,8 @@ class Executable:
     engine: str
     dual_rate: bool
     encode: Callable[[NDArray[np.uint8]], FloatArray]
-    """RGB [any height, any width, 3] -> feature [1, F]; in single-rate mode -> the preprocessed
-    image [1, 3, H, W]."""
-    act: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-    """(encode's value, state [1, 13], history [1, K, 4]) -> chunk [1, horizon, 4]."""
+    """RGB [any height, any width, 3] -> what ``act`` of the same executable takes: opaque to the
+    loops, float32, of a shape that each engine knows."""
+    act: Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
+    """(encode's value, state [1, 13], history [1, K, 4], seconds from the state of the last chunk
+    to this one or None to start afresh) -> chunk [1, horizon, 4]."""

@@ -15,8 +15,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from policy.contract import Contract, DualRatePolicy, Executable, PolicyError, SingleRatePolicy
+from policy.contract import (
+    Contract,
+    DualRatePolicy,
+    Executable,
+    PolicyError,
+    SingleRatePolicy,
+    WarmStartPolicy,
+)
+from policy.engines.executable import EngineName, Settings
 from policy.scripted import ScriptedPolicy
+from policy.user_code import user_code
 
 if TYPE_CHECKING:
     from policy.checkpoint import BuiltinConfig, BuiltinPolicy
@@ -38,9 +47,13 @@ def load_policy(
     *,
     checkpoint: Path | None,
     allow_untrained: bool,
+    engine: EngineName = "auto",
     device: str,
+    vision_device: str | None = None,
+    action_device: str | None = None,
     dual_rate: bool,
     num_diffusion_steps: int,
+    head_steps: int | None = None,
     image_size: int | None,
     seed: int,
     now_s: Callable[[], float],
@@ -51,9 +64,13 @@ def load_policy(
         spec: one of the forms in the module's docstring.
         checkpoint: weights; a user's class gets it as ``Class(checkpoint=path)``.
         allow_untrained: whether seeded random weights will do where there is no checkpoint.
+        engine: what runs the network; auto = the fastest that passes the parity gate.
         device: torch's name of where to run: cpu, cuda, cuda:0, mps.
+        vision_device: where to encode images, if that is another one.
+        action_device: where to sample chunks, if that is another one.
         dual_rate: asked for; a policy without a fast path is made single-rate, with a note.
-        num_diffusion_steps: denoising steps of every sample.
+        num_diffusion_steps: denoising steps of a full solve.
+        head_steps: denoising steps of a solve from the last chunk; None = all solves are full.
         image_size: height and width that the policy takes; None leaves it to the contract.
         seed: of untrained weights and of the flight's initial noise.
         now_s: monotonic seconds, for scripted programs.
@@ -87,32 +104,41 @@ def load_policy(
             f"warning: {spec} has no fast path (encode_visual and predict_fast), so it flies in "
             "single-rate mode, the whole network for every action"
         )
-    return LoadedPolicy(
-        executable=_executable(spec, policy, device, dual_rate, num_diffusion_steps),
-        notes=tuple(notes),
+    if head_steps is not None and not (dual_rate and isinstance(policy, WarmStartPolicy)):
+        notes.append(
+            f"warning: --head-steps {head_steps} is not used: it takes --dual-rate and a policy "
+            "with refine_fast, such as toge; every solve is a full one"
+        )
+    settings = Settings(
+        name=spec,
+        vision_device=vision_device or device,
+        action_device=action_device or device,
+        num_diffusion_steps=num_diffusion_steps,
+        head_steps=head_steps,
+        dual_rate=dual_rate,
     )
+    executable, engine_notes = _executable(policy, engine, settings)
+    return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes))
 
 
 def _executable(
-    name: str, policy: SingleRatePolicy, device: str, dual_rate: bool, num_diffusion_steps: int
-) -> Executable:
-    """The engine that takes the policy's kind of arrays."""
+    policy: SingleRatePolicy, engine: EngineName, settings: Settings
+) -> tuple[Executable, tuple[str, ...]]:
+    """An engine that takes the policy's kind of arrays, and what to say of it."""
     if policy.contract.arrays == "numpy":
         from policy.engines.direct import make_numpy_executable
 
-        return make_numpy_executable(
-            policy, name=name, num_diffusion_steps=num_diffusion_steps, dual_rate=dual_rate
-        )
-    from policy.engines.torch_eager import make_torch_executable
+        if engine != "auto":
+            raise PolicyError(
+                f"{settings.name} computes in numpy, which --engine {engine} cannot run: leave "
+                "the flag out"
+            )
+        return make_numpy_executable(policy, settings), ()
+    from policy.engines.choose import choose_executable
 
-    _require_device(device)
-    return make_torch_executable(
-        policy,
-        name=name,
-        device=device,
-        num_diffusion_steps=num_diffusion_steps,
-        dual_rate=dual_rate,
-    )
+    for device in (settings.vision_device, settings.action_device):
+        _require_device(device)
+    return choose_executable(policy, engine, settings)
 
 
 def _scripted(
@@ -162,7 +188,21 @@ def _trained(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
         )
     policy.reset(seed)
-    return policy, [f"weights of {checkpoint} ({', '.join(parts)})"]
+    notes = [f"weights of {checkpoint} ({', '.join(parts)})"]
+    if checkpoint.suffix != ".safetensors":
+        notes.append(_assumptions(checkpoint, policy))
+    return policy, notes
+
+
+def _assumptions(checkpoint: Path, policy: "BuiltinPolicy") -> str:
+    contract, schedule = policy.contract, policy.config.schedule
+    return (
+        f"warning: {checkpoint} may hold no contract; it is flown with frame "
+        f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
+        f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
+        f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
+        f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
+    )
 
 
 def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
@@ -184,11 +224,12 @@ def _user_class(spec: str, checkpoint: Path | None) -> SingleRatePolicy:
     if not all(name.isidentifier() for name in names):
         raise PolicyError(f"policy {spec!r} is unknown; write {_FORMS}")
     try:
-        module = importlib.import_module(module_name)
-    except (ImportError, SyntaxError) as error:
+        with user_code(f"importing {module_name} failed"):
+            module = importlib.import_module(module_name)
+    except PolicyError as error:
         raise PolicyError(
-            f"--policy {spec}: cannot import {module_name} ({error}); put its folder on PYTHONPATH "
-            f"or install it, or write {_FORMS}"
+            f"--policy {spec}: {error}; put its folder on PYTHONPATH or install it, or write "
+            f"{_FORMS}"
         ) from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
@@ -204,7 +245,8 @@ def _instance(spec: str, found: type, checkpoint: Path | None) -> SingleRatePoli
     except (TypeError, ValueError) as error:
         call = "Class()" if checkpoint is None else "Class(checkpoint=path)"
         raise PolicyError(f"--policy {spec}: cannot be made with {call}: {error}") from error
-    policy: object = found(**arguments)
+    with user_code(f"--policy {spec}: making it failed"):
+        policy: object = found(**arguments)
     contract = getattr(policy, "contract", None)
     if not isinstance(policy, SingleRatePolicy) or not isinstance(contract, Contract):
         raise PolicyError(

@@ -127,6 +127,24 @@ class Toge(nn.Module):
         condition = self.encode_and_fuse(feature, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)
 
+    def refine_fast(
+        self,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor | None,
+        guess: Tensor,
+        num_diffusion_steps: int,
+        head_steps: int,
+    ) -> Tensor:
+        """As ``predict_fast``, by its last ``head_steps`` from ``guess`` [B, horizon, 4].
+
+        Raises:
+            PolicyError: a shape is not the contract's, or there are not that many steps.
+        """
+        require_shape("guess", guess, self.contract.horizon, ACTION_DIM)
+        condition = self.encode_and_fuse(feature, state, action_history)
+        return self.head.refine(condition, guess, num_diffusion_steps, head_steps)
+
     def predict(
         self,
         image: Tensor,

@@ -126,8 +126,8 @@ class UNet1d(nn.Module):
         self.out = nn.Linear(channels, config.action_dim)
 
         widths_of_blocks = (*widths[:-1], widths[-1], widths[-1], *reversed(widths[:-1]))
-        self._film_sizes = [2 * width for width in widths_of_blocks]
-        self.film_dim = sum(self._film_sizes)
+        self.film_sizes = [2 * width for width in widths_of_blocks]
+        self.film_dim = sum(self.film_sizes)
         self.time_mlp = nn.Sequential(
             nn.Linear(TIME_DIM, 2 * TIME_DIM),
             nn.SiLU(),
@@ -154,7 +154,7 @@ class UNet1d(nn.Module):
 
     def forward(self, noisy: Tensor, film: Tensor) -> Tensor:
         """Noisy actions [B, horizon, action_dim] and FiLM [B, film_dim] -> the net's prediction."""
-        films = iter(torch.split(film, self._film_sizes, dim=-1))
+        films = iter(torch.split(film, self.film_sizes, dim=-1))
         x = noisy
         skips = []
         for block, downsample in zip(self.down, self.downsample, strict=True):

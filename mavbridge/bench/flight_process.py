@@ -74,8 +74,10 @@ def arguments(description: str | None) -> argparse.Namespace:
 def level_climb(executable: Executable) -> Executable:
     """The same work, other sticks."""
 
-    def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        chunk = executable.act(encoded, state, history).copy()
+    def act(
+        encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        chunk = executable.act(encoded, state, history, elapsed_s).copy()
         chunk[...] = (CLIMB_STICK, 0.0, 0.0, 0.0)
         return chunk
 

@@ -19,9 +19,12 @@ from mavbridge.records import Percentiles
 from mavbridge.timing import Histogram
 from policy.checkpoint import build_policy
 from policy.contract import ACTION_DIM, STATE_DIM, Executable
+from policy.engines.executable import EngineName
 from policy.toge import Toge, TogeConfig
 
 ENCODE = "encode one image (EfficientNet-B3)"
+WARM_ELAPSED_S = 0.01
+"""Between two chunks at 100 Hz."""
 SAMPLE = {
     "toge:small": "sample one chunk (TOGE small)",
     "toge:medium": "sample one chunk (TOGE medium)",
@@ -40,7 +43,7 @@ class Effort:
 @dataclass(frozen=True, kw_only=True)
 class _Case:
     work: str
-    engine: str
+    engine: EngineName
     call: Callable[[], object]
 
 
@@ -72,13 +75,16 @@ def rooflines(clock: Clock) -> tuple[Roofline, ...]:
     )
 
 
-def _cases(engine: str) -> list[_Case]:
+def _cases(engine: EngineName) -> list[_Case]:
     cases: list[_Case] = []
     for policy, work in SAMPLE.items():
         executable = engines.load(policy, engine)
         if not cases:  # the image path is the same network for every size of the action path
             cases.append(_Case(work=ENCODE, engine=engine, call=_encode_call(executable)))
-        cases.append(_Case(work=work, engine=engine, call=_act_call(executable)))
+        cases.append(_Case(work=work, engine=engine, call=_act_call(executable, None)))
+        warm = engines.load(policy, engine, head_steps=engines.WARM_STEPS)
+        name = f"{work}, warm start of {engines.WARM_STEPS} steps"
+        cases.append(_Case(work=name, engine=engine, call=_act_call(warm, WARM_ELAPSED_S)))
     return cases
 
 
@@ -88,13 +94,14 @@ def _encode_call(executable: Executable) -> Callable[[], object]:
     return lambda: executable.encode(rgb)
 
 
-def _act_call(executable: Executable) -> Callable[[], object]:
+def _act_call(executable: Executable, elapsed_s: float | None) -> Callable[[], object]:
     contract = executable.contract
-    feature = np.zeros((1, contract.feature_dim), np.float32)
+    feature = executable.encode(np.zeros((64, 64, 3), np.uint8))
     state = np.zeros((1, STATE_DIM), np.float32)
     state[0, 3] = 1.0  # level
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
-    return lambda: executable.act(feature, state, history)
+    executable.act(feature, state, history, None)  # a warm start needs a chunk to start from
+    return lambda: executable.act(feature, state, history, elapsed_s)
 
 
 def _block(call: Callable[[], object], block_s: float, clock: Clock) -> Percentiles:

@@ -34,7 +34,9 @@ ROLL = 3
 """Index in an action."""
 
 
-def repeat_roll_rate(_feature: FloatArray, state: FloatArray, _history: FloatArray) -> FloatArray:
+def repeat_roll_rate(
+    _feature: FloatArray, state: FloatArray, _history: FloatArray, _elapsed_s: float | None
+) -> FloatArray:
     """State [1, 13] -> chunk [1, 16, 4]: the roll stick is the roll rate, in rad/s."""
     chunk = np.zeros((1, Contract.horizon, ACTION_DIM), np.float32)
     chunk[0, :, ROLL] = state[0, RATE][0]

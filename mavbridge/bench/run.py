@@ -124,8 +124,11 @@ def _flights(plan: _Plan, say: Callable[[str], None]) -> tuple[Flight, ...]:
 
 
 def _top_rates(plan: _Plan, say: Callable[[str], None]) -> tuple[TopRate, ...]:
+    """Not of the eager engine, which does not keep even the lowest beside 30 Hz vision."""
     return tuple(
-        flights.top_rate(engine, plan.rates_hz, plan.rate_trial_s, say) for engine in ENGINES
+        flights.top_rate(engine, plan.rates_hz, plan.rate_trial_s, say)
+        for engine in ENGINES
+        if engine != EAGER
     )
 
 

@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 
 from policy.contract import Executable, FloatArray, PolicyError, SingleRatePolicy
-from policy.engines.executable import make_executable
+from policy.engines.executable import Settings, make_executable
 
 NAME = "numpy"
 
 
-def make_numpy_executable(
-    policy: SingleRatePolicy, *, name: str, num_diffusion_steps: int, dual_rate: bool
-) -> Executable:
+def make_numpy_executable(policy: SingleRatePolicy, settings: Settings) -> Executable:
     """Wrap a numpy policy for the loops; tried once.
 
     Raises:
@@ -21,18 +19,13 @@ def make_numpy_executable(
     """
 
     def run(method: Callable[..., Any], *arrays: FloatArray) -> FloatArray:
-        result = method(*arrays)
+        # Copies in and out: what is published is read-only, and what is returned may be a buffer
+        # that the policy writes to again.
+        result = method(*(array.copy() for array in arrays))
         if not isinstance(result, np.ndarray):
             raise PolicyError(
-                f"{name} returned {type(result).__name__}; its contract says numpy arrays"
+                f"{settings.name} returned {type(result).__name__}; its contract says numpy arrays"
             )
-        return np.asarray(result, np.float32)
+        return np.array(result, np.float32)
 
-    return make_executable(
-        policy,
-        run,
-        name=name,
-        engine=NAME,
-        num_diffusion_steps=num_diffusion_steps,
-        dual_rate=dual_rate,
-    )
+    return make_executable(policy, policy, run, run, engine=NAME, settings=settings)

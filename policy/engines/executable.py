@@ -1,7 +1,9 @@
 """What all engines share: the policy's methods as an ``Executable``, tried once before it flies."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +11,38 @@ from numpy.typing import NDArray
 from policy.contract import (
     ACTION_DIM,
     STATE_DIM,
+    Contract,
     DualRatePolicy,
     Executable,
     FloatArray,
     PolicyError,
     SingleRatePolicy,
+    WarmStartPolicy,
 )
+from policy.engines.warm_start import Refine, Sample, WarmStart
 from policy.preprocess import image_to_input
+from policy.user_code import user_code
+
+EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
+Precision = Literal["bf16", "f32"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How a policy is to be executed, whatever the engine."""
+
+    name: str
+    """Of the policy, shown to people."""
+    vision_device: str = "cpu"
+    """torch's name of where images are encoded."""
+    action_device: str = "cpu"
+    """torch's name of where chunks are sampled."""
+    num_diffusion_steps: int = 10
+    """Of a full solve."""
+    head_steps: int | None = None
+    """Of a solve from the last chunk; None = always a full one."""
+    dual_rate: bool = True
+    """Whether encode runs the image path; needs a ``DualRatePolicy``."""
 
 
 class Run(Protocol):
@@ -27,39 +54,90 @@ class Run(Protocol):
 
 
 def make_executable(
-    policy: SingleRatePolicy,
-    run: Run,
+    vision: SingleRatePolicy,
+    action: SingleRatePolicy,
+    run_vision: Run,
+    run_action: Run,
     *,
-    name: str,
     engine: str,
-    num_diffusion_steps: int,
-    dual_rate: bool,
+    settings: Settings,
 ) -> Executable:
-    """Wrap a policy for the loops and try it on a dummy sample, which also warms it up.
+    """Wrap a policy's methods for the loops and try them on a dummy sample.
+
+    Args:
+        vision: the policy where images are encoded.
+        action: the same policy where chunks are sampled.
+        run_vision: how ``vision``'s methods are called.
+        run_action: how ``action``'s methods are called.
+        engine: its name.
+        settings: what was asked for.
 
     Raises:
         PolicyError: no fast path where one was asked for, or the policy failed on the sample.
     """
-    contract = policy.contract
-    encode_visual: Callable[[Any], Any] | None = None
-    predict: Callable[[Any, Any, Any, int], Any] = policy.predict
-    if dual_rate:
-        if not isinstance(policy, DualRatePolicy):
-            raise PolicyError(f"{name} has no encode_visual and predict_fast: fly it single-rate")
-        encode_visual, predict = policy.encode_visual, policy.predict_fast
+    steps = settings.num_diffusion_steps
+    if not settings.dual_rate:
+        sample = partial(run_action, lambda e, s, h: action.predict(e, s, h, steps))
+        return assemble(action.contract, lambda image: image, sample, None, engine, settings)
+    if not isinstance(vision, DualRatePolicy) or not isinstance(action, DualRatePolicy):
+        raise PolicyError(
+            f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
+        )
+    fast = action
+    sample = partial(run_action, lambda e, s, h: fast.predict_fast(e, s, h, steps))
+    refine: Refine | None = None
+    if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
+        warm, head_steps = action, settings.head_steps
+        refine = partial(
+            run_action, lambda e, s, h, g: warm.refine_fast(e, s, h, g, steps, head_steps)
+        )
+    encode = partial(run_vision, vision.encode_visual)
+    return assemble(action.contract, encode, sample, refine, engine, settings)
 
-    def predict_with_steps(observation: Any, state: Any, history: Any) -> Any:
-        return predict(observation, state, history, num_diffusion_steps)
 
-    def encode(rgb: NDArray[np.uint8]) -> FloatArray:
-        image = image_to_input(rgb, contract)
-        return image if encode_visual is None else run(encode_visual, image)
+def assemble(
+    contract: Contract,
+    encode: Callable[[FloatArray], FloatArray],
+    sample: Sample,
+    refine: Refine | None,
+    engine: str,
+    settings: Settings,
+) -> Executable:
+    """An executable of an engine's three functions, tried on a dummy sample, which warms it up.
 
-    def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        return run(predict_with_steps, encoded, state, history)
+    Args:
+        contract: of the policy.
+        encode: normalised image [1, 3, H, W] -> what the others take.
+        sample: full solve.
+        refine: solve from a guess; None = there is none.
+        engine: its name.
+        settings: what was asked for.
+
+    Raises:
+        PolicyError: a function failed on the sample, or returned the wrong shape or no numbers.
+    """
+
+    warm = None if refine is None else WarmStart(sample, refine, chunk_dt_s=contract.chunk_dt_s)
+
+    def encode_rgb(rgb: NDArray[np.uint8]) -> FloatArray:
+        with user_code(f"{settings.name} failed on an image"):
+            return encode(image_to_input(rgb, contract))
+
+    def act(
+        encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        with user_code(f"{settings.name} failed on a state"):
+            if warm is None:
+                return sample(encoded, state, history)
+            return warm(encoded, state, history, elapsed_s)
 
     executable = Executable(
-        contract=contract, name=name, engine=engine, dual_rate=dual_rate, encode=encode, act=act
+        contract=contract,
+        name=settings.name,
+        engine=engine,
+        dual_rate=settings.dual_rate,
+        encode=encode_rgb,
+        act=act,
     )
     _try(executable)
     return executable
@@ -75,17 +153,15 @@ def _try(executable: Executable) -> None:
         encoded = executable.encode(rgb)
         if executable.dual_rate:
             _require(executable, "encode_visual", encoded, (1, contract.feature_dim))
-        chunk = executable.act(encoded, state, history)
-    except PolicyError:
-        raise
-    except (RuntimeError, ValueError, TypeError, AttributeError, LookupError) as error:
+        chunks = [executable.act(encoded, state, history, elapsed_s) for elapsed_s in (None, 0.01)]
+    except PolicyError as error:
         raise PolicyError(
-            f"{executable.name} failed on a dummy sample ({type(error).__name__}: {error}); it "
-            f"gets image [1, 3, {contract.image_height}, {contract.image_width}], "
-            f"state [1, {STATE_DIM}] and action_history [1, {contract.history_len}, {ACTION_DIM}] "
-            f"as {contract.arrays} arrays"
+            f"{error}; this was a dummy sample: image [1, 3, {contract.image_height}, "
+            f"{contract.image_width}], state [1, {STATE_DIM}], action_history "
+            f"[1, {contract.history_len}, {ACTION_DIM}], as {contract.arrays} arrays"
         ) from error
-    _require(executable, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))
+    for chunk in chunks:
+        _require(executable, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))
 
 
 def _require(executable: Executable, what: str, array: FloatArray, shape: tuple[int, ...]) -> None:

@@ -90,6 +90,7 @@ class Rig:
         self.camera = ScriptedCamera(self.vision_clock, self.frames_ns)
         self.pacer = GridPacer(self.clock, period_ns=self.period_ns)
         self.histories: list[FloatArray] = []
+        self.elapsed_s: list[float | None] = []
         self.vision = VisionLoop(
             camera=self.camera,
             encode=self._encode,
@@ -114,8 +115,15 @@ class Rig:
         self.vision_clock.advance_ns(self.encode_ns)
         return np.zeros((1, 8), dtype=np.float32)
 
-    def _act(self, feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+    def _act(
+        self,
+        feature: FloatArray,
+        state: FloatArray,
+        history: FloatArray,
+        elapsed_s: float | None,
+    ) -> FloatArray:
         tick = len(self.histories)
+        self.elapsed_s.append(elapsed_s)
         self.histories.append(history)
         self.clock.advance_ns(self.act_ns(tick))
         return self.chunk(tick)
@@ -278,6 +286,29 @@ def test_the_chunk_is_sampled_at_the_time_it_acts() -> None:
     # state 2 ms old at the tick, 3 ms of inference, 50 ms of lead on a ramp of 1/s
     assert rig.sink.ticks[-1].trace is not None
     assert rig.sink.ticks[-1].trace.raw.roll == pytest.approx(0.055, abs=1e-6)
+
+
+def test_the_policy_is_told_the_time_since_the_state_of_its_last_chunk() -> None:
+    rig = Rig(act_ns=lambda tick: 13 * MS if tick == 20 else 3 * MS)
+
+    def poll(link: FakeLink) -> None:
+        link.armed = not 500 * MS <= link.clock.now_ns() - START_NS < 700 * MS
+
+    rig.link.on_poll = poll
+    rig.fly(1.0)
+    assert rig.elapsed_s[0] is None
+    assert rig.elapsed_s[1:21] == pytest.approx([0.01] * 20)
+    assert rig.elapsed_s[21] == pytest.approx(0.02)  # a slot was missed
+    (again,) = (k for k, elapsed_s in enumerate(rig.elapsed_s[1:], 1) if elapsed_s is None)
+    assert rig.elapsed_s[again - 1 : again + 2] == pytest.approx([0.01, None, 0.01])
+
+
+def test_a_chunk_that_is_refused_is_not_built_upon() -> None:
+    def chunk(tick: int) -> FloatArray:
+        return np.full((1, 16, 4), np.nan if tick == 9 else 0.25, np.float32)
+
+    rig = Rig(chunk=chunk).fly(0.3)
+    assert rig.elapsed_s[:12] == pytest.approx([None, *[0.01] * 9, None, 0.01])
 
 
 def test_a_faster_camera_is_thinned_to_the_visual_rate() -> None:

@@ -56,6 +56,47 @@ def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
+def contents_of(path: Path) -> dict[str, torch.Tensor]:
+    with safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+def test_a_test_vector_is_carried_and_kept(small_toge: Toge, saved: Path) -> None:
+    contents = contents_of(saved)
+    assert contents["test_vector.rgb"].shape == (4, 32, 32, 3)
+    assert contents["test_vector.chunks"].shape == (4, 16, 4)
+    assert contents["test_vector.chunks"].abs().max() > 0.1
+    loaded = load_checkpoint(saved, fallback=small_toge.config)
+    assert not any(name.startswith("test_vector") for name in loaded.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"test_vector.chunks": lambda x: x + 0.02}, r"off by 0\.02.*damaged"),
+        ({"test_vector.chunks": lambda x: x[:2]}, "chunks of shape"),
+        ({"test_vector.chunks": lambda x: x * float("nan")}, "NaN"),
+        ({"test_vector.rgb": lambda x: x.flip(0)}, "do not make the sticks"),
+        ({"test_vector.rgb": lambda x: x.float()}, "test vector is damaged: an image must be"),
+        ({"test_vector.state": lambda x: x[:, :12]}, "test vector is damaged: state must be"),
+        ({"test_vector.history": lambda x: None}, "test vector is damaged: it must hold"),
+        ({"head.unet.out.weight": lambda x: -x}, "do not make the sticks that they made"),
+    ],
+)
+def test_weights_that_do_not_make_their_vector_are_refused(
+    small_toge: Toge, saved: Path, tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    contents = contents_of(saved)
+    for name, change in changes.items():
+        changed = change(contents.pop(name))
+        if changed is not None:
+            contents[name] = changed.contiguous()
+    path = tmp_path / "a.safetensors"
+    save_file(contents, path, metadata=header_of(saved))
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint(path, fallback=small_toge.config)
+
+
 def test_resnet_unet_round_trips(tmp_path: Path) -> None:
     policy = build_policy(ResnetUnetConfig(contract=SMALL))
     save_checkpoint(tmp_path / "a.safetensors", policy)

@@ -22,6 +22,7 @@ def load(spec: str, **changes: Any) -> LoadedPolicy:
     arguments: dict[str, Any] = {
         "checkpoint": None,
         "allow_untrained": False,
+        "engine": "torch",
         "device": "cpu",
         "dual_rate": True,
         "num_diffusion_steps": 2,
@@ -29,12 +30,14 @@ def load(spec: str, **changes: Any) -> LoadedPolicy:
         "seed": 0,
         "now_s": lambda: 0.0,
     }
+    if spec.startswith(("scripted", "my_user_policies")):
+        arguments["engine"] = "auto"  # what they compute in has no choice of engines
     return load_policy(spec, **{**arguments, **changes})
 
 
 def act(loaded: LoadedPolicy) -> np.ndarray:
     executable = loaded.executable
-    return executable.act(executable.encode(RGB), STATE, HISTORY)
+    return executable.act(executable.encode(RGB), STATE, HISTORY, None)
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +76,38 @@ def test_untrained_weights_are_seeded_and_said() -> None:
     np.testing.assert_array_equal(act(first), act(again))
     assert not np.array_equal(act(first), act(other))
     assert torch.equal(torch.random.get_rng_state(), torch_state)
+
+
+def test_the_fastest_engine_that_agrees_flies_and_is_named(checkpoint: Path) -> None:
+    fast, reference = (
+        load("toge", checkpoint=checkpoint, engine=engine, head_steps=1)
+        for engine in ("auto", "torch")
+    )
+    assert fast.executable.engine.startswith("openvino")
+    assert any("agrees with torch" in note for note in fast.notes)
+    np.testing.assert_allclose(act(fast), act(reference), atol=0.01)
+
+
+def test_single_rate_takes_the_fast_engine_too(tmp_path: Path) -> None:
+    contract = Contract(image_height=32, image_width=32)
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, build_policy(ResnetUnetConfig(contract=contract)))
+    fast, reference = (
+        load("resnet-unet", checkpoint=path, engine=engine, dual_rate=False)
+        for engine in ("openvino", "torch")
+    )
+    assert fast.executable.engine.startswith("openvino")
+    np.testing.assert_allclose(act(fast), act(reference), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("spec", "changes"),
+    [("resnet-unet", {}), ("toge:small:resnet18", {"dual_rate": False}), ("scripted:hover", {})],
+)
+def test_head_steps_where_they_have_no_use_are_said(spec: str, changes: dict[str, Any]) -> None:
+    untrained = not spec.startswith("scripted")
+    loaded = load(spec, allow_untrained=untrained, image_size=32, head_steps=1, **changes)
+    assert any("--head-steps 1 is not used" in note for note in loaded.notes)
 
 
 def test_untrained_needs_permission() -> None:
@@ -143,8 +178,12 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("toge:resnet18", {"allow_untrained": True, "image_size": 1}, "image_height"),
         ("resnet-unet", {"allow_untrained": True, "device": "tpu"}, "this machine has"),
         ("resnet-unet", {"allow_untrained": True, "device": "cuda:99"}, "this machine has"),
+        ("resnet-unet", {"allow_untrained": True, "vision_device": "cuda:9"}, "this machine has"),
+        ("resnet-unet", {"allow_untrained": True, "action_device": "cuda:9"}, "this machine has"),
+        ("toge:resnet18", {"allow_untrained": True, "image_size": 32, "head_steps": 3}, r"1\.\.2"),
+        ("scripted:yaw", {"engine": "openvino"}, "computes in numpy"),
         ("resnet-unet", {"allow_untrained": True, "num_diffusion_steps": 101}, r"1\.\.100"),
-        ("no_such_module:Policy", {}, "cannot import no_such_module"),
+        ("no_such_module:Policy", {}, "importing no_such_module failed"),
         ("policy.contract:Nothing", {}, "no class Nothing"),
         ("policy.contract:STATE_DIM", {}, "no class STATE_DIM"),
     ],
@@ -241,5 +280,5 @@ def test_a_class_that_will_not_do_is_refused(
 
 
 def test_a_module_with_a_syntax_error_is_refused(user_module: str) -> None:
-    with pytest.raises(PolicyError, match="cannot import my_broken_policies"):
+    with pytest.raises(PolicyError, match="importing my_broken_policies failed"):
         load("my_broken_policies:Policy")

@@ -1,0 +1,121 @@
+"""Which engine runs a policy: the fastest that is present and computes what plain torch computes.
+
+An engine that cannot be made, or fails the parity gate, is passed over with its reason said; torch,
+the reference, is last.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+
+from policy.contract import Executable, FloatArray, PolicyError, SingleRatePolicy
+from policy.engines.executable import EngineName, Precision, Settings
+from policy.engines.torch_eager import make_torch_executable
+from policy.parity import Probe, disagreement, make_probe
+from policy.resnet_unet import ResnetUnet
+from policy.toge import Toge
+
+BUILTIN = (Toge, ResnetUnet)
+PROBE_ELAPSED_S = 0.02
+"""Between the two chunks of a sample: with a warm start, the second one is a refinement."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """An engine to try."""
+
+    label: str
+    make: Callable[[], Executable]
+
+
+def choose_executable(
+    policy: SingleRatePolicy, engine: EngineName, settings: Settings
+) -> tuple[Executable, tuple[str, ...]]:
+    """The executable and lines for a person: the engine, and why faster ones were passed over.
+
+    Raises:
+        PolicyError: the engine asked for is absent here or does not serve this policy or device;
+            or the policy itself failed.
+    """
+    if engine == "torch" or (engine == "auto" and not isinstance(policy, BUILTIN)):
+        return make_torch_executable(policy, settings), ()
+    if not isinstance(policy, BUILTIN):
+        raise PolicyError(
+            f"--engine {engine} knows toge and resnet-unet only: leave it out, and "
+            f"{settings.name} runs on torch"
+        )
+    candidates = _candidates(policy, engine, settings)
+    return first_faithful(policy, candidates, settings)
+
+
+def first_faithful(
+    policy: Toge | ResnetUnet, candidates: list[Candidate], settings: Settings
+) -> tuple[Executable, tuple[str, ...]]:
+    """The first candidate that passes the gate, or torch, with a line for each one passed over.
+
+    Raises:
+        PolicyError: the policy fails on torch itself.
+    """
+    notes: list[str] = []
+    if candidates:
+        on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
+        probe = make_probe(policy.contract)
+        expected = probe_chunks(make_torch_executable(policy, on_cpu), probe)
+    for candidate in candidates:
+        try:
+            executable = candidate.make()
+            reason = disagreement(expected, probe_chunks(executable, probe))
+        except (PolicyError, RuntimeError, TypeError) as error:
+            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
+        if reason is None:
+            return executable, (*notes, f"engine {executable.engine}: agrees with torch")
+        notes.append(f"warning: engine {candidate.label} is passed over: {reason}")
+    return make_torch_executable(policy, settings), tuple(notes)
+
+
+def probe_chunks(executable: Executable, probe: Probe) -> FloatArray:
+    """Chunks [2 * samples, horizon, 4] from image to stick: each sample afresh, then once more."""
+    chunks = []
+    for rgb, state, history in zip(probe.rgb, probe.state, probe.history, strict=True):
+        encoded = executable.encode(rgb)
+        for elapsed_s in (None, PROBE_ELAPSED_S):
+            chunks.append(executable.act(encoded, state[None], history[None], elapsed_s)[0])
+    return np.stack(chunks)
+
+
+def _candidates(
+    policy: Toge | ResnetUnet, engine: EngineName, settings: Settings
+) -> list[Candidate]:
+    devices = {settings.vision_device.split(":")[0], settings.action_device.split(":")[0]}
+    if engine == "openvino" and devices != {"cpu"}:
+        raise PolicyError(f"--engine openvino runs on --device cpu, not on {sorted(devices)}")
+    if engine == "cuda-graph" and devices != {"cuda"}:
+        raise PolicyError(f"--engine cuda-graph runs on --device cuda, not on {sorted(devices)}")
+    if devices == {"cpu"} and find_spec("openvino") is not None:
+        return _openvino(policy, settings)
+    if engine == "openvino":
+        raise PolicyError("--engine openvino: the package is missing; pip install openvino")
+    if devices == {"cuda"} and torch.cuda.is_available():
+        return [_cuda_graph(policy, settings)]
+    return []
+
+
+def _openvino(policy: Toge | ResnetUnet, settings: Settings) -> list[Candidate]:
+    from policy.engines.openvino_cpu import make_openvino_executable, precisions
+
+    def candidate(vision: Precision, action: Precision) -> Candidate:
+        return Candidate(
+            label=f"openvino (images {vision}, actions {action})",
+            make=lambda: make_openvino_executable(policy, settings, vision, action),
+        )
+
+    return [candidate(vision, action) for vision, action in precisions()]
+
+
+def _cuda_graph(policy: Toge | ResnetUnet, settings: Settings) -> Candidate:
+    from policy.engines.cuda_graph import make_cuda_graph_executable
+
+    return Candidate(label="cuda-graph", make=lambda: make_cuda_graph_executable(policy, settings))

@@ -1,0 +1,67 @@
+"""Compiled graphs on disk, so that the second start of a policy is a quick one.
+
+A cache and nothing more: whatever goes wrong with a file or its folder means that a graph is
+compiled again. Entries carry a checksum, because an engine that reads half a file may crash.
+"""
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+MAX_ENTRIES = 12
+"""Files kept, the least recently used goes first: about four policies of three graphs each."""
+_DIGEST_BYTES = hashlib.sha256().digest_size
+
+
+def user_cache_folder() -> Path:
+    """XDG base directory specification: $XDG_CACHE_HOME or ~/.cache; an own folder in it."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    # The specification says to ignore a relative path.
+    root = Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()
+    return root / "mavbridge"
+
+
+class CompileCache:
+    """Bytes by key, in one folder of a file each."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def load(self, key: str) -> bytes | None:
+        """What was stored under ``key``; None where that is nothing, unreadable or damaged."""
+        path = self._path(key)
+        try:
+            content = path.read_bytes()
+            path.touch()
+        except OSError:
+            return None
+        digest, blob = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        return blob if hashlib.sha256(blob).digest() == digest else None
+
+    def store(self, key: str, blob: bytes) -> None:
+        """Keep ``blob``, if that is possible; older entries give way."""
+        path = self._path(key)
+        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            partial.write_bytes(hashlib.sha256(blob).digest() + blob)
+            partial.replace(path)
+            self._make_room()
+        except OSError:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+
+    def _path(self, key: str) -> Path:
+        return self._folder / f"{hashlib.sha256(key.encode()).hexdigest()}.graph"
+
+    def _make_room(self) -> None:
+        newest_first = sorted(self._entries(), reverse=True)
+        for _, path in newest_first[MAX_ENTRIES:]:
+            path.unlink(missing_ok=True)
+
+    def _entries(self) -> Iterator[tuple[int, Path]]:
+        for path in self._folder.glob("*.graph*"):  # leftovers of a killed process count too
+            with contextlib.suppress(FileNotFoundError):  # another process made room
+                yield path.stat().st_mtime_ns, path

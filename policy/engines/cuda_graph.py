@@ -1,0 +1,111 @@
+"""NVIDIA GPUs: the image path and the action path captured once as CUDA graphs, then replayed.
+
+A replay launches hundreds of kernels in one call, which is what an action head on a GPU spends its
+time on. Each path has a stream of its own, the action's with high priority, so that a tick does not
+wait for an image; where both are on one GPU the encoder's kernels still run between its kernels.
+
+Every graph reads and writes static memory. Inputs go up and results come down through pinned memory
+on the graph's own stream, and the caller waits for an event behind them: nothing of a replay is
+left in flight, and encoded images are handed over as arrays, so no tensor has two streams.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from policy.contract import ACTION_DIM, STATE_DIM, Executable, FloatArray, PolicyError
+from policy.engines.executable import Settings, assemble
+from policy.engines.warm_start import Refine
+from policy.resnet_unet import ResnetUnet
+from policy.toge import Toge
+
+NAME = "cuda-graph"
+WARM_UP_CALLS = 3
+"""Before a capture, so that libraries have their choices and handles (PyTorch's CUDA notes)."""
+HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
+"""Of CUDA streams."""
+
+
+def make_cuda_graph_executable(policy: Toge | ResnetUnet, settings: Settings) -> Executable:
+    """Capture a copy of the policy for the loops; tried once.
+
+    Raises:
+        PolicyError: it failed on a dummy sample.
+        RuntimeError: a capture failed.
+    """
+    contract, steps = policy.contract, settings.num_diffusion_steps
+    action_device = torch.device(settings.action_device)
+    action = copy.deepcopy(policy).to(action_device).eval()
+    image = (1, 3, contract.image_height, contract.image_width)
+    rest = ((1, STATE_DIM), (1, contract.history_len, ACTION_DIM))
+    stream = _stream(action_device, HIGH_PRIORITY)
+    if not settings.dual_rate or not isinstance(action, Toge):
+        if settings.dual_rate:
+            raise PolicyError(f"{settings.name} has no fast path: fly it single-rate")
+        predict = _Graph(lambda i, s, h: action.predict(i, s, h, steps), (image, *rest), stream)
+        return assemble(contract, lambda array: array, predict, None, NAME, settings)
+    toge = action
+    vision_device = torch.device(settings.vision_device)
+    vision = toge if vision_device == action_device else copy.deepcopy(toge).to(vision_device)
+    encode = _Graph(vision.encode_visual, (image,), _stream(vision_device, NORMAL_PRIORITY))
+    fast = ((1, contract.feature_dim), *rest)
+    sample = _Graph(lambda e, s, h: toge.predict_fast(e, s, h, steps), fast, stream)
+    refine: Refine | None = None
+    if (head_steps := settings.head_steps) is not None:
+        shapes = (*fast, (1, contract.horizon, ACTION_DIM))
+        refine = _Graph(
+            lambda e, s, h, g: toge.refine_fast(e, s, h, g, steps, head_steps), shapes, stream
+        )
+    return assemble(contract, encode, sample, refine, NAME, settings)
+
+
+def _stream(device: torch.device, priority: int) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device, priority)  # type: ignore[no-untyped-call]
+
+
+class _Graph:
+    """A function captured with static inputs and output; for one thread."""
+
+    def __init__(
+        self,
+        function: Callable[..., Tensor],
+        shapes: Sequence[tuple[int, ...]],
+        stream: torch.cuda.Stream,
+    ) -> None:
+        self._stream = stream
+        self._pinned = [torch.zeros(shape, pin_memory=True) for shape in shapes]
+        # Work of other streams that this one builds upon, such as the copy of the weights.
+        torch.cuda.synchronize(stream.device)
+        with torch.cuda.device(stream.device), torch.cuda.stream(stream), torch.inference_mode():
+            self._inputs = [host.to(stream.device) for host in self._pinned]
+            for _ in range(WARM_UP_CALLS):
+                function(*self._inputs)
+            stream.synchronize()
+            self._graph = torch.cuda.CUDAGraph()
+            # thread_local: what other threads do with CUDA meanwhile does not end the capture.
+            with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
+                self._output = function(*self._inputs)
+            self._result = torch.zeros(self._output.shape, pin_memory=True)
+        self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
+
+    def __call__(self, *arrays: FloatArray) -> FloatArray:
+        """Run the graph; the result is the caller's.
+
+        Raises:
+            PolicyError: an array is not of the input's shape.
+        """
+        for host, array in zip(self._pinned, arrays, strict=True):
+            if array.shape != tuple(host.shape):
+                raise PolicyError(f"an input must be {list(host.shape)}, got {list(array.shape)}")
+            np.copyto(host.numpy(), array)
+        with torch.cuda.stream(self._stream), torch.inference_mode():
+            for host, device in zip(self._pinned, self._inputs, strict=True):
+                device.copy_(host, non_blocking=True)
+            self._graph.replay()
+            self._result.copy_(self._output, non_blocking=True)
+            self._done.record(self._stream)
+        self._done.synchronize()  # without the GIL
+        return self._result.numpy().copy()

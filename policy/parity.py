@@ -1,0 +1,65 @@
+"""Whether two ways to compute a policy agree, from image to stick."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, Contract, FloatArray
+
+MIN_COSINE = 0.999
+"""Of two chunks as vectors, of each sample."""
+MAX_STICK_ERROR = 0.01
+"""In full deflections: 5 us of PWM on the usual 1000..2000 us."""
+SAMPLES = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probe:
+    """Made-up inputs that reach all of a policy; the same for the same contract."""
+
+    rgb: NDArray[np.uint8]
+    """[samples, image_height, image_width, 3]"""
+    state: FloatArray
+    """[samples, 13] in the ranges of flight"""
+    history: FloatArray
+    """[samples, K, 4]"""
+
+
+def make_probe(contract: Contract) -> Probe:
+    """Soft random images, and states and sticks of a brisk flight."""
+    random = np.random.default_rng(0)
+    height, width = contract.image_height, contract.image_width
+    coarse = random.integers(0, 256, (SAMPLES, 8, 8, 3), dtype=np.uint8)
+    rows, columns = np.arange(height) * 8 // height, np.arange(width) * 8 // width
+    fine = random.integers(0, 32, (SAMPLES, height, width, 3), dtype=np.uint8)
+    rgb = coarse[:, rows][:, :, columns] // 8 * 7 + fine
+    state = random.normal(0.0, 2.0, (SAMPLES, STATE_DIM))
+    state[:, QUATERNION] /= np.linalg.norm(state[:, QUATERNION], axis=1, keepdims=True)
+    history = random.uniform(-1.0, 1.0, (SAMPLES, contract.history_len, ACTION_DIM))
+    return Probe(
+        rgb=rgb.astype(np.uint8),
+        state=state.astype(np.float32),
+        history=history.astype(np.float32),
+    )
+
+
+def disagreement(expected: FloatArray, chunks: FloatArray) -> str | None:
+    """Why two arrays of chunks [samples, horizon, 4] are not the same policy, or None."""
+    if expected.shape != chunks.shape:
+        return f"chunks of shape {list(chunks.shape)} instead of {list(expected.shape)}"
+    if not np.isfinite(chunks).all():
+        return "NaN or infinity in a chunk"
+    furthest = float(np.abs(expected - chunks).max())
+    cosine = min(_cosine(a, b) for a, b in zip(expected, chunks, strict=True))
+    if furthest <= MAX_STICK_ERROR and cosine >= MIN_COSINE:
+        return None
+    return (
+        f"a stick is off by {furthest:.4f} (at most {MAX_STICK_ERROR}), the cosine is "
+        f"{cosine:.5f} (at least {MIN_COSINE})"
+    )
+
+
+def _cosine(a: FloatArray, b: FloatArray) -> float:
+    lengths = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float((a * b).sum()) / lengths if lengths > 0 else float(np.array_equal(a, b))
