@@ -187,7 +187,7 @@ def _trained(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
         )
     policy.reset(seed)
-    return policy, [f"weights of {checkpoint} ({', '.join(parts)})"]
+    return policy, [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
 
 
 def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
@@ -199,7 +199,7 @@ def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", lis
         torch.manual_seed(seed)
         policy = build_policy(config).eval()
     policy.reset(seed)
-    note = f"untrained: seeded random weights (seed {seed}); for timing and bring-up only"
+    note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
     return policy, [note]
 
 
