@@ -188,7 +188,7 @@ def _trained(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
         )
     policy.reset(seed)
-    notes = [f"weights of {checkpoint} ({', '.join(parts)})"]
+    notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
     if checkpoint.suffix != ".safetensors":
         notes.append(_assumptions(checkpoint, policy))
     return policy, notes
@@ -214,7 +214,7 @@ def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", lis
         torch.manual_seed(seed)
         policy = build_policy(config).eval()
     policy.reset(seed)
-    note = f"untrained: seeded random weights (seed {seed}); for timing and bring-up only"
+    note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
     return policy, [note]
 
 

@@ -72,7 +72,7 @@ def test_untrained_weights_are_seeded_and_said() -> None:
         load("toge:small:resnet18", allow_untrained=True, image_size=32, seed=seed)
         for seed in (3, 3, 4)
     )
-    assert "untrained: seeded random weights (seed 3)" in first.notes[0]
+    assert "untrained: seeded random weights (seed 3, noise too)" in first.notes[0]
     np.testing.assert_array_equal(act(first), act(again))
     assert not np.array_equal(act(first), act(other))
     assert torch.equal(torch.random.get_rng_state(), torch_state)
