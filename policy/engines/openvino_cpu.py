@@ -16,6 +16,7 @@ from policy.contract import Executable, FloatArray, PolicyError
 from policy.engines.compile_cache import CompileCache, user_cache_folder
 from policy.engines.executable import Precision, Settings, assemble
 from policy.engines.openvino_graph import refine_graph, sample_graph, vision_graph
+from policy.engines.signal_stack import signal_stack_kept
 from policy.resnet_unet import ResnetUnet
 from policy.toge import Toge
 
@@ -30,6 +31,7 @@ _PROPERTIES = {
 }
 
 
+@signal_stack_kept()
 def precisions() -> tuple[tuple[Precision, Precision], ...]:
     """Pairs to try for the image and the action path, the fastest first.
 
@@ -40,6 +42,7 @@ def precisions() -> tuple[tuple[Precision, Precision], ...]:
     return (("f32", "f32"),)
 
 
+@signal_stack_kept()
 def make_openvino_executable(
     policy: Toge | ResnetUnet, settings: Settings, vision: Precision, action: Precision
 ) -> Executable:

@@ -14,7 +14,7 @@ def test_every_code_comes_back_through_policy_and_calibration() -> None:
     state = np.zeros((1, 13), np.float32)
     for code in range(CODES):
         state[0, 7] = stick_of(code)
-        chunk = repeat_roll_rate(feature, state, history)
+        chunk = repeat_roll_rate(feature, state, history, None)
         assert chunk.shape == (1, 16, 4)
         roll_us = calibration(PARAMS).to_pwm_us(Sticks(*chunk[0, 0].tolist()))[3]
         assert roll_us == 1000 + code
