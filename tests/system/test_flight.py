@@ -18,7 +18,7 @@ def assert_handed_back(flown: Flight) -> None:
     overrides = flown.relay.overrides
     releases = [k for k, sticks in enumerate(overrides) if sticks == RELEASE]
     assert releases == list(range(len(overrides) - 10, len(overrides)))
-    assert set(overrides[-15:-10]) == {NEUTRAL}
+    assert overrides[-11] == NEUTRAL
 
 
 def test_takes_off_holds_altitude_and_hands_back(tmp_path: Path) -> None:
@@ -92,7 +92,8 @@ def test_toge_runs_both_loops_untrained(tmp_path: Path) -> None:
         status, output = flown.end()
     assert status == 0, output
     report = flown.report()
-    assert (report["mode"], report["engine"][:5]) == ("dual", "torch")
+    assert report["mode"] == "dual"
+    assert report["engine"].startswith("openvino")
     assert report["action"]["predict_ms"]["p50"] > 0
     assert report["vision"]["encode_ms"]["p50"] > 0
     assert flown.relay.overrides == []
