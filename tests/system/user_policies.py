@@ -53,5 +53,5 @@ class Hanging(Climbing):
         self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
     ) -> Array:
         if self._calls == 100:
-            time.sleep(1.5)  # noqa: TID251 - the hang itself
+            time.sleep(2.5)  # noqa: TID251 - the hang itself
         return super().predict_fast(feature, state, action_history, num_diffusion_steps)
