@@ -225,11 +225,6 @@ class FlyConfig:
         if self.link.readonly and (self.arm or self.mode is not None):
             raise UserError("--readonly sends nothing, so it cannot be used with --arm or --mode")
 
-    @property
-    def tick_hz(self) -> float:
-        """Rate of the action loop in the chosen mode."""
-        return self.rates.action_rate if self.policy.dual_rate else self.rates.rate
-
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)

@@ -130,11 +130,12 @@ class Engagement:
     def _on_ground(self, facts: Facts) -> Directive:
         self.phase = Phase.WAITING
         wants_mode = self._wanted_mode is not None and not self._has_wanted_mode(facts)
-        if self.engaged_ns is not None or not self._may_arm:
+        if self.engaged_ns is not None:
             self._own_mode = None
-            ask: Ask | None = "mode" if wants_mode and self.engaged_ns is None else None
-            if self.engaged_ns is not None:
-                return self._wait("disarmed: the flight is over, or arm it yourself")
+            return self._wait("disarmed: the flight is over, or arm it yourself")
+        if not self._may_arm:
+            self._own_mode = None
+            ask: Ask | None = "mode" if wants_mode else None
             return self._wait("disarmed: arm the vehicle, or start with --arm", ask)
         if self._wanted_mode is None and facts.mode not in PILOTED_MODES:
             return self._wait(f"{facts.mode} is not flown with sticks: name one with --mode")

@@ -171,7 +171,7 @@ class MavlinkLink:
     def _problem(self, now_ns: int) -> str | None:
         if self._wire.is_down:
             return "the link is down"
-        if self._vehicle is None or self._vehicle.status() is None:
+        if self._vehicle is None or not self._vehicle.has_beaten:
             return "waiting for the vehicle's heartbeat"
         if self._vehicle.is_lost(now_ns):
             return "the vehicle's heartbeat is lost"

@@ -1,5 +1,8 @@
 """What is known of the vehicle that was chosen, and whether it can be flown."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.clock import NS_PER_S
@@ -34,6 +37,22 @@ _SWITCH_ON_US = 1800
 """ArduPilot's threshold of a high auxiliary switch."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Override:
+    """What the parameters say of overriding this vehicle."""
+
+    obstacles: str
+    """Why it would not obey us; empty where nothing speaks against it."""
+    switch_channel: int | None
+
+    @classmethod
+    def read(cls, values: Mapping[str, float], source_system: int) -> "_Override":
+        return cls(
+            obstacles="; ".join(params.override_obstacles(values, source_system)),
+            switch_channel=params.override_switch(values),
+        )
+
+
 class Vehicle:
     """One vehicle from its first heartbeat to its next reboot.
 
@@ -64,6 +83,7 @@ class Vehicle:
         )
         self._beat: tuple[int, Heartbeat] | None = None
         self._rc: tuple[int, RcChannels] | None = None
+        self._override: _Override | None = None
         self._boot_ms = 0
         self._old_stamps = 0
 
@@ -141,14 +161,20 @@ class Vehicle:
         """Why it cannot be flown now, before any stick is sent; None if it can."""
         if (problem := self.handshake.problem) is not None or not self._is_override:
             return problem
-        obstacles = params.override_obstacles(self.handshake.values, self._config.source_system)
-        if reasons := "; ".join(obstacles):
-            return f"the vehicle would not act on our sticks: {reasons}"
-        if (channel := params.override_switch(self.handshake.values)) is not None:
+        if self._override is None:  # once: the parameters are all read by now
+            self._override = _Override.read(self.handshake.values, self._config.source_system)
+        if self._override.obstacles:
+            return f"the vehicle would not act on our sticks: {self._override.obstacles}"
+        if (channel := self._override.switch_channel) is not None:
             values = self._rc[1].channels_us if self._rc else ()
             if len(values) < channel or values[channel - 1] < _SWITCH_ON_US:
                 return f"the override switch (RC{channel}) is off"
         return None
+
+    @property
+    def has_beaten(self) -> bool:
+        """Its heartbeat was heard, since it was chosen."""
+        return self._beat is not None
 
     def is_lost(self, now_ns: int) -> bool:
         """It has stopped beating."""
