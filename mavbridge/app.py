@@ -1,12 +1,10 @@
 """Composition root: builds one flight from its config, starts it, and stops it in reverse order."""
 
-import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 
 import cv2
 from rich.console import Console
@@ -28,6 +26,7 @@ from mavbridge.safety import Engagement
 from mavbridge.smoothing import Smoothing, StickSmoother
 from mavbridge.state import Freshness
 from mavbridge.state_pacer import StatePacer
+from mavbridge.stopping import StopRequest, stop_on_signals
 from mavbridge.terminal import FlightScreen
 from mavbridge.timing import FlightTiming, ObserverDrops, TimingReport, report_json
 from mavbridge.vision_loop import VisionLoop
@@ -218,7 +217,7 @@ class _Flight:
             ),
         )
 
-    def run(self, stop: threading.Event) -> None:
+    def run(self, stop: StopRequest) -> None:
         """Fly until the action loop ends, the camera dies, or somebody says stop."""
         rates = self._config.rates
         vision = Worker("mavbridge-vision", self._scheduled(self._vision.run, cpu=rates.vision_cpu))
@@ -305,24 +304,3 @@ def _check_report(config: FlyConfig) -> None:
         config.report.open("a").close()
     except OSError as error:
         raise UserError(f"cannot write --report {config.report}: {error.strerror}") from error
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
-    """Signals that end a process set the event; the flight ends in order, however many come."""
-    stop = threading.Event()
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    # SIGHUP: the terminal, or the connection to this computer, is gone.
-    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    previous = {
-        number: signal.signal(number, on_signal)
-        for number in (getattr(signal, name) for name in names)
-    }
-    try:
-        yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

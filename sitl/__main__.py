@@ -6,11 +6,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sitl.app import RunOptions, run_vehicle, stop_on_signal, tell
+from sitl.app import RunOptions, run_vehicle, tell
 from sitl.autopilot import VehicleConfig
 from sitl.course import course_to_json, make_course
 from sitl.errors import UsageError
 from sitl.follow import run_follow
+from sitl.stopping import stop_on_signal
 
 
 def main(argv: Sequence[str] | None = None) -> int:

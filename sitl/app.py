@@ -1,6 +1,5 @@
 """The vehicle in real time: sockets, the 400 Hz loop, the camera thread, the report at the end."""
 
-import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
@@ -15,6 +14,7 @@ from sitl.course import Course, make_course
 from sitl.errors import UsageError
 from sitl.report import write_report
 from sitl.shm import FramePublisher
+from sitl.stopping import StopRequest, stop_on_signal
 from sitl.transport import Transport, open_transport
 from sitl.vehicle import Vehicle
 
@@ -72,7 +72,7 @@ def fly(
     vehicle: Vehicle,
     transports: Sequence[Transport],
     clock: Clock,
-    stop: threading.Event,
+    stop: StopRequest,
     end_ns: int | None,
 ) -> None:
     """The loop: take in what has come, advance to now, send what is due, on a 2.5 ms grid.
@@ -93,19 +93,6 @@ def fly(
         missed = max(0, (clock.now_ns() - due_ns) // STEP_NS)
         due_ns += (missed + 1) * STEP_NS
         clock.sleep_until_ns(due_ns)
-
-
-@contextmanager
-def stop_on_signal() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set; the old handlers come back afterwards."""
-    stop = threading.Event()
-    signals = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(number, lambda *_: stop.set()) for number in signals]
-    try:
-        yield stop
-    finally:
-        for number, handler in zip(signals, previous, strict=True):
-            signal.signal(number, handler)
 
 
 def tell(line: str) -> None:

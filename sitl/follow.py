@@ -7,7 +7,6 @@ heading north.
 import math
 import socket
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import closing
 from typing import Protocol, TypeAlias
@@ -18,6 +17,7 @@ from sitl.course import make_course
 from sitl.errors import UsageError
 from sitl.onlooker import Onlooker
 from sitl.shm import FramePublisher
+from sitl.stopping import StopRequest
 
 Address: TypeAlias = tuple[str, int]
 
@@ -37,7 +37,7 @@ def run_follow(
     width: int,
     height: int,
     fps: float,
-    stop: threading.Event,
+    stop: StopRequest,
 ) -> int:
     """Publish the view from the vehicle on ``url`` until ``stop`` is set; returns exit status 0.
 

@@ -13,6 +13,7 @@ from sitl.course import make_course
 from sitl.errors import UsageError
 from sitl.follow import open_wire, run_follow
 from sitl.rotation import IDENTITY
+from sitl.stopping import StopRequest
 
 SHM = "mb-test-follow"
 POSITION_M = (2.0, 0.5, -2.5)
@@ -46,7 +47,7 @@ def test_a_port_in_use_is_refused():
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_rate_that_is_none_is_refused(fps):
     with pytest.raises(UsageError, match="frame rate"):
-        run_follow("udpout:127.0.0.1:9", SHM, 7, 64, 48, fps, threading.Event())
+        run_follow("udpout:127.0.0.1:9", SHM, 7, 64, 48, fps, StopRequest())
 
 
 def test_a_listening_wire_answers_whoever_spoke():
@@ -111,7 +112,7 @@ def wait_for_end(wire):
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
 def test_a_vehicle_over_udp_is_seen_through_shared_memory(capfd):
     """A vehicle that streams only after it was asked to; the frames must show its pose."""
-    stop = threading.Event()
+    stop = StopRequest()
     course = make_course(7)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
         vehicle.bind(("127.0.0.1", 0))

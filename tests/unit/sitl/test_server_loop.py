@@ -13,12 +13,13 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
-from sitl.app import RunOptions, filming, fly, stop_on_signal
+from sitl.app import RunOptions, filming, fly
 from sitl.autopilot import STEP_NS, VehicleConfig
 from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from sitl.course import make_course
 from sitl.modes import Mode
 from sitl.report import FlightLog, write_report
+from sitl.stopping import StopRequest, stop_on_signal
 from sitl.transport import Received
 from sitl.vehicle import Vehicle
 
@@ -66,7 +67,7 @@ def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
     clock = FakeClock()
     vehicle = Vehicle(links=1, boot_ns=0)
 
-    fly(vehicle, [FakeTransport(clock)], clock, threading.Event(), end_ns=NS_PER_S)
+    fly(vehicle, [FakeTransport(clock)], clock, StopRequest(), end_ns=NS_PER_S)
 
     assert clock.sleeps_ns == [STEP_NS * n for n in range(1, 401)]
     assert vehicle.ap.now_ns == NS_PER_S - STEP_NS
@@ -78,7 +79,7 @@ def test_after_a_stall_it_catches_up_without_a_burst():
     vehicle.server.links[0].set_interval(mav.MAVLINK_MSG_ID_ATTITUDE, 10_000)
     transport = FakeTransport(clock)
 
-    fly(vehicle, [transport], clock, threading.Event(), end_ns=2 * NS_PER_S)
+    fly(vehicle, [transport], clock, StopRequest(), end_ns=2 * NS_PER_S)
 
     sent_ns = [stamp_ns for stamp_ns, _ in transport.sent]
     after_ns = [stamp_ns for stamp_ns in sent_ns if stamp_ns > NS_PER_S]
@@ -94,7 +95,7 @@ def test_the_loop_takes_in_bytes_and_says_who_came(capsys):
     frame = mav.MAVLink_command_long_message(1, 1, 176, 0, 1, int(Mode.ALT_HOLD), *[0] * 5)
     arrivals = [Received(frame.pack(mav.MAVLink(None, srcSystem=255)), 50 * NS_PER_MS)]
 
-    fly(vehicle, [FakeTransport(clock, arrivals)], clock, threading.Event(), end_ns=NS_PER_S)
+    fly(vehicle, [FakeTransport(clock, arrivals)], clock, StopRequest(), end_ns=NS_PER_S)
 
     assert capsys.readouterr().err == "sitl: link 0 connected\nsitl: mode ALT_HOLD\n"
 
@@ -104,7 +105,7 @@ def test_a_signal_ends_the_loop_and_handlers_come_back(number):
     before = signal.getsignal(number)
     with stop_on_signal() as stop:
         os.kill(os.getpid(), number)
-        assert stop.wait(5.0)
+        assert stop.is_set()
         fly(Vehicle(links=0, boot_ns=0), [], FakeClock(), stop, end_ns=None)
 
     assert signal.getsignal(number) is before

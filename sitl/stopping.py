@@ -1,0 +1,34 @@
+"""Signals that end the program in order, however many of them come."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class StopRequest:
+    """Set from a signal handler. Not a ``threading.Event``: a second signal would wait for the lock
+    that the first one's handler holds."""
+
+    def __init__(self) -> None:
+        self._is_set = False
+
+    def set(self) -> None:
+        """Ask for the stop."""
+        self._is_set = True
+
+    def is_set(self) -> bool:
+        """Somebody asked."""
+        return self._is_set
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[StopRequest]:
+    """SIGINT and SIGTERM ask for the stop; the old handlers come back afterwards."""
+    stop = StopRequest()
+    signals = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, lambda *_: stop.set()) for number in signals]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(signals, previous, strict=True):
+            signal.signal(number, handler)
