@@ -1,4 +1,4 @@
-"""The fast path: pace, poll, state, feature, act, smooth, guard, send, emit."""
+"""The fast path: pace, poll, state, feature, act, smooth, guard, send, emit, tend."""
 
 import threading
 from collections.abc import Callable
@@ -116,6 +116,7 @@ class ActionLoop:
         self._has_commanded = isinstance(decision, Command)
         self._history.append(sent, sent_ns)
         self._sink.emit(_tick(slot, step, decision, sent, sent_ns))
+        self._link.tend()
         self.alive_ns = sent_ns
 
     def _decide(self, step: _Step) -> Decision:

@@ -21,12 +21,8 @@ def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks
     low = int(position)
     high = min(low + 1, last)
     weight = position - low
-    return Sticks(
-        *(
-            (1.0 - weight) * a + weight * b
-            for a, b in zip(chunk[low].tolist(), chunk[high].tolist(), strict=True)
-        )
-    )
+    a, b = chunk[low].tolist(), chunk[high].tolist()
+    return Sticks(*[(1.0 - weight) * a[k] + weight * b[k] for k in range(4)])
 
 
 class SentHistory:
@@ -50,12 +46,14 @@ class SentHistory:
 
     def resample(self, now_ns: int) -> FloatArray:
         """[1, K, 4], oldest first; the newest is one ``history_dt_s`` before ``now_ns``."""
-        out = np.zeros((1, self._length, 4), dtype=np.float32)
-        k = self._length - 1
+        newest_first: list[Sticks] = []
+        at_ns = now_ns - self._dt_ns
         for sent_ns, sticks in reversed(self._sent):
-            while k >= 0 and now_ns - (self._length - k) * self._dt_ns >= sent_ns:
-                out[0, k] = sticks
-                k -= 1
-            if k < 0:
+            while at_ns >= sent_ns and len(newest_first) < self._length:
+                newest_first.append(sticks)
+                at_ns -= self._dt_ns
+            if len(newest_first) == self._length:
                 break
-        return out
+        newest_first += [NEUTRAL] * (self._length - len(newest_first))
+        flat = [value for sticks in reversed(newest_first) for value in sticks]
+        return np.array(flat, dtype=np.float32).reshape(1, self._length, 4)

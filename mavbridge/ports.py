@@ -30,7 +30,11 @@ class Link(Protocol):
     """The vehicle's end of the action loop; used by the action loop's thread alone."""
 
     def poll(self) -> LinkSnapshot:
-        """Take in all that has arrived, do the housekeeping that is due; never blocks."""
+        """Take in all that has arrived; never blocks."""
+        ...
+
+    def tend(self) -> None:
+        """Heartbeat, handshake and requests that are due; called when the sticks have left."""
         ...
 
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:

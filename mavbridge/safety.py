@@ -1,10 +1,9 @@
 """Who holds the sticks: one pure state machine, and the last check of what a policy returns."""
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal, TypeAlias
-
-import numpy as np
 
 from mavbridge.clock import NS_PER_S
 from mavbridge.errors import PeerError
@@ -192,6 +191,6 @@ def check_chunk(chunk: FloatArray) -> Release | None:
     """Refuse a chunk [1, horizon, 4] that is none, or holds a value that is not finite."""
     if chunk.ndim != 3 or chunk.shape[0] != 1 or not chunk.shape[1] or chunk.shape[2] != 4:
         return Release(f"the policy returned {list(chunk.shape)} instead of [1, horizon, 4]")
-    if not np.isfinite(chunk).all():
+    if not math.isfinite(chunk.sum()):  # one pass; NaN and infinity survive every sum
         return Release("the policy returned a value that is not finite")
     return None

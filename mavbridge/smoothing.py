@@ -54,7 +54,7 @@ class StickSmoother:
         if self._last_ns is not None:
             dt_s = min(max(now_ns - self._last_ns, 0) / NS_PER_S, self._settings.max_dt_s)
         self._last_ns = now_ns
-        clipped = Sticks(*(min(max(value, -1.0), 1.0) for value in raw))
+        clipped = Sticks(*[min(max(value, -1.0), 1.0) for value in raw])
         before = self._slewed
         slewed = self._slew(clipped, dt_s)
         smoothed = self._low_pass(before, slewed, dt_s)
@@ -67,10 +67,10 @@ class StickSmoother:
             return target
         reach = limit * dt_s
         return Sticks(
-            *(
+            *[
                 now + min(max(goal - now, -reach), reach)
                 for now, goal in zip(self._slewed, target, strict=True)
-            )
+            ]
         )
 
     def _low_pass(self, u0: Sticks, u1: Sticks, dt_s: float) -> Sticks:
@@ -82,8 +82,8 @@ class StickSmoother:
         decay = math.exp(-dt_s / tau_s)
         lag = tau_s / dt_s
         return Sticks(
-            *(
+            *[
                 b - (b - a) * lag + (y - a + (b - a) * lag) * decay
                 for a, b, y in zip(u0, u1, self._smoothed, strict=True)
-            )
+            ]
         )

@@ -1,5 +1,6 @@
 """Telemetry -> the 13-D state of the contract, or the reason why there is none."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,7 +11,7 @@ from mavbridge.records import Reading, Release, Telemetry, VehicleState
 
 StateFrame = Literal["ned_frd", "enu_flu"]
 
-_HALF_SQRT2 = float(np.sqrt(0.5))
+_HALF_SQRT2 = math.sqrt(0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,22 +28,19 @@ def build_state(
     telemetry: Telemetry, now_ns: int, *, frame: StateFrame, freshness: Freshness
 ) -> VehicleState | Release:
     """Join the newest readings; a part that is missing or too old is a reason, never a zero."""
-    attitude = _fresh(telemetry.ned_from_body_wxyz, "attitude", now_ns, freshness.attitude_ns)
-    rate = _fresh(telemetry.rate_body_radps, "body rates", now_ns, freshness.attitude_ns)
-    velocity = _fresh(telemetry.velocity_ned_mps, "velocity", now_ns, freshness.velocity_ns)
-    force = _fresh(
-        telemetry.specific_force_body_mps2, "acceleration", now_ns, freshness.velocity_ns
-    )
-    if isinstance(attitude, Release):
-        return attitude
-    if isinstance(rate, Release):
-        return rate
-    if isinstance(velocity, Release):
-        return velocity
-    if isinstance(force, Release):
-        return force
-    convert = _to_enu_flu if frame == "enu_flu" else _as_ned_frd
-    v, q, w, a = convert(velocity.values, attitude.values, rate.values, force.values)
+    attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
+    velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
+    if attitude is None or now_ns - attitude.arrived_ns > freshness.attitude_ns:
+        return _stale(attitude, "attitude", freshness.attitude_ns)
+    if rate is None or now_ns - rate.arrived_ns > freshness.attitude_ns:
+        return _stale(rate, "body rates", freshness.attitude_ns)
+    if velocity is None or now_ns - velocity.arrived_ns > freshness.velocity_ns:
+        return _stale(velocity, "velocity", freshness.velocity_ns)
+    if force is None or now_ns - force.arrived_ns > freshness.velocity_ns:
+        return _stale(force, "acceleration", freshness.velocity_ns)
+    v, q, w, a = velocity.values, attitude.values, rate.values, force.values
+    if frame == "enu_flu":
+        v, q, w, a = _to_enu_flu(v, q, w, a)
     values = np.array((*v, *_unit_positive(q), *w, *a), dtype=np.float32)
     values.setflags(write=False)
     return VehicleState(
@@ -54,22 +52,14 @@ def build_state(
     )
 
 
-def _fresh(reading: Reading | None, what: str, now_ns: int, limit_ns: int) -> Reading | Release:
+def _stale(reading: Reading | None, what: str, limit_ns: int) -> Release:
     if reading is None:
         return Release(f"no {what} from the vehicle yet")
-    if now_ns - reading.arrived_ns > limit_ns:
-        # The limit, not the age: a reason that changes every tick could not be compared.
-        return Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
-    return reading
+    # The limit, not the age: a reason that changes every tick could not be compared.
+    return Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
 
 
 _Parts = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]
-
-
-def _as_ned_frd(
-    v: tuple[float, ...], q: tuple[float, ...], w: tuple[float, ...], a: tuple[float, ...]
-) -> _Parts:
-    return v, q, w, a
 
 
 def _to_enu_flu(
@@ -94,6 +84,7 @@ def _to_enu_flu(
 
 def _unit_positive(q: tuple[float, ...]) -> tuple[float, ...]:
     """Unit length and w >= 0: q and -q are one attitude, and a net should see one of them."""
-    norm = float(np.sqrt(sum(part * part for part in q)))
-    scale = (-1.0 if q[0] < 0 else 1.0) / norm
-    return tuple(part * scale for part in q)
+    w, x, y, z = q
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    scale = (-1.0 if w < 0 else 1.0) / norm
+    return w * scale, x * scale, y * scale, z * scale

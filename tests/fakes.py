@@ -137,6 +137,9 @@ class FakeLink:
             echo_confirmed=self.echo_confirmed,
         )
 
+    def tend(self) -> None:
+        pass
+
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
         arrivals = (t for t in self.attitudes_ns if t > newer_than_ns)
         self.clock.sleep_until_ns(min(next(arrivals, until_ns), until_ns))

@@ -85,12 +85,12 @@ class RcCalibration:
 
     def to_pwm_us(self, sticks: Sticks) -> Pwm:
         """PWM of throttle, yaw, pitch, roll, inside the calibrated range."""
-        throttle, yaw, pitch, roll = (
+        throttle, yaw, pitch, roll = [
             channel.to_us(stick * sign, centre_us=centre_us)
             for channel, stick, sign, centre_us in zip(
                 self.channels, sticks, PWM_SIGN, self._centres_us(), strict=True
             )
-        )
+        ]
         return max(throttle, self.throttle_floor_us), yaw, pitch, roll
 
     def to_sticks(self, pwm_us: Pwm) -> Sticks:

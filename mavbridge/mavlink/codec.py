@@ -1,30 +1,14 @@
 """Bytes <-> records, with no socket and no clock; the wire's sentinels and last refusals."""
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.mavlink.calibration import Pwm, RcCalibration
-from mavbridge.mavlink.messages import (
-    Attitude,
-    AutopilotVersion,
-    Body,
-    CommandAck,
-    Heartbeat,
-    Incoming,
-    LocalVelocity,
-    ParamValue,
-    RcChannels,
-    Source,
-    SpecificForce,
-    StatusText,
-    Timesync,
-)
+from mavbridge.mavlink.fast_packets import STATE_READERS, decode_state_packet, pack_override
+from mavbridge.mavlink.messages import Incoming, Source
+from mavbridge.mavlink.readers import READERS, UnusableError
 from mavbridge.records import Sticks
-
-MG_TO_MPS2 = 9.80665e-3
-"""Milli-g to m/s^2, standard gravity."""
 
 RELEASE_US = 0
 """RC_CHANNELS_OVERRIDE ch 1-8: give the channel back to the receiver."""
@@ -36,9 +20,6 @@ PWM_LIMITS_US = (800, 2200)
 
 _PACKET_STARTS = (b"\xfd", b"\xfe")
 """MAVLink 2 and 1."""
-
-_HIGHRES_ACCEL_FIELDS = 0b111
-"""fields_updated bits of xacc, yacc, zacc."""
 
 
 class CommandRefusedError(Exception):
@@ -65,6 +46,10 @@ class Codec:
         What was left of an earlier one then was cut off, and must not swallow this one. A datagram
         that starts otherwise may be the next piece of a serial stream that somebody cut at will.
         """
+        if (state := decode_state_packet(data)) is not None:
+            self.forget_partial()
+            yield state
+            return
         if data[:1] in _PACKET_STARTS:
             self.forget_partial()
         elif not self._mav.buf_len():
@@ -82,7 +67,7 @@ class Codec:
             reader = _READERS.get(name)
             try:
                 body = None if reader is None else reader(message)
-            except _UnusableError:
+            except UnusableError:
                 self.bad_data_count += 1
                 continue
             source = Source(message.get_srcSystem(), message.get_srcComponent())
@@ -123,14 +108,19 @@ class Codec:
             channels_us[channel.number - 1] = value_us
         if pwm_us[0] < calibration.throttle_floor_us:
             raise CommandRefusedError(f"throttle {pwm_us[0]} us is a radio failsafe")
-        return self._pack(self._mav.rc_channels_override_encode(*target, *channels_us))
+        return self._pack_override(target, channels_us)
 
     def encode_release(self, target: Source, calibration: RcCalibration) -> bytes:
         """RC_CHANNELS_OVERRIDE that gives the four stick channels back."""
         channels_us = [IGNORE_US] * 8
         for channel in calibration.channels:
             channels_us[channel.number - 1] = RELEASE_US
-        return self._pack(self._mav.rc_channels_override_encode(*target, *channels_us))
+        return self._pack_override(target, channels_us)
+
+    def _pack_override(self, target: Source, channels_us: list[int]) -> bytes:
+        data = pack_override(self.source, self._mav.seq, target, channels_us)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return data
 
     def encode_manual_control(self, target_system: int, sticks: Sticks) -> bytes:
         """MANUAL_CONTROL: x forward, y right, r nose right in -1000..1000, z up in 0..1000.
@@ -187,119 +177,4 @@ def _refuse_bad_sticks(sticks: Sticks) -> None:
             raise CommandRefusedError(f"{name} stick {value!r} is not in [-1, 1]")
 
 
-class _UnusableError(Exception):
-    """A well-formed message whose values mean nothing."""
-
-
-def _finite(*values: float) -> None:
-    if not all(map(math.isfinite, values)):
-        raise _UnusableError
-
-
-def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
-    return Heartbeat(
-        vehicle_type=m.type,
-        autopilot=m.autopilot,
-        base_mode=m.base_mode,
-        custom_mode=m.custom_mode,
-    )
-
-
-def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body:
-    q = (m.q1, m.q2, m.q3, m.q4)
-    rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
-    _finite(*q, *rate)
-    if not 0.9 < math.hypot(*q) < 1.1:
-        raise _UnusableError
-    return Attitude(
-        is_quaternion=True, boot_ms=m.time_boot_ms, ned_from_body_wxyz=q, rate_body_radps=rate
-    )
-
-
-def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
-    rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
-    _finite(m.roll, m.pitch, m.yaw, *rate)
-    return Attitude(
-        is_quaternion=False,
-        boot_ms=m.time_boot_ms,
-        ned_from_body_wxyz=quaternion_from_euler(m.roll, m.pitch, m.yaw),
-        rate_body_radps=rate,
-    )
-
-
-def quaternion_from_euler(
-    roll_rad: float, pitch_rad: float, yaw_rad: float
-) -> tuple[float, float, float, float]:
-    """ned_from_body quaternion (w, x, y, z) of MAVLink's intrinsic Z-Y-X Euler angles."""
-    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
-    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
-    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
-
-
-def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:
-    _finite(m.vx, m.vy, m.vz)
-    return LocalVelocity(velocity_ned_mps=(m.vx, m.vy, m.vz))
-
-
-def _highres_imu(m: dialect.MAVLink_highres_imu_message) -> Body:
-    _finite(m.xacc, m.yacc, m.zacc)
-    if m.fields_updated & _HIGHRES_ACCEL_FIELDS != _HIGHRES_ACCEL_FIELDS:
-        raise _UnusableError
-    return SpecificForce(source=m.get_type(), specific_force_body_mps2=(m.xacc, m.yacc, m.zacc))
-
-
-def _milli_g_imu(m: dialect.MAVLink_scaled_imu_message) -> Body:
-    x, y, z = (value * MG_TO_MPS2 for value in (m.xacc, m.yacc, m.zacc))
-    return SpecificForce(source=m.get_type(), specific_force_body_mps2=(x, y, z))
-
-
-def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
-    values = (getattr(m, f"chan{number}_raw") for number in range(1, 19))
-    return RcChannels(channels_us=tuple(values)[: m.chancount or 18])
-
-
-def _command_ack(m: dialect.MAVLink_command_ack_message) -> Body:
-    target = Source(m.target_system, m.target_component)
-    return CommandAck(command=m.command, result=m.result, target=target)
-
-
-def _param_value(m: dialect.MAVLink_param_value_message) -> Body:
-    _finite(m.param_value)
-    return ParamValue(name=m.param_id, value=m.param_value)
-
-
-def _statustext(m: dialect.MAVLink_statustext_message) -> Body:
-    return StatusText(text=m.text)
-
-
-def _timesync(m: dialect.MAVLink_timesync_message) -> Body:
-    return Timesync(tc1=m.tc1, ts1=m.ts1)
-
-
-def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
-    v = m.flight_sw_version
-    return AutopilotVersion(version=f"{v >> 24 & 255}.{v >> 16 & 255}.{v >> 8 & 255}")
-
-
-_READERS: dict[str, Callable[[dialect.MAVLink_message], Body]] = {
-    "HEARTBEAT": _heartbeat,
-    "ATTITUDE_QUATERNION": _attitude_quaternion,
-    "ATTITUDE": _attitude,
-    "LOCAL_POSITION_NED": _local_position,
-    "HIGHRES_IMU": _highres_imu,
-    "SCALED_IMU": _milli_g_imu,
-    "SCALED_IMU2": _milli_g_imu,
-    "RAW_IMU": _milli_g_imu,
-    "RC_CHANNELS": _rc_channels,
-    "COMMAND_ACK": _command_ack,
-    "PARAM_VALUE": _param_value,
-    "STATUSTEXT": _statustext,
-    "TIMESYNC": _timesync,
-    "AUTOPILOT_VERSION": _autopilot_version,
-}
+_READERS = READERS | STATE_READERS

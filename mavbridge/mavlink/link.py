@@ -35,7 +35,7 @@ _ASK_AGAIN_NS = NS_PER_S
 class MavlinkLink:
     """Implements ``ports.Link`` over a transport.
 
-    Raises from ``poll``:
+    Raises from ``tend``:
         PeerError: no vehicle within the timeout, two vehicles, or one that cannot be flown.
     """
 
@@ -57,6 +57,8 @@ class MavlinkLink:
         """Of the last override that left: what a release needs, whatever else is lost."""
         self._has_advised = False
         self._has_been_confirmed = False
+        self._is_drained = False
+        """Whoever waited for the attitude has just taken in all there was."""
         self._release_due_ns = 0
         self._releases_left = 0
         self._asked_ns: dict[int, int] = {}
@@ -64,21 +66,31 @@ class MavlinkLink:
     # --- coming in
 
     def poll(self) -> LinkSnapshot:
-        """Take in all that has arrived, do the housekeeping that is due; never blocks."""
-        self._receive()
+        """Take in all that has arrived; never blocks. Nothing here that can wait for ``tend``."""
+        if not self._is_drained:
+            self._receive()
+        self._is_drained = False
+        if self._vehicle is not None and self._vehicle.has_rebooted:
+            self._wire.texts.append("the vehicle has rebooted: starting over")
+            self._adopt(self._vehicle.peer)
+        return self._snapshot(self._clock.now_ns())
+
+    def tend(self) -> None:
+        """Find or follow the vehicle, and keep house; called when the sticks have left."""
         now_ns = self._clock.now_ns()
         if self._vehicle is None:
             self._look_for_vehicle(now_ns)
-        else:
-            self._follow(self._vehicle, now_ns)
+        elif (peer := self._roster.moved(self._vehicle.peer, now_ns)) is not None:
+            self._wire.texts.append(f"the vehicle now speaks from {peer.address}: starting over")
+            self._adopt(peer)
         self._housekeep(now_ns)
-        return self._snapshot(now_ns)
 
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
         """Take in what arrives until an attitude newer than that has come, or until the time."""
         while self._clock.now_ns() < until_ns:
             self._receive()
             if self._attitude_ns() > newer_than_ns:
+                self._is_drained = True
                 break
             self._wire.wait(until_ns)
         return self._attitude_ns()
@@ -143,14 +155,6 @@ class MavlinkLink:
         self._counters.new_sequence()
         self._has_advised = False
         self._wire.answer_to(peer.address)
-
-    def _follow(self, vehicle: Vehicle, now_ns: int) -> None:
-        if vehicle.has_rebooted:
-            self._wire.texts.append("the vehicle has rebooted: starting over")
-            self._adopt(vehicle.peer)
-        elif (peer := self._roster.moved(vehicle.peer, now_ns)) is not None:
-            self._wire.texts.append(f"the vehicle now speaks from {peer.address}: starting over")
-            self._adopt(peer)
 
     # --- what is known
 

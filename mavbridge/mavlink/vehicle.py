@@ -81,6 +81,8 @@ class Vehicle:
             needs_calibration=self._is_override,
             wanted=streams.groups(state_hz=state_hz, rc_hz=RC_CHANNELS_HZ),
         )
+        self._status: VehicleStatus | None = None
+        """As last told; None after a message that may have changed it."""
         self._beat: tuple[int, Heartbeat] | None = None
         self._rc: tuple[int, RcChannels] | None = None
         self._override: _Override | None = None
@@ -108,10 +110,12 @@ class Vehicle:
             case SpecificForce():
                 self.telemetry.force(body, arrived_ns)
             case RcChannels():
+                self._status = None
                 self._rc = (arrived_ns, body)
                 if (pwm_us := self._stick_channels_us(body)) is not None:
                     self.echo.received(pwm_us, arrived_ns)
             case Heartbeat():
+                self._status = None
                 self._beat = (arrived_ns, body)
             case CommandAck():
                 self.handshake.receive_ack(body)
@@ -138,9 +142,11 @@ class Vehicle:
 
     def status(self) -> VehicleStatus | None:
         """What it says of itself; None before its first heartbeat."""
-        if self._beat is None:
-            return None
-        beat_ns, beat = self._beat
+        if self._status is None and self._beat is not None:
+            self._status = self._tell_status(*self._beat)
+        return self._status
+
+    def _tell_status(self, beat_ns: int, beat: Heartbeat) -> VehicleStatus:
         rc_sticks = None
         if self._rc and self.calibration:
             pwm_us = self._stick_channels_us(self._rc[1])

@@ -136,6 +136,7 @@ class Bench:
             self.texts += snapshot.texts
             if decision is not None:
                 self.link.send(decision)
+            self.link.tend()
             self.clock.advance_ns(10 * MS)
         return snapshot
 
