@@ -55,8 +55,8 @@ class Rates:
     """Commands a second (dual rate)."""
     rate: float = 30.0
     """Commands a second in single-rate mode, each with the newest image."""
-    realtime: bool = False
-    """Ask for real-time scheduling of the action loop (SCHED_FIFO)."""
+    realtime: bool = True
+    """Real-time scheduling of the action loop (SCHED_FIFO), where the system permits it."""
     action_cpu: int | None = None
     """Run the action loop on this CPU alone."""
     vision_cpu: int | None = None

@@ -20,16 +20,21 @@ def settle_process() -> None:
 
 def settle_thread(*, realtime: bool, cpu: int | None) -> str | None:
     """Scheduling of the calling thread; returns what was refused and what to do, or None."""
-    if not hasattr(os, "sched_setscheduler"):
-        return "this system cannot schedule threads" if realtime or cpu is not None else None
+    if not hasattr(os, "sched_setaffinity"):
+        return None if cpu is None else "this system cannot place threads: leave the CPUs to it"
+    has_company = len(os.sched_getaffinity(0)) > 1
     if cpu is not None:
         try:
             os.sched_setaffinity(0, {cpu})
         except OSError as error:
             return f"cannot run on CPU {cpu} ({error.strerror}); it runs where the system puts it"
-    if realtime:
+    # On a single CPU a slow policy would leave nothing to the thread that watches over it.
+    if realtime and has_company:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
         except PermissionError:
-            return "real-time scheduling was refused: allow it with ulimit -r or CAP_SYS_NICE"
+            return (
+                "the action loop has no real-time scheduling, so others may delay it: allow it "
+                "with ulimit -r 10 or CAP_SYS_NICE, or say --no-realtime"
+            )
     return None

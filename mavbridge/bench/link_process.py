@@ -19,7 +19,7 @@ from mavbridge.feature_cache import FeatureCache
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport import make_transport
 from mavbridge.observers import FanOut
-from mavbridge.realtime import settle_process
+from mavbridge.realtime import settle_process, settle_thread
 from mavbridge.records import Event, FeatureFrame, FloatArray, LinkStats, Tick
 from mavbridge.safety import Engagement
 from mavbridge.smoothing import Smoothing, StickSmoother
@@ -63,6 +63,7 @@ def main() -> None:
     parser.add_argument("--pace", choices=("clock", "state"), default="clock")
     args = parser.parse_args()
     settle_process()
+    settle_thread(realtime=True, cpu=None)  # as a flight does
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     clock = MonotonicClock()
