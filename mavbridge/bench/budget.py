@@ -42,7 +42,7 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
     for flight in result.flights:
         if flight.runner != OURS_NAME or not flight.action_hz:
             continue
-        name = f"flight: {flight.engine}"
+        name = f"flight: {flight.label}"
         yield f"{name} period / asked period", flight.asked_action_hz / flight.action_hz
         if naive is None or not naive.action_hz:
             continue

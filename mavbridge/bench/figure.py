@@ -108,7 +108,7 @@ def _in_two_lines(work: str) -> str:
 
 
 def _draw_rates(axes: Axes, result: BenchResult) -> None:
-    """What was reached of what was asked; and the highest rate that each engine keeps."""
+    """What was reached of what was asked; and the highest rate that is kept."""
     flights = result.flights
     for row, flight in enumerate(flights):
         for shift, reached, asked in (
@@ -119,19 +119,18 @@ def _draw_rates(axes: Axes, result: BenchResult) -> None:
             bars = axes.barh(row + shift, reached or 0.0, 0.34, color=_flight_color(flight))
             axes.bar_label(bars, [f"{reached or 0:.0f} {kind}"], padding=4, fontsize=9)
             axes.plot([asked] * 2, [row + shift - 0.17, row + shift + 0.17], color=ACCENT)
-    labels = [f"{flight.runner}\n{flight.engine}{_best(result, flight)}" for flight in flights]
+    labels = [_flight_label(flight) for flight in flights]
     axes.set_yticks(range(len(flights)), labels)
     axes.set_ylim(len(flights) - 0.5, -0.5)
     axes.set_xlim(0, 1.25 * max((flight.asked_action_hz for flight in flights), default=1))
-    axes.set_xlabel("Hz; red: what was asked for")
+    tops = [top for top in result.top_rates if top.action_hz]
+    best = "".join(f"; {top.label} keeps up to {top.action_hz:g} Hz" for top in tops)
+    axes.set_xlabel(f"Hz; red: what was asked for{best}")
     axes.set_title("Flying: rates")
 
 
-def _best(result: BenchResult, flight: Flight) -> str:
-    if flight.runner != OURS_NAME:
-        return ""
-    best = [top.action_hz for top in result.top_rates if top.engine == flight.engine]
-    return f"\nkeeps up to {best[0]:g} Hz" if best and best[0] else ""
+def _flight_label(flight: Flight) -> str:
+    return f"{flight.runner}\n{flight.label}".replace(", ", "\n")
 
 
 def _draw_spans(axes: Axes, title: str, spans: Sequence[_Span]) -> None:
@@ -163,8 +162,7 @@ def _flight_span(flight: Flight) -> _Span:
     latency = flight.state_to_wire_ms
     if latency is None:
         raise ValueError("a flight without latency cannot be drawn")
-    label = f"{flight.runner}\n{flight.engine}"
-    return _Span(label, latency.p50, latency.p99, _flight_color(flight))
+    return _Span(_flight_label(flight), latency.p50, latency.p99, _flight_color(flight))
 
 
 def _links(result: BenchResult) -> list[_Span]:

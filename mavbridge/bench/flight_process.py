@@ -40,7 +40,9 @@ def main() -> None:
     """Fly once and write the figures."""
     args = arguments(__doc__)
     clock = MonotonicClock()
-    executable = level_climb(engines.load(engines.FLIGHT_POLICY, args.engine))
+    executable = level_climb(
+        engines.load(engines.FLIGHT_POLICY, args.engine, head_steps=args.head_steps)
+    )
     meter = FlightMeter(action_hz=args.action_hz, vision_hz=args.vision_hz)
     with GcWatch(clock) as collector:
         witness = Witness(
@@ -64,6 +66,7 @@ def arguments(description: str | None) -> argparse.Namespace:
     parser.add_argument("--port", type=int, required=True, help="UDP, where the vehicle sends")
     parser.add_argument("--camera", required=True, help="shm:NAME")
     parser.add_argument("--engine", default=engines.EAGER, choices=engines.ENGINES)
+    parser.add_argument("--head-steps", type=int, help="of a warm start")
     parser.add_argument("--action-hz", type=float, required=True)
     parser.add_argument("--vision-hz", type=float, required=True)
     parser.add_argument("--duration", type=float, required=True, help="seconds, once engaged")
@@ -118,6 +121,7 @@ def _flight(
         cpu_cores=round(meter.cpu_ns / (report.duration_s * NS_PER_S), 3),
         stolen_ms=meter.stolen_ms,
         missed_by_cause=witness.missed_by_cause,
+        head_steps=args.head_steps,
     )
 
 

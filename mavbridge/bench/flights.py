@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,7 +24,23 @@ STARTING_S = 90.0
 """Most that a process may take beside its flight: imports, compiling an engine, arming."""
 
 
-def fly(module: str, *, engine: str, action_hz: float, duration_s: float) -> Flight:
+@dataclass(frozen=True, kw_only=True)
+class Runner:
+    """Who flies, and how it computes."""
+
+    module: str
+    engine: str
+    head_steps: int | None = None
+    """Steps of a warm start; None = every chunk is solved in full."""
+
+    @property
+    def label(self) -> str:
+        """For a person."""
+        warm = "" if self.head_steps is None else f", warm start of {self.head_steps}"
+        return f"{OURS_NAME if self.module == OURS else NAIVE_NAME}, {self.engine}{warm}"
+
+
+def fly(runner: Runner, *, action_hz: float, duration_s: float) -> Flight:
     """One flight of one runner against a vehicle of its own.
 
     Raises:
@@ -39,16 +56,18 @@ def fly(module: str, *, engine: str, action_hz: float, duration_s: float) -> Fli
             *(sys.executable, "-m", "sitl", "--camera", camera),
             *("--connect", f"udpout:127.0.0.1:{port}", "--report", str(vehicle_report)),
         )
-        runner_command = (
-            *(sys.executable, "-m", module, "--port", str(port), "--camera", camera),
-            *("--engine", engine, "--duration", str(duration_s)),
+        runner_command: tuple[str, ...] = (
+            *(sys.executable, "-m", runner.module, "--port", str(port), "--camera", camera),
+            *("--engine", runner.engine, "--duration", str(duration_s)),
             *("--action-hz", str(action_hz), "--vision-hz", str(VISION_HZ)),
             *("--out", str(figures)),
         )
+        if runner.head_steps is not None:
+            runner_command += ("--head-steps", str(runner.head_steps))
         with running(*vehicle_command, log=vehicle_log) as vehicle:
             try:
-                with running(*runner_command, log=log) as runner:
-                    wait(runner, f"python -m {module}", log, duration_s + STARTING_S)
+                with running(*runner_command, log=log) as process:
+                    wait(process, f"python -m {runner.module}", log, duration_s + STARTING_S)
             except UserError:
                 if vehicle.poll() is not None:  # then the runner's words are not the reason
                     wait(vehicle, "python -m sitl", vehicle_log, STARTING_S)
@@ -70,24 +89,24 @@ def _vehicle(report: Path) -> Vehicle:
 
 
 def top_rate(
-    engine: str, rates_hz: Sequence[float], duration_s: float, say: Callable[[str], None]
+    runner: Runner, rates_hz: Sequence[float], duration_s: float, say: Callable[[str], None]
 ) -> TopRate:
-    """The highest action rate that one engine keeps up with beside 30 Hz vision."""
+    """The highest action rate that one runner keeps up with beside 30 Hz vision."""
     trials: list[RateTrial] = []
 
     def missed_fraction(action_hz: float) -> float:
-        flight = fly(OURS, engine=engine, action_hz=action_hz, duration_s=duration_s)
+        flight = fly(runner, action_hz=action_hz, duration_s=duration_s)
         trial = RateTrial(
             action_hz=action_hz,
             missed_fraction=round(flight.missed_fraction, 5),
             vision_hz=flight.vision_hz,
         )
         trials.append(trial)
-        say(f"{engine} at {action_hz:g} Hz: {trial.missed_fraction:.2%} missed")
+        say(f"{runner.label} at {action_hz:g} Hz: {trial.missed_fraction:.2%} missed")
         return trial.missed_fraction
 
     action_hz = highest_rate(rates_hz, missed_fraction)
-    return TopRate(engine=engine, action_hz=action_hz, trials=tuple(trials))
+    return TopRate(label=runner.label, action_hz=action_hz, trials=tuple(trials))
 
 
 def highest_rate(

@@ -85,7 +85,16 @@ class Flight:
     """Processor time that the host took from this machine meanwhile; None = not known."""
     missed_by_cause: Mapping[str, int] | None
     """Missed slots by ``attribution.Cause``; None = this runner is not watched."""
+    head_steps: int | None = None
+    """Steps of a warm start; None = every chunk is solved in full."""
     vehicle: Vehicle | None = None
+
+    @property
+    def label(self) -> str:
+        """Engine and kind of solve."""
+        if self.head_steps is None:
+            return self.engine
+        return f"{self.engine}, warm start of {self.head_steps}"
 
     @property
     def missed_fraction(self) -> float:
@@ -107,7 +116,8 @@ class RateTrial:
 class TopRate:
     """The highest action rate with few enough missed slots."""
 
-    engine: str
+    label: str
+    """Engine and kind of solve."""
     action_hz: float | None
     """None: not even the lowest rate tried."""
     trials: tuple[RateTrial, ...]

@@ -13,9 +13,9 @@ from rich.text import Text
 
 from mavbridge.bench import flights, kernels, link
 from mavbridge.bench.budget import ratios, read_budget, violations
-from mavbridge.bench.engines import EAGER, ENGINES
+from mavbridge.bench.engines import EAGER, WARM_STEPS
 from mavbridge.bench.processes import require_source_tree
-from mavbridge.bench.results import BenchResult, Flight, Machine, TopRate, to_json
+from mavbridge.bench.results import BenchResult, Flight, Machine, to_json
 from mavbridge.bench.tables import print_result
 from mavbridge.clock import MonotonicClock
 from mavbridge.config import BenchConfig
@@ -39,12 +39,12 @@ INTERRUPTED = 130
 PIPED_WIDTH = 120
 """Columns of the tables where there is no terminal to ask."""
 FULL = _Plan(
-    kernels=kernels.Effort(repeats=5, block_s=2.0),
+    kernels=kernels.Effort(repeats=5, block_s=1.5),
     flight_s=60.0,
     rates_hz=flights.RATES_HZ,
     rate_trial_s=10.0,
     link_repeats=3,
-    attitudes=600,
+    attitudes=500,
 )
 QUICK = _Plan(
     kernels=kernels.Effort(repeats=2, block_s=0.5),
@@ -102,7 +102,7 @@ def measure(plan: _Plan, *, is_quick: bool, say: Callable[[str], None]) -> Bench
         kernels=kernels.measure(plan.kernels, clock, say),
         rooflines=kernels.rooflines(clock),
         flights=_flights(plan, say),
-        top_rates=_top_rates(plan, say),
+        top_rates=(flights.top_rate(_WARM, plan.rates_hz, plan.rate_trial_s, say),),
         links=link.measure(
             contenders, repeats=plan.link_repeats, attitudes=plan.attitudes, say=say
         ),
@@ -110,26 +110,18 @@ def measure(plan: _Plan, *, is_quick: bool, say: Callable[[str], None]) -> Bench
     )
 
 
+_EAGER = flights.Runner(module=flights.OURS, engine=EAGER)
+_FULL = flights.Runner(module=flights.OURS, engine="openvino")
+_WARM = flights.Runner(module=flights.OURS, engine="openvino", head_steps=WARM_STEPS)
+_NAIVE = flights.Runner(module=flights.NAIVE, engine=EAGER)
+
+
 def _flights(plan: _Plan, say: Callable[[str], None]) -> tuple[Flight, ...]:
-    runners = [(flights.OURS, engine) for engine in ENGINES] + [(flights.NAIVE, EAGER)]
     found = []
-    for module, engine in runners:
-        say(f"flight of {plan.flight_s:g} s: {module}, {engine}")
-        found.append(
-            flights.fly(
-                module, engine=engine, action_hz=flights.ACTION_HZ, duration_s=plan.flight_s
-            )
-        )
+    for runner in (_WARM, _FULL, _EAGER, _NAIVE):
+        say(f"flight of {plan.flight_s:g} s: {runner.label}")
+        found.append(flights.fly(runner, action_hz=flights.ACTION_HZ, duration_s=plan.flight_s))
     return tuple(found)
-
-
-def _top_rates(plan: _Plan, say: Callable[[str], None]) -> tuple[TopRate, ...]:
-    """Not of the eager engine, which does not keep even the lowest beside 30 Hz vision."""
-    return tuple(
-        flights.top_rate(engine, plan.rates_hz, plan.rate_trial_s, say)
-        for engine in ENGINES
-        if engine != EAGER
-    )
 
 
 def _drawing(path: Path) -> Callable[[BenchResult], None]:

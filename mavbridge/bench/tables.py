@@ -75,7 +75,7 @@ def flight_table(flights: Iterable[Flight]) -> Table:
     table.add_column("")
     for flight in flights:
         table.add_column(
-            f"{flight.runner}, {flight.engine}\n{flight.duration_s:.0f} s", justify="right"
+            f"{flight.runner}\n{flight.label}\n{flight.duration_s:.0f} s", justify="right"
         )
     for name, cell in _FLIGHT_ROWS:
         table.add_row(name, *(cell(flight) for flight in flights))
@@ -98,12 +98,12 @@ def _gaps(flight: Flight) -> str:
 
 
 def top_rate_table(top_rates: Iterable[TopRate]) -> Table:
-    """A row for each engine."""
+    """A row for each runner."""
     table = Table(
         title="Highest action rate with under 0.1 % missed slots, beside 30 Hz vision",
         title_justify="left",
     )
-    table.add_column("engine")
+    table.add_column("runner")
     table.add_column("actions, Hz", justify="right")
     table.add_column("tried: missed slots")
     for top in top_rates:
@@ -112,7 +112,7 @@ def top_rate_table(top_rates: Iterable[TopRate]) -> Table:
         )
         lowest = min(trial.action_hz for trial in top.trials) if top.trials else 0
         best = f"under {lowest:g}" if top.action_hz is None else f"{top.action_hz:g}"
-        table.add_row(top.engine, best, tried)
+        table.add_row(top.label, best, tried)
     return table
 
 

@@ -85,11 +85,11 @@ RESULT = BenchResult(
     ),
     top_rates=(
         TopRate(
-            engine="torch",
+            label="torch",
             action_hz=None,
             trials=(RateTrial(action_hz=25.0, missed_fraction=0.5, vision_hz=9.0),),
         ),
-        TopRate(engine="quick", action_hz=250.0, trials=()),
+        TopRate(label="quick", action_hz=250.0, trials=()),
     ),
     links=(
         make_link("mavbridge, 100 Hz clock", round_trip_ms=5.0, work_ms=0.6),
