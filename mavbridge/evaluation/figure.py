@@ -68,7 +68,7 @@ def _draw_reach(axes: Axes, evaluation: Evaluation) -> None:
         linewidth=0,
     )
     axes.plot(gates, [share.value for share in shares], "o-", color=BLUE)
-    axes.set_ylim(0, 1.03)
+    axes.set_ylim(-0.03, 1.03)
     axes.set_xlabel("gate")
     axes.set_title("Flights that passed gate n, 95 %")
 
@@ -94,6 +94,7 @@ def _draw_style(axes: Axes, evaluation: Evaluation) -> None:
         ]
         if dots:
             axes.plot(*zip(*dots, strict=True), "o", color=colour, alpha=0.6, label=label)
+    axes.margins(0.15)
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("mean speed, m/s")
