@@ -302,9 +302,7 @@ def test_a_policy_that_fails_gives_the_sticks_back() -> None:
 
 def interrupted(episode: Episode) -> EpisodeResult:
     stop_ns = episode.clock.now_ns() + 6 * NS_PER_S
-    return episode.fly(
-        steady(lambda: CLIMB), should_stop=lambda: episode.clock.now_ns() >= stop_ns
-    )
+    return episode.fly(steady(lambda: CLIMB), should_stop=lambda: episode.clock.now_ns() >= stop_ns)
 
 
 def negative(episode: Episode) -> EpisodeResult:
