@@ -35,7 +35,7 @@ class RunOptions:
     duration_s: float | None
     """None = until a signal."""
     vehicle: VehicleConfig
-    end_with_course: bool
+    end_with_course: bool = False
     """End a second after the last gate, or at a crash."""
 
 

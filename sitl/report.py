@@ -84,10 +84,11 @@ class FlightLog:
         """How the course has ended: with a crash, or a second after its last gate; None if not."""
         if self.crashed:
             return "crashed"
-        if self._gates is None or len(self._gates.passed) < self.gates_total:
+        passed = self._gates.passed if self._gates else ()
+        if not passed or len(passed) < self.gates_total:
             return None
         over_ns = now_ns - self._start_ns - END_AFTER_NS
-        return "finished" if self._gates.passed[-1].t_s * NS_PER_S <= over_ns else None
+        return "finished" if passed[-1].t_s * NS_PER_S <= over_ns else None
 
     def on_override(self, arrived_ns: int) -> None:
         """An RC_CHANNELS_OVERRIDE that drives at least one stick."""

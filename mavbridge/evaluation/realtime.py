@@ -78,7 +78,12 @@ def _fly(job: Job, folder: Path, should_stop: Callable[[], bool]) -> Flown | Non
         *("--image-size", str(job.policy.image_size or _IMAGE_SIZE)),
     )
     with running(*command, log=log) as vehicle:
-        bridge = _fly_bridge(job, port, camera, vehicle, should_stop)
+        try:
+            bridge = _fly_bridge(job, port, camera, vehicle, should_stop)
+        except MavbridgeError:
+            if vehicle.poll():  # then the bridge's words are not the reason
+                wait(vehicle, "python -m sitl", log, END_TIMEOUT_S)
+            raise
         end(vehicle)
         wait(vehicle, "python -m sitl", log, END_TIMEOUT_S)
     if bridge is None:

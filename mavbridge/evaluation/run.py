@@ -115,6 +115,9 @@ def _drawing(path: Path) -> Callable[[Evaluation], None]:
 def _require_writable(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        was_there = path.exists()
         path.open("ab").close()
+        if not was_there:
+            path.unlink()
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error

@@ -81,7 +81,7 @@ class Measured:
 class Delays:
     """Of one episode; by default what a flight with TOGE small takes on two shared cores."""
 
-    camera: Delay = field(default=Fixed(2 * NS_PER_MS))
+    camera: Delay = field(default=Fixed(3 * NS_PER_MS))
     """Exposure to the frame being there."""
     vision: Delay = field(default=LogNormal(p50_ns=11 * NS_PER_MS, p99_ns=25 * NS_PER_MS))
     """Image to feature."""

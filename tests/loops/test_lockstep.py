@@ -1,6 +1,7 @@
 """Whole flights in memory: the real loops and link against the real simulator."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_thirty_frames_feed_a_hundred_actions_a_second() -> None:
         sinks=(sink,),
     )
     ticks = flying(sink)
-    assert {b.due_ns - a.due_ns for a, b in zip(ticks, ticks[1:], strict=False)} == {10 * MS}
+    assert {b.due_ns - a.due_ns for a, b in pairwise(ticks)} == {10 * MS}
     assert sum(tick.missed_slots for tick in ticks) == 0
     captured = [vision.captured_ns for vision in sink.visions]
     assert set(np.diff(captured) // STEP_NS) <= {13, 14}  # 33.3 ms on the grid of 2.5
