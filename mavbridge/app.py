@@ -1,19 +1,23 @@
 """Composition root: builds one flight from its config, starts it, and stops it in reverse order."""
 
-import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 
 import cv2
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.action_loop import ActionLoop, ActionSettings
+from mavbridge.assembly import (
+    action_rate_hz,
+    load_configured_policy,
+    make_action_loop,
+    make_vision_loop,
+    vision_limits_hz,
+)
 from mavbridge.camera.open import open_camera
-from mavbridge.clock import NS_PER_S, Clock, GridPacer, MonotonicClock, Pacer
-from mavbridge.config import STATE_HZ, STATUS_HZ, FlyConfig, Limits, period_ns
+from mavbridge.clock import NS_PER_S, Clock, MonotonicClock
+from mavbridge.config import STATE_HZ, STATUS_HZ, FlyConfig
 from mavbridge.errors import PeerError, UserError
 from mavbridge.feature_cache import FeatureCache
 from mavbridge.mavlink.link import MavlinkLink
@@ -22,18 +26,12 @@ from mavbridge.observers import FanOut, ObserverThread
 from mavbridge.ports import Camera, TickSink
 from mavbridge.realtime import settle_process, settle_thread
 from mavbridge.rerun_view import RerunView
-from mavbridge.safety import Engagement
-from mavbridge.smoothing import Smoothing, StickSmoother
-from mavbridge.state import Freshness
-from mavbridge.state_pacer import StatePacer
 from mavbridge.stopping import StopRequest, stop_on_signals
 from mavbridge.terminal import FlightScreen
 from mavbridge.timing import FlightTiming, ObserverDrops, TimingReport, report_json
-from mavbridge.vision_loop import VisionLoop
 from mavbridge.vision_rate import AdaptiveRate
 from mavbridge.workers import HungError, Worker
 from policy.contract import Executable
-from policy.loading import load_policy
 
 RERUN_CAPACITY = 1000
 """Ticks that may wait for the viewer: ten seconds at 100 Hz."""
@@ -84,23 +82,7 @@ def fly_executable(
 
 
 def _load_policy(config: FlyConfig, clock: Clock, console: Console) -> Executable:
-    wanted = config.policy
-    sys.path.append(str(Path.cwd()))  # a person's own module:Class lies where they work
-    loaded = load_policy(
-        wanted.policy,
-        checkpoint=wanted.checkpoint,
-        allow_untrained=wanted.allow_untrained,
-        engine=wanted.engine,
-        device=wanted.device,
-        vision_device=wanted.vision_device,
-        action_device=wanted.action_device,
-        dual_rate=wanted.dual_rate,
-        num_diffusion_steps=wanted.num_diffusion_steps,
-        head_steps=wanted.head_steps,
-        image_size=wanted.image_size,
-        seed=wanted.seed,
-        now_s=lambda: clock.now_ns() / NS_PER_S,
-    )
+    loaded = load_configured_policy(config.policy, clock)
     for note in loaded.notes:
         console.print(Text(note, style="yellow"))
     return loaded.executable
@@ -126,8 +108,8 @@ class _Flight:
         self._is_dual = executable.dual_rate
         self._has_hung = False
         rates = config.rates
-        self._action_hz = rates.action_rate if self._is_dual else rates.rate
-        self._vision_limits_hz = rates.visual_limits_hz if self._is_dual else (rates.rate,) * 2
+        self._action_hz = action_rate_hz(rates, is_dual=self._is_dual)
+        self._vision_limits_hz = vision_limits_hz(rates, is_dual=self._is_dual)
         self._vision_hz = self._vision_limits_hz[1]
         self._timing = FlightTiming(action_hz=self._action_hz, vision_hz=self._vision_hz)
         self._screen = FlightScreen(
@@ -147,8 +129,17 @@ class _Flight:
         if look.is_adaptive:
             own.append(look)
         self._sink = FanOut([*own, *sinks])
-        self._vision = self._make_vision(camera, cache, look)
-        self._action = self._make_action(cache)
+        self._vision = make_vision_loop(
+            executable,
+            clock=clock,
+            camera=camera,
+            cache=cache,
+            sink=self._sink,
+            period_ns=look.period_ns,
+        )
+        self._action = make_action_loop(
+            config, executable, clock=clock, link=self._link, cache=cache, sink=self._sink
+        )
 
     def _open_viewer(self) -> ObserverThread | None:
         if self._config.rerun == "off":
@@ -173,49 +164,6 @@ class _Flight:
         link = MavlinkLink(transport, self._clock, config, state_hz=max(self._action_hz, STATE_HZ))
         self._stack.callback(link.close)
         return link
-
-    def _make_vision(self, camera: Camera, cache: FeatureCache, look: AdaptiveRate) -> VisionLoop:
-        return VisionLoop(
-            camera=camera,
-            encode=self._executable.encode,
-            cache=cache,
-            sink=self._sink,
-            clock=self._clock,
-            period_ns=look.period_ns,
-        )
-
-    def _make_action(self, cache: FeatureCache) -> ActionLoop:
-        config, contract = self._config, self._executable.contract
-        action_period_ns = period_ns(self._action_hz)
-        smoothing = Smoothing(max_slew_per_s=config.limits.max_slew, tau_s=config.limits.tau)
-        pacer: Pacer
-        if config.rates.pace == "state":
-            pacer = StatePacer(self._clock, self._link, period_ns=action_period_ns)
-        else:
-            pacer = GridPacer(self._clock, period_ns=action_period_ns)
-        return ActionLoop(
-            clock=self._clock,
-            pacer=pacer,
-            link=self._link,
-            cache=cache,
-            act=self._executable.act,
-            smoother=StickSmoother(smoothing),
-            engagement=Engagement(
-                wanted_mode=config.mode, arm=config.arm, readonly=config.link.readonly
-            ),
-            sink=self._sink,
-            settings=ActionSettings(
-                state_frame=contract.state_frame,
-                chunk_dt_s=contract.chunk_dt_s,
-                history_len=contract.history_len,
-                history_dt_s=contract.history_dt_s,
-                freshness=_freshness(config.limits),
-                max_feature_age_ns=round(config.limits.max_feature_age * NS_PER_S),
-                lead_s=config.limits.tau,
-                mode=config.mode,
-                duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
-            ),
-        )
 
     def run(self, stop: StopRequest) -> None:
         """Fly until the action loop ends, the camera dies, or somebody says stop."""
@@ -286,13 +234,6 @@ class _Flight:
             link=self._link.stats(),
             observer_drops=drops,
         )
-
-
-def _freshness(limits: Limits) -> Freshness:
-    return Freshness(
-        attitude_ns=round(limits.max_attitude_age * NS_PER_S),
-        velocity_ns=round(limits.max_velocity_age * NS_PER_S),
-    )
 
 
 def _check_report(config: FlyConfig) -> None:

@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
-from mavbridge.config import BenchConfig, FlyConfig
+from mavbridge.config import BenchConfig, EvaluateConfig, FlyConfig
 from mavbridge.errors import UserError
 
 cli = App(
@@ -35,6 +35,20 @@ def bench(config: BenchConfig | None = None) -> int:
     from mavbridge.bench.run import bench as run_bench  # torch: not for --help
 
     return run_bench(BenchConfig() if config is None else config)
+
+
+@cli.command
+def evaluate(config: EvaluateConfig | None = None) -> int:
+    """Fly a policy over many simulated gate courses, and say how well it does."""
+    try:
+        from mavbridge.evaluation.run import evaluate as run_evaluation  # torch: not for --help
+    except ModuleNotFoundError as error:
+        if error.name != "mujoco":
+            raise
+        raise UserError(
+            "evaluate needs the simulator's dynamics: pip install 'mavbridge[sitl]'"
+        ) from error
+    return run_evaluation(EvaluateConfig() if config is None else config)
 
 
 @cli.meta.default

@@ -28,6 +28,8 @@ AUTO_VISUAL_HZ = (10.0, 60.0)
 """Limits of --visual-rate auto where none are given."""
 STATE_HZ = 50.0
 """Least rate of telemetry to ask for, however slow the actions are: ages are limits in seconds."""
+SIM_CAMERA_HZ = 30.0
+"""Frames a second of the simulated camera, unless the visual rate asks for more."""
 STATUS_HZ = 5.0
 """Terminal refresh."""
 
@@ -169,7 +171,8 @@ class PolicyConfig:
     action_device: str | None = None
     """Device of the action head, if it is another one."""
     seed: int = 0
-    """Seed of random weights and of the flight's initial diffusion noise."""
+    """Seed of random weights and of the flight's initial diffusion noise; evaluate: of courses and
+    delays, too."""
 
     def __post_init__(self) -> None:
         """Refuse what the scheduler and encoders cannot serve."""
@@ -239,3 +242,56 @@ class BenchConfig:
     """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
     check: Path | None = None
     """Compare with this budget of ratios, and exit with 1 if something got worse."""
+
+
+HELD_OUT_COURSE_SEED = 1_000_000
+"""Course seeds from here on are for evaluation: nothing is ever trained on them."""
+MAX_EPISODES = 10_000
+"""Of one evaluation, so that another seed has other courses."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """One evaluation: many courses that no policy was trained on."""
+
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    limits: Limits = field(default_factory=Limits)
+    visual_rate: float | str = 30.0
+    """Most frames a second through the image encoder (dual rate), or auto[:MIN:MAX]."""
+    action_rate: float = 100.0
+    """Commands a second (dual rate)."""
+    rate: float = 30.0
+    """Commands a second in single-rate mode."""
+    episodes: int = 20
+    """Courses to fly."""
+    max_time: float = 60.0
+    """Seconds that a flight may take, from the policy's first action."""
+    realtime: Annotated[bool, Parameter(negative="--lockstep")] = False
+    """--realtime: real processes over UDP against the wall clock, one flight at a time. --lockstep
+    (default): bridge and simulator on one simulated clock, as fast as the processor allows."""
+    workers: int = 1
+    """Episodes at a time; more than 1 takes ray (the extra "cluster")."""
+    ray: str | None = None
+    """Ray cluster to use, as HOST:PORT or auto; by default one on this machine, if needed."""
+    json: Path | None = None
+    """Write all results here as JSON."""
+    plot: Path | None = None
+    """Draw the results here as PNG; needs matplotlib (the extra "bench")."""
+
+    def __post_init__(self) -> None:
+        """Refuse contradictions."""
+        _check("episodes", self.episodes, 1, MAX_EPISODES, "")
+        _check("max-time", self.max_time, 1, 3600, "s")
+        _check("workers", self.workers, 1, 10_000, "")
+        if self.realtime and (self.workers > 1 or self.ray is not None):
+            raise UserError(
+                "--realtime flies one episode at a time, since the processors must be its own: "
+                "leave out --workers and --ray"
+            )
+        _ = self.rates
+
+    @property
+    def rates(self) -> Rates:
+        """As ``fly`` takes them."""
+        return Rates(visual_rate=self.visual_rate, action_rate=self.action_rate, rate=self.rate)

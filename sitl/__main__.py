@@ -46,6 +46,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--duration", type=_positive, metavar="S", help="stop after this time")
     parser.add_argument(
+        "--end-with-course",
+        action="store_true",
+        help="stop a second after the last gate, or at a crash",
+    )
+    parser.add_argument(
         "--receiver",
         choices=("idle", "none"),
         default="idle",
@@ -83,6 +88,7 @@ def _options(args: argparse.Namespace) -> RunOptions:
         report=args.report,
         duration_s=args.duration,
         vehicle=VehicleConfig(receiver=args.receiver == "idle"),
+        end_with_course=args.end_with_course,
     )
 
 

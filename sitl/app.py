@@ -35,6 +35,8 @@ class RunOptions:
     duration_s: float | None
     """None = until a signal."""
     vehicle: VehicleConfig
+    end_with_course: bool = False
+    """End a second after the last gate, or at a crash."""
 
 
 def run_vehicle(options: RunOptions) -> int:
@@ -61,7 +63,7 @@ def run_vehicle(options: RunOptions) -> int:
         end_ns = (
             clock.now_ns() + round(options.duration_s * NS_PER_S) if options.duration_s else None
         )
-        fly(vehicle, transports, clock, stop, end_ns)
+        fly(vehicle, transports, clock, stop, end_ns, end_with_course=options.end_with_course)
     if options.report is not None:
         write_report(options.report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
         tell(f"report written to {options.report}")
@@ -74,6 +76,8 @@ def fly(
     clock: Clock,
     stop: StopRequest,
     end_ns: int | None,
+    *,
+    end_with_course: bool = False,
 ) -> None:
     """The loop: take in what has come, advance to now, send what is due, on a 2.5 ms grid.
 
@@ -90,6 +94,8 @@ def fly(
         for link_id, transport in enumerate(transports):
             transport.send(vehicle.take_outgoing(link_id))
         console.update()
+        if end_with_course and vehicle.log.verdict(vehicle.ap.now_ns) is not None:
+            return
         missed = max(0, (clock.now_ns() - due_ns) // STEP_NS)
         due_ns += (missed + 1) * STEP_NS
         clock.sleep_until_ns(due_ns)

@@ -2,6 +2,7 @@
 
 All times are seconds since the vehicle's start (``t_s``). Keys:
 
+    start_ns             CLOCK_MONOTONIC of t_s = 0, shared by all processes of one machine
     duration_s           simulated time
     overrides            RC_CHANNELS_OVERRIDE let in that drove at least one of channels 1-8:
       count, first_t_s, last_t_s
@@ -27,13 +28,13 @@ All times are seconds since the vehicle's start (``t_s``). Keys:
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from sitl.autopilot import Autopilot
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course import Course, GateCounter
+from sitl.course import Course, GateCounter, GatePass
 from sitl.rotation import cos_tilt, to_euler
 
 CRASH_SPEED_MPS = 3.5
@@ -41,6 +42,8 @@ CRASH_SPEED_MPS = 3.5
 CRASH_TILT_COS = math.cos(math.radians(45.0))
 MAX_RELEASE_TIMES = 100
 MAX_TEXTS = 200
+END_AFTER_NS = NS_PER_S
+"""From the last gate to the end of a flown course: a crash just behind the gate still counts."""
 PATH_PERIOD_NS = NS_PER_S // 20
 """Path length is summed at 20 Hz: fine enough for turns, coarse enough not to add up vibration."""
 
@@ -51,7 +54,7 @@ class FlightLog:
     def __init__(self, start_ns: int, course: Course | None) -> None:
         self.refused_messages = 0
         self._start_ns = start_ns
-        self._gates_total = len(course.gates) if course else 0
+        self.gates_total = len(course.gates) if course else 0
         self._gates = GateCounter(course) if course else None
         self._overrides = _OverrideStats()
         self._release_times_s: list[float] = []
@@ -63,13 +66,29 @@ class FlightLog:
         self._armed_ns = 0
         self._last_ns = start_ns
         self._max_altitude_m = 0.0
-        self._distance_m = 0.0
+        self.distance_m = 0.0
+        """Flown so far."""
         self._path_due_ns = start_ns
         self._path_point = (0.0, 0.0, 0.0)
         self._was_touching = True
         self._speed_mps = 0.0
         self._impact_mps = 0.0
         self.crashed = False
+
+    @property
+    def gates_passed(self) -> tuple[GatePass, ...]:
+        """In order, so far."""
+        return tuple(self._gates.passed) if self._gates else ()
+
+    def verdict(self, now_ns: int) -> Literal["crashed", "finished"] | None:
+        """How the course has ended: with a crash, or a second after its last gate; None if not."""
+        if self.crashed:
+            return "crashed"
+        passed = self._gates.passed if self._gates else ()
+        if not passed or len(passed) < self.gates_total:
+            return None
+        over_ns = now_ns - self._start_ns - END_AFTER_NS
+        return "finished" if passed[-1].t_s * NS_PER_S <= over_ns else None
 
     def on_override(self, arrived_ns: int) -> None:
         """An RC_CHANNELS_OVERRIDE that drives at least one stick."""
@@ -102,7 +121,7 @@ class FlightLog:
         self._max_altitude_m = max(self._max_altitude_m, -body.position_ned_m[2])
         if ap.now_ns >= self._path_due_ns:
             self._path_due_ns = ap.now_ns + PATH_PERIOD_NS
-            self._distance_m += math.dist(body.position_ned_m, self._path_point)
+            self.distance_m += math.dist(body.position_ned_m, self._path_point)
             self._path_point = body.position_ned_m
         if self._gates is not None:
             self._gates.update(body.position_ned_m, self._t_s(ap.now_ns))
@@ -118,6 +137,7 @@ class FlightLog:
         body = ap.truth
         angles = to_euler(body.ned_from_body_wxyz)
         return {
+            "start_ns": self._start_ns,
             "duration_s": self._t_s(ap.now_ns),
             "overrides": self._overrides.summary(self._start_ns),
             "releases": {"count": self._releases, "t_s": self._release_times_s},
@@ -126,7 +146,7 @@ class FlightLog:
             "bad_frames": bad_frames,
             "armed_s": self._armed_ns / NS_PER_S,
             "max_altitude_m": self._max_altitude_m,
-            "distance_m": self._distance_m,
+            "distance_m": self.distance_m,
             "crashed": self.crashed,
             "impact_speed_mps": self._impact_mps,
             "gates": self._gates_summary(),
@@ -146,7 +166,7 @@ class FlightLog:
         if self._gates is None:
             return None
         passed = [{"index": gate.index, "t_s": gate.t_s} for gate in self._gates.passed]
-        return {"total": self._gates_total, "passed": passed}
+        return {"total": self.gates_total, "passed": passed}
 
     def _t_s(self, now_ns: int) -> float:
         return (now_ns - self._start_ns) / NS_PER_S

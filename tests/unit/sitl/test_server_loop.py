@@ -16,7 +16,7 @@ from sitl.__main__ import main
 from sitl.app import RunOptions, filming, fly
 from sitl.autopilot import STEP_NS, VehicleConfig
 from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from sitl.course import make_course
+from sitl.course import Course, make_course
 from sitl.modes import Mode
 from sitl.report import FlightLog, write_report
 from sitl.stopping import StopRequest, stop_on_signal
@@ -71,6 +71,17 @@ def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
 
     assert clock.sleeps_ns == [STEP_NS * n for n in range(1, 401)]
     assert vehicle.ap.now_ns == NS_PER_S - STEP_NS
+
+
+@pytest.mark.parametrize(("wanted", "ends_ns"), [(True, 0), (False, NS_PER_S // 2)])
+def test_a_crash_ends_the_loop_if_the_course_is_to_end_it(wanted, ends_ns):
+    clock = FakeClock()
+    vehicle = Vehicle(links=0, boot_ns=0, course=make_course(1))
+    vehicle.log.crashed = True
+
+    fly(vehicle, [], clock, StopRequest(), end_ns=NS_PER_S // 2, end_with_course=wanted)
+
+    assert clock.now_ns() == ends_ns
 
 
 def test_after_a_stall_it_catches_up_without_a_burst():
@@ -192,6 +203,11 @@ def test_falling_out_of_the_sky_is_a_crash(pilot):
     summary = log.summary(pilot.ap, 0)
     assert summary["crashed"]
     assert summary["impact_speed_mps"] > 5.0
+
+
+def test_a_course_without_gates_is_never_finished():
+    assert FlightLog(0, None).verdict(10 * NS_PER_S) is None
+    assert FlightLog(0, Course(seed=0, gates=())).verdict(10 * NS_PER_S) is None
 
 
 def test_modes_and_gates_are_logged(pilot):

@@ -1,0 +1,98 @@
+"""One episode of an evaluation as a value, and the flying of it, by whichever worker."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+from mavbridge.assembly import load_configured_policy
+from mavbridge.clock import Clock, MonotonicClock
+from mavbridge.config import (
+    HELD_OUT_COURSE_SEED,
+    MAX_EPISODES,
+    EvaluateConfig,
+    Limits,
+    PolicyConfig,
+    Rates,
+)
+from mavbridge.lockstep.episode import Episode, Setup
+from mavbridge.lockstep.result import EpisodeResult
+from policy.contract import Executable
+from policy.loading import LoadedPolicy
+
+BUILT_IN = ("toge", "resnet-unet")
+SCRIPTED = "scripted"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One episode; its seeds follow from the evaluation's seed and its index alone."""
+
+    index: int
+    course_seed: int
+    seed: int
+    policy: PolicyConfig
+    rates: Rates
+    limits: Limits
+    max_time_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flown:
+    """What a worker hands back."""
+
+    index: int
+    engine: str
+    result: EpisodeResult
+
+
+def make_jobs(config: EvaluateConfig) -> tuple[Job, ...]:
+    """All episodes of an evaluation: ``--seed`` S flies the held-out courses S * 10000 and on."""
+    first = config.policy.seed * MAX_EPISODES
+    return tuple(
+        Job(
+            index=index,
+            course_seed=HELD_OUT_COURSE_SEED + first + index,
+            seed=first + index,
+            policy=config.policy,
+            rates=config.rates,
+            limits=config.limits,
+            max_time_s=config.max_time,
+        )
+        for index in range(config.episodes)
+    )
+
+
+def is_stateless(policy: PolicyConfig) -> bool:
+    """A built-in net, which starts afresh with each flight; anything else may remember the last."""
+    return policy.policy.partition(":")[0] in BUILT_IN
+
+
+@lru_cache(maxsize=1)
+def _loaded_once(policy: PolicyConfig) -> LoadedPolicy:
+    return load_configured_policy(policy, MonotonicClock())
+
+
+def load(policy: PolicyConfig, clock: Clock) -> LoadedPolicy:
+    """A policy that knows nothing of earlier flights; nets are loaded once in a process.
+
+    Raises:
+        PolicyError: it cannot be loaded.
+    """
+    if is_stateless(policy):
+        return _loaded_once(policy)
+    return load_configured_policy(policy, clock)
+
+
+def fly_job(job: Job, should_stop: Callable[[], bool] | None = None) -> Flown:
+    """Fly one episode in lockstep.
+
+    Raises:
+        EpisodeInterruptedError: ``should_stop`` said so.
+        MavbridgeError, PolicyError: it cannot be flown.
+    """
+    is_scripted = job.policy.policy.partition(":")[0] == SCRIPTED
+    setup = Setup(rates=job.rates, limits=job.limits, draw_images=not is_scripted)
+    episode = Episode(course_seed=job.course_seed, seed=job.seed, setup=setup)
+    executable: Executable = load(job.policy, episode.clock).executable
+    result = episode.fly(executable, max_time_s=job.max_time_s, should_stop=should_stop)
+    return Flown(index=job.index, engine=executable.engine, result=result)

@@ -1,0 +1,123 @@
+"""The whole evaluation: fly, count, print, write, draw."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from mavbridge.clock import MonotonicClock
+from mavbridge.config import EvaluateConfig
+from mavbridge.errors import UserError
+from mavbridge.evaluation.cluster import fly_on_ray
+from mavbridge.evaluation.jobs import Flown, Job, fly_job, load, make_jobs
+from mavbridge.evaluation.realtime import fly_realtime
+from mavbridge.evaluation.results import Evaluation, to_json
+from mavbridge.evaluation.tables import print_evaluation
+from mavbridge.lockstep.referee import EpisodeInterruptedError
+from mavbridge.stopping import stop_on_signals
+
+INTERRUPTED = 130
+"""What shells report of a program ended by Ctrl-C."""
+
+
+def evaluate(config: EvaluateConfig) -> int:
+    """Fly all that the config asks for; 130 if interrupted, with the results so far.
+
+    Raises:
+        MavbridgeError, PolicyError: for whatever a person can have caused.
+    """
+    # Refused now, not after an hour.
+    draw = None if config.plot is None else _drawing(config.plot)
+    for path in (config.json, config.plot):
+        if path is not None:
+            _require_writable(path)
+    console = Console(stderr=True, emoji=False)
+    with stop_on_signals() as stop:
+        evaluation = _fly(config, console, stop.is_set)
+        was_stopped = stop.is_set()
+    if evaluation.episodes:
+        print_evaluation(evaluation, Console())
+        if draw is not None:
+            draw(evaluation)
+    if config.json is not None:
+        config.json.write_text(to_json(evaluation))
+    if not was_stopped:
+        return 0
+    done = len(evaluation.episodes)
+    console.print(Text(f"interrupted after {done} of {config.episodes} episodes", style="yellow"))
+    return INTERRUPTED
+
+
+def _fly(config: EvaluateConfig, console: Console, should_stop: Callable[[], bool]) -> Evaluation:
+    """Every episode, until somebody says stop; an error ends it, too."""
+    flown: list[Flown] = []
+    progress = Progress(
+        TextColumn("flying"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[score]}"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+    with progress:
+        bar = progress.add_task("flying", total=config.episodes, score="")
+        for one in _episodes(config, console, should_stop):
+            flown.append(one)
+            finished = sum(other.result.has_finished for other in flown)
+            progress.update(bar, advance=1, score=f"{finished} of {len(flown)} finished")
+    flown.sort(key=lambda one: one.index)
+    return Evaluation(
+        policy=config.policy.policy,
+        engine=flown[0].engine if flown else "",
+        mode="realtime" if config.realtime else "lockstep",
+        seed=config.policy.seed,
+        asked_episodes=config.episodes,
+        episodes=tuple(one.result for one in flown),
+    )
+
+
+def _episodes(
+    config: EvaluateConfig, console: Console, should_stop: Callable[[], bool]
+) -> Iterable[Flown]:
+    """Results as they come, in any order; ends early when somebody says stop."""
+    jobs = make_jobs(config)
+    if config.realtime:
+        return fly_realtime(jobs, should_stop=should_stop)
+    if config.workers > 1 or config.ray is not None:
+        return fly_on_ray(jobs, workers=config.workers, address=config.ray, should_stop=should_stop)
+    for note in load(config.policy, MonotonicClock()).notes:
+        console.print(Text(note, style="yellow"))
+    return _one_by_one(jobs, should_stop)
+
+
+def _one_by_one(jobs: Iterable[Job], should_stop: Callable[[], bool]) -> Iterator[Flown]:
+    with suppress(EpisodeInterruptedError):
+        for job in jobs:
+            yield fly_job(job, should_stop)
+
+
+def _drawing(path: Path) -> Callable[[Evaluation], None]:
+    """What draws the figure to ``path``; looked for before the run."""
+    try:
+        from mavbridge.evaluation.figure import draw
+    except ModuleNotFoundError as error:
+        if error.name != "matplotlib":
+            raise
+        raise UserError(
+            "--plot needs the package matplotlib: pip install 'mavbridge[bench]'"
+        ) from error
+    return lambda evaluation: draw(evaluation, path)
+
+
+def _require_writable(path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        was_there = path.exists()
+        path.open("ab").close()
+        if not was_there:
+            path.unlink()
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
