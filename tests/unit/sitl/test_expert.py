@@ -1,4 +1,4 @@
-"""The demonstrator over whole courses in stepped time; a few of them, the rest is measured apart."""
+"""The demonstrator over whole courses in stepped time: a few of them."""
 
 import math
 from itertools import pairwise
