@@ -142,6 +142,10 @@ class GateCounter:
         index = self._first + len(self.passed)
         return index if index < len(self._gates) else None
 
+    def interrupt(self) -> None:
+        """The next position will not have been reached by flying: a reboot."""
+        self._previous = None
+
     def update(self, position_ned_m: Vec3, t_s: float) -> None:
         """Take the next position of the trajectory, which is straight since the last one."""
         previous, self._previous = self._previous, (position_ned_m, t_s)

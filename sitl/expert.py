@@ -14,6 +14,7 @@ from typing import NamedTuple
 from sitl.control import clamp
 from sitl.course import Course, Gate, GateCounter, crossing, in_gate_axes, turned_to_gate
 from sitl.dynamics import GRAVITY_MPS2
+from sitl.errors import UsageError
 from sitl.guidance import Knot, Plan, least_acceleration
 from sitl.params import Params
 from sitl.rotation import Quat, Vec3, rotate, to_euler, wrap_pi
@@ -32,6 +33,7 @@ SPEED_GAIN_PER_S = 1.5
 DRAG_PER_S = 0.125
 """Linear drag over mass, leant against."""
 MIN_SPEED_MPS = 1.5
+MAX_SPEED_MPS = 10.0
 LOOK_M = 5.0
 """The nose points at the next gate, and nearer than this along the leg after it."""
 YAW_GAIN_PER_S = 2.5
@@ -72,9 +74,19 @@ CENTRED = Sticks4(0.0, 0.0, 0.0, 0.0)
 
 
 class Expert:
-    """One flight over a course; ask it at the rate at which sticks are sent, 50 Hz or more."""
+    """One flight over a course; ask it at the rate at which sticks are sent, 50 Hz or more.
+
+    ``speed_mps`` is what it flies where the course lets it: at 8 m/s it slows down for corners.
+
+    Raises:
+        UsageError: a speed that it cannot fly at.
+    """
 
     def __init__(self, course: Course, speed_mps: float, *, next_gate: int = 0) -> None:
+        if not MIN_SPEED_MPS <= speed_mps <= MAX_SPEED_MPS:
+            raise UsageError(
+                f"the expert flies at {MIN_SPEED_MPS} to {MAX_SPEED_MPS} m/s, got {speed_mps}"
+            )
         self._last = course.gates[-1]
         self._beyond = _straight_on(self._last)
         self._gates = course.gates + self._beyond

@@ -96,6 +96,13 @@ class FlightLog:
         self._was_touching = False
         self.crash = None
 
+    def on_reboot(self) -> None:
+        """The vehicle is back at the origin, without having flown there."""
+        if self._gates is not None:
+            self._gates.interrupt()
+        self._position_ned_m = None
+        self._was_touching = True
+
     def on_override(self, arrived_ns: int) -> None:
         """An RC_CHANNELS_OVERRIDE that drives at least one stick."""
         self._overrides.add(arrived_ns)

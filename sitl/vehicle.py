@@ -76,3 +76,4 @@ class Vehicle:
         """Start again on the ground at the origin: time_boot_ms is 0, parameters stay."""
         self.ap = Autopilot(self.params, self._config, self.ap.now_ns)
         self.server.restart(self.ap)
+        self.log.on_reboot()

@@ -13,6 +13,7 @@ from sitl.camera import body_from_camera
 from sitl.conditions import random_conditions
 from sitl.course import Start, in_gate_axes, make_course
 from sitl.disturbance import StickDisturbance, random_start
+from sitl.errors import UsageError
 from sitl.expert import Expert
 from sitl.guidance import Knot, least_acceleration
 from sitl.rotation import IDENTITY, from_euler
@@ -105,6 +106,12 @@ def test_a_missed_gate_is_flown_at_again(axial_m, right_m):
 def test_it_takes_over_in_the_air():
     course = make_course(11)
     assert fly_course(course, 6.0, start=random_start(course, 11, speed_mps=6.0)).succeeded
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 20.0, math.nan])
+def test_a_speed_it_cannot_fly_at_is_refused(speed_mps):
+    with pytest.raises(UsageError, match=r"1\.5 to 10\.0 m/s"):
+        Expert(make_course(0), speed_mps)
 
 
 def test_least_acceleration_is_none_where_none_is_needed():
