@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sitl.app import RunOptions, run_vehicle, tell
 from sitl.autopilot import VehicleConfig
+from sitl.conditions import NOMINAL, random_conditions
 from sitl.course import course_to_json, make_course
 from sitl.errors import UsageError
 from sitl.follow import run_follow
@@ -56,6 +57,12 @@ def _parser() -> argparse.ArgumentParser:
         default="idle",
         help="RC receiver: idle sticks (default), or none at all",
     )
+    parser.add_argument(
+        "--conditions",
+        type=_natural,
+        metavar="SEED",
+        help="another vehicle, wind, light, colours and lens by seed (default: nominal)",
+    )
     _add_camera_flags(parser)
     commands = parser.add_subparsers(dest="command", metavar="")
     camera = commands.add_parser(
@@ -87,7 +94,10 @@ def _options(args: argparse.Namespace) -> RunOptions:
         fps=args.fps,
         report=args.report,
         duration_s=args.duration,
-        vehicle=VehicleConfig(receiver=args.receiver == "idle"),
+        vehicle=VehicleConfig(
+            receiver=args.receiver == "idle",
+            conditions=NOMINAL if args.conditions is None else random_conditions(args.conditions),
+        ),
         end_with_course=args.end_with_course,
     )
 

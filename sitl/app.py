@@ -116,6 +116,7 @@ class _Console:
         self._mode = vehicle.ap.mode
         self._armed = vehicle.ap.armed
         self._texts = 0
+        self._crashed = False
 
     def heard(self, link_id: int) -> None:
         """Something came in on a link."""
@@ -132,6 +133,10 @@ class _Console:
         if ap.armed != self._armed:
             self._armed = ap.armed
             tell("armed" if ap.armed else "disarmed")
+        crash = self._vehicle.log.crash
+        if crash is not None and not self._crashed:
+            tell(f"crash: hit {crash.hit} at {crash.speed_mps:.1f} m/s")
+        self._crashed = crash is not None
         for text in self._vehicle.log.texts[self._texts :]:
             self._texts += 1
             tell(str(text["text"]))
@@ -143,7 +148,9 @@ def filming(
 ) -> Iterator[None]:
     """The FPV camera in its own thread, for as long as the context lasts."""
     stop = threading.Event()
-    renderer = FpvRenderer(course, options.image_size, options.image_size)
+    renderer = FpvRenderer(
+        course, options.image_size, options.image_size, options.vehicle.conditions
+    )
     publisher = FramePublisher(shm_name, options.image_size, options.image_size)
     period_ns = round(NS_PER_S / options.fps)
 

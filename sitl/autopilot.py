@@ -7,15 +7,17 @@ that it says about them. Nothing here knows about MAVLink, sockets or the host's
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from sitl.air import Air, SensorNoise
 from sitl.arming import prearm_refusal, stick_refusal
 from sitl.clock import NS_PER_S
+from sitl.conditions import NOMINAL, Conditions
 from sitl.dynamics import PHYSICS_STEP_NS, BodyState, Quadrotor
 from sitl.failsafe import GcsFailsafe, RadioFailsafe
 from sitl.flight import STOPPED, FlightControl
 from sitl.modes import Mode
 from sitl.params import Params
 from sitl.rc import IDLE_RECEIVER_US, RcEngine
-from sitl.rotation import cos_tilt
+from sitl.rotation import Quat, Vec3, cos_tilt
 from sitl.sticks import read_sticks
 
 SUBSTEPS = 2
@@ -51,6 +53,8 @@ class VehicleConfig:
     """From boot until arming is possible (about 23 s on the real firmware)."""
     position_ready_s: float = 5.0
     """From boot until the estimator has a position (about 40 s on the real firmware)."""
+    conditions: Conditions = NOMINAL
+    """Airframe, air and sensors; what concerns the camera is for `sitl.camera.FpvRenderer`."""
 
 
 class Autopilot:
@@ -73,7 +77,9 @@ class Autopilot:
         self.sensors_frozen = False
         """Fault: telemetry and control keep the last state, the world goes on."""
         self._control = FlightControl(params)
-        self._quad = Quadrotor()
+        self._quad = Quadrotor(config.conditions)
+        self._air = Air(config.conditions, STEP_NS / NS_PER_S)
+        self._noise = SensorNoise(config.conditions)
         self._physics = self._quad.at_rest()
         self.sensed = self._physics.body
         self.gps = self._physics.body
@@ -160,14 +166,32 @@ class Autopilot:
         if self.gcs_failsafe.update(self.now_ns):
             self._on_gcs_change()
         self.motor_commands = self._motors()
-        self._physics = self._quad.step(self._physics, self.motor_commands, SUBSTEPS)
+        self._physics = self._quad.step(
+            self._physics, self.motor_commands, SUBSTEPS, self._air.step()
+        )
         if not self.sensors_frozen:
-            self.sensed = self._physics.body
+            self.sensed = self._noise.sense(self._physics.body)
             if self.now_ns >= self._gps_due_ns:
                 self._gps_due_ns += GPS_PERIOD_NS
                 self.gps = self.sensed
         self._detect_landing()
         self._detect_crash()
+
+    def launch(
+        self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
+    ) -> None:
+        """Be flying in this state from now on, armed and in ALT_HOLD, without having taken off.
+
+        What the sticks say counts from the next step: an idle receiver asks for a descent.
+        """
+        self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
+        self.sensed = self.gps = self._physics.body
+        self.armed = True
+        self.landed = False
+        self.mode = Mode.ALT_HOLD
+        self._idle_since_ns = self.now_ns
+        self._still_since_ns = self._tipped_since_ns = None
+        self._control.reset(self.sensed)
 
     def _motors(self) -> tuple[float, ...]:
         if not self.armed:

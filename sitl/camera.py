@@ -1,8 +1,8 @@
 """What a camera on the vehicle sees of a gate course, drawn with OpenCV.
 
 Frames: NED world; FRD body; camera x right, y down, z along the optical axis. The camera sits at
-the body's origin and looks forward, tilted up. Pinhole, square pixels, no distortion; integer pixel
-coordinates are pixel centres.
+the body's origin and looks forward, tilted up, unless the conditions shift it. Pinhole, square
+pixels, no distortion; integer pixel coordinates are pixel centres.
 """
 
 import math
@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl import scenery
+from sitl.conditions import NOMINAL, Conditions
 from sitl.course import Course
 from sitl.errors import UsageError
-from sitl.rotation import Quat, Vec3, rotate
+from sitl.imager import Imager
+from sitl.rotation import Quat, Vec3, from_euler, rotate
 
 FloatArray: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.uint8]
 
-HORIZONTAL_FOV_RAD = math.radians(90.0)
-TILT_UP_RAD = math.radians(10.0)
-"""As on racing quadrotors, which fly nose down."""
+TILT_UP_RAD = NOMINAL.camera_tilt_rad
 NEAR_M = 0.05
 """What is nearer than this, or behind, is cut off before it is projected."""
 LOWEST_EYE_M = 0.12
@@ -34,22 +34,19 @@ GROUND_FADE_M = 14.0
 SUBPIXEL_BITS = 4
 """Corners are rounded to 1/16 pixel."""
 
-BODY_FROM_CAMERA = np.array(
-    [
-        [0.0, math.sin(TILT_UP_RAD), math.cos(TILT_UP_RAD)],
-        [1.0, 0.0, 0.0],
-        [0.0, math.cos(TILT_UP_RAD), -math.sin(TILT_UP_RAD)],
-    ]
-)
-
 
 class FpvRenderer:
-    """Draws the view from any pose; holds only what the course and the image size determine."""
+    """Draws the view from any pose; holds what course, image size and conditions determine.
 
-    def __init__(self, course: Course, width: int, height: int) -> None:
+    Only image noise, where the conditions ask for it, depends on how many frames came before.
+    """
+
+    def __init__(
+        self, course: Course, width: int, height: int, conditions: Conditions = NOMINAL
+    ) -> None:
         if min(width, height) < 16:
             raise UsageError(f"the image must have at least 16x16 pixels, got {width}x{height}")
-        self._focal_px = width / 2 / math.tan(HORIZONTAL_FOV_RAD / 2)
+        self._focal_px = width / 2 / math.tan(conditions.horizontal_fov_rad / 2)
         self._center_px = np.array([(width - 1) / 2, (height - 1) / 2])
         self._ray_from_pixel = (
             np.array(
@@ -63,22 +60,29 @@ class FpvRenderer:
         )
         self._u_px = np.arange(width, dtype=np.float32)
         self._v_px = np.arange(height, dtype=np.float32)[:, None]
-        self._backdrop = scenery.backdrop_colours()
-        self._ground = scenery.ground_tile()
+        self._body_from_camera = body_from_camera(conditions)
+        self._offset_body_m = conditions.camera_offset_body_m
+        self._backdrop = scenery.backdrop_colours(conditions)
+        self._haze_rgb = scenery.tinted(scenery.HAZE_RGB, conditions.sky_tint)
+        self._ridge_rgb = scenery.tinted(scenery.RIDGE_RGB, conditions.sky_tint)
+        self._ground = scenery.ground_tile(conditions)
         self._ridge = scenery.ridge_directions(course.seed)
-        self._faces = scenery.gate_faces(course)
+        self._faces = scenery.gate_faces(course, conditions)
+        self._imager = Imager(conditions, width, height)
         self._centers_ned_m = np.array([gate.center_ned_m for gate in course.gates])
 
     def render(self, position_ned_m: Vec3, ned_from_body_wxyz: Quat) -> Image:
         """The view as [H, W, 3] uint8 RGB, a new array."""
         eye_ned_m = np.array(position_ned_m, dtype=np.float64)
+        if any(self._offset_body_m):
+            eye_ned_m += rotate(ned_from_body_wxyz, self._offset_body_m)
         eye_ned_m[2] = min(eye_ned_m[2], -LOWEST_EYE_M)
-        ned_from_camera = rotation_matrix(ned_from_body_wxyz) @ BODY_FROM_CAMERA
+        ned_from_camera = rotation_matrix(ned_from_body_wxyz) @ self._body_from_camera
         image = self._draw_backdrop(eye_ned_m, ned_from_camera)
         ridge = self._ridge @ ned_from_camera
-        self._fill(image, ridge, np.tile(scenery.RIDGE_RGB, (len(ridge), 1)), cv2.LINE_8)
+        self._fill(image, ridge, np.tile(self._ridge_rgb, (len(ridge), 1)), cv2.LINE_8)
         self._draw_gates(image, eye_ned_m, ned_from_camera)
-        return image
+        return self._imager.expose(image)
 
     def _draw_backdrop(self, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> Image:
         """Sky and ground. A ray of unit depth falls by a linear function of the pixel."""
@@ -129,7 +133,7 @@ class FpvRenderer:
         order = np.argsort(-distance_m, kind="stable")
         order = order[facing[order]]
         haze = 1 - np.exp(-distance_m[order, None] / GATE_HAZE_M)
-        rgb = faces.rgb[order] * (1 - haze) + np.array(scenery.HAZE_RGB) * haze
+        rgb = faces.rgb[order] * (1 - haze) + self._haze_rgb * haze
         self._fill(image, from_eye_m[order] @ ned_from_camera, rgb, cv2.LINE_AA)
 
     def _fill(self, image: Image, corners_m: FloatArray, rgb: FloatArray, line_type: int) -> None:
@@ -162,6 +166,18 @@ class FpvRenderer:
             ]
         )
         return np.asarray(~outside.all(axis=2).any(axis=0))
+
+
+def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
+    """[3, 3] from camera axes (x right, y down, z forward) to FRD body axes."""
+    sine, cosine = math.sin(conditions.camera_tilt_rad), math.cos(conditions.camera_tilt_rad)
+    tilted = np.array([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
+    roll_rad, yaw_rad = conditions.camera_roll_rad, conditions.camera_yaw_rad
+    if roll_rad == 0.0 and yaw_rad == 0.0:
+        return tilted
+    about_axis = rotation_matrix(from_euler(0.0, 0.0, roll_rad))
+    about_down = rotation_matrix(from_euler(0.0, 0.0, yaw_rad))
+    return np.asarray(about_down @ tilted @ about_axis)
 
 
 def _rows(top: int) -> FloatArray:

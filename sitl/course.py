@@ -11,11 +11,15 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from sitl.errors import UsageError
-from sitl.rotation import Vec3, wrap_pi
+from sitl.rotation import Quat, Vec3, wrap_pi
 
 GATE_COUNT = 8
 OPENING_M = 2.4
 """Side of the opening: five times the width of a 0.5 m quadrotor."""
+BAR_M = 0.32
+"""Width of the bars around an opening."""
+DEPTH_M = 0.24
+"""Of the frame, along the passage; the gate's centre is in the middle of it."""
 
 # At 8 m/s the sharpest turn over the shortest leg, 35 degrees in 7 m, asks for v^2 * angle / leg =
 # 5.6 m/s^2 = g * tan(30 deg), ArduCopter's default lean limit. The climb limit asks for 1.1 m/s.
@@ -54,6 +58,17 @@ class GatePass:
 
     index: int
     t_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """A state to begin a flight in, in the air."""
+
+    position_ned_m: Vec3
+    velocity_ned_mps: Vec3
+    ned_from_body_wxyz: Quat
+    next_gate: int
+    """Gates are counted from this one."""
 
 
 def make_course(seed: int) -> Course:
@@ -110,14 +125,26 @@ def course_to_json(course: Course) -> str:
 class GateCounter:
     """Watches a trajectory and counts gates: in order, in the right direction, inside the opening.
 
+    ``first`` is the gate to begin with, for a flight that starts in the middle of the course.
     A point on the very edge of the opening is inside. A gate that was flown around stays the next
     one until it has been passed.
     """
 
-    def __init__(self, course: Course) -> None:
+    def __init__(self, course: Course, *, first: int = 0) -> None:
         self._gates = course.gates
+        self._first = first
         self._previous: tuple[Vec3, float] | None = None
         self.passed: list[GatePass] = []
+
+    @property
+    def next_gate(self) -> int | None:
+        """Index of the gate to be passed next; None after the last."""
+        index = self._first + len(self.passed)
+        return index if index < len(self._gates) else None
+
+    def interrupt(self) -> None:
+        """The next position will not have been reached by flying: a reboot."""
+        self._previous = None
 
     def update(self, position_ned_m: Vec3, t_s: float) -> None:
         """Take the next position of the trajectory, which is straight since the last one."""
@@ -126,9 +153,9 @@ class GateCounter:
             return
         start_ned_m, start_s = previous
         reached = 0.0
-        while len(self.passed) < len(self._gates):
-            gate = self._gates[len(self.passed)]
-            fraction = _crossing(gate, start_ned_m, position_ned_m)
+        while (index := self.next_gate) is not None:
+            gate = self._gates[index]
+            fraction = crossing(gate, start_ned_m, position_ned_m)
             if fraction is None or fraction < reached:
                 return
             reached = fraction
@@ -136,10 +163,10 @@ class GateCounter:
             self.passed.append(GatePass(index=gate.index, t_s=passed_s))
 
 
-def _crossing(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> float | None:
+def crossing(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> float | None:
     """Where on the segment, 0 to 1, it passes forward through the opening; None if it does not."""
-    ahead_start_m, right_start_m, down_start_m = _in_gate(gate, start_ned_m)
-    ahead_end_m, right_end_m, down_end_m = _in_gate(gate, end_ned_m)
+    ahead_start_m, right_start_m, down_start_m = in_gate_axes(gate, start_ned_m)
+    ahead_end_m, right_end_m, down_end_m = in_gate_axes(gate, end_ned_m)
     if not ahead_start_m < 0.0 <= ahead_end_m:
         return None
     fraction = ahead_start_m / (ahead_start_m - ahead_end_m)
@@ -149,14 +176,16 @@ def _crossing(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> float | None:
     return fraction if abs(right_m) <= half_m and abs(down_m) <= half_m else None
 
 
-def _in_gate(gate: Gate, position_ned_m: Vec3) -> Vec3:
-    """A position in the gate's own axes: ahead along the passage, right, down."""
+def in_gate_axes(gate: Gate, position_ned_m: Vec3) -> Vec3:
+    """A position from the gate's centre, in its own axes: ahead along the passage, right, down."""
     north_m, east_m, down_m = (
         a - b for a, b in zip(position_ned_m, gate.center_ned_m, strict=True)
     )
+    return turned_to_gate(gate, (north_m, east_m, down_m))
+
+
+def turned_to_gate(gate: Gate, vector_ned: Vec3) -> Vec3:
+    """A direction, velocity or offset in the gate's axes: ahead along the passage, right, down."""
+    north, east, down = vector_ned
     cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
-    return (
-        north_m * cos_yaw + east_m * sin_yaw,
-        east_m * cos_yaw - north_m * sin_yaw,
-        down_m,
-    )
+    return (north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw, down)

@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.rotation import Quat, Vec3
+from sitl.conditions import NOMINAL, Conditions
+from sitl.rotation import Quat, Vec3, cos_tilt
 
 GRAVITY_MPS2 = 9.80665
 MASS_KG = 1.2
@@ -27,23 +28,39 @@ MOTOR_LAG_S = 0.028
 ROTOR_DRAG_NSPM = 0.15
 """Linear drag of spinning rotors, about 0.1 1/s of mass at this size; body drag is MuJoCo's own
 quadratic model on the equivalent inertia box."""
+AIR_DENSITY_KGPM3 = 1.225
 REST_HEIGHT_M = 0.06
 
 PHYSICS_STEP_NS = 1_250_000
 
-_MODEL = f"""
+_BODY = 1
+"""After the world."""
+_FULL_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+def _model_xml(conditions: Conditions) -> str:
+    """The model, compiled anew for other masses: MuJoCo derives more from them than it shows.
+
+    Motor order and directions are ArduCopter's quad X: front right and rear left turn anticlockwise
+    seen from above, so they push the nose to the right.
+    """
+    density = AIR_DENSITY_KGPM3 * conditions.drag_factor
+    thrust_n = MAX_MOTOR_THRUST_N * conditions.thrust_factor
+    inertia_kgm2 = [conditions.mass_factor * moment for moment in INERTIA_KGM2]
+    return f"""
 <mujoco>
-  <option timestep="{PHYSICS_STEP_NS / 1e9}" gravity="0 0 -{GRAVITY_MPS2}" density="1.225"
+  <option timestep="{PHYSICS_STEP_NS / 1e9}" gravity="0 0 -{GRAVITY_MPS2}" density="{density}"
           integrator="implicitfast"/>
   <default>
-    <general dyntype="filterexact" dynprm="{MOTOR_LAG_S}" gainprm="{MAX_MOTOR_THRUST_N}"
+    <general dyntype="filterexact" dynprm="{MOTOR_LAG_S}" gainprm="{thrust_n}"
              ctrlrange="0 1" ctrllimited="true"/>
   </default>
   <worldbody>
     <geom type="plane" pos="0 0 {-REST_HEIGHT_M}" size="0 0 1"/>
     <body>
       <freejoint/>
-      <inertial pos="0 0 0" mass="{MASS_KG}" diaginertia="{" ".join(map(str, INERTIA_KGM2))}"/>
+      <inertial pos="0 0 0" mass="{MASS_KG * conditions.mass_factor}"
+                diaginertia="{" ".join(map(str, inertia_kgm2))}"/>
       <geom type="sphere" size="0.02" pos="0.12 0.12 -0.04"/>
       <geom type="sphere" size="0.02" pos="0.12 -0.12 -0.04"/>
       <geom type="sphere" size="0.02" pos="-0.12 0.12 -0.04"/>
@@ -65,10 +82,6 @@ _MODEL = f"""
   <sensor><accelerometer site="imu"/></sensor>
 </mujoco>
 """
-"""Motor order and directions are ArduCopter's quad X: front right and rear left turn anticlockwise
-seen from above, so they push the nose to the right."""
-
-_FULL_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class BodyState(NamedTuple):
@@ -102,9 +115,12 @@ def _flip(v: Sequence[float]) -> Vec3:
 class Quadrotor:
     """The model; its MuJoCo data is scratch space, all state is in the argument and the result."""
 
-    def __init__(self) -> None:
-        self._model = mujoco.MjModel.from_xml_string(_MODEL)
-        self._model.dof_damping[:3] = ROTOR_DRAG_NSPM
+    def __init__(self, conditions: Conditions = NOMINAL) -> None:
+        self._model = mujoco.MjModel.from_xml_string(_model_xml(conditions))
+        self._mass_kg = MASS_KG * conditions.mass_factor
+        self._max_motor_thrust_n = MAX_MOTOR_THRUST_N * conditions.thrust_factor
+        self._rotor_drag_nspm = ROTOR_DRAG_NSPM * conditions.drag_factor
+        self._model.dof_damping[:3] = self._rotor_drag_nspm
         self._data = mujoco.MjData(self._model)
         self._state_size = mujoco.mj_stateSize(self._model, _FULL_STATE)
 
@@ -114,12 +130,38 @@ class Quadrotor:
         mujoco.mj_forward(self._model, self._data)
         return self._capture()
 
-    def step(
-        self, state: PhysicsState, motor_commands: Sequence[float], substeps: int
+    def airborne(
+        self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> PhysicsState:
-        """The state ``substeps`` physics steps later, with the four commands held (0..1)."""
+        """In the air and not turning, motors at the thrust that carries the weight."""
+        mujoco.mj_resetData(self._model, self._data)
+        w, *vector = ned_from_body_wxyz
+        self._data.qpos[:] = (*_flip(position_ned_m), w, *_flip(vector))
+        self._data.qvel[:3] = _flip(velocity_ned_mps)
+        tilt = max(0.5, cos_tilt(ned_from_body_wxyz))
+        self._data.act[:] = min(
+            1.0, self._mass_kg * GRAVITY_MPS2 / (4.0 * self._max_motor_thrust_n * tilt)
+        )
+        mujoco.mj_forward(self._model, self._data)
+        return self._capture()
+
+    def step(
+        self,
+        state: PhysicsState,
+        motor_commands: Sequence[float],
+        substeps: int,
+        wind_ned_mps: Vec3 = (0.0, 0.0, 0.0),
+    ) -> PhysicsState:
+        """The state ``substeps`` physics steps later, with the four commands (0..1) and wind held.
+
+        MuJoCo's body drag knows the wind; its damping, the rotors' drag, is against the ground, so
+        what the moving air adds to it is a force.
+        """
         mujoco.mj_setState(self._model, self._data, state.integration, _FULL_STATE)
         self._data.ctrl[:] = motor_commands
+        wind = _flip(wind_ned_mps)
+        self._model.opt.wind[:] = wind
+        self._data.xfrc_applied[_BODY, :3] = [self._rotor_drag_nspm * speed for speed in wind]
         mujoco.mj_step(self._model, self._data, nstep=substeps)
         return self._capture()
 

@@ -17,9 +17,12 @@ All times are seconds since the vehicle's start (``t_s``). Keys:
     armed_s              time armed
     max_altitude_m       above the start
     distance_m           flown over ground and through the air, along the path
-    crashed              hit the ground faster than 3.5 m/s or tilted by more than 45 degrees
+    crashed              hit the ground faster than 3.5 m/s or tilted by more than 45 degrees,
+                         or the frame of a gate; gates after that do not count
+    crash                {t_s, hit: "ground" or "gate N", speed_mps} of the first; null for none
     impact_speed_mps     of the hardest touch; 0.0 if it never left the ground
     gates                {total, passed: [{index, t_s}, ...]} or null without a course
+    conditions           every number of `sitl.conditions.Conditions` that this flight had
     modes                [{t_s, mode}, ...] from the first
     statustexts          [{t_s, text}, ...]; at most the first 200
     final                {mode, armed, landed, position_ned_m, velocity_ned_mps, roll_pitch_yaw_deg}
@@ -27,6 +30,7 @@ All times are seconds since the vehicle's start (``t_s``). Keys:
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,8 +38,9 @@ import numpy as np
 
 from sitl.autopilot import Autopilot
 from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.collision import Crash, struck_gate
 from sitl.course import Course, GateCounter, GatePass
-from sitl.rotation import cos_tilt, to_euler
+from sitl.rotation import Vec3, cos_tilt, to_euler
 
 CRASH_SPEED_MPS = 3.5
 """ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash."""
@@ -55,7 +60,9 @@ class FlightLog:
         self.refused_messages = 0
         self._start_ns = start_ns
         self.gates_total = len(course.gates) if course else 0
+        self._course = course
         self._gates = GateCounter(course) if course else None
+        self._position_ned_m: Vec3 | None = None
         self._overrides = _OverrideStats()
         self._release_times_s: list[float] = []
         self._releases = 0
@@ -73,7 +80,33 @@ class FlightLog:
         self._was_touching = True
         self._speed_mps = 0.0
         self._impact_mps = 0.0
-        self.crashed = False
+        self.crash: Crash | None = None
+        """What was hit first."""
+
+    @property
+    def crashed(self) -> bool:
+        """The frame of a gate, or the ground, was hit hard."""
+        return self.crash is not None
+
+    @property
+    def next_gate(self) -> int | None:
+        """Index of the gate to be passed next; None after the last, or without a course."""
+        return self._gates.next_gate if self._gates else None
+
+    def start_over(self, next_gate: int) -> None:
+        """The vehicle has been put somewhere else: count gates from this one."""
+        if self._course is not None:
+            self._gates = GateCounter(self._course, first=next_gate)
+        self._position_ned_m = None
+        self._was_touching = False
+        self.crash = None
+
+    def on_reboot(self) -> None:
+        """The vehicle is back at the origin, without having flown there."""
+        if self._gates is not None:
+            self._gates.interrupt()
+        self._position_ned_m = None
+        self._was_touching = True
 
     @property
     def gates_passed(self) -> tuple[GatePass, ...]:
@@ -85,7 +118,7 @@ class FlightLog:
         if self.crashed:
             return "crashed"
         passed = self._gates.passed if self._gates else ()
-        if not passed or len(passed) < self.gates_total:
+        if not passed or self.next_gate is not None:
             return None
         over_ns = now_ns - self._start_ns - END_AFTER_NS
         return "finished" if passed[-1].t_s * NS_PER_S <= over_ns else None
@@ -123,14 +156,28 @@ class FlightLog:
             self._path_due_ns = ap.now_ns + PATH_PERIOD_NS
             self.distance_m += math.dist(body.position_ned_m, self._path_point)
             self._path_point = body.position_ned_m
-        if self._gates is not None:
-            self._gates.update(body.position_ned_m, self._t_s(ap.now_ns))
+        self._watch_gates(body.position_ned_m, ap.now_ns)
         if body.touching and not self._was_touching:
             self._impact_mps = max(self._impact_mps, self._speed_mps)
             tilted = cos_tilt(body.ned_from_body_wxyz) < CRASH_TILT_COS
-            self.crashed = self.crashed or tilted or self._speed_mps > CRASH_SPEED_MPS
+            if tilted or self._speed_mps > CRASH_SPEED_MPS:
+                self._on_crash("ground", ap.now_ns)
         self._was_touching = body.touching
         self._speed_mps = math.hypot(*body.velocity_ned_mps)
+
+    def _watch_gates(self, position_ned_m: Vec3, now_ns: int) -> None:
+        before_ned_m, self._position_ned_m = self._position_ned_m, position_ned_m
+        if self._course is None or self._gates is None or self.crashed:
+            return
+        self._gates.update(position_ned_m, self._t_s(now_ns))
+        if before_ned_m is not None:
+            struck = struck_gate(self._course, before_ned_m, position_ned_m)
+            if struck is not None:
+                self._on_crash(f"gate {struck}", now_ns)
+
+    def _on_crash(self, hit: str, now_ns: int) -> None:
+        if self.crash is None:
+            self.crash = Crash(t_s=self._t_s(now_ns), hit=hit, speed_mps=self._speed_mps)
 
     def summary(self, ap: Autopilot, bad_frames: int) -> dict[str, Any]:
         """The report, ready for JSON."""
@@ -148,8 +195,10 @@ class FlightLog:
             "max_altitude_m": self._max_altitude_m,
             "distance_m": self.distance_m,
             "crashed": self.crashed,
+            "crash": asdict(self.crash) if self.crash else None,
             "impact_speed_mps": self._impact_mps,
             "gates": self._gates_summary(),
+            "conditions": ap.config.conditions.numbers(),
             "modes": self._modes,
             "statustexts": self.texts,
             "final": {
@@ -163,7 +212,7 @@ class FlightLog:
         }
 
     def _gates_summary(self) -> dict[str, Any] | None:
-        if self._gates is None:
+        if self._course is None or self._gates is None:
             return None
         passed = [{"index": gate.index, "t_s": gate.t_s} for gate in self._gates.passed]
         return {"total": self.gates_total, "passed": passed}

@@ -8,16 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.course import Course, Gate
+from sitl.conditions import NOMINAL, Conditions, Rgb
+from sitl.course import BAR_M, DEPTH_M, Course, Gate
 from sitl.rotation import Vec3
 
 FloatArray: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.uint8]
-Rgb: TypeAlias = tuple[int, int, int]
 
-BAR_M = 0.32
-"""Width of the bars around an opening."""
-DEPTH_M = 0.24
 LEG_M = 0.09
 PIP_M = 0.16
 PIP_PITCH_M = 0.32
@@ -38,8 +35,8 @@ LEG_RGB = (58, 60, 68)
 PIP_RGB = (255, 248, 232)
 BACK_RGB = (96, 98, 112)
 """A gate is grey from behind: it must not be flown from there."""
-FRONT_RGB = ((255, 126, 22), (222, 34, 48))
-"""Orange for gates 0, 2, ..., red for gates 1, 3, ...; the white squares on top count from one."""
+FRONT_RGB = NOMINAL.gate_rgb
+"""Of even gates, of odd gates; the white squares on top count from one."""
 BACKDROP_RGB = (
     (-1.0, (78, 98, 66)),
     (-0.30, (92, 108, 76)),
@@ -50,10 +47,6 @@ BACKDROP_RGB = (
     (1.0, (52, 100, 182)),
 )
 """How far a viewing ray of unit depth rises -> colour, interpolated between."""
-SUN_NED = (-0.45, 0.35, -0.82)
-"""Direction to the sun, unit length."""
-AMBIENT = 0.78
-"""Brightness of a surface turned away from the sun."""
 
 
 class _Face(NamedTuple):
@@ -79,14 +72,15 @@ class Faces:
     point, a later one is never hidden by an earlier one."""
 
 
-def gate_faces(course: Course) -> Faces:
+def gate_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
     """All surfaces of all gates."""
+    sun_ned, ambient = np.array(conditions.sun_ned), conditions.ambient
     corners, normals, rgb, owners = [], [], [], []
     for gate in course.gates:
         ned_from_gate = _ned_from_gate(gate)
-        for face in _gate_parts(gate):
+        for face in _gate_parts(gate, conditions.gate_rgb):
             normal_ned = ned_from_gate @ np.array(face.normal)
-            light = AMBIENT + (1 - AMBIENT) * max(0.0, float(normal_ned @ np.array(SUN_NED)))
+            light = ambient + (1 - ambient) * max(0.0, float(normal_ned @ sun_ned))
             corners.append(np.array(face.corners_m) @ ned_from_gate.T + gate.center_ned_m)
             normals.append(normal_ned)
             rgb.append(np.array(face.rgb) * light)
@@ -104,7 +98,7 @@ def _ned_from_gate(gate: Gate) -> FloatArray:
     return np.array([[cos_yaw, -sin_yaw, 0.0], [sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _gate_parts(gate: Gate) -> list[_Face]:
+def _gate_parts(gate: Gate, front_rgb: tuple[Rgb, Rgb]) -> list[_Face]:
     """Faces in drawing order.
 
     Walls inside the opening are hidden by any other part of the frame that is in the way, so they
@@ -112,7 +106,7 @@ def _gate_parts(gate: Gate) -> list[_Face]:
     """
     inner_m = gate.size_m / 2
     outer_m = inner_m + BAR_M
-    paint = FRONT_RGB[gate.index % len(FRONT_RGB)]
+    paint = front_rgb[gate.index % len(front_rgb)]
     inside = _scaled(paint, 0.7)
     return [
         *_legs(gate, inner_m, outer_m),
@@ -208,7 +202,12 @@ def ridge_directions(seed: int) -> FloatArray:
     return np.stack([foot[:-1], foot[1:], crest[1:], crest[:-1]], axis=1)
 
 
-def backdrop_colours() -> Image:
+def tinted(rgb: Rgb, tint: Vec3) -> FloatArray:
+    """[3] the colour in another light, of 255."""
+    return np.asarray(np.clip(np.array(rgb) * np.array(tint), 0, 255))
+
+
+def backdrop_colours(conditions: Conditions = NOMINAL) -> Image:
     """Sky above and far ground below, [256, 1, 3] uint8 RGB.
 
     Entry k is for a ray of unit depth that rises by k / 127.5 - 1.
@@ -216,26 +215,28 @@ def backdrop_colours() -> Image:
     up = np.linspace(-1.0, 1.0, 256)
     stops, rgb = zip(*BACKDROP_RGB, strict=True)
     channels = [np.interp(up, stops, [c[k] for c in rgb]) for k in range(3)]
-    colours = np.stack(channels, axis=1).round().reshape(256, 1, 3)
-    return np.asarray(colours, dtype=np.uint8)
+    colours = (np.stack(channels, axis=1) * conditions.sky_tint).round().reshape(256, 1, 3)
+    return np.asarray(np.clip(colours, 0, 255), dtype=np.uint8)
 
 
-def ground_tile() -> Image:
+def ground_tile(conditions: Conditions = NOMINAL) -> Image:
     """A square of ground that repeats seamlessly, [GROUND_TILE_PX, GROUND_TILE_PX, 3] RGB.
 
     Mottled grass and soil under a 2 m grid: texture for optic flow, lines for scale. Axis 0 is
     east, axis 1 is north.
     """
-    random = np.random.Generator(np.random.PCG64(0))
+    random = np.random.Generator(np.random.PCG64(conditions.ground_seed))
     patches = _periodic_noise(random, smooth_m=1.2)[..., None]
     speckle = _periodic_noise(random, smooth_m=0.06)[..., None]
     mix = np.clip(0.5 + 0.35 * patches, 0, 1)
     ground = mix * np.array(SOIL_RGB) + (1 - mix) * np.array(GRASS_RGB)
-    tile = np.asarray(np.clip(ground * (1 + 0.13 * speckle), 0, 255), dtype=np.uint8)
+    lit = ground * (1 + 0.13 * speckle) * conditions.ground_tint
+    tile = np.asarray(np.clip(lit, 0, 255), dtype=np.uint8)
+    grid_rgb = tinted(GRID_RGB, conditions.ground_tint).tolist()
     pitch_px = round(GRID_M * GROUND_TILE_PX / GROUND_TILE_M)
     for at_px in range(pitch_px // 2, GROUND_TILE_PX, pitch_px):
-        cv2.line(tile, (at_px, 0), (at_px, GROUND_TILE_PX), GRID_RGB, thickness=3)
-        cv2.line(tile, (0, at_px), (GROUND_TILE_PX, at_px), GRID_RGB, thickness=3)
+        cv2.line(tile, (at_px, 0), (at_px, GROUND_TILE_PX), grid_rgb, thickness=3)
+        cv2.line(tile, (0, at_px), (GROUND_TILE_PX, at_px), grid_rgb, thickness=3)
     return tile
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sitl.autopilot import STEP_NS, Autopilot, VehicleConfig
-from sitl.course import Course
+from sitl.course import Course, Start
 from sitl.dynamics import BodyState
 from sitl.mavlink_server import MavlinkServer
 from sitl.params import Params
@@ -66,7 +66,14 @@ class Vehicle:
         """What the link has to send: whole frames, in order."""
         return self.server.links[link_id].take_outgoing()
 
+    def launch(self, start: Start) -> None:
+        """Be airborne in this state from now on: armed, in ALT_HOLD, gates counted from its own."""
+        self.ap.launch(start.position_ned_m, start.velocity_ned_mps, start.ned_from_body_wxyz)
+        self.log.start_over(start.next_gate)
+        self.pose = Pose(stamp_ns=self.ap.now_ns, body=self.ap.truth)
+
     def reboot(self) -> None:
         """Start again on the ground at the origin: time_boot_ms is 0, parameters stay."""
         self.ap = Autopilot(self.params, self._config, self.ap.now_ns)
         self.server.restart(self.ap)
+        self.log.on_reboot()

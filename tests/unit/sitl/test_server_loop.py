@@ -16,6 +16,7 @@ from sitl.__main__ import main
 from sitl.app import RunOptions, filming, fly
 from sitl.autopilot import STEP_NS, VehicleConfig
 from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from sitl.collision import Crash
 from sitl.course import Course, make_course
 from sitl.modes import Mode
 from sitl.report import FlightLog, write_report
@@ -77,7 +78,7 @@ def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
 def test_a_crash_ends_the_loop_if_the_course_is_to_end_it(wanted, ends_ns):
     clock = FakeClock()
     vehicle = Vehicle(links=0, boot_ns=0, course=make_course(1))
-    vehicle.log.crashed = True
+    vehicle.log.crash = Crash(t_s=0.0, hit="ground", speed_mps=5.0)
 
     fly(vehicle, [], clock, StopRequest(), end_ns=NS_PER_S // 2, end_with_course=wanted)
 

@@ -1,0 +1,214 @@
+"""What differs from one flight to the next: vehicle, air, sensors, light, colours and lens.
+
+The defaults are the nominal vehicle and view, to the bit. `random_conditions` draws others, so that
+a policy learns to fly a vehicle rather than this one (Tobin et al., "Domain Randomization", 2017).
+"""
+
+import colorsys
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from sitl.errors import UsageError
+from sitl.rotation import Vec3
+
+Rgb: TypeAlias = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Conditions:
+    """One world; factors are 1 and offsets 0 where nothing differs."""
+
+    seed: int = 0
+    """Of gusts, sensor noise and image noise."""
+
+    mass_factor: float = 1.0
+    """Of mass and inertia."""
+    thrust_factor: float = 1.0
+    """Of full thrust: battery, propellers, air."""
+    drag_factor: float = 1.0
+    """Of rotor and body drag."""
+    wind_ned_mps: Vec3 = (0.0, 0.0, 0.0)
+    """Where the air moves to, in the mean."""
+    gust_rms_mps: float = 0.0
+    """Per axis; half of it in the vertical."""
+    gust_time_s: float = 1.5
+
+    velocity_noise_mps: float = 0.0
+    """Standard deviations per sample of the vehicle's sensors, per axis."""
+    rate_noise_radps: float = 0.0
+    specific_force_noise_mps2: float = 0.0
+
+    camera_tilt_rad: float = math.radians(10.0)
+    """Upwards; as on racing quadrotors, which fly nose down."""
+    camera_roll_rad: float = 0.0
+    """About the optical axis, right side down."""
+    camera_yaw_rad: float = 0.0
+    """To the right."""
+    camera_offset_body_m: Vec3 = (0.0, 0.0, 0.0)
+    """FRD."""
+    horizontal_fov_rad: float = math.radians(90.0)
+
+    gate_rgb: tuple[Rgb, Rgb] = ((255, 126, 22), (222, 34, 48))
+    """Fronts: orange for gates 0, 2, ..., red for gates 1, 3, ..."""
+    ground_tint: Vec3 = (1.0, 1.0, 1.0)
+    """Factors on red, green, blue."""
+    sky_tint: Vec3 = (1.0, 1.0, 1.0)
+    """Of sky, haze and far ground."""
+    ground_seed: int = 0
+    """Of the pattern of grass and soil."""
+    sun_ned: Vec3 = (-0.45, 0.35, -0.82)
+    """Direction to the sun, unit length."""
+    ambient: float = 0.78
+    """Brightness of a surface turned away from the sun."""
+
+    exposure: float = 1.0
+    """Factor on all colours, before they saturate."""
+    white_balance: Vec3 = (1.0, 1.0, 1.0)
+    blur_px: float = 0.0
+    """Standard deviation, in pixels of a 224 pixel wide image."""
+    image_noise: float = 0.0
+    """Standard deviation per pixel and channel, of 255."""
+
+    def numbers(self) -> dict[str, float]:
+        """Every number by name, ``name_k`` for those of a vector: for a flight's ``meta.json``."""
+        return dict(_flat(asdict(self)))
+
+
+NOMINAL = Conditions()
+
+
+def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
+    """The conditions of this seed: the same on every machine; ``strength`` 0 is nominal but for it.
+
+    Raises:
+        UsageError: a negative seed, or a strength outside [0, 2].
+    """
+    if seed < 0:
+        raise UsageError(f"a conditions seed is a non-negative integer, got {seed}")
+    if not 0.0 <= strength <= 2.0:
+        raise UsageError(f"the strength of conditions lies within 0..2, got {strength}")
+    if strength == 0.0:
+        return replace(NOMINAL, seed=seed)
+    draw = _Draw(np.random.Generator(np.random.PCG64(seed)), strength)
+    conditions = replace(NOMINAL, seed=seed)
+    for part in (_vehicle, _air_and_sensors, _lens, _scene, _image):
+        conditions = part(conditions, draw)
+    return conditions
+
+
+class _Draw:
+    """Uniform draws around a nominal value, as wide as the strength makes them."""
+
+    def __init__(self, random: np.random.Generator, strength: float) -> None:
+        self.random = random
+        self.strength = strength
+
+    def offset(self, half: float) -> float:
+        """Within +-half."""
+        return self.strength * float(self.random.uniform(-half, half))
+
+    def factor(self, most: float) -> float:
+        """Within 1 / most .. most, as likely above 1 as below."""
+        return math.exp(self.offset(math.log(most)))
+
+    def amount(self, most: float) -> float:
+        """Within 0 .. most."""
+        return self.strength * float(self.random.uniform(0.0, most))
+
+    def tint(self, most: float) -> Vec3:
+        """A factor for each colour."""
+        return (self.factor(most), self.factor(most), self.factor(most))
+
+
+def _vehicle(nominal: Conditions, draw: _Draw) -> Conditions:
+    return replace(
+        nominal,
+        mass_factor=draw.factor(1.12),
+        thrust_factor=draw.factor(1.1),
+        drag_factor=draw.factor(1.5),
+    )
+
+
+def _air_and_sensors(nominal: Conditions, draw: _Draw) -> Conditions:
+    wind_mps, towards_rad = draw.amount(4.0), float(draw.random.uniform(-math.pi, math.pi))
+    return replace(
+        nominal,
+        wind_ned_mps=(
+            wind_mps * math.cos(towards_rad),
+            wind_mps * math.sin(towards_rad),
+            draw.offset(0.3),
+        ),
+        gust_rms_mps=draw.amount(1.2),
+        gust_time_s=1.5 * draw.factor(2.0),
+        velocity_noise_mps=draw.amount(0.05),
+        rate_noise_radps=draw.amount(0.01),
+        specific_force_noise_mps2=draw.amount(0.3),
+    )
+
+
+def _lens(nominal: Conditions, draw: _Draw) -> Conditions:
+    return replace(
+        nominal,
+        camera_tilt_rad=nominal.camera_tilt_rad + draw.offset(math.radians(4.0)),
+        camera_roll_rad=draw.offset(math.radians(2.0)),
+        camera_yaw_rad=draw.offset(math.radians(2.0)),
+        camera_offset_body_m=(draw.offset(0.08), draw.offset(0.02), draw.offset(0.04)),
+        horizontal_fov_rad=nominal.horizontal_fov_rad + draw.offset(math.radians(5.0)),
+    )
+
+
+def _scene(nominal: Conditions, draw: _Draw) -> Conditions:
+    azimuth_rad = float(draw.random.uniform(-math.pi, math.pi))
+    elevation_rad = math.radians(float(draw.random.uniform(15.0, 80.0)))
+    first, second = nominal.gate_rgb
+    return replace(
+        nominal,
+        gate_rgb=(_repainted(first, draw), _repainted(second, draw)),
+        ground_tint=_lit(draw.tint(1.25), draw.factor(1.3)),
+        sky_tint=_lit(draw.tint(1.1), draw.factor(1.15)),
+        ground_seed=int(draw.random.integers(1 << 16)),
+        sun_ned=(
+            math.cos(elevation_rad) * math.cos(azimuth_rad),
+            math.cos(elevation_rad) * math.sin(azimuth_rad),
+            -math.sin(elevation_rad),
+        ),
+        ambient=min(0.95, max(0.4, nominal.ambient + draw.offset(0.15))),
+    )
+
+
+def _image(nominal: Conditions, draw: _Draw) -> Conditions:
+    return replace(
+        nominal,
+        exposure=draw.factor(1.3),
+        white_balance=draw.tint(1.08),
+        blur_px=draw.amount(0.9),
+        image_noise=draw.amount(8.0),
+    )
+
+
+def _repainted(rgb: Rgb, draw: _Draw) -> Rgb:
+    """Another shade: hue within 20 degrees, paler or darker."""
+    hue, saturation, value = colorsys.rgb_to_hsv(*(part / 255 for part in rgb))
+    red, green, blue = colorsys.hsv_to_rgb(
+        (hue + draw.offset(20.0) / 360.0) % 1.0,
+        max(0.3, saturation - draw.amount(0.35)),
+        max(0.3, value - draw.amount(0.3)),
+    )
+    return (round(255 * red), round(255 * green), round(255 * blue))
+
+
+def _lit(tint: Vec3, light: float) -> Vec3:
+    red, green, blue = tint
+    return (light * red, light * green, light * blue)
+
+
+def _flat(values: dict[str, object], prefix: str = "") -> Iterator[tuple[str, float]]:
+    for name, value in values.items():
+        if isinstance(value, tuple):
+            yield from _flat({str(k): part for k, part in enumerate(value)}, f"{prefix}{name}_")
+        elif isinstance(value, (int, float)):
+            yield prefix + name, float(value)

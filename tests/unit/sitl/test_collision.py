@@ -1,0 +1,101 @@
+import pytest
+
+from sitl.autopilot import STEP_NS, VehicleConfig
+from sitl.collision import VEHICLE_RADIUS_M, struck_gate
+from sitl.course import BAR_M, DEPTH_M, Course, Gate, Start
+from sitl.modes import Mode
+from sitl.rotation import IDENTITY
+from sitl.vehicle import Vehicle
+
+GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0)
+FAR_GATE = Gate(center_ned_m=(20.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=1)
+COURSE = Course(seed=0, gates=(GATE, FAR_GATE))
+FREE_M = 1.2 - VEHICLE_RADIUS_M
+OUTER_M = 1.2 + BAR_M + VEHICLE_RADIUS_M
+FRONT_M = 10.0 - DEPTH_M / 2 - VEHICLE_RADIUS_M
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "struck"),
+    [
+        pytest.param((5, 0, -2), (15, 0, -2), None, id="through the middle"),
+        pytest.param((5, 1.36, -2), (15, 1.36, -2), 0, id="right bar"),
+        pytest.param((5, -1.36, -2), (15, -1.36, -2), 0, id="left bar"),
+        pytest.param((5, 0, -3.36), (15, 0, -3.36), 0, id="top bar"),
+        pytest.param((5, 0, -0.64), (15, 0, -0.64), 0, id="bottom bar"),
+        pytest.param((5, FREE_M - 0.01, -2), (15, FREE_M - 0.01, -2), None, id="just inside"),
+        pytest.param((5, FREE_M + 0.01, -2), (15, FREE_M + 0.01, -2), 0, id="touches inside"),
+        pytest.param((5, OUTER_M - 0.01, -2), (15, OUTER_M - 0.01, -2), 0, id="touches outside"),
+        pytest.param((5, OUTER_M + 0.01, -2), (15, OUTER_M + 0.01, -2), None, id="just outside"),
+        pytest.param((5, 1.36, -2), (FRONT_M - 0.01, 1.36, -2), None, id="stops short of it"),
+        pytest.param((5, 1.36, -2), (FRONT_M + 0.01, 1.36, -2), 0, id="arrives"),
+        pytest.param((9.9, 0, -2), (9.9, 3, -2), 0, id="sideways from inside"),
+        pytest.param((10, 1.36, -2), (10, 1.36, -2), 0, id="stands in it"),
+        pytest.param((25, 1.36, -2), (15, 1.36, -2), 1, id="the second one, from behind"),
+        pytest.param((5, 1.36, -9), (15, 1.36, -9), None, id="high above"),
+    ],
+)
+def test_a_straight_way(start, end, struck):
+    assert struck_gate(COURSE, start, end) == struck
+
+
+def launched(start, *, course=COURSE):
+    config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0)
+    vehicle = Vehicle(links=1, boot_ns=0, config=config, course=course)
+    vehicle.launch(start)
+    return vehicle
+
+
+def glide(vehicle, seconds):
+    for _ in range(round(seconds * 100)):
+        vehicle.ap.rc.override([1500] * 4 + [65535] * 4, vehicle.ap.now_ns)
+        vehicle.step(vehicle.ap.now_ns + 4 * STEP_NS)
+
+
+def test_hitting_a_frame_is_a_crash_and_the_gates_after_it_do_not_count():
+    start = Start(
+        position_ned_m=(7.0, 1.1, -2.0),
+        velocity_ned_mps=(6.0, 0.0, 0.0),
+        ned_from_body_wxyz=IDENTITY,
+        next_gate=0,
+    )
+    vehicle = launched(start)
+    glide(vehicle, 1.0)
+    summary = vehicle.log.summary(vehicle.ap, 0)
+    assert vehicle.ap.truth.position_ned_m[0] > 11.0
+    assert summary["crashed"]
+    assert summary["crash"]["hit"] == "gate 0"
+    assert summary["crash"]["speed_mps"] == pytest.approx(6.0, abs=1.0)
+    assert summary["gates"]["passed"] == []
+
+
+def test_a_launched_vehicle_flies_on_from_there():
+    start = Start(
+        position_ned_m=(12.0, 0.0, -2.0),
+        velocity_ned_mps=(5.0, 0.0, 0.0),
+        ned_from_body_wxyz=IDENTITY,
+        next_gate=1,
+    )
+    vehicle = launched(start)
+    assert vehicle.pose.body.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
+    assert (vehicle.ap.armed, vehicle.ap.landed, vehicle.ap.mode) == (True, False, Mode.ALT_HOLD)
+    glide(vehicle, 2.5)
+    summary = vehicle.log.summary(vehicle.ap, 0)
+    assert summary["crash"] is None
+    assert [entry["index"] for entry in summary["gates"]["passed"]] == [1]
+    assert vehicle.log.next_gate is None
+    assert vehicle.ap.truth.position_ned_m[2] == pytest.approx(-2.0, abs=0.3)
+
+
+def test_a_reboot_takes_the_vehicle_home_through_no_gate():
+    start = Start(
+        position_ned_m=(14.0, 2.0, -2.0),
+        velocity_ned_mps=(0.0, 0.0, 0.0),
+        ned_from_body_wxyz=IDENTITY,
+        next_gate=0,
+    )
+    vehicle = launched(start)
+    glide(vehicle, 0.2)
+    vehicle.reboot()
+    glide(vehicle, 0.2)
+    assert vehicle.log.summary(vehicle.ap, 0)["crash"] is None
