@@ -1,0 +1,156 @@
+"""H.264 in fragmented MP4, one fragment a frame: what has been appended stays readable.
+
+Layout: ISO/IEC 14496-12. A moov box without samples, then a moof and an mdat box for each frame.
+The muxer holds a frame back until the next one tells its duration, so a file that was cut off
+lacks at most its last frame.
+"""
+
+from collections.abc import Iterator
+from fractions import Fraction
+from io import BufferedWriter
+from itertools import islice
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import OutputContainer
+from av.error import FFmpegError
+
+from mavbridge.errors import MavbridgeError
+from mavbridge.records import ImageArray
+
+CRF = "20"
+"""Constant quality; 17 to 18 is taken for visually lossless, 23 is x264's default."""
+GOP_FRAMES = 30
+"""A second between key frames."""
+TIME_BASE = Fraction(1, 90_000)
+"""What players expect of video; the exact stamps are in the table."""
+_OPTIONS: dict[str, object] = {
+    "preset": "veryfast",
+    "tune": "zerolatency",  # a frame in, a packet out
+    "crf": CRF,
+    "threads": "1",
+    "g": str(GOP_FRAMES),
+}
+_FRAGMENTED = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
+_BOX_HEADER_BYTES = 8
+
+
+class VideoError(MavbridgeError):
+    """A video that cannot be read."""
+
+
+class FragmentedMp4:
+    """A video file that grows by a frame at a time."""
+
+    def __init__(self, path: Path, *, height: int, width: int, hz: float) -> None:
+        """Create the file.
+
+        Args:
+            path: must not exist.
+            height: of every frame; even.
+            width: of every frame; even.
+            hz: nominal frame rate; the frames' own stamps decide.
+
+        Raises:
+            OSError: it exists, or cannot be written.
+        """
+        self._file: BufferedWriter = path.open("xb")
+        self._container: OutputContainer = av.open(
+            self._file, "w", format="mp4", options=_FRAGMENTED
+        )
+        stream = self._container.add_stream("libx264", Fraction(hz).limit_denominator(1000))
+        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+        stream.options = _OPTIONS
+        stream.codec_context.time_base = TIME_BASE
+        self._stream = stream
+        self._first_ns: int | None = None
+        self._last_pts = -1
+        self.frames = 0
+
+    def append(self, rgb: ImageArray, captured_ns: int) -> None:
+        """Encode one frame and hand it to the kernel.
+
+        Args:
+            rgb: [H, W, 3] uint8.
+            captured_ns: its place in time; one that is not after the last is moved behind it.
+
+        Raises:
+            OSError, FFmpegError: it cannot be written.
+        """
+        if self._first_ns is None:
+            self._first_ns = captured_ns
+        pts = max(self._last_pts + 1, (captured_ns - self._first_ns) * 9 // 100_000)
+        frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
+        frame.pts, frame.time_base = pts, TIME_BASE
+        self._container.mux(self._stream.encode(frame))
+        self._file.flush()
+        self._last_pts = pts
+        self.frames += 1
+
+    def close(self) -> None:
+        """Write what is left and close the file, also after an error.
+
+        Raises:
+            OSError, FFmpegError: it cannot be written.
+        """
+        try:
+            self._container.mux(self._stream.encode(None))
+            self._container.close()
+        finally:
+            self._file.close()
+
+
+WRITE_ERRORS = (OSError, FFmpegError)
+"""What ``FragmentedMp4`` raises."""
+
+
+def count_frames(path: Path) -> int:
+    """Whole frames of a file of ``FragmentedMp4``, however it ended.
+
+    Raises:
+        VideoError: it cannot be read.
+    """
+    try:
+        return sum(kind == b"mdat" for kind in _whole_boxes(path))
+    except OSError as error:
+        raise VideoError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _whole_boxes(path: Path) -> Iterator[bytes]:
+    """Types of the boxes in their order, up to the first that is cut off."""
+    left = path.stat().st_size
+    with path.open("rb") as file:
+        while left >= _BOX_HEADER_BYTES:
+            header = file.read(_BOX_HEADER_BYTES)
+            size = int.from_bytes(header[:4], "big")
+            if not _BOX_HEADER_BYTES <= size <= left:
+                return  # cut off; a 64-bit or open-ended box is never written here
+            yield header[4:]
+            file.seek(size - _BOX_HEADER_BYTES, 1)
+            left -= size
+
+
+def read_video(path: Path, frames: int | None = None) -> Iterator[ImageArray]:
+    """Frames of a video in their order, [H, W, 3] uint8 RGB.
+
+    Args:
+        path: any video file.
+        frames: how many to read; by default all whole ones, of a file of ``FragmentedMp4``.
+
+    Raises:
+        VideoError: it cannot be read, or ends before that.
+    """
+    wanted = count_frames(path) if frames is None else frames
+    if wanted == 0:
+        return
+    seen = 0
+    try:
+        with av.open(str(path)) as container:
+            for frame in islice(container.decode(video=0), wanted):
+                yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
+                seen += 1
+    except (OSError, FFmpegError) as error:
+        raise VideoError(f"{path} cannot be decoded after {seen} frames: {error}") from error
+    if seen < wanted:
+        raise VideoError(f"{path} ends after {seen} of {wanted} frames: it was damaged later")
