@@ -5,11 +5,13 @@ The muxer holds a frame back until the next one tells its duration, so a file th
 lacks at most its last frame.
 """
 
+import os
 from collections.abc import Iterator
 from fractions import Fraction
-from io import BufferedWriter
+from io import RawIOBase
 from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 import av
 import numpy as np
@@ -34,6 +36,8 @@ _OPTIONS: dict[str, object] = {
 }
 _FRAGMENTED = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
 _BOX_HEADER_BYTES = 8
+_BUFFER_BYTES = 1 << 20
+"""More than a fragment: it goes out in one piece, which a kill cannot tear."""
 
 
 class VideoError(MavbridgeError):
@@ -55,7 +59,7 @@ class FragmentedMp4:
         Raises:
             OSError: it exists, or cannot be written.
         """
-        self._file: BufferedWriter = path.open("xb")
+        self._file: BinaryIO = path.open("xb", buffering=_BUFFER_BYTES)
         self._container: OutputContainer = av.open(
             self._file, "w", format="mp4", options=_FRAGMENTED
         )
@@ -112,31 +116,61 @@ def count_frames(path: Path) -> int:
         VideoError: it cannot be read.
     """
     try:
-        return sum(kind == b"mdat" for kind in _whole_boxes(path))
+        return sum(kind == b"mdat" for kind, _ in _whole_boxes(path))
     except OSError as error:
         raise VideoError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _whole_boxes(path: Path) -> Iterator[bytes]:
-    """Types of the boxes in their order, up to the first that is cut off."""
-    left = path.stat().st_size
+def _whole_boxes(path: Path) -> Iterator[tuple[bytes, int]]:
+    """Type and end of the boxes in their order, up to the first that is cut off."""
+    at, size_bytes = 0, path.stat().st_size
     with path.open("rb") as file:
-        while left >= _BOX_HEADER_BYTES:
+        while at + _BOX_HEADER_BYTES <= size_bytes:
             header = file.read(_BOX_HEADER_BYTES)
             size = int.from_bytes(header[:4], "big")
-            if not _BOX_HEADER_BYTES <= size <= left:
+            at += size
+            if size < _BOX_HEADER_BYTES or at > size_bytes:
                 return  # cut off; a 64-bit or open-ended box is never written here
-            yield header[4:]
-            file.seek(size - _BOX_HEADER_BYTES, 1)
-            left -= size
+            yield header[4:], at
+            file.seek(at)
+
+
+class _Beginning(RawIOBase):
+    """A file that ends where its whole frames do: demuxers stumble over a torn box."""
+
+    def __init__(self, path: Path, end: int) -> None:
+        self._file = path.open("rb")
+        self._end = end
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        if whence == os.SEEK_END:
+            offset, whence = self._end + offset, os.SEEK_SET
+        return self._file.seek(offset, whence)
+
+    def read(self, size: int = -1) -> bytes:
+        left = max(0, self._end - self._file.tell())
+        return self._file.read(left if size < 0 else min(size, left))
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
 
 
 def read_video(path: Path, frames: int | None = None) -> Iterator[ImageArray]:
-    """Frames of a video in their order, [H, W, 3] uint8 RGB.
+    """Frames of a file of ``FragmentedMp4`` in their order, [H, W, 3] uint8 RGB.
 
     Args:
-        path: any video file.
-        frames: how many to read; by default all whole ones, of a file of ``FragmentedMp4``.
+        path: the file, whole or cut off.
+        frames: how many to read; by default all whole ones.
 
     Raises:
         VideoError: it cannot be read, or ends before that.
@@ -146,7 +180,8 @@ def read_video(path: Path, frames: int | None = None) -> Iterator[ImageArray]:
         return
     seen = 0
     try:
-        with av.open(str(path)) as container:
+        end = max((end for kind, end in _whole_boxes(path) if kind == b"mdat"), default=0)
+        with _Beginning(path, end) as file, av.open(file, "r") as container:
             for frame in islice(container.decode(video=0), wanted):
                 yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
                 seen += 1

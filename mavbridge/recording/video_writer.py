@@ -94,7 +94,7 @@ class FrameSender:
                 raise ValueError(f"a frame of {rgb.shape} in a video of {self.size}")
             self.wait_until(lambda: bool(self._free))
         if not (self._free and is_same_size):
-            self._pending_drops += 1
+            self._pending_drops += 1 + row.dropped_before
             return False
         self._put(rgb, row)
         return True
