@@ -28,7 +28,7 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
     flags = """--connect --policy --checkpoint --dual-rate --visual-rate --action-rate --rate
         --num-diffusion-steps --allow-untrained --camera --window-name --image-size --device --tau
         --max-slew --output --readonly --source-system --mode --arm --duration --rerun --report
-        --config"""
+        --record --config"""
     missing = [flag for flag in flags.split() if flag not in text]
     assert missing == []
 
@@ -57,6 +57,14 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         (
             ["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--rerun", "flight.txt"],
             ".rrd",
+        ),
+        (
+            ["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--record", "tests"],
+            "is not empty",
+        ),
+        (
+            ["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--record", "Makefile"],
+            "cannot be written",
         ),
         (
             ["--connect", "bluetooth", "--policy", "scripted", "--camera", "shm:unused"],
