@@ -67,6 +67,8 @@ class FlightWriter:
         try:
             write_meta(folder, meta)
             self._table = TableWriter(folder / TICKS, self._schema)
+            # Now and not in flight: whatever the first conversion has to import.
+            self._table.append(ticks_batch([], self._schema))
             self._tlog = (
                 None
                 if wall_offset_ns is None

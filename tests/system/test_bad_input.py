@@ -80,6 +80,17 @@ def test_a_bad_flag_is_one_clear_error(
     assert told in text
 
 
+def test_a_flight_that_did_not_begin_leaves_the_folder_free(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "flight"
+    flags = ("--connect", "bluetooth", "--policy", "scripted", "--record", str(folder))
+    status, text = run(capsys, *flags)
+    assert status == 1
+    assert "HOST:PORT" in text
+    assert list(folder.iterdir()) == []
+
+
 def test_an_unknown_config_key_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

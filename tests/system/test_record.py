@@ -44,7 +44,8 @@ def assert_rows_match_frames(back: RecordedFlight) -> None:
 def test_the_recording_is_what_happened(tmp_path: Path) -> None:
     folder = tmp_path / "recording"
     with flight(tmp_path) as flown:
-        flown.start(*FLY, "--duration", "3", "--record", str(folder))
+        rrd = str(folder / "flight.rrd")  # may lie in the same folder
+        flown.start(*FLY, "--duration", "3", "--record", str(folder), "--rerun", rrd)
         status, output = flown.end()
     assert status == 0, output
     assert str(folder) in output.splitlines()[-1]

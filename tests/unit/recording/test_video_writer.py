@@ -149,8 +149,10 @@ def test_a_killed_writer_is_noticed_and_leaves_a_readable_file(
     tmp_path: Path, pressure: Pressure
 ) -> None:
     with writer(tmp_path, pressure) as video:
+        offered = 0
         while video.written < 40:
-            video.submit(picture(video.written), make_row(video.written))
+            video.submit(picture(offered), make_row(offered))
+            offered += 1
         kill(video, signal.SIGKILL)
         with pytest.raises(WriterDiedError, match="has died"):
             submit(video, 1 if pressure == "online" else 100)
