@@ -12,7 +12,7 @@ POLICY ?= scripted:square
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable '.[sitl,screen,bench,cluster,dev]'
+	$(PIP) --editable '.[sitl,record,screen,bench,cluster,dev]'
 	touch $@
 
 # The peers live apart: MAVProxy brings the OpenCV build with a GUI, which shadows the headless one.

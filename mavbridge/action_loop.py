@@ -94,6 +94,7 @@ class ActionLoop:
         self._history = SentHistory(length=settings.history_len, dt_s=settings.history_dt_s)
         self._is_flying = False
         self._has_commanded = False
+        self._ticks = 0
         self._chunk_state_ns: int | None = None
         self.alive_ns = clock.now_ns()
         """When the last tick ended; read by the watchdog of another thread."""
@@ -115,7 +116,8 @@ class ActionLoop:
         sent_ns = self._clock.now_ns()
         self._has_commanded = isinstance(decision, Command)
         self._history.append(sent, sent_ns)
-        self._sink.emit(_tick(slot, step, decision, sent, sent_ns))
+        self._sink.emit(_tick(self._ticks, slot, step, decision, sent, sent_ns))
+        self._ticks += 1
         self._link.tend()
         self.alive_ns = sent_ns
 
@@ -216,9 +218,12 @@ def _current_sticks(step: _Step) -> Sticks:
     return status.rc_sticks if is_fresh else NEUTRAL
 
 
-def _tick(slot: Slot, step: _Step, decision: Decision, sent: Sticks | None, sent_ns: int) -> Tick:
+def _tick(
+    serial: int, slot: Slot, step: _Step, decision: Decision, sent: Sticks | None, sent_ns: int
+) -> Tick:
     status = step.snapshot.status
     return Tick(
+        serial=serial,
         index=slot.index,
         due_ns=slot.due_ns,
         woke_ns=slot.woke_ns,

@@ -3,11 +3,14 @@
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 import cv2
 from rich.console import Console
 from rich.text import Text
 
+import mavbridge
 from mavbridge.assembly import (
     action_rate_hz,
     load_configured_policy,
@@ -16,15 +19,17 @@ from mavbridge.assembly import (
     vision_limits_hz,
 )
 from mavbridge.camera.open import open_camera
-from mavbridge.clock import NS_PER_S, Clock, MonotonicClock
+from mavbridge.clock import NS_PER_S, Clock, MonotonicClock, wall_offset_ns
 from mavbridge.config import STATE_HZ, STATUS_HZ, FlyConfig
 from mavbridge.errors import PeerError, UserError
 from mavbridge.feature_cache import FeatureCache
 from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.tap import PacketTap
 from mavbridge.mavlink.transport import make_transport
 from mavbridge.observers import FanOut, ObserverThread
 from mavbridge.ports import Camera, TickSink
 from mavbridge.realtime import settle_process, settle_thread
+from mavbridge.recording.folder import prepare_folder
 from mavbridge.rerun_view import RerunView
 from mavbridge.stopping import StopRequest, stop_on_signals
 from mavbridge.terminal import FlightScreen
@@ -33,9 +38,14 @@ from mavbridge.vision_rate import AdaptiveRate
 from mavbridge.workers import HungError, Worker
 from policy.contract import Executable
 
+if TYPE_CHECKING:  # the extra "record" may not be installed
+    from mavbridge.recording.recorder import Recorder
+
 RERUN_CAPACITY = 1000
 """Ticks that may wait for the viewer: ten seconds at 100 Hz."""
 JOIN_S = 2.0
+RECORDER_JOIN_S = 60.0
+"""The tables of a long flight become Parquet within seconds; the vehicle is released by then."""
 HANG_NS = NS_PER_S
 """Silence of the action loop after which the flight is ended for it."""
 
@@ -46,6 +56,8 @@ def fly(config: FlyConfig) -> int:
     Raises:
         MavbridgeError: for whatever a person can have caused.
     """
+    if config.record is not None:
+        prepare_folder(config.record)
     _check_report(config)
     clock = MonotonicClock()
     console = Console(stderr=True, emoji=False)
@@ -118,10 +130,16 @@ class _Flight:
             vision_hz=self._vision_hz,
             readonly=config.link.readonly,
         )
+        self._recorder: Recorder | None = None
+        stack.callback(self._close_recorder)  # after the link: it records the release as well
+        self._tap = None if config.record is None else PacketTap()
         self._link = self._open_link()
         self._viewer = self._open_viewer()
         camera = self._open_camera()
+        self._recorder = self._open_recorder()
         own: list[TickSink] = [self._timing, self._screen]
+        if self._recorder is not None:
+            own.append(self._recorder)
         if self._viewer is not None:
             own.append(self._viewer)
         cache = FeatureCache()
@@ -149,6 +167,42 @@ class _Flight:
         self._stack.callback(viewer.close, JOIN_S)
         return viewer
 
+    def _open_recorder(self) -> "Recorder | None":
+        if self._config.record is None or self._tap is None:
+            return None
+        from mavbridge.recording.meta import FlightMeta
+        from mavbridge.recording.recorder import Recorder
+
+        start_ns, offset_ns = self._clock.now_ns(), wall_offset_ns(self._clock)
+        meta = FlightMeta(
+            started_at=datetime.fromtimestamp((start_ns + offset_ns) / NS_PER_S, UTC).isoformat(),
+            start_ns=start_ns,
+            mavbridge_version=mavbridge.__version__,
+            source="flight",
+            policy=self._executable.name,
+            engine=self._executable.engine,
+            mode="dual" if self._is_dual else "single",
+            action_hz=self._action_hz,
+            visual_hz=self._vision_hz,
+            contract=self._executable.contract,
+            seed=self._config.policy.seed,
+        )
+        try:
+            return Recorder(
+                self._config.record,
+                meta,
+                packets=self._tap,
+                wall_offset_ns=offset_ns,
+                autopilot=lambda: self._link.autopilot,
+                tell=self._screen.tell,
+            )
+        except OSError as error:
+            raise UserError(f"--record {self._config.record}: {error}") from error
+
+    def _close_recorder(self) -> None:
+        if self._recorder is not None:
+            self._recorder.close(RECORDER_JOIN_S)
+
     def _open_camera(self) -> Camera:
         camera = open_camera(
             self._config.camera.source,
@@ -161,7 +215,13 @@ class _Flight:
     def _open_link(self) -> MavlinkLink:
         config = self._config.link
         transport = make_transport(config.connect, self._clock)
-        link = MavlinkLink(transport, self._clock, config, state_hz=max(self._action_hz, STATE_HZ))
+        link = MavlinkLink(
+            transport,
+            self._clock,
+            config,
+            state_hz=max(self._action_hz, STATE_HZ),
+            tap=self._tap,
+        )
         self._stack.callback(link.close)
         return link
 
@@ -221,11 +281,16 @@ class _Flight:
         """Say how it went."""
         report = self._report()
         self._screen.show_report(report)
+        if self._recorder is not None:
+            self._console.print(Text(self._recorder.summary()), soft_wrap=True)
         if self._config.report is not None:
             self._config.report.write_text(report_json(report))
 
     def _report(self) -> TimingReport:
-        drops = ObserverDrops(rerun=self._viewer.dropped if self._viewer else None, recorder=None)
+        drops = ObserverDrops(
+            rerun=self._viewer.dropped if self._viewer else None,
+            recorder=self._recorder.dropped if self._recorder else None,
+        )
         return self._timing.report(
             mode="dual" if self._is_dual else "single",
             engine=self._executable.engine,

@@ -8,6 +8,11 @@ NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
 
 
+def wall_offset_ns(clock: "Clock") -> int:
+    """Unix time minus the clock: to be taken once, since wall time steps. Names moments, only."""
+    return time.time_ns() - clock.now_ns()
+
+
 class Clock(Protocol):
     """Time source of every loop; tests inject a virtual one."""
 

@@ -218,6 +218,9 @@ class FlyConfig:
     duration: float | None = None
     """Seconds to fly once engaged; by default until Ctrl-C."""
     rerun: Annotated[str, Parameter(help="spawn, connect[=URL], FILE.rrd, or off.")] = "off"
+    record: Path | None = None
+    """Record the flight into this folder, new or empty: camera, ticks, raw MAVLink; needs the extra
+    "record"."""
     report: Path | None = None
     """Write the timing report here as JSON."""
 

@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from mavbridge.records import Decision, Event, Frame, LinkSnapshot, Sticks
+from mavbridge.records import Decision, Event, Frame, LinkSnapshot, Packet, Sticks
 
 
 class Camera(Protocol):
@@ -66,6 +66,19 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Free the socket or port."""
+        ...
+
+
+class PacketSource(Protocol):
+    """What goes over the link, for a recorder; drained by one thread."""
+
+    @property
+    def dropped(self) -> int:
+        """Pieces that nobody drained in time."""
+        ...
+
+    def drain(self) -> list[Packet]:
+        """Packets of both directions since the last call."""
         ...
 
 

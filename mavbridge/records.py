@@ -151,6 +151,8 @@ class StickTrace:
 class Tick:
     """One pass of the action loop, complete enough to explain it afterwards."""
 
+    serial: int
+    """Number among all ticks of the flight, without gaps: what an observer missed is one."""
     index: int
     due_ns: int
     woke_ns: int
@@ -190,6 +192,8 @@ class Tick:
 class VisionTick:
     """One frame through the vision loop."""
 
+    serial: int
+    """Number among all frames through the loop, without gaps."""
     frame_id: int
     captured_ns: int
     started_ns: int
@@ -201,6 +205,14 @@ class VisionTick:
 
 
 Event: TypeAlias = Tick | VisionTick
+
+
+class Packet(NamedTuple):
+    """One MAVLink packet as it came or left."""
+
+    stamp_ns: int
+    """Arrival, or handed to the kernel."""
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

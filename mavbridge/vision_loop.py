@@ -38,6 +38,7 @@ class VisionLoop:
         self._period_ns = period_ns
         self._used_ns: int | None = None
         """Slot of the last frame that was used."""
+        self._frames = 0
 
     def run(self, stop: threading.Event) -> None:
         """Encode until told to stop.
@@ -75,6 +76,7 @@ class VisionLoop:
         )
         self._sink.emit(
             VisionTick(
+                serial=self._frames,
                 frame_id=frame.frame_id,
                 captured_ns=captured_ns,
                 started_ns=started_ns,
@@ -83,6 +85,7 @@ class VisionLoop:
                 rgb=frame.rgb,
             )
         )
+        self._frames += 1
 
     def _is_due(self, captured_ns: int) -> bool:
         if self._used_ns is None:

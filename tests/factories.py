@@ -41,6 +41,7 @@ def make_tick(index: int = 0, **changes: Any) -> Tick:
     """Tick ``index``: on time, 2 ms of prediction, 3 ms old attitude, 40 ms old feature, flying."""
     due_ns = START_NS + index * TICK_NS
     tick = Tick(
+        serial=index,
         index=index,
         due_ns=due_ns,
         woke_ns=due_ns,
@@ -78,6 +79,7 @@ def make_vision_tick(frame_id: int = 1, **changes: Any) -> VisionTick:
     rgb = np.zeros((24, 32, 3), dtype=np.uint8)
     rgb.flags.writeable = False
     vision = VisionTick(
+        serial=frame_id - 1,
         frame_id=frame_id,
         captured_ns=captured_ns,
         started_ns=captured_ns + 2 * NS_PER_MS,

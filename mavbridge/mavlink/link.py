@@ -12,6 +12,7 @@ from mavbridge.mavlink.messages import CommandAck, Heartbeat, StatusText, Timesy
 from mavbridge.mavlink.requests import AskCommand, AskParam, Request
 from mavbridge.mavlink.roster import Peer, Roster
 from mavbridge.mavlink.stats import LinkCounters
+from mavbridge.mavlink.tap import PacketTap
 from mavbridge.mavlink.timesync import TimesyncFilter
 from mavbridge.mavlink.transport import Transport
 from mavbridge.mavlink.vehicle import Vehicle
@@ -40,13 +41,19 @@ class MavlinkLink:
     """
 
     def __init__(
-        self, transport: Transport, clock: Clock, config: LinkConfig, *, state_hz: float
+        self,
+        transport: Transport,
+        clock: Clock,
+        config: LinkConfig,
+        *,
+        state_hz: float,
+        tap: PacketTap | None = None,
     ) -> None:
         self._clock = clock
         self._config = config
         self._state_hz = state_hz
         self._codec = Codec(source_system=config.source_system, source_component=SOURCE_COMPONENT)
-        self._wire = Wire(transport, self._codec, clock)
+        self._wire = Wire(transport, self._codec, clock, tap)
         self._roster = Roster(target_system=config.target_system)
         self._counters = LinkCounters()
         self._timesync = TimesyncFilter()

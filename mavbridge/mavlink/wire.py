@@ -7,6 +7,7 @@ from typing import NamedTuple
 from mavbridge.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.mavlink.codec import Codec
 from mavbridge.mavlink.messages import Incoming
+from mavbridge.mavlink.tap import PacketTap
 from mavbridge.mavlink.transport import Address, Transport, TransportDownError
 
 REOPEN_NS = NS_PER_S
@@ -26,10 +27,13 @@ class Arrival(NamedTuple):
 class Wire:
     """The link's bytes; one thread uses it, and another may take sending away from it."""
 
-    def __init__(self, transport: Transport, codec: Codec, clock: Clock) -> None:
+    def __init__(
+        self, transport: Transport, codec: Codec, clock: Clock, tap: PacketTap | None = None
+    ) -> None:
         self._transport = transport
         self._codec = codec
         self._clock = clock
+        self._tap = tap
         self._reopen_ns: int | None = None
         self._answer_to: Address | None = None
         self._lock = threading.Lock()
@@ -67,6 +71,8 @@ class Wire:
             self._open(now_ns)
         try:
             for chunk in self._transport.drain():
+                if self._tap is not None:
+                    self._tap.received(chunk)
                 is_stream = chunk.sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(chunk.data):
@@ -94,10 +100,13 @@ class Wire:
             if self.is_down or (self._is_sealed and not is_last_word):
                 return False
             try:
-                return self._transport.send(data)
+                has_left = self._transport.send(data)
             except TransportDownError as error:
                 self._lose(str(error), self._clock.now_ns())
                 return False
+            if has_left and self._tap is not None:
+                self._tap.sent(data, self._clock.now_ns())
+            return has_left
 
     def seal(self) -> None:
         """From now on only last words leave, whoever else still tries."""

@@ -28,7 +28,7 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
     flags = """--connect --policy --checkpoint --dual-rate --visual-rate --action-rate --rate
         --num-diffusion-steps --allow-untrained --camera --window-name --image-size --device --tau
         --max-slew --output --readonly --source-system --mode --arm --duration --rerun --report
-        --config"""
+        --record --config"""
     missing = [flag for flag in flags.split() if flag not in text]
     assert missing == []
 
@@ -59,6 +59,14 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
             ".rrd",
         ),
         (
+            ["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--record", "tests"],
+            "is not empty",
+        ),
+        (
+            ["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--record", "Makefile"],
+            "cannot be written",
+        ),
+        (
             ["--connect", "bluetooth", "--policy", "scripted", "--camera", "shm:unused"],
             "HOST:PORT",
         ),
@@ -70,6 +78,17 @@ def test_a_bad_flag_is_one_clear_error(
     status, text = run(capsys, *flags)
     assert status != 0
     assert told in text
+
+
+def test_a_flight_that_did_not_begin_leaves_the_folder_free(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "flight"
+    flags = ("--connect", "bluetooth", "--policy", "scripted", "--record", str(folder))
+    status, text = run(capsys, *flags)
+    assert status == 1
+    assert "HOST:PORT" in text
+    assert list(folder.iterdir()) == []
 
 
 def test_an_unknown_config_key_is_an_error(

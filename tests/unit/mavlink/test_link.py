@@ -13,6 +13,7 @@ from mavbridge.clock import NS_PER_MS, NS_PER_S
 from mavbridge.config import LinkConfig
 from mavbridge.errors import PeerError
 from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.tap import PacketTap
 from mavbridge.mavlink.transport import Address, Chunk, TransportDownError
 from mavbridge.records import IDLE, Command, LinkSnapshot, Release, Sticks
 
@@ -119,11 +120,13 @@ class Bench:
     def __init__(self, **config: Any) -> None:
         self.clock = FakeClock()
         self.vehicle = Vehicle(self.clock)
+        self.tap = PacketTap()
         self.link = MavlinkLink(
             self.vehicle,
             self.clock,
             LinkConfig(connect="memory", **config),
             state_hz=100.0,
+            tap=self.tap,
         )
         self.ticks = 0
         self.texts: list[str] = []
@@ -169,6 +172,23 @@ def test_from_first_heartbeat_to_ready() -> None:
     }
     assert intervals == {31: 10000, 32: 10000, 105: 10000, 65: 50000}
     assert any("RC_OVERRIDE_TIME is 3" in text for text in bench.texts)
+
+
+def test_the_tap_sees_both_directions_and_only_what_left() -> None:
+    bench = Bench()
+    bench.run(9.5)
+    bench.vehicle.is_deaf = True
+    bench.run(1.0)
+    bench.vehicle.is_deaf = False
+    packets = bench.tap.drain()
+    assert bench.tap.dropped == 0
+    end = WireEnd()
+    read = [message for packet in packets for message in end.read(packet.data)]
+    assert len(read) == len(packets)
+    sent = [message for message in read if message.get_srcSystem() == 255]
+    assert [m.get_type() for m in sent] == bench.vehicle.names()
+    assert sum(m.get_type() == "ATTITUDE_QUATERNION" for m in read) == bench.ticks
+    assert all(packet.stamp_ns <= bench.clock.now_ns() for packet in packets)
 
 
 def test_we_beat_once_a_second_and_only_while_polled() -> None:

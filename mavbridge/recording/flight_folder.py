@@ -1,0 +1,80 @@
+"""Reads a recorded flight, finished or cut off."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mavbridge.recording.folder import FRAMES, TICKS, VIDEO
+from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
+from mavbridge.recording.rows import FrameRow, TickRow
+from mavbridge.recording.schema import FRAMES as FRAMES_SCHEMA
+from mavbridge.recording.schema import TICKS as TICKS_SCHEMA
+from mavbridge.recording.schema import read_frames, read_ticks
+from mavbridge.recording.tables import read_table
+from mavbridge.recording.video_file import count_frames, read_video
+from mavbridge.records import ImageArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedFlight:
+    """One flight. Row k of ``frames`` is image k, always."""
+
+    folder: Path
+    meta: FlightMeta
+    ticks: Any
+    """``pyarrow.Table`` with the columns of docs/flight_folder.md."""
+    frames: Any
+    """The same, one row an image."""
+
+    def tick_rows(self) -> Iterator[TickRow]:
+        """The ticks as records, with their labels where the flight is a demonstration."""
+        return read_ticks(self.ticks)
+
+    def frame_rows(self) -> Iterator[FrameRow]:
+        """What is known of each image."""
+        return read_frames(self.frames)
+
+    def images(self) -> Iterator[ImageArray]:
+        """The images, decoded one by one: [H, W, 3] uint8 RGB.
+
+        Raises:
+            VideoError: the video was damaged after it was recorded.
+        """
+        return read_video(self.folder / VIDEO, self.frames.num_rows)
+
+
+def open_flight(folder: Path) -> RecordedFlight:
+    """Read the tables of a flight.
+
+    A flight that was cut off (``meta.finished`` is false) is there up to its last whole batch of
+    rows; frames without a row, and rows without a frame, are left out.
+
+    Raises:
+        MavbridgeError: it is no recorded flight, or a damaged one; the message says what to do.
+    """
+    meta = read_meta(folder)
+    ticks = read_table(folder / TICKS, TICKS_SCHEMA)
+    frames = _frames(folder, meta)
+    return RecordedFlight(folder=folder, meta=meta, ticks=ticks, frames=frames)
+
+
+def _frames(folder: Path, meta: FlightMeta) -> Any:
+    has_table = any((folder / FRAMES).with_suffix(end).exists() for end in (".parquet", ".arrows"))
+    has_video = (folder / VIDEO).exists()
+    if not (has_table and has_video):
+        if meta.finished and meta.frames:
+            missing = VIDEO if has_table else f"{FRAMES}.parquet"
+            raise FlightError(
+                f"{folder} lacks {missing}, though {meta.frames} frames were recorded: copy the "
+                "folder again, whole"
+            )
+        return FRAMES_SCHEMA.empty_table()  # the flight ended before its first frame
+    table = read_table(folder / FRAMES, FRAMES_SCHEMA)
+    whole = count_frames(folder / VIDEO)
+    if meta.finished and whole != table.num_rows:
+        raise FlightError(
+            f"{folder / VIDEO} holds {whole} frames, {FRAMES}.parquet {table.num_rows} rows: one "
+            "of them was damaged or replaced later"
+        )
+    return table.slice(0, min(whole, table.num_rows))

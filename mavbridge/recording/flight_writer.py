@@ -1,0 +1,204 @@
+"""One flight into its folder, by one thread: ticks, frames, packets, and meta around them."""
+
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
+from mavbridge.recording.meta import FlightMeta, write_meta
+from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow
+from mavbridge.recording.schema import DEMONSTRATION_TICKS, ticks_batch
+from mavbridge.recording.schema import TICKS as TICKS_SCHEMA
+from mavbridge.recording.tables import TableWriter
+from mavbridge.recording.tlog import TlogWriter
+from mavbridge.recording.video_writer import Pressure, VideoWriter, WriterDiedError
+from mavbridge.records import Packet, Tick, VisionTick
+
+FLUSH_NS = 500_000_000
+"""Longest span of events that a crash may take with it."""
+FLUSH_ROWS = 256
+
+
+class FlightWriter:
+    """Writes as the flight goes on; ``finish`` closes it in order.
+
+    After an error of ``tick``, ``frame`` or ``packets``, only ``finish`` and ``close`` may follow.
+    What was written before stays readable.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        meta: FlightMeta,
+        *,
+        pressure: Pressure,
+        with_labels: bool = False,
+        wall_offset_ns: int | None = None,
+    ) -> None:
+        """Create the files and start the writer process.
+
+        Args:
+            folder: from ``prepare_folder``.
+            meta: what is known at the start.
+            pressure: "offline" drops nothing, and waits; see ``VideoWriter``.
+            with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
+            wall_offset_ns: wall time minus the clock of the stamps, for a tlog; None = no tlog.
+
+        Raises:
+            OSError: the folder cannot be written.
+            WriterError: the writer process does not start.
+        """
+        self._folder = folder
+        self.meta = meta
+        self._schema = DEMONSTRATION_TICKS if with_labels else TICKS_SCHEMA
+        self._rows: list[TickRow] = []
+        self._flushed_ns = meta.start_ns
+        self._tick_serial = self._frame_serial = -1
+        self._ticks_dropped = 0
+        self._source_size: tuple[int, int] | None = None
+        self._video = VideoWriter(
+            folder / VIDEO,
+            pressure=pressure,
+            hz=meta.visual_hz,
+            rows=folder / FRAMES,
+            with_truth=with_labels,
+        )
+        try:
+            write_meta(folder, meta)
+            self._table = TableWriter(folder / TICKS, self._schema)
+            # Now and not in flight: whatever the first conversion has to import.
+            self._table.append(ticks_batch([], self._schema))
+            self._tlog = (
+                None
+                if wall_offset_ns is None
+                else TlogWriter(folder / TLOG, wall_offset_ns=wall_offset_ns)
+            )
+        except OSError:
+            self._video.close()
+            raise
+        self.video_failure: WriterDiedError | None = None
+        """Why there are no more frames, though the rest goes on."""
+
+    def tick(self, tick: Tick, labels: TickLabels | None = None) -> None:
+        """Record a tick; serial numbers that were left out count as dropped.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        dropped = tick.serial - self._tick_serial - 1
+        self._tick_serial = tick.serial
+        self._ticks_dropped += dropped
+        self._rows.append(TickRow(tick, dropped, labels))
+        if len(self._rows) >= FLUSH_ROWS:
+            self._flush()
+        self._flush_if_due(tick.woke_ns)
+
+    def frame(self, vision: VisionTick, truth: FrameTruth | None = None) -> None:
+        """Record a frame; serial numbers that were left out count as dropped.
+
+        A writer process that died costs the frames alone: see ``video_failure``.
+
+        Raises:
+            WriterError: it cannot be written.
+        """
+        self._flush_if_due(vision.ready_ns)
+        dropped = vision.serial - self._frame_serial - 1
+        self._frame_serial = vision.serial
+        if self.video_failure is not None:
+            return
+        if self._source_size is None:
+            self._source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
+        row = FrameRow(
+            frame_id=vision.frame_id,
+            captured_ns=vision.captured_ns,
+            ready_ns=vision.ready_ns,
+            dropped_before=dropped,
+            truth=truth,
+        )
+        try:
+            self._video.submit(vision.rgb, row)
+        except WriterDiedError as error:
+            self.video_failure = error
+
+    def packets(self, packets: Iterable[Packet]) -> None:
+        """Append to the tlog.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        if self._tlog is not None:
+            self._tlog.append(packets)
+
+    def _flush_if_due(self, now_ns: int) -> None:
+        if now_ns - self._flushed_ns >= FLUSH_NS:
+            self._flushed_ns = now_ns
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._rows:
+            # First: rows that could not be written are not tried again.
+            rows, self._rows = self._rows, []
+            self._table.append(ticks_batch(rows, self._schema))
+
+    @property
+    def frames_written(self) -> int:
+        """Frames known to be in the video."""
+        return self._video.written
+
+    @property
+    def ticks(self) -> int:
+        """Rows so far."""
+        return self._table.rows + len(self._rows)
+
+    def finish(self, meta: FlightMeta) -> None:
+        """Close everything in order; ``meta`` is completed with what was counted here.
+
+        A writer that died leaves its table as it was, and ``finished`` false.
+
+        Raises:
+            OSError, WriterError: it could not all be written.
+        """
+        try:
+            self._flush()
+            self._table.finish()
+            self._finish_video()
+        except BaseException:
+            self.close()
+            raise
+        if self._tlog is not None:
+            self._tlog.close()
+        self.meta = self._completed(meta)
+        write_meta(self._folder, self.meta)
+
+    def _finish_video(self) -> None:
+        if self.video_failure is None:
+            try:
+                self._video.finish()
+            except WriterDiedError as error:
+                self.video_failure = error
+
+    def _completed(self, meta: FlightMeta) -> FlightMeta:
+        is_whole = self.video_failure is None
+        height, width = self._video.size or (None, None)
+        source_height, source_width = self._source_size or (None, None)
+        return replace(
+            meta,
+            image_height=height,
+            image_width=width,
+            source_height=source_height,
+            source_width=source_width,
+            finished=is_whole,
+            ticks=self._table.rows,
+            frames=self._video.written if is_whole else None,
+            ticks_dropped=self._ticks_dropped,
+            frames_dropped=self._frame_serial + 1 - self._video.written,
+        )
+
+    def close(self) -> None:
+        """Leave everything as it is, after an error; may be called twice."""
+        self._video.close()
+        self._table.abandon()
+        if self._tlog is not None:
+            with suppress(OSError):  # the error that led here, again
+                self._tlog.close()

@@ -1,0 +1,44 @@
+"""The folder of one flight: names, and whether a flight may be written there. Imports no extra."""
+
+import importlib.util
+from pathlib import Path
+
+from mavbridge.errors import UserError
+
+META = "meta.json"
+TICKS = "ticks"
+FRAMES = "frames"
+"""Stems of the tables: .arrows while they grow, .parquet once they are whole."""
+VIDEO = "camera.mp4"
+TLOG = "link.tlog"
+
+EXTRA = ("av", "pyarrow")
+"""What ``pip install 'mavbridge[record]'`` brings."""
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make sure that a flight can be recorded into this folder; makes it.
+
+    Raises:
+        UserError: the extra is not installed, or the folder holds something, or cannot be written.
+    """
+    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UserError(f"--record needs {' and '.join(missing)}: pip install 'mavbridge[record]'")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        taken = sorted(entry.name for entry in folder.iterdir())
+        if not taken:
+            probe = folder / META
+            probe.open("xb").close()
+            probe.unlink()
+    except OSError as error:
+        raise UserError(
+            f"--record {folder} cannot be written ({error.strerror}); name a folder that you may "
+            "write to"
+        ) from error
+    if taken:
+        raise UserError(
+            f"--record {folder} is not empty (it holds {taken[0]}); every flight has a folder of "
+            "its own: name a new one"
+        )

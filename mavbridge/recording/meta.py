@@ -1,0 +1,134 @@
+"""``meta.json``: who flew what, with which contract."""
+
+import json
+import math
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from mavbridge.errors import MavbridgeError
+from mavbridge.recording.folder import META
+from policy.contract import Contract, ContractError
+
+FORMAT = "mavbridge-flight"
+VERSION = 1
+Source = Literal["flight", "demonstration", "dagger", "imagined"]
+
+
+class FlightError(MavbridgeError):
+    """A recorded flight that cannot be read."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightMeta:
+    """What is known of a flight as a whole; None = not known, or not known yet."""
+
+    started_at: str
+    """ISO 8601, UTC."""
+    start_ns: int
+    """The same moment on the clock of all stamps."""
+    mavbridge_version: str
+    source: Source
+    policy: str | None
+    engine: str | None
+    mode: Literal["dual", "single"]
+    autopilot: str | None = None
+    action_hz: float
+    visual_hz: float
+    image_height: int | None = None
+    """Of the recorded frames; these three are known with the first frame, and written at the
+    end."""
+    image_width: int | None = None
+    source_height: int | None = None
+    """Of the frames as they came: H.264 cannot have an odd last row or column, which is cut off."""
+    source_width: int | None = None
+    contract: Contract | None
+    course_seed: int | None = None
+    seed: int | None = None
+    finished: bool = False
+    """Closed in order."""
+    ticks: int | None = None
+    frames: int | None = None
+    """Rows; known at the end."""
+    ticks_dropped: int | None = None
+    frames_dropped: int | None = None
+    packets_dropped: int | None = None
+    """Lost on the way to the recording, up to its last row."""
+    success: bool | None = None
+    gates_passed: int | None = None
+    conditions: dict[str, float] = field(default_factory=dict)
+    """What was randomised."""
+
+
+def write_meta(folder: Path, meta: FlightMeta) -> None:
+    """Write or replace ``meta.json``, whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    document = {"format": FORMAT, "version": VERSION} | asdict(meta)
+    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
+    part = folder / f"{META}.part"
+    try:
+        part.write_text(text)
+        part.replace(folder / META)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def read_meta(folder: Path) -> FlightMeta:
+    """Read ``meta.json``.
+
+    Raises:
+        FlightError: there is none, or it is not one of ours; the message says what to do.
+    """
+    try:
+        document: Any = json.loads((folder / META).read_text())
+    except OSError as error:
+        raise FlightError(_unreadable(folder)) from error
+    except ValueError as error:
+        raise FlightError(f"{folder / META} is not JSON: {error}") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise FlightError(f"{folder / META} is not of a recorded flight: no format {FORMAT!r}")
+    if document.get("version") != VERSION:
+        raise FlightError(
+            f"{folder} has version {document.get('version')} of the format, this build reads "
+            f"{VERSION}: use the mavbridge that recorded it"
+        )
+    return _meta(folder, document)
+
+
+def _unreadable(folder: Path) -> str:
+    if not folder.exists():
+        return f"there is no folder {folder}: name one that mavbridge --record made"
+    if not folder.is_dir():
+        return f"{folder} is a file: a recorded flight is a folder, made by mavbridge --record"
+    inside = sorted(entry.name for entry in folder.iterdir())
+    if not inside:
+        return f"{folder} is empty: nothing was recorded there"
+    flights = [name for name in inside if (folder / name / META).is_file()]
+    if flights:
+        return f"{folder} holds flights, and is none: name one of them ({folder / flights[0]})"
+    return (
+        f"{folder} is no recorded flight: it has no {META} (it has {', '.join(inside[:3])}); "
+        "mavbridge --record makes one"
+    )
+
+
+def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
+    """Keys of later versions are left aside; those of this one must be there and be sound."""
+    known = {f.name: document[f.name] for f in fields(FlightMeta) if f.name in document}
+    try:
+        if known.get("contract") is not None:
+            known["contract"] = Contract.from_json(json.dumps(known["contract"]))
+        meta = FlightMeta(**known)
+    except (TypeError, ContractError) as error:
+        raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error
+    if meta.source not in get_args(Source) or meta.mode not in ("dual", "single"):
+        raise FlightError(f"{folder / META}: source {meta.source!r}, mode {meta.mode!r}")
+    for name in ("start_ns", "action_hz", "visual_hz"):
+        value = getattr(meta, name)
+        if not isinstance(value, int | float) or not math.isfinite(value):
+            raise FlightError(f"{folder / META}: {name} is {value!r}, not a number")
+    return meta

@@ -1,0 +1,151 @@
+"""Records a flight while it flies: a ``TickSink`` whose work is done on a thread of its own.
+
+Cannot hurt the flight: events and packets wait in bounded queues, are dropped and counted when
+these are full, and an error ends the recording alone, with one warning.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from mavbridge.observers import ObserverThread
+from mavbridge.ports import PacketSource
+from mavbridge.recording.flight_writer import FlightWriter
+from mavbridge.recording.meta import FlightMeta
+from mavbridge.records import Event, Tick
+
+CAPACITY = 6000
+"""Ticks that may wait: a minute at 100 Hz."""
+IMAGE_CAPACITY = 32
+
+
+class Recorder:
+    """One recorded flight; see the module."""
+
+    def __init__(
+        self,
+        folder: Path,
+        meta: FlightMeta,
+        *,
+        packets: PacketSource,
+        wall_offset_ns: int,
+        autopilot: Callable[[], str],
+        tell: Callable[[str], None],
+    ) -> None:
+        """Create the files, start the writer process and the thread.
+
+        Args:
+            folder: from ``prepare_folder``.
+            meta: what is known at the start.
+            packets: what the link sends and receives; drained by the recorder's thread.
+            wall_offset_ns: wall time minus the clock of the stamps.
+            autopilot: who flew, asked at the end.
+            tell: shows a person a line; for any thread.
+
+        Raises:
+            OSError: the folder cannot be written.
+            WriterError: the writer process does not start.
+        """
+        self._folder = folder
+        writer = FlightWriter(folder, meta, pressure="online", wall_offset_ns=wall_offset_ns)
+        self._consumer = _FlightConsumer(writer, packets, autopilot, tell)
+        self._packets = packets
+        self._observer = ObserverThread(
+            "mavbridge-recorder", self._consumer, capacity=CAPACITY, image_capacity=IMAGE_CAPACITY
+        )
+
+    def emit(self, event: Event) -> None:
+        """Queue the event, or drop and count it."""
+        self._observer.emit(event)
+
+    def close(self, timeout_s: float) -> None:
+        """Finish the recording, for at most ``timeout_s``; after the link was closed."""
+        self._observer.close(timeout_s)
+
+    @property
+    def dropped(self) -> int:
+        """Ticks, frames and packets that are not in the recording; exact after ``close``."""
+        return self._observer.dropped + self._consumer.frames_lost + self._packets.dropped
+
+    def summary(self) -> str:
+        """Where the recording is and how it went, in one line, for a person."""
+        failure = self._observer.failure or self._consumer.failure
+        if failure is None and not self.dropped:
+            return f"recorded {self._consumer.counted} in {self._folder}"
+        lacks = failure or f"{self.dropped} events were dropped, since the machine was too busy"
+        return f"recorded in {self._folder}, not completely: {lacks}"
+
+
+class _FlightConsumer:
+    """The recorder's thread."""
+
+    def __init__(
+        self,
+        writer: FlightWriter,
+        packets: PacketSource,
+        autopilot: Callable[[], str],
+        tell: Callable[[str], None],
+    ) -> None:
+        self._writer = writer
+        self._packets = packets
+        self._autopilot = autopilot
+        self._tell = tell
+        self._seen_frames = 0
+        self._has_failed = False
+        self.failure: str | None = None
+
+    @property
+    def frames_lost(self) -> int:
+        """Frames that were taken from the queue and are not in the video."""
+        return max(0, self._seen_frames - self._writer.frames_written)
+
+    @property
+    def counted(self) -> str:
+        """What there is, for a person."""
+        return f"{self._writer.ticks} ticks and {self._writer.frames_written} frames"
+
+    def consume(self, batch: Sequence[Event]) -> None:
+        """Write one batch, and the packets that came meanwhile.
+
+        Raises:
+            OSError, WriterError: the disk does not take it.
+        """
+        seen_frames = self._seen_frames
+        try:
+            self._writer.packets(self._packets.drain())
+            for event in batch:
+                self._write(event)
+        except BaseException:
+            self._has_failed = True
+            self._seen_frames = seen_frames  # the observer counts this whole batch as lost
+            raise
+
+    def _write(self, event: Event) -> None:
+        if isinstance(event, Tick):
+            self._writer.tick(event)
+            return
+        self._seen_frames += 1
+        self._writer.frame(event)
+        if self._writer.video_failure is not None and self.failure is None:
+            self.failure = str(self._writer.video_failure)
+            self._tell(f"recording no more images: {self.failure}; the rest is still recorded")
+
+    def close(self) -> None:
+        """Finish in order, or after an error leave things as they are.
+
+        Raises:
+            OSError, WriterError: it could not all be written.
+        """
+        if self._has_failed:
+            self._writer.close()
+            return
+        self._writer.packets(self._packets.drain())
+        self._writer.finish(
+            replace(
+                self._writer.meta,
+                autopilot=self._autopilot(),
+                packets_dropped=self._packets.dropped,
+            )
+        )
+        if self._writer.video_failure is not None and self.failure is None:
+            self.failure = str(self._writer.video_failure)

@@ -1,0 +1,152 @@
+"""Tables that survive a crash: an Arrow IPC stream while they grow, Parquet once they are whole."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mavbridge.errors import MavbridgeError
+
+READ_ERRORS = (pa.ArrowException, OSError)
+
+
+class TableError(MavbridgeError):
+    """A table that cannot be read."""
+
+
+class TableWriter:
+    """Appends batches to ``STEM.arrows``; ``finish`` makes ``STEM.parquet`` of it."""
+
+    def __init__(self, stem: Path, schema: pa.Schema) -> None:
+        """Create the file.
+
+        Args:
+            stem: path without a suffix; neither file may exist.
+            schema: of every batch.
+
+        Raises:
+            OSError: it exists, or cannot be written.
+        """
+        self._stream = stem.with_suffix(".arrows")
+        self._parquet = stem.with_suffix(".parquet")
+        self._stream.open("xb").close()
+        self._sink = pa.OSFile(str(self._stream), "wb")  # no buffer of its own
+        self._writer = pa.ipc.new_stream(self._sink, schema)
+        self.rows = 0
+
+    def append(self, batch: pa.RecordBatch) -> None:
+        """Hand a batch to the kernel.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._writer.write_batch(batch)
+        self.rows += batch.num_rows
+
+    def finish(self) -> None:
+        """Close the stream and replace it by Parquet, a batch at a time.
+
+        Raises:
+            OSError: there is no room for it; the stream stays.
+        """
+        self._writer.close()
+        self._sink.close()
+        to_parquet(self._stream, self._parquet)
+
+    def abandon(self) -> None:
+        """Leave the stream as it is, after an error."""
+        self._sink.close()
+
+
+_GROUP_ROWS = 16_384
+"""Rows of a Parquet row group: two to three minutes of ticks."""
+
+
+def to_parquet(stream: Path, parquet: Path) -> None:
+    """Replace an Arrow stream by the Parquet file of its whole batches, in constant memory.
+
+    Raises:
+        OSError: it cannot be written; the stream stays.
+    """
+    part = parquet.with_suffix(".parquet.part")
+    try:
+        with stream.open("rb") as file:
+            schema, batches = _whole_batches(file)
+            with pq.ParquetWriter(part, schema, compression="zstd") as writer:
+                for table in _groups(schema, batches):
+                    writer.write_table(table)
+        part.replace(parquet)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+    stream.unlink()
+
+
+def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.Table]:
+    """Small batches joined: a row group for each would be larger than the stream."""
+    group: list[pa.RecordBatch] = []
+    rows = 0
+    for batch in batches:
+        group.append(batch)
+        rows += batch.num_rows
+        if rows >= _GROUP_ROWS:
+            yield pa.Table.from_batches(group, schema).combine_chunks()
+            group, rows = [], 0
+    if group:
+        yield pa.Table.from_batches(group, schema).combine_chunks()
+
+
+def read_table(stem: Path, schema: pa.Schema) -> pa.Table:
+    """The table under this stem, whichever form it has; of a cut-off stream the whole batches.
+
+    Args:
+        stem: path without a suffix.
+        schema: the columns that must be there; others may follow.
+
+    Raises:
+        TableError: there is none, it is damaged, or it is another table.
+    """
+    parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
+    path = parquet if parquet.exists() else stream
+    try:
+        if path is parquet:
+            table = pq.read_table(parquet)
+        elif stream.stat().st_size == 0:  # killed before the first batch
+            table = schema.empty_table()
+        else:
+            with stream.open("rb") as file:
+                found, batches = _whole_batches(file)
+                table = pa.Table.from_batches(batches, found)
+    except FileNotFoundError as error:
+        raise TableError(
+            f"{stem.parent} has neither {parquet.name} nor {stream.name}: it is no whole flight"
+        ) from error
+    except READ_ERRORS as error:
+        raise TableError(f"{path} is damaged: {error}") from error
+    missing = [
+        field.name
+        for field in schema
+        if field.name not in table.column_names or table.schema.field(field.name).type != field.type
+    ]
+    if missing:
+        raise TableError(
+            f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
+            "of docs/flight_folder.md: another program or version wrote it"
+        )
+    return table
+
+
+def _whole_batches(file: IO[bytes]) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
+    reader = pa.ipc.open_stream(file)
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        while True:
+            try:
+                batch = reader.read_next_batch()
+            except (StopIteration, pa.ArrowInvalid, OSError):
+                return  # the end, or where the writer was killed
+            yield batch
+
+    return reader.schema, batches()

@@ -1,0 +1,50 @@
+"""Telemetry logs as MAVProxy and the ground stations read them.
+
+Every packet with eight bytes in front: Unix time in microseconds, big-endian, whose lowest two
+bits number the link (pymavlink's mavlogfile takes them so); ours is link 0.
+"""
+
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+
+from mavbridge.records import Packet
+
+_STAMP = struct.Struct(">Q")
+_LINK_MASK = 0b11
+
+
+class TlogWriter:
+    """One ``.tlog`` file."""
+
+    def __init__(self, path: Path, *, wall_offset_ns: int) -> None:
+        """Create the file.
+
+        Args:
+            path: must not exist.
+            wall_offset_ns: wall time minus the clock of the stamps, taken once: wall time steps.
+
+        Raises:
+            OSError: it exists, or cannot be written.
+        """
+        self._file = path.open("xb")
+        self._offset_ns = wall_offset_ns
+
+    def append(self, packets: Iterable[Packet]) -> None:
+        """Hand packets to the kernel.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        for packet in sorted(packets, key=lambda packet: packet.stamp_ns):
+            stamp_us = (packet.stamp_ns + self._offset_ns) // 1000 & ~_LINK_MASK
+            self._file.write(_STAMP.pack(stamp_us) + packet.data)
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file.
+
+        Raises:
+            OSError: what was left cannot be written.
+        """
+        self._file.close()

@@ -1,0 +1,198 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from factories import make_tick
+from mavbridge.errors import MavbridgeError, UserError
+from mavbridge.recording import folder as names
+from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.flight_writer import FlightWriter
+from mavbridge.recording.folder import prepare_folder
+from mavbridge.recording.rows import FrameTruth, TickLabels
+from mavbridge.records import Sticks
+from recordings import make_frame, make_meta, number_of
+
+
+def record(folder: Path, *, ticks: int = 30, frames: int = 10) -> FlightWriter:
+    folder.mkdir(parents=True)
+    writer = FlightWriter(folder, make_meta(), pressure="offline", wall_offset_ns=0)
+    for k in range(ticks):
+        writer.tick(make_tick(k))
+    for k in range(frames):
+        writer.frame(make_frame(k))
+    return writer
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """A finished one."""
+    folder = tmp_path / "flight"
+    writer = record(folder)
+    writer.finish(writer.meta)
+    return folder
+
+
+def test_a_flight_comes_back(flight: Path) -> None:
+    back = open_flight(flight)
+    assert [row.tick.index for row in back.tick_rows()] == list(range(30))
+    assert [row.frame_id for row in back.frame_rows()] == list(range(1, 11))
+    assert [number_of(rgb) for rgb in back.images()] == list(range(10))
+    expected = make_meta(
+        finished=True,
+        ticks=30,
+        frames=10,
+        ticks_dropped=0,
+        frames_dropped=0,
+        image_height=48,
+        image_width=64,
+        source_height=48,
+        source_width=64,
+    )
+    assert back.meta == expected
+    assert sorted(path.name for path in flight.iterdir()) == [
+        *("camera.mp4", "frames.parquet", "link.tlog", "meta.json", "ticks.parquet")
+    ]
+
+
+def test_a_demonstration_has_its_labels(tmp_path: Path) -> None:
+    expert = TickLabels(expert=Sticks(0.25, 0.5, -0.5, 1.0))
+    truth = FrameTruth(
+        position_ned_m=(1.0, 2.0, -3.0),
+        ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
+        velocity_ned_mps=(0.5, 0.0, 0.0),
+        next_gate=None,
+        gate_body_m=None,
+        gate_yaw_rad=None,
+        gate_after_body_m=None,
+    )
+    meta = make_meta(source="demonstration", course_seed=7, conditions={"wind_mps": 3.5})
+    writer = FlightWriter(tmp_path, meta, pressure="offline", with_labels=True)
+    writer.tick(make_tick(0), expert)
+    writer.frame(make_frame(0), truth)
+    writer.finish(meta)
+    back = open_flight(tmp_path)
+    assert [row.labels for row in back.tick_rows()] == [expert]
+    assert [row.truth for row in back.frame_rows()] == [truth]
+    assert back.meta.conditions == {"wind_mps": 3.5}
+    assert not (tmp_path / "link.tlog").exists()
+
+
+def test_what_an_observer_missed_is_counted_before_the_next_row(tmp_path: Path) -> None:
+    writer = FlightWriter(tmp_path, make_meta(), pressure="offline")
+    for serial in (1, 2, 5):
+        writer.tick(make_tick(serial))
+        writer.frame(make_frame(serial))
+    writer.finish(writer.meta)
+    back = open_flight(tmp_path)
+    assert [row.dropped_before for row in back.tick_rows()] == [1, 0, 2]
+    assert [row.dropped_before for row in back.frame_rows()] == [1, 0, 2]
+    assert [row.tick.serial for row in back.tick_rows()] == [1, 2, 5]
+    assert (back.meta.ticks_dropped, back.meta.frames_dropped) == (3, 3)
+
+
+def test_a_flight_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    writer = record(folder, ticks=600, frames=40)
+    writer.close()  # as after a kill: nothing is finished but the video
+    back = open_flight(folder)
+    assert not back.meta.finished
+    assert 512 <= back.ticks.num_rows <= 600
+    assert back.frames.num_rows == 40
+    video = folder / "camera.mp4"
+    video.write_bytes(video.read_bytes()[:-3000])
+    back = open_flight(folder)
+    assert 0 < back.frames.num_rows < 40
+    assert [number_of(rgb) for rgb in back.images()] == list(range(back.frames.num_rows))
+
+
+def test_a_flight_without_a_frame_is_a_flight(tmp_path: Path) -> None:
+    writer = record(tmp_path / "flight", frames=0)
+    writer.finish(writer.meta)
+    back = open_flight(tmp_path / "flight")
+    assert (back.ticks.num_rows, back.frames.num_rows) == (30, 0)
+    assert list(back.images()) == []
+
+
+def _without(name: str) -> Callable[[Path], object]:
+    return lambda flight: (flight / name).unlink()
+
+
+def _meta(**changes: object) -> Callable[[Path], object]:
+    def change(flight: Path) -> None:
+        path = flight / "meta.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+    return change
+
+
+def _damage(name: str) -> Callable[[Path], object]:
+    return lambda flight: (flight / name).write_bytes(b"something else altogether")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (_without("meta.json"), "has no meta.json"),
+        (_without("ticks.parquet"), "neither ticks.parquet nor ticks.arrows"),
+        (_without("frames.parquet"), "lacks frames.parquet, though 10 frames were recorded"),
+        (_without("camera.mp4"), "lacks camera.mp4, though 10 frames were recorded"),
+        (_damage("meta.json"), "is not JSON"),
+        (_damage("ticks.parquet"), "ticks.parquet is damaged"),
+        (_damage("camera.mp4"), "holds 0 frames"),
+        (_meta(format="other"), "is not of a recorded flight"),
+        (_meta(version=2), "has version 2 of the format, this build reads 1"),
+        (_meta(contract={"horizon": 0}), "horizon must be an integer"),
+        (_meta(source="dream"), "source 'dream'"),
+        (_meta(start_ns="now"), "start_ns is 'now', not a number"),
+    ],
+)
+def test_a_spoiled_flight_says_what_is_wrong(
+    flight: Path, spoil: Callable[[Path], object], told: str
+) -> None:
+    spoil(flight)
+    with pytest.raises(MavbridgeError) as error:
+        open_flight(flight)
+    assert told in str(error.value)
+
+
+def test_what_is_no_flight_says_what_is_wanted(flight: Path) -> None:
+    folder = flight.parent
+    (folder / "empty").mkdir()
+    for path, told in (
+        (folder / "nowhere", "there is no folder"),
+        (flight / "meta.json", "is a file: a recorded flight is a folder"),
+        (folder / "empty", "is empty: nothing was recorded there"),
+        (folder, "holds flights, and is none: name one of them"),
+        (Path(__file__).parent, "is no recorded flight: it has no meta.json"),
+    ):
+        with pytest.raises(MavbridgeError) as error:
+            open_flight(path)
+        assert told in str(error.value)
+
+
+def test_later_keys_in_meta_are_left_aside(flight: Path) -> None:
+    _meta(weather="fine")(flight)
+    assert open_flight(flight).meta.finished
+
+
+def test_a_new_or_empty_folder_is_prepared(tmp_path: Path) -> None:
+    prepare_folder(tmp_path / "a" / "b")
+    prepare_folder(tmp_path / "a" / "b")
+    assert list((tmp_path / "a" / "b").iterdir()) == []
+
+
+def test_a_folder_that_cannot_take_a_flight_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "notes.txt").write_text("precious")
+    with pytest.raises(UserError, match=r"is not empty \(it holds notes.txt\)"):
+        prepare_folder(tmp_path)
+    with pytest.raises(UserError, match="cannot be written"):
+        prepare_folder(tmp_path / "notes.txt")
+    with pytest.raises(UserError, match="cannot be written"):
+        prepare_folder(Path("/proc/nowhere"))
+    monkeypatch.setattr(names, "EXTRA", ("av", "no_such_module"))
+    with pytest.raises(UserError, match=r"needs no_such_module: pip install 'mavbridge\[record\]'"):
+        prepare_folder(tmp_path / "new")

@@ -1,0 +1,57 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mavbridge.recording.ring import MAX_BYTES, MAX_SLOTS, MIN_SLOTS, FrameRing
+
+
+def shm_file(ring: FrameRing) -> Path:
+    return Path("/dev/shm") / ring.shape.name
+
+
+def test_both_ends_see_the_same_slots() -> None:
+    ring = FrameRing.create(6, 4)
+    other = FrameRing.attach(ring.shape)
+    for index in range(ring.shape.slots):
+        ring.slot(index)[:] = index
+    assert [int(other.slot(k)[5, 3, 2]) for k in range(ring.shape.slots)] == list(range(MAX_SLOTS))
+    other.close()
+    ring.close()
+    ring.close()
+
+
+def test_the_name_can_go_while_both_work_on() -> None:
+    ring = FrameRing.create(6, 4)
+    other = FrameRing.attach(ring.shape)
+    assert shm_file(ring).exists()
+    ring.unlink()
+    assert not shm_file(ring).exists()
+    ring.slot(1)[:] = 7
+    assert np.all(other.slot(1) == 7)
+    other.close()
+    ring.close()
+
+
+@pytest.mark.parametrize(("side", "slots"), [(224, MAX_SLOTS), (1080, 9), (3000, MIN_SLOTS)])
+def test_memory_is_bounded(side: int, slots: int) -> None:
+    ring = FrameRing.create(side, side)
+    assert ring.shape.slots == slots
+    assert slots == MIN_SLOTS or slots * side * side * 3 <= MAX_BYTES
+    ring.close()
+
+
+def test_too_little_memory_is_an_error_now_and_not_a_crash_later() -> None:
+    before = set(Path("/dev/shm").iterdir())
+    with pytest.raises(OSError):  # noqa: PT011 - ENOSPC or ENOMEM
+        FrameRing.create(200_000, 200_000)
+    assert {
+        path for path in set(Path("/dev/shm").iterdir()) - before if "psm_" in path.name
+    } == set()
+
+
+def test_a_closed_ring_has_no_slots() -> None:
+    ring = FrameRing.create(2, 2)
+    ring.close()
+    with pytest.raises(ValueError, match="closed"):
+        ring.slot(0)

@@ -1,0 +1,120 @@
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factories import make_released_tick, make_state, make_tick, make_trace
+from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow
+from mavbridge.recording.schema import (
+    DEMONSTRATION_FRAMES,
+    DEMONSTRATION_TICKS,
+    FRAMES,
+    TICKS,
+    frames_batch,
+    read_frames,
+    read_ticks,
+    ticks_batch,
+)
+from mavbridge.records import Sticks, Tick, VehicleState
+from recordings import make_row
+
+floats = st.floats(-1e3, 1e3, width=32)
+sticks = st.builds(Sticks, *(st.floats(-1, 1, width=32),) * 4)
+stamps = st.integers(0, 2**62)
+vectors = st.tuples(floats, floats, floats)
+
+
+@st.composite
+def ticks(draw: st.DrawFn) -> Tick:
+    state = None
+    if draw(st.booleans()):
+        values = np.array(draw(st.lists(floats, min_size=13, max_size=13)), np.float32)
+        state = replace(make_state(draw(stamps)), values=values)
+    return replace(
+        make_tick(draw(st.integers(0, 10**6))),
+        predict_ns=draw(st.none() | stamps),
+        feature_frame_id=draw(st.none() | st.integers(0, 10**6)),
+        feature_captured_ns=draw(st.none() | stamps),
+        state=state,
+        trace=make_trace(draw(sticks)) if draw(st.booleans()) else None,
+        sent=draw(st.none() | sticks),
+        rc_sticks=draw(st.none() | sticks),
+        release_reason=draw(st.none() | st.text()),
+        mode=draw(st.none() | st.text()),
+        armed=draw(st.booleans()),
+        rc_channels_us=tuple(draw(st.lists(st.integers(0, 65535), max_size=18))),
+        texts=tuple(draw(st.lists(st.text(), max_size=3))),
+    )
+
+
+labels = st.builds(TickLabels, expert=st.none() | sticks)
+tick_rows = st.builds(TickRow, ticks(), st.integers(0, 9), labels)
+truths = st.builds(
+    FrameTruth,
+    position_ned_m=vectors,
+    ned_from_body_wxyz=st.tuples(floats, floats, floats, floats),
+    velocity_ned_mps=vectors,
+    next_gate=st.none() | st.integers(0, 30),
+    gate_body_m=st.none() | vectors,
+    gate_yaw_rad=st.none() | floats,
+    gate_after_body_m=st.none() | vectors,
+)
+frame_rows = st.builds(
+    FrameRow,
+    frame_id=stamps,
+    captured_ns=stamps,
+    ready_ns=stamps,
+    dropped_before=st.integers(0, 9),
+    truth=st.none() | truths,
+)
+
+
+def same_state(one: VehicleState | None, other: VehicleState | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    values = np.array_equal(one.values, other.values)
+    return values and replace(one, values=other.values) == other
+
+
+@given(st.lists(tick_rows, max_size=8))
+def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
+    table = pa.Table.from_batches([ticks_batch(rows, DEMONSTRATION_TICKS)])
+    back = list(read_ticks(table))
+    assert len(back) == len(rows)
+    serial = -1
+    for before, after in zip(rows, back, strict=True):
+        serial += 1 + before.dropped_before
+        assert same_state(before.tick.state, after.tick.state)
+        expected = replace(before.tick, serial=serial, state=after.tick.state)
+        assert after == TickRow(expected, before.dropped_before, before.labels)
+
+
+@given(st.lists(frame_rows, max_size=8))
+def test_frames_come_back_as_they_were(rows: list[FrameRow]) -> None:
+    table = pa.Table.from_batches([frames_batch(rows, DEMONSTRATION_FRAMES)])
+    assert list(read_frames(table)) == rows
+
+
+def test_a_flight_without_labels_has_none() -> None:
+    table = pa.Table.from_batches([ticks_batch([TickRow(make_tick(), 0)], TICKS)])
+    (row,) = read_ticks(table)
+    assert row.labels is None
+    frames = pa.Table.from_batches([frames_batch([make_row(0)], FRAMES)])
+    assert [row.truth for row in read_frames(frames)] == [None]
+
+
+def test_what_was_not_there_is_null_and_not_zero() -> None:
+    tick = replace(make_released_tick(), state=None, rc_sticks=None, mode=None)
+    table = pa.Table.from_batches([ticks_batch([TickRow(tick, 0)], TICKS)])
+    absent = ("predict_ns", "state", "attitude_ns", "raw", "smoothed", "sent", "rc_sticks", "mode")
+    assert [table.column(name).null_count for name in absent] == [1] * len(absent)
+
+
+def test_the_columns_are_those_of_the_document() -> None:
+    from pathlib import Path
+
+    text = (Path(__file__).parents[3] / "docs" / "flight_folder.md").read_text()
+    names = {*DEMONSTRATION_TICKS.names, *DEMONSTRATION_FRAMES.names}
+    assert [name for name in names if name not in text] == []

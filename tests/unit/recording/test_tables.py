@@ -1,0 +1,107 @@
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavbridge.recording.schema import FRAMES, TICKS, frames_batch
+from mavbridge.recording.tables import TableError, TableWriter, read_table
+from recordings import make_row
+
+SCHEMA_BYTES = FRAMES.serialize().size
+
+
+def write(stem: Path, sizes: list[int]) -> TableWriter:
+    writer = TableWriter(stem, FRAMES)
+    number = 0
+    for size in sizes:
+        rows = [make_row(number + k) for k in range(size)]
+        writer.append(frames_batch(rows, FRAMES))
+        number += size
+    return writer
+
+
+@contextmanager
+def disk_of(limit_bytes: int) -> Iterator[None]:
+    """No file of this process grows beyond that."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_the_stream_can_be_read_while_it_grows(tmp_path: Path) -> None:
+    writer = write(tmp_path / "frames", [3, 2])
+    assert read_table(tmp_path / "frames", FRAMES)["frame_id"].to_pylist() == [0, 1, 2, 3, 4]
+    writer.abandon()
+
+
+def test_finishing_leaves_parquet_alone(tmp_path: Path) -> None:
+    write(tmp_path / "frames", [3, 2]).finish()
+    assert [path.name for path in tmp_path.iterdir()] == ["frames.parquet"]
+    assert pq.ParquetFile(tmp_path / "frames.parquet").num_row_groups == 1
+    assert read_table(tmp_path / "frames", FRAMES)["frame_id"].to_pylist() == [0, 1, 2, 3, 4]
+
+
+@given(st.floats(0, 1))
+def test_a_stream_cut_off_anywhere_has_its_whole_batches(share: float) -> None:
+    with TemporaryDirectory() as folder:
+        stem = Path(folder) / "frames"
+        write(stem, [2, 1, 3]).abandon()
+        stream = stem.with_suffix(".arrows")
+        data = stream.read_bytes()
+        keep = round(share * len(data))
+        if keep < SCHEMA_BYTES:  # written in one piece
+            keep = 0
+        stream.write_bytes(data[:keep])
+        ids = read_table(stem, FRAMES)["frame_id"].to_pylist()
+    assert ids == list(range(len(ids)))
+    assert len(ids) in {0, 2, 3, 6}
+    if share == 1:
+        assert len(ids) == 6
+
+
+def test_a_full_disk_keeps_what_was_written(tmp_path: Path) -> None:
+    writer = write(tmp_path / "frames", [10])
+    written = (tmp_path / "frames.arrows").stat().st_size
+    with disk_of(written + 100), pytest.raises(OSError, match="large"):
+        writer.append(frames_batch([make_row(k) for k in range(50)], FRAMES))
+    writer.abandon()
+    assert read_table(tmp_path / "frames", FRAMES).num_rows == 10
+
+
+def test_no_room_for_parquet_leaves_the_stream(tmp_path: Path) -> None:
+    writer = write(tmp_path / "frames", [500])
+    with disk_of(100), pytest.raises(OSError, match="large"):
+        writer.finish()
+    assert [path.name for path in tmp_path.iterdir()] == ["frames.arrows"]
+    assert read_table(tmp_path / "frames", FRAMES).num_rows == 500
+
+
+def test_an_existing_table_is_not_overwritten(tmp_path: Path) -> None:
+    write(tmp_path / "frames", [1]).abandon()
+    with pytest.raises(FileExistsError):
+        TableWriter(tmp_path / "frames", FRAMES)
+
+
+def test_errors_say_what_is_wrong(tmp_path: Path) -> None:
+    with pytest.raises(TableError, match=r"neither ticks\.parquet nor ticks\.arrows"):
+        read_table(tmp_path / "ticks", TICKS)
+    (tmp_path / "ticks.parquet").write_bytes(b"this is no table at all")
+    with pytest.raises(TableError, match="damaged"):
+        read_table(tmp_path / "ticks", TICKS)
+    (tmp_path / "ticks.arrows").write_bytes(b"neither is this")
+    (tmp_path / "ticks.parquet").unlink()
+    with pytest.raises(TableError, match="damaged"):
+        read_table(tmp_path / "ticks", TICKS)
+    pq.write_table(pa.table({"index": [1.5]}), tmp_path / "ticks.parquet")
+    with pytest.raises(TableError, match="lacks the columns index, due_ns"):
+        read_table(tmp_path / "ticks", TICKS)

@@ -1,0 +1,315 @@
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import Pipe
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavbridge.recording import ring
+from mavbridge.recording.messages import Finish, VideoJob
+from mavbridge.recording.ring import MIN_SLOTS
+from mavbridge.recording.schema import DEMONSTRATION_FRAMES, FRAMES, read_frames
+from mavbridge.recording.tables import read_table
+from mavbridge.recording.video_file import count_frames, read_video
+from mavbridge.recording.video_writer import (
+    FrameSender,
+    Pressure,
+    VideoWriter,
+    WriterDiedError,
+    WriterError,
+)
+from mavbridge.recording.writer_process import WriterService
+from recordings import make_row, number_of, picture
+
+DEADLINE_S = 30.0
+
+
+@contextmanager
+def writer(folder: Path, pressure: Pressure, *, with_truth: bool = False) -> Iterator[VideoWriter]:
+    video = VideoWriter(
+        folder / "camera.mp4",
+        pressure=pressure,
+        hz=30,
+        rows=folder / "frames",
+        with_truth=with_truth,
+    )
+    try:
+        yield video
+    finally:
+        video.close()
+
+
+def kill(video: VideoWriter, number: signal.Signals) -> None:
+    assert video.pid is not None
+    os.kill(video.pid, number)
+    if number == signal.SIGKILL:
+        os.waitid(os.P_PID, video.pid, os.WEXITED | os.WNOWAIT)
+
+
+def submit(video: VideoWriter, count: int) -> None:
+    for k in range(count):
+        video.submit(picture(k), make_row(k))
+
+
+def read_back(folder: Path) -> tuple[list[int], list[int]]:
+    """Numbers of the images, and of their rows."""
+    rows = read_table(folder / "frames", FRAMES)["frame_id"].to_pylist()
+    return [number_of(rgb) for rgb in read_video(folder / "camera.mp4")], rows
+
+
+def test_offline_nothing_is_dropped_and_rows_match_frames(tmp_path: Path) -> None:
+    with writer(tmp_path, "offline") as video:
+        for k in range(200):  # the ring is far smaller
+            assert video.submit(picture(k), make_row(k))
+        video.finish()
+    assert read_back(tmp_path) == (list(range(200)), list(range(200)))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["camera.mp4", "frames.parquet"]
+    assert (video.written, video.lost) == (200, 0)
+
+
+def test_a_video_alone_needs_no_table(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "rollout.mp4", pressure="offline", hz=10) as video:
+        submit(video, 40)
+    assert [path.name for path in tmp_path.iterdir()] == ["rollout.mp4"]
+    assert [number_of(rgb) for rgb in read_video(tmp_path / "rollout.mp4")] == list(range(40))
+
+
+def test_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "odd.mp4", pressure="offline", hz=10) as video:
+        video.submit(picture(5, height=49, width=67), make_row(0))
+        assert video.size == (48, 66)
+    (rgb,) = read_video(tmp_path / "odd.mp4")
+    assert rgb.shape == (48, 66, 3)
+    assert number_of(rgb) == 5
+
+
+def test_a_name_stays_in_no_case(tmp_path: Path) -> None:
+    before = {path.name for path in Path("/dev/shm").glob("psm_*")}
+    with VideoWriter(tmp_path / "a.mp4", pressure="offline", hz=10) as video:
+        submit(video, 40)
+        assert {path.name for path in Path("/dev/shm").glob("psm_*")} == before
+
+
+def test_online_a_full_ring_drops_and_the_next_row_says_so(tmp_path: Path) -> None:
+    with writer(tmp_path, "online") as video:
+        assert video.submit(picture(0), make_row(0))
+        kill(video, signal.SIGSTOP)
+        taken = [0] + [k for k in range(1, 60) if video.submit(picture(k), make_row(k))]
+        assert 0 < len(taken) < 60
+        kill(video, signal.SIGCONT)
+        last = 59
+        while taken[-1] == last or not video.submit(picture(last), make_row(last)):
+            last += 1
+        taken.append(last)
+        video.finish()
+    frames, rows = read_back(tmp_path)
+    assert frames == rows == taken
+    dropped = [row.dropped_before for row in read_frames(read_table(tmp_path / "frames", FRAMES))]
+    gap = last - taken[-2] - 1
+    assert dropped[:-1] == [0] * (len(taken) - 1)
+    assert dropped[-1] >= gap > 0
+
+
+def test_offline_a_full_ring_waits_for_the_writer(tmp_path: Path) -> None:
+    with writer(tmp_path, "offline") as video:
+        video.submit(picture(0), make_row(0))
+        kill(video, signal.SIGSTOP)
+        submitted: list[int] = []
+        ring_is_full = threading.Event()
+
+        def produce() -> None:
+            for k in range(1, 100):
+                video.submit(picture(k), make_row(k))
+                submitted.append(k)
+                if k == MIN_SLOTS:
+                    ring_is_full.set()
+
+        producer = threading.Thread(target=produce)
+        producer.start()
+        assert ring_is_full.wait(DEADLINE_S)
+        assert len(submitted) < 99
+        kill(video, signal.SIGCONT)
+        producer.join(DEADLINE_S)
+        video.finish()
+    assert read_back(tmp_path)[0] == list(range(100))
+
+
+@pytest.mark.parametrize("pressure", ["online", "offline"])
+def test_a_killed_writer_is_noticed_and_leaves_a_readable_file(
+    tmp_path: Path, pressure: Pressure
+) -> None:
+    with writer(tmp_path, pressure) as video:
+        offered = 0
+        while video.written < 40:
+            video.submit(picture(offered), make_row(offered))
+            offered += 1
+        kill(video, signal.SIGKILL)
+        with pytest.raises(WriterDiedError, match="has died"):
+            submit(video, 1 if pressure == "online" else 100)
+        with pytest.raises(WriterDiedError, match="has died"):
+            video.finish()
+    table = read_table(tmp_path / "frames", FRAMES)
+    assert table.num_rows > 0
+    assert count_frames(tmp_path / "camera.mp4") >= 38
+
+
+def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> None:
+    with writer(tmp_path, "offline") as video:
+        video.submit(picture(0), make_row(0))
+        kill(video, signal.SIGSTOP)
+        reasons: list[str] = []
+        has_begun = threading.Event()
+
+        def produce() -> None:
+            try:
+                for k in range(1, 100):
+                    video.submit(picture(k), make_row(k))
+                    has_begun.set()
+            except WriterError as error:
+                reasons.append(str(error))
+
+        producer = threading.Thread(target=produce)
+        producer.start()
+        assert has_begun.wait(DEADLINE_S)
+        kill(video, signal.SIGKILL)
+        producer.join(DEADLINE_S)
+        assert len(reasons) == 1
+        assert "has died" in reasons[0]
+
+
+def test_a_full_disk_reaches_the_producer_and_leaves_a_readable_file(tmp_path: Path) -> None:
+    with writer(tmp_path, "offline") as video:
+        assert video.pid is not None
+        resource.prlimit(video.pid, resource.RLIMIT_FSIZE, (20_000, 20_000))
+        with pytest.raises(WriterError, match="File too large"):
+            submit(video, 2000)
+    frames, rows = read_back(tmp_path)
+    assert len(frames) > 5
+    assert frames == list(range(len(frames)))
+    assert rows == list(range(len(rows)))
+
+
+def test_a_video_that_exists_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "camera.mp4").write_text("precious")
+    with writer(tmp_path, "offline") as video, pytest.raises(WriterError, match="exists"):
+        submit(video, 100)
+    assert (tmp_path / "camera.mp4").read_text() == "precious"
+
+
+def test_ctrl_c_is_not_for_the_writer(tmp_path: Path) -> None:
+    with writer(tmp_path, "offline") as video:
+        video.submit(picture(0), make_row(0))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            kill(video, number)
+        video.submit(picture(1), make_row(1))
+        video.finish()
+    assert read_back(tmp_path)[0] == [0, 1]
+
+
+PRODUCER = """
+import os, signal, sys
+from pathlib import Path
+from mavbridge.recording.video_writer import VideoWriter
+from recordings import make_row, picture
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    video = VideoWriter(folder / "camera.mp4", pressure="offline", hz=30, rows=folder / "frames")
+    print(video.pid, flush=True)
+    for k in range(50):
+        video.submit(picture(k), make_row(k))
+    if sys.argv[2] == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("how", ["kill", "forget"])
+def test_without_its_producer_the_writer_finishes_by_itself(tmp_path: Path, how: str) -> None:
+    script = tmp_path / "producer.py"
+    script.write_text(PRODUCER)
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    path = os.pathsep.join([*sys.path])
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(folder), how],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": path},
+        text=True,
+    )
+    with process:
+        assert process.stdout is not None
+        # The writer has inherited the output: its end is the writer's end.
+        process.stdout.read()
+        status = process.wait(DEADLINE_S)
+    assert status == (-signal.SIGKILL if how == "kill" else 0)
+    assert read_back(folder) == (list(range(50)), list(range(50)))
+    assert (folder / "frames.parquet").exists()
+
+
+class Alive:
+    """A process that never ends; the service is driven by hand in the same thread."""
+
+    sentinel = -1
+    exitcode = None
+
+
+@settings(max_examples=40)
+@given(st.lists(st.integers(0, 3), max_size=60))
+def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
+    """0..2: a frame is offered, with so many lost before it; 3: the writer does one thing."""
+    with TemporaryDirectory() as name, patch.object(ring, "MAX_SLOTS", MIN_SLOTS):
+        folder = Path(name)
+        ours, its = Pipe()
+        job = VideoJob(
+            video=folder / "camera.mp4",
+            rows=folder / "frames",
+            with_truth=False,
+            hz=30,
+            yield_cpu=False,
+        )
+        service = WriterService(its, job)
+        sender = FrameSender(ours, Alive(), pressure="online")
+        offered = lost_upstream = 0
+        taken: list[int] = []
+        for step in steps:
+            if step == 3:
+                if its.poll():
+                    service.serve(0)
+                continue
+            lost_upstream += step
+            if sender.submit(picture(offered), make_row(offered, dropped_before=step)):
+                taken.append(offered)
+                lost_upstream_taken = lost_upstream
+            offered += 1
+        ours.send(Finish())
+        while service.is_open:
+            service.serve(0)
+        sender.receive()
+        sender.close()
+        its.close()
+        if not taken:
+            return
+        table = read_table(folder / "frames", FRAMES)
+        rows = list(read_frames(table))
+        assert [row.frame_id for row in rows] == taken
+        assert count_frames(folder / "camera.mp4") == len(rows)
+        dropped = sum(row.dropped_before for row in rows)
+        assert dropped == lost_upstream_taken + taken[-1] + 1 - len(taken)
+        assert sender.written == len(rows)
+
+
+def test_demonstrations_have_room_for_the_truth(tmp_path: Path) -> None:
+    with writer(tmp_path, "offline", with_truth=True) as video:
+        video.submit(picture(0), make_row(0))
+        video.finish()
+    assert read_table(tmp_path / "frames", DEMONSTRATION_FRAMES).num_rows == 1
