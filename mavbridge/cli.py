@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
-from mavbridge.config import BenchConfig, EvaluateConfig, FlyConfig
+from mavbridge.config import BenchConfig, DemonstrateConfig, EvaluateConfig, FlyConfig
 from mavbridge.errors import UserError
 
 cli = App(
@@ -49,6 +49,23 @@ def evaluate(config: EvaluateConfig | None = None) -> int:
             "evaluate needs the simulator's dynamics: pip install 'mavbridge[sitl]'"
         ) from error
     return run_evaluation(EvaluateConfig() if config is None else config)
+
+
+@cli.command
+def demonstrate(config: DemonstrateConfig) -> int:
+    """Record flights of simulated gate courses by an expert, to learn from."""
+    from mavbridge.recording.folder import require_extra
+
+    require_extra("demonstrate")
+    try:
+        from mavbridge.demonstration.run import demonstrate as run_demonstrations
+    except ModuleNotFoundError as error:
+        if error.name != "mujoco":
+            raise
+        raise UserError(
+            "demonstrate needs the simulator's dynamics: pip install 'mavbridge[sitl]'"
+        ) from error
+    return run_demonstrations(config)
 
 
 @cli.meta.default

@@ -255,6 +255,35 @@ MAX_EPISODES = 10_000
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
+class DemonstrateConfig:
+    """Flights to learn from."""
+
+    out: Path
+    """Folder for the flights, each in a folder of its own; what is there already is kept."""
+    episodes: int = 100
+    """Flights in all."""
+    speed: float = 5.0
+    """Of the expert along the course, in m/s."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    """With --checkpoint the policy flies, and the expert only says what it would do (DAgger)."""
+    workers: int = 1
+    """Flights at a time."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be flown."""
+        _check("episodes", self.episodes, 1, MAX_EPISODES, "")
+        _check("speed", self.speed, 1.5, 10, "m/s")
+        _check("workers", self.workers, 1, 64, "")
+        _check("seed", self.policy.seed, 0, HELD_OUT_COURSE_SEED // MAX_EPISODES - 1, "")
+
+    @property
+    def first_course_seed(self) -> int:
+        """Never one of those that evaluate flies."""
+        return self.policy.seed * MAX_EPISODES
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
     """One evaluation: many courses that no policy was trained on."""
 

@@ -16,15 +16,24 @@ EXTRA = ("av", "pyarrow")
 """What ``pip install 'mavbridge[record]'`` brings."""
 
 
+def require_extra(what: str) -> None:
+    """Refuse to begin what cannot be recorded.
+
+    Raises:
+        UserError: the extra is not installed.
+    """
+    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UserError(f"{what} needs {' and '.join(missing)}: pip install 'mavbridge[record]'")
+
+
 def prepare_folder(folder: Path) -> None:
     """Make sure that a flight can be recorded into this folder; makes it.
 
     Raises:
         UserError: the extra is not installed, or the folder holds something, or cannot be written.
     """
-    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UserError(f"--record needs {' and '.join(missing)}: pip install 'mavbridge[record]'")
+    require_extra("--record")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         taken = sorted(entry.name for entry in folder.iterdir())
