@@ -1,5 +1,8 @@
 """Flights to record: images that say which one they are, and a meta."""
 
+import os
+import signal
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -62,3 +65,11 @@ def make_meta(**changes: Any) -> FlightMeta:
         contract=Contract(),
     )
     return replace(meta, **changes)
+
+
+def send_signal(pid: int, number: signal.Signals) -> None:
+    """Stop, kill or continue a child, and see it done: ``os.kill`` returns before that."""
+    os.kill(pid, number)
+    if number != signal.SIGCONT:
+        with suppress(ChildProcessError):  # its parent's other thread has seen to it
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WSTOPPED | os.WNOWAIT)

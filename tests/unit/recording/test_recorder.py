@@ -1,4 +1,3 @@
-import os
 import resource
 import signal
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from factories import make_tick
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.recorder import Recorder
 from mavbridge.records import Packet
-from recordings import make_frame, make_meta, number_of
+from recordings import make_frame, make_meta, number_of, send_signal
 
 DEADLINE_S = 30.0
 
@@ -94,8 +93,7 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
             stood.recorder.emit(make_tick(k))
             stood.recorder.emit(make_frame(k))
         until(stood, 10)
-        os.kill(stood.pid, signal.SIGKILL)
-        os.waitid(os.P_PID, stood.pid, os.WEXITED | os.WNOWAIT)
+        send_signal(stood.pid, signal.SIGKILL)
         for k in range(10, 40):
             stood.recorder.emit(make_tick(k))
         for k in range(10, 20):
@@ -115,7 +113,7 @@ def test_a_writer_killed_after_the_last_frame_is_told_in_the_end(tmp_path: Path)
     with stand(tmp_path) as stood:
         stood.recorder.emit(make_tick(0))
         until(stood, 1)
-        os.kill(stood.pid, signal.SIGKILL)
+        send_signal(stood.pid, signal.SIGKILL)
     assert "not completely: the writer process has died" in stood.recorder.summary()
     assert open_flight(tmp_path).ticks.num_rows == 1
 

@@ -1,8 +1,11 @@
+import errno
+from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mavbridge.recording import ring as ring_module
 from mavbridge.recording.ring import MAX_BYTES, MAX_SLOTS, MIN_SLOTS, FrameRing
 
 
@@ -41,13 +44,24 @@ def test_memory_is_bounded(side: int, slots: int) -> None:
     ring.close()
 
 
-def test_too_little_memory_is_an_error_now_and_not_a_crash_later() -> None:
-    before = set(Path("/dev/shm").iterdir())
+def test_too_little_memory_is_an_error_now_and_not_a_crash_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reserved: list[str] = []
+
+    def refuse(memory: SharedMemory) -> None:
+        reserved.append(memory.name)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ring_module, "_reserve", refuse)
+    with pytest.raises(OSError, match="No space"):
+        FrameRing.create(20, 20)
+    assert not (Path("/dev/shm") / reserved[0]).exists()
+
+
+def test_more_than_there_can_be_is_refused() -> None:
     with pytest.raises(OSError):  # noqa: PT011 - ENOSPC or ENOMEM
         FrameRing.create(200_000, 200_000)
-    assert {
-        path for path in set(Path("/dev/shm").iterdir()) - before if "psm_" in path.name
-    } == set()
 
 
 def test_a_closed_ring_has_no_slots() -> None:
