@@ -106,6 +106,7 @@ def make_action_loop(
         sink=sink,
         settings=ActionSettings(
             state_frame=contract.state_frame,
+            since_exposure=contract.since_exposure,
             chunk_dt_s=contract.chunk_dt_s,
             history_len=contract.history_len,
             history_dt_s=contract.history_dt_s,
