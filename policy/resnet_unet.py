@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from policy.action_head import DiffusionHead, Size, size_dims
 from policy.backbones import build_backbone
-from policy.contract import ACTION_DIM, STATE_DIM, Contract, ContractError
+from policy.contract import ACTION_DIM, Contract, ContractError
 from policy.diffusion import NoiseSchedule
 from policy.encoders import StateEncoder, require_shape
 
@@ -44,7 +44,7 @@ class ResnetUnet(nn.Module):
         self.contract = config.contract
         self.config = config
         self.backbone = build_backbone("resnet18")
-        self.state_encoder = StateEncoder(dim)
+        self.state_encoder = StateEncoder(dim, self.contract.state_dim)
         self.visual_projection = nn.Sequential(
             nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
         )
@@ -66,9 +66,12 @@ class ResnetUnet(nn.Module):
         """
         contract = self.contract
         require_shape("image", image, 3, contract.image_height, contract.image_width)
-        require_shape("state", state, STATE_DIM)
+        require_shape("state", state, contract.state_dim)
         require_shape("action_history", action_history, contract.history_len, ACTION_DIM)
-        visual = self.visual_projection(self.backbone(image))
+        return self.fuse_visual(self.visual_projection(self.backbone(image)), state, action_history)
+
+    def fuse_visual(self, visual: Tensor, state: Tensor, action_history: Tensor) -> Tensor:
+        """Projected image [B, C], state, history [B, K, 4] -> condition [B, C]."""
         parts = [visual, self.state_encoder(state), action_history.flatten(1)]
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition
