@@ -27,7 +27,6 @@ from policy.train_model import (
     GRADIENT_LIMIT,
     Ema,
     StickSpread,
-    Trainee,
     computing_in,
     make_optimiser,
     uses_bf16,
@@ -41,7 +40,7 @@ from policy.train_plan import (
     make_stages,
 )
 from policy.train_report import Progress, Report, TrainResult, Validation
-from policy.train_start import starting_policy, training_card
+from policy.train_start import starting_trainee, training_card
 from policy.train_state import Position, RunFolder, TrainingError, identity_of
 
 VALIDATION_SAMPLES = 256
@@ -106,7 +105,7 @@ class _Run:
         self._contract = settings.policy.contract
         self._ages_ns = _ages(episodes, settings)
         self._load(episodes)
-        self._trainee = Trainee(starting_policy(settings))
+        self._trainee = starting_trainee(settings)
         self._trainee.to(self._device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._ema = Ema(self._trainee, settings.ema_decay)
         self._position = Position()

@@ -182,7 +182,7 @@ def make_optimiser(trainee: Trainee, learning_rate: float, decay: float) -> torc
         {"params": [p for p in moving if p.ndim >= 2], "weight_decay": decay},
         {"params": [p for p in moving if p.ndim < 2], "weight_decay": 0.0},
     ]
-    return torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.98))
+    return torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.98), fused=True)
 
 
 @contextmanager

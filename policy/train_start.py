@@ -12,22 +12,28 @@ from policy.backbones import load_imagenet_state
 from policy.checkpoint import BuiltinPolicy, build_policy, load_checkpoint
 from policy.contract import STATE_NAMES, PolicyError
 from policy.dataset import Episode, Nanoseconds
+from policy.train_model import Trainee
 from policy.train_plan import TrainSettings
 
 AGE_BIN_MS = 5
 
 
-def starting_policy(settings: TrainSettings) -> BuiltinPolicy:
-    """Seeded random weights, an encoder's weights under them, or a checkpoint.
+def starting_trainee(settings: TrainSettings) -> Trainee:
+    """The policy to start from, and a new gate head; the process's random stream stays as it was.
 
     Raises:
         PolicyError: weights that do not fit.
     """
-    if settings.start_from is not None:
-        return _checkpoint(settings, settings.start_from)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        policy = build_policy(settings.policy)
+        return Trainee(_starting_policy(settings))
+
+
+def _starting_policy(settings: TrainSettings) -> BuiltinPolicy:
+    """Random weights, an encoder's weights under them, or a checkpoint."""
+    if settings.start_from is not None:
+        return _checkpoint(settings, settings.start_from)
+    policy = build_policy(settings.policy)
     if settings.backbone_weights is not None:
         state = _state_dict(settings.backbone_weights)
         load_imagenet_state(policy.backbone, state)

@@ -44,7 +44,8 @@ def ticks_table(
 ) -> pa.Table:
     count = len(woke_ns)
     state = [LEVEL] * count if state is None else state
-    attitude_ns = [None if s is None else w - attitude_lag_ns for w, s in zip(woke_ns, state)]
+    pairs = zip(woke_ns, state, strict=True)
+    attitude_ns = [None if s is None else w - attitude_lag_ns for w, s in pairs]
     columns = {
         "woke_ns": pa.array(woke_ns, pa.int64()),
         "sent_ns": pa.array([w + sent_lag_ns for w in woke_ns], pa.int64()),
