@@ -146,10 +146,10 @@ def make_stages(settings: TrainSettings) -> tuple[Stage, ...]:
             name=f"encoder and head, {width}x{height}",
             image_size=(height, width),
             trains_encoder=True,
-            start=end - share,
+            start=start,
             end=end,
         )
-        for ((height, width), share), end in zip(shares.items(), ends, strict=True)
+        for (height, width), start, end in zip(shares, (0.0, *ends), ends, strict=False)
     ]
     head = Stage(name="head", image_size=full, trains_encoder=False, start=ends[-1], end=1.0)
     return (*joint, head)
