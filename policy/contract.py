@@ -25,15 +25,6 @@ STATE_NAMES = (
 STATE_DIM = len(STATE_NAMES)
 VELOCITY, QUATERNION, RATE, SPECIFIC_FORCE = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
 
-SINCE_EXPOSURE_NAMES = (
-    "age_s",
-    *("turned_x_rad", "turned_y_rad", "turned_z_rad"),
-    *("dvx_mps", "dvy_mps", "dvz_mps"),
-)
-"""From the image's exposure to the state: time, the body's rotation vector, change of velocity; the
-vectors in body axes at the exposure."""
-SINCE_EXPOSURE_DIM = len(SINCE_EXPOSURE_NAMES)
-
 ACTION_NAMES = ("throttle", "yaw", "pitch", "roll")
 """Sticks in [-1, 1]: up, nose right, stick forward (nose down), right; 0 = centred."""
 ACTION_DIM = len(ACTION_NAMES)
@@ -80,8 +71,6 @@ class Contract:
     """K past actions, oldest first, as they were sent."""
     history_dt_s: float = 0.05
     """Time between them; the newest is history_dt_s before the state."""
-    since_exposure: bool = False
-    """Whether the state ends in ``SINCE_EXPOSURE_NAMES``."""
     arrays: Arrays = "torch"
     """What the policy takes and returns."""
     version: int = CONTRACT_VERSION
@@ -117,11 +106,6 @@ class Contract:
             raise ContractError("image_mean_rgb and image_std_rgb must be finite numbers")
         if min(self.image_std_rgb) <= 0:
             raise ContractError(f"image_std_rgb must be positive, got {self.image_std_rgb}")
-
-    @property
-    def state_dim(self) -> int:
-        """Width of the state that the policy takes: 13, or 20 with what happened since exposure."""
-        return STATE_DIM + (SINCE_EXPOSURE_DIM if self.since_exposure else 0)
 
     def to_json(self) -> str:
         """Header form of a checkpoint."""

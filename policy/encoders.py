@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, PolicyError
-from policy.preprocess import SINCE_EXPOSURE_SCALE, STATE_SCALE
+from policy.preprocess import STATE_SCALE
 
 HEADS = 4
 
@@ -22,14 +22,13 @@ def require_shape(name: str, array: Tensor, *shape: int) -> None:
 
 
 class StateEncoder(nn.Module):
-    """State [B, 13], or [B, 20] with what happened since exposure, in SI units -> [B, dim]."""
+    """State [B, 13] in SI units -> token [B, dim]."""
 
-    def __init__(self, dim: int, state_dim: int = STATE_DIM) -> None:
+    def __init__(self, dim: int) -> None:
         super().__init__()
-        self.mlp = nn.Sequential(nn.Linear(state_dim, dim), nn.SiLU(), nn.Linear(dim, dim))
+        self.mlp = nn.Sequential(nn.Linear(STATE_DIM, dim), nn.SiLU(), nn.Linear(dim, dim))
         self._scale: Tensor
-        scale = (*STATE_SCALE, *SINCE_EXPOSURE_SCALE)
-        self.register_buffer("_scale", torch.tensor(scale[:state_dim]), persistent=False)
+        self.register_buffer("_scale", torch.tensor(STATE_SCALE), persistent=False)
 
     def normalise(self, state: Tensor) -> Tensor:
         """Each dimension over its scale; of q and -q, the same attitude, the one with w >= 0."""
@@ -39,7 +38,7 @@ class StateEncoder(nn.Module):
         return torch.cat([before, flipped, after], dim=1) / self._scale
 
     def forward(self, state: Tensor) -> Tensor:
-        """State [B, state_dim] -> token [B, dim]."""
+        """State [B, 13] -> token [B, dim]."""
         token: Tensor = self.mlp(self.normalise(state))
         return token
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, QUATERNION, Contract, FloatArray
+from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, Contract, FloatArray
 
 MIN_COSINE = 0.999
 """Of two chunks as vectors, of each sample."""
@@ -21,7 +21,7 @@ class Probe:
     rgb: NDArray[np.uint8]
     """[samples, image_height, image_width, 3]"""
     state: FloatArray
-    """[samples, state_dim] in the ranges of flight"""
+    """[samples, 13] in the ranges of flight"""
     history: FloatArray
     """[samples, K, 4]"""
 
@@ -34,7 +34,7 @@ def make_probe(contract: Contract) -> Probe:
     rows, columns = np.arange(height) * 8 // height, np.arange(width) * 8 // width
     fine = random.integers(0, 32, (SAMPLES, height, width, 3), dtype=np.uint8)
     rgb = coarse[:, rows][:, :, columns] // 8 * 7 + fine
-    state = random.normal(0.0, 2.0, (SAMPLES, contract.state_dim))
+    state = random.normal(0.0, 2.0, (SAMPLES, STATE_DIM))
     state[:, QUATERNION] /= np.linalg.norm(state[:, QUATERNION], axis=1, keepdims=True)
     history = random.uniform(-1.0, 1.0, (SAMPLES, contract.history_len, ACTION_DIM))
     return Probe(

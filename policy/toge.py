@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from policy.action_head import DiffusionHead, Size, size_dims
 from policy.backbones import BACKBONE_NAMES, BackboneName, build_backbone
-from policy.contract import ACTION_DIM, Contract, ContractError, PolicyError
+from policy.contract import ACTION_DIM, STATE_DIM, Contract, ContractError, PolicyError
 from policy.diffusion import NoiseSchedule
 from policy.encoders import Fusion, HistoryEncoder, StateEncoder, require_shape
 
@@ -66,7 +66,7 @@ class Toge(nn.Module):
         self.visual_projection = nn.Sequential(
             nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
         )
-        self.state_encoder = StateEncoder(dim, self.contract.state_dim)
+        self.state_encoder = StateEncoder(dim)
         self.history_encoder = HistoryEncoder(dim, self.contract.history_len)
         self.fusion = Fusion(dim)
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
@@ -94,7 +94,7 @@ class Toge(nn.Module):
             PolicyError: a shape is not the contract's.
         """
         require_shape("feature", feature, self.contract.feature_dim)
-        require_shape("state", state, self.contract.state_dim)
+        require_shape("state", state, STATE_DIM)
         history = None
         if action_history is not None:
             require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
