@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from mavbridge.actions import SentHistory, sample_chunk
 from mavbridge.clock import NS_PER_MS, NS_PER_S, Clock, Pacer, Slot
+from mavbridge.ego_motion import EgoMotion
 from mavbridge.feature_cache import FeatureCache
 from mavbridge.ports import Link, TickSink
 from mavbridge.records import (
@@ -27,8 +28,8 @@ from mavbridge.smoothing import StickSmoother
 from mavbridge.state import Freshness, StateFrame, build_state
 
 Act = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
-"""(encoded image, state [1, 13], history [1, K, 4], seconds since the state of the last chunk or
-None to start afresh) -> chunk [1, horizon, 4]."""
+"""(encoded image, state [1, 13 or 20], history [1, K, 4], seconds since the state of the last chunk
+or None to start afresh) -> chunk [1, horizon, 4]."""
 
 NEUTRAL_NS = 50 * NS_PER_MS
 """How long the sticks are neutral before they are given back at the end of a flight."""
@@ -42,6 +43,8 @@ class ActionSettings:
     """What the loop needs to know of the contract and the limits."""
 
     state_frame: StateFrame
+    since_exposure: bool
+    """Whether the policy is told the age of the image and the motion since."""
     chunk_dt_s: float
     history_len: int
     history_dt_s: float
@@ -92,6 +95,9 @@ class ActionLoop:
         self._sink = sink
         self._settings = settings
         self._history = SentHistory(length=settings.history_len, dt_s=settings.history_dt_s)
+        self._ego_motion: EgoMotion | None = None
+        if settings.since_exposure:
+            self._ego_motion = EgoMotion(span_ns=settings.max_feature_age_ns)
         self._is_flying = False
         self._has_commanded = False
         self._chunk_state_ns: int | None = None
@@ -126,6 +132,8 @@ class ActionLoop:
             freshness=self._settings.freshness,
         )
         step.state = state if isinstance(state, VehicleState) else None
+        if step.state is not None and self._ego_motion is not None:
+            self._ego_motion.push(step.state)
         problem = state if isinstance(state, Release) else self._feature_problem(step)
         directive = self._engagement.step(_facts(step, problem))
         self._ask(directive.ask)
@@ -153,7 +161,10 @@ class ActionLoop:
         started_ns = self._clock.now_ns()
         history = self._history.resample(step.now_ns)
         elapsed_s = self._elapsed_s(step.state)
-        chunk = self._act(step.feature.value, step.state.values[None], history, elapsed_s)
+        state = step.state.values[None]
+        if self._ego_motion is not None:
+            state = self._ego_motion.append_to(step.state, step.feature.captured_ns)
+        chunk = self._act(step.feature.value, state, history, elapsed_s)
         done_ns = self._clock.now_ns()
         step.predict_ns = done_ns - started_ns
         if (refusal := check_chunk(chunk)) is not None:

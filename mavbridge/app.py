@@ -206,6 +206,7 @@ class _Flight:
             sink=self._sink,
             settings=ActionSettings(
                 state_frame=contract.state_frame,
+                since_exposure=contract.since_exposure,
                 chunk_dt_s=contract.chunk_dt_s,
                 history_len=contract.history_len,
                 history_dt_s=contract.history_dt_s,

@@ -25,6 +25,19 @@ STATE_NAMES = (
 STATE_DIM = len(STATE_NAMES)
 VELOCITY, QUATERNION, RATE, SPECIFIC_FORCE = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
 
+SINCE_EXPOSURE_NAMES = (
+    "age_s",
+    *("rotation_x_rad", "rotation_y_rad", "rotation_z_rad"),
+    *("velocity_change_x_mps", "velocity_change_y_mps", "velocity_change_z_mps"),
+)
+"""From the exposure of the image to the state, appended to the state where a contract asks for it.
+
+Time between them, a little below zero where the image is newer than the attitude; the body's
+rotation vector; the change of its velocity. Both vectors in the body's axes at the exposure.
+"""
+SINCE_EXPOSURE_DIM = len(SINCE_EXPOSURE_NAMES)
+AGE, ROTATION, VELOCITY_CHANGE = slice(13, 14), slice(14, 17), slice(17, 20)
+
 ACTION_NAMES = ("throttle", "yaw", "pitch", "roll")
 """Sticks in [-1, 1]: up, nose right, stick forward (nose down), right; 0 = centred."""
 ACTION_DIM = len(ACTION_NAMES)
@@ -73,6 +86,8 @@ class Contract:
     """Time between them; the newest is history_dt_s before the state."""
     arrays: Arrays = "torch"
     """What the policy takes and returns."""
+    since_exposure: bool = False
+    """Whether the state is followed by ``SINCE_EXPOSURE_NAMES``."""
     version: int = CONTRACT_VERSION
 
     def __post_init__(self) -> None:
@@ -88,6 +103,10 @@ class Contract:
             )
         if self.arrays not in ("numpy", "torch"):
             raise ContractError(f"arrays {self.arrays!r} is unknown; use 'numpy' or 'torch'")
+        if not isinstance(self.since_exposure, bool):
+            raise ContractError(
+                f"since_exposure must be true or false, got {self.since_exposure!r}"
+            )
         for name, low, high in (
             ("image_height", 16, 4096),
             ("image_width", 16, 4096),
@@ -102,10 +121,18 @@ class Contract:
             value = getattr(self, name)
             if not (math.isfinite(value) and 0 < value <= 1):
                 raise ContractError(f"{name} must be in (0, 1] seconds, got {value!r}")
+        self._require_image_statistics()
+
+    def _require_image_statistics(self) -> None:
         if not all(map(math.isfinite, (*self.image_mean_rgb, *self.image_std_rgb))):
             raise ContractError("image_mean_rgb and image_std_rgb must be finite numbers")
         if min(self.image_std_rgb) <= 0:
             raise ContractError(f"image_std_rgb must be positive, got {self.image_std_rgb}")
+
+    @property
+    def state_dim(self) -> int:
+        """Width of the state that the policy takes: 13, or 20 with ``since_exposure``."""
+        return STATE_DIM + (SINCE_EXPOSURE_DIM if self.since_exposure else 0)
 
     def to_json(self) -> str:
         """Header form of a checkpoint."""
@@ -148,9 +175,9 @@ def _rgb(name: str, value: object) -> tuple[float, float, float]:
 class SingleRatePolicy(Protocol):
     """The least that flies: image, state and history in, a chunk out.
 
-    Shapes, float32: image [B, 3, H, W] normalised by the contract, state [B, 13] in SI units,
-    action_history [B, K, 4]; returns [B, horizon, 4] sticks in [-1, 1]. Arrays are numpy or torch,
-    as ``contract.arrays`` says. Any class with these members will do; nothing is inherited.
+    Shapes, float32: image [B, 3, H, W] normalised by the contract, state [B, state_dim] in SI
+    units, action_history [B, K, 4]; returns [B, horizon, 4] sticks in [-1, 1]. Arrays are numpy or
+    torch, as ``contract.arrays`` says. Any class with these members will do; nothing is inherited.
     """
 
     contract: Contract
@@ -208,5 +235,5 @@ class Executable:
     """RGB [any height, any width, 3] -> what ``act`` of the same executable takes: opaque to the
     loops, float32, of a shape that each engine knows."""
     act: Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
-    """(encode's value, state [1, 13], history [1, K, 4], seconds from the state of the last chunk
-    to this one or None to start afresh) -> chunk [1, horizon, 4]."""
+    """(encode's value, state [1, state_dim], history [1, K, 4], seconds from the state of the last
+    chunk to this one or None to start afresh) -> chunk [1, horizon, 4]."""

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from policy import rotation
 from policy.contract import (
     ACTION_DIM,
+    AGE,
     QUATERNION,
     RATE,
+    ROTATION,
     SPECIFIC_FORCE,
     STATE_DIM,
     VELOCITY,
+    VELOCITY_CHANGE,
     Contract,
     FloatArray,
 )
@@ -87,7 +90,8 @@ class Timeline:
         self.tick_ns, self._attitude_ns = stamps("tick_ns")[known], stamps("attitude_ns")[known]
         self._state = state[known]
         self._attitude = _Knots(self._attitude_ns, self._state[:, QUATERNION])
-        self._velocity = _Knots(stamps("velocity_ns")[known], self._state[:, VELOCITY])
+        self._velocity_ns = stamps("velocity_ns")[known]
+        self._velocity = _Knots(self._velocity_ns, self._state[:, VELOCITY])
         self._target_ns = stamps("target_ns")
         self._target = np.concatenate([episode.target for episode in episodes])
         # Before its first stick, a flight's sticks were neutral.
@@ -159,13 +163,18 @@ class Timeline:
         state: FloatArray = self._state[ticks]
         if not self.contract.since_exposure:
             return state
-        captured_ns = self.captured_ns[frames]
-        age_s = (self.tick_ns[ticks] - captured_ns)[:, None] / NS_PER_S
-        then = rotation.conjugate(self._attitude.rotations_at(captured_ns))
+        captured_ns, attitude_ns = self.captured_ns[frames], self._attitude_ns[ticks]
+        # An image newer than the attitude: in flight nothing later is known, so nothing has moved.
+        turned_from = self._attitude.rotations_at(np.minimum(captured_ns, attitude_ns))
+        moved_from = self._velocity.vectors_at(np.minimum(captured_ns, self._velocity_ns[ticks]))
+        then = rotation.conjugate(turned_from)
         turned = rotation.multiply(then, state[:, QUATERNION].astype(np.float64))
-        change = state[:, VELOCITY] - self._velocity.vectors_at(captured_ns)
-        parts = (state, age_s, rotation.rotation_vector(turned), rotation.rotate(then, change))
-        return np.concatenate(parts, axis=1).astype(np.float32)
+        out = np.empty((len(ticks), self.contract.state_dim), np.float32)
+        out[:, :STATE_DIM] = state
+        out[:, AGE] = (attitude_ns - captured_ns)[:, None] / NS_PER_S
+        out[:, ROTATION] = rotation.rotation_vector(turned)
+        out[:, VELOCITY_CHANGE] = rotation.rotate(then, state[:, VELOCITY] - moved_from)
+        return out
 
     def histories(self, ticks: Indices, random: np.random.Generator | None = None) -> FloatArray:
         """[B, K, 4] sticks as they were sent, oldest first, held until the next one."""
@@ -287,8 +296,8 @@ def mirror(samples: Samples, is_mirrored: NDArray[np.bool_]) -> Samples:
     signs[VELOCITY] = signs[SPECIFIC_FORCE] = vector
     signs[RATE] = signs[QUATERNION.start + 1 : QUATERNION.stop] = axial
     if samples.state.shape[1] > STATE_DIM:
-        signs[STATE_DIM + 1 : STATE_DIM + 4] = axial
-        signs[STATE_DIM + 4 :] = vector
+        signs[ROTATION] = axial
+        signs[VELOCITY_CHANGE] = vector
     sticks = np.array((1.0, -1.0, 1.0, -1.0), np.float32)  # yaw and roll
     gate = np.array((*vector, -1.0, *vector), np.float32)
 

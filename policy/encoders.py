@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, PolicyError
-from policy.preprocess import STATE_SCALE
+from policy.contract import ACTION_DIM, QUATERNION, Contract, PolicyError
+from policy.preprocess import state_scale
 
 HEADS = 4
 
@@ -22,13 +22,13 @@ def require_shape(name: str, array: Tensor, *shape: int) -> None:
 
 
 class StateEncoder(nn.Module):
-    """State [B, 13] in SI units -> token [B, dim]."""
+    """State [B, state_dim] in SI units -> token [B, dim]."""
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, contract: Contract) -> None:
         super().__init__()
-        self.mlp = nn.Sequential(nn.Linear(STATE_DIM, dim), nn.SiLU(), nn.Linear(dim, dim))
+        self.mlp = nn.Sequential(nn.Linear(contract.state_dim, dim), nn.SiLU(), nn.Linear(dim, dim))
         self._scale: Tensor
-        self.register_buffer("_scale", torch.tensor(STATE_SCALE), persistent=False)
+        self.register_buffer("_scale", torch.tensor(state_scale(contract)), persistent=False)
 
     def normalise(self, state: Tensor) -> Tensor:
         """Each dimension over its scale; of q and -q, the same attitude, the one with w >= 0."""
@@ -38,7 +38,7 @@ class StateEncoder(nn.Module):
         return torch.cat([before, flipped, after], dim=1) / self._scale
 
     def forward(self, state: Tensor) -> Tensor:
-        """State [B, 13] -> token [B, dim]."""
+        """State [B, state_dim] -> token [B, dim]."""
         token: Tensor = self.mlp(self.normalise(state))
         return token
 

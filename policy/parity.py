@@ -5,7 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, Contract, FloatArray
+from policy.contract import (
+    ACTION_DIM,
+    QUATERNION,
+    SINCE_EXPOSURE_DIM,
+    STATE_DIM,
+    Contract,
+    FloatArray,
+)
+from policy.preprocess import SINCE_EXPOSURE_SCALE
 
 MIN_COSINE = 0.999
 """Of two chunks as vectors, of each sample."""
@@ -21,7 +29,7 @@ class Probe:
     rgb: NDArray[np.uint8]
     """[samples, image_height, image_width, 3]"""
     state: FloatArray
-    """[samples, 13] in the ranges of flight"""
+    """[samples, state_dim] in the ranges of flight"""
     history: FloatArray
     """[samples, K, 4]"""
 
@@ -37,6 +45,10 @@ def make_probe(contract: Contract) -> Probe:
     state = random.normal(0.0, 2.0, (SAMPLES, STATE_DIM))
     state[:, QUATERNION] /= np.linalg.norm(state[:, QUATERNION], axis=1, keepdims=True)
     history = random.uniform(-1.0, 1.0, (SAMPLES, contract.history_len, ACTION_DIM))
+    if contract.since_exposure:
+        since = random.uniform(-1.0, 1.0, (SAMPLES, SINCE_EXPOSURE_DIM)) * SINCE_EXPOSURE_SCALE
+        since[:, 0] = np.abs(since[:, 0])
+        state = np.concatenate([state, since], axis=1)
     return Probe(
         rgb=rgb.astype(np.uint8),
         state=state.astype(np.float32),

@@ -24,12 +24,18 @@ STATE_SCALE = (
 Fixed, not taken from data: every checkpoint shares it, and a sensor that is off by a unit shows.
 """
 
+
 SINCE_EXPOSURE_SCALE = (
-    0.1,  # s: the usual age of a feature
-    *(0.3, 0.3, 0.3),  # rad: 3 rad/s for 0.1 s
-    *(1.0, 1.0, 1.0),  # m/s: 1 g for 0.1 s
+    0.1,  # s: about the age of an image that is too old to be of use
+    *(0.5, 0.5, 0.5),  # rad: an image turned by half its width
+    *(2.0, 2.0, 2.0),  # m/s: two tenths of a second of hard acceleration
 )
-"""The same for ``SINCE_EXPOSURE_NAMES``, which may follow it."""
+"""As ``STATE_SCALE``, for what a contract may append to the state."""
+
+
+def state_scale(contract: Contract) -> tuple[float, ...]:
+    """What each of the ``contract.state_dim`` dimensions of the state is divided by."""
+    return STATE_SCALE + (SINCE_EXPOSURE_SCALE if contract.since_exposure else ())
 
 
 def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:

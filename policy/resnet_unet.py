@@ -44,7 +44,7 @@ class ResnetUnet(nn.Module):
         self.contract = config.contract
         self.config = config
         self.backbone = build_backbone("resnet18")
-        self.state_encoder = StateEncoder(dim, self.contract.state_dim)
+        self.state_encoder = StateEncoder(dim, self.contract)
         self.visual_projection = nn.Sequential(
             nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
         )
@@ -59,7 +59,7 @@ class ResnetUnet(nn.Module):
         self.head.reset(seed)
 
     def encode_observation(self, image: Tensor, state: Tensor, action_history: Tensor) -> Tensor:
-        """Image [B, 3, H, W], state [B, 13], history [B, K, 4] -> condition [B, C].
+        """Image [B, 3, H, W], state [B, state_dim], history [B, K, 4] -> condition [B, C].
 
         Raises:
             PolicyError: a shape is not the contract's.

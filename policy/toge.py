@@ -1,7 +1,7 @@
 """TOGE, the dual-rate vision policy: a slow image path, a fast action path, one condition.
 
     image --backbone, projection--> feature --.
-    state [B, 13] ----------------------------+--attention--> condition --diffusion head--> chunk
+    state [B, 13 or 20] ----------------------+--attention--> condition --diffusion head--> chunk
     action history [B, K, 4] --attention------'
 
 Everything left of the feature runs at the camera's rate, the rest at the action rate.
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from policy.action_head import DiffusionHead, Size, size_dims
 from policy.backbones import BACKBONE_NAMES, BackboneName, build_backbone
-from policy.contract import ACTION_DIM, STATE_DIM, Contract, ContractError, PolicyError
+from policy.contract import ACTION_DIM, Contract, ContractError, PolicyError
 from policy.diffusion import NoiseSchedule
 from policy.encoders import Fusion, HistoryEncoder, StateEncoder, require_shape
 
@@ -66,7 +66,7 @@ class Toge(nn.Module):
         self.visual_projection = nn.Sequential(
             nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
         )
-        self.state_encoder = StateEncoder(dim)
+        self.state_encoder = StateEncoder(dim, self.contract)
         self.history_encoder = HistoryEncoder(dim, self.contract.history_len)
         self.fusion = Fusion(dim)
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
@@ -88,13 +88,13 @@ class Toge(nn.Module):
     def encode_and_fuse(
         self, feature: Tensor, state: Tensor, action_history: Tensor | None
     ) -> Tensor:
-        """Feature [B, F], state [B, 13], history [B, K, 4] or None -> condition [B, C].
+        """Feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
 
         Raises:
             PolicyError: a shape is not the contract's.
         """
         require_shape("feature", feature, self.contract.feature_dim)
-        require_shape("state", state, STATE_DIM)
+        require_shape("state", state, self.contract.state_dim)
         history = None
         if action_history is not None:
             require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)

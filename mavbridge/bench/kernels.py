@@ -18,7 +18,7 @@ from mavbridge.clock import NS_PER_S, Clock
 from mavbridge.records import Percentiles
 from mavbridge.timing import Histogram
 from policy.checkpoint import build_policy
-from policy.contract import ACTION_DIM, STATE_DIM, Executable
+from policy.contract import ACTION_DIM, Executable
 from policy.engines.executable import EngineName
 from policy.toge import Toge, TogeConfig
 
@@ -97,7 +97,7 @@ def _encode_call(executable: Executable) -> Callable[[], object]:
 def _act_call(executable: Executable, elapsed_s: float | None) -> Callable[[], object]:
     contract = executable.contract
     feature = executable.encode(np.zeros((64, 64, 3), np.uint8))
-    state = np.zeros((1, STATE_DIM), np.float32)
+    state = np.zeros((1, contract.state_dim), np.float32)
     state[0, 3] = 1.0  # level
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     executable.act(feature, state, history, None)  # a warm start needs a chunk to start from
@@ -140,7 +140,8 @@ def _sample_work(name: str, net: Toge) -> Work:
     """The condition once, the U-Net once a step; a full solve, which warm starts may undercut."""
     contract = net.contract
     feature = torch.zeros(1, contract.feature_dim)
-    state, history = torch.zeros(1, STATE_DIM), torch.zeros(1, contract.history_len, ACTION_DIM)
+    state = torch.zeros(1, contract.state_dim)
+    history = torch.zeros(1, contract.history_len, ACTION_DIM)
     once: dict[nn.Module, int] = {net.state_encoder: 1, net.history_encoder: 1, net.fusion: 1}
     return count_work(
         name,

@@ -104,6 +104,7 @@ def _loop(clock: MonotonicClock, link: MavlinkLink, sink: FanOut, pace: Pace) ->
         sink=sink,
         settings=ActionSettings(
             state_frame=contract.state_frame,
+            since_exposure=False,
             chunk_dt_s=contract.chunk_dt_s,
             history_len=contract.history_len,
             history_dt_s=contract.history_dt_s,

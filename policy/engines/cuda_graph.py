@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from policy.contract import ACTION_DIM, STATE_DIM, Executable, FloatArray, PolicyError
+from policy.contract import ACTION_DIM, Executable, FloatArray, PolicyError
 from policy.engines.executable import Settings, assemble
 from policy.engines.warm_start import Refine
 from policy.resnet_unet import ResnetUnet
@@ -40,7 +40,7 @@ def make_cuda_graph_executable(policy: Toge | ResnetUnet, settings: Settings) ->
     action_device = torch.device(settings.action_device)
     action = copy.deepcopy(policy).to(action_device).eval()
     image = (1, 3, contract.image_height, contract.image_width)
-    rest = ((1, STATE_DIM), (1, contract.history_len, ACTION_DIM))
+    rest = ((1, contract.state_dim), (1, contract.history_len, ACTION_DIM))
     stream = _stream(action_device, HIGH_PRIORITY)
     if not settings.dual_rate or not isinstance(action, Toge):
         if settings.dual_rate:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from policy.contract import (
     ACTION_DIM,
-    STATE_DIM,
     Contract,
     DualRatePolicy,
     Executable,
@@ -146,7 +145,7 @@ def assemble(
 def _try(executable: Executable) -> None:
     contract = executable.contract
     rgb = np.full((contract.image_height, contract.image_width, 3), 128, np.uint8)
-    state = np.zeros((1, STATE_DIM), np.float32)
+    state = np.zeros((1, contract.state_dim), np.float32)
     state[0, 3] = 1.0  # level attitude
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     try:
@@ -157,7 +156,7 @@ def _try(executable: Executable) -> None:
     except PolicyError as error:
         raise PolicyError(
             f"{error}; this was a dummy sample: image [1, 3, {contract.image_height}, "
-            f"{contract.image_width}], state [1, {STATE_DIM}], action_history "
+            f"{contract.image_width}], state [1, {contract.state_dim}], action_history "
             f"[1, {contract.history_len}, {ACTION_DIM}], as {contract.arrays} arrays"
         ) from error
     for chunk in chunks:

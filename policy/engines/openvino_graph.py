@@ -15,7 +15,7 @@ from openvino import opset15 as ops
 from torch import nn
 
 from policy.action_head import DiffusionHead, size_dims
-from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, Contract
+from policy.contract import ACTION_DIM, QUATERNION, Contract
 from policy.diffusion import DdimStep, NoiseSchedule
 from policy.encoders import Fusion, HistoryEncoder, StateEncoder
 from policy.engines.openvino_layers import Layer, Node, constant, conv, ints, layer, same
@@ -58,7 +58,7 @@ def refine_graph(policy: Toge, num_diffusion_steps: int, head_steps: int) -> ov.
 def _action_inputs(policy: Toge | ResnetUnet) -> tuple[Node, Node, Node]:
     return (
         _parameter("feature", 1, size_dims(policy.config.size).base_dim),
-        _parameter("state", 1, STATE_DIM),
+        _parameter("state", 1, policy.contract.state_dim),
         _parameter("history", 1, policy.contract.history_len, ACTION_DIM),
     )
 
@@ -88,7 +88,7 @@ def _state_token(encoder: StateEncoder, state: Node) -> Node:
     before, quaternion, after = ops.variadic_split(
         state,
         ints(1),
-        ints(QUATERNION.start, QUATERNION.stop - QUATERNION.start, STATE_DIM - QUATERNION.stop),
+        ints(QUATERNION.start, QUATERNION.stop - QUATERNION.start, -1),
     ).outputs()
     w = ops.gather(quaternion, ints(0), ints(1))
     sign = ops.select(ops.less(w, constant(0.0)), constant(-1.0), constant(1.0))

@@ -20,6 +20,7 @@ from mavbridge.records import (
     FloatArray,
     Frame,
     ImageArray,
+    Reading,
     Release,
     Sticks,
 )
@@ -32,6 +33,7 @@ MS = NS_PER_MS
 FRAME_NS = NS_PER_S // 30
 SETTINGS = ActionSettings(
     state_frame="ned_frd",
+    since_exposure=False,
     chunk_dt_s=0.05,
     history_len=4,
     history_dt_s=0.05,
@@ -91,6 +93,7 @@ class Rig:
         self.pacer = GridPacer(self.clock, period_ns=self.period_ns)
         self.histories: list[FloatArray] = []
         self.elapsed_s: list[float | None] = []
+        self.states: list[FloatArray] = []
         self.vision = VisionLoop(
             camera=self.camera,
             encode=self._encode,
@@ -124,6 +127,7 @@ class Rig:
     ) -> FloatArray:
         tick = len(self.histories)
         self.elapsed_s.append(elapsed_s)
+        self.states.append(state)
         self.histories.append(history)
         self.clock.advance_ns(self.act_ns(tick))
         return self.chunk(tick)
@@ -301,6 +305,42 @@ def test_the_policy_is_told_the_time_since_the_state_of_its_last_chunk() -> None
     assert rig.elapsed_s[21] == pytest.approx(0.02)  # a slot was missed
     (again,) = (k for k, elapsed_s in enumerate(rig.elapsed_s[1:], 1) if elapsed_s is None)
     assert rig.elapsed_s[again - 1 : again + 2] == pytest.approx([0.01, None, 0.01])
+
+
+def test_a_policy_that_asks_is_told_the_age_of_its_image_and_the_motion_since() -> None:
+    rig = Rig(settings=replace(SETTINGS, since_exposure=True))
+
+    def poll(link: FakeLink) -> None:
+        """Turns right at 1 rad/s and accelerates downwards at 2 m/s^2."""
+        now_ns = link.clock.now_ns() - link.telemetry_age_ns
+        flown_s = (now_ns - START_NS) / NS_PER_S
+        attitude = (np.cos(flown_s / 2), 0.0, 0.0, np.sin(flown_s / 2))
+        link.telemetry = replace(
+            level_telemetry(now_ns),
+            ned_from_body_wxyz=Reading(now_ns, attitude),
+            velocity_ned_mps=Reading(now_ns, (0.0, 0.0, 2 * flown_s)),
+        )
+
+    rig.link.on_poll = poll
+    rig.fly(1.0)
+    flown = [tick for tick in rig.sink.ticks if tick.trace is not None]
+    assert len(flown) == len(rig.states) > 90
+    for tick, state in zip(flown, rig.states, strict=True):
+        assert tick.state is not None
+        assert tick.feature_captured_ns is not None
+        age_s = (tick.state.attitude_ns - tick.feature_captured_ns) / NS_PER_S
+        assert 0.02 < age_s < 0.07
+        assert state.shape == (1, 20)
+        np.testing.assert_array_equal(state[0, :13], tick.state.values)
+        told = [age_s, 0, 0, age_s, 0, 0, 2 * age_s]
+        known_s = (tick.state.attitude_ns - rig.sink.ticks[0].woke_ns) / NS_PER_S
+        if age_s <= known_s:
+            assert state[0, 13:].tolist() == pytest.approx(told, abs=1e-5)
+
+
+def test_a_policy_that_does_not_ask_sees_thirteen_numbers() -> None:
+    rig = Rig().fly(0.2)
+    assert {state.shape for state in rig.states} == {(1, 13)}
 
 
 def test_a_chunk_that_is_refused_is_not_built_upon() -> None:

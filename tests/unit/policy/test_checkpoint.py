@@ -42,7 +42,9 @@ def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
     config = TogeConfig(
         size="small",
         backbone="resnet18",
-        contract=Contract(image_height=32, image_width=48, state_frame="enu_flu", horizon=8),
+        contract=Contract(
+            image_height=32, image_width=48, state_frame="enu_flu", horizon=8, since_exposure=True
+        ),
         schedule=NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50),
     )
     policy = build_policy(config).eval()

@@ -153,3 +153,7 @@ def test_the_probe_reaches_all_that_a_policy_looks_at(small_toge: Toge) -> None:
     assert probe.rgb.min() < 30 < 220 < probe.rgb.max()
     assert not np.array_equal(probe.rgb[0], probe.rgb[1])
     np.testing.assert_allclose(np.linalg.norm(probe.state[:, 3:7], axis=1), 1, rtol=1e-6)
+    asked = make_probe(replace(small_toge.contract, since_exposure=True))
+    np.testing.assert_array_equal(asked.state[:, :13], probe.state)
+    assert asked.state.shape == (4, 20)
+    assert (asked.state[:, 13:] != 0).all()

@@ -1,13 +1,41 @@
 import json
+from dataclasses import replace
 
 import pytest
 
-from policy.contract import Contract, ContractError
+from policy.contract import (
+    AGE,
+    ROTATION,
+    SINCE_EXPOSURE_NAMES,
+    STATE_NAMES,
+    VELOCITY_CHANGE,
+    Contract,
+    ContractError,
+)
 
 
 def test_round_trips_through_its_header_form() -> None:
-    contract = Contract(state_frame="enu_flu", feature_dim=256, horizon=8, chunk_dt_s=0.02)
+    contract = Contract(
+        state_frame="enu_flu", feature_dim=256, horizon=8, chunk_dt_s=0.02, since_exposure=True
+    )
     assert Contract.from_json(contract.to_json()) == contract
+
+
+def test_a_header_that_does_not_speak_of_the_exposure_is_of_thirteen_numbers() -> None:
+    header = json.loads(Contract().to_json())
+    del header["since_exposure"]
+    contract = Contract.from_json(json.dumps(header))
+    assert contract == Contract()
+    assert contract.state_dim == len(STATE_NAMES) == 13
+    assert replace(contract, since_exposure=True).state_dim == 20
+
+
+def test_the_appended_names_lie_where_their_slices_say() -> None:
+    names = STATE_NAMES + SINCE_EXPOSURE_NAMES
+    assert names[AGE] == ("age_s",)
+    assert all(name.startswith("rotation_") for name in names[ROTATION])
+    assert all(name.startswith("velocity_change_") for name in names[VELOCITY_CHANGE])
+    assert VELOCITY_CHANGE.stop == len(names)
 
 
 @pytest.mark.parametrize(
@@ -25,6 +53,7 @@ def test_round_trips_through_its_header_form() -> None:
         ({"image_mean_rgb": ["a", "b", "c"]}, "three numbers"),
         ({"image_std_rgb": [0.2, 0.2, 0.0]}, "positive"),
         ({"image_std_rgb": [0.2, 0.2, float("nan")]}, "finite"),
+        ({"since_exposure": 1}, "since_exposure must be true or false"),
         ({"colour": "bgr"}, "unknown contract keys"),
     ],
 )

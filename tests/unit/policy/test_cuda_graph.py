@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,11 +29,15 @@ SMALL = Contract(image_height=64, image_width=64)
 ON_GPU = Settings(name="toge", vision_device="cuda", action_device="cuda", head_steps=2)
 
 
-@pytest.mark.parametrize("size", ["small", "medium", "large"])
-def test_toge_computes_what_torch_computes(size: Size) -> None:
+@pytest.mark.parametrize(
+    ("size", "since_exposure"),
+    [("small", False), ("small", True), ("medium", False), ("large", False)],
+)
+def test_toge_computes_what_torch_computes(size: Size, since_exposure: bool) -> None:
     torch.manual_seed(0)
-    config: BuiltinConfig = TogeConfig(size=size, contract=SMALL)
-    policy, probe = build_policy(config).eval(), make_probe(SMALL)
+    contract = replace(SMALL, since_exposure=since_exposure)
+    config: BuiltinConfig = TogeConfig(size=size, contract=contract)
+    policy, probe = build_policy(config).eval(), make_probe(contract)
     expected = probe_chunks(make_torch_executable(policy, Settings(name="t", head_steps=2)), probe)
     chunks = probe_chunks(make_cuda_graph_executable(policy, ON_GPU), probe)
     assert disagreement(expected, chunks) is None

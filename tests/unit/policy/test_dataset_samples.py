@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mavbridge.actions import SentHistory, sample_chunk
-from mavbridge.records import Sticks
+from mavbridge.ego_motion import EgoMotion
+from mavbridge.records import Sticks, VehicleState
 from policy import rotation
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
 from policy.dataset import DatasetError, Episode
@@ -134,6 +135,28 @@ def test_since_exposure_by_hand() -> None:
     np.testing.assert_allclose(told[0], [0.1, 0, 0, np.pi / 2, 0, -1, 0], atol=1e-5)
     half = np.sqrt(0.5) / 2
     np.testing.assert_allclose(told[1], [0.05, 0, 0, np.pi / 4, -half, -half, 0], atol=1e-5)
+
+
+def test_the_runtime_tells_the_same_of_an_image() -> None:
+    episode = flown(ticks=60)
+    line = timeline(episode)
+    runtime = EgoMotion(span_ns=300 * MS)
+    frames = np.arange(3, 20)
+    for tick in range(60):
+        state = VehicleState(
+            values=episode.state[tick],
+            attitude_ns=int(episode.attitude_ns[tick]),
+            rate_ns=0,
+            velocity_ns=int(episode.velocity_ns[tick]),
+            specific_force_ns=0,
+        )
+        runtime.push(state)
+        age_ns = episode.tick_ns[tick] - episode.captured_ns[frames]
+        # Down to an image that is newer than the attitude of the tick.
+        for frame in frames[(age_ns >= 0) & (age_ns < 200 * MS)]:
+            expected = runtime.append_to(state, int(episode.captured_ns[frame]))
+            told = line.states(np.array([frame]), np.array([tick]))
+            np.testing.assert_allclose(told, expected, atol=2e-5)
 
 
 def test_without_since_exposure_the_state_has_13_numbers() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy.contract import Contract, PolicyError, SingleRatePolicy
+from policy.contract import Contract, Executable, PolicyError, SingleRatePolicy
 from policy.engines.direct import make_numpy_executable
 from policy.engines.executable import Settings
 from policy.engines.torch_eager import make_torch_executable
@@ -17,6 +17,7 @@ from policy.toge import Toge
 RGB = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
 STATE = np.eye(1, 13, 3, dtype=np.float32)
 HISTORY = np.zeros((1, 4, 4), np.float32)
+CHUNK = np.zeros((1, 4, 4), np.float32)
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
@@ -64,6 +65,23 @@ def test_numpy_policies_are_called_as_they_are(dual_rate: bool) -> None:
     )
 
 
+@pytest.mark.parametrize("make", [make_numpy_executable, make_torch_executable])
+def test_a_persons_policy_that_asks_gets_the_motion_since_the_exposure(
+    make: Callable[..., Executable],
+) -> None:
+    seen: list[tuple[int, ...]] = []
+    policy = Fake(act=lambda feature, state: seen.append(tuple(state.shape)) or CHUNK)
+    policy.contract = replace(policy.contract, since_exposure=True)
+    if make is make_torch_executable:
+        policy = Fake(
+            encode=lambda _: torch.zeros(1, 2),
+            act=lambda feature, state: seen.append(tuple(state.shape)) or torch.tensor(CHUNK),
+        )
+        policy.contract = replace(policy.contract, since_exposure=True, arrays="torch")
+    make(policy, Settings(name="fake"))
+    assert set(seen) == {(1, 20)}
+
+
 class Fake:
     """A dual-rate numpy policy whose parts can be replaced."""
 
@@ -99,7 +117,7 @@ def raises(error: Exception) -> Callable[..., Any]:
         ({"act": lambda *_: np.zeros((4, 4))}, r"the chunk must be \[1, 4, 4\]"),
         ({"act": lambda *_: np.full((1, 4, 4), np.inf)}, "the chunk holds NaN or infinity"),
         ({"act": raises(RuntimeError("boom"))}, r"RuntimeError: boom \(.*test_engines.py:\d+\)"),
-        ({"act": raises(KeyError("x"))}, r"image \[1, 3, 16, 16\]"),
+        ({"act": raises(KeyError("x"))}, r"image \[1, 3, 16, 16\], state \[1, 13\]"),
     ],
 )
 def test_a_policy_that_breaks_its_contract_never_flies(

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,13 @@ def test_toge_computes_what_torch_computes(size: Size, backbone: BackboneName) -
     np.testing.assert_allclose(chunks, expected, atol=2e-3)
 
 
-@pytest.mark.parametrize("size", ["small", "medium", "large"])
-def test_resnet_unet_computes_what_torch_computes(size: Size) -> None:
-    policy = seeded(ResnetUnetConfig(size=size, contract=SMALL))
+@pytest.mark.parametrize(
+    ("size", "since_exposure"),
+    [("small", False), ("small", True), ("medium", False), ("large", False)],
+)
+def test_resnet_unet_computes_what_torch_computes(size: Size, since_exposure: bool) -> None:
+    contract = replace(SMALL, since_exposure=since_exposure)
+    policy = seeded(ResnetUnetConfig(size=size, contract=contract))
     settings = Settings(name="resnet-unet", num_diffusion_steps=3, dual_rate=False)
     expected, chunks = both(policy, settings)
     np.testing.assert_allclose(chunks, expected, atol=2e-3)
@@ -70,6 +75,7 @@ def test_resnet_unet_computes_what_torch_computes(size: Size) -> None:
     [
         {"schedule": NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50)},
         {"contract": Contract(image_height=32, image_width=48, horizon=8, history_len=2)},
+        {"contract": replace(SMALL, since_exposure=True)},
     ],
 )
 @pytest.mark.parametrize("dual_rate", [True, False])

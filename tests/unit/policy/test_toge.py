@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from policy.checkpoint import BuiltinPolicy
 from policy.contract import Contract, ContractError, DualRatePolicy, PolicyError, SingleRatePolicy
 from policy.diffusion import NoiseSchedule
 from policy.resnet_unet import ResnetUnet, ResnetUnetConfig
@@ -113,6 +114,30 @@ def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
         small_toge.predict_fast(feature, state[0], history)
     with pytest.raises(PolicyError, match=r"action_history must be \[B, 4, 4\]"):
         small_toge.predict_fast(feature, state, history[:, :3])
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("kind", [TogeConfig, ResnetUnetConfig])
+def test_every_number_since_the_exposure_reaches_the_sticks(
+    kind: type[TogeConfig | ResnetUnetConfig],
+) -> None:
+    image, state, history = sample()
+    contract = Contract(image_height=32, image_width=32, since_exposure=True)
+    if kind is TogeConfig:
+        policy: BuiltinPolicy = Toge(TogeConfig(backbone="resnet18", contract=contract)).eval()
+    else:
+        policy = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
+    with pytest.raises(PolicyError, match=r"state must be \[B, 20\], got \[1, 13\]"):
+        policy.predict(image, state, history, 2)
+    wide = torch.cat([state, torch.zeros(1, 7)], dim=1)
+    chunk = policy.predict(image, wide, history, 2)
+    for index in range(13, 20):
+        moved = wide.clone()
+        moved[0, index] = 1.0
+        assert not torch.equal(policy.predict(image, moved, history, 2), chunk), index
+    # Over its scale: a tenth of a second of age counts as much as 2 m/s.
+    normal = policy.state_encoder.normalise(torch.ones(1, 20))[0, 13:]
+    assert normal.tolist() == pytest.approx([10, 2, 2, 2, 0.5, 0.5, 0.5])
 
 
 @pytest.mark.parametrize(
