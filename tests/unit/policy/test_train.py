@@ -22,7 +22,7 @@ from policy.train import train
 from policy.train_model import gate_labels, gate_loss
 from policy.train_plan import Budget, TrainSettings, learning_rate_factor, make_stages
 from policy.train_report import Progress, TrainResult
-from policy.train_state import TrainingError
+from policy.train_state import Position, RunFolder, TrainingError
 
 CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
 
@@ -247,3 +247,15 @@ def test_gate_labels_leave_out_what_no_camera_sees() -> None:
     assert made.grad is not None
     assert made.grad.isfinite().all()
     assert not made.grad[1].any()
+
+
+def test_a_state_that_cannot_be_written_is_one_message(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run", "identity")
+    folder.path.rmdir()
+    with pytest.raises(TrainingError, match="the training cannot be kept"):
+        folder.save(Position(), {})
+    assert not folder.has_state
+    folder.path.mkdir()
+    (folder.path / "state.pt").write_bytes(b"PK torn")
+    with pytest.raises(TrainingError, match="is damaged"):
+        folder.load()
