@@ -132,7 +132,10 @@ def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
     reference = copy.deepcopy(policy).cpu().eval()
     probe = make_probe(policy.contract)
     arrays = (probe.rgb, probe.state, probe.history, _chunks(reference, probe))
-    return {name: torch.from_numpy(array) for name, array in zip(VECTOR_NAMES, arrays, strict=True)}
+    return {
+        name: torch.from_numpy(np.ascontiguousarray(array))  # safetensors takes no other
+        for name, array in zip(VECTOR_NAMES, arrays, strict=True)
+    }
 
 
 @torch.inference_mode()

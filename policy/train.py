@@ -189,8 +189,8 @@ class _Run:
                 if since == LOG_STEPS:
                     self._log(stage, (sums / since).tolist())
                     sums, since = torch.zeros(2, device=self._device), 0
-                due = int(self._fraction() * self._settings.validations)
-                if position.validations < due < self._settings.validations:
+                due = int(self._fraction() * self._settings.validation_count)
+                if position.validations < due < self._settings.validation_count:
                     position.validations = due
                     self._look_back(stage, is_last=False)
 

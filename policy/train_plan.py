@@ -104,14 +104,15 @@ class TrainSettings:
     """A checkpoint of the same architecture."""
     backbone_weights: Path | None = None
     """torchvision's state dict of the encoder, as .pth."""
-    validations: int = 20
-    """In a run, evenly spaced; the state of the run is kept at the same times."""
+    validations: int | None = None
+    """In a run, evenly spaced; the state of the run is kept at the same times. None = one every two
+    minutes or fifty steps, 4 to 20."""
     check_every: int = 5
     """Validations between two calls of the closed-loop check."""
 
     def __post_init__(self) -> None:
         """Refuse what no run could do."""
-        for name in ("batch_size", "repeats", "head_batch_size", "validations", "check_every"):
+        for name in ("batch_size", "repeats", "head_batch_size", "check_every"):
             if getattr(self, name) < 1:
                 raise PolicyError(f"{name} must be 1 or more, got {getattr(self, name)}")
         if self.batch_size < 2:
@@ -124,6 +125,14 @@ class TrainSettings:
             raise PolicyError(f"--out {self.out}: checkpoints are written as .safetensors")
         if self.start_from is not None and self.backbone_weights is not None:
             raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
+
+    @property
+    def validation_count(self) -> int:
+        """Validations in the run."""
+        if self.validations is not None:
+            return self.validations
+        steps, seconds = self.budget.steps or 0, self.budget.seconds or 0.0
+        return max(4, min(20, int(steps / 50 + seconds / 120)))
 
     @property
     def work_folder(self) -> Path:
