@@ -1,5 +1,6 @@
 """The command line: every flag is a field of a config dataclass."""
 
+import os
 import tomllib
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +9,7 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
-from mavbridge.config import BenchConfig, DemonstrateConfig, EvaluateConfig, FlyConfig
+from mavbridge.config import BenchConfig, DemonstrateConfig, EvaluateConfig, FlyConfig, TrainConfig
 from mavbridge.errors import UserError
 
 cli = App(
@@ -66,6 +67,26 @@ def demonstrate(config: DemonstrateConfig) -> int:
             "demonstrate needs the simulator's dynamics: pip install 'mavbridge[sitl]'"
         ) from error
     return run_demonstrations(config)
+
+
+@cli.command
+def train(*flights: Path, config: TrainConfig | None = None) -> int:
+    """Train a policy from flights.
+
+    Args:
+        flights: flight folders, or folders of them.
+        config: the settings.
+    """
+    if not flights:
+        raise UserError("name the flights to learn from: mavbridge train DIR... --out FILE")
+    if config is None or config.out is None:
+        raise UserError("name the checkpoint to write: --out FILE.safetensors")
+    # torch's threads else spin at every barrier: on a core that somebody else uses too, ten times
+    # the time. OpenMP reads it once, as torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    from mavbridge.train import train_policy  # torch: not for --help
+
+    return train_policy(flights, config, config.out)
 
 
 @cli.meta.default

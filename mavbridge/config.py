@@ -234,6 +234,60 @@ class FlyConfig:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """One training run."""
+
+    out: Path | None = None
+    """Checkpoint to write (.safetensors); an unfinished run is kept beside it."""
+    policy: str = "toge"
+    """toge[:small|medium|large][:BACKBONE] or resnet-unet[:SIZE]."""
+    image_size: int = 224
+    """Pixels a side into the encoder."""
+    minutes: float | None = None
+    """How long to train; 45 if neither this nor --steps is given."""
+    steps: int | None = None
+    """How many optimiser steps to train, in place of --minutes."""
+    batch_size: int = 32
+    """Images a step while the encoder learns."""
+    seed: int = 0
+    """Of weights, order and noise."""
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1."""
+    resume: bool = False
+    """Go on with the unfinished run of --out."""
+    validation_fraction: float = 0.1
+    """Share of the flights that are held out."""
+    ages: str | None = None
+    """Image ages to train for: the flight folder that they were measured in, or LOW:HIGH in ms; by
+    default those measured in the flights."""
+    start_from: Path | None = None
+    """Checkpoint to go on from, e.g. after more flights were added."""
+    backbone_weights: Path | None = None
+    """torchvision's ImageNet weights of the encoder (.pth)."""
+    mirror: bool = True
+    """Mirror half of the samples; --no-mirror for a camera that does not look straight ahead."""
+    since_exposure: bool = True
+    """Tell the policy its image's age and how it moved since; --no-since-exposure to leave out."""
+    gate_weight: float = 0.2
+    """Weight of the loss that asks the encoder where the gates are; 0 = off."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that no run could use."""
+        if self.minutes is not None and self.steps is not None:
+            raise UserError("--minutes and --steps contradict each other: give one of them")
+        _check("image-size", self.image_size, 32, 1024, "pixels")
+        _check("batch-size", self.batch_size, 2, 4096, "")
+        _check("seed", self.seed, 0, 2**63 - 1, "")
+        _check("validation-fraction", self.validation_fraction, 0, 0.9, "")
+        _check("gate-weight", self.gate_weight, 0, 100, "")
+        if self.minutes is not None:
+            _check("minutes", self.minutes, 0.01, 100_000, "minutes")
+        if self.steps is not None:
+            _check("steps", self.steps, 1, 10**9, "steps")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class BenchConfig:
     """One benchmark run."""
 

@@ -34,6 +34,7 @@ BuiltinConfig: TypeAlias = TogeConfig | ResnetUnetConfig
 
 CONTRACT_KEY = "contract"
 ARCHITECTURE_KEY = "architecture"
+TRAINING_KEY = "training"
 HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
 VECTOR_PREFIX = "test_vector."
 VECTOR_NAMES = ("rgb", "state", "history", "chunks")
@@ -68,8 +69,13 @@ def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
     return Toge(config) if isinstance(config, TogeConfig) else ResnetUnet(config)
 
 
-def save_checkpoint(path: Path, policy: BuiltinPolicy) -> None:
+def save_checkpoint(path: Path, policy: BuiltinPolicy, *, training: str | None = None) -> None:
     """Write weights, contract, architecture and a test vector; replaces ``path`` at once or not.
+
+    Args:
+        path: a ``.safetensors`` file.
+        policy: whose weights.
+        training: JSON that says how it was trained, for people and reports; no runtime reads it.
 
     Raises:
         CheckpointError: weights that are not finite, or a path that cannot be written.
@@ -84,6 +90,8 @@ def save_checkpoint(path: Path, policy: BuiltinPolicy) -> None:
         CONTRACT_KEY: policy.contract.to_json(),
         ARCHITECTURE_KEY: _architecture_to_json(policy.config),
     }
+    if training is not None:
+        header[TRAINING_KEY] = training
     partial = path.with_name(path.name + ".partial")
     try:
         save_file(state, partial, metadata=header)
@@ -124,7 +132,10 @@ def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
     reference = copy.deepcopy(policy).cpu().eval()
     probe = make_probe(policy.contract)
     arrays = (probe.rgb, probe.state, probe.history, _chunks(reference, probe))
-    return {name: torch.from_numpy(array) for name, array in zip(VECTOR_NAMES, arrays, strict=True)}
+    return {
+        name: torch.from_numpy(np.ascontiguousarray(array))  # safetensors takes no other
+        for name, array in zip(VECTOR_NAMES, arrays, strict=True)
+    }
 
 
 @torch.inference_mode()

@@ -121,6 +121,21 @@ def load_policy(
     return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes))
 
 
+def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
+    """The built-in network that ``spec`` names, with the default contract at that image size.
+
+    Raises:
+        PolicyError: it names none.
+    """
+    kind, *options = spec.split(":")
+    if kind not in ("toge", "resnet-unet"):
+        raise PolicyError(
+            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE] or "
+            "resnet-unet[:SIZE]"
+        )
+    return _config(kind, options, image_size)
+
+
 def _executable(
     policy: SingleRatePolicy, engine: EngineName, settings: Settings
 ) -> tuple[Executable, tuple[str, ...]]:

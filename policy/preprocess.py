@@ -57,21 +57,24 @@ def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:
             "convert it in the camera source"
         )
     height, width = contract.image_height, contract.image_width
-    if rgb.shape[:2] != (height, width):
-        shrinks = rgb.shape[0] > height or rgb.shape[1] > width
-        # Area averaging does not alias when shrinking; it is nearest-neighbour when enlarging.
-        interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        resized = cv2.resize(
-            np.ascontiguousarray(rgb), (width, height), interpolation=interpolation
-        )
-    else:
-        resized = rgb
+    resized = resize(rgb, height, width)
     scale, offset = _scale_offset(contract)
     planes = np.empty((1, 3, height, width), np.float32)
     for channel in range(3):
         np.multiply(resized[..., channel], scale[channel], out=planes[0, channel])
         planes[0, channel] += offset[channel]
     return planes
+
+
+def resize(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """[H, W, 3] -> [height, width, 3]; the same array where there is nothing to do."""
+    if rgb.shape[:2] == (height, width):
+        return rgb
+    shrinks = rgb.shape[0] > height or rgb.shape[1] > width
+    # Area averaging does not alias when shrinking; it is nearest-neighbour when enlarging.
+    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    resized = cv2.resize(np.ascontiguousarray(rgb), (width, height), interpolation=interpolation)
+    return resized.astype(np.uint8, copy=False)
 
 
 @lru_cache(maxsize=8)

@@ -68,7 +68,10 @@ class ResnetUnet(nn.Module):
         require_shape("image", image, 3, contract.image_height, contract.image_width)
         require_shape("state", state, contract.state_dim)
         require_shape("action_history", action_history, contract.history_len, ACTION_DIM)
-        visual = self.visual_projection(self.backbone(image))
+        return self.fuse_visual(self.visual_projection(self.backbone(image)), state, action_history)
+
+    def fuse_visual(self, visual: Tensor, state: Tensor, action_history: Tensor) -> Tensor:
+        """Projected image [B, C], state, history [B, K, 4] -> condition [B, C]."""
         parts = [visual, self.state_encoder(state), action_history.flatten(1)]
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition

@@ -1,0 +1,171 @@
+"""``mavbridge train``: flight folders in, a checkpoint out, and what a person sees meanwhile."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.config import TrainConfig
+from mavbridge.errors import UserError
+from policy.dataset import Episode, Nanoseconds, common_frame
+from policy.loading import builtin_config
+from policy.train import train
+from policy.train_plan import Budget, Check, TrainSettings
+from policy.train_report import Progress as TrainProgress
+from policy.train_report import TrainResult
+
+MINUTES = 45.0
+
+
+def train_policy(
+    flights: Sequence[Path], config: TrainConfig, out: Path, check: Check | None = None
+) -> int:
+    """Train as the config says; 0 when the checkpoint is written.
+
+    Args:
+        flights: flight folders, or folders of them.
+        config: the settings.
+        out: the checkpoint.
+        check: flies a checkpoint in closed loop and says how well, if there is such a check.
+
+    Raises:
+        UserError: pyarrow or PyAV is missing, or a flag cannot be used.
+        PolicyError: flights, weights or a run that cannot be used.
+    """
+    try:
+        from policy.dataset_flights import find_flights, read_flight
+    except ImportError as error:
+        raise UserError(
+            f"reading flights needs pyarrow and PyAV ({error}): install mavbridge[record]"
+        ) from error
+    _require_device(config.device)
+    episodes = [read_flight(folder) for folder in find_flights(flights)]
+    settings = _settings(config, out, episodes)
+    clock = MonotonicClock()
+    with _Display() as display:
+        result = train(
+            episodes,
+            settings,
+            now_s=lambda: clock.now_ns() / NS_PER_S,
+            report=display.show,
+            check=check,
+        )
+    _print_result(result)
+    return 0
+
+
+def _settings(config: TrainConfig, out: Path, episodes: list[Episode]) -> TrainSettings:
+    network = builtin_config(config.policy, image_size=config.image_size)
+    contract = replace(
+        network.contract,
+        state_frame=common_frame(episodes),
+        since_exposure=config.since_exposure,
+    )
+    minutes = MINUTES if config.minutes is None else config.minutes
+    budget = Budget(steps=config.steps) if config.steps else Budget(seconds=60.0 * minutes)
+    return TrainSettings(
+        policy=replace(network, contract=contract),
+        out=out,
+        budget=budget,
+        batch_size=config.batch_size,
+        gate_weight=config.gate_weight,
+        mirror=config.mirror,
+        seed=config.seed,
+        device=config.device,
+        resume=config.resume,
+        validation_fraction=config.validation_fraction,
+        ages_ns=None if config.ages is None else _ages(config.ages),
+        start_from=config.start_from,
+        backbone_weights=config.backbone_weights,
+    )
+
+
+def _ages(spec: str) -> Nanoseconds:
+    """``--ages``: a flight folder, or a range in ms whose ages are all as likely."""
+    from policy.dataset_flights import read_ages
+
+    low, colon, high = spec.partition(":")
+    if Path(spec).is_dir() or not colon:
+        return read_ages(Path(spec))
+    try:
+        low_ms, high_ms = float(low), float(high)
+    except ValueError:
+        low_ms, high_ms = np.nan, np.nan
+    if not 0 < low_ms <= high_ms <= 1000:
+        raise UserError(
+            f"--ages {spec} is neither a flight folder nor LOW:HIGH with 0 < LOW <= HIGH <= 1000 ms"
+        )
+    return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
+
+
+def _require_device(device: str) -> None:
+    available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+    if (device if device != "cuda" else "cuda:0") not in available:
+        raise UserError(f"--device {device} is not available; this machine has {available}")
+
+
+class _Display:
+    """A bar where there is a terminal, a line now and then where there is none."""
+
+    def __init__(self) -> None:
+        self._console = Console(file=sys.stderr, highlight=False)
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[losses]}"),
+            console=self._console,
+        )
+        self._task = self._bar.add_task("starting", total=1.0, losses="")
+
+    def __enter__(self) -> "_Display":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def show(self, progress: TrainProgress) -> None:
+        """Everything that the run reports."""
+        if progress.note is not None:
+            self._bar.print(f"note: {progress.note}")
+            return
+        self._bar.update(self._task, description=progress.stage, completed=progress.fraction)
+        if progress.loss is not None:
+            losses = (
+                f"step {progress.step}  loss {progress.loss:.3f}  gates {progress.gate_loss:.3f}"
+            )
+            self._bar.update(self._task, losses=losses)
+        if (held_out := progress.validation) is not None:
+            self._bar.print(
+                f"{progress.fraction:4.0%} {progress.stage}, step {progress.step}: held-out loss "
+                f"{held_out.loss:.3f}, stick error {held_out.stick_error:.3f} (mean stick "
+                f"{held_out.mean_stick_error:.3f}, last stick held {held_out.hold_error:.3f})"
+            )
+
+
+def _print_result(result: TrainResult) -> None:
+    console = Console(highlight=False)
+    console.print(f"{result.checkpoint}: {result.steps} steps", soft_wrap=True)
+    if (held_out := result.validation) is not None:
+        console.print(
+            f"stick error on held-out flights {held_out.stick_error:.3f} of full deflection; "
+            f"{held_out.mean_stick_error:.3f} by the mean stick, {held_out.hold_error:.3f} by "
+            "holding the last one",
+            soft_wrap=True,
+        )
+    if result.score is not None:
+        console.print(f"closed-loop score {result.score:.3f}")

@@ -1,0 +1,80 @@
+"""From the end of the encoder's training to kept features for the head's."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from policy.contract import Contract, FloatArray
+from policy.dataset_frames import disk_error
+from policy.dataset_samples import Indices
+from policy.train_batches import Batches, PooledStore, normalise_image
+from policy.train_model import Trainee, computing_in, refresh_batch_norm
+
+NORM_BATCHES = 16
+ENCODE_BATCH = 64
+
+
+class Encoder:
+    """The backbone of a trainee on stored images, as they are in flight."""
+
+    def __init__(
+        self, trainee: Trainee, batches: Batches, *, device: torch.device, bf16: bool
+    ) -> None:
+        self._trainee, self._batches = trainee, batches
+        self._device, self._bf16 = device, bf16
+        self._contract: Contract = trainee.policy.contract
+
+    def refresh_norms(self) -> None:
+        """Batch norms of the images at their full size."""
+        frames = self._batches.frames
+        count = min(NORM_BATCHES * ENCODE_BATCH, len(frames))
+        chosen = frames[np.linspace(0, len(frames) - 1, count).astype(int)]
+
+        def images() -> Iterator[Tensor]:
+            for part in np.array_split(chosen, max(1, count // ENCODE_BATCH)):
+                yield self._images(part, mirrored=False)
+
+        with computing_in(self._device, self._bf16):
+            refresh_batch_norm(self._trainee, images())
+
+    def encode_all(
+        self, path: Path, *, mirror: bool, seed: int, go_on: Callable[[float], bool]
+    ) -> PooledStore:
+        """Encode the images to ``path``, in a random order, while ``go_on`` of the part done.
+
+        Raises:
+            DatasetError: no room on the disk.
+        """
+        frames = np.random.default_rng([seed, 3]).permutation(self._batches.frames)
+        row_of = np.full((2, int(frames.max()) + 1), -1, np.int64)
+        rows = 0
+        try:
+            with path.open("wb") as file:
+                for start in range(0, len(frames), ENCODE_BATCH):
+                    if start and not go_on(start / len(frames)):
+                        break
+                    part = frames[start : start + ENCODE_BATCH]
+                    for mirrored in (False, True)[: 2 if mirror else 1]:
+                        file.write(self._encode(part, mirrored=mirrored).tobytes())
+                        row_of[int(mirrored), part] = rows + np.arange(len(part))
+                        rows += len(part)
+        except OSError as error:
+            raise disk_error(path, error) from error
+        return PooledStore(path, self._trainee.policy.backbone.out_dim, row_of)
+
+    @torch.inference_mode()
+    def _encode(self, frames: Indices, *, mirrored: bool) -> FloatArray:
+        """[B, D], float16 to save half the disk."""
+        with computing_in(self._device, self._bf16):
+            pooled = self._trainee.policy.backbone(self._images(frames, mirrored=mirrored))
+        out: FloatArray = pooled.to(torch.float16).cpu().numpy()
+        return out
+
+    def _images(self, frames: Indices, *, mirrored: bool) -> Tensor:
+        contract = self._contract
+        size = (contract.image_height, contract.image_width)
+        images = self._batches.images(frames, size, mirrored=mirrored).to(self._device)
+        return normalise_image(images.permute(0, 3, 1, 2).float() / 255, contract)

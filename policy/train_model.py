@@ -1,0 +1,218 @@
+"""What is optimised: a policy, a head for the gates that is not shipped, and their losses."""
+
+import copy
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from policy.action_head import size_dims
+from policy.checkpoint import BuiltinPolicy
+from policy.contract import FloatArray
+from policy.diffusion import NoiseSchedule
+from policy.toge import Toge
+from policy.train_batches import Batch, normalised
+from policy.train_report import Validation
+
+GATE_LABELS = 10
+"""Direction [3] and log distance of the next gate, cos and sin of its passage, direction [3] and
+log distance of the gate after it."""
+MIN_STICK_STD = 0.1
+"""A stick that hardly moves in the flights does not count more than this makes it."""
+VALIDATION_STEPS = 10
+"""Denoising steps of the sticks that are compared with the flown ones."""
+GRADIENT_LIMIT = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Losses:
+    """Of one batch."""
+
+    sticks: Tensor
+    """Squared error over the variance of the flown sticks: 1 is the mean stick."""
+    gate: Tensor
+    """Smooth L1 of the gate labels; 0 where no image has one."""
+
+
+class Trainee(nn.Module):
+    """A policy with its gate head."""
+
+    def __init__(self, policy: BuiltinPolicy) -> None:
+        super().__init__()
+        self.policy = policy
+        self.gate_head = nn.Linear(size_dims(policy.config.size).base_dim, GATE_LABELS)
+
+    @property
+    def schedule(self) -> NoiseSchedule:
+        """The policy's noise schedule."""
+        return self.policy.config.schedule
+
+    def pool(self, batch: Batch) -> Tensor:
+        """Outputs of the backbone [B, D]: kept ones, or of the images."""
+        if batch.pooled is not None:
+            return batch.pooled
+        image = normalised(batch, self.policy.contract)
+        size = (image.shape[2], image.shape[3])
+        bf16 = torch.is_autocast_enabled(image.device.type) and (
+            not torch.is_grad_enabled() or encoder_learns_in_bf16(image.device, size)
+        )
+        with computing_in(image.device, bf16):
+            pooled: Tensor = self.policy.backbone(image)
+        return pooled
+
+    def condition(self, visual: Tensor, batch: Batch) -> Tensor:
+        """Projected images [B, C], each for its samples -> conditions [S, C]."""
+        visual = visual.repeat_interleave(len(batch.state) // len(visual), dim=0)
+        if isinstance(self.policy, Toge):
+            return self.policy.encode_and_fuse(visual, batch.state, batch.history)
+        return self.policy.fuse_visual(visual, batch.state, batch.history)
+
+    def forward(self, batch: Batch, stick_scale: Tensor) -> Losses:
+        """Losses of a batch; ``stick_scale`` [4] is the spread of each flown stick."""
+        visual = self.policy.visual_projection(self.pool(batch))
+        noisy = self.schedule.add_noise(batch.chunk, batch.noise, batch.timestep)
+        made = self.policy.denoise(noisy, batch.timestep, self.condition(visual, batch)).float()
+        if self.schedule.prediction == "sample":
+            error = (made - batch.chunk) / stick_scale
+        else:
+            error = made - batch.noise
+        squared = error.square().mean(dim=-1)[batch.known].mean()
+        return Losses(sticks=squared, gate=gate_loss(self.gate_head(visual).float(), batch.gate))
+
+
+def gate_labels(gate: Tensor) -> Tensor:
+    """[B, 7] in body axes -> [B, 10] of size about 1; NaN where unknown or behind the camera."""
+
+    def place(position: Tensor) -> Tensor:
+        position = torch.where(position[:, :1] > 0, position, torch.nan)
+        distance = position.norm(dim=1, keepdim=True).clamp_min(0.1)
+        return torch.cat([position / distance, (distance / 10.0).log()], dim=1)
+
+    yaw = torch.where(gate[:, :1] > 0, gate[:, 3:4], torch.nan)
+    return torch.cat([place(gate[:, :3]), yaw.cos(), yaw.sin(), place(gate[:, 4:])], dim=1)
+
+
+def gate_loss(made: Tensor, gate: Tensor) -> Tensor:
+    """Smooth L1 [] of predicted labels [B, 10], over those that are known."""
+    labels = gate_labels(gate)
+    known = ~labels.isnan()
+    error = F.smooth_l1_loss(made, labels.nan_to_num(0.0), reduction="none")
+    return (error * known).sum() / known.sum().clamp_min(1)
+
+
+class Ema:
+    """An exponential moving average of a trainee, itself a trainee in eval mode."""
+
+    def __init__(self, trainee: Trainee, decay: float) -> None:
+        self.average = copy.deepcopy(trainee).eval().requires_grad_(False)
+        self._decay = decay
+
+    @torch.no_grad()
+    def update(self, trainee: Trainee, updates: int) -> None:
+        """Move towards ``trainee``, faster in the first of ``updates``; counters are copied."""
+        weight = 1.0 - min(self._decay, (1 + updates) / (10 + updates))
+        mine, its = dict(self.average.state_dict()), trainee.state_dict()
+        names = [name for name, value in mine.items() if value.is_floating_point()]
+        torch._foreach_lerp_(  # one call for some thousand tensors
+            [mine[name] for name in names], [its[name] for name in names], weight
+        )
+        for name in mine.keys() - set(names):
+            mine[name].copy_(its[name])
+
+
+@torch.no_grad()
+def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
+    """Take the statistics of the batch norms anew from images [B, 3, height, width].
+
+    Those that were averaged while weights and image size changed fit neither.
+    """
+    norms = [m for m in trainee.policy.backbone.modules() if isinstance(m, nn.BatchNorm2d)]
+    if not norms:
+        return
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None  # a plain average over all batches
+        norm.train()
+    for image in batches:
+        trainee.policy.backbone(image)
+    for norm, momentum in zip(norms, momenta, strict=True):
+        norm.momentum = momentum
+        norm.eval()
+
+
+@torch.no_grad()
+def validate(trainee: Trainee, batches: Iterator[Batch], spread: "StickSpread") -> Validation:
+    """Losses and stick errors over all ``batches``, weighted by their size."""
+    totals, weight = torch.zeros(5, dtype=torch.float64), 0
+    for batch in batches:
+        losses = trainee(batch, spread.scale)
+        visual = trainee.policy.visual_projection(trainee.pool(batch))
+        steps = min(VALIDATION_STEPS, trainee.schedule.num_train_timesteps)
+        chunk = trainee.policy.head.sample(trainee.condition(visual, batch), steps).float()
+        held = batch.history[:, -1:].expand_as(batch.chunk)
+        guesses = (chunk, spread.mean.expand_as(batch.chunk), held)
+        errors = [(guess - batch.chunk).abs()[batch.known].mean() for guess in guesses]
+        values = torch.stack([losses.sticks, losses.gate, *errors]).double().cpu()
+        totals += len(batch.state) * values
+        weight += len(batch.state)
+    loss, gate, sticks, mean, hold = (totals / weight).tolist()
+    return Validation(
+        loss=loss, gate_loss=gate, stick_error=sticks, mean_stick_error=mean, hold_error=hold
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StickSpread:
+    """Mean and spread [4] of the sticks to imitate."""
+
+    mean: Tensor
+    scale: Tensor
+    """Standard deviation, but not below ``MIN_STICK_STD``."""
+
+    @classmethod
+    def of(cls, sticks: FloatArray, device: torch.device) -> "StickSpread":
+        """From all sticks [M, 4]."""
+        values = torch.from_numpy(sticks)
+        scale = values.std(dim=0, correction=0).clamp_min(MIN_STICK_STD)
+        return cls(mean=values.mean(dim=0).to(device), scale=scale.to(device))
+
+
+def make_optimiser(trainee: Trainee, learning_rate: float, decay: float) -> torch.optim.AdamW:
+    """AdamW over what may move; biases, norms and embeddings of one row are not decayed."""
+    moving = [p for p in trainee.parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for p in moving if p.ndim >= 2], "weight_decay": decay},
+        {"params": [p for p in moving if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.98), fused=True)
+
+
+@contextmanager
+def computing_in(device: torch.device, bf16: bool) -> Iterator[None]:
+    """Autocast to bfloat16, or nothing."""
+    with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+        yield
+
+
+def encoder_learns_in_bf16(device: torch.device, image_size: tuple[int, int]) -> bool:
+    """Whether bfloat16 makes the encoder's backward pass faster, where it is used at all.
+
+    On a CPU without matrix units it does so from about 160x160 pixels on; below, its depthwise
+    convolutions are slower. All other parts gain at every size.
+    """
+    if device.type != "cpu" or torch.cpu._is_amx_tile_supported():
+        return True
+    return image_size[0] * image_size[1] >= 160 * 160
+
+
+def uses_bf16(precision: str, device: torch.device) -> bool:
+    """Whether to compute in bfloat16; ``auto`` does where the hardware multiplies it."""
+    if precision != "auto":
+        return precision == "bf16"
+    if device.type == "cuda":
+        return bool(torch.cuda.is_bf16_supported())
+    return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())

@@ -1,0 +1,180 @@
+"""What to train, how long, and in which stages.
+
+First encoder and head learn together, on images that grow from stage to stage: the encoders are
+fully convolutional, and a small image costs a fraction. Then the encoder stands still, each image
+is encoded once, and the head alone learns from the kept features: some ten times the steps.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from policy.contract import PolicyError
+from policy.dataset import Nanoseconds
+from policy.resnet_unet import ResnetUnetConfig
+from policy.toge import TogeConfig
+
+Precision = Literal["auto", "bf16", "f32"]
+Check: TypeAlias = Callable[[Path], float]
+"""Flies a checkpoint and says how well: more is better."""
+
+_SMALLER = ((3 / 7, 0.35, 0.20), (5 / 7, 0.30, 0.15), (1.0, 0.10, 0.10))
+"""Image size over the full one, share of the time, share of the steps; the head has the rest."""
+MIN_IMAGE_SIZE = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A part of a run, between two fractions of its budget."""
+
+    name: str
+    image_size: tuple[int, int]
+    """Height and width, px."""
+    trains_encoder: bool
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """Optimiser steps or seconds, one of them.
+
+    Raises:
+        PolicyError: neither, both, or less than one.
+    """
+
+    steps: int | None = None
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a run without an end."""
+        if (self.steps is None) == (self.seconds is None):
+            raise PolicyError("give either --minutes or --steps")
+        if self.steps is not None and self.steps < 1:
+            raise PolicyError(f"--steps must be 1 or more, got {self.steps}")
+        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0):
+            raise PolicyError(f"--minutes must be more than 0, got {self.seconds / 60:g}")
+
+    def fraction(self, step: int, spent_s: float) -> float:
+        """How much of it is used, 0 to 1."""
+        if self.steps is not None:
+            return min(step / self.steps, 1.0)
+        return min(spent_s / (self.seconds or 1.0), 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings:
+    """One training run.
+
+    Raises:
+        PolicyError: a value is out of its range.
+    """
+
+    policy: TogeConfig | ResnetUnetConfig
+    """Its contract's ``state_frame`` must be the flights'."""
+    out: Path
+    """The checkpoint; what a resumed run needs is kept beside it until the end."""
+    budget: Budget
+    batch_size: int = 32
+    """Images a step while the encoder learns; each serves ``repeats`` samples."""
+    repeats: int = 4
+    """Moments after its exposure for which one encoded image is used."""
+    head_batch_size: int = 256
+    """Samples a step while the head learns alone."""
+    learning_rate: float = 1e-3
+    """Peak of AdamW's; a third of it where the weights come from ``start_from``."""
+    weight_decay: float = 0.02
+    ema_decay: float = 0.999
+    gate_weight: float = 0.2
+    """Of the auxiliary loss that asks the feature for the gates; 0 = off."""
+    mirror: bool = True
+    """Half of the samples are mirrored: off for a camera that does not look straight ahead."""
+    seed: int = 0
+    device: str = "cpu"
+    precision: Precision = "auto"
+    resume: bool = False
+    validation_fraction: float = 0.1
+    """Flights held out."""
+    ages_ns: Nanoseconds | None = None
+    """Measured ages of images to train for; None = those measured in the flights."""
+    start_from: Path | None = None
+    """A checkpoint of the same architecture."""
+    backbone_weights: Path | None = None
+    """torchvision's state dict of the encoder, as .pth."""
+    validations: int | None = None
+    """In a run, evenly spaced; the state of the run is kept at the same times. None = one every two
+    minutes or fifty steps, 4 to 20."""
+    check_every: int = 5
+    """Validations between two calls of the closed-loop check."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could do."""
+        for name in ("batch_size", "repeats", "head_batch_size", "check_every"):
+            if getattr(self, name) < 1:
+                raise PolicyError(f"{name} must be 1 or more, got {getattr(self, name)}")
+        if self.batch_size < 2:
+            raise PolicyError("--batch-size must be 2 or more: batch norm needs two images")
+        if not 0 <= self.validation_fraction < 1:
+            raise PolicyError(
+                f"--validation-fraction must be in [0, 1), got {self.validation_fraction:g}"
+            )
+        if self.out.suffix != ".safetensors":
+            raise PolicyError(f"--out {self.out}: checkpoints are written as .safetensors")
+        if self.start_from is not None and self.backbone_weights is not None:
+            raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
+
+    @property
+    def validation_count(self) -> int:
+        """Validations in the run."""
+        if self.validations is not None:
+            return self.validations
+        steps, seconds = self.budget.steps or 0, self.budget.seconds or 0.0
+        return max(4, min(20, int(steps / 50 + seconds / 120)))
+
+    @property
+    def work_folder(self) -> Path:
+        """Where an unfinished run lives."""
+        return self.out.with_name(self.out.stem + ".training")
+
+
+def make_stages(settings: TrainSettings) -> tuple[Stage, ...]:
+    """The stages of a run, in order; they fill the budget."""
+    contract = settings.policy.contract
+    full = (contract.image_height, contract.image_width)
+    shares: dict[tuple[int, int], float] = {}
+    for scale, of_time, of_steps in _SMALLER:
+        size = (_scaled(full[0], scale), _scaled(full[1], scale))
+        share = of_time if settings.budget.steps is None else of_steps
+        shares[size] = shares.get(size, 0.0) + share
+    ends = list(accumulate(shares.values()))
+    joint = [
+        Stage(
+            name=f"encoder and head, {width}x{height}",
+            image_size=(height, width),
+            trains_encoder=True,
+            start=start,
+            end=end,
+        )
+        for (height, width), start, end in zip(shares, (0.0, *ends), ends, strict=False)
+    ]
+    head = Stage(name="head", image_size=full, trains_encoder=False, start=ends[-1], end=1.0)
+    return (*joint, head)
+
+
+def learning_rate_factor(progress: float) -> float:
+    """Linear warm-up over the first twentieth, then half a cosine down to a hundredth."""
+    warm_up = 0.05
+    if progress < warm_up:
+        return max(progress / warm_up, 0.01)
+    along = min((progress - warm_up) / (1 - warm_up), 1.0)
+    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * along))
+
+
+def _scaled(full: int, scale: float) -> int:
+    """A multiple of 32, the stride of all encoders, where it is not the full size."""
+    if scale == 1.0:
+        return full
+    return min(full, max(MIN_IMAGE_SIZE, round(full * scale / 32) * 32))

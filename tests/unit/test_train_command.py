@@ -1,0 +1,117 @@
+"""``mavbridge train``, from the command line to the checkpoint that flies."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from flight_folders import write_meta, write_spot_flight
+from mavbridge.__main__ import main
+from mavbridge.config import TrainConfig
+from mavbridge.errors import UserError
+from mavbridge.train import _ages, _settings
+from policy.dataset_flights import read_ages, read_flight
+from policy.loading import load_policy
+from policy.toge import TogeConfig
+
+
+def status_of(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", *arguments])
+    assert isinstance(stopped.value.code, int)
+    return stopped.value.code
+
+
+def test_a_checkpoint_is_trained_and_loads_to_fly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in range(2):
+        write_spot_flight(tmp_path / "flights" / str(seed), seed, seconds=0.5)
+    out = tmp_path / "trained.safetensors"
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        asked = ("--policy", "toge:small:resnet18", "--image-size", "32", "--steps", "3")
+        status = status_of(
+            str(tmp_path / "flights"), "--out", str(out), *asked, "--batch-size", "4"
+        )
+    finally:
+        torch.set_num_threads(threads)
+    printed = capsys.readouterr()
+    assert status == 0, printed.err
+    assert "stick error on held-out flights" in printed.out
+    loaded = load_policy(
+        "toge",
+        checkpoint=out,
+        allow_untrained=False,
+        engine="torch",
+        device="cpu",
+        dual_rate=True,
+        num_diffusion_steps=2,
+        image_size=None,
+        seed=0,
+        now_s=lambda: 0.0,
+    )
+    executable = loaded.executable
+    assert executable.contract.since_exposure
+    feature = executable.encode(np.zeros((48, 64, 3), np.uint8))
+    state, history = np.zeros((1, 20), np.float32), np.zeros((1, 4, 4), np.float32)
+    state[0, 3] = 1.0
+    assert executable.act(feature, state, history, None).shape == (1, 16, 4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "name the flights"),
+        (["flights"], "name the checkpoint"),
+        (["flights", "--out", "a.pt"], ".safetensors"),
+        (["flights", "--out", "a.safetensors", "--policy", "scripted"], "cannot be trained"),
+        (["flights", "--out", "a.safetensors", "--policy", "toge:huge"], "neither a size"),
+        (["missing", "--out", "a.safetensors"], "no such folder"),
+        (["foreign", "--out", "a.safetensors"], "not a flight of mavbridge"),
+        (["flights", "--out", "a.safetensors", "--device", "cuda:9"], "not available"),
+        (["flights", "--out", "a.safetensors", "--ages", "90:40"], "LOW:HIGH"),
+        (["flights", "--out", "a.safetensors", "--steps", "1", "--minutes", "1"], "contradict"),
+        (["flights", "--out", "a.safetensors", "--resume"], "no run to resume"),
+        (["flights", "--out", "no/a.safetensors"], "no folder no"),
+        (["flights", "--out", "a.safetensors", "--start-from", "b.safetensors"], "no such file"),
+        (["flights", "--out", "a.safetensors", "--backbone-weights", "b.pth"], "not a readable"),
+    ],
+)
+def test_bad_input_is_one_message(
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_spot_flight(tmp_path / "flights", 0, seconds=0.3)
+    write_meta(tmp_path / "foreign", format="something else")
+    assert status_of(*arguments) == 1
+    printed = capsys.readouterr().err
+    assert says in printed
+    assert "Traceback" not in printed
+
+
+def test_ages_are_a_range_or_those_of_a_flight(tmp_path: Path) -> None:
+    spread = _ages("40:90")
+    assert (spread[0], spread[-1]) == (40_000_000, 90_000_000)
+    folder = write_spot_flight(tmp_path / "a", 0, seconds=0.5)
+    np.testing.assert_array_equal(_ages(str(folder)), read_ages(folder))
+    with pytest.raises(UserError, match="LOW:HIGH"):
+        _ages("few:many")
+
+
+def test_the_policy_takes_the_frame_of_the_flights(tmp_path: Path) -> None:
+    folder = write_spot_flight(tmp_path / "a", 0, seconds=0.3)
+    write_meta(folder, contract={"state_frame": "enu_flu"})
+    made = _settings(
+        TrainConfig(since_exposure=False), tmp_path / "a.safetensors", [read_flight(folder)]
+    )
+    assert isinstance(made.policy, TogeConfig)
+    assert made.policy.contract.state_frame == "enu_flu"
+    assert not made.policy.contract.since_exposure
+    assert made.budget.seconds == 45 * 60
