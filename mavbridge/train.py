@@ -40,13 +40,14 @@ def train_policy(
         PolicyError: flights, weights or a run that cannot be used.
     """
     try:
-        from policy.dataset_flights import find_flights, read_flight
+        from policy.dataset_flights import find_flights, is_exemplary, read_flight
     except ImportError as error:
         raise UserError(
             f"reading flights needs pyarrow and PyAV ({error}): install mavbridge[record]"
         ) from error
     _require_device(config.device)
-    episodes = [read_flight(folder) for folder in find_flights(flights)]
+    folders = [folder for folder in find_flights(flights) if is_exemplary(folder)]
+    episodes = [read_flight(folder) for folder in folders]
     settings = _settings(config, out, episodes)
     clock = MonotonicClock()
     with _Display() as display:

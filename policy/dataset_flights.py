@@ -49,6 +49,16 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys(flight.resolve() for flight in found))
 
 
+def is_exemplary(folder: Path) -> bool:
+    """Not a demonstration that failed: what led into a gate's frame is nothing to imitate.
+
+    Raises:
+        DatasetError: not a flight of ours.
+    """
+    meta = _read_meta(folder)
+    return meta.get("source") != "demonstration" or meta.get("success") is not False
+
+
 def read_flight(folder: Path) -> Episode:
     """One flight folder, finished or left behind by a crash.
 
@@ -146,8 +156,7 @@ def decode_video(path: Path) -> Iterator[ImageArray]:
             yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
 
 
-def _state_frame(folder: Path) -> StateFrame:
-    """Check meta.json; what of it matters here."""
+def _read_meta(folder: Path) -> dict[str, object]:
     path = folder / "meta.json"
     try:
         data: object = json.loads(path.read_text())
@@ -161,7 +170,11 @@ def _state_frame(folder: Path) -> StateFrame:
         raise DatasetError(
             f"{folder}: flight format version {data.get('version')}, this build reads {VERSION}"
         )
-    contract = data.get("contract")
+    return data
+
+
+def _state_frame(folder: Path) -> StateFrame:
+    contract = _read_meta(folder).get("contract")
     frame = contract.get("state_frame") if isinstance(contract, dict) else None
     for known in get_args(StateFrame):
         if frame == known:

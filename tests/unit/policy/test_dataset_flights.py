@@ -16,7 +16,7 @@ from flight_folders import (
     write_spot_flight,
 )
 from policy.dataset import DatasetError, common_frame, hold_out, measured_ages
-from policy.dataset_flights import find_flights, read_ages, read_flight
+from policy.dataset_flights import find_flights, is_exemplary, read_ages, read_flight
 
 WOKE = [0, 10 * MS, 20 * MS]
 STICK = (0.1, 0.2, 0.3, 0.4)
@@ -182,3 +182,19 @@ def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
     assert len(hold_out([episode] * 2, 0.01, seed=0)[1]) == 1
     assert hold_out([episode], 0.5, seed=0) == ([0], [])
     assert hold_out([episode] * 3, 0.0, seed=0)[1] == []
+
+
+@pytest.mark.parametrize(
+    ("meta", "exemplary"),
+    [
+        ({"source": "demonstration", "success": False}, False),
+        ({"source": "demonstration", "success": True}, True),
+        ({"source": "dagger", "success": False}, True),
+        ({"source": "flight", "success": None}, True),
+    ],
+)
+def test_a_failed_demonstration_is_nothing_to_imitate(
+    tmp_path: Path, meta: dict[str, object], exemplary: bool
+) -> None:
+    write_meta(tmp_path / "flight", **meta)
+    assert is_exemplary(tmp_path / "flight") is exemplary
