@@ -12,7 +12,7 @@ import numpy as np
 import openvino as ov
 import torch
 from openvino import opset15 as ops
-from torch import nn
+from torch import Tensor, nn
 
 from policy.action_head import DiffusionHead, size_dims
 from policy.contract import ACTION_DIM, QUATERNION, Contract
@@ -123,13 +123,20 @@ def _solve(head: DiffusionHead, condition: Node, start: Node, steps: Sequence[Dd
     unet = head.unet
     timesteps = torch.tensor([step.timestep for step in steps])
     with torch.inference_mode():
-        film_of_steps = unet.film_of_timestep(timesteps.to(head.initial_noise.device))
+        film_of_steps = unet.film_of_timestep(timesteps.to(head.initial_noise.device)).cpu()
+        film_of_steps = film_of_steps + _one_at_every_scale(unet)
     film = ops.add(layer(unet.film_condition)(condition), constant(film_of_steps))
     denoise = _UNetGraph(unet)
-    sample = start
+    sample = ops.unsqueeze(ops.transpose(start, ints(0, 2, 1)), ints(2))
     for step, film_of_step in zip(steps, _split(film, 0, [1] * len(steps)), strict=True):
         sample = _update(head.schedule, step, sample, denoise(sample, film_of_step))
-    return sample
+    return ops.transpose(ops.squeeze(sample, ints(2)), ints(0, 2, 1))
+
+
+def _one_at_every_scale(unet: UNet1d) -> Tensor:
+    """FiLM's scales are about 1: what to add to all of them beforehand; [film_dim]."""
+    halves = [(torch.ones(size // 2), torch.zeros(size // 2)) for size in unet.film_sizes]
+    return torch.cat([half for pair in halves for half in pair])
 
 
 def _update(schedule: NoiseSchedule, step: DdimStep, noisy: Node, output: Node) -> Node:
@@ -151,7 +158,7 @@ def _update(schedule: NoiseSchedule, step: DdimStep, noisy: Node, output: Node) 
 
 
 class _UNetGraph:
-    """``UNet1d`` on images of one row, [1, C, 1, L]; its constants serve all steps."""
+    """``UNet1d`` on images of one row, [1, C, 1, L]; its weights serve all steps."""
 
     def __init__(self, unet: UNet1d) -> None:
         self._film_sizes = unet.film_sizes
@@ -163,9 +170,12 @@ class _UNetGraph:
         self._out = _linear_of_row(unet.out)
 
     def __call__(self, noisy: Node, film: Node) -> Node:
-        """Noisy actions [1, horizon, 4] and FiLM [1, film_dim] -> prediction [1, horizon, 4]."""
+        """Noisy actions and FiLM [1, film_dim], 1 added to its scales -> prediction.
+
+        Actions are rows [1, 4, 1, horizon], here and through the whole solve.
+        """
         films = iter(_split(ops.unsqueeze(film, ints(2, 3)), 1, self._film_sizes))
-        x = ops.unsqueeze(ops.transpose(noisy, ints(0, 2, 1)), ints(2))
+        x = noisy
         skips = []
         for block, downsample in zip(self._down, self._downsample, strict=True):
             x = block(x, next(films))
@@ -176,7 +186,7 @@ class _UNetGraph:
         for block, upsample in zip(self._up, self._upsample, strict=True):
             x = upsample(_doubled(x))
             x = block(ops.concat([x, skips.pop()], axis=1), next(films))
-        return ops.transpose(ops.squeeze(self._out(x), ints(2)), ints(0, 2, 1))
+        return self._out(x)
 
 
 def _residual_block(block: nn.Module) -> Callable[[Node, Node], Node]:
@@ -184,7 +194,6 @@ def _residual_block(block: nn.Module) -> Callable[[Node, Node], Node]:
         raise TypeError(f"{type(block).__name__} has no OpenVINO form as a block of the U-Net")
     conv1, conv2 = layer(block.conv1), layer(block.conv2)
     norm1, norm2 = layer(block.norm1), layer(block.norm2)
-    one = constant(1.0)
     shortcut: Layer = same
     if isinstance(block.shortcut, nn.Linear):
         shortcut = _linear_of_row(block.shortcut)
@@ -192,7 +201,7 @@ def _residual_block(block: nn.Module) -> Callable[[Node, Node], Node]:
     def apply(x: Node, film: Node) -> Node:
         scale, shift = ops.split(film, ops.constant(np.int64(1)), 2).outputs()
         hidden = ops.swish(norm1(conv1(x)))
-        hidden = ops.add(ops.multiply(hidden, ops.add(scale, one)), shift)
+        hidden = ops.add(ops.multiply(hidden, scale), shift)
         return ops.add(ops.swish(norm2(conv2(hidden))), shortcut(x))
 
     return apply

@@ -12,6 +12,7 @@ import torch
 from policy.contract import Contract, Executable, FloatArray, PolicyError
 from policy.engines.choose import Candidate, choose_executable, first_faithful, probe_chunks
 from policy.engines.executable import EngineName, Settings
+from policy.engines.openvino_cpu import make_openvino_executable, precisions
 from policy.engines.torch_eager import make_torch_executable
 from policy.parity import MAX_STICK_ERROR, disagreement, make_probe
 from policy.toge import Toge
@@ -106,6 +107,26 @@ def test_the_default_on_a_cpu_is_openvino(small_toge: Toge) -> None:
     reference, quiet = choose_executable(small_toge, "torch", SETTINGS)
     assert (reference.engine, quiet) == ("torch", ())
     assert disagreement(probe_chunks(reference, probe), probe_chunks(executable, probe)) is None
+
+
+@pytest.mark.parametrize("weights", ["small_toge", "trained_toge"])
+def test_the_fastest_precision_that_passes_is_taken_and_the_others_are_named(
+    weights: str, request: pytest.FixtureRequest
+) -> None:
+    policy: Toge = request.getfixturevalue(weights)
+    settings = Settings(name="toge", head_steps=2)
+    probe = make_probe(policy.contract)
+    expected = probe_chunks(make_torch_executable(policy, settings), probe)
+    failed = []
+    for vision, action in precisions():
+        first = make_openvino_executable(policy, settings, vision, action)
+        if disagreement(expected, probe_chunks(first, probe)) is None:
+            break
+        failed.append(f"openvino (images {vision}, actions {action}) is passed over: a stick is")
+    executable, notes = choose_executable(policy, "auto", settings)
+    assert executable.engine == first.engine
+    assert len(notes) == len(failed) + 1
+    assert all(reason in note for reason, note in zip(failed, notes[:-1], strict=True))
 
 
 def test_without_openvino_torch_flies(small_toge: Toge, monkeypatch: pytest.MonkeyPatch) -> None:
