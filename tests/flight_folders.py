@@ -16,7 +16,7 @@ from policy.contract import Contract
 LEVEL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.80665)
 MS = 1_000_000
 
-_VECTOR = pa.list_(pa.float32())
+_STATE, _STICKS, _VECTOR = (pa.list_(pa.float32(), width) for width in (13, 4, 3))
 
 
 def write_meta(folder: Path, **changes: object) -> None:
@@ -50,15 +50,15 @@ def ticks_table(
         "woke_ns": pa.array(woke_ns, pa.int64()),
         "sent_ns": pa.array([w + sent_lag_ns for w in woke_ns], pa.int64()),
         "feature_captured_ns": pa.array(captured_ns or [None] * count, pa.int64()),
-        "state": pa.array(state, _VECTOR),
+        "state": pa.array(state, _STATE),
         "attitude_ns": pa.array(attitude_ns, pa.int64()),
         "velocity_ns": pa.array(attitude_ns, pa.int64()),
-        "sent": pa.array(sent, _VECTOR),
-        "rc_sticks": pa.array(rc_sticks or [None] * count, _VECTOR),
+        "sent": pa.array(sent, _STICKS),
+        "rc_sticks": pa.array(rc_sticks or [None] * count, _STICKS),
         "armed": pa.array([True] * count if armed is None else armed, pa.bool_()),
     }
     if expert is not None:
-        columns["expert"] = pa.array(expert, _VECTOR)
+        columns["expert"] = pa.array(expert, _STICKS)
     return pa.table(columns)
 
 

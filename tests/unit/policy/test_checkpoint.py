@@ -85,15 +85,6 @@ def test_a_test_vector_is_carried_and_kept(small_toge: Toge, saved: Path) -> Non
         ({"head.unet.out.weight": lambda x: -x}, "do not make the sticks that they made"),
     ],
 )
-@pytest.mark.parametrize("size", [(224, 224), (40, 64)])
-def test_a_vector_of_any_image_size_is_written(size: tuple[int, int], tmp_path: Path) -> None:
-    contract = Contract(image_height=size[0], image_width=size[1])
-    config = TogeConfig(backbone="resnet18", contract=contract)
-    save_checkpoint(tmp_path / "a.safetensors", build_policy(config).eval())
-    policy = load_checkpoint(tmp_path / "a.safetensors", fallback=config)
-    assert (policy.contract.image_height, policy.contract.image_width) == size
-
-
 def test_weights_that_do_not_make_their_vector_are_refused(
     small_toge: Toge, saved: Path, tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
@@ -106,6 +97,15 @@ def test_weights_that_do_not_make_their_vector_are_refused(
     save_file(contents, path, metadata=header_of(saved))
     with pytest.raises(CheckpointError, match=message):
         load_checkpoint(path, fallback=small_toge.config)
+
+
+@pytest.mark.parametrize("size", [(224, 224), (40, 64)])
+def test_a_vector_of_any_image_size_is_written(size: tuple[int, int], tmp_path: Path) -> None:
+    contract = Contract(image_height=size[0], image_width=size[1])
+    config = TogeConfig(backbone="resnet18", contract=contract)
+    save_checkpoint(tmp_path / "a.safetensors", build_policy(config).eval())
+    policy = load_checkpoint(tmp_path / "a.safetensors", fallback=config)
+    assert (policy.contract.image_height, policy.contract.image_width) == size
 
 
 def test_resnet_unet_round_trips(tmp_path: Path) -> None:
