@@ -36,6 +36,12 @@ HISTORY_JITTER_S = 0.005
 """Slots of the history are taken so much earlier or later: half a tick at 100 Hz."""
 FRESH_START_SHARE = 0.15
 """Samples that look like a policy just engaged: the older part of the history is neutral."""
+BLIND_SHARE = 0.4
+"""Samples without any history. Sticks change slowly, so a net that sees the last ones learns to
+copy them and not to look (de Haan et al., "Causal Confusion in Imitation Learning", 2019), and then
+drifts off in flight, however small its error on the data."""
+HISTORY_NOISE = 0.1
+"""Standard deviation of an offset on the sticks of a history, against the same."""
 
 _BETWEEN_NS = 10 * NS_PER_S
 """Put between two flights on the common axis of time: far beyond every gap that is bridged."""
@@ -188,8 +194,12 @@ class Timeline:
         row = np.maximum(np.searchsorted(self._sent_ns, at_ns, side="right") - 1, 0)
         history: FloatArray = self._sent[row]
         if random is not None:
-            is_fresh = random.random(len(ticks)) < FRESH_START_SHARE
+            offset = random.normal(0.0, HISTORY_NOISE, (len(ticks), 1, ACTION_DIM))
+            history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
+            chance = random.random(len(ticks))
+            is_fresh = chance < FRESH_START_SHARE
             neutral = np.where(is_fresh, random.integers(1, count + 1, len(ticks)), 0)
+            neutral = np.where(chance > 1 - BLIND_SHARE, count, neutral)
             history = np.where(
                 (np.arange(count) < neutral[:, None])[..., None], np.float32(0), history
             )
@@ -269,20 +279,6 @@ def _offsets(episodes: Sequence[Episode]) -> list[int]:
         end = offset + max(int(stamps.max()) for stamps in lists if len(stamps))
         offsets.append(offset)
     return offsets
-
-
-def turn_world(state: FloatArray, angle_rad: NDArray[np.float64]) -> FloatArray:
-    """The same flight seen from a world turned by ``angle_rad`` [B] about the vertical.
-
-    Velocity and attitude turn together, what is in body axes stays. A net trained on all headings
-    alike cannot know a course by its compass.
-    """
-    turn = rotation.about_z(angle_rad)
-    out = state.copy()
-    out[:, VELOCITY] = rotation.rotate(turn, state[:, VELOCITY].astype(np.float64))
-    attitude = rotation.multiply(turn, state[:, QUATERNION].astype(np.float64))
-    out[:, QUATERNION] = np.where(attitude[:, :1] < 0, -attitude, attitude)
-    return out
 
 
 def mirror(samples: Samples, is_mirrored: NDArray[np.bool_]) -> Samples:

@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy.contract import ACTION_DIM, QUATERNION, Contract, PolicyError
-from policy.preprocess import state_scale
+from policy.contract import ACTION_DIM, Contract, PolicyError
+from policy.preprocess import egocentric_columns, egocentric_scale
 
 HEADS = 4
 
@@ -26,16 +26,14 @@ class StateEncoder(nn.Module):
 
     def __init__(self, dim: int, contract: Contract) -> None:
         super().__init__()
-        self.mlp = nn.Sequential(nn.Linear(contract.state_dim, dim), nn.SiLU(), nn.Linear(dim, dim))
+        scale = egocentric_scale(contract)
+        self.mlp = nn.Sequential(nn.Linear(len(scale), dim), nn.SiLU(), nn.Linear(dim, dim))
         self._scale: Tensor
-        self.register_buffer("_scale", torch.tensor(state_scale(contract)), persistent=False)
+        self.register_buffer("_scale", torch.tensor(scale), persistent=False)
 
     def normalise(self, state: Tensor) -> Tensor:
-        """Each dimension over its scale; of q and -q, the same attitude, the one with w >= 0."""
-        quaternion = state[:, QUATERNION]
-        flipped = torch.where(quaternion[:, :1] < 0, -quaternion, quaternion)
-        before, after = state[:, : QUATERNION.start], state[:, QUATERNION.stop :]
-        return torch.cat([before, flipped, after], dim=1) / self._scale
+        """``preprocess.egocentric`` on tensors."""
+        return torch.stack(egocentric_columns(state.unbind(1)), dim=1) / self._scale
 
     def forward(self, state: Tensor) -> Tensor:
         """State [B, state_dim] -> token [B, dim]."""

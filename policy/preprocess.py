@@ -1,11 +1,13 @@
 """From a camera image and a vehicle state to what a net takes: one copy for training and flight.
 
-The image is normalised here, before the net, by the checkpoint's contract. The state is normalised
-inside the nets (``encoders.StateEncoder``) with the constants of this module, so that a checkpoint
-takes SI units. No torch: the scripted policies pass through here too.
+The image is normalised here, before the net, by the checkpoint's contract. The state is turned
+into body axes and normalised inside the nets (``encoders.StateEncoder``) by the functions of this
+module, so that a checkpoint takes SI units. No torch: the scripted policies pass through here too.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +21,7 @@ STATE_SCALE = (
     *(3.0, 3.0, 3.0),  # rad/s: about ArduPilot's default yaw and roll rates at full stick
     *(9.80665, 9.80665, 9.80665),  # m/s^2: standard gravity
 )
-"""Each dimension of the state is divided by this; typical flight then lies within [-1, 1].
+"""Over this, each dimension of the state lies within [-1, 1] in typical flight.
 
 Fixed, not taken from data: every checkpoint shares it, and a sensor that is off by a unit shows.
 """
@@ -33,9 +35,49 @@ SINCE_EXPOSURE_SCALE = (
 """As ``STATE_SCALE``, for what a contract may append to the state."""
 
 
-def state_scale(contract: Contract) -> tuple[float, ...]:
-    """What each of the ``contract.state_dim`` dimensions of the state is divided by."""
-    return STATE_SCALE + (SINCE_EXPOSURE_SCALE if contract.since_exposure else ())
+EGOCENTRIC_SCALE = (
+    *(5.0, 5.0, 5.0),  # m/s
+    *(1.0, 1.0, 1.0),  # a unit vector
+    *STATE_SCALE[7:],  # body rates and specific force, as they are
+)
+"""Each dimension of ``egocentric_columns`` is divided by this."""
+
+
+def egocentric_scale(contract: Contract) -> tuple[float, ...]:
+    """What each dimension of what a net sees of the state is divided by."""
+    return EGOCENTRIC_SCALE + (SINCE_EXPOSURE_SCALE if contract.since_exposure else ())
+
+
+def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
+    """The state as the vehicle feels it: the same on every heading, and for q as for -q.
+
+    Velocity in body axes, the world's vertical axis in body axes, then rates, specific force and
+    whatever the contract appends, unchanged. No net has to learn what a rotation is, and none can
+    know a course by its compass.
+
+    Args:
+        columns: of the state, in the contract's order; floats, or arrays of any kind.
+
+    Returns:
+        12 columns, or 19: one fewer than came in.
+    """
+    vx, vy, vz, w, x, y, z, *rest = columns
+    # Columns of world_from_body, by a unit quaternion; velocity_body = its transpose @ velocity.
+    forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    side = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+    up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    velocity_body = [vx * a + vy * b + vz * c for a, b, c in (forward, side, up)]
+    return [*velocity_body, forward[2], side[2], up[2], *rest]
+
+
+def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
+    """State [B, state_dim] in SI units -> what a net sees of it [B, state_dim - 1], normalised."""
+    scale = egocentric_scale(contract)
+    rows = [
+        [value / unit for value, unit in zip(egocentric_columns(row), scale, strict=True)]
+        for row in state.tolist()
+    ]
+    return np.array(rows, dtype=np.float32)
 
 
 def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from policy.contract import Contract, FloatArray
 from policy.dataset_frames import FrameStore
-from policy.dataset_samples import Indices, Samples, Timeline, mirror, turn_world
+from policy.dataset_samples import Indices, Samples, Timeline, mirror
 
 SHIFT = 0.015
 """Images move by at most this share of their side, as a camera mount is off by a degree."""
@@ -173,9 +173,6 @@ class Batches:
         ticks = self._timeline.draw_ticks(repeated, random)
         samples = self._timeline.samples(repeated, ticks, random)
         samples = mirror(samples, np.repeat(is_mirrored, repeats))
-        angle = random.uniform(-np.pi, np.pi, len(repeated))
-        turned = turn_world(samples.state, angle)
-        samples = Samples(**{**vars(samples), "state": turned})
         return self._tensors(random, samples, frames, images=images, look=look, pooled=pooled)
 
     def _tensors(

@@ -17,6 +17,7 @@ from policy.engines.compile_cache import CompileCache, user_cache_folder
 from policy.engines.executable import Precision, Settings, assemble
 from policy.engines.openvino_graph import refine_graph, sample_graph, vision_graph
 from policy.engines.signal_stack import signal_stack_kept
+from policy.preprocess import egocentric
 from policy.resnet_unet import ResnetUnet
 from policy.toge import Toge
 
@@ -65,7 +66,7 @@ def make_openvino_executable(
     run_sample = compiler.compile(f"sample {steps}", action, lambda: sample_graph(policy, steps))
 
     def sample(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        return run_sample(encoded, state, history, noise)
+        return run_sample(encoded, egocentric(state, policy.contract), history, noise)
 
     name = f"{NAME}-{vision}" if vision == action else f"{NAME}-{vision}-{action}"
     if not settings.dual_rate:
@@ -84,7 +85,7 @@ def make_openvino_executable(
     def refine(
         encoded: FloatArray, state: FloatArray, history: FloatArray, guess: FloatArray
     ) -> FloatArray:
-        return run_refine(encoded, state, history, guess, noise)
+        return run_refine(encoded, egocentric(state, warm.contract), history, guess, noise)
 
     return assemble(policy.contract, encode, sample, refine, name, settings)
 

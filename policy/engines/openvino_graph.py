@@ -15,10 +15,11 @@ from openvino import opset15 as ops
 from torch import Tensor, nn
 
 from policy.action_head import DiffusionHead, size_dims
-from policy.contract import ACTION_DIM, QUATERNION, Contract
+from policy.contract import ACTION_DIM, Contract
 from policy.diffusion import DdimStep, NoiseSchedule
-from policy.encoders import Fusion, HistoryEncoder, StateEncoder
+from policy.encoders import Fusion, HistoryEncoder
 from policy.engines.openvino_layers import Layer, Node, constant, conv, ints, layer, same
+from policy.preprocess import egocentric_scale
 from policy.resnet_unet import ResnetUnet
 from policy.toge import Toge
 from policy.unet1d import ResidualBlock, UNet1d
@@ -33,7 +34,7 @@ def vision_graph(policy: Toge | ResnetUnet) -> ov.Model:
 
 
 def sample_graph(policy: Toge | ResnetUnet, num_diffusion_steps: int) -> ov.Model:
-    """(feature, state, history, noise) -> chunk [1, horizon, 4]: all steps, unrolled."""
+    """(feature, egocentric, history, noise) -> chunk [1, horizon, 4]: all steps, unrolled."""
     inputs = _action_inputs(policy)
     noise = _chunk_parameter("noise", policy.contract)
     steps = policy.head.schedule.ddim_steps(num_diffusion_steps)
@@ -42,7 +43,7 @@ def sample_graph(policy: Toge | ResnetUnet, num_diffusion_steps: int) -> ov.Mode
 
 
 def refine_graph(policy: Toge, num_diffusion_steps: int, head_steps: int) -> ov.Model:
-    """(feature, state, history, guess, noise) -> chunk: the last steps, from a re-noised guess."""
+    """(feature, egocentric, history, guess, noise) -> chunk: the last steps."""
     inputs = _action_inputs(policy)
     guess = _chunk_parameter("guess", policy.contract)
     noise = _chunk_parameter("noise", policy.contract)
@@ -58,7 +59,7 @@ def refine_graph(policy: Toge, num_diffusion_steps: int, head_steps: int) -> ov.
 def _action_inputs(policy: Toge | ResnetUnet) -> tuple[Node, Node, Node]:
     return (
         _parameter("feature", 1, size_dims(policy.config.size).base_dim),
-        _parameter("state", 1, policy.contract.state_dim),
+        _parameter("egocentric", 1, len(egocentric_scale(policy.contract))),
         _parameter("history", 1, policy.contract.history_len, ACTION_DIM),
     )
 
@@ -75,25 +76,13 @@ def _chunk_parameter(name: str, contract: Contract) -> Node:
 
 
 def _condition(policy: Toge | ResnetUnet, feature: Node, state: Node, history: Node) -> Node:
-    token = _state_token(policy.state_encoder, state)
+    token = layer(policy.state_encoder.mlp)(state)
     if isinstance(policy, Toge):
         return _fuse(
             policy.fusion, feature, token, _history_tokens(policy.history_encoder, history)
         )
     flat = ops.reshape(history, ints(1, -1), special_zero=False)
     return layer(policy.fuse)(ops.concat([feature, token, flat], axis=1))
-
-
-def _state_token(encoder: StateEncoder, state: Node) -> Node:
-    before, quaternion, after = ops.variadic_split(
-        state,
-        ints(1),
-        ints(QUATERNION.start, QUATERNION.stop - QUATERNION.start, -1),
-    ).outputs()
-    w = ops.gather(quaternion, ints(0), ints(1))
-    sign = ops.select(ops.less(w, constant(0.0)), constant(-1.0), constant(1.0))
-    upright = ops.concat([before, ops.multiply(quaternion, sign), after], axis=1)
-    return layer(encoder.mlp)(ops.divide(upright, constant(encoder._scale)))
 
 
 def _history_tokens(encoder: HistoryEncoder, history: Node) -> Node:

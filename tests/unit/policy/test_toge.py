@@ -67,12 +67,14 @@ def test_a_quaternion_and_its_negative_are_one_attitude(small_toge: Toge) -> Non
     negated = state.clone()
     negated[:, 3:7] *= -1
     first, second = (small_toge.predict(image, s, history, 2) for s in (state, negated))
-    assert torch.equal(first, second)
+    torch.testing.assert_close(first, second)
 
 
 def test_state_is_scaled_by_the_documented_constants(small_toge: Toge) -> None:
-    state = torch.tensor([[5.0, 0, -10, -1, 0, 0, 0.5, 3, 0, -1.5, 0, 0, -9.80665]])
-    expected = torch.tensor([[1.0, 0, -2, 1, 0, 0, -0.5, 1, 0, -0.5, 0, 0, -1]])
+    # Heading east (yaw 90 degrees) and level: 5 m/s to the north is 5 m/s to the left.
+    r = 0.5**0.5
+    state = torch.tensor([[5.0, 0, -10, r, 0, 0, r, 3, 0, -1.5, 0, 0, -9.80665]])
+    expected = torch.tensor([[0.0, -1, -2, 0, 0, 1, 1, 0, -0.5, 0, 0, -1]])
     torch.testing.assert_close(small_toge.state_encoder.normalise(state), expected)
 
 
@@ -136,7 +138,7 @@ def test_every_number_since_the_exposure_reaches_the_sticks(
         moved[0, index] = 1.0
         assert not torch.equal(policy.predict(image, moved, history, 2), chunk), index
     # Over its scale: a tenth of a second of age counts as much as 2 m/s.
-    normal = policy.state_encoder.normalise(torch.ones(1, 20))[0, 13:]
+    normal = policy.state_encoder.normalise(torch.ones(1, 20))[0, 12:]
     assert normal.tolist() == pytest.approx([10, 2, 2, 2, 0.5, 0.5, 0.5])
 
 
