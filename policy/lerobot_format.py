@@ -1,6 +1,6 @@
 """Names in a LeRobot dataset of format v3.0, for what is written and what is read.
 
-Source: lerobot 0.6.1, ``datasets/utils.py`` (paths, ``DatasetInfo``), ``datasets/dataset_writer.py``,
+Source: lerobot 0.6.1, ``datasets/utils.py`` (paths, info), ``datasets/dataset_writer.py``,
 ``datasets/dataset_metadata.py`` (columns of the episodes), ``utils/constants.py`` (features).
 """
 

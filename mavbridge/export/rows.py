@@ -128,16 +128,21 @@ def common_fps(parts: Sequence[Stretch]) -> int:
     Raises:
         UserError: flights of several rates.
     """
-    all_fps = NS_PER_S / float(np.median(np.concatenate([np.diff(p.captured_ns) for p in parts])))
-    fps = max(1, round(all_fps))
+    fps = max(1, round(_rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))))
     for part in parts:
-        own = NS_PER_S / float(np.median(np.diff(part.captured_ns)))
+        own = _rate_hz(np.diff(part.captured_ns))
         if abs(own / fps - 1.0) > MAX_RATE_OFF:
             raise UserError(
                 f"{part.episode.name} has {own:.3g} frames a second, most of the rest {fps}: a "
                 "LeRobot dataset has one rate, so export them apart"
             )
     return fps
+
+
+def _rate_hz(periods_ns: Nanoseconds) -> float:
+    """Mean rate, where no frame is missing."""
+    whole = periods_ns[periods_ns <= 1.5 * np.median(periods_ns)]
+    return NS_PER_S / float(np.maximum(whole.mean(), 1.0))
 
 
 def worst_shift_ns(part: Stretch, fps: int) -> int:
