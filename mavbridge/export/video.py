@@ -24,7 +24,7 @@ _OPTIONS = {
     "preset": "veryfast",
     "crf": "20",  # as the recorder's
     "g": "2",  # LeRobot's own: any frame is to be had for two decoded
-    "bf": "0",  # no frame before time 0
+    "tune": "zerolatency",  # a frame in, a packet out; none is before time 0
     "threads": "1",
 }
 

@@ -40,10 +40,10 @@ def test_episodes_follow_each_other_in_a_file(tmp_path: Path) -> None:
 
 
 def test_a_file_that_would_grow_too_large_is_followed_by_another(tmp_path: Path) -> None:
-    spans = write(tmp_path, [5, 5, 5], limit_bytes=20_000)
+    spans = write(tmp_path, [5, 5, 5], limit_bytes=10_000)
     sizes = [path.stat().st_size for path in sorted(tmp_path.rglob("*.mp4"))]
     assert len(sizes) > 1
-    assert max(sizes) < 25_000
+    assert max(sizes) < 12_000
     assert all(span.from_s == 0 for span in spans if span.file_index != spans[0].file_index)
 
 
