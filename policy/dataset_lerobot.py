@@ -135,7 +135,7 @@ def _require_vector(
     feature = features.get(key)
     if feature is None:
         raise DatasetError(f"{folder}: no feature {key}; it has {sorted(features)}")
-    shape = list(feature.get("shape") or ())
+    shape = feature.get("shape")
     if shape != [len(wanted)]:
         raise DatasetError(
             f"{folder}: {key} has shape {shape}, the policy takes [{len(wanted)}]: {list(wanted)}"
@@ -265,7 +265,8 @@ def _episode(info: _Info, row: _Row, table: pa.Table, digest: str) -> Episode:
 
 def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
     """As the dataset says; else by gravity: what is not falling pushes up, -z in FRD, +z in FLU."""
-    said = (info.features[names.STATE_KEY].get("info") or {}).get(names.STATE_FRAME)
+    about = info.features[names.STATE_KEY].get("info")
+    said = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
     if said is None:
         up = float(np.median(state[:, SPECIFIC_FORCE][:, 2]))
         return "ned_frd" if up < 0 else "enu_flu"
