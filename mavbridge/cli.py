@@ -9,7 +9,14 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
-from mavbridge.config import BenchConfig, DemonstrateConfig, EvaluateConfig, FlyConfig, TrainConfig
+from mavbridge.config import (
+    BenchConfig,
+    DemonstrateConfig,
+    EvaluateConfig,
+    ExportConfig,
+    FlyConfig,
+    TrainConfig,
+)
 from mavbridge.errors import UserError
 
 cli = App(
@@ -74,7 +81,7 @@ def train(*flights: Path, config: TrainConfig | None = None) -> int:
     """Train a policy from flights.
 
     Args:
-        flights: flight folders, or folders of them.
+        flights: flight folders, folders of them, or LeRobot datasets (v3).
         config: the settings.
     """
     if not flights:
@@ -87,6 +94,24 @@ def train(*flights: Path, config: TrainConfig | None = None) -> int:
     from mavbridge.train import train_policy  # torch: not for --help
 
     return train_policy(flights, config, config.out)
+
+
+@cli.command
+def export(*flights: Path, config: ExportConfig) -> int:
+    """Make a LeRobot dataset (v3.0) of flights. Demonstrations that failed are left out.
+
+    Args:
+        flights: flight folders, or folders of them.
+        config: the settings.
+    """
+    from mavbridge.recording.folder import require_extra
+
+    require_extra("export")
+    from mavbridge.export.run import export as run_export  # PyAV and pyarrow: not for --help
+
+    if not flights:
+        raise UserError("name the flights to export: mavbridge export DIR... --out DIR")
+    return run_export(flights, config)
 
 
 @cli.meta.default

@@ -234,6 +234,22 @@ class FlyConfig:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
+class ExportConfig:
+    """One LeRobot dataset made of flights."""
+
+    out: Path
+    """Folder for the dataset, new or empty."""
+    task: str = "fly"
+    """What the flights do, in words, for policies that read them."""
+
+    def __post_init__(self) -> None:
+        """Refuse a task that says nothing."""
+        if not self.task.strip():
+            raise UserError("--task must say something")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """One training run."""
 
@@ -260,6 +276,8 @@ class TrainConfig:
     ages: str | None = None
     """Image ages to train for: the flight folder that they were measured in, or LOW:HIGH in ms; by
     default those measured in the flights."""
+    camera_key: str | None = None
+    """Camera of a LeRobot dataset that has several, e.g. observation.images.front."""
     start_from: Path | None = None
     """Checkpoint to go on from, e.g. after more flights were added."""
     backbone_weights: Path | None = None

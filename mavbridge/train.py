@@ -30,7 +30,7 @@ def train_policy(
     """Train as the config says; 0 when the checkpoint is written.
 
     Args:
-        flights: flight folders, or folders of them.
+        flights: flight folders, folders of them, or LeRobot datasets.
         config: the settings.
         out: the checkpoint.
         check: flies a checkpoint in closed loop and says how well, if there is such a check.
@@ -39,15 +39,8 @@ def train_policy(
         UserError: pyarrow or PyAV is missing, or a flag cannot be used.
         PolicyError: flights, weights or a run that cannot be used.
     """
-    try:
-        from policy.dataset_flights import find_flights, is_exemplary, read_flight
-    except ImportError as error:
-        raise UserError(
-            f"reading flights needs pyarrow and PyAV ({error}): install mavbridge[record]"
-        ) from error
     _require_device(config.device)
-    folders = [folder for folder in find_flights(flights) if is_exemplary(folder)]
-    episodes = [read_flight(folder) for folder in folders]
+    episodes = _read_episodes(flights, config.camera_key)
     settings = _settings(config, out, episodes)
     clock = MonotonicClock()
     with _Display() as display:
@@ -60,6 +53,24 @@ def train_policy(
         )
     _print_result(result)
     return 0
+
+
+def _read_episodes(paths: Sequence[Path], camera_key: str | None) -> list[Episode]:
+    """A folder with meta/info.json is a LeRobot dataset, every other one flights of ours."""
+    try:
+        from policy.dataset_flights import find_flights, is_exemplary, read_flight
+        from policy.dataset_lerobot import is_lerobot, read_dataset
+    except ImportError as error:
+        raise UserError(
+            f"reading flights needs pyarrow and PyAV ({error}): install mavbridge[record]"
+        ) from error
+    datasets = [path for path in paths if is_lerobot(path)]
+    if camera_key is not None and not datasets:
+        raise UserError("--camera-key is for LeRobot datasets; flights have one camera")
+    flights = [path for path in paths if path not in datasets]
+    folders = find_flights(flights) if flights else []
+    episodes = [read_flight(folder) for folder in folders if is_exemplary(folder)]
+    return episodes + [e for path in datasets for e in read_dataset(path, camera_key)]
 
 
 def _settings(config: TrainConfig, out: Path, episodes: list[Episode]) -> TrainSettings:

@@ -1,0 +1,32 @@
+"""Names in a LeRobot dataset of format v3.0, for what is written and what is read.
+
+Source: lerobot 0.6.1, ``datasets/utils.py`` (paths, info), ``datasets/dataset_writer.py``,
+``datasets/dataset_metadata.py`` (columns of the episodes), ``utils/constants.py`` (features).
+"""
+
+CODEBASE_VERSION = "v3.0"
+
+INFO = "meta/info.json"
+STATS = "meta/stats.json"
+TASKS = "meta/tasks.parquet"
+EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+
+CAMERA_KEY = "observation.images.front"
+STATE_KEY = "observation.state"
+ACTION_KEY = "action"
+
+CAPTURED, TICK, ATTITUDE, VELOCITY, ACTED, SENT_AT = (
+    *("stamp.captured_ns", "stamp.tick_ns", "stamp.attitude_ns", "stamp.velocity_ns"),
+    *("stamp.action_ns", "stamp.sent_ns"),
+)
+STAMPS = (CAPTURED, TICK, ATTITUDE, VELOCITY, ACTED, SENT_AT)
+"""Our own columns, the true stamps of a row: exposure of the image, tick that the state is of,
+arrival of its attitude and velocity, of the action, of the sticks that flew. LeRobot takes every
+feature whose name begins with "observation" or "action" for an input or output of its policies
+(``utils/feature_utils.py:dataset_to_policy_features``), so these begin with neither."""
+SENT = "sent"
+"""Our own column: the sticks that flew."""
+STATE_FRAME = "state_frame"
+"""In the ``info`` of the state's feature: ``Contract.state_frame``."""
