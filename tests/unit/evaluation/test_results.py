@@ -18,6 +18,8 @@ def evaluation(*episodes: EpisodeResult) -> Evaluation:
         policy="toge",
         engine="openvino",
         mode="lockstep",
+        conditions="random",
+        vision_delay_ms=50.0,
         seed=0,
         asked_episodes=5,
         episodes=episodes,
