@@ -17,6 +17,7 @@ from mavbridge.errors import UserError
 Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 Output = Literal["rc-override", "manual-control"]
 Pace = Literal["clock", "state"]
+Variety = Literal["nominal", "random"]
 
 HEARTBEAT_HZ = 1.0
 """MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
@@ -371,6 +372,11 @@ class EvaluateConfig:
     """Courses to fly."""
     max_time: float = 60.0
     """Seconds that a flight may take, from the policy's first action."""
+    conditions: Variety = "nominal"
+    """random: each flight has another vehicle, firmware settings, wind, light, colours and lens."""
+    vision_delay: float = 0.0
+    """Milliseconds by which each image takes longer to encode, with --lockstep; images older than
+    --max-feature-age are not flown by, whatever made them so."""
     realtime: Annotated[bool, Parameter(negative="--lockstep")] = False
     """--realtime: real processes over UDP against the wall clock, one flight at a time. --lockstep
     (default): bridge and simulator on one simulated clock, as fast as the processor allows."""
@@ -388,6 +394,11 @@ class EvaluateConfig:
         _check("episodes", self.episodes, 1, MAX_EPISODES, "")
         _check("max-time", self.max_time, 1, 3600, "s")
         _check("workers", self.workers, 1, 10_000, "")
+        _check("vision-delay", self.vision_delay, 0, 5000, "ms")
+        if self.realtime and self.vision_delay:
+            raise UserError(
+                "--realtime takes the time that it takes: --vision-delay is for --lockstep"
+            )
         if self.realtime and (self.workers > 1 or self.ray is not None):
             raise UserError(
                 "--realtime flies one episode at a time, since the processors must be its own: "

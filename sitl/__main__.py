@@ -61,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
         "--conditions",
         type=_natural,
         metavar="SEED",
-        help="another vehicle, wind, light, colours and lens by seed (default: nominal)",
+        help="another vehicle, firmware, wind, light, colours and lens by seed (default: nominal)",
     )
     _add_camera_flags(parser)
     commands = parser.add_subparsers(dest="command", metavar="")

@@ -1,4 +1,4 @@
-"""What differs from one flight to the next: vehicle, air, sensors, light, colours and lens.
+"""What differs from one flight to the next: vehicle, firmware settings, air, sensors, light, lens.
 
 The defaults are the nominal vehicle and view, to the bit. `random_conditions` draws others, so that
 a policy learns to fly a vehicle rather than this one (Tobin et al., "Domain Randomization", 2017).
@@ -36,6 +36,38 @@ class Conditions:
     gust_rms_mps: float = 0.0
     """Per axis; half of it in the vertical."""
     gust_time_s: float = 1.5
+
+    angle_max_cdeg: float = 3000.0
+    """ANGLE_MAX; from here to ``lean_accel_max_cdegps2`` parameters that the vehicle boots with."""
+    pilot_yaw_rate_degps: float = 202.5
+    """PILOT_Y_RATE."""
+    pilot_yaw_expo: float = 0.0
+    """PILOT_Y_EXPO."""
+    pilot_speed_up_cmps: float = 250.0
+    """PILOT_SPEED_UP."""
+    pilot_speed_down_cmps: float = 0.0
+    """PILOT_SPEED_DN; 0: as up."""
+    pilot_accel_z_cmps2: float = 250.0
+    """PILOT_ACCEL_Z."""
+    throttle_dead_zone_permille: float = 100.0
+    """THR_DZ: of the stick's travel, each side of the middle."""
+    rc_dead_zones_us: tuple[float, float, float, float] = (20.0, 20.0, 30.0, 20.0)
+    """RCn_DZ of channels 1 to 4: roll, pitch, throttle, yaw."""
+    input_time_s: float = 0.15
+    """ATC_INPUT_TC: how fast the target lean follows the stick."""
+    angle_gains_per_s: Vec3 = (6.0, 6.0, 3.0)
+    """ATC_ANG_RLL_P, ATC_ANG_PIT_P, ATC_ANG_YAW_P."""
+    lean_rate_max_degps: float = 220.0
+    """ATC_RATE_R_MAX, ATC_RATE_P_MAX."""
+    lean_accel_max_cdegps2: float = 110_000.0
+    """ATC_ACCEL_R_MAX, ATC_ACCEL_P_MAX."""
+
+    stream_slowdown_ms: int = 0
+    """Added to every message interval, as ArduPilot does where its radio reports a full buffer."""
+    stream_jitter_ms: float = 0.0
+    """Most by which a message is late, at random."""
+    stream_phase_spread: float = 0.0
+    """Most of its interval by which a stream begins earlier, at random; at most 1."""
 
     velocity_noise_mps: float = 0.0
     """Standard deviations per sample of the vehicle's sensors, per axis."""
@@ -95,7 +127,7 @@ def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
         return replace(NOMINAL, seed=seed)
     draw = _Draw(np.random.Generator(np.random.PCG64(seed)), strength)
     conditions = replace(NOMINAL, seed=seed)
-    for part in (_vehicle, _air_and_sensors, _lens, _scene, _image):
+    for part in (_vehicle, _air_and_sensors, _lens, _scene, _image, _firmware, _streams):
         conditions = part(conditions, draw)
     return conditions
 
@@ -118,6 +150,10 @@ class _Draw:
     def amount(self, most: float) -> float:
         """Within 0 .. most."""
         return self.strength * float(self.random.uniform(0.0, most))
+
+    def dead_zone_us(self) -> float:
+        """Within 0 .. 30: RCn_DZ's nominal values spread over all that is usual."""
+        return float(round(self.amount(30.0)))
 
     def tint(self, most: float) -> Vec3:
         """A factor for each colour."""
@@ -187,6 +223,48 @@ def _image(nominal: Conditions, draw: _Draw) -> Conditions:
         white_balance=draw.tint(1.08),
         blur_px=draw.amount(0.9),
         image_noise=draw.amount(8.0),
+    )
+
+
+def _firmware(nominal: Conditions, draw: _Draw) -> Conditions:
+    """Whole numbers where the firmware stores integers, three decimals where it stores floats."""
+    gain = draw.factor(1.35)
+    return replace(
+        nominal,
+        angle_max_cdeg=round(nominal.angle_max_cdeg + draw.amount(1500.0)),
+        pilot_yaw_rate_degps=round(nominal.pilot_yaw_rate_degps * draw.factor(1.4), 3),
+        pilot_yaw_expo=round(min(0.6, draw.amount(0.3)), 3),
+        pilot_speed_up_cmps=round(nominal.pilot_speed_up_cmps * draw.factor(1.4)),
+        # Nominal is the same as up.
+        pilot_speed_down_cmps=round(nominal.pilot_speed_up_cmps * draw.factor(1.4)),
+        pilot_accel_z_cmps2=round(nominal.pilot_accel_z_cmps2 * draw.factor(1.4)),
+        throttle_dead_zone_permille=round(nominal.throttle_dead_zone_permille * draw.factor(1.4)),
+        rc_dead_zones_us=(
+            draw.dead_zone_us(),
+            draw.dead_zone_us(),
+            draw.dead_zone_us(),
+            draw.dead_zone_us(),
+        ),
+        input_time_s=round(nominal.input_time_s * draw.factor(1.6), 3),
+        angle_gains_per_s=(
+            round(nominal.angle_gains_per_s[0] * gain, 3),
+            round(nominal.angle_gains_per_s[1] * gain, 3),
+            round(nominal.angle_gains_per_s[2] * draw.factor(1.35), 3),
+        ),
+        lean_rate_max_degps=round(nominal.lean_rate_max_degps * draw.factor(1.4)),
+        lean_accel_max_cdegps2=round(nominal.lean_accel_max_cdegps2 * draw.factor(1.4)),
+    )
+
+
+def _streams(nominal: Conditions, draw: _Draw) -> Conditions:
+    """Half of the links are fast enough for all that is asked of them."""
+    is_slow = draw.random.random() < 0.5
+    slowdown_ms = round(draw.amount(23.0))
+    return replace(
+        nominal,
+        stream_slowdown_ms=slowdown_ms if is_slow else 0,
+        stream_jitter_ms=draw.amount(5.0),
+        stream_phase_spread=min(1.0, draw.amount(1.0)),
     )
 
 

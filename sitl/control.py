@@ -10,6 +10,7 @@ from sitl.dynamics import (
     YAW_TORQUE_PER_THRUST_M,
     BodyState,
 )
+from sitl.params import Params
 from sitl.rotation import (
     IDENTITY,
     Vec3,
@@ -21,17 +22,14 @@ from sitl.rotation import (
     to_euler,
 )
 
-ANGLE_GAIN_PER_S: Vec3 = (6.0, 6.0, 3.0)
 RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
 """With a 28 ms motor lag 18/s keeps the rate loop at a damping ratio of about 0.7."""
-INPUT_TIME_S = 0.15
-"""ATC_INPUT_TC: how fast the target lean follows the stick."""
-MAX_LEAN_RATE_RADPS = math.radians(220.0)
-MAX_LEAN_ACCEL_RADPS2 = math.radians(1100.0)
+MIN_INPUT_TIME_S = 0.01
 MAX_TARGET_LEAD_RAD = math.radians(30.0)
 """In rate mode the target may run ahead of the vehicle by this much before it is pulled back."""
 SPIN_MIN = 0.05
 """Lowest thrust of an armed, flying motor."""
+_ANGLE_GAINS = ("ATC_ANG_RLL_P", "ATC_ANG_PIT_P", "ATC_ANG_YAW_P")
 
 
 def clamp(value: float, limit: float) -> float:
@@ -42,7 +40,8 @@ def clamp(value: float, limit: float) -> float:
 class AttitudeController:
     """Tracks leans with a yaw rate, or body rates; the target lives here between steps."""
 
-    def __init__(self) -> None:
+    def __init__(self, params: Params) -> None:
+        self._params = params
         self._target = IDENTITY
         self._roll = self._pitch = self._yaw = 0.0
         self._roll_rate = self._pitch_rate = 0.0
@@ -57,8 +56,8 @@ class AttitudeController:
         self, body: BodyState, roll: float, pitch: float, yaw_rate_radps: float, dt_s: float
     ) -> Vec3:
         """Body angular acceleration (rad/s^2) towards a roll and pitch, turning at a yaw rate."""
-        self._roll_rate = _shape(roll - self._roll, self._roll_rate, dt_s)
-        self._pitch_rate = _shape(pitch - self._pitch, self._pitch_rate, dt_s)
+        self._roll_rate = self._shape("R", roll - self._roll, self._roll_rate, dt_s)
+        self._pitch_rate = self._shape("P", pitch - self._pitch, self._pitch_rate, dt_s)
         self._roll += self._roll_rate * dt_s
         self._pitch += self._pitch_rate * dt_s
         self._yaw += yaw_rate_radps * dt_s
@@ -86,7 +85,7 @@ class AttitudeController:
             rate_gain * (feedforward + angle_gain * angle - rate)
             for rate_gain, angle_gain, feedforward, angle, rate in zip(
                 RATE_GAIN_PER_S,
-                ANGLE_GAIN_PER_S,
+                [self._params[name] for name in _ANGLE_GAINS],
                 feedforward_radps,
                 error,
                 body.rate_body_radps,
@@ -95,11 +94,18 @@ class AttitudeController:
         )
         return (ax, ay, az)
 
+    def _shape(self, axis: str, error_rad: float, rate_radps: float, dt_s: float) -> float:
+        """Next rate of a target angle that closes its error without a jump in rate."""
+        input_time_s = max(MIN_INPUT_TIME_S, self._params.decimal("ATC_INPUT_TC"))
+        max_rate_radps = math.radians(self._limit(f"ATC_RATE_{axis}_MAX"))
+        max_accel_radps2 = math.radians(self._limit(f"ATC_ACCEL_{axis}_MAX") / 100.0)
+        wanted = clamp(error_rad / input_time_s, max_rate_radps)
+        return rate_radps + clamp(wanted - rate_radps, max_accel_radps2 * dt_s)
 
-def _shape(error_rad: float, rate_radps: float, dt_s: float) -> float:
-    """Next rate of a target angle that closes its error without a jump in rate."""
-    wanted = clamp(error_rad / INPUT_TIME_S, MAX_LEAN_RATE_RADPS)
-    return rate_radps + clamp(wanted - rate_radps, MAX_LEAN_ACCEL_RADPS2 * dt_s)
+    def _limit(self, name: str) -> float:
+        """0 means that there is none."""
+        limit = self._params[name]
+        return limit if limit > 0.0 else math.inf
 
 
 class HeightController:

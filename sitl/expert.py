@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from sitl.conditions import NOMINAL
 from sitl.control import clamp
 from sitl.course import Course, Gate, GateCounter, crossing, in_gate_axes, turned_to_gate
 from sitl.dynamics import GRAVITY_MPS2
@@ -20,7 +21,7 @@ from sitl.params import Params
 from sitl.rotation import Quat, Vec3, rotate, to_euler, wrap_pi
 
 LAG_S = 0.17
-"""From stick to lean; position and velocity are rolled forward by it."""
+"""From stick to lean, of the nominal vehicle; position and velocity are rolled forward by it."""
 GATES_AHEAD = 3
 MAX_ACCEL_MPS2 = 5.3
 """A lean of 28 degrees of the 30 that there are."""
@@ -77,12 +78,20 @@ class Expert:
     """One flight over a course; ask it at the rate at which sticks are sent, 50 Hz or more.
 
     ``speed_mps`` is what it flies where the course lets it: at 8 m/s it slows down for corners.
+    ``params`` are the vehicle's: what a stick means, and how fast it is obeyed.
 
     Raises:
         UsageError: a speed that it cannot fly at.
     """
 
-    def __init__(self, course: Course, speed_mps: float, *, next_gate: int = 0) -> None:
+    def __init__(
+        self,
+        course: Course,
+        speed_mps: float,
+        *,
+        next_gate: int = 0,
+        params: Params | None = None,
+    ) -> None:
         if not MIN_SPEED_MPS <= speed_mps <= MAX_SPEED_MPS:
             raise UsageError(
                 f"the expert flies at {MIN_SPEED_MPS} to {MAX_SPEED_MPS} m/s, got {speed_mps}"
@@ -92,7 +101,9 @@ class Expert:
         self._gates = course.gates + self._beyond
         self._speed_mps = speed_mps
         self._referee = GateCounter(course, first=next_gate)
-        self._response = _Response(Params())
+        params = Params() if params is None else params
+        self._lag_s = LAG_S + (params.decimal("ATC_INPUT_TC") - NOMINAL.input_time_s)
+        self._response = _Response(params)
 
     @property
     def next_gate(self) -> int | None:
@@ -109,7 +120,13 @@ class Expert:
     ) -> Sticks4:
         """What to hold now; the positions of all calls are the trajectory that passes gates."""
         self._referee.update(position_ned_m, t_s)
-        state = _State.ahead(position_ned_m, velocity_ned_mps, ned_from_body_wxyz, rate_body_radps)
+        state = _State.ahead(
+            position_ned_m,
+            velocity_ned_mps,
+            ned_from_body_wxyz,
+            rate_body_radps,
+            lag_s=self._lag_s,
+        )
         ahead = self._ahead(position_ned_m, state)
         wanted = _approach(state, ahead[:GATES_AHEAD], self._speed_mps)
         if len(ahead) <= GATES_AHEAD:
@@ -140,7 +157,7 @@ class _Demand(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _State:
-    """The vehicle ``LAG_S`` from now, if the sticks change nothing before."""
+    """The vehicle one lag from now, if the sticks change nothing before."""
 
     position_m: Vec3
     velocity_mps: Vec3
@@ -157,23 +174,25 @@ class _State:
         velocity_mps: Vec3,
         ned_from_body: Quat,
         rate_body_radps: Vec3,
+        *,
+        lag_s: float,
     ) -> "_State":
         thrust = rotate(ned_from_body, (0.0, 0.0, -1.0))
         per_g = GRAVITY_MPS2 / max(0.5, -thrust[2])
         velocity_n, velocity_e, velocity_d = velocity_mps
         accel_n = thrust[0] * per_g - DRAG_PER_S * velocity_n
         accel_e = thrust[1] * per_g - DRAG_PER_S * velocity_e
-        half = LAG_S * LAG_S / 2
+        half = lag_s * lag_s / 2
         north_m, east_m, down_m = position_m
         _, _, yaw = to_euler(ned_from_body)
         return cls(
             position_m=(
-                north_m + velocity_n * LAG_S + accel_n * half,
-                east_m + velocity_e * LAG_S + accel_e * half,
-                down_m + velocity_d * LAG_S,
+                north_m + velocity_n * lag_s + accel_n * half,
+                east_m + velocity_e * lag_s + accel_e * half,
+                down_m + velocity_d * lag_s,
             ),
-            velocity_mps=(velocity_n + accel_n * LAG_S, velocity_e + accel_e * LAG_S, velocity_d),
-            yaw_rad=wrap_pi(yaw + rate_body_radps[2] * LAG_S),
+            velocity_mps=(velocity_n + accel_n * lag_s, velocity_e + accel_e * lag_s, velocity_d),
+            yaw_rad=wrap_pi(yaw + rate_body_radps[2] * lag_s),
         )
 
 
@@ -346,8 +365,11 @@ class _Response:
     def __init__(self, params: Params) -> None:
         self._lean_rad = math.radians(params["ANGLE_MAX"] / 100.0)
         self._yaw_radps = math.radians(params["PILOT_Y_RATE"])
+        self._yaw_expo = params["PILOT_Y_EXPO"]
         self._climb_mps = params["PILOT_SPEED_UP"] / 100.0
-        self._lean_dead = params["RC2_DZ"] / 500.0
+        self._descent_mps = params["PILOT_SPEED_DN"] / 100.0 or self._climb_mps
+        self._roll_dead = params["RC1_DZ"] / 500.0
+        self._pitch_dead = params["RC2_DZ"] / 500.0
         self._yaw_dead = params["RC4_DZ"] / 500.0
         half = (1000.0 - params["RC3_DZ"]) / 2.0
         self._throttle_dead = 2.0 * params["THR_DZ"] * (half / 500.0) / 1000.0
@@ -362,12 +384,19 @@ class _Response:
         right = (accel_e * cos_yaw - accel_n * sin_yaw) / GRAVITY_MPS2
         nose_down_rad = math.atan(forward)
         right_rad = math.atan(right * math.cos(nose_down_rad))
+        full_mps = self._climb_mps if wanted.climb_mps > 0.0 else self._descent_mps
+        turn = wanted.yaw_rate_radps / self._yaw_radps
         return Sticks4(
-            throttle=_past_dead_zone(wanted.climb_mps / self._climb_mps, self._throttle_dead),
-            yaw=_past_dead_zone(wanted.yaw_rate_radps / self._yaw_radps, self._yaw_dead),
-            pitch=_past_dead_zone(nose_down_rad / self._lean_rad, self._lean_dead),
-            roll=_past_dead_zone(right_rad / self._lean_rad, self._lean_dead),
+            throttle=_past_dead_zone(wanted.climb_mps / full_mps, self._throttle_dead),
+            yaw=_past_dead_zone(_without_expo(turn, self._yaw_expo), self._yaw_dead),
+            pitch=_past_dead_zone(nose_down_rad / self._lean_rad, self._pitch_dead),
+            roll=_past_dead_zone(right_rad / self._lean_rad, self._roll_dead),
         )
+
+
+def _without_expo(value: float, expo: float) -> float:
+    """The input that ArduPilot's ``input_expo`` makes this value of."""
+    return value / (1.0 - expo * (1.0 - abs(value)))
 
 
 def _past_dead_zone(value: float, dead: float) -> float:

@@ -34,7 +34,7 @@ class FlightControl:
 
     def __init__(self, params: Params) -> None:
         self._params = params
-        self._attitude = AttitudeController()
+        self._attitude = AttitudeController(params)
         self._height = HeightController()
         self._home_reached = False
         self.collective = 0.0

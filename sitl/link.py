@@ -35,7 +35,7 @@ class Link:
         """Begin again with a vehicle that has just booted; framing and sequence numbers go on."""
         self.reboot_requested = False
         self._ap = ap
-        self._streams = Streams(BUILDERS, ap.now_ns)
+        self._streams = Streams(BUILDERS, ap.now_ns, ap.config.conditions)
         self._param_queue: list[int] = []
         self._param_due_ns = ap.now_ns
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS

@@ -84,7 +84,7 @@ def lean_angles(sticks: Sticks, params: Params) -> tuple[float, float]:
 
 def yaw_rate_radps(sticks: Sticks, params: Params) -> float:
     """Yaw rate of the angle modes."""
-    return sticks.yaw * math.radians(params["PILOT_Y_RATE"])
+    return math.radians(params["PILOT_Y_RATE"]) * _expo(sticks.yaw, params["PILOT_Y_EXPO"])
 
 
 def acro_rates_radps(sticks: Sticks, params: Params) -> tuple[float, float, float]:

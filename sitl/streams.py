@@ -3,9 +3,11 @@
 from collections.abc import Collection
 from dataclasses import dataclass
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
+from sitl.conditions import NOMINAL, Conditions
 
 HEARTBEAT_INTERVAL_MS = 1000
 MAX_INTERVAL_US = 60_000_000
@@ -44,13 +46,26 @@ STREAM_GROUPS: dict[int, tuple[int, ...]] = {
 class _Stream:
     interval_ms: int
     due_ns: int
+    """On the stream's own grid."""
+    late_ns: int = 0
+    """By how much the next one is sent later than that."""
 
 
 class Streams:
-    """The message intervals of one link; stamps are the vehicle's clock, intervals whole ms."""
+    """The message intervals of one link; stamps are the vehicle's clock, intervals whole ms.
 
-    def __init__(self, known: Collection[int], now_ns: int) -> None:
+    What the conditions add to them (a slow link, jitter, phases) is not in what MESSAGE_INTERVAL
+    reports, as on the firmware.
+    """
+
+    def __init__(
+        self, known: Collection[int], now_ns: int, conditions: Conditions = NOMINAL
+    ) -> None:
         self._known = known
+        self._slowdown_ms = conditions.stream_slowdown_ms
+        self._jitter_ns = conditions.stream_jitter_ms * NS_PER_MS
+        self._phase_spread = conditions.stream_phase_spread
+        self._random = np.random.Generator(np.random.PCG64((conditions.seed, 5)))
         self._streams: dict[int, _Stream] = {}
         self._start(mav.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_INTERVAL_MS, now_ns)
 
@@ -86,12 +101,19 @@ class Streams:
 
     def due(self, now_ns: int, slowdown: int) -> list[int]:
         """Ids to send now. Slots that were missed are dropped: a late message is sent once."""
-        ready = [key for key, stream in self._streams.items() if now_ns >= stream.due_ns]
+        ready = [
+            key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
+        ]
         for message_id in ready:
             stream = self._streams[message_id]
-            period_ns = stream.interval_ms * NS_PER_MS * slowdown
+            period_ns = (stream.interval_ms + self._slowdown_ms) * NS_PER_MS * slowdown
             stream.due_ns += period_ns * ((now_ns - stream.due_ns) // period_ns + 1)
+            stream.late_ns = self._below(self._jitter_ns)
         return ready
+
+    def _below(self, most_ns: float) -> int:
+        """From 0 to ``most_ns``, at random."""
+        return int(self._random.uniform(0.0, most_ns)) if most_ns else 0
 
     @staticmethod
     def _rounded_ms(message_id: int, interval_us: int) -> int:
@@ -105,7 +127,8 @@ class Streams:
         self._streams.pop(message_id, None)
         if interval_ms > 0:
             interval_ms = self._bucket(interval_ms)
-            due_ns = now_ns + interval_ms * NS_PER_MS
+            period_ns = (interval_ms + self._slowdown_ms) * NS_PER_MS
+            due_ns = now_ns + period_ns - self._below(self._phase_spread * period_ns)
             self._streams[message_id] = _Stream(interval_ms=interval_ms, due_ns=due_ns)
 
     def _bucket(self, interval_ms: int) -> int:

@@ -33,7 +33,7 @@ class Vehicle:
         course: Course | None = None,
     ) -> None:
         self._config = config or VehicleConfig()
-        self.params = Params()
+        self.params = Params(self._config.conditions)
         self.log = FlightLog(boot_ns, course)
         self.ap = Autopilot(self.params, self._config, boot_ns)
         self.server = MavlinkServer(self.ap, links, self.log)

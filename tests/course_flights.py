@@ -84,7 +84,8 @@ def fly_course(
         assert vehicle.ap.arm(force=False), vehicle.ap.texts
     else:
         vehicle.launch(start)
-    expert = Expert(course, speed_mps, next_gate=start.next_gate if start else 0)
+    next_gate = start.next_gate if start else 0
+    expert = Expert(course, speed_mps, next_gate=next_gate, params=vehicle.params)
     ticks: list[Tick] = []
     over_ns = None
     begin_ns = now_ns = vehicle.ap.now_ns

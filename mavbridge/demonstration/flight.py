@@ -12,19 +12,16 @@ from mavbridge.clock import NS_PER_MS, NS_PER_S
 from mavbridge.config import Limits, Rates
 from mavbridge.lockstep.delays import Delays, Fixed, LogNormal
 from mavbridge.lockstep.episode import Episode, Setup
-from mavbridge.lockstep.world import QUICK_BOOT, Exposure, Scene
+from mavbridge.lockstep.world import Exposure, varied_scene
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.rows import FrameTruth, TickLabels
 from mavbridge.records import Event, Sticks, Tick
 from policy.contract import Contract, Executable, FloatArray
-from sitl.camera import FpvRenderer
 from sitl.conditions import NOMINAL, Conditions, random_conditions
-from sitl.course import make_course
 from sitl.disturbance import StickDisturbance, random_start
 from sitl.expert import Expert, Sticks4
 from sitl.truth import gate_truth
-from sitl.vehicle import Vehicle
 
 MAX_TIME_S = 40.0
 NOMINAL_SHARE = 0.25
@@ -118,7 +115,7 @@ def demonstrate_once(
         course_seed=seed,
         seed=seed,
         setup=Setup(rates=Rates(), limits=Limits(), delays=drawn.delays),
-        build_scene=lambda **given: _scene(drawn, **given),
+        build_scene=varied_scene(drawn.conditions),
     )
     pilot = _Pilot(episode, drawn, speed_mps=speed_mps, contract=contract, student=student)
     writer = FlightWriter(
@@ -139,16 +136,6 @@ def demonstrate_once(
         replace(writer.meta, autopilot="sitl", success=success, gates_passed=result.gates_passed)
     )
     return Outcome(success=success, gates_passed=result.gates_passed, ticks=writer.ticks)
-
-
-def _scene(drawn: Draw, *, course_seed: int, seed: int, boot_ns: int) -> Scene:
-    course = make_course(course_seed)
-    config = replace(QUICK_BOOT, conditions=drawn.conditions)
-    return Scene(
-        vehicle=Vehicle(links=1, boot_ns=boot_ns, config=config, course=course),
-        course=course,
-        make_renderer=lambda width, height: FpvRenderer(course, width, height, drawn.conditions),
-    )
 
 
 def _meta(
@@ -227,13 +214,16 @@ class _Pilot:
 
     def _begin(self, now_ns: int) -> Expert:
         """At the first action, so that the sticks are ours when the vehicle is in the air."""
+        params = self._episode.vehicle.params
         if not self._drawn.starts_airborne:
             self.records_from_ns = now_ns
-            return Expert(self._episode.course, self._speed_mps)
+            return Expert(self._episode.course, self._speed_mps, params=params)
         start = random_start(self._episode.course, self._drawn.seed, speed_mps=self._speed_mps)
         self._episode.vehicle.launch(start)
         self.records_from_ns = now_ns + SETTLE_NS
-        return Expert(self._episode.course, self._speed_mps, next_gate=start.next_gate)
+        return Expert(
+            self._episode.course, self._speed_mps, next_gate=start.next_gate, params=params
+        )
 
     def _expert_chunk(self, *_: object) -> FloatArray:
         if self.opinion is None:

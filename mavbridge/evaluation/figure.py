@@ -41,7 +41,7 @@ def draw(evaluation: Evaluation, path: Path) -> None:
         _draw_outcomes(axes[1], evaluation)
         _draw_style(axes[2], evaluation)
         figure.suptitle(
-            f"{evaluation.policy} ({evaluation.engine}), {evaluation.mode}, "
+            f"{evaluation.policy} ({evaluation.engine}), {evaluation.setting}, "
             f"{len(evaluation.episodes)} held-out courses",
             x=0.012,
             ha="left",

@@ -1,11 +1,11 @@
 """One episode of an evaluation as a value, and the flying of it, by whichever worker."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from mavbridge.assembly import load_configured_policy
-from mavbridge.clock import Clock, MonotonicClock
+from mavbridge.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.config import (
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
@@ -13,9 +13,12 @@ from mavbridge.config import (
     Limits,
     PolicyConfig,
     Rates,
+    Variety,
 )
+from mavbridge.lockstep.delays import Delays, Longer
 from mavbridge.lockstep.episode import Episode, Setup
 from mavbridge.lockstep.result import EpisodeResult
+from mavbridge.lockstep.world import nominal_scene, random_scene
 from policy.contract import Executable
 from policy.loading import LoadedPolicy
 
@@ -34,6 +37,13 @@ class Job:
     rates: Rates
     limits: Limits
     max_time_s: float
+    conditions: Variety
+    vision_delay_ns: int
+
+    @property
+    def conditions_seed(self) -> int | None:
+        """None = the nominal vehicle. The course's: no demonstration had these conditions."""
+        return self.course_seed if self.conditions == "random" else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +67,8 @@ def make_jobs(config: EvaluateConfig) -> tuple[Job, ...]:
             rates=config.rates,
             limits=config.limits,
             max_time_s=config.max_time,
+            conditions=config.conditions,
+            vision_delay_ns=round(config.vision_delay * NS_PER_MS),
         )
         for index in range(config.episodes)
     )
@@ -91,8 +103,14 @@ def fly_job(job: Job, should_stop: Callable[[], bool] | None = None) -> Flown:
         MavbridgeError, PolicyError: it cannot be flown.
     """
     is_scripted = job.policy.policy.partition(":")[0] == SCRIPTED
-    setup = Setup(rates=job.rates, limits=job.limits, draw_images=not is_scripted)
-    episode = Episode(course_seed=job.course_seed, seed=job.seed, setup=setup)
+    seed, delays = job.conditions_seed, Delays()
+    delays = replace(delays, vision=Longer(than=delays.vision, by_ns=job.vision_delay_ns))
+    episode = Episode(
+        course_seed=job.course_seed,
+        seed=job.seed,
+        setup=Setup(rates=job.rates, limits=job.limits, delays=delays, draw_images=not is_scripted),
+        build_scene=nominal_scene if seed is None else random_scene(seed),
+    )
     executable: Executable = load(job.policy, episode.clock).executable
     result = episode.fly(executable, max_time_s=job.max_time_s, should_stop=should_stop)
     return Flown(index=job.index, engine=executable.engine, result=result)

@@ -76,6 +76,7 @@ def _fly(job: Job, folder: Path, should_stop: Callable[[], bool]) -> Flown | Non
         *("--connect", f"udpout:127.0.0.1:{port}", "--report", str(report)),
         *("--course", str(job.course_seed)),
         *("--image-size", str(job.policy.image_size or _IMAGE_SIZE)),
+        *(() if job.conditions_seed is None else ("--conditions", str(job.conditions_seed))),
     )
     with running(*command, log=log) as vehicle:
         try:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
+from mavbridge.config import Variety
 from mavbridge.evaluation.statistics import Estimate, mean, rate
 from mavbridge.lockstep.result import EpisodeResult, Outcome
 
@@ -53,10 +54,24 @@ class Evaluation:
     engine: str
     mode: str
     """"lockstep" or "realtime"."""
+    conditions: Variety
+    """random: those that ``python -m sitl --conditions`` draws from each episode's course seed."""
+    vision_delay_ms: float
+    """Added to the encoding of each image."""
     seed: int
     asked_episodes: int
     episodes: tuple[EpisodeResult, ...]
     """In the order of their seeds; fewer than asked for if the run was interrupted."""
+
+    @property
+    def setting(self) -> str:
+        """How it was flown, in a few words."""
+        parts = [self.mode]
+        if self.conditions != "nominal":
+            parts.append(f"{self.conditions} conditions")
+        if self.vision_delay_ms:
+            parts.append(f"images {self.vision_delay_ms:g} ms later")
+        return ", ".join(parts)
 
 
 def to_json(evaluation: Evaluation) -> str:

@@ -73,6 +73,8 @@ def _fly(config: EvaluateConfig, console: Console, should_stop: Callable[[], boo
         policy=config.policy.policy,
         engine=flown[0].engine if flown else "",
         mode="realtime" if config.realtime else "lockstep",
+        conditions=config.conditions,
+        vision_delay_ms=config.vision_delay,
         seed=config.policy.seed,
         asked_episodes=config.episodes,
         episodes=tuple(one.result for one in flown),

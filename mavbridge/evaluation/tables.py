@@ -20,7 +20,7 @@ def summary_table(evaluation: Evaluation) -> Table:
     """A row for each figure, with its 95 % interval."""
     summary = summarise(evaluation.episodes)
     gates = evaluation.episodes[0].gates_total
-    table = Table(title=f"{evaluation.policy} ({evaluation.engine}), {evaluation.mode}")
+    table = Table(title=f"{evaluation.policy} ({evaluation.engine}), {evaluation.setting}")
     for heading in ("", "mean", "95 % interval", "flights"):
         table.add_column(heading, justify="left" if heading == "" else "right")
     table.add_row("success rate", *_cells(summary.success_rate, "{:.1%}"))

@@ -78,6 +78,23 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Longer:
+    """Another distribution, and a fixed time on top."""
+
+    than: Delay
+    by_ns: int
+
+    def __post_init__(self) -> None:
+        """Refuse to go back in time."""
+        if self.by_ns < 0:
+            raise UserError(f"a delay cannot get shorter, got {self.by_ns} ns")
+
+    def sample_ns(self, random: np.random.Generator, count: int) -> list[int]:
+        """The other's draws, each longer."""
+        return [ns + self.by_ns for ns in self.than.sample_ns(random, count)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Delays:
     """Of one episode; by default what a flight with TOGE small takes on two shared cores."""
 

@@ -2,8 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +12,7 @@ from mavbridge.lockstep.wire import Path
 from mavbridge.records import Frame, ImageArray
 from sitl.autopilot import STEP_NS, VehicleConfig
 from sitl.camera import FpvRenderer
+from sitl.conditions import NOMINAL, Conditions, random_conditions
 from sitl.course import Course, make_course
 from sitl.dynamics import BodyState
 from sitl.rotation import Quat, Vec3
@@ -60,18 +60,32 @@ class BuildScene(Protocol):
         ...
 
 
-def nominal_scene(*, course_seed: int, seed: int, boot_ns: int) -> Scene:
-    """The vehicle and the view as ``python -m sitl`` has them; nothing is random.
+def varied_scene(conditions: Conditions) -> BuildScene:
+    """The vehicle and the view as ``python -m sitl`` has them under these conditions."""
+
+    def build(*, course_seed: int, seed: int, boot_ns: int) -> Scene:
+        course = make_course(course_seed)
+        config = replace(QUICK_BOOT, conditions=conditions)
+        return Scene(
+            vehicle=Vehicle(links=1, boot_ns=boot_ns, config=config, course=course),
+            course=course,
+            make_renderer=lambda width, height: FpvRenderer(course, width, height, conditions),
+        )
+
+    return build
+
+
+def random_scene(conditions_seed: int) -> BuildScene:
+    """As ``python -m sitl --conditions SEED``.
 
     Raises:
-        UsageError: the course seed is negative.
+        UsageError: the seed is negative.
     """
-    course = make_course(course_seed)
-    return Scene(
-        vehicle=Vehicle(links=1, boot_ns=boot_ns, config=QUICK_BOOT, course=course),
-        course=course,
-        make_renderer=partial(FpvRenderer, course),
-    )
+    return varied_scene(random_conditions(conditions_seed))
+
+
+nominal_scene = varied_scene(NOMINAL)
+"""Nothing is random."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -40,7 +40,9 @@ def test_a_killed_worker_costs_a_retry_and_changes_no_result(tmp_path: Path) -> 
 
 def test_an_episode_flies_in_real_time() -> None:
     (job,) = make_jobs(
-        EvaluateConfig(policy=CONFIG.policy, episodes=1, max_time=2.0, realtime=True)
+        EvaluateConfig(
+            policy=CONFIG.policy, episodes=1, max_time=2.0, realtime=True, conditions="random"
+        )
     )
     (flown,) = fly_realtime([job], should_stop=lambda: False)
     assert flown.engine == "numpy"

@@ -18,6 +18,8 @@ def evaluation(*episodes: EpisodeResult) -> Evaluation:
         policy="toge",
         engine="openvino",
         mode="lockstep",
+        conditions="random",
+        vision_delay_ms=50.0,
         seed=0,
         asked_episodes=5,
         episodes=episodes,
@@ -50,6 +52,7 @@ def test_json_holds_the_summary_and_every_episode() -> None:
     assert document["summary"]["success_rate"]["value"] == 0.5
     assert document["summary"]["outcomes"] == {"finished": 1, "crashed": 1}
     assert document["asked_episodes"] == 5
+    assert (document["conditions"], document["vision_delay_ms"]) == ("random", 50.0)
     assert [episode["outcome"] for episode in document["episodes"]] == ["finished", "crashed"]
     assert document["episodes"][0]["gate_times_s"] == [4.0, 9.0]
 
@@ -68,6 +71,7 @@ def test_the_table_shows_rate_interval_and_ends() -> None:
     assert "50.0%" in text
     assert "9.5% to 90.5%" in text  # Wilson's of 1 in 2
     assert "2 flights: 1 finished, 1 crashed" in text
+    assert "lockstep, random conditions, images 50 ms later" in text
 
 
 def test_the_picture_is_drawn(tmp_path: Path) -> None:

@@ -7,19 +7,23 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mavbridge.__main__ import main
+from mavbridge.clock import NS_PER_MS
 from mavbridge.config import (
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
     EvaluateConfig,
     PolicyConfig,
+    Variety,
 )
 from mavbridge.errors import UserError
 from mavbridge.evaluation import jobs, run
 from mavbridge.evaluation.jobs import fly_job, is_stateless, make_jobs
 from mavbridge.evaluation.run import INTERRUPTED, evaluate
+from mavbridge.lockstep.episode import Episode, Setup
 
 CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)
 
@@ -62,6 +66,47 @@ def test_two_runs_write_the_same_file(tmp_path: Path) -> None:
     assert document["summary"]["outcomes"] == {"timed out": 2}
 
 
+def test_varied_vehicles_fly_the_same_twice_and_not_as_the_nominal_one(tmp_path: Path) -> None:
+    def episodes(name: str, conditions: Variety) -> list[dict[str, Any]]:
+        path = tmp_path / name
+        config = EvaluateConfig(
+            policy=CIRCLE, episodes=2, max_time=1.5, conditions=conditions, json=path
+        )
+        assert evaluate(config) == 0
+        document = json.loads(path.read_text())
+        assert document["conditions"] == conditions
+        flown: list[dict[str, Any]] = document["episodes"]
+        return flown
+
+    first = episodes("first.json", "random")
+    assert episodes("second.json", "random") == first
+    nominal = episodes("nominal.json", "nominal")
+    assert all(a["distance_m"] != b["distance_m"] for a, b in zip(first, nominal, strict=True))
+
+
+def test_random_conditions_are_held_out_like_the_courses() -> None:
+    for conditions, held_out in (("random", [1_000_000, 1_000_001]), ("nominal", [None, None])):
+        config = EvaluateConfig(policy=CIRCLE, episodes=2, conditions=conditions)
+        assert [job.conditions_seed for job in make_jobs(config)] == held_out
+
+
+def test_each_image_takes_longer_by_the_vision_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Setup] = []
+
+    class Spy(Episode):
+        def __init__(self, *, setup: Setup, **given: Any) -> None:
+            asked.append(setup)
+            super().__init__(setup=setup, **given)
+
+    monkeypatch.setattr(jobs, "Episode", Spy)
+    for vision_delay in (0.0, 75.0):
+        config = EvaluateConfig(policy=CIRCLE, episodes=1, max_time=1.0, vision_delay=vision_delay)
+        fly_job(make_jobs(config)[0])
+    plain, slow = (setup.delays.vision.sample_ns(np.random.default_rng(1), 50) for setup in asked)
+    assert plain == Setup().delays.vision.sample_ns(np.random.default_rng(1), 50)
+    assert {b - a for a, b in zip(plain, slow, strict=True)} == {75 * NS_PER_MS}
+
+
 def test_ctrl_c_ends_with_the_results_so_far(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -85,6 +130,9 @@ def test_ctrl_c_ends_with_the_results_so_far(
         (["--workers", "0"], "--workers must be between"),
         (["--max-time", "0"], "--max-time must be between"),
         (["--realtime", "--workers", "2"], "--realtime flies one episode at a time"),
+        (["--realtime", "--vision-delay", "50"], "--vision-delay is for --lockstep"),
+        (["--vision-delay", "-1"], "--vision-delay must be between 0 and 5000 ms"),
+        (["--conditions", "stormy"], "--conditions"),
         (["--action-rate", "0"], "between 10 and 500 Hz"),
         (["--policy", "toge"], "--allow-untrained"),
         (["--policy", "scripted", "--json", "/proc/none/out.json"], "cannot write"),
@@ -106,7 +154,7 @@ def test_help_tells_both_ways_of_flying(capsys: pytest.CaptureFixture[str]) -> N
     status, text = told(capsys, "--help")
     assert status == 0
     flags = """--realtime --lockstep --episodes --workers --ray --json --plot --seed --policy
-        --checkpoint --engine --head-steps --dual-rate --max-time"""
+        --conditions --vision-delay --checkpoint --engine --head-steps --dual-rate --max-time"""
     assert [flag for flag in flags.split() if flag not in text] == []
 
 

@@ -1,0 +1,245 @@
+"""Vehicles that are set up differently: they say so, and they fly so."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from course_flights import fly_course, pwm_us
+from sitl.autopilot import STEP_NS, VehicleConfig
+from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.conditions import NOMINAL, random_conditions
+from sitl.course import Start, make_course
+from sitl.expert import Expert, Sticks4
+from sitl.params import Params
+from sitl.rotation import IDENTITY, to_euler
+from sitl.streams import Streams
+from sitl.vehicle import Vehicle
+
+ALOFT = Start(
+    position_ned_m=(0.0, 0.0, -30.0),
+    velocity_ned_mps=(0.0, 0.0, 0.0),
+    ned_from_body_wxyz=IDENTITY,
+    next_gate=0,
+)
+CENTRED = Sticks4(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
+ATTITUDE = mav.MAVLINK_MSG_ID_ATTITUDE
+
+
+def hold(sticks, seconds=2.0, **conditions):
+    """The vehicle after it has been flown with these sticks since it hung in the air."""
+    config = VehicleConfig(conditions=replace(NOMINAL, **conditions))
+    vehicle = Vehicle(links=1, boot_ns=0, config=config)
+    vehicle.launch(ALOFT)
+    for now_ns in range(STEP_NS, round(seconds * NS_PER_S), STEP_NS):
+        vehicle.ap.rc.override(pwm_us(sticks), now_ns)
+        vehicle.step(now_ns)
+    return vehicle.ap.truth
+
+
+def roll_deg(body):
+    return math.degrees(to_euler(body.ned_from_body_wxyz)[0])
+
+
+def told(vehicle, name):
+    """PARAM_REQUEST_READ over the wire."""
+    station = mav.MAVLink(None, srcSystem=255, srcComponent=190)
+    request = mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1)
+    vehicle.receive(0, request.pack(station), vehicle.ap.now_ns)
+    (answer,) = (
+        message
+        for message in mav.MAVLink(None).parse_buffer(vehicle.take_outgoing(0))
+        if message.get_type() == "PARAM_VALUE"
+    )
+    assert answer.param_id == name
+    return answer.param_value
+
+
+def test_the_vehicle_tells_what_its_conditions_are():
+    drawn = random_conditions(8)
+    vehicle = Vehicle(links=1, boot_ns=0, config=VehicleConfig(conditions=drawn))
+    wanted = {
+        "ANGLE_MAX": drawn.angle_max_cdeg,
+        "PILOT_Y_RATE": drawn.pilot_yaw_rate_degps,
+        "PILOT_Y_EXPO": drawn.pilot_yaw_expo,
+        "PILOT_SPEED_UP": drawn.pilot_speed_up_cmps,
+        "PILOT_SPEED_DN": drawn.pilot_speed_down_cmps,
+        "PILOT_ACCEL_Z": drawn.pilot_accel_z_cmps2,
+        "THR_DZ": drawn.throttle_dead_zone_permille,
+        "RC1_DZ": drawn.rc_dead_zones_us[0],
+        "RC3_DZ": drawn.rc_dead_zones_us[2],
+        "ATC_INPUT_TC": drawn.input_time_s,
+        "ATC_ANG_PIT_P": drawn.angle_gains_per_s[1],
+        "ATC_RATE_R_MAX": drawn.lean_rate_max_degps,
+        "ATC_ACCEL_P_MAX": drawn.lean_accel_max_cdegps2,
+    }
+    assert {name: told(vehicle, name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
+    nominal = Params()
+    assert not [name for name, value in wanted.items() if value == nominal[name]]
+
+
+def test_what_is_drawn_is_usual():
+    for seed in range(50):
+        params = Params(random_conditions(seed))
+        assert 3000 <= params["ANGLE_MAX"] <= 4500
+        assert all(0 <= params[f"RC{n}_DZ"] <= 30 for n in (1, 2, 3, 4))
+        assert 145 <= params["PILOT_Y_RATE"] <= 284
+        assert all(178 <= params[name] <= 350 for name in ("PILOT_SPEED_UP", "PILOT_SPEED_DN"))
+        integers = ("ANGLE_MAX", "PILOT_SPEED_UP", "PILOT_ACCEL_Z", "RC2_DZ", "THR_DZ")
+        assert all(params[name] == int(params[name]) for name in integers)
+
+
+def test_strength_scales_the_firmware():
+    weak, strong = (random_conditions(3, strength) for strength in (0.1, 1.0))
+    assert 3000 < weak.angle_max_cdeg < strong.angle_max_cdeg
+    assert abs(weak.input_time_s - 0.15) < abs(strong.input_time_s - 0.15)
+
+
+@pytest.mark.parametrize("angle_max_cdeg", [3000, 4500])
+def test_the_lean_of_a_stick_is_its_share_of_angle_max(angle_max_cdeg):
+    body = hold(
+        CENTRED._replace(roll=0.4), angle_max_cdeg=angle_max_cdeg, rc_dead_zones_us=(0,) * 4
+    )
+    assert roll_deg(body) == pytest.approx(0.4 * angle_max_cdeg / 100, rel=0.02)
+
+
+@pytest.mark.parametrize(("dead_zone_us", "is_dead"), [(15.0, False), (25.0, True)])
+def test_a_dead_zone_is_dead(dead_zone_us, is_dead):
+    body = hold(CENTRED._replace(roll=0.04), rc_dead_zones_us=(dead_zone_us, 0.0, 0.0, 0.0))
+    assert (abs(roll_deg(body)) < 0.01) is is_dead
+
+
+def test_the_throttle_s_dead_zone_too():
+    nudged = CENTRED._replace(throttle=0.3)
+    assert hold(nudged).velocity_ned_mps[2] < -0.1
+    assert abs(hold(nudged, throttle_dead_zone_permille=180.0).velocity_ned_mps[2]) < 0.02
+
+
+@pytest.mark.parametrize(("stick", "speed_mps"), [(1.0, -3.2), (-1.0, 1.8)])
+def test_full_throttle_climbs_and_descends_at_the_speeds_set(stick, speed_mps):
+    body = hold(
+        CENTRED._replace(throttle=stick),
+        seconds=4.0,
+        pilot_speed_up_cmps=320.0,
+        pilot_speed_down_cmps=180.0,
+    )
+    assert body.velocity_ned_mps[2] == pytest.approx(speed_mps, rel=0.05)
+
+
+def test_a_slower_climb_acceleration_climbs_later():
+    up = CENTRED._replace(throttle=1.0)
+    slow, fast = (
+        -hold(up, 0.8, pilot_accel_z_cmps2=accel).velocity_ned_mps[2] for accel in (150.0, 350.0)
+    )
+    assert 0.3 < slow < 0.7 * fast
+
+
+def test_the_yaw_stick_has_its_rate_and_its_expo():
+    full, half = CENTRED._replace(yaw=1.0), CENTRED._replace(yaw=0.51)
+    settings = {"pilot_yaw_rate_degps": 150.0, "rc_dead_zones_us": (0.0, 0.0, 0.0, 10.0)}
+    rates_degps = [
+        math.degrees(hold(sticks, pilot_yaw_expo=expo, **settings).rate_body_radps[2])
+        for sticks, expo in ((full, 0.3), (half, 0.0), (half, 0.3))
+    ]
+    # input_expo(0.5, 0.3) = 0.7 * 0.5 / (1 - 0.3 * 0.5)
+    assert rates_degps == pytest.approx([150.0, 75.0, 150.0 * 0.35 / 0.85], rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "slower",
+    [{"input_time_s": 0.3}, {"lean_rate_max_degps": 40.0}, {"lean_accel_max_cdegps2": 30_000.0}],
+)
+def test_a_softer_attitude_response_leans_later(slower):
+    right = CENTRED._replace(roll=1.0)
+    assert roll_deg(hold(right, 0.25, **slower)) < 0.8 * roll_deg(hold(right, 0.25))
+    assert roll_deg(hold(right, 2.0, **slower)) == pytest.approx(30.0, abs=1.5)
+
+
+def test_no_limit_is_none():
+    """0, the firmware's default of ATC_RATE_R_MAX."""
+    body = hold(CENTRED._replace(roll=1.0), lean_rate_max_degps=0.0, lean_accel_max_cdegps2=0.0)
+    assert roll_deg(body) == pytest.approx(30.0, abs=0.5)
+
+
+@pytest.mark.parametrize("gain", [1 / 1.35, 1.35])
+def test_every_angle_gain_that_is_drawn_is_stable(gain):
+    settings = {"angle_gains_per_s": (6.0 * gain, 6.0 * gain, 3.0 * gain), "input_time_s": 0.094}
+    leans_deg = [
+        roll_deg(hold(CENTRED._replace(roll=0.8), t_s, **settings)) for t_s in (0.6, 1.0, 1.4)
+    ]
+    assert leans_deg == pytest.approx([leans_deg[-1]] * 3, abs=2.0)
+
+
+def sent_ms(seed=0, seconds=4, interval_us=10_000, **conditions):
+    streams = Streams([ATTITUDE], 0, replace(NOMINAL, seed=seed, **conditions))
+    assert streams.set_interval(ATTITUDE, interval_us, loop_hz=400.0, now_ns=0) is None
+    stamps = range(STEP_NS, seconds * NS_PER_S, STEP_NS)
+    return [now / NS_PER_MS for now in stamps if ATTITUDE in streams.due(now, 1)]
+
+
+def test_a_slow_link_adds_to_every_interval_and_does_not_say_so():
+    sent = sent_ms(stream_slowdown_ms=15)
+    assert set(np.diff(sent)) == {25.0}
+    streams = Streams([ATTITUDE], 0, replace(NOMINAL, stream_slowdown_ms=15))
+    streams.set_interval(ATTITUDE, 10_000, loop_hz=400.0, now_ns=0)
+    assert streams.interval_us(ATTITUDE) == 10_000
+
+
+def test_jitter_delays_messages_and_loses_none():
+    sent = np.array(sent_ms(stream_jitter_ms=5.0))
+    late_ms = sent - 10.0 * np.arange(1, len(sent) + 1)
+    assert len(sent) == pytest.approx(399, abs=1)
+    assert set(late_ms) == {0.0, 2.5, 5.0}
+
+
+def test_phases_differ_from_vehicle_to_vehicle_and_follow_from_the_seed():
+    firsts = [sent_ms(seed, interval_us=40_000, stream_phase_spread=1.0)[0] for seed in range(9)]
+    assert len(set(firsts)) > 4
+    assert 0.0 < min(firsts) <= max(firsts) <= 40.0
+    assert sent_ms(3, stream_phase_spread=1.0) == sent_ms(3, stream_phase_spread=1.0)
+
+
+def test_the_nominal_stream_is_on_the_grid():
+    assert sent_ms() == [10.0 * k for k in range(1, 400)]
+
+
+def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_differently():
+    """A turn in flight: the same lean and turn are asked for with other sticks."""
+    course = make_course(3)
+    gate = course.gates[2]
+    position = tuple(part - 3.0 for part in gate.center_ned_m[:2])
+    pose = ((*position, -1.0), (2.0, -1.0, 0.0), IDENTITY, (0.0, 0.0, 0.0), 0.0)
+    nominal = replace(NOMINAL, rc_dead_zones_us=(0.0,) * 4, throttle_dead_zone_permille=0.0)
+    other = replace(
+        nominal,
+        angle_max_cdeg=4500,
+        pilot_yaw_rate_degps=405.0,
+        pilot_speed_up_cmps=500,
+        pilot_speed_down_cmps=500,
+    )
+    first, second = (
+        Expert(course, 5.0, next_gate=2, params=Params(conditions)).sticks(*pose)
+        for conditions in (nominal, other)
+    )
+    assert min(map(abs, first)) > 0.02
+    assert max(map(abs, first)) < 1.0
+    ratios = [b / a for a, b in zip(first, second, strict=True)]
+    assert ratios == pytest.approx([0.5, 0.5, 2 / 3, 2 / 3])
+
+
+def test_it_flies_the_most_different_vehicle():
+    conditions = replace(
+        random_conditions(1),
+        angle_max_cdeg=4500,
+        pilot_yaw_rate_degps=145.0,
+        pilot_yaw_expo=0.3,
+        pilot_speed_up_cmps=180,
+        pilot_speed_down_cmps=350,
+        pilot_accel_z_cmps2=180,
+        rc_dead_zones_us=(30.0,) * 4,
+        input_time_s=0.24,
+        angle_gains_per_s=(4.5, 4.5, 2.3),
+    )
+    assert fly_course(make_course(5), 5.0, conditions=conditions).succeeded
