@@ -3,9 +3,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from policy.contract import Contract, Executable, FloatArray
+from policy.contract import QUATERNION, Contract, Executable, FloatArray
 from policy.toge import Toge, TogeConfig
 
 
@@ -42,9 +43,11 @@ def trained_toge() -> Toge:
 
 def _denoising_loss(policy: Toge, batch: int) -> Tensor:
     state, feature = torch.randn(batch, 13), torch.randn(batch, policy.contract.feature_dim)
+    state[:, QUATERNION] = F.normalize(state[:, QUATERNION], dim=1)
     history = torch.rand(batch, 4, 4) * 2 - 1
     ahead_s = torch.arange(16) * policy.contract.chunk_dt_s
-    chunk = 0.8 * torch.tanh(0.5 * state[:, :4, None] + 0.7 * state[:, 7:11, None] * ahead_s)
+    seen = policy.state_encoder.normalise(state)[:, :4, None]  # the same on every heading
+    chunk = 0.8 * torch.tanh(2.5 * seen + 0.7 * state[:, 7:11, None] * ahead_s)
     chunk = chunk.transpose(1, 2)
     timestep = torch.randint(0, 100, (batch,))
     noisy = policy.head.schedule.add_noise(chunk, torch.randn(chunk.shape), timestep)
