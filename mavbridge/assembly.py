@@ -2,10 +2,11 @@
 
 import sys
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 from mavbridge.action_loop import ActionLoop, ActionSettings
-from mavbridge.clock import NS_PER_S, Clock, GridPacer, Pacer
+from mavbridge.clock import NS_PER_S, Clock, GridPacer, MonotonicClock, Pacer
 from mavbridge.config import FlyConfig, Limits, PolicyConfig, Rates, period_ns
 from mavbridge.feature_cache import FeatureCache
 from mavbridge.ports import Camera, Link, TickSink
@@ -16,6 +17,8 @@ from mavbridge.state_pacer import StatePacer
 from mavbridge.vision_loop import VisionLoop
 from policy.contract import Executable
 from policy.loading import LoadedPolicy, load_policy
+
+BUILT_IN = ("toge", "resnet-unet")
 
 
 def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
@@ -42,6 +45,27 @@ def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
         seed=wanted.seed,
         now_s=lambda: clock.now_ns() / NS_PER_S,
     )
+
+
+def is_stateless(policy: PolicyConfig) -> bool:
+    """A built-in net, which starts afresh with each flight; anything else may remember the last."""
+    return policy.policy.partition(":")[0] in BUILT_IN
+
+
+@lru_cache(maxsize=1)
+def _loaded_once(policy: PolicyConfig) -> LoadedPolicy:
+    return load_configured_policy(policy, MonotonicClock())
+
+
+def load_for_episodes(policy: PolicyConfig, clock: Clock) -> LoadedPolicy:
+    """A policy that knows nothing of earlier flights; nets are loaded once in a process.
+
+    Raises:
+        PolicyError: it cannot be loaded.
+    """
+    if is_stateless(policy):
+        return _loaded_once(policy)
+    return load_configured_policy(policy, clock)
 
 
 def action_rate_hz(rates: Rates, *, is_dual: bool) -> float:

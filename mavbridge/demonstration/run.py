@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from mavbridge.assembly import load_configured_policy
+from mavbridge.assembly import load_for_episodes
 from mavbridge.clock import MonotonicClock
 from mavbridge.config import DemonstrateConfig
 from mavbridge.demonstration.flight import Outcome, demonstrate_once
@@ -126,7 +126,7 @@ def _fly_job(job: _Job) -> Outcome:
     student = None
     contract = Contract(feature_dim=1, arrays="numpy")
     if config.policy.checkpoint is not None:
-        student = load_configured_policy(
+        student = load_for_episodes(
             replace(config.policy, dual_rate=True), MonotonicClock()
         ).executable
         contract = student.contract

@@ -2,10 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
-from mavbridge.assembly import load_configured_policy
-from mavbridge.clock import NS_PER_MS, Clock, MonotonicClock
+from mavbridge.assembly import load_for_episodes
+from mavbridge.clock import NS_PER_MS
 from mavbridge.config import (
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
@@ -20,9 +19,7 @@ from mavbridge.lockstep.episode import Episode, Setup
 from mavbridge.lockstep.result import EpisodeResult
 from mavbridge.lockstep.world import nominal_scene, random_scene
 from policy.contract import Executable
-from policy.loading import LoadedPolicy
 
-BUILT_IN = ("toge", "resnet-unet")
 SCRIPTED = "scripted"
 
 
@@ -74,27 +71,6 @@ def make_jobs(config: EvaluateConfig) -> tuple[Job, ...]:
     )
 
 
-def is_stateless(policy: PolicyConfig) -> bool:
-    """A built-in net, which starts afresh with each flight; anything else may remember the last."""
-    return policy.policy.partition(":")[0] in BUILT_IN
-
-
-@lru_cache(maxsize=1)
-def _loaded_once(policy: PolicyConfig) -> LoadedPolicy:
-    return load_configured_policy(policy, MonotonicClock())
-
-
-def load(policy: PolicyConfig, clock: Clock) -> LoadedPolicy:
-    """A policy that knows nothing of earlier flights; nets are loaded once in a process.
-
-    Raises:
-        PolicyError: it cannot be loaded.
-    """
-    if is_stateless(policy):
-        return _loaded_once(policy)
-    return load_configured_policy(policy, clock)
-
-
 def fly_job(job: Job, should_stop: Callable[[], bool] | None = None) -> Flown:
     """Fly one episode in lockstep.
 
@@ -111,6 +87,6 @@ def fly_job(job: Job, should_stop: Callable[[], bool] | None = None) -> Flown:
         setup=Setup(rates=job.rates, limits=job.limits, delays=delays, draw_images=not is_scripted),
         build_scene=nominal_scene if seed is None else random_scene(seed),
     )
-    executable: Executable = load(job.policy, episode.clock).executable
+    executable: Executable = load_for_episodes(job.policy, episode.clock).executable
     result = episode.fly(executable, max_time_s=job.max_time_s, should_stop=should_stop)
     return Flown(index=job.index, engine=executable.engine, result=result)

@@ -8,11 +8,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from mavbridge.assembly import load_for_episodes
 from mavbridge.clock import MonotonicClock
 from mavbridge.config import EvaluateConfig
 from mavbridge.errors import UserError
 from mavbridge.evaluation.cluster import fly_on_ray
-from mavbridge.evaluation.jobs import Flown, Job, fly_job, load, make_jobs
+from mavbridge.evaluation.jobs import Flown, Job, fly_job, make_jobs
 from mavbridge.evaluation.realtime import fly_realtime
 from mavbridge.evaluation.results import Evaluation, to_json
 from mavbridge.evaluation.tables import print_evaluation
@@ -90,7 +91,7 @@ def _episodes(
         return fly_realtime(jobs, should_stop=should_stop)
     if config.workers > 1 or config.ray is not None:
         return fly_on_ray(jobs, workers=config.workers, address=config.ray, should_stop=should_stop)
-    for note in load(config.policy, MonotonicClock()).notes:
+    for note in load_for_episodes(config.policy, MonotonicClock()).notes:
         console.print(Text(note, style="yellow"))
     return _one_by_one(jobs, should_stop)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mavbridge.__main__ import main
+from mavbridge.assembly import is_stateless
 from mavbridge.clock import NS_PER_MS
 from mavbridge.config import (
     HELD_OUT_COURSE_SEED,
@@ -21,7 +22,7 @@ from mavbridge.config import (
 )
 from mavbridge.errors import UserError
 from mavbridge.evaluation import jobs, run
-from mavbridge.evaluation.jobs import fly_job, is_stateless, make_jobs
+from mavbridge.evaluation.jobs import fly_job, make_jobs
 from mavbridge.evaluation.run import INTERRUPTED, evaluate
 from mavbridge.lockstep.episode import Episode, Setup
 
