@@ -94,9 +94,9 @@ def _draw_style(axes: Axes, evaluation: Evaluation) -> None:
         ]
         if dots:
             axes.plot(*zip(*dots, strict=True), "o", color=colour, alpha=0.6, label=label)
-    axes.margins(0.15)
-    axes.set_xlim(left=0)
-    axes.set_ylim(bottom=0)
+    if axes.lines:  # margins are shares of the range, which is none where all flights are alike
+        axes.set_xlim(0, 1.15 * axes.dataLim.x1 or 1)
+        axes.set_ylim(0, 1.15 * axes.dataLim.y1 or 1)
     axes.set_xlabel("mean speed, m/s")
     axes.set_ylabel("stick movement, 1/s")
     axes.set_title("Speed and smoothness")
