@@ -7,6 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from policy.pooling import MOMENTS, moments
+
 WIDTHS = (96, 192, 384, 768)
 DEPTHS = (3, 3, 9, 3)
 NORM_EPS = 1e-6
@@ -59,9 +61,9 @@ class ConvNextBlock(nn.Module):
 
 
 class ConvNextTiny(nn.Module):
-    """Image [B, 3, H, W] -> pooled, normalised feature [B, 768].
+    """Image [B, 3, H, W] -> moments [B, 3 * 768].
 
-    The norm after pooling bears torchvision's name ``classifier.0``; the linear layer after it,
+    The norm of their average bears torchvision's name ``classifier.0``; the linear layer after it,
     ``classifier.2``, is left out.
     """
 
@@ -85,10 +87,10 @@ class ConvNextTiny(nn.Module):
                 )
         self.features = nn.Sequential(*layers)
         self.classifier = nn.Sequential(ChannelNorm(WIDTHS[-1], eps=NORM_EPS), nn.Flatten())
-        self.out_dim = WIDTHS[-1]
+        self.out_dim = MOMENTS * WIDTHS[-1]
 
     def forward(self, image: Tensor) -> Tensor:
-        """Pooled feature [B, 768]."""
-        pooled = self.features(image).mean(dim=(2, 3), keepdim=True)
-        feature: Tensor = self.classifier(pooled)
-        return feature
+        """``pooling.moments`` of the last map, flat, the average normalised."""
+        features = self.features(image)
+        average = self.classifier(features.mean(dim=(2, 3), keepdim=True))
+        return torch.cat([average, moments(features)[:, 1:].flatten(1)], dim=1)

@@ -6,6 +6,8 @@ Stochastic depth and dropout are left out: they hold no parameters and do nothin
 import torch
 from torch import Tensor, nn
 
+from policy.pooling import MOMENTS, moments
+
 STEM_CHANNELS = 40
 # expand ratio, kernel, stride, channels out, depth: B0's table at width 1.2 and depth 1.4
 STAGES = (
@@ -61,7 +63,7 @@ class MBConv(nn.Module):
 
 
 class EfficientNetB3(nn.Module):
-    """Image [B, 3, H, W] -> pooled feature [B, 1536]; torchvision's ``classifier`` is left out."""
+    """Image [B, 3, H, W] -> moments [B, 3 * 1536]; torchvision's ``classifier`` is left out."""
 
     classifier_keys = ("classifier.1.weight", "classifier.1.bias")
 
@@ -85,11 +87,11 @@ class EfficientNetB3(nn.Module):
             layers.append(nn.Sequential(*blocks))
         layers.append(_conv_norm(channels, OUT_CHANNELS, 1))
         self.features = nn.Sequential(*layers)
-        self.out_dim = OUT_CHANNELS
+        self.out_dim = MOMENTS * OUT_CHANNELS
 
     def forward(self, image: Tensor) -> Tensor:
-        """Pooled feature [B, 1536]."""
-        pooled: Tensor = self.features(image).mean(dim=(2, 3))
+        """``pooling.moments`` of the last map, flat."""
+        pooled: Tensor = moments(self.features(image)).flatten(1)
         return pooled
 
 

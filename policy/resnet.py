@@ -5,6 +5,8 @@ ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
 
 from torch import Tensor, nn
 
+from policy.pooling import MOMENTS, moments
+
 
 class BasicBlock(nn.Module):
     """Two 3x3 convolutions around a shortcut."""
@@ -55,7 +57,7 @@ class Bottleneck(nn.Module):
 
 
 class ResNet(nn.Module):
-    """Image [B, 3, H, W] -> pooled feature [B, out_dim]; torchvision's ``fc`` is left out."""
+    """Image [B, 3, H, W] -> moments [B, out_dim]; torchvision's ``fc`` is left out."""
 
     classifier_keys = ("fc.weight", "fc.bias")
 
@@ -72,13 +74,13 @@ class ResNet(nn.Module):
         self.layer2 = _layer(block, 64 * wide, 128, depths[1], stride=2)
         self.layer3 = _layer(block, 128 * wide, 256, depths[2], stride=2)
         self.layer4 = _layer(block, 256 * wide, 512, depths[3], stride=2)
-        self.out_dim = 512 * wide
+        self.out_dim = MOMENTS * 512 * wide
 
     def forward(self, image: Tensor) -> Tensor:
-        """Pooled feature [B, out_dim]."""
+        """``pooling.moments`` of the last map, flat."""
         x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
         x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
-        pooled: Tensor = x.mean(dim=(2, 3))
+        pooled: Tensor = moments(x).flatten(1)
         return pooled
 
 

@@ -23,7 +23,8 @@ Check: TypeAlias = Callable[[Path], float]
 
 _SMALLER = ((3 / 7, 0.35, 0.20), (5 / 7, 0.30, 0.15), (1.0, 0.10, 0.10))
 """Image size over the full one, share of the time, share of the steps; the head has the rest."""
-MIN_IMAGE_SIZE = 32
+MIN_IMAGE_SIZE = 96
+"""Below it, an image costs a CPU hardly less."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from policy.convnext import ChannelNorm, ConvNextBlock, ConvNextTiny, Permute
 from policy.efficientnet import EfficientNetB3, MBConv, SqueezeExcitation
 from policy.encoders import HEADS, AttentionBlock
+from policy.pooling import MOMENTS, moment_weights
 from policy.resnet import BasicBlock, Bottleneck, ResNet
 from policy.unet1d import Conv
 
@@ -66,8 +67,16 @@ def conv(
     return apply
 
 
-def _pool(x: Node, *, keep_dims: bool) -> Node:
-    return ops.reduce_mean(x, ints(2, 3), keep_dims=keep_dims)
+def _average(x: Node) -> Node:
+    return ops.reduce_mean(x, ints(2, 3), keep_dims=True)
+
+
+def _moments(x: Node) -> Node:
+    """``pooling.moments``: [1, C, H, W] -> [1, 3, C]."""
+    _, channels, height, width = x.get_output_shape(0)
+    cells = ops.reshape(x, ints(1, channels, height * width), False)
+    weights = constant(moment_weights(height, width).T[None])
+    return ops.matmul(weights, cells, False, True)
 
 
 @singledispatch
@@ -196,7 +205,7 @@ def _(module: nn.MaxPool2d) -> Layer:
 @layer.register
 def _(module: SqueezeExcitation) -> Layer:
     gate = _sequence(layer(module.fc1), layer(module.activation), layer(module.fc2))
-    return lambda x: ops.multiply(x, ops.sigmoid(gate(_pool(x, keep_dims=True))))
+    return lambda x: ops.multiply(x, ops.sigmoid(gate(_average(x))))
 
 
 @layer.register
@@ -208,7 +217,7 @@ def _(module: MBConv) -> Layer:
 @layer.register
 def _(module: EfficientNetB3) -> Layer:
     features = layer(module.features)
-    return lambda x: _pool(features(x), keep_dims=False)
+    return lambda x: ops.reshape(_moments(features(x)), ints(1, -1), False)
 
 
 @layer.register
@@ -233,7 +242,7 @@ def _(module: ResNet) -> Layer:
     stem = (module.conv1, module.bn1, module.relu, module.maxpool)
     stages = (module.layer1, module.layer2, module.layer3, module.layer4)
     features = _sequence(*[layer(part) for part in (*stem, *stages)])
-    return lambda x: _pool(features(x), keep_dims=False)
+    return lambda x: ops.reshape(_moments(features(x)), ints(1, -1), False)
 
 
 @layer.register
@@ -245,7 +254,13 @@ def _(module: ConvNextBlock) -> Layer:
 @layer.register
 def _(module: ConvNextTiny) -> Layer:
     features, classifier = layer(module.features), layer(module.classifier)
-    return lambda x: classifier(_pool(features(x), keep_dims=True))
+
+    def apply(x: Node) -> Node:
+        y = features(x)
+        places = ops.slice(_moments(y), ints(1), ints(MOMENTS), ints(1), ints(1))
+        return ops.concat([classifier(_average(y)), ops.reshape(places, ints(1, -1), False)], 1)
+
+    return apply
 
 
 @layer.register

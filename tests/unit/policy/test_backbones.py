@@ -47,7 +47,7 @@ def test_has_torchvisions_parameter_count(name: BackboneName, total: int, out_di
     backbone = build_backbone(name)
     classifier = out_dim * 1000 + 1000
     assert sum(p.numel() for p in backbone.parameters()) + classifier == total
-    assert backbone.out_dim == out_dim
+    assert backbone.out_dim == 3 * out_dim
 
 
 @pytest.mark.parametrize("name", [name for name, _, _ in KNOWN_TOTALS])
@@ -63,7 +63,7 @@ def test_has_torchvisions_names_and_shapes(name: BackboneName) -> None:
 def test_pools_any_image_size(name: BackboneName, out_dim: int, size: int) -> None:
     with torch.inference_mode():
         feature = build_backbone(name).eval()(torch.randn(2, 3, size, size))
-    assert feature.shape == (2, out_dim)
+    assert feature.shape == (2, 3 * out_dim)
     assert torch.isfinite(feature).all()
 
 
