@@ -4,9 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 PORT ?= 14550
-COURSE ?= 7
+COURSE ?= 1000007
 DURATION ?= 60
-POLICY ?= scripted:square
+POLICY ?= toge
 
 .PHONY: fly test lint bench clean
 
@@ -27,7 +27,7 @@ fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy 
 	@$(BIN)/python -m sitl --connect udpout:127.0.0.1:$(PORT) --camera shm:fpv-$(PORT) \
 		--course $(COURSE) --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
-	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --dual-rate --policy $(POLICY) \
+	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --dual-rate --head-steps 2 --policy $(POLICY) \
 		--camera shm:fpv-$(PORT) --mode ALT_HOLD --arm --duration $(DURATION) \
 		--rerun out/flight.rrd --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \

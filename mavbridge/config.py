@@ -151,7 +151,7 @@ class PolicyConfig:
     """toge[:small|medium|large[:BACKBONE]], resnet-unet, scripted[:hover|square|circle|yaw],
     or your own package.module:Class."""
     checkpoint: Path | None = None
-    """Weights: .safetensors with the contract in its header, or .pt."""
+    """Weights: .safetensors with the contract in its header, or .pt; toge has shipped ones."""
     dual_rate: bool = False
     """Encode images in their own thread and sample actions faster from the cached feature."""
     num_diffusion_steps: int = 10
@@ -249,6 +249,14 @@ class ExportConfig:
             raise UserError("--task must say something")
 
 
+CHECK_COURSE_SEED = 900_000
+"""Course seeds from here on are flown during training, and neither learned from nor evaluated."""
+HELD_OUT_COURSE_SEED = 1_000_000
+"""Course seeds from here on are for evaluation: nothing is ever trained on them."""
+MAX_EPISODES = 10_000
+"""Of one evaluation, so that another seed has other courses."""
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
@@ -281,8 +289,15 @@ class TrainConfig:
     """Camera of a LeRobot dataset that has several, e.g. observation.images.front."""
     start_from: Path | None = None
     """Checkpoint to go on from, e.g. after more flights were added."""
+    freeze_encoder: bool = False
+    """Train the head alone, on what the encoder of --start-from makes of the images."""
     backbone_weights: Path | None = None
     """torchvision's ImageNet weights of the encoder (.pth)."""
+    pack: bool = False
+    """Write a checkpoint to ship, a third of the size: the encoder in int8, the rest in float16."""
+    check_flights: int = 0
+    """Courses to fly with the weights now and then; the best in flight are kept, not those with the
+    least loss. Takes the extra "sitl"."""
     mirror: bool = True
     """Mirror half of the samples; --no-mirror for a camera that does not look straight ahead."""
     since_exposure: bool = True
@@ -299,6 +314,7 @@ class TrainConfig:
         _check("seed", self.seed, 0, 2**63 - 1, "")
         _check("validation-fraction", self.validation_fraction, 0, 0.9, "")
         _check("gate-weight", self.gate_weight, 0, 100, "")
+        _check("check-flights", self.check_flights, 0, MAX_EPISODES, "")
         if self.minutes is not None:
             _check("minutes", self.minutes, 0.01, 100_000, "minutes")
         if self.steps is not None:
@@ -318,12 +334,6 @@ class BenchConfig:
     """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
     check: Path | None = None
     """Compare with this budget of ratios, and exit with 1 if something got worse."""
-
-
-HELD_OUT_COURSE_SEED = 1_000_000
-"""Course seeds from here on are for evaluation: nothing is ever trained on them."""
-MAX_EPISODES = 10_000
-"""Of one evaluation, so that another seed has other courses."""
 
 
 @Parameter(name="*")
@@ -347,11 +357,11 @@ class DemonstrateConfig:
         _check("episodes", self.episodes, 1, MAX_EPISODES, "")
         _check("speed", self.speed, 1.5, 10, "m/s")
         _check("workers", self.workers, 1, 64, "")
-        _check("seed", self.policy.seed, 0, HELD_OUT_COURSE_SEED // MAX_EPISODES - 1, "")
+        _check("seed", self.policy.seed, 0, CHECK_COURSE_SEED // MAX_EPISODES - 1, "")
 
     @property
     def first_course_seed(self) -> int:
-        """Never one of those that evaluate flies."""
+        """Never one of those that train or evaluate flies."""
         return self.policy.seed * MAX_EPISODES
 
 

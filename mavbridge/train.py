@@ -24,16 +24,13 @@ from policy.train_report import TrainResult
 MINUTES = 45.0
 
 
-def train_policy(
-    flights: Sequence[Path], config: TrainConfig, out: Path, check: Check | None = None
-) -> int:
+def train_policy(flights: Sequence[Path], config: TrainConfig, out: Path) -> int:
     """Train as the config says; 0 when the checkpoint is written.
 
     Args:
         flights: flight folders, folders of them, or LeRobot datasets.
         config: the settings.
         out: the checkpoint.
-        check: flies a checkpoint in closed loop and says how well, if there is such a check.
 
     Raises:
         UserError: pyarrow or PyAV is missing, or a flag cannot be used.
@@ -49,7 +46,7 @@ def train_policy(
             settings,
             now_s=lambda: clock.now_ns() / NS_PER_S,
             report=display.show,
-            check=check,
+            check=_check(config),
         )
     _print_result(result)
     return 0
@@ -95,8 +92,23 @@ def _settings(config: TrainConfig, out: Path, episodes: list[Episode]) -> TrainS
         validation_fraction=config.validation_fraction,
         ages_ns=None if config.ages is None else _ages(config.ages),
         start_from=config.start_from,
+        freeze_encoder=config.freeze_encoder,
+        pack=config.pack,
         backbone_weights=config.backbone_weights,
     )
+
+
+def _check(config: TrainConfig) -> Check | None:
+    """Flights in closed loop, if there are to be any."""
+    if config.check_flights == 0:
+        return None
+    try:
+        from mavbridge.train_check import share_of_gates
+    except ImportError as error:
+        raise UserError(
+            f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
+        ) from error
+    return lambda checkpoint: share_of_gates(checkpoint, config.policy, config.check_flights)
 
 
 def _ages(spec: str) -> Nanoseconds:

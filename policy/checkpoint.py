@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from policy.contract import Contract, FloatArray, PolicyError
 from policy.diffusion import NoiseSchedule
+from policy.packing import pack, unpack
 from policy.parity import Probe, disagreement, make_probe
 from policy.preprocess import image_to_input
 from policy.resnet_unet import ResnetUnet, ResnetUnetConfig
@@ -37,6 +38,7 @@ ARCHITECTURE_KEY = "architecture"
 TRAINING_KEY = "training"
 HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
 VECTOR_PREFIX = "test_vector."
+BACKBONE_PREFIX = "backbone."
 VECTOR_NAMES = ("rgb", "state", "history", "chunks")
 VECTOR_STEPS = 10
 """Denoising steps of a test vector, or all if the schedule has fewer; its noise is reset(0)'s."""
@@ -69,13 +71,16 @@ def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
     return Toge(config) if isinstance(config, TogeConfig) else ResnetUnet(config)
 
 
-def save_checkpoint(path: Path, policy: BuiltinPolicy, *, training: str | None = None) -> None:
+def save_checkpoint(
+    path: Path, policy: BuiltinPolicy, *, training: str | None = None, packed: bool = False
+) -> None:
     """Write weights, contract, architecture and a test vector; replaces ``path`` at once or not.
 
     Args:
         path: a ``.safetensors`` file.
         policy: whose weights.
         training: JSON that says how it was trained, for people and reports; no runtime reads it.
+        packed: a third of the size, rounded as ``packing`` says; the test vector is of the rounded.
 
     Raises:
         CheckpointError: weights that are not finite, or a path that cannot be written.
@@ -84,6 +89,10 @@ def save_checkpoint(path: Path, policy: BuiltinPolicy, *, training: str | None =
         raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
     state = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
     _require_finite(path, state)
+    if packed:
+        state = pack(state, coarse=BACKBONE_PREFIX)
+        policy = copy.deepcopy(policy)
+        policy.load_state_dict(unpack(state))
     for name, value in _make_vector(policy).items():
         state[VECTOR_PREFIX + name] = value
     header = {
@@ -240,7 +249,7 @@ def _read_safetensors(path: Path) -> _Contents:
     }
     _require_finite(path, vector)
     return _Contents(
-        state=state,
+        state=unpack(state),
         vector=vector,
         contract=header[CONTRACT_KEY],
         architecture=header[ARCHITECTURE_KEY],

@@ -30,6 +30,8 @@ from policy.user_code import user_code
 if TYPE_CHECKING:
     from policy.checkpoint import BuiltinConfig, BuiltinPolicy
 
+SHIPPED = Path(__file__).parent / "weights" / "toge.safetensors"
+"""Flown by ``toge`` where no other weights are named; its card is beside it."""
 _FORMS = "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM] or package.module:Class"
 
 
@@ -62,7 +64,8 @@ def load_policy(
 
     Args:
         spec: one of the forms in the module's docstring.
-        checkpoint: weights; a user's class gets it as ``Class(checkpoint=path)``.
+        checkpoint: weights; a user's class gets it as ``Class(checkpoint=path)``. Without it,
+            ``toge`` takes the shipped ones.
         allow_untrained: whether seeded random weights will do where there is no checkpoint.
         engine: what runs the network; auto = the fastest that passes the parity gate.
         device: torch's name of where to run: cpu, cuda, cuda:0, mps.
@@ -85,6 +88,8 @@ def load_policy(
         notes = [f"{spec}: flies a fixed program, the camera is not looked at"]
     elif kind in ("toge", "resnet-unet"):
         config = _config(kind, options, image_size)
+        if spec == "toge" and not allow_untrained and SHIPPED.is_file():
+            checkpoint = checkpoint or SHIPPED
         if checkpoint is not None:
             policy, notes = _trained(config, options, checkpoint, seed)
         elif allow_untrained:

@@ -32,6 +32,7 @@ from policy.train_model import (
     uses_bf16,
     validate,
 )
+from policy.train_parallel import Gradients
 from policy.train_plan import (
     Check,
     Stage,
@@ -178,13 +179,14 @@ class _Run:
     # ---- steps ----
 
     def _train(self, stage: Stage) -> None:
-        self._trainee.train()
-        if not stage.trains_encoder:
-            self._trainee.policy.backbone.eval()
         position, sums, since = self._position, torch.zeros(2, device=self._device), 0
-        with closing(ahead(self._maker(stage), position.step)) as batches:
+        with (
+            Gradients(self._trainee, device=self._device, bf16=self._bf16) as gradients,
+            closing(ahead(self._maker(stage), position.step)) as batches,
+        ):
+            gradients.set_mode(trains_encoder=stage.trains_encoder)
             while self._fraction() < stage.end:
-                sums += self._step(next(batches).to(self._device))
+                sums += self._step(next(batches).to(self._device), gradients)
                 since += 1
                 if since == LOG_STEPS:
                     self._log(stage, (sums / since).tolist())
@@ -204,22 +206,18 @@ class _Run:
             step, count=settings.batch_size, repeats=settings.repeats, size=stage.image_size
         )
 
-    def _step(self, batch: Batch) -> Tensor:
+    def _step(self, batch: Batch, gradients: Gradients) -> Tensor:
         """One step of the optimiser; the losses [2], of sticks and gates."""
         position, settings = self._position, self._settings
         factor = learning_rate_factor(self._along_phase())
         for group in self._optimiser.param_groups:
             group["lr"] = self._learning_rate * factor
-        with computing_in(self._device, self._bf16):
-            losses = self._trainee(batch, self._spread.scale)
-        total: Tensor = losses.sticks + settings.gate_weight * losses.gate
-        self._optimiser.zero_grad()
-        total.backward()  # type: ignore[no-untyped-call]
+        losses = gradients.compute(batch, self._spread.scale, settings.gate_weight)
         torch.nn.utils.clip_grad_norm_(self._trainee.parameters(), GRADIENT_LIMIT)
         self._optimiser.step()
         position.step += 1
         self._ema.update(self._trainee, position.step - position.phase_step)
-        return torch.stack([losses.sticks.detach(), losses.gate.detach()])
+        return losses
 
     def _along_phase(self) -> float:
         """How much of encoder-and-head, or of the head alone, is done."""
@@ -250,7 +248,8 @@ class _Run:
         encoder = Encoder(trainee, self._batches, device=self._device, bf16=self._bf16)
         if is_new:
             trainee.load_state_dict(self._ema.average.state_dict())
-            encoder.refresh_norms()
+            if not settings.freeze_encoder:
+                encoder.refresh_norms()
             self._ema.average.load_state_dict(trainee.state_dict())
         trainee.policy.backbone.requires_grad_(requires_grad=False).eval()
         begun = self._fraction()
@@ -328,7 +327,8 @@ class _Run:
             steps=position.step,
             validation=position.kept,
         )
-        save_checkpoint(path, copy.deepcopy(self._ema.average.policy), training=card)
+        policy = copy.deepcopy(self._ema.average.policy)
+        save_checkpoint(path, policy, training=card, packed=self._settings.pack)
 
     def _save_state(self) -> None:
         position = self._position

@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ BRIGHTNESS, CONTRAST, COLOUR, NOISE = 0.15, 0.25, 0.08, 0.03
 """Half-ranges of the image augmentations, of full scale; the noise is the largest sigma."""
 AHEAD = 3
 """Batches prepared while the net computes."""
+_OF_SAMPLES = ("state", "history", "chunk", "known", "noise", "timestep")
 _VALIDATION_KEY = 2**31
 """In place of a step; no run has as many."""
 
@@ -62,6 +64,27 @@ class Batch:
         names = [name for name, value in vars(self).items() if value is not None]
         moved = {name: getattr(self, name).to(device, non_blocking=True) for name in names}
         return replace(self, **moved)
+
+    def split(self, count: int) -> "list[Batch]":
+        """At most ``count`` parts of about the same size, each of whole images."""
+        images, samples = len(self.look), len(self.state)
+        repeats = samples // images
+        bounds = [images * part // count for part in range(count + 1)]
+        return [
+            self._rows(slice(start, stop), slice(start * repeats, stop * repeats))
+            for start, stop in pairwise(bounds)
+            if stop > start
+        ]
+
+    def _rows(self, images: slice, samples: slice) -> "Batch":
+        return replace(
+            self,
+            images=None if self.images is None else self.images[images],
+            look=self.look[images],
+            pooled=None if self.pooled is None else self.pooled[images],
+            gate=self.gate[images],
+            **{name: getattr(self, name)[samples] for name in _OF_SAMPLES},
+        )
 
 
 class PooledStore:

@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from policy.contract import Contract, FloatArray
+from policy.contract import Contract
 from policy.dataset_frames import disk_error
 from policy.dataset_samples import Indices
+from policy.engines.openvino_bulk import BulkEncoder
 from policy.train_batches import Batches, PooledStore, normalise_image
 from policy.train_model import Trainee, computing_in, refresh_batch_norm
 
@@ -50,7 +52,7 @@ class Encoder:
         """
         frames = np.random.default_rng([seed, 3]).permutation(self._batches.frames)
         row_of = np.full((2, int(frames.max()) + 1), -1, np.int64)
-        rows = 0
+        rows, encode = 0, self._encode()
         try:
             with path.open("wb") as file:
                 for start in range(0, len(frames), ENCODE_BATCH):
@@ -58,20 +60,30 @@ class Encoder:
                         break
                     part = frames[start : start + ENCODE_BATCH]
                     for mirrored in (False, True)[: 2 if mirror else 1]:
-                        file.write(self._encode(part, mirrored=mirrored).tobytes())
+                        file.write(encode(part, mirrored).tobytes())
                         row_of[int(mirrored), part] = rows + np.arange(len(part))
                         rows += len(part)
         except OSError as error:
             raise disk_error(path, error) from error
         return PooledStore(path, self._trainee.policy.backbone.out_dim, row_of)
 
-    @torch.inference_mode()
-    def _encode(self, frames: Indices, *, mirrored: bool) -> FloatArray:
-        """[B, D], float16 to save half the disk."""
-        with computing_in(self._device, self._bf16):
-            pooled = self._trainee.policy.backbone(self._images(frames, mirrored=mirrored))
-        out: FloatArray = pooled.to(torch.float16).cpu().numpy()
-        return out
+    def _encode(self) -> Callable[[Indices, bool], NDArray[np.float16]]:
+        """(frames, mirrored) -> [B, D], half the precision for half the disk."""
+        backbone = self._trainee.policy.backbone
+        if self._device.type == "cpu":
+            bulk = BulkEncoder(self._trainee.policy, "bf16" if self._bf16 else "f32")
+            return lambda frames, mirrored: bulk(
+                self._images(frames, mirrored=mirrored).numpy()
+            ).astype(np.float16)
+
+        @torch.inference_mode()
+        def in_torch(frames: Indices, mirrored: bool) -> NDArray[np.float16]:
+            with computing_in(self._device, self._bf16):
+                pooled = backbone(self._images(frames, mirrored=mirrored))
+            out: NDArray[np.float16] = pooled.to(torch.float16).cpu().numpy()
+            return out
+
+        return in_torch
 
     def _images(self, frames: Indices, *, mirrored: bool) -> Tensor:
         contract = self._contract

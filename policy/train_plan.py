@@ -81,7 +81,7 @@ class TrainSettings:
     budget: Budget
     batch_size: int = 32
     """Images a step while the encoder learns; each serves ``repeats`` samples."""
-    repeats: int = 4
+    repeats: int = 2
     """Moments after its exposure for which one encoded image is used."""
     head_batch_size: int = 256
     """Samples a step while the head learns alone."""
@@ -103,8 +103,12 @@ class TrainSettings:
     """Measured ages of images to train for; None = those measured in the flights."""
     start_from: Path | None = None
     """A checkpoint of the same architecture."""
+    freeze_encoder: bool = False
+    """Leave the encoder of ``start_from`` as it is: all the time is the head's."""
     backbone_weights: Path | None = None
     """torchvision's state dict of the encoder, as .pth."""
+    pack: bool = False
+    """Write the checkpoint in a third of the bytes (``policy.packing``)."""
     validations: int | None = None
     """In a run, evenly spaced; the state of the run is kept at the same times. None = one every two
     minutes or fifty steps, 4 to 20."""
@@ -126,6 +130,8 @@ class TrainSettings:
             raise PolicyError(f"--out {self.out}: checkpoints are written as .safetensors")
         if self.start_from is not None and self.backbone_weights is not None:
             raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
+        if self.freeze_encoder and self.start_from is None:
+            raise PolicyError("--freeze-encoder needs a trained one: give --start-from CHECKPOINT")
 
     @property
     def validation_count(self) -> int:
@@ -145,8 +151,12 @@ def make_stages(settings: TrainSettings) -> tuple[Stage, ...]:
     """The stages of a run, in order; they fill the budget."""
     contract = settings.policy.contract
     full = (contract.image_height, contract.image_width)
+    if settings.freeze_encoder:
+        return (Stage(name="head", image_size=full, trains_encoder=False, start=0.0, end=1.0),)
     shares: dict[tuple[int, int], float] = {}
-    for scale, of_time, of_steps in _SMALLER:
+    least = min(MIN_IMAGE_SIZE / min(full), 1.0)
+    for wanted, of_time, of_steps in _SMALLER:
+        scale = max(wanted, least)
         size = (_scaled(full[0], scale), _scaled(full[1], scale))
         share = of_time if settings.budget.steps is None else of_steps
         shares[size] = shares.get(size, 0.0) + share
@@ -178,4 +188,4 @@ def _scaled(full: int, scale: float) -> int:
     """A multiple of 32, the stride of all encoders, where it is not the full size."""
     if scale == 1.0:
         return full
-    return min(full, max(MIN_IMAGE_SIZE, round(full * scale / 32) * 32))
+    return min(full, round(full * scale / 32) * 32)

@@ -13,7 +13,7 @@ from mavbridge.evaluation.statistics import rate
 INK, MUTED, GRID, BLUE, RED = "#1f2933", "#6b7885", "#dfe4ea", "#2b6cb0", "#d1495b"
 SIZE_INCHES = (12.0, 4.2)
 DOTS_PER_INCH = 150
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": 10,
     "text.color": INK,
     "axes.labelcolor": MUTED,
@@ -34,7 +34,7 @@ _STYLE: dict[Any, Any] = {
 
 def draw(evaluation: Evaluation, path: Path) -> None:
     """Write the PNG; the evaluation holds at least one episode."""
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor="white")
         axes = figure.subplots(1, 3)
         _draw_reach(axes[0], evaluation)

@@ -25,6 +25,13 @@ from policy.toge import Toge
 from policy.unet1d import ResidualBlock, UNet1d
 
 
+def backbone_graph(policy: Toge | ResnetUnet) -> ov.Model:
+    """Normalised image [1, 3, H, W] -> output of the backbone [1, D]."""
+    contract = policy.contract
+    image = _parameter("image", 1, 3, contract.image_height, contract.image_width)
+    return ov.Model([ops.result(layer(policy.backbone)(image))], [image], "backbone")
+
+
 def vision_graph(policy: Toge | ResnetUnet) -> ov.Model:
     """Normalised image [1, 3, H, W] -> feature [1, F]."""
     contract = policy.contract

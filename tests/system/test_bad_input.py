@@ -43,7 +43,7 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         (["--connect", "udp:127.0.0.1:1", "--num-diffusion-steps", "0"], "between 1 and 100"),
         (["--connect", "udp:127.0.0.1:1", "--readonly", "--arm"], "--readonly sends nothing"),
         (["--connect", "udp:127.0.0.1:1", "--config", "none.toml"], "none.toml"),
-        (["--connect", "udp:127.0.0.1:1"], "--allow-untrained"),
+        (["--connect", "udp:127.0.0.1:1", "--policy", "toge:medium"], "--allow-untrained"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "tog"], "tog"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "nowhere.at_all:Policy"], "nowhere"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "pathlib:Path"], "predict"),

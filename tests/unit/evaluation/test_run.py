@@ -135,7 +135,7 @@ def test_ctrl_c_ends_with_the_results_so_far(
         (["--vision-delay", "-1"], "--vision-delay must be between 0 and 5000 ms"),
         (["--conditions", "stormy"], "--conditions"),
         (["--action-rate", "0"], "between 10 and 500 Hz"),
-        (["--policy", "toge"], "--allow-untrained"),
+        (["--policy", "toge:medium"], "--allow-untrained"),
         (["--policy", "scripted", "--json", "/proc/none/out.json"], "cannot write"),
         (["--policy", "scripted", "--json", "/"], "cannot write /"),
         (["--policy", "scripted", "--plot", "/proc/none/out.png"], "cannot write"),

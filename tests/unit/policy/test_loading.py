@@ -112,7 +112,7 @@ def test_head_steps_where_they_have_no_use_are_said(spec: str, changes: dict[str
 
 def test_untrained_needs_permission() -> None:
     with pytest.raises(PolicyError, match="--allow-untrained"):
-        load("toge")
+        load("toge:medium")
 
 
 @pytest.mark.parametrize("spec", ["toge", "toge:small", "toge:small:resnet18", "toge:resnet18"])

@@ -165,6 +165,31 @@ def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(
         run(episodes[:2], other)
 
 
+def test_a_frozen_encoder_stays_and_the_head_learns(
+    episodes: list[Episode], tmp_path: Path, whole: TrainResult
+) -> None:
+    made = settings(
+        tmp_path, start_from=whole.checkpoint, freeze_encoder=True, budget=Budget(steps=3)
+    )
+    stages: list[str] = []
+    result = run(episodes, made, lambda progress: stages.append(progress.stage))
+    before, after = _weights(whole.checkpoint), _weights(result.checkpoint)
+    encoder = [name for name in before if name.startswith("backbone.")]
+    assert [name for name in encoder if before[name] != after[name]] == []
+    assert before["head.unet.out.weight"] != after["head.unet.out.weight"]
+    assert not any(stage.startswith("encoder") for stage in stages)
+    with pytest.raises(PolicyError, match="--start-from"):
+        replace(made, start_from=None)
+
+
+def test_a_packed_checkpoint_is_smaller_and_flies_alike(
+    episodes: list[Episode], tmp_path: Path, whole: TrainResult
+) -> None:
+    result = run(episodes, settings(tmp_path, pack=True))
+    assert result.checkpoint.stat().st_size < whole.checkpoint.stat().st_size / 2.5
+    load_checkpoint(result.checkpoint, fallback=settings(tmp_path).policy)
+
+
 def test_a_budget_of_time_ends_and_has_time_for_the_head(
     episodes: list[Episode], tmp_path: Path
 ) -> None:
@@ -219,7 +244,7 @@ def test_settings_that_no_run_could_use_are_refused(tmp_path: Path) -> None:
 def test_stages_grow_and_fill_the_budget(tmp_path: Path) -> None:
     contract = Contract(image_height=224, image_width=160)
     stages = make_stages(settings(tmp_path, policy=TogeConfig(contract=contract)))
-    assert [stage.image_size for stage in stages] == [(96, 64), (160, 128), (224, 160), (224, 160)]
+    assert [stage.image_size for stage in stages] == [(128, 96), (160, 128), (224, 160), (224, 160)]
     assert [stage.trains_encoder for stage in stages] == [True, True, True, False]
     assert stages[0].start == 0
     assert stages[-1].end == 1

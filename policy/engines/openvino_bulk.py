@@ -1,0 +1,44 @@
+"""Many images through an encoder, as fast as the CPU can: for training, not for flight."""
+
+import numpy as np
+import openvino as ov
+
+from policy.contract import FloatArray
+from policy.engines.executable import Precision
+from policy.engines.openvino_cpu import DEVICE
+from policy.engines.openvino_graph import backbone_graph
+from policy.engines.signal_stack import signal_stack_kept
+from policy.resnet_unet import ResnetUnet
+from policy.toge import Toge
+
+
+class BulkEncoder:
+    """The backbone of a policy, with its weights as they are now; one image a stream and core.
+
+    Measured on two cores without matrix units, EfficientNet-B3 at 128x128: four times as many
+    images a second as torch in batches.
+    """
+
+    def __init__(self, policy: Toge | ResnetUnet, precision: Precision) -> None:
+        properties = {
+            "PERFORMANCE_HINT": "THROUGHPUT",
+            "INFERENCE_PRECISION_HINT": precision,
+        }
+        with signal_stack_kept():
+            compiled = ov.Core().compile_model(backbone_graph(policy), DEVICE, properties)
+            self._queue = ov.AsyncInferQueue(compiled, 0)
+        self._dim = policy.backbone.out_dim
+
+    def __call__(self, images: FloatArray) -> FloatArray:
+        """Normalised images [B, 3, H, W] of the contract's size -> outputs [B, D]."""
+        out = np.empty((len(images), self._dim), np.float32)
+
+        def keep(request: "ov.InferRequest", row: int) -> None:
+            out[row] = request.get_output_tensor(0).data[0]
+
+        self._queue.set_callback(keep)
+        for row in range(len(images)):
+            image = np.ascontiguousarray(images[row : row + 1])
+            self._queue.start_async({0: image}, row)
+        self._queue.wait_all()
+        return out
