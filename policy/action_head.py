@@ -1,6 +1,5 @@
 """The diffusion action head: a condition vector in, a chunk of stick positions out."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -8,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract, PolicyError
-from policy.diffusion import DdimStep, NoiseSchedule, ddim_solve
+from policy.diffusion import NoiseSchedule, ddim_solve
 from policy.unet1d import UNet1d, UNet1dConfig
 
 Size = Literal["small", "medium", "large"]
@@ -89,31 +88,38 @@ class DiffusionHead(nn.Module):
         Raises:
             PolicyError: the number of steps is not one that the schedule has.
         """
-        steps = self.schedule.ddim_steps(num_diffusion_steps)
         noise = self.initial_noise.expand(condition.shape[0], -1, -1)
-        return self._solve(condition, noise, steps)
+        return self.denoise_steps(condition, noise, num_diffusion_steps, 0, num_diffusion_steps)
 
-    def refine(
-        self, condition: Tensor, guess: Tensor, num_diffusion_steps: int, head_steps: int
+    def denoise_steps(
+        self, condition: Tensor, noisy: Tensor, num_diffusion_steps: int, first: int, count: int
     ) -> Tensor:
-        """``guess`` [B, horizon, 4], noised as far as the last ``head_steps`` denoise -> chunk.
+        """``count`` steps of a solve from step ``first`` on, bit for bit as within the whole one.
+
+        Args:
+            condition: [B, C].
+            noisy: [B, horizon, 4], as step ``first`` starts with it.
+            num_diffusion_steps: of the whole solve.
+            first: counted from 0, the noisiest step.
+            count: how many steps.
 
         Raises:
-            PolicyError: the schedule lacks that many steps.
+            PolicyError: the schedule or the solve has no such steps.
         """
-        steps = self.schedule.last_steps(num_diffusion_steps, head_steps)
-        noisy = steps[0].signal * guess + steps[0].noise * self.initial_noise
-        return self._solve(condition, noisy, steps)
-
-    def _solve(self, condition: Tensor, noisy: Tensor, steps: Sequence[DdimStep]) -> Tensor:
+        steps = self.schedule.ddim_steps(num_diffusion_steps)
+        if not 0 <= first < first + count <= num_diffusion_steps:
+            raise PolicyError(
+                f"a solve of {num_diffusion_steps} steps has no {count} from step {first} on"
+            )
         # Picked on the device: a capture of a CUDA graph allows no copy from the host.
         timesteps = torch.stack([self._timesteps[step.timestep] for step in steps])
-        # Both shares of FiLM are outside the loop; row i belongs to step i.
-        film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)
+        # Both shares of FiLM are outside the loop. That of all timesteps is one product, also where
+        # few are wanted: a product of fewer rows may round otherwise.
+        film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)[first : first + count]
         film_of_condition = self.unet.film_of_condition(condition)
 
         def denoise(index: int, noisy: Tensor) -> Tensor:
             prediction: Tensor = self.unet(noisy, film_of_step[index] + film_of_condition)
             return prediction
 
-        return ddim_solve(self.schedule, steps, denoise, noisy)
+        return ddim_solve(self.schedule, steps[first : first + count], denoise, noisy)

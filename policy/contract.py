@@ -204,18 +204,32 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
 
 @runtime_checkable
 class WarmStartPolicy(DualRatePolicy, Protocol):
-    """A policy that can improve a guess of the chunk in fewer steps than a sample takes."""
+    """A policy whose solve can be entered before any of its steps, and left after any.
 
-    def refine_fast(
+    ``predict_fast`` is ``denoise_fast`` by all steps from ``initial_noise``.
+    """
+
+    @property
+    def initial_noise(self) -> Any:
+        """[1, horizon, 4]; the same for a whole flight."""
+        ...
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
+        ...
+
+    def denoise_fast(
         self,
         feature: Any,
         state: Any,
         action_history: Any,
-        guess: Any,
+        noisy: Any,
         num_diffusion_steps: int,
-        head_steps: int,
+        first: int,
+        count: int,
     ) -> Any:
-        """As ``predict_fast``, by its last ``head_steps`` from ``guess`` [B, horizon, 4]."""
+        """``count`` steps of a solve: ``noisy`` [B, horizon, 4] as step ``first`` starts with it
+        -> as the next step would; after the last step, the chunk."""
         ...
 
 

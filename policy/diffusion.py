@@ -94,17 +94,6 @@ class NoiseSchedule:
             )
         return _ddim_steps(total, self.betas, count)
 
-    def last_steps(self, count: int, last: int) -> tuple[DdimStep, ...]:
-        """The last ``last`` of the ``count`` reverse steps: what improves a guess of the sample.
-
-        Raises:
-            PolicyError: there are not that many.
-        """
-        steps = self.ddim_steps(count)
-        if not 1 <= last <= count:
-            raise PolicyError(f"head_steps must be in 1..{count} (num_diffusion_steps), got {last}")
-        return steps[-last:]
-
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
         """Forward process, for training.
 

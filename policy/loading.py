@@ -112,7 +112,7 @@ def load_policy(
     if head_steps is not None and not (dual_rate and isinstance(policy, WarmStartPolicy)):
         notes.append(
             f"warning: --head-steps {head_steps} is not used: it takes --dual-rate and a policy "
-            "with refine_fast, such as toge; every solve is a full one"
+            "with denoise_fast, such as toge; every solve is a full one"
         )
     settings = Settings(
         name=spec,

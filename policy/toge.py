@@ -127,23 +127,38 @@ class Toge(nn.Module):
         condition = self.encode_and_fuse(feature, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)
 
-    def refine_fast(
+    @property
+    def initial_noise(self) -> Tensor:
+        """[1, horizon, 4]: what every solve of a flight starts from."""
+        return self.head.initial_noise
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with.
+
+        Raises:
+            PolicyError: the steps are not 1..100.
+        """
+        step = self.head.schedule.ddim_steps(num_diffusion_steps)[first]
+        return step.signal, step.noise
+
+    def denoise_fast(
         self,
         feature: Tensor,
         state: Tensor,
         action_history: Tensor | None,
-        guess: Tensor,
+        noisy: Tensor,
         num_diffusion_steps: int,
-        head_steps: int,
+        first: int,
+        count: int,
     ) -> Tensor:
-        """As ``predict_fast``, by its last ``head_steps`` from ``guess`` [B, horizon, 4].
+        """Steps ``first`` to ``first + count`` of ``predict_fast``: [B, horizon, 4] -> the same.
 
         Raises:
-            PolicyError: a shape is not the contract's, or there are not that many steps.
+            PolicyError: a shape is not the contract's, or the solve has no such steps.
         """
-        require_shape("guess", guess, self.contract.horizon, ACTION_DIM)
+        require_shape("noisy", noisy, self.contract.horizon, ACTION_DIM)
         condition = self.encode_and_fuse(feature, state, action_history)
-        return self.head.refine(condition, guess, num_diffusion_steps, head_steps)
+        return self.head.denoise_steps(condition, noisy, num_diffusion_steps, first, count)
 
     def predict(
         self,

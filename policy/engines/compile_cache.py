@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 MAX_ENTRIES = 12
-"""Files kept, the least recently used goes first: about four policies of three graphs each."""
+"""Files kept, the least recently used goes first: about six policies of two graphs each."""
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 

@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from policy.contract import ACTION_DIM, Executable, FloatArray, PolicyError
-from policy.engines.executable import Settings, assemble
-from policy.engines.warm_start import Refine
+from policy.engines.executable import Settings, always_full, assemble, warm_started
 from policy.resnet_unet import ResnetUnet
 from policy.toge import Toge
 
@@ -46,20 +45,26 @@ def make_cuda_graph_executable(policy: Toge | ResnetUnet, settings: Settings) ->
         if settings.dual_rate:
             raise PolicyError(f"{settings.name} has no fast path: fly it single-rate")
         predict = _Graph(lambda i, s, h: action.predict(i, s, h, steps), (image, *rest), stream)
-        return assemble(contract, lambda array: array, predict, None, NAME, settings)
+        return assemble(contract, lambda array: array, always_full(predict), NAME, settings)
     toge = action
     vision_device = torch.device(settings.vision_device)
     vision = toge if vision_device == action_device else copy.deepcopy(toge).to(vision_device)
     encode = _Graph(vision.encode_visual, (image,), _stream(vision_device, NORMAL_PRIORITY))
     fast = ((1, contract.feature_dim), *rest)
-    sample = _Graph(lambda e, s, h: toge.predict_fast(e, s, h, steps), fast, stream)
-    refine: Refine | None = None
-    if (head_steps := settings.head_steps) is not None:
-        shapes = (*fast, (1, contract.horizon, ACTION_DIM))
-        refine = _Graph(
-            lambda e, s, h, g: toge.refine_fast(e, s, h, g, steps, head_steps), shapes, stream
+    if settings.head_steps is None:
+        sample = _Graph(lambda e, s, h: toge.predict_fast(e, s, h, steps), fast, stream)
+        return assemble(contract, encode, always_full(sample), NAME, settings)
+
+    def segment(first: int, count: int) -> _Graph:
+        return _Graph(
+            lambda e, s, h, noisy: toge.denoise_fast(e, s, h, noisy, steps, first, count),
+            (*fast, (1, contract.horizon, ACTION_DIM)),
+            stream,
         )
-    return assemble(contract, encode, sample, refine, NAME, settings)
+
+    noise = toge.initial_noise.cpu().numpy()
+    act = warm_started(toge, noise, steps, settings.head_steps, segment)
+    return assemble(contract, encode, act, NAME, settings)
 
 
 def _stream(device: torch.device, priority: int) -> torch.cuda.Stream:

@@ -18,12 +18,16 @@ from policy.contract import (
     SingleRatePolicy,
     WarmStartPolicy,
 )
-from policy.engines.warm_start import Refine, Sample, WarmStart
+from policy.engines.warm_start import Segment, Solve, WarmStart, segment_spans
 from policy.preprocess import image_to_input
 from policy.user_code import user_code
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
+Act = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
+"""``Executable.act``."""
+Sample = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+"""(encoded image, state, history) -> chunk [1, horizon, 4], from noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,39 +80,82 @@ def make_executable(
     """
     steps = settings.num_diffusion_steps
     if not settings.dual_rate:
-        sample = partial(run_action, lambda e, s, h: action.predict(e, s, h, steps))
-        return assemble(action.contract, lambda image: image, sample, None, engine, settings)
+        act = always_full(partial(run_action, lambda e, s, h: action.predict(e, s, h, steps)))
+        return assemble(action.contract, lambda image: image, act, engine, settings)
     if not isinstance(vision, DualRatePolicy) or not isinstance(action, DualRatePolicy):
         raise PolicyError(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
         )
-    fast = action
-    sample = partial(run_action, lambda e, s, h: fast.predict_fast(e, s, h, steps))
-    refine: Refine | None = None
-    if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
-        warm, head_steps = action, settings.head_steps
-        refine = partial(
-            run_action, lambda e, s, h, g: warm.refine_fast(e, s, h, g, steps, head_steps)
-        )
     encode = partial(run_vision, vision.encode_visual)
-    return assemble(action.contract, encode, sample, refine, engine, settings)
+    if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
+        act = _warm_started(action, settings.head_steps, run_action, settings)
+        return assemble(action.contract, encode, act, engine, settings)
+    fast = action
+    act = always_full(partial(run_action, lambda e, s, h: fast.predict_fast(e, s, h, steps)))
+    return assemble(action.contract, encode, act, engine, settings)
+
+
+def _warm_started(policy: WarmStartPolicy, head_steps: int, run: Run, settings: Settings) -> Act:
+    steps = settings.num_diffusion_steps
+
+    def segment(first: int, count: int) -> Segment:
+        return partial(
+            run, lambda e, s, h, noisy: policy.denoise_fast(e, s, h, noisy, steps, first, count)
+        )
+
+    with user_code(f"{settings.name} failed to prepare its warm start"):
+        noise = run(lambda: policy.initial_noise)
+        return warm_started(policy, noise, steps, head_steps, segment)
+
+
+def warm_started(
+    policy: WarmStartPolicy,
+    noise: FloatArray,
+    num_diffusion_steps: int,
+    head_steps: int,
+    segment: Callable[[int, int], Segment],
+) -> Act:
+    """Warm starts, and full solves spread over ticks, by an engine's segments.
+
+    Args:
+        policy: whose shares of noise count; the engine runs it.
+        noise: its initial noise [1, horizon, 4].
+        num_diffusion_steps: of a full solve.
+        head_steps: of a warm start, and of each segment but the first, which may have fewer.
+        segment: (first step, number of steps) -> what runs them.
+
+    Raises:
+        PolicyError: there are not that many steps.
+    """
+    spans = segment_spans(num_diffusion_steps, head_steps)
+    guess_share, noise_share = policy.noise_shares(num_diffusion_steps, spans[-1][0])
+    solve = Solve(
+        noise=noise,
+        segments=tuple(segment(first, count) for first, count in spans),
+        guess_share=guess_share,
+        noise_share=noise_share,
+    )
+    return WarmStart(solve, chunk_dt_s=policy.contract.chunk_dt_s)
+
+
+def always_full(sample: Sample) -> Act:
+    """Every chunk from noise, whenever the last one was."""
+    return lambda encoded, state, history, _elapsed_s: sample(encoded, state, history)
 
 
 def assemble(
     contract: Contract,
     encode: Callable[[FloatArray], FloatArray],
-    sample: Sample,
-    refine: Refine | None,
+    act: Act,
     engine: str,
     settings: Settings,
 ) -> Executable:
-    """An executable of an engine's three functions, tried on a dummy sample, which warms it up.
+    """An executable of an engine's two functions, tried on a dummy sample, which warms it up.
 
     Args:
         contract: of the policy.
-        encode: normalised image [1, 3, H, W] -> what the others take.
-        sample: full solve.
-        refine: solve from a guess; None = there is none.
+        encode: normalised image [1, 3, H, W] -> what ``act`` takes.
+        act: see ``Executable``.
         engine: its name.
         settings: what was asked for.
 
@@ -116,19 +163,15 @@ def assemble(
         PolicyError: a function failed on the sample, or returned the wrong shape or no numbers.
     """
 
-    warm = None if refine is None else WarmStart(sample, refine, chunk_dt_s=contract.chunk_dt_s)
-
     def encode_rgb(rgb: NDArray[np.uint8]) -> FloatArray:
         with user_code(f"{settings.name} failed on an image"):
             return encode(image_to_input(rgb, contract))
 
-    def act(
+    def act_on(
         encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
     ) -> FloatArray:
         with user_code(f"{settings.name} failed on a state"):
-            if warm is None:
-                return sample(encoded, state, history)
-            return warm(encoded, state, history, elapsed_s)
+            return act(encoded, state, history, elapsed_s)
 
     executable = Executable(
         contract=contract,
@@ -136,7 +179,7 @@ def assemble(
         engine=engine,
         dual_rate=settings.dual_rate,
         encode=encode_rgb,
-        act=act,
+        act=act_on,
     )
     _try(executable)
     return executable

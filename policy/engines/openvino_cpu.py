@@ -14,9 +14,16 @@ import openvino as ov
 
 from policy.contract import Executable, FloatArray, PolicyError
 from policy.engines.compile_cache import CompileCache, user_cache_folder
-from policy.engines.executable import Precision, Settings, assemble
-from policy.engines.openvino_graph import refine_graph, sample_graph, vision_graph
+from policy.engines.executable import (
+    Precision,
+    Settings,
+    always_full,
+    assemble,
+    warm_started,
+)
+from policy.engines.openvino_graph import denoise_graph, step_inputs, vision_graph
 from policy.engines.signal_stack import signal_stack_kept
+from policy.engines.warm_start import Segment
 from policy.preprocess import egocentric
 from policy.resnet_unet import ResnetUnet
 from policy.toge import Toge
@@ -61,33 +68,54 @@ def make_openvino_executable(
     """
     compiler = _Compiler(policy)
     noise = policy.head.initial_noise.cpu().numpy().copy()
-    steps, head_steps = settings.num_diffusion_steps, settings.head_steps
+    name = f"{NAME}-{vision}" if vision == action else f"{NAME}-{vision}-{action}"
+    steps = settings.num_diffusion_steps
     encode = compiler.compile("vision", vision, lambda: vision_graph(policy))
-    run_sample = compiler.compile(f"sample {steps}", action, lambda: sample_graph(policy, steps))
+    if settings.dual_rate and settings.head_steps is not None and isinstance(policy, Toge):
+        segment = _segments(compiler, policy, action, steps, settings.head_steps)
+        act = warm_started(policy, noise, steps, settings.head_steps, segment)
+        return assemble(policy.contract, encode, act, name, settings)
+    whole = _segments(compiler, policy, action, steps, steps)(0, steps)
 
     def sample(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        return run_sample(encoded, egocentric(state, policy.contract), history, noise)
+        return whole(encoded, state, history, noise)
 
-    name = f"{NAME}-{vision}" if vision == action else f"{NAME}-{vision}-{action}"
-    if not settings.dual_rate:
+    def from_image(image: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        return sample(encode(image), state, history)
 
-        def from_image(image: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-            return sample(encode(image), state, history)
+    if settings.dual_rate:
+        return assemble(policy.contract, encode, always_full(sample), name, settings)
+    act = always_full(from_image)
+    return assemble(policy.contract, lambda image: image, act, name, settings)
 
-        return assemble(policy.contract, lambda image: image, from_image, None, name, settings)
-    if head_steps is None or not isinstance(policy, Toge):
-        return assemble(policy.contract, encode, sample, None, name, settings)
-    warm = policy
-    run_refine = compiler.compile(
-        f"refine {steps} {head_steps}", action, lambda: refine_graph(warm, steps, head_steps)
+
+def _segments(
+    compiler: "_Compiler",
+    policy: Toge | ResnetUnet,
+    precision: Precision,
+    steps: int,
+    unrolled: int,
+) -> Callable[[int, int], Segment]:
+    """(first, count <= ``unrolled``) -> that part of a solve of ``steps``.
+
+    One graph, and so one copy of the weights, runs them all: what tells the steps apart are inputs.
+    """
+    denoise = compiler.compile(
+        f"denoise {unrolled}", precision, lambda: denoise_graph(policy, unrolled)
     )
 
-    def refine(
-        encoded: FloatArray, state: FloatArray, history: FloatArray, guess: FloatArray
-    ) -> FloatArray:
-        return run_refine(encoded, egocentric(state, warm.contract), history, guess, noise)
+    def segment(first: int, count: int) -> Segment:
+        films, updates = step_inputs(policy.head, steps, first, count, unrolled)
 
-    return assemble(policy.contract, encode, sample, refine, name, settings)
+        def run(
+            encoded: FloatArray, state: FloatArray, history: FloatArray, noisy: FloatArray
+        ) -> FloatArray:
+            known = egocentric(state, policy.contract)
+            return denoise(encoded, known, history, noisy, films, updates)
+
+        return run
+
+    return segment
 
 
 class _Compiler:

@@ -15,7 +15,7 @@ from openvino import opset15 as ops
 from torch import Tensor, nn
 
 from policy.action_head import DiffusionHead, size_dims
-from policy.contract import ACTION_DIM, Contract
+from policy.contract import ACTION_DIM, FloatArray
 from policy.diffusion import DdimStep, NoiseSchedule
 from policy.encoders import Fusion, HistoryEncoder
 from policy.engines.openvino_layers import Layer, Node, constant, conv, ints, layer, same
@@ -40,27 +40,48 @@ def vision_graph(policy: Toge | ResnetUnet) -> ov.Model:
     return ov.Model([ops.result(feature)], [image], "vision")
 
 
-def sample_graph(policy: Toge | ResnetUnet, num_diffusion_steps: int) -> ov.Model:
-    """(feature, egocentric, history, noise) -> chunk [1, horizon, 4]: all steps, unrolled."""
+def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
+    """``count`` steps of a solve, unrolled; ``step_inputs`` says which ones.
+
+    (feature, egocentric, history, noisy [1, horizon, 4], films, updates) -> less noisy.
+    """
+    unet = policy.head.unet
     inputs = _action_inputs(policy)
-    noise = _chunk_parameter("noise", policy.contract)
-    steps = policy.head.schedule.ddim_steps(num_diffusion_steps)
-    chunk = _solve(policy.head, _condition(policy, *inputs), noise, steps)
-    return ov.Model([ops.result(chunk)], [*inputs, noise], "sample")
+    noisy = _parameter("noisy", 1, policy.contract.horizon, ACTION_DIM)
+    films = _parameter("films", count, unet.film_dim)
+    updates = _parameter("updates", count, 4)
+    film = ops.add(layer(unet.film_condition)(_condition(policy, *inputs)), films)
+    denoise = _UNetGraph(unet)
+    sample = ops.unsqueeze(ops.transpose(noisy, ints(0, 2, 1)), ints(2))
+    for film_of_step, update in zip(
+        _split(film, 0, [1] * count), _split(updates, 0, [1] * count), strict=True
+    ):
+        sample = _updated(sample, denoise(sample, film_of_step), update)
+    less_noisy = ops.transpose(ops.squeeze(sample, ints(2)), ints(0, 2, 1))
+    return ov.Model([ops.result(less_noisy)], [*inputs, noisy, films, updates], "denoise")
 
 
-def refine_graph(policy: Toge, num_diffusion_steps: int, head_steps: int) -> ov.Model:
-    """(feature, egocentric, history, guess, noise) -> chunk: the last steps."""
-    inputs = _action_inputs(policy)
-    guess = _chunk_parameter("guess", policy.contract)
-    noise = _chunk_parameter("noise", policy.contract)
-    steps = policy.head.schedule.last_steps(num_diffusion_steps, head_steps)
-    start = ops.add(
-        ops.multiply(guess, constant(steps[0].signal)),
-        ops.multiply(noise, constant(steps[0].noise)),
-    )
-    chunk = _solve(policy.head, _condition(policy, *inputs), start, steps)
-    return ov.Model([ops.result(chunk)], [*inputs, guess, noise], "refine")
+def step_inputs(
+    head: DiffusionHead, num_diffusion_steps: int, first: int, count: int, unrolled: int
+) -> tuple[FloatArray, FloatArray]:
+    """What makes a graph of ``unrolled`` steps the steps ``first`` to ``first + count`` of a solve.
+
+    Where those are fewer, steps that change nothing come before them.
+
+    Returns:
+        The timesteps' shares of FiLM [unrolled, film_dim], 1 added to the scales, and the
+        coefficients of ``_updated`` [unrolled, 4].
+    """
+    steps = head.schedule.ddim_steps(num_diffusion_steps)[first : first + count]
+    timesteps = torch.tensor([step.timestep for step in steps])
+    with torch.inference_mode():
+        film_of_steps = head.unet.film_of_timestep(timesteps.to(head.initial_noise.device)).cpu()
+        films = (film_of_steps + _one_at_every_scale(head.unet)).numpy()
+    updates = np.array([_coefficients(head.schedule, step) for step in steps], np.float32)
+    idle = unrolled - count
+    unchanged = np.tile(np.array([[0, 0, 0, 1]], np.float32), (idle, 1))
+    films = np.concatenate([films[:1].repeat(idle, axis=0), films])
+    return films, np.concatenate([unchanged, updates])
 
 
 def _action_inputs(policy: Toge | ResnetUnet) -> tuple[Node, Node, Node]:
@@ -73,10 +94,6 @@ def _action_inputs(policy: Toge | ResnetUnet) -> tuple[Node, Node, Node]:
 
 def _parameter(name: str, *shape: int) -> Node:
     return ops.parameter(list(shape), np.float32, name)
-
-
-def _chunk_parameter(name: str, contract: Contract) -> Node:
-    return _parameter(name, 1, contract.horizon, ACTION_DIM)
 
 
 # --- the condition
@@ -114,43 +131,30 @@ def _fuse(fusion: Fusion, feature: Node, state_token: Node, history: Node) -> No
 # --- the sampler
 
 
-def _solve(head: DiffusionHead, condition: Node, start: Node, steps: Sequence[DdimStep]) -> Node:
-    """``diffusion.ddim_solve``, unrolled."""
-    unet = head.unet
-    timesteps = torch.tensor([step.timestep for step in steps])
-    with torch.inference_mode():
-        film_of_steps = unet.film_of_timestep(timesteps.to(head.initial_noise.device)).cpu()
-        film_of_steps = film_of_steps + _one_at_every_scale(unet)
-    film = ops.add(layer(unet.film_condition)(condition), constant(film_of_steps))
-    denoise = _UNetGraph(unet)
-    sample = ops.unsqueeze(ops.transpose(start, ints(0, 2, 1)), ints(2))
-    for step, film_of_step in zip(steps, _split(film, 0, [1] * len(steps)), strict=True):
-        sample = _update(head.schedule, step, sample, denoise(sample, film_of_step))
-    return ops.transpose(ops.squeeze(sample, ints(2)), ints(0, 2, 1))
-
-
 def _one_at_every_scale(unet: UNet1d) -> Tensor:
     """FiLM's scales are about 1: what to add to all of them beforehand; [film_dim]."""
     halves = [(torch.ones(size // 2), torch.zeros(size // 2)) for size in unet.film_sizes]
     return torch.cat([half for pair in halves for half in pair])
 
 
-def _update(schedule: NoiseSchedule, step: DdimStep, noisy: Node, output: Node) -> Node:
-    """``NoiseSchedule.ddim_update`` with its coefficients folded."""
-    clean = output
+def _coefficients(schedule: NoiseSchedule, step: DdimStep) -> tuple[float, float, float, float]:
+    """``NoiseSchedule.ddim_update`` as ``next = c * clip(a * noisy + b * output) + d * noisy``."""
+    a, b = 0.0, 1.0
     if schedule.prediction == "epsilon":
-        clean = ops.add(
-            ops.multiply(noisy, constant(1 / step.signal)),
-            ops.multiply(output, constant(-step.noise / step.signal)),
-        )
-    clean = ops.clamp(clean, -1.0, 1.0)
-    if step.next_noise == 0.0:
-        return clean
+        a, b = 1 / step.signal, -step.noise / step.signal
     kept = step.next_noise / step.noise
-    return ops.add(
-        ops.multiply(clean, constant(step.next_signal - kept * step.signal)),
-        ops.multiply(noisy, constant(kept)),
-    )
+    return a, b, step.next_signal - kept * step.signal, kept
+
+
+def _updated(noisy: Node, output: Node, update: Node) -> Node:
+    """One reverse step by the net's output; ``update`` [1, 4] are its ``_coefficients``.
+
+    ``noisy`` and ``update`` also reach the graph's end by a way without convolutions; along such a
+    way OpenVINO keeps float32 where the rest is bf16.
+    """
+    a, b, c, d = _split(ops.reshape(update, ints(1, 4, 1, 1), special_zero=False), 1, [1] * 4)
+    clean = ops.clamp(ops.add(ops.multiply(noisy, a), ops.multiply(output, b)), -1.0, 1.0)
+    return ops.add(ops.multiply(clean, c), ops.multiply(noisy, d))
 
 
 class _UNetGraph:

@@ -2,22 +2,66 @@
 
 Training-free, after Falcon (Chen et al. 2025, arXiv 2503.00339) and RTI-DP (arXiv 2508.05396). A
 guess that is only ever improved can settle beside what a full solve finds ("execution stall", STEP,
-arXiv 2602.08245), so every ``FULL_EVERY_S`` the chunk is sampled from noise again.
+arXiv 2602.08245), so every ``FULL_EVERY_S`` a chunk is sampled from noise again. That solve is
+spread over ticks, a segment beside each warm-started one: no tick but one without a guess takes
+more than twice the steps of a warm start.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from policy.contract import FloatArray
+from policy.contract import FloatArray, PolicyError
 
 FULL_EVERY_S = 1.0
-"""Time between full solves, in seconds of the states that the chunks belong to."""
+"""Between the starts of full solves, and the age of a guess that is none any more; in seconds of
+the states that the chunks belong to."""
 
-Sample = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""(encoded image, state, history) -> chunk [1, horizon, 4], from noise."""
-Refine = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
-"""(encoded image, state, history, guess [1, horizon, 4]) -> chunk [1, horizon, 4]."""
+Segment = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+"""(encoded image, state, history, noisy chunk [1, horizon, 4]) -> less noisy chunk."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solve:
+    """An engine's full solve, in segments of a warm start's steps, and how a guess enters it."""
+
+    noise: FloatArray
+    """[1, horizon, 4]: what the first segment starts with."""
+    segments: tuple[Segment, ...]
+    """Each starts with what the one before made; the last one makes the chunk."""
+    guess_share: float
+    noise_share: float
+    """Of a guess and of noise, in what the last segment starts with."""
+
+    def sample(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        """All segments, from noise -> chunk [1, horizon, 4]."""
+        noisy = self.noise
+        for segment in self.segments:
+            noisy = segment(encoded, state, history, noisy)
+        return noisy
+
+    def refine(
+        self, encoded: FloatArray, state: FloatArray, history: FloatArray, guess: FloatArray
+    ) -> FloatArray:
+        """The last segment, from ``guess`` [1, horizon, 4] -> chunk."""
+        noisy = self.guess_share * guess + self.noise_share * self.noise
+        return self.segments[-1](encoded, state, history, noisy)
+
+
+def segment_spans(num_diffusion_steps: int, head_steps: int) -> list[tuple[int, int]]:
+    """(first step, number of steps) of each segment; only the first one may have fewer.
+
+    Raises:
+        PolicyError: the solve does not have ``head_steps``.
+    """
+    if not 1 <= head_steps <= num_diffusion_steps:
+        raise PolicyError(
+            f"head_steps must be in 1..{num_diffusion_steps} (num_diffusion_steps), "
+            f"got {head_steps}"
+        )
+    ends = reversed(range(num_diffusion_steps, 0, -head_steps))
+    return [(max(end - head_steps, 0), min(end, head_steps)) for end in ends]
 
 
 def moved_chunk(chunk: FloatArray, periods: float) -> FloatArray:
@@ -35,14 +79,41 @@ def moved_chunk(chunk: FloatArray, periods: float) -> FloatArray:
     return moved
 
 
-class WarmStart:
-    """``Executable.act``; keeps the last chunk. The same calls give the same chunks."""
+@dataclass(slots=True)
+class _Guess:
+    chunk: FloatArray
+    age_s: float
+    """From the state that it was made from to that of the last call."""
 
-    def __init__(self, sample: Sample, refine: Refine, *, chunk_dt_s: float) -> None:
-        self._sample = sample
-        self._refine = refine
+
+class _SpreadSolve:
+    """A full solve on the inputs of the tick where it began, a segment at a time."""
+
+    def __init__(
+        self, solve: Solve, encoded: FloatArray, state: FloatArray, history: FloatArray
+    ) -> None:
+        # Copies: the caller may write to its arrays before the last segment reads them.
+        self._inputs = encoded.copy(), state.copy(), history.copy()
+        self._noisy = solve.noise
+        self._segments = iter(solve.segments)
+        self._left = len(solve.segments)
+        self.age_s = 0.0
+
+    def run_segment(self) -> FloatArray | None:
+        """The chunk, if that was the last segment."""
+        self._noisy = next(self._segments)(*self._inputs, self._noisy)
+        self._left -= 1
+        return None if self._left else self._noisy
+
+
+class WarmStart:
+    """``Executable.act``; keeps a guess of the next chunk. The same calls give the same chunks."""
+
+    def __init__(self, solve: Solve, *, chunk_dt_s: float) -> None:
+        self._solve = solve
         self._chunk_dt_s = chunk_dt_s
-        self._last: FloatArray | None = None
+        self._guess: _Guess | None = None
+        self._spread: _SpreadSolve | None = None
         self._since_full_s = 0.0
 
     def __call__(
@@ -52,14 +123,37 @@ class WarmStart:
         history: FloatArray,
         elapsed_s: float | None,
     ) -> FloatArray:
-        """A full solve when fresh, overdue or after time went backwards; else a refinement."""
-        last, self._last = self._last, None
-        self._since_full_s += elapsed_s or 0.0
-        if last is None or elapsed_s is None or elapsed_s < 0 or self._since_full_s >= FULL_EVERY_S:
+        """A whole solve where there is no guess, or time went backwards; else a refinement."""
+        # Taken, not read: a solve that fails leaves nothing behind.
+        guess, self._guess = self._guess, None
+        spread, self._spread = self._spread, None
+        if guess is None or elapsed_s is None or elapsed_s < 0:
+            return self._afresh(encoded, state, history)
+        guess.age_s += elapsed_s
+        if guess.age_s >= FULL_EVERY_S:
+            return self._afresh(encoded, state, history)
+        moved = moved_chunk(guess.chunk, guess.age_s / self._chunk_dt_s)
+        chunk = self._solve.refine(encoded, state, history, moved)
+        self._guess = _Guess(chunk, 0.0)
+        self._since_full_s += elapsed_s
+        if spread is not None:
+            spread.age_s += elapsed_s
+        elif self._since_full_s >= FULL_EVERY_S:
             self._since_full_s = 0.0
-            chunk = self._sample(encoded, state, history)
-        else:
-            guess = moved_chunk(last, elapsed_s / self._chunk_dt_s)
-            chunk = self._refine(encoded, state, history, guess)
-        self._last = chunk
+            spread = _SpreadSolve(self._solve, encoded, state, history)
+        if spread is not None:
+            self._run_segment(spread)
         return chunk
+
+    def _afresh(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        self._since_full_s = 0.0
+        chunk = self._solve.sample(encoded, state, history)
+        self._guess = _Guess(chunk, 0.0)
+        return chunk
+
+    def _run_segment(self, spread: _SpreadSolve) -> None:
+        chunk = spread.run_segment()
+        if chunk is None:
+            self._spread = spread
+        else:
+            self._guess = _Guess(chunk, spread.age_s)

@@ -65,6 +65,17 @@ def test_the_same_flight_gives_the_same_sticks(small_toge: Toge, fly: Fly) -> No
     np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.parametrize("head_steps", [2, 3])
+def test_a_flight_with_a_spread_solve_is_that_of_torch(
+    trained_toge: Toge, fly: Fly, head_steps: int
+) -> None:
+    on_gpu = replace(ON_GPU, head_steps=head_steps)
+    settings = Settings(name="t", head_steps=head_steps)
+    expected = fly(make_torch_executable(trained_toge, settings), 0.01)
+    chunks = fly(make_cuda_graph_executable(trained_toge, on_gpu), 0.01)
+    assert disagreement(expected, chunks) is None
+
+
 def test_both_paths_at_once_do_not_touch_each_other(small_toge: Toge) -> None:
     executable, probe = make_cuda_graph_executable(small_toge, ON_GPU), make_probe(SMALL)
     rgb = probe.rgb[:, :32, :32]

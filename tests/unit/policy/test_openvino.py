@@ -16,11 +16,11 @@ from policy.action_head import Size
 from policy.backbones import BACKBONE_NAMES, BackboneName
 from policy.checkpoint import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, Executable, FloatArray, PolicyError
-from policy.diffusion import NoiseSchedule
+from policy.diffusion import NoiseSchedule, Prediction
 from policy.engines.choose import probe_chunks
 from policy.engines.executable import Settings
 from policy.engines.openvino_cpu import make_openvino_executable, precisions
-from policy.engines.openvino_graph import sample_graph
+from policy.engines.openvino_graph import denoise_graph
 from policy.engines.openvino_layers import layer
 from policy.engines.signal_stack import signal_stack_kept
 from policy.engines.torch_eager import make_torch_executable
@@ -106,12 +106,36 @@ def test_every_bias_is_added_within_its_convolution(trained_toge: Toge, action: 
 
     with signal_stack_kept():
         properties = {"INFERENCE_PRECISION_HINT": action}
-        compiled = ov.Core().compile_model(sample_graph(trained_toge, 3), "CPU", properties)
+        compiled = ov.Core().compile_model(denoise_graph(trained_toge, 3), "CPU", properties)
         operators = [op.get_rt_info() for op in compiled.get_runtime_model().get_ops()]
     convolutions = [op for op in operators if op["layerType"].astype(str) == "Convolution"]
     assert len(convolutions) == 3 * 22
     for convolution in convolutions:
         assert "Add" in convolution["originalLayersNames"].astype(str)
+
+
+@pytest.mark.parametrize("prediction", ["sample", "epsilon"])
+@pytest.mark.parametrize("head_steps", [1, 2, 4, 10])  # 4: the first segment is padded
+def test_segments_compute_what_a_whole_solve_on_torch_does(
+    head_steps: int, prediction: Prediction
+) -> None:
+    schedule = NoiseSchedule(prediction=prediction)
+    policy = seeded(TogeConfig(backbone="resnet18", contract=SMALL, schedule=schedule))
+    probe = make_probe(SMALL)
+    whole = make_torch_executable(policy, Settings(name="toge"))
+    settings = Settings(name="toge", head_steps=head_steps)
+    segmented = make_openvino_executable(policy, settings, "f32", "f32")
+    for rgb, state, history in zip(probe.rgb, probe.state, probe.history, strict=True):
+        inputs = whole.encode(rgb), state[None], history[None]
+        expected = whole.act(*inputs, None)
+        np.testing.assert_allclose(segmented.act(*inputs, None), expected, atol=2e-3)
+
+
+def test_a_flight_with_a_spread_solve_is_that_of_torch(trained_toge: Toge, fly: Fly) -> None:
+    settings = Settings(name="toge", head_steps=3)
+    expected = fly(make_torch_executable(trained_toge, settings), 0.01)
+    chunks = fly(make_openvino_executable(trained_toge, settings, "f32", "f32"), 0.01)
+    np.testing.assert_allclose(chunks, expected, atol=2e-3)
 
 
 def test_the_same_flight_gives_the_same_sticks(small_toge: Toge, fly: Fly) -> None:

@@ -3,7 +3,14 @@ import torch
 from torch import Tensor
 
 from policy.checkpoint import BuiltinPolicy
-from policy.contract import Contract, ContractError, DualRatePolicy, PolicyError, SingleRatePolicy
+from policy.contract import (
+    Contract,
+    ContractError,
+    DualRatePolicy,
+    PolicyError,
+    SingleRatePolicy,
+    WarmStartPolicy,
+)
 from policy.diffusion import NoiseSchedule
 from policy.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.toge import Toge, TogeConfig
@@ -33,6 +40,36 @@ def test_both_paths_agree_bit_for_bit(small_toge: Toge, steps: int, with_history
     assert torch.equal(direct, cached)
     assert direct.shape == (1, 16, 4)
     assert direct.abs().max() <= 1.0
+
+
+def test_keeps_the_protocol_of_a_warm_start(small_toge: Toge) -> None:
+    assert isinstance(small_toge, WarmStartPolicy)
+    assert small_toge.noise_shares(10, 9)[0] > 0.9 > small_toge.noise_shares(10, 5)[0]
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("counts", [[1] * 10, [2] * 5, [1, 3, 3, 3], [2, 4, 4], [10]])
+def test_a_solve_in_parts_is_the_whole_one_bit_for_bit(
+    trained_toge: Toge, counts: list[int]
+) -> None:
+    image, state, history = sample()
+    feature = trained_toge.encode_visual(image)
+    noisy, first = trained_toge.initial_noise, 0
+    for count in counts:
+        noisy = trained_toge.denoise_fast(feature, state, history, noisy, 10, first, count)
+        first += count
+    assert torch.equal(noisy, trained_toge.predict_fast(feature, state, history, 10))
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize(("first", "count"), [(-1, 2), (3, 0), (3, 2), (4, 1)])
+def test_refuses_steps_that_a_solve_does_not_have(small_toge: Toge, first: int, count: int) -> None:
+    image, state, history = sample()
+    feature, noise = small_toge.encode_visual(image), small_toge.initial_noise
+    with pytest.raises(PolicyError, match=f"a solve of 4 steps has no {count} from step {first}"):
+        small_toge.denoise_fast(feature, state, history, noise, 4, first, count)
+    with pytest.raises(PolicyError, match=r"noisy must be \[B, 16, 4\]"):
+        small_toge.denoise_fast(feature, state, history, noise[:, 1:], 4, 0, 1)
 
 
 @torch.inference_mode()
