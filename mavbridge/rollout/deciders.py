@@ -66,7 +66,8 @@ class PolicyDecider:
             for read in range(self._frames * READS_A_STEP)
         ]
         means = np.array(sticks, np.float32).reshape(self._frames, READS_A_STEP, -1).mean(axis=1)
-        return np.clip(means, -1.0, 1.0)
+        clipped: FloatArray = np.clip(means, -1.0, 1.0)
+        return clipped
 
 
 class WorldModelDecider:
@@ -89,5 +90,4 @@ class WorldModelDecider:
             latents = self._sampler.encode(np.stack(seen.images))[None]
         else:
             latents = seen.latents()
-        imagined = self._sampler.sample(latents, seen.states(), None, seed=seed)
-        return np.clip(imagined.actions, -1.0, 1.0)
+        return self._sampler.sample(latents, seen.states(), None, seed=seed).actions

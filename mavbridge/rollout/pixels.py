@@ -24,7 +24,7 @@ class Latents:
         self.values = values
         self.ready: torch.cuda.Event | None = None
         if values.is_cuda:
-            self.ready = torch.cuda.Event()
+            self.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self.ready.record(torch.cuda.current_stream(values.device))
 
 
@@ -60,7 +60,7 @@ class _StreamSource:
 
     def __init__(self, model: WorldModel, device: torch.device) -> None:
         self._model = model
-        self._stream = torch.cuda.Stream(device)
+        self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         size = model.config.image_size
         ring = torch.empty(PINNED_FRAMES, size, size, 3, dtype=torch.uint8, pin_memory=True)
         self._slots = [ring[k] for k in range(PINNED_FRAMES)]
@@ -85,7 +85,7 @@ class _StreamSource:
         with torch.inference_mode(), torch.cuda.stream(self._stream):
             pixels = self._model.decode(latent)
             self._slots[slot].copy_(pixels[0], non_blocking=True)
-            event = torch.cuda.Event()
+            event = torch.cuda.Event()  # type: ignore[no-untyped-call]
             event.record(self._stream)
         return event
 

@@ -53,9 +53,7 @@ def imagine(config: ImagineConfig) -> int:
     flight = open_flight(config.start)
     model = _load_model(config, plan)
     start = read_start(flight, model.config, config.start_at)
-    sampler = Sampler(
-        model, ddim_steps=plan.ddim_steps, decode_all=config.serial, clock=clock
-    )
+    sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=config.serial, clock=clock)
     decider = _decider(config, sampler, clock, console)
     with _onlooker(config, flight, sampler, start) as on_frame:
         output = make_output(
@@ -90,9 +88,7 @@ def make_output(
         MavbridgeError: the files cannot be made.
     """
     kind = CollectedOutput if serial else StreamedOutput
-    return kind(
-        out, sampler, plan, decode_video=decode_video, clock=clock, on_frame=on_frame
-    )
+    return kind(out, sampler, plan, decode_video=decode_video, clock=clock, on_frame=on_frame)
 
 
 def run_rollout(
@@ -153,9 +149,7 @@ def _load_model(config: ImagineConfig, plan: RolloutPlan) -> WorldModel:
         ) from error
 
 
-def _decider(
-    config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console
-) -> Decider:
+def _decider(config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console) -> Decider:
     if config.decider == "world-model":
         if config.policy.checkpoint is not None:
             raise UserError(
@@ -164,9 +158,7 @@ def _decider(
             )
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
     # One image, one chunk, as in flight; warm starts are for a policy that is asked 100 times a s.
-    loaded = load_configured_policy(
-        replace(config.policy, dual_rate=True, head_steps=None), clock
-    )
+    loaded = load_configured_policy(replace(config.policy, dual_rate=True, head_steps=None), clock)
     for note in loaded.notes:
         console.print(Text(note, style="yellow" if note.startswith("warning") else "dim"))
     return PolicyDecider(loaded.executable, sampler)
@@ -204,5 +196,3 @@ def _print(config: ImagineConfig, plan: RolloutPlan, sampler: Sampler, output: O
     )
     if config.decode_video:
         console.print(f"sha256 of the frames: {output.sha256}", soft_wrap=True)
-
-

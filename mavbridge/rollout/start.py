@@ -118,9 +118,7 @@ def _sent_before(flight: RecordedFlight, now_ns: int) -> tuple[tuple[int, Sticks
     )
 
 
-def _images(
-    flight: RecordedFlight, chosen: list[int], size: int
-) -> NDArray[np.uint8]:
+def _images(flight: RecordedFlight, chosen: list[int], size: int) -> NDArray[np.uint8]:
     wanted = set(chosen)
     found: dict[int, ImageArray] = {}
     for index, rgb in enumerate(flight.images()):

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 
+import torch
+
 from mavbridge.clock import NS_PER_S, Clock
 from mavbridge.recording.video_writer import VideoWriter
 from mavbridge.records import ImageArray, RolloutFrame
@@ -67,6 +69,7 @@ class StreamedOutput:
         self._frame_dt_s = sampler.config.frame_dt_s
         self._meter = sampler.meter
         self._source = make_frame_source(sampler.model)
+        self._torch_threads = torch.get_num_threads()
         self._clock = clock
         self._on_frame = on_frame
         self._digest = FrameDigest()
@@ -168,6 +171,7 @@ class StreamedOutput:
 
     def _serve(self, stop: Event) -> None:
         """The thread."""
+        torch.set_num_threads(self._torch_threads)  # sums are rounded by how they are split up
         while not stop.is_set():
             try:
                 job = self._jobs.get(timeout=_POLL_S)
