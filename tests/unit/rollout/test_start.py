@@ -8,14 +8,13 @@ import pytest
 
 from factories import START_NS
 from mavbridge.clock import NS_PER_MS, NS_PER_S
-from mavbridge.errors import MavbridgeError, UserError
+from mavbridge.errors import UserError
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.records import FloatArray
 from mavbridge.rollout.deciders import PolicyDecider
 from mavbridge.rollout.observation import ObservationQueue
 from mavbridge.rollout.start import RealFrames, read_start
 from policy.contract import Contract
-from recordings import make_meta
 from rollouts import SIZE, TINY, grey, make_sampler, make_start, noise_executable, write_flight
 
 
@@ -49,22 +48,31 @@ def test_real_frames_follow_at_the_same_spacing_until_the_flight_ends(flight: Pa
 
 
 @pytest.mark.parametrize(
-    ("changes", "start_s", "told"),
+    ("changes", "told"), [({"ticks": False}, "no state"), ({"camera_hz": 0.0}, "no frames")]
+)
+def test_a_flight_without_states_or_frames_is_refused(
+    tmp_path: Path, changes: dict[str, object], told: str
+) -> None:
+    flight = open_flight(write_flight(tmp_path / "a", **changes))  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=told):
+        read_start(flight, TINY, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("contract", "start_s", "told"),
     [
-        ({"seconds": 0.06}, 0.0, "too short"),
-        ({}, 0.95, "too short"),
-        ({"ticks": False}, 0.0, "no state"),
-        ({"camera_hz": 0.0}, 0.0, "no frames"),
-        ({"meta": make_meta(contract=Contract(state_frame="enu_flu"))}, 0.0, "enu_flu"),
-        ({"meta": make_meta(contract=None)}, 0.0, "unknown frame"),
+        (Contract(), 0.95, "too short"),
+        (Contract(state_frame="enu_flu"), 0.0, "enu_flu"),
+        (None, 0.0, "unknown frame"),
     ],
 )
 def test_a_flight_that_starts_nothing_is_refused(
-    tmp_path: Path, changes: dict[str, object], start_s: float, told: str
+    flight: Path, contract: Contract | None, start_s: float, told: str
 ) -> None:
-    flight = open_flight(write_flight(tmp_path / "a", **changes))  # type: ignore[arg-type]
-    with pytest.raises(MavbridgeError, match=told):
-        read_start(flight, TINY, start_s)
+    opened = open_flight(flight)
+    changed = replace(opened, meta=replace(opened.meta, contract=contract))
+    with pytest.raises(UserError, match=told):
+        read_start(changed, TINY, start_s)
 
 
 def test_a_policy_of_another_frame_is_refused() -> None:

@@ -203,13 +203,14 @@ def test_files_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from rollouts import make_plan, make_sampler, make_decider, make_start
-from mavbridge.clock import MonotonicClock
-from mavbridge.rollout.loop import rollout
-from mavbridge.rollout.output import ignore
-from mavbridge.rollout.streamed import StreamedOutput
 
-if __name__ == "__main__":
+
+def main():  # the writer process imports this script, too: nothing heavy outside
+    from mavbridge.clock import MonotonicClock
+    from mavbridge.rollout.loop import rollout
+    from mavbridge.rollout.streamed import StreamedOutput
+    from rollouts import make_decider, make_plan, make_sampler, make_start
+
     def on_frame(frame, rgb):
         if frame.number == 100:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -225,6 +226,10 @@ if __name__ == "__main__":
     )
     for segment in rollout(sampler, make_decider("toge", sampler), make_start(), plan):
         output.put(segment)
+
+
+if __name__ == "__main__":
+    main()
 """
 
 
