@@ -374,8 +374,8 @@ class RolloutBenchConfig:
     plot: Path | None = None
     """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
     world_model: Path | None = None
-    """Weights of the world model; by default those that come with mavbridge, or random ones, which take
-    as long."""
+    """Weights of the world model; by default those that come with mavbridge, or else random
+    ones, which take as long."""
 
 
 HELD_OUT_COURSE_SEED = 1_000_000
