@@ -9,9 +9,10 @@ from torch import Tensor
 
 from policy.contract import Contract, FloatArray
 from policy.dataset_frames import disk_error
-from policy.dataset_samples import Indices
+from policy.dataset_time import Indices
 from policy.train_batches import Batches, PooledStore, normalise_image
-from policy.train_model import Trainee, computing_in, refresh_batch_norm
+from policy.train_loop import computing_in
+from policy.train_model import Trainee, refresh_batch_norm
 
 NORM_BATCHES = 16
 ENCODE_BATCH = 64

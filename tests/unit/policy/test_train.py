@@ -219,7 +219,7 @@ def test_settings_that_no_run_could_use_are_refused(tmp_path: Path) -> None:
 def test_stages_grow_and_fill_the_budget(tmp_path: Path) -> None:
     contract = Contract(image_height=224, image_width=160)
     stages = make_stages(settings(tmp_path, policy=TogeConfig(contract=contract)))
-    assert [stage.image_size for stage in stages] == [(96, 64), (160, 128), (224, 160), (224, 160)]
+    assert [stage.image_size for stage in stages] == [(96, 96), (160, 128), (224, 160), (224, 160)]
     assert [stage.trains_encoder for stage in stages] == [True, True, True, False]
     assert stages[0].start == 0
     assert stages[-1].end == 1
