@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import resource
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +13,7 @@ from rich.console import Console
 
 from mavbridge.bench.rollout_results import Trial
 from mavbridge.clock import NS_PER_S, MonotonicClock
-from mavbridge.records import NEUTRAL
+from mavbridge.records import NEUTRAL, ImageArray, RolloutFrame
 from mavbridge.rollout.deciders import WorldModelDecider
 from mavbridge.rollout.loop import rollout
 from mavbridge.rollout.plan import RolloutPlan
@@ -55,13 +54,27 @@ def _measure(model: WorldModel, args: argparse.Namespace, out: Path) -> Trial:
     is_serial = args.way == "serial"
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=is_serial, clock=clock)
     decider = WorldModelDecider(sampler, from_pixels=False)
+    writer_rss_mb: list[float | None] = []
+
+    def on_frame(frame: RolloutFrame, _: ImageArray | None) -> None:
+        is_last = frame.number + 1 == plan.iterations * plan.frames
+        if is_last and output.writer_pid is not None:  # it is still there
+            writer_rss_mb.append(_peak_rss_mb(output.writer_pid))
+
     before_ns = clock.now_ns()
-    output = make_output(out, sampler, plan, serial=is_serial, decode_video=True, clock=clock)
+    output = make_output(
+        out,
+        sampler,
+        plan,
+        serial=is_serial,
+        decode_video=True,
+        clock=clock,
+        on_frame=on_frame,
+    )
     start_ns = clock.now_ns()
     run_rollout(sampler, decider, start, plan, output, out, Console(file=sys.stderr))
     end_ns = clock.now_ns()
     on_gpu = args.device != "cpu"
-    writer_kb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
     return Trial(
         way=args.way,
         device=args.device,
@@ -74,8 +87,8 @@ def _measure(model: WorldModel, args: argparse.Namespace, out: Path) -> Trial:
         sample_s=sampler.meter.sample.seconds,
         decode_s=sampler.meter.decode.seconds,
         write_s=sampler.meter.write.seconds,
-        peak_rss_mb=_peak_rss_mb(),
-        writer_rss_mb=None if is_serial else writer_kb / 1024,
+        peak_rss_mb=_peak_rss_mb("self") or 0.0,
+        writer_rss_mb=writer_rss_mb[-1] if writer_rss_mb else None,
         peak_gpu_mb=torch.cuda.max_memory_allocated() / MB if on_gpu else None,
         sha256=output.sha256,
     )
@@ -106,13 +119,14 @@ def _start(config: WorldModelConfig) -> Start:
     )
 
 
-def _peak_rss_mb() -> float:
-    """Not ``ru_maxrss``, which a process inherits from the one that started it."""
+def _peak_rss_mb(pid: int | str) -> float | None:
+    """Not ``ru_maxrss``, which a process inherits from the one that started it; None: not known."""
     try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
-    except (OSError, StopIteration):
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return None
+    peaks = (int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+    return next(peaks, None)
 
 
 def _arguments() -> argparse.Namespace:

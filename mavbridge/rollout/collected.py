@@ -52,6 +52,11 @@ class CollectedOutput:
         return len(self._collected) - self._written
 
     @property
+    def writer_pid(self) -> int | None:
+        """There is none."""
+        return None
+
+    @property
     def sha256(self) -> str:
         """Of all frames so far, raw, in their order."""
         return self._digest.hexdigest()

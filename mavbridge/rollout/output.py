@@ -67,6 +67,11 @@ class Output(Protocol):
         ...
 
     @property
+    def writer_pid(self) -> int | None:
+        """The writer process, where there is one."""
+        ...
+
+    @property
     def sha256(self) -> str:
         """Of all frames so far, raw, in their order."""
         ...

@@ -97,6 +97,11 @@ class StreamedOutput:
         return 0 if self._video is None else self._video.lost
 
     @property
+    def writer_pid(self) -> int | None:
+        """The writer process, where there is one."""
+        return None if self._video is None else self._video.pid
+
+    @property
     def sha256(self) -> str:
         """Of all frames so far, raw, in their order."""
         return self._digest.hexdigest()
