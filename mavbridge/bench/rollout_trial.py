@@ -56,7 +56,7 @@ def _measure(model: WorldModel, args: argparse.Namespace, out: Path) -> Trial:
     decider = WorldModelDecider(sampler, from_pixels=False)
     writer_rss_mb: list[float | None] = []
 
-    def on_frame(frame: RolloutFrame, _: ImageArray | None) -> None:
+    def on_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
         is_last = frame.number + 1 == plan.iterations * plan.frames
         if is_last and output.writer_pid is not None:  # it is still there
             writer_rss_mb.append(_peak_rss_mb(output.writer_pid))
