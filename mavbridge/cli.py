@@ -15,6 +15,8 @@ from mavbridge.config import (
     EvaluateConfig,
     ExportConfig,
     FlyConfig,
+    ImagineConfig,
+    RolloutBenchConfig,
     TrainConfig,
 )
 from mavbridge.errors import UserError
@@ -37,12 +39,40 @@ def fly(config: FlyConfig | None = None) -> int:
     return run_flight(config)
 
 
-@cli.command
+bench_cli = App(name="bench")
+cli.command(bench_cli)
+
+
+@bench_cli.default
 def bench(config: BenchConfig | None = None) -> int:
     """Measure this machine: engines, loops against a simulated vehicle, the link, the peers."""
     from mavbridge.bench.run import bench as run_bench  # torch: not for --help
 
     return run_bench(BenchConfig() if config is None else config)
+
+
+@bench_cli.command(name="rollout")
+def bench_rollout(config: RolloutBenchConfig | None = None) -> int:
+    """Measure imagined flights: the plain serial way against ours."""
+    from mavbridge.recording.folder import require_extra
+
+    require_extra("bench rollout")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as for train
+    from mavbridge.bench.rollout import bench_rollout as run_bench  # torch: not for --help
+
+    return run_bench(RolloutBenchConfig() if config is None else config)
+
+
+@cli.command
+def imagine(config: ImagineConfig) -> int:
+    """Let a policy and a world model imagine a flight, from the start of a recorded one."""
+    from mavbridge.recording.folder import require_extra
+
+    require_extra("imagine")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as for train
+    from mavbridge.rollout.run import imagine as run_rollout  # torch: not for --help
+
+    return run_rollout(config)
 
 
 @cli.command

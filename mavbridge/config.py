@@ -18,6 +18,7 @@ Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 Output = Literal["rc-override", "manual-control"]
 Pace = Literal["clock", "state"]
 Variety = Literal["nominal", "random"]
+Decider = Literal["toge", "world-model"]
 
 HEARTBEAT_HZ = 1.0
 """MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
@@ -334,6 +335,63 @@ class BenchConfig:
     """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
     check: Path | None = None
     """Compare with this budget of ratios, and exit with 1 if something got worse."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ImagineConfig:
+    """One imagined flight."""
+
+    start: Path
+    """Recorded flight that the imagination goes on from."""
+    out: Path
+    """Video to write (.mp4), new; its rows go beside it (.parquet)."""
+    decider: Decider = "world-model"
+    """Who chooses the sticks: the world model itself, or toge, the policy of --checkpoint."""
+    world_model: Path | None = None
+    """Weights of the world model; by default those that come with mavbridge."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    start_at: float = 0.0
+    """Seconds into the flight, from its first frame with a state."""
+    n_iter: int = 8
+    """Iterations: a decision, and a simulation of what comes of it."""
+    frames: int = 16
+    """Imagined frames of each iteration that are shown."""
+    exe_steps: int = 1
+    """Steps that are executed before the next decision; --frames 1 shows these alone."""
+    ddim_steps: int = 4
+    """DDIM steps of the world model."""
+    decode_video: bool = True
+    """Write a video; without it only the rows are written."""
+    fast_policy_no_decode: bool = True
+    """Let the world model decide from its latents; otherwise they are decoded and encoded again."""
+    serial: bool = False
+    """The plain path, for comparison: decode everything at once, write everything at the end."""
+    rerun: Annotated[str, Parameter(help="spawn, connect[=URL], FILE.rrd, or off.")] = "off"
+
+    def __post_init__(self) -> None:
+        """Refuse what no world model could do."""
+        _check("start-at", self.start_at, 0, 86400, "s")
+        _check("n-iter", self.n_iter, 1, 1_000_000, "")
+        _check("frames", self.frames, 1, 256, "")
+        _check("exe-steps", self.exe_steps, 1, 256, "")
+        _check("ddim-steps", self.ddim_steps, 1, 1000, "")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RolloutBenchConfig:
+    """One benchmark of rollouts."""
+
+    quick: bool = False
+    """Short runs: figures to look at, not to quote."""
+    json: Path | None = None
+    """Write all figures here as JSON."""
+    plot: Path | None = None
+    """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
+    world_model: Path | None = None
+    """Weights of the world model; by default those that come with mavbridge, or else random
+    ones, which take as long."""
 
 
 @Parameter(name="*")

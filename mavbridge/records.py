@@ -243,3 +243,29 @@ class LinkStats:
     """Corrupt, cut off, or holding NaN."""
     vehicle_clock_offset_ns: int | None = None
     """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutFrame:
+    """What is known of an imagined frame besides its pixels."""
+
+    number: int
+    """In the video."""
+    iteration: int
+    frame: int
+    """Within its iteration."""
+    executed: bool
+    """The next decision was made after it; the others were only looked at."""
+    step: int
+    """Since the newest frame that was really seen, whose step is 0; iterations may overlap."""
+    frame_dt_s: float
+    """Of a step."""
+    state: FloatArray
+    """[13]"""
+    action: FloatArray
+    """[4], the mean stick of the step before it."""
+
+    @property
+    def time_s(self) -> float:
+        """Since the newest frame that was really seen."""
+        return self.step * self.frame_dt_s

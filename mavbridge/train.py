@@ -168,28 +168,21 @@ class _Display:
             self._bar.print(f"note: {progress.note}")
             return
         self._bar.update(self._task, description=progress.stage, completed=progress.fraction)
-        if progress.loss is not None:
-            losses = (
-                f"step {progress.step}  loss {progress.loss:.3f}  gates {progress.gate_loss:.3f}"
-            )
+        if progress.losses is not None:
+            parts = (f"{name} {value:.3f}" for name, value in progress.losses.items())
+            losses = f"step {progress.step}  {'  '.join(parts).replace('_', ' ')}"
             self._bar.update(self._task, losses=losses)
-        if (held_out := progress.validation) is not None:
+        if progress.validation is not None:
             self._bar.print(
-                f"{progress.fraction:4.0%} {progress.stage}, step {progress.step}: held-out loss "
-                f"{held_out.loss:.3f}, stick error {held_out.stick_error:.3f} (mean stick "
-                f"{held_out.mean_stick_error:.3f}, last stick held {held_out.hold_error:.3f})"
+                f"{progress.fraction:4.0%} {progress.stage}, step {progress.step}: "
+                f"{progress.validation.describe()}"
             )
 
 
 def _print_result(result: TrainResult) -> None:
     console = Console(highlight=False)
     console.print(f"{result.checkpoint}: {result.steps} steps", soft_wrap=True)
-    if (held_out := result.validation) is not None:
-        console.print(
-            f"stick error on held-out flights {held_out.stick_error:.3f} of full deflection; "
-            f"{held_out.mean_stick_error:.3f} by the mean stick, {held_out.hold_error:.3f} by "
-            "holding the last one",
-            soft_wrap=True,
-        )
+    if result.validation is not None:
+        console.print(result.validation.describe(), soft_wrap=True)
     if result.score is not None:
         console.print(f"closed-loop score {result.score:.3f}")

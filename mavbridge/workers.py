@@ -34,6 +34,11 @@ class Worker:
         """Still at work."""
         return self._thread.is_alive()
 
+    def ends_within(self, timeout_s: float) -> bool:
+        """Wait for it without telling it to stop; whether it has ended."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
     def join(self, timeout_s: float) -> None:
         """Tell the thread to stop, wait for it, and raise what it raised.
 

@@ -11,17 +11,22 @@ import json
 import pickle
 import struct
 import warnings
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
+from policy.checkpoint_file import (
+    CheckpointError,
+    read_tensors,
+    require_file,
+    require_finite,
+    require_fit,
+    write_tensors,
+)
 from policy.contract import Contract, FloatArray, PolicyError
 from policy.diffusion import NoiseSchedule
 from policy.packing import pack, unpack
@@ -49,10 +54,6 @@ _DAMAGED = (
     *(AssertionError, ArithmeticError, MemoryError, struct.error),
 )
 """What torch.load raises on flipped bytes: its reader interprets them before it checks them."""
-
-
-class CheckpointError(PolicyError):
-    """A checkpoint that cannot be read, or does not fit; the message says what to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,10 +86,8 @@ def save_checkpoint(
     Raises:
         CheckpointError: weights that are not finite, or a path that cannot be written.
     """
-    if path.suffix != ".safetensors":
-        raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
     state = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
-    _require_finite(path, state)
+    require_finite(path, state)
     if packed:
         state = pack(state, coarse=BACKBONE_PREFIX)
         policy = copy.deepcopy(policy)
@@ -101,13 +100,7 @@ def save_checkpoint(
     }
     if training is not None:
         header[TRAINING_KEY] = training
-    partial = path.with_name(path.name + ".partial")
-    try:
-        save_file(state, partial, metadata=header)
-        partial.replace(path)
-    except (OSError, SafetensorError) as error:
-        partial.unlink(missing_ok=True)
-        raise CheckpointError(f"cannot write {path}: {error}") from error
+    write_tensors(path, state, header)
 
 
 def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
@@ -123,12 +116,12 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
             it no longer makes the chunks of its test vector.
     """
     contents = _read(path)
-    _require_finite(path, contents.state)
+    require_finite(path, contents.state)
     try:
         policy = build_policy(_config_of(contents, fallback))
     except PolicyError as error:
         raise CheckpointError(f"{path}: {error}") from error
-    _require_fit(path, policy, contents.state)
+    require_fit(path, policy, contents.state)
     policy.load_state_dict(contents.state)
     policy.eval()
     if contents.vector:
@@ -219,22 +212,12 @@ def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
 def _read(path: Path) -> _Contents:
     if path.suffix not in SUFFIXES:
         raise CheckpointError(f"{path}: not a checkpoint; use one of {', '.join(SUFFIXES)}")
-    if not path.is_file():
-        near = sorted(p.name for p in path.parent.glob("*") if p.suffix in SUFFIXES)
-        there = f"its folder holds {near}" if near else "its folder holds no checkpoint"
-        raise CheckpointError(f"{path}: no such file; {there}")
+    require_file(path, SUFFIXES)
     return _read_safetensors(path) if path.suffix == ".safetensors" else _read_torch(path)
 
 
 def _read_safetensors(path: Path) -> _Contents:
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(
-            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
-        ) from error
+    header, state = read_tensors(path)
     for key in HEADER_KEYS:
         if key not in header:
             raise CheckpointError(
@@ -247,7 +230,7 @@ def _read_safetensors(path: Path) -> _Contents:
         for name in list(state)
         if name.startswith(VECTOR_PREFIX)
     }
-    _require_finite(path, vector)
+    require_finite(path, vector)
     return _Contents(
         state=unpack(state),
         vector=vector,
@@ -304,29 +287,3 @@ def _text_or_none(path: Path, loaded: dict[Any, Any], key: str) -> str | None:
     if value is None or isinstance(value, str):
         return value
     raise CheckpointError(f"{path}: {key!r} must be JSON text, got {type(value).__name__}")
-
-
-def _require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
-    bad = [name for name, value in state.items() if not torch.isfinite(value).all()]
-    if bad:
-        raise CheckpointError(
-            f"{path}: {len(bad)} tensors hold NaN or infinity, the first is {bad[0]!r}: "
-            "training diverged; take an earlier checkpoint"
-        )
-
-
-def _require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor]) -> None:
-    """Name the first few weights that do not fit; torch's own message lists hundreds."""
-    wanted = {name: list(value.shape) for name, value in policy.state_dict().items()}
-    problems = [f"missing {name!r}" for name in wanted if name not in state]
-    problems += [f"unexpected {name!r}" for name in state if name not in wanted]
-    problems += [
-        f"{name!r} is {list(state[name].shape)}, must be {shape}"
-        for name, shape in wanted.items()
-        if name in state and list(state[name].shape) != shape
-    ]
-    if problems:
-        raise CheckpointError(
-            f"{path}: does not fit this policy in {len(problems)} places: "
-            f"{'; '.join(problems[:4])}. Choose the size and backbone that it was trained with"
-        )

@@ -25,11 +25,8 @@ from policy.contract import (
     FloatArray,
 )
 from policy.dataset import GATE_DIM, DatasetError, Episode, Nanoseconds
+from policy.dataset_time import NS_PER_S, Indices, Knots, covered
 
-NS_PER_S = 1_000_000_000
-
-MAX_GAP_NS = 200_000_000
-"""Sticks and attitudes further apart are not interpolated."""
 TICK_TOLERANCE_NS = 20_000_000
 """How far the nearest tick may be from the moment that was drawn: two ticks at 100 Hz."""
 HISTORY_JITTER_S = 0.005
@@ -45,8 +42,6 @@ HISTORY_NOISE = 0.1
 
 _BETWEEN_NS = 10 * NS_PER_S
 """Put between two flights on the common axis of time: far beyond every gap that is bridged."""
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,9 +90,9 @@ class Timeline:
         known = ~np.isnan(state).any(axis=1)
         self.tick_ns, self._attitude_ns = stamps("tick_ns")[known], stamps("attitude_ns")[known]
         self._state = state[known]
-        self._attitude = _Knots(self._attitude_ns, self._state[:, QUATERNION])
+        self._attitude = Knots(self._attitude_ns, self._state[:, QUATERNION])
         self._velocity_ns = stamps("velocity_ns")[known]
-        self._velocity = _Knots(self._velocity_ns, self._state[:, VELOCITY])
+        self._velocity = Knots(self._velocity_ns, self._state[:, VELOCITY])
         self._target_ns = stamps("target_ns")
         self._target = np.concatenate([episode.target for episode in episodes])
         # Before its first stick, a flight's sticks were neutral.
@@ -210,7 +205,7 @@ class Timeline:
         horizon = self.contract.horizon
         step_ns = round(self.contract.chunk_dt_s * NS_PER_S)
         at_ns = self._attitude_ns[ticks][:, None] + np.arange(horizon) * step_ns
-        known = np.logical_and.accumulate(_covered(self._target_ns, at_ns), axis=1)
+        known = np.logical_and.accumulate(covered(self._target_ns, at_ns), axis=1)
         flat = at_ns.ravel()
         columns = [np.interp(flat, self._target_ns, column) for column in self._target.T]
         chunk = np.stack(columns, axis=-1).reshape(len(ticks), horizon, ACTION_DIM)
@@ -218,50 +213,6 @@ class Timeline:
         held = np.minimum(np.arange(horizon), last[:, None])
         filled = np.take_along_axis(chunk, held[..., None], axis=1)
         return filled.astype(np.float32), known
-
-
-class _Knots:
-    """A quantity at increasing times, the newest where two arrived at once."""
-
-    def __init__(self, at_ns: Nanoseconds, values: FloatArray) -> None:
-        order = np.argsort(at_ns, kind="stable")
-        at_ns, values = at_ns[order], values[order]
-        is_last = np.append(np.diff(at_ns) > 0, True)[: len(at_ns)]
-        self._at_ns, self._values = at_ns[is_last], values[is_last].astype(np.float64)
-
-    def covers(self, at_ns: Nanoseconds) -> NDArray[np.bool_]:
-        """Whether each time lies between two values that are not too far apart."""
-        return _covered(self._at_ns, at_ns)
-
-    def vectors_at(self, at_ns: Nanoseconds) -> NDArray[np.float64]:
-        """Linear between the values."""
-        before, after, weight = self._around(at_ns)
-        return (1.0 - weight[:, None]) * before + weight[:, None] * after
-
-    def rotations_at(self, at_ns: Nanoseconds) -> NDArray[np.float64]:
-        """Between two attitudes, a unit quaternion."""
-        return rotation.interpolate(*self._around(at_ns))
-
-    def _around(
-        self, at_ns: Nanoseconds
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        after = np.minimum(np.searchsorted(self._at_ns, at_ns), len(self._at_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        span = np.maximum(self._at_ns[after] - self._at_ns[before], 1)
-        weight = np.clip((at_ns - self._at_ns[before]) / span, 0.0, 1.0)
-        return self._values[before], self._values[after], weight
-
-
-def _covered(knots_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.bool_]:
-    if len(knots_ns) == 0:
-        return np.zeros(at_ns.shape, bool)
-    after = np.searchsorted(knots_ns, at_ns, side="left")
-    inside = np.minimum(after, len(knots_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    is_near = knots_ns[inside] - knots_ns[before] <= MAX_GAP_NS
-    is_between = (after > 0) & (after < len(knots_ns)) & is_near
-    out: NDArray[np.bool_] = is_between | (knots_ns[inside] == at_ns)
-    return out
 
 
 def _start_ns(episode: Episode) -> int:
@@ -281,31 +232,44 @@ def _offsets(episodes: Sequence[Episode]) -> list[int]:
     return offsets
 
 
+_VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
+STICK_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
+"""What a mirror makes of sticks: yaw and roll change their sign."""
+
+
+def mirror_signs(state_dim: int) -> FloatArray:
+    """What a mirror makes of a state [state_dim], as factors of 1 and -1."""
+    signs = np.ones(state_dim, np.float32)
+    signs[VELOCITY] = signs[SPECIFIC_FORCE] = _VECTOR
+    signs[RATE] = signs[QUATERNION.start + 1 : QUATERNION.stop] = _AXIAL
+    if state_dim > STATE_DIM:
+        signs[ROTATION] = _AXIAL
+        signs[VELOCITY_CHANGE] = _VECTOR
+    return signs
+
+
+def mirrored(values: FloatArray, signs: FloatArray, is_mirrored: NDArray[np.bool_]) -> FloatArray:
+    """``values`` [B, ..., D], times ``signs`` [D] where ``is_mirrored`` [B]."""
+    chosen = is_mirrored.reshape(-1, *[1] * (values.ndim - 1))
+    return np.where(chosen, values * signs, values).astype(np.float32)
+
+
 def mirror(samples: Samples, is_mirrored: NDArray[np.bool_]) -> Samples:
     """The flight in a mirror, left and right exchanged, where ``is_mirrored`` [B].
 
     The mirror is the plane of the first and third axis, of the world and of the body: true vectors
     lose the sign of y, rotations those of x and z. It holds in both state frames.
     """
-    vector, axial = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
-    signs = np.ones(samples.state.shape[1], np.float32)
-    signs[VELOCITY] = signs[SPECIFIC_FORCE] = vector
-    signs[RATE] = signs[QUATERNION.start + 1 : QUATERNION.stop] = axial
-    if samples.state.shape[1] > STATE_DIM:
-        signs[ROTATION] = axial
-        signs[VELOCITY_CHANGE] = vector
-    sticks = np.array((1.0, -1.0, 1.0, -1.0), np.float32)  # yaw and roll
-    gate = np.array((*vector, -1.0, *vector), np.float32)
+    gate = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
 
     def where(values: FloatArray, factor: FloatArray) -> FloatArray:
-        chosen = is_mirrored.reshape(-1, *[1] * (values.ndim - 1))
-        return np.where(chosen, values * factor, values).astype(np.float32)
+        return mirrored(values, factor, is_mirrored)
 
     return Samples(
         frame=samples.frame,
-        state=where(samples.state, signs),
-        history=where(samples.history, sticks),
-        chunk=where(samples.chunk, sticks),
+        state=where(samples.state, mirror_signs(samples.state.shape[1])),
+        history=where(samples.history, STICK_SIGNS),
+        chunk=where(samples.chunk, STICK_SIGNS),
         known=samples.known,
         gate=where(samples.gate, gate),
     )

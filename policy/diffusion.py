@@ -116,17 +116,19 @@ class NoiseSchedule:
         at = power[timestep].reshape(-1, *[1] * (clean.ndim - 1))
         return at.sqrt().to(clean.dtype) * clean + (1 - at).sqrt().to(clean.dtype) * noise
 
-    def ddim_update(self, step: DdimStep, noisy: Tensor, output: Tensor) -> Tensor:
+    def ddim_update(
+        self, step: DdimStep, noisy: Tensor, output: Tensor, *, limit: float = 1.0
+    ) -> Tensor:
         """One reverse step from the net's output.
 
-        x_0 is clipped to [-1, 1], the range of an action, and eps is then recomputed, so that both
-        still explain ``noisy``.
+        x_0 is clipped to [-limit, limit], by default the range of an action, and eps is then
+        recomputed, so that both still explain ``noisy``.
         """
         if self.prediction == "sample":
             clean = output
         else:
             clean = (noisy - step.noise * output) / step.signal
-        clean = clean.clamp(-1.0, 1.0)
+        clean = clean.clamp(-limit, limit)
         if step.next_noise == 0.0:
             return clean
         noise = (noisy - step.signal * clean) / step.noise

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -19,7 +20,8 @@ from torch import Tensor
 
 from policy.contract import Contract, FloatArray
 from policy.dataset_frames import FrameStore
-from policy.dataset_samples import Indices, Samples, Timeline, mirror
+from policy.dataset_samples import Samples, Timeline, mirror
+from policy.dataset_time import Indices
 
 SHIFT = 0.015
 """Images move by at most this share of their side, as a camera mount is off by a degree."""
@@ -28,8 +30,10 @@ BRIGHTNESS, CONTRAST, COLOUR, NOISE = 0.15, 0.25, 0.08, 0.03
 AHEAD = 3
 """Batches prepared while the net computes."""
 _OF_SAMPLES = ("state", "history", "chunk", "known", "noise", "timestep")
-_VALIDATION_KEY = 2**31
+VALIDATION_KEY = 2**31
 """In place of a step; no run has as many."""
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +70,9 @@ class Batch:
         return replace(self, **moved)
 
     def split(self, count: int) -> "list[Batch]":
-        """At most ``count`` parts of about the same size, each of whole images."""
+        """At most ``count`` parts of about the same size, each of two images or more."""
         images, samples = len(self.look), len(self.state)
+        count = max(1, min(count, images // 2))
         repeats = samples // images
         bounds = [images * part // count for part in range(count + 1)]
         return [
@@ -110,6 +115,23 @@ class PooledStore:
         return np.asarray(self._rows[rows], dtype=np.float32)
 
 
+def next_of(among: Indices, step: int, count: int, seed: int) -> Indices:
+    """The ``count`` that are next in ``step``, in an order drawn anew for each pass over all."""
+    total = len(among)
+    at = np.arange(step * count, (step + 1) * count)
+    parts = [
+        _order(seed, int(epoch), total)[at[at // total == epoch] % total]
+        for epoch in np.unique(at // total)
+    ]
+    chosen: Indices = among[np.concatenate(parts)]
+    return chosen
+
+
+@lru_cache(maxsize=4)
+def _order(seed: int, epoch: int, total: int) -> Indices:
+    return np.random.default_rng([seed, 2, epoch]).permutation(total)
+
+
 class Batches:
     """Makes batches of one set of flights."""
 
@@ -121,14 +143,13 @@ class Batches:
         self._timesteps = timesteps
         self._seed = seed
         self._mirrors = mirrors
-        self._order = lru_cache(maxsize=2)(self._order_of_epoch)
         self.frames = timeline.frames
         """Images that can be used."""
 
     def with_images(self, step: int, *, count: int, repeats: int, size: tuple[int, int]) -> Batch:
         """Training of encoder and head."""
         random = np.random.default_rng([self._seed, step])
-        frames = self._next(self.frames, step, count)
+        frames = next_of(self.frames, step, count, self._seed)
         is_mirrored = self._mirrored(random, count)
         height, width = self._timeline.contract.image_height, self._timeline.contract.image_width
         most = np.array([round(SHIFT * height), round(SHIFT * width)])
@@ -143,7 +164,7 @@ class Batches:
     def with_pooled(self, step: int, *, count: int, pooled: PooledStore) -> Batch:
         """Training of the head alone."""
         random = np.random.default_rng([self._seed, step])
-        frames = self._next(pooled.frames, step, count)
+        frames = next_of(pooled.frames, step, count, self._seed)
         is_mirrored = self._mirrored(random, count) & pooled.has_mirrored
         rows = pooled.read(frames, is_mirrored)
         return self._batch(random, frames, is_mirrored, 1, pooled=rows)
@@ -153,7 +174,7 @@ class Batches:
         frames = self.frames
         chosen = frames[np.linspace(0, len(frames) - 1, min(samples, len(frames))).astype(int)]
         for start in range(0, len(chosen), count):
-            random = np.random.default_rng([self._seed, _VALIDATION_KEY, start])
+            random = np.random.default_rng([self._seed, VALIDATION_KEY, start])
             part = chosen[start : start + count]
             ticks = self._timeline.draw_ticks(part, random)
             images = self._store.read(part, size, np.zeros((len(part), 2), np.int64))
@@ -166,20 +187,6 @@ class Batches:
 
     def _mirrored(self, random: np.random.Generator, count: int) -> NDArray[np.bool_]:
         return (random.random(count) < 0.5) & self._mirrors
-
-    def _next(self, among: Indices, step: int, count: int) -> Indices:
-        """The next images in an order that is drawn anew for each pass over them."""
-        total = len(among)
-        at = np.arange(step * count, (step + 1) * count)
-        parts = [
-            self._order(int(epoch), total)[at[at // total == epoch] % total]
-            for epoch in np.unique(at // total)
-        ]
-        chosen: Indices = among[np.concatenate(parts)]
-        return chosen
-
-    def _order_of_epoch(self, epoch: int, total: int) -> Indices:
-        return np.random.default_rng([self._seed, 2, epoch]).permutation(total)
 
     def _batch(
         self,
@@ -229,13 +236,13 @@ class Batches:
         )
 
 
-def ahead(make: Callable[[int], Batch], first: int) -> Generator[Batch]:
+def ahead(make: Callable[[int], T], first: int) -> Generator[T]:
     """``make(first)``, ``make(first + 1)``, ... without end, prepared in one thread.
 
     Close the iterator to end and join the thread.
     """
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="train-loader") as pool:
-        waiting: deque[Future[Batch]] = deque()
+        waiting: deque[Future[T]] = deque()
         step = first
         try:
             while True:

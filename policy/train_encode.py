@@ -10,10 +10,11 @@ from torch import Tensor
 
 from policy.contract import Contract
 from policy.dataset_frames import disk_error
-from policy.dataset_samples import Indices
+from policy.dataset_time import Indices
 from policy.engines.openvino_bulk import BulkEncoder
 from policy.train_batches import Batches, PooledStore, normalise_image
-from policy.train_model import Trainee, computing_in, refresh_batch_norm
+from policy.train_model import Trainee, refresh_batch_norm
+from policy.train_parallel import computing_in
 
 NORM_BATCHES = 16
 ENCODE_BATCH = 64

@@ -1,8 +1,6 @@
 """What is optimised: a policy, a head for the gates that is not shipped, and their losses."""
 
-import copy
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +13,7 @@ from policy.contract import FloatArray
 from policy.diffusion import NoiseSchedule
 from policy.toge import Toge
 from policy.train_batches import Batch, normalised
+from policy.train_parallel import computing_in
 from policy.train_report import Validation
 
 GATE_LABELS = 10
@@ -24,7 +23,6 @@ MIN_STICK_STD = 0.1
 """A stick that hardly moves in the flights does not count more than this makes it."""
 VALIDATION_STEPS = 10
 """Denoising steps of the sticks that are compared with the flown ones."""
-GRADIENT_LIMIT = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,26 +101,6 @@ def gate_loss(made: Tensor, gate: Tensor) -> Tensor:
     return (error * known).sum() / known.sum().clamp_min(1)
 
 
-class Ema:
-    """An exponential moving average of a trainee, itself a trainee in eval mode."""
-
-    def __init__(self, trainee: Trainee, decay: float) -> None:
-        self.average = copy.deepcopy(trainee).eval().requires_grad_(False)
-        self._decay = decay
-
-    @torch.no_grad()
-    def update(self, trainee: Trainee, updates: int) -> None:
-        """Move towards ``trainee``, faster in the first of ``updates``; counters are copied."""
-        weight = 1.0 - min(self._decay, (1 + updates) / (10 + updates))
-        mine, its = dict(self.average.state_dict()), trainee.state_dict()
-        names = [name for name, value in mine.items() if value.is_floating_point()]
-        torch._foreach_lerp_(  # one call for some thousand tensors
-            [mine[name] for name in names], [its[name] for name in names], weight
-        )
-        for name in mine.keys() - set(names):
-            mine[name].copy_(its[name])
-
-
 @torch.no_grad()
 def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
     """Take the statistics of the batch norms anew from images [B, 3, height, width].
@@ -181,23 +159,6 @@ class StickSpread:
         return cls(mean=values.mean(dim=0).to(device), scale=scale.to(device))
 
 
-def make_optimiser(trainee: Trainee, learning_rate: float, decay: float) -> torch.optim.AdamW:
-    """AdamW over what may move; biases, norms and embeddings of one row are not decayed."""
-    moving = [p for p in trainee.parameters() if p.requires_grad]
-    groups = [
-        {"params": [p for p in moving if p.ndim >= 2], "weight_decay": decay},
-        {"params": [p for p in moving if p.ndim < 2], "weight_decay": 0.0},
-    ]
-    return torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.98), fused=True)
-
-
-@contextmanager
-def computing_in(device: torch.device, bf16: bool) -> Iterator[None]:
-    """Autocast to bfloat16, or nothing."""
-    with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
-        yield
-
-
 def encoder_learns_in_bf16(device: torch.device, image_size: tuple[int, int]) -> bool:
     """Whether bfloat16 makes the encoder's backward pass faster, where it is used at all.
 
@@ -207,12 +168,3 @@ def encoder_learns_in_bf16(device: torch.device, image_size: tuple[int, int]) ->
     if device.type != "cpu" or torch.cpu._is_amx_tile_supported():
         return True
     return image_size[0] * image_size[1] >= 160 * 160
-
-
-def uses_bf16(precision: str, device: torch.device) -> bool:
-    """Whether to compute in bfloat16; ``auto`` does where the hardware multiplies it."""
-    if precision != "auto":
-        return precision == "bf16"
-    if device.type == "cuda":
-        return bool(torch.cuda.is_bf16_supported())
-    return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())

@@ -5,31 +5,62 @@ cores that somebody else uses too, that left half of the time unused.
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from types import TracebackType
+from typing import Generic, Protocol, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from policy.train_batches import Batch
-from policy.train_model import Losses, Trainee, computing_in
+M = TypeVar("M", bound=nn.Module)
 
 
-class Gradients:
+class Divisible(Protocol):
+    """A batch."""
+
+    def to(self: "B", device: torch.device) -> "B":
+        """The same on a device."""
+        ...
+
+    def split(self: "B", count: int) -> "list[B]":
+        """At most ``count`` parts of about the same size, none of which a batch norm refuses."""
+        ...
+
+
+B = TypeVar("B", bound=Divisible)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepLoss:
+    """Of one batch."""
+
+    total: Tensor
+    """What is minimised."""
+    told: Mapping[str, Tensor]
+    """What a person is told of it, by name; ``loss`` is among them."""
+
+
+class Gradients(Generic[M]):
     """Computes losses and gradients of a trainee; close it to join its threads."""
 
-    def __init__(self, trainee: Trainee, *, device: torch.device, bf16: bool) -> None:
-        """Take as many threads as torch has, on a CPU; a GPU takes the whole batch."""
+    def __init__(self, trainee: M, *, device: torch.device, bf16: bool) -> None:
+        """Take as many threads as torch has, on a CPU; a GPU takes the whole batch.
+
+        Weights are shared, buffers are not: statistics of norms are those of the first part.
+        """
         self._device, self._bf16 = device, bf16
-        self._threads = torch.get_num_threads() if device.type == "cpu" else 1
-        others = [_sharing_weights(trainee) for _ in range(self._threads - 1)]
+        threads = torch.get_num_threads() if device.type == "cpu" else 1
+        shared = {id(weight): weight for weight in trainee.parameters()}
+        others = [copy.deepcopy(trainee, dict(shared)) for _ in range(threads - 1)]
         self._replicas = [trainee, *others]
         self._pool = ThreadPoolExecutor(
-            self._threads, thread_name_prefix="train", initializer=_use_one_thread
+            threads, thread_name_prefix="train", initializer=_use_one_thread
         )
 
-    def __enter__(self) -> "Gradients":
+    def __enter__(self) -> "Gradients[M]":
         return self
 
     def __exit__(
@@ -40,42 +71,41 @@ class Gradients:
     ) -> None:
         self._pool.shutdown()
 
-    def set_mode(self, *, trains_encoder: bool) -> None:
-        """Training mode, but for the norms of an encoder that stands still."""
-        for replica in self._replicas:
-            replica.train()
-            replica.policy.backbone.train(trains_encoder)
-
-    def compute(self, batch: Batch, stick_scale: Tensor, gate_weight: float) -> Tensor:
-        """Set ``grad`` of all weights; losses [2], of sticks and gates.
+    def compute(self, batch: B, losses: Callable[[M, B], StepLoss]) -> dict[str, Tensor]:
+        """Set ``grad`` of all weights that may move; returns what is told of the mean loss.
 
         The same numbers for the same batch and count of threads: parts are added in order.
         """
         weights = [p for p in self._replicas[0].parameters() if p.requires_grad]
-        # A batch norm needs two images.
-        parts = batch.split(max(1, min(self._threads, len(batch.look) // 2)))
 
-        def one(replica: Trainee, part: Batch) -> tuple[Tensor, Sequence[Tensor]]:
+        def one(replica: M, part: B) -> tuple[Mapping[str, Tensor], Sequence[Tensor]]:
             with computing_in(self._device, self._bf16):
-                losses: Losses = replica(part, stick_scale)
-            total = losses.sticks + gate_weight * losses.gate
-            made = torch.autograd.grad(total, weights, allow_unused=True, materialize_grads=True)
-            return torch.stack([losses.sticks.detach(), losses.gate.detach()]), made
+                loss = losses(replica, part)
+            made = torch.autograd.grad(loss.total, weights, materialize_grads=True)
+            return {name: value.detach() for name, value in loss.told.items()}, made
 
-        results = list(self._pool.map(one, self._replicas, parts))
+        results = list(self._pool.map(one, self._replicas, batch.split(len(self._replicas))))
         share = 1.0 / len(results)
-        told, sums = results[0][0] * share, [g * share for g in results[0][1]]
-        for losses, made in results[1:]:
-            told += share * losses
+        told = {name: value * share for name, value in results[0][0].items()}
+        sums = [gradient * share for gradient in results[0][1]]
+        for others, made in results[1:]:
+            told = {name: value + share * others[name] for name, value in told.items()}
             torch._foreach_add_(sums, list(made), alpha=share)
         for weight, gradient in zip(weights, sums, strict=True):
             weight.grad = gradient
         return told
 
+    def each(self, change: Callable[[M], object]) -> None:
+        """Do the same to the trainee and its replicas, such as to choose their mode."""
+        for replica in self._replicas:
+            change(replica)
 
-def _sharing_weights(trainee: Trainee) -> Trainee:
-    """The same parameters, with buffers of its own."""
-    return copy.deepcopy(trainee, {id(weight): weight for weight in trainee.parameters()})
+
+@contextmanager
+def computing_in(device: torch.device, bf16: bool) -> Iterator[None]:
+    """Autocast to bfloat16, or nothing."""
+    with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+        yield
 
 
 def _use_one_thread() -> None:

@@ -28,15 +28,21 @@ MIN_IMAGE_SIZE = 96
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
+class Span:
     """A part of a run, between two fractions of its budget."""
 
     name: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage(Span):
+    """A part of a policy's training."""
+
     image_size: tuple[int, int]
     """Height and width, px."""
     trains_encoder: bool
-    start: float
-    end: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,30 +73,22 @@ class Budget:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainSettings:
-    """One training run.
+class RunSettings:
+    """What every training run is told.
 
     Raises:
         PolicyError: a value is out of its range.
     """
 
-    policy: TogeConfig | ResnetUnetConfig
-    """Its contract's ``state_frame`` must be the flights'."""
     out: Path
     """The checkpoint; what a resumed run needs is kept beside it until the end."""
     budget: Budget
     batch_size: int = 32
-    """Images a step while the encoder learns; each serves ``repeats`` samples."""
-    repeats: int = 2
-    """Moments after its exposure for which one encoded image is used."""
-    head_batch_size: int = 256
-    """Samples a step while the head learns alone."""
+    """Images a step while the encoder learns."""
     learning_rate: float = 1e-3
-    """Peak of AdamW's; a third of it where the weights come from ``start_from``."""
+    """Peak of AdamW's."""
     weight_decay: float = 0.02
     ema_decay: float = 0.999
-    gate_weight: float = 0.2
-    """Of the auxiliary loss that asks the feature for the gates; 0 = off."""
     mirror: bool = True
     """Half of the samples are mirrored: off for a camera that does not look straight ahead."""
     seed: int = 0
@@ -99,27 +97,12 @@ class TrainSettings:
     resume: bool = False
     validation_fraction: float = 0.1
     """Flights held out."""
-    ages_ns: Nanoseconds | None = None
-    """Measured ages of images to train for; None = those measured in the flights."""
-    start_from: Path | None = None
-    """A checkpoint of the same architecture."""
-    freeze_encoder: bool = False
-    """Leave the encoder of ``start_from`` as it is: all the time is the head's."""
-    backbone_weights: Path | None = None
-    """torchvision's state dict of the encoder, as .pth."""
-    pack: bool = False
-    """Write the checkpoint in a third of the bytes (``policy.packing``)."""
     validations: int | None = None
     """In a run, evenly spaced; the state of the run is kept at the same times. None = one every two
     minutes or fifty steps, 4 to 20."""
-    check_every: int = 5
-    """Validations between two calls of the closed-loop check."""
 
     def __post_init__(self) -> None:
         """Refuse what no run could do."""
-        for name in ("batch_size", "repeats", "head_batch_size", "check_every"):
-            if getattr(self, name) < 1:
-                raise PolicyError(f"{name} must be 1 or more, got {getattr(self, name)}")
         if self.batch_size < 2:
             raise PolicyError("--batch-size must be 2 or more: batch norm needs two images")
         if not 0 <= self.validation_fraction < 1:
@@ -128,10 +111,6 @@ class TrainSettings:
             )
         if self.out.suffix != ".safetensors":
             raise PolicyError(f"--out {self.out}: checkpoints are written as .safetensors")
-        if self.start_from is not None and self.backbone_weights is not None:
-            raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
-        if self.freeze_encoder and self.start_from is None:
-            raise PolicyError("--freeze-encoder needs a trained one: give --start-from CHECKPOINT")
 
     @property
     def validation_count(self) -> int:
@@ -145,6 +124,47 @@ class TrainSettings:
     def work_folder(self) -> Path:
         """Where an unfinished run lives."""
         return self.out.with_name(self.out.stem + ".training")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(RunSettings):
+    """The training of a policy.
+
+    Raises:
+        PolicyError: a value is out of its range.
+    """
+
+    policy: TogeConfig | ResnetUnetConfig
+    """Its contract's ``state_frame`` must be the flights'."""
+    repeats: int = 2
+    """Moments after its exposure for which one encoded image is used."""
+    head_batch_size: int = 256
+    """Samples a step while the head learns alone."""
+    gate_weight: float = 0.2
+    """Of the auxiliary loss that asks the feature for the gates; 0 = off."""
+    ages_ns: Nanoseconds | None = None
+    """Measured ages of images to train for; None = those measured in the flights."""
+    start_from: Path | None = None
+    """A checkpoint of the same architecture; the learning rate is a third then."""
+    freeze_encoder: bool = False
+    """Leave the encoder of ``start_from`` as it is: all the time is the head's."""
+    backbone_weights: Path | None = None
+    """torchvision's state dict of the encoder, as .pth."""
+    pack: bool = False
+    """Write the checkpoint in a third of the bytes (``policy.packing``)."""
+    check_every: int = 5
+    """Validations between two calls of the closed-loop check."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could do."""
+        super().__post_init__()
+        for name in ("repeats", "head_batch_size", "check_every"):
+            if getattr(self, name) < 1:
+                raise PolicyError(f"{name} must be 1 or more, got {getattr(self, name)}")
+        if self.start_from is not None and self.backbone_weights is not None:
+            raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
+        if self.freeze_encoder and self.start_from is None:
+            raise PolicyError("--freeze-encoder needs a trained one: give --start-from CHECKPOINT")
 
 
 def make_stages(settings: TrainSettings) -> tuple[Stage, ...]:

@@ -1,7 +1,7 @@
 """The weights that a training run starts from, and what a checkpoint says of its training."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -78,7 +78,7 @@ def training_card(
     ages_ns: Nanoseconds,
     *,
     steps: int,
-    validation: dict[str, float] | None,
+    validation: Mapping[str, float] | None,
 ) -> str:
     """What a checkpoint says of its training, as JSON."""
     state = np.concatenate([episode.state for episode in episodes])

@@ -9,12 +9,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from policy.contract import PolicyError
 from policy.dataset import Episode
 from policy.dataset_frames import disk_error
-from policy.train_plan import TrainSettings
+from policy.train_plan import RunSettings
 
 _STATE, _LOG = "state.pt", "log.jsonl"
 
@@ -38,7 +39,7 @@ class Position:
     validations: int = 0
     best: float | None = None
     """Score of the exported weights, more is better."""
-    kept: dict[str, float] | None = None
+    kept: dict[str, Any] | None = None
     """Validation of the exported weights."""
 
 
@@ -144,14 +145,13 @@ def _step_of(line: str) -> float:
     return step if isinstance(step, int) else float("inf")
 
 
-def identity_of(settings: TrainSettings, episodes: Sequence[Episode]) -> str:
+def identity_of(settings: RunSettings, episodes: Sequence[Episode]) -> str:
     """Changes with everything that a resumed run must not change."""
     told = {
-        name: str(value)
+        name: value.tolist() if isinstance(value, np.ndarray) else str(value)
         for name, value in vars(settings).items()
-        if name not in ("resume", "device", "out", "check_every", "ages_ns")
+        if name not in ("resume", "device", "out", "check_every")
     }
     flights = [(episode.fingerprint, len(episode.tick_ns)) for episode in episodes]
-    ages = None if settings.ages_ns is None else settings.ages_ns.tolist()
-    text = json.dumps([told, flights, ages], sort_keys=True)
+    text = json.dumps([told, flights], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

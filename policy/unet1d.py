@@ -139,7 +139,7 @@ class UNet1d(nn.Module):
             nn.SiLU(), nn.Linear(config.condition_dim, self.film_dim, bias=False)
         )
         self._frequencies: Tensor
-        self.register_buffer("_frequencies", _frequencies(TIME_DIM), persistent=False)
+        self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
 
     def film_of_timestep(self, timestep: Tensor) -> Tensor:
         """Timesteps [M] of any numeric type -> their share of FiLM [M, film_dim]."""
@@ -170,7 +170,7 @@ class UNet1d(nn.Module):
         return out
 
 
-def _frequencies(dim: int) -> Tensor:
+def sinusoid_frequencies(dim: int) -> Tensor:
     """Geometric frequencies 1..1e-4 of the sinusoidal embedding (Vaswani et al. 2017)."""
     half = dim // 2
     return torch.exp(-math.log(10_000.0) * torch.arange(half) / (half - 1))

@@ -20,7 +20,7 @@ OURS = ("#9cc5e8", "#2b6cb0", "#1a365d")
 """An engine each, the eager one the palest."""
 SIZE_INCHES = (12.0, 7.6)
 DOTS_PER_INCH = 150
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
     "text.color": INK,
@@ -56,7 +56,7 @@ class _Span(NamedTuple):
 
 def draw(result: BenchResult, path: Path) -> None:
     """Write the PNG."""
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor="white")
         panels = figure.subplots(2, 2)
         _draw_kernels(panels[0][0], result)

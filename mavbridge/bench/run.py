@@ -68,12 +68,12 @@ def bench(config: BenchConfig) -> int:
     draw = None if config.plot is None else _drawing(config.plot)
     for path in (config.json, config.plot):
         if path is not None:
-            _require_folder(path)
+            require_folder(path)
     console = Console()
     if not console.is_terminal:
         console.width = PIPED_WIDTH
     try:
-        result = measure(QUICK if config.quick else FULL, is_quick=config.quick, say=_sayer())
+        result = measure(QUICK if config.quick else FULL, is_quick=config.quick, say=sayer())
     except KeyboardInterrupt:
         console.print("interrupted: nothing is written")
         return INTERRUPTED
@@ -97,7 +97,7 @@ def measure(plan: _Plan, *, is_quick: bool, say: Callable[[str], None]) -> Bench
     clock = MonotonicClock()
     contenders, notes = link.clients()
     return BenchResult(
-        machine=_machine(),
+        machine=machine(),
         quick=is_quick,
         kernels=kernels.measure(plan.kernels, clock, say),
         rooflines=kernels.rooflines(clock),
@@ -137,7 +137,12 @@ def _drawing(path: Path) -> Callable[[BenchResult], None]:
     return lambda result: draw(result, path)
 
 
-def _require_folder(path: Path) -> None:
+def require_folder(path: Path) -> None:
+    """Make sure that a result can be written there.
+
+    Raises:
+        UserError: it cannot.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -146,12 +151,14 @@ def _require_folder(path: Path) -> None:
         raise UserError(f"cannot write {path}: a folder, or in one that may not be written to")
 
 
-def _sayer() -> Callable[[str], None]:
+def sayer() -> Callable[[str], None]:
+    """Tells a person what is going on, beside the results."""
     console = Console(stderr=True)
     return lambda line: console.print(Text(line, style="dim"))
 
 
-def _machine() -> Machine:
+def machine() -> Machine:
+    """This one."""
     return Machine(
         cpu=_cpu_name(),
         cores=len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1,

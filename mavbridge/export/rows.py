@@ -15,7 +15,7 @@ from mavbridge.clock import NS_PER_S
 from mavbridge.errors import UserError
 from policy.contract import ACTION_DIM, FloatArray
 from policy.dataset import Episode, Nanoseconds
-from policy.dataset_samples import MAX_GAP_NS
+from policy.dataset_time import MAX_GAP_NS
 
 MAX_HELD_NS = MAX_GAP_NS
 """A state or sticks older than this are not those of a frame any more."""

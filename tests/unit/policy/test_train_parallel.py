@@ -14,7 +14,7 @@ from policy.dataset_samples import Timeline
 from policy.toge import Toge, TogeConfig
 from policy.train_batches import Batch, Batches
 from policy.train_model import Trainee
-from policy.train_parallel import Gradients
+from policy.train_parallel import Gradients, StepLoss
 
 CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
 CPU = torch.device("cpu")
@@ -47,11 +47,21 @@ def trainee() -> Trainee:
     return Trainee(Toge(TogeConfig(backbone="resnet18", contract=CONTRACT)))
 
 
+def losses(model: Trainee, batch: Batch) -> StepLoss:
+    made = model(batch, torch.ones(4))
+    return StepLoss(total=made.sticks + made.gate, told={"loss": made.sticks})
+
+
+def frozen(model: Trainee) -> None:
+    model.train()
+    model.policy.backbone.eval()  # batch norms would see other batches
+
+
 def gradients_of(batch: Batch, model: Trainee) -> dict[str, torch.Tensor]:
     with Gradients(model, device=CPU, bf16=False) as gradients:
-        gradients.set_mode(trains_encoder=False)  # batch norms would see other batches
-        losses = gradients.compute(batch, torch.ones(4), 1.0)
-    assert losses.isfinite().all()
+        gradients.each(frozen)
+        told = gradients.compute(batch, losses)
+    assert told["loss"].isfinite()
     return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
 
 
@@ -68,8 +78,7 @@ def test_gradients_are_those_of_the_mean_loss(batch: Batch, threads: int) -> Non
     model.zero_grad()
     parts = batch.split(threads)
     for part in parts:
-        losses = model(part, torch.ones(4))
-        ((losses.sticks + losses.gate) / len(parts)).backward()
+        (losses(model, part).total / len(parts)).backward()  # type: ignore[no-untyped-call]
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None
         torch.testing.assert_close(parameter.grad, made[name], rtol=1e-3, atol=1e-6)
@@ -85,8 +94,8 @@ def test_statistics_of_norms_are_those_of_the_first_part(batch: Batch, threads: 
     model = trainee()
     before = model.policy.backbone.bn1.running_mean.clone()  # type: ignore[union-attr, operator]
     with Gradients(model, device=CPU, bf16=False) as gradients:
-        gradients.set_mode(trains_encoder=True)
-        gradients.compute(batch, torch.ones(4), 1.0)
+        gradients.each(Trainee.train)
+        gradients.compute(batch, losses)
     alone = trainee().train()
     alone(batch.split(threads)[0], torch.ones(4))
     after = model.policy.backbone.bn1.running_mean  # type: ignore[union-attr]

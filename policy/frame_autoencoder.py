@@ -1,0 +1,85 @@
+"""A per-frame autoencoder: pixels to a few latent channels at an eighth of the side, and back."""
+
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+FACTOR = 8
+"""Pixels of a side for one latent."""
+MAX_LOG_VARIANCE = 4.0
+
+
+class ResidualConv(nn.Module):
+    """Two convolutions around a shortcut; [N, C, h, w] -> the same."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(width, width, 3, padding=1)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """No norm: a net so shallow needs none, and a CPU would feel it."""
+        out: Tensor = x + self.conv2(F.silu(self.conv1(F.silu(x))))
+        return out
+
+
+class FrameAutoencoder(nn.Module):
+    """Encoder and decoder of single frames; latents are normalised to unit scale per channel.
+
+    Widths are of the levels at a half, a quarter and an eighth of the side. Full resolution is
+    reached by a pixel shuffle alone: there a convolution would cost more than all others together.
+    """
+
+    def __init__(self, latent_channels: int, widths: tuple[int, int, int]) -> None:
+        super().__init__()
+        first, last = widths[0], widths[-1]
+        down: list[nn.Module] = [nn.Conv2d(3, first, 3, stride=2, padding=1), ResidualConv(first)]
+        for width, deeper in pairwise(widths):
+            down += [nn.Conv2d(width, deeper, 3, stride=2, padding=1), ResidualConv(deeper)]
+        self.encoder = nn.Sequential(*down, nn.SiLU())
+        self.moments = nn.Conv2d(last, 2 * latent_channels, 1)
+        up: list[nn.Module] = [nn.Conv2d(latent_channels, last, 3, padding=1), ResidualConv(last)]
+        for width, shallower in pairwise(reversed(widths)):
+            up += [nn.Conv2d(width, 4 * shallower, 3, padding=1), nn.PixelShuffle(2)]
+            up += [ResidualConv(shallower)]
+        up += [nn.SiLU(), nn.Conv2d(first, 4 * 3, 3, padding=1), nn.PixelShuffle(2)]
+        self.decoder = nn.Sequential(*up)
+        self.latent_mean: Tensor
+        self.latent_std: Tensor
+        self.register_buffer("latent_mean", torch.zeros(latent_channels))
+        self.register_buffer("latent_std", torch.ones(latent_channels))
+
+    def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """[N, 3, H, W] in [-1, 1] -> mean and log variance [N, C, h, w], not normalised."""
+        mean, log_variance = self.moments(self.encoder(images)).chunk(2, dim=1)
+        return mean, log_variance.clamp(-20.0, MAX_LOG_VARIANCE)
+
+    def reconstruct(self, latents: Tensor) -> Tensor:
+        """Latents [N, C, h, w] that are not normalised -> [N, 3, H, W] about [-1, 1]."""
+        images: Tensor = self.decoder(latents)
+        return images
+
+    def normalise(self, latents: Tensor) -> Tensor:
+        """Raw latents [N, C, h, w] -> unit scale."""
+        return (latents - _per_channel(self.latent_mean)) / _per_channel(self.latent_std)
+
+    def denormalise(self, latents: Tensor) -> Tensor:
+        """The inverse of ``normalise``."""
+        return latents * _per_channel(self.latent_std) + _per_channel(self.latent_mean)
+
+
+def to_unit(images: Tensor) -> Tensor:
+    """[N, H, W, 3] uint8 -> [N, 3, H, W] float in [-1, 1], channels-last memory."""
+    return images.permute(0, 3, 1, 2).float() / 127.5 - 1.0
+
+
+def to_bytes(images: Tensor) -> Tensor:
+    """[N, 3, H, W] about [-1, 1] -> [N, H, W, 3] uint8."""
+    scaled = ((images + 1.0) * 127.5).round().clamp(0.0, 255.0)
+    return scaled.to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+
+
+def _per_channel(values: Tensor) -> Tensor:
+    return values.view(1, -1, 1, 1)
