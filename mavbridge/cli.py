@@ -108,7 +108,7 @@ def demonstrate(config: DemonstrateConfig) -> int:
 
 @cli.command
 def train(*flights: Path, config: TrainConfig | None = None) -> int:
-    """Train a policy from flights.
+    """Train a policy, or a world model, from flights.
 
     Args:
         flights: flight folders, folders of them, or LeRobot datasets (v3).

@@ -266,9 +266,9 @@ class TrainConfig:
     out: Path | None = None
     """Checkpoint to write (.safetensors); an unfinished run is kept beside it."""
     policy: str = "toge"
-    """toge[:small|medium|large][:BACKBONE] or resnet-unet[:SIZE]."""
-    image_size: int = 224
-    """Pixels a side into the encoder."""
+    """toge[:small|medium|large][:BACKBONE], resnet-unet[:SIZE], or world-model."""
+    image_size: int | None = None
+    """Pixels a side into the encoder; 224, or 64 for a world model, if not given."""
     minutes: float | None = None
     """How long to train; 45 if neither this nor --steps is given."""
     steps: int | None = None
@@ -310,7 +310,8 @@ class TrainConfig:
         """Refuse values that no run could use."""
         if self.minutes is not None and self.steps is not None:
             raise UserError("--minutes and --steps contradict each other: give one of them")
-        _check("image-size", self.image_size, 32, 1024, "pixels")
+        if self.image_size is not None:
+            _check("image-size", self.image_size, 32, 1024, "pixels")
         _check("batch-size", self.batch_size, 2, 4096, "")
         _check("seed", self.seed, 0, 2**63 - 1, "")
         _check("validation-fraction", self.validation_fraction, 0, 0.9, "")

@@ -14,14 +14,20 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.config import TrainConfig
 from mavbridge.errors import UserError
+from policy.contract import Contract
 from policy.dataset import Episode, Nanoseconds, common_frame
 from policy.loading import builtin_config
 from policy.train import train
-from policy.train_plan import Budget, Check, TrainSettings
+from policy.train_plan import Budget, Check, TrainSettings, WorldTrainSettings
 from policy.train_report import Progress as TrainProgress
 from policy.train_report import TrainResult
+from policy.train_world import train_world_model
+from policy.world_model import WorldModelConfig
 
 MINUTES = 45.0
+IMAGE_SIZE = 224
+WORLD_MODEL = "world-model"
+"""In place of a policy: what ``mavbridge imagine`` imagines with."""
 
 
 def train_policy(flights: Sequence[Path], config: TrainConfig, out: Path) -> int:
@@ -37,17 +43,23 @@ def train_policy(flights: Sequence[Path], config: TrainConfig, out: Path) -> int
         PolicyError: flights, weights or a run that cannot be used.
     """
     _require_device(config.device)
+    is_world_model = config.policy == WORLD_MODEL
+    if is_world_model:
+        _refuse_what_is_for_policies(config)
     episodes = _read_episodes(flights, config.camera_key)
-    settings = _settings(config, out, episodes)
     clock = MonotonicClock()
+
+    def now_s() -> float:
+        return clock.now_ns() / NS_PER_S
+
     with _Display() as display:
-        result = train(
-            episodes,
-            settings,
-            now_s=lambda: clock.now_ns() / NS_PER_S,
-            report=display.show,
-            check=_check(config),
-        )
+        if is_world_model:
+            model_settings = _world_model_settings(config, out, episodes)
+            result = train_world_model(episodes, model_settings, now_s=now_s, report=display.show)
+        else:
+            settings = _settings(config, out, episodes)
+            check = _check(config)
+            result = train(episodes, settings, now_s=now_s, report=display.show, check=check)
     _print_result(result)
     return 0
 
@@ -71,18 +83,16 @@ def _read_episodes(paths: Sequence[Path], camera_key: str | None) -> list[Episod
 
 
 def _settings(config: TrainConfig, out: Path, episodes: list[Episode]) -> TrainSettings:
-    network = builtin_config(config.policy, image_size=config.image_size)
+    network = builtin_config(config.policy, image_size=config.image_size or IMAGE_SIZE)
     contract = replace(
         network.contract,
         state_frame=common_frame(episodes),
         since_exposure=config.since_exposure,
     )
-    minutes = MINUTES if config.minutes is None else config.minutes
-    budget = Budget(steps=config.steps) if config.steps else Budget(seconds=60.0 * minutes)
     return TrainSettings(
         policy=replace(network, contract=contract),
         out=out,
-        budget=budget,
+        budget=_budget(config),
         batch_size=config.batch_size,
         gate_weight=config.gate_weight,
         mirror=config.mirror,
@@ -109,6 +119,43 @@ def _check(config: TrainConfig) -> Check | None:
             f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
         ) from error
     return lambda checkpoint: share_of_gates(checkpoint, config.policy, config.check_flights)
+
+
+def _world_model_settings(
+    config: TrainConfig, out: Path, episodes: list[Episode]
+) -> WorldTrainSettings:
+    contract = Contract(state_frame=common_frame(episodes))
+    size = WorldModelConfig.image_size if config.image_size is None else config.image_size
+    return WorldTrainSettings(
+        model=WorldModelConfig(image_size=size, contract=contract),
+        out=out,
+        budget=_budget(config),
+        batch_size=config.batch_size,
+        mirror=config.mirror,
+        seed=config.seed,
+        device=config.device,
+        resume=config.resume,
+        validation_fraction=config.validation_fraction,
+    )
+
+
+def _refuse_what_is_for_policies(config: TrainConfig) -> None:
+    for flag, value in (
+        ("--ages", config.ages),
+        ("--start-from", config.start_from),
+        ("--backbone-weights", config.backbone_weights),
+        ("--freeze-encoder", config.freeze_encoder),
+        ("--check-flights", config.check_flights),
+        ("--pack", config.pack),
+    ):
+        if value:
+            raise UserError(f"{flag} is for policies: leave it out for a world model")
+
+
+def _budget(config: TrainConfig) -> Budget:
+    if config.steps:
+        return Budget(steps=config.steps)
+    return Budget(seconds=60.0 * (MINUTES if config.minutes is None else config.minutes))
 
 
 def _ages(spec: str) -> Nanoseconds:

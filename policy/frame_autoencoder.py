@@ -9,6 +9,8 @@ from torch import Tensor, nn
 FACTOR = 8
 """Pixels of a side for one latent."""
 MAX_LOG_VARIANCE = 4.0
+_FIRST_LOG_VARIANCE = -4.0
+"""Of a new encoder: at 0 the noise would drown what little its latents say at first."""
 
 
 class ResidualConv(nn.Module):
@@ -40,6 +42,7 @@ class FrameAutoencoder(nn.Module):
             down += [nn.Conv2d(width, deeper, 3, stride=2, padding=1), ResidualConv(deeper)]
         self.encoder = nn.Sequential(*down, nn.SiLU())
         self.moments = nn.Conv2d(last, 2 * latent_channels, 1)
+        nn.init.constant_(self.moments.bias[latent_channels:], _FIRST_LOG_VARIANCE)  # type: ignore[index]
         up: list[nn.Module] = [nn.Conv2d(latent_channels, last, 3, padding=1), ResidualConv(last)]
         for width, shallower in pairwise(reversed(widths)):
             up += [nn.Conv2d(width, 4 * shallower, 3, padding=1), nn.PixelShuffle(2)]

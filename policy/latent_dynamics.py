@@ -65,7 +65,7 @@ class LatentDynamics(nn.Module):
         per_patch = latent_channels * patch * patch
         features = 12 + MOTION_DIM * (context_frames - 1)
         self.embed_patch = nn.Linear((1 + context_frames) * per_patch, width)
-        self.embed_vehicle = nn.Linear(MOTION_DIM + ACTION_DIM + 1, width)
+        self.embed_vehicle = nn.Linear(MOTION_DIM + 2 * ACTION_DIM + 1, width)
         self.frame_position = nn.Parameter(_SMALL * torch.randn(frames, 1, width))
         self.slot_position = nn.Parameter(_SMALL * torch.randn(self._grid**2 + 1, width))
         self.condition = nn.Sequential(
@@ -95,7 +95,9 @@ class LatentDynamics(nn.Module):
         given = past.latents.flatten(1, 2).unsqueeze(1).expand(-1, frames, -1, -1, -1)
         patches = self.embed_patch(self._patches(torch.cat([noisy.latents, given], dim=2)))
         known_of_frame = known.unsqueeze(1).expand(-1, frames, -1)
-        vehicle = torch.cat([noisy.motion, noisy.actions, known_of_frame], dim=-1)
+        # Sticks are rates: what they add up to is nearly what they do.
+        so_far = noisy.actions.cumsum(dim=1) / frames**0.5
+        vehicle = torch.cat([noisy.motion, noisy.actions, so_far, known_of_frame], dim=-1)
         tokens = torch.cat([patches, self.embed_vehicle(vehicle).unsqueeze(2)], dim=2)
         tokens = tokens + self.frame_position + self.slot_position
         for layer in self.layers:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -22,6 +21,7 @@ from policy.contract import Contract, FloatArray
 from policy.dataset_frames import FrameStore
 from policy.dataset_samples import Samples, Timeline, mirror
 from policy.dataset_time import Indices
+from policy.train_parallel import row_parts
 
 SHIFT = 0.015
 """Images move by at most this share of their side, as a camera mount is off by a degree."""
@@ -72,13 +72,10 @@ class Batch:
     def split(self, count: int) -> "list[Batch]":
         """At most ``count`` parts of about the same size, each of two images or more."""
         images, samples = len(self.look), len(self.state)
-        count = max(1, min(count, images // 2))
         repeats = samples // images
-        bounds = [images * part // count for part in range(count + 1)]
         return [
-            self._rows(slice(start, stop), slice(start * repeats, stop * repeats))
-            for start, stop in pairwise(bounds)
-            if stop > start
+            self._rows(rows, slice(rows.start * repeats, rows.stop * repeats))
+            for rows in row_parts(images, max(1, min(count, images // 2)))
         ]
 
     def _rows(self, images: slice, samples: slice) -> "Batch":

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from policy.contract import Contract
@@ -52,37 +51,24 @@ class Encoder:
             DatasetError: no room on the disk.
         """
         frames = np.random.default_rng([seed, 3]).permutation(self._batches.frames)
-        row_of = np.full((2, int(frames.max()) + 1), -1, np.int64)
-        rows, encode = 0, self._encode()
-        try:
-            with path.open("wb") as file:
-                for start in range(0, len(frames), ENCODE_BATCH):
-                    if start and not go_on(start / len(frames)):
-                        break
-                    part = frames[start : start + ENCODE_BATCH]
-                    for mirrored in (False, True)[: 2 if mirror else 1]:
-                        file.write(encode(part, mirrored).tobytes())
-                        row_of[int(mirrored), part] = rows + np.arange(len(part))
-                        rows += len(part)
-        except OSError as error:
-            raise disk_error(path, error) from error
-        return PooledStore(path, self._trainee.policy.backbone.out_dim, row_of)
+        dim = self._trainee.policy.backbone.out_dim
+        return encode_rows(path, frames, self._encode(), dim=dim, mirror=mirror, go_on=go_on)
 
-    def _encode(self) -> Callable[[Indices, bool], NDArray[np.float16]]:
-        """(frames, mirrored) -> [B, D], half the precision for half the disk."""
-        backbone = self._trainee.policy.backbone
+    def _encode(self) -> Callable[[Indices, bool], Tensor]:
+        """(frames, are they mirrored) -> [B, D]"""
         if self._device.type == "cpu":
             bulk = BulkEncoder(self._trainee.policy, "bf16" if self._bf16 else "f32")
-            return lambda frames, mirrored: bulk(
-                self._images(frames, mirrored=mirrored).numpy()
-            ).astype(np.float16)
+            return lambda frames, mirrored: torch.from_numpy(
+                bulk(self._images(frames, mirrored=mirrored).numpy())
+            )
 
         @torch.inference_mode()
-        def in_torch(frames: Indices, mirrored: bool) -> NDArray[np.float16]:
+        def in_torch(frames: Indices, mirrored: bool) -> Tensor:
             with computing_in(self._device, self._bf16):
-                pooled = backbone(self._images(frames, mirrored=mirrored))
-            out: NDArray[np.float16] = pooled.to(torch.float16).cpu().numpy()
-            return out
+                pooled: Tensor = self._trainee.policy.backbone(
+                    self._images(frames, mirrored=mirrored)
+                )
+            return pooled
 
         return in_torch
 
@@ -91,3 +77,43 @@ class Encoder:
         size = (contract.image_height, contract.image_width)
         images = self._batches.images(frames, size, mirrored=mirrored).to(self._device)
         return normalise_image(images.permute(0, 3, 1, 2).float() / 255, contract)
+
+
+def encode_rows(
+    path: Path,
+    frames: Indices,
+    encode: Callable[[Indices, bool], Tensor],
+    *,
+    dim: int,
+    mirror: bool,
+    go_on: Callable[[float], bool],
+) -> PooledStore:
+    """Encode images to ``path``, in float16 to save half the disk, while there is time.
+
+    Args:
+        path: the file.
+        frames: of the images, in this order.
+        encode: some images, as they are or all mirrored -> [B, dim].
+        dim: of what it makes.
+        mirror: whether to encode each image both ways.
+        go_on: of the part done; False ends it.
+
+    Raises:
+        DatasetError: no room on the disk.
+    """
+    row_of = np.full((2, int(frames.max()) + 1), -1, np.int64)
+    rows = 0
+    try:
+        with path.open("wb") as file:
+            for start in range(0, len(frames), ENCODE_BATCH):
+                if start and not go_on(start / len(frames)):
+                    break
+                part = frames[start : start + ENCODE_BATCH]
+                for is_mirrored in (False, True)[: 2 if mirror else 1]:
+                    encoded = encode(part, is_mirrored).to(torch.float16)
+                    file.write(encoded.cpu().numpy().tobytes())
+                    row_of[int(is_mirrored), part] = rows + np.arange(len(part))
+                    rows += len(part)
+    except OSError as error:
+        raise disk_error(path, error) from error
+    return PooledStore(path, dim, row_of)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
@@ -99,6 +100,12 @@ class Gradients(Generic[M]):
         """Do the same to the trainee and its replicas, such as to choose their mode."""
         for replica in self._replicas:
             change(replica)
+
+
+def row_parts(count: int, parts: int) -> list[slice]:
+    """At most ``parts`` slices of about the same size, together ``count`` rows."""
+    bounds = [count * part // parts for part in range(parts + 1)]
+    return [slice(start, stop) for start, stop in pairwise(bounds) if stop > start]
 
 
 @contextmanager

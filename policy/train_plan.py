@@ -16,6 +16,7 @@ from policy.contract import PolicyError
 from policy.dataset import Nanoseconds
 from policy.resnet_unet import ResnetUnetConfig
 from policy.toge import TogeConfig
+from policy.world_model import WorldModelConfig
 
 Precision = Literal["auto", "bf16", "f32"]
 Check: TypeAlias = Callable[[Path], float]
@@ -165,6 +166,43 @@ class TrainSettings(RunSettings):
             raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
         if self.freeze_encoder and self.start_from is None:
             raise PolicyError("--freeze-encoder needs a trained one: give --start-from CHECKPOINT")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldTrainSettings(RunSettings):
+    """The training of a world model.
+
+    Raises:
+        PolicyError: a value is out of its range.
+    """
+
+    model: WorldModelConfig
+    """Its contract's ``state_frame`` must be the flights'."""
+    window_batch_size: int = 16
+    """Windows a step while the dynamics learns."""
+    autoencoder_share: float = 0.3
+    """Of the budget; the dynamics has the rest."""
+    decision_share: float = 0.3
+    """Of the windows, those in which the actions are to be found."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could do."""
+        super().__post_init__()
+        if self.window_batch_size < 1:
+            raise PolicyError(f"window_batch_size must be 1 or more, got {self.window_batch_size}")
+        if not 0 < self.autoencoder_share < 1:
+            raise PolicyError(f"autoencoder_share must be in (0, 1), got {self.autoencoder_share}")
+        if not 0 <= self.decision_share <= 1:
+            raise PolicyError(f"decision_share must be in [0, 1], got {self.decision_share}")
+
+    @property
+    def stages(self) -> tuple[Span, Span]:
+        """Of the run, in order."""
+        turn = self.autoencoder_share
+        return (
+            Span(name="autoencoder", start=0.0, end=turn),
+            Span(name="dynamics", start=turn, end=1.0),
+        )
 
 
 def make_stages(settings: TrainSettings) -> tuple[Stage, ...]:

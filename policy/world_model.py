@@ -247,11 +247,11 @@ class WorldModel(nn.Module):
         )
 
     def denoise(self, noisy: Future, timestep: Tensor, past: Past) -> Future:
-        """One network call: the estimate of the clean future.
+        """One network call: the estimate of the clean future, x_0.
 
-        The net tells how x_0 differs from the best guess of one who knows only the noise level and
-        a prior of unit variance about the last frame (about zero for motion and actions), in units
-        of that guess's error: its targets then have about unit scale at every level of noise.
+        The net tells latents as a change of the last frame's. Given the actions most of a future is
+        no matter of chance, so x_0 is what it can tell best at every level of noise, and few steps
+        lose little.
 
         Args:
             noisy: the future as ``Future`` has it; known actions in it are clean.
@@ -259,16 +259,10 @@ class WorldModel(nn.Module):
             past: the context.
         """
         output = self.dynamics(noisy, timestep, past)
-        power = torch.tensor(self.config.schedule.signal_power(), device=timestep.device)[timestep]
-        signal, noise = power.sqrt().view(-1, 1, 1), (1 - power).sqrt().view(-1, 1, 1)
-        signal_5d, noise_5d = signal[..., None, None], noise[..., None, None]
-        last = past.latents[:, -1:]
-        estimate = signal_5d * noisy.latents + noise_5d**2 * last + noise_5d * output.latents
-        actions = signal * noisy.actions + noise * output.actions
         return Future(
-            latents=estimate,
-            motion=signal * noisy.motion + noise * output.motion,
-            actions=torch.where(past.knows_actions.view(-1, 1, 1), noisy.actions, actions),
+            latents=past.latents[:, -1:] + output.latents,
+            motion=output.motion,
+            actions=torch.where(past.knows_actions.view(-1, 1, 1), noisy.actions, output.actions),
         )
 
     def normalise_actions(self, actions: Tensor) -> Tensor:

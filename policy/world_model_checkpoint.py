@@ -38,7 +38,8 @@ def save_world_model(
     """
     dtype = torch.float16 if half else torch.float32
     state = {
-        name: value.detach().to(dtype).contiguous() for name, value in model.state_dict().items()
+        name: value.detach().to(dtype).cpu().contiguous()
+        for name, value in model.state_dict().items()
     }
     require_finite(path, state)
     config = model.config

@@ -14,6 +14,9 @@ from mavbridge.train import _ages, _settings
 from policy.dataset_flights import read_ages, read_flight
 from policy.loading import load_policy
 from policy.toge import TogeConfig
+from policy.world_model_checkpoint import load_world_model
+
+WORLD_MODEL = ["flights", "--out", "a.safetensors", "--policy", "world-model"]
 
 
 def status_of(*arguments: str) -> int:
@@ -62,6 +65,29 @@ def test_a_checkpoint_is_trained_and_loads_to_fly(
     assert executable.act(feature, state, history, None).shape == (1, 16, 4)
 
 
+def test_a_world_model_is_trained_by_the_same_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in range(2):
+        write_spot_flight(tmp_path / "flights" / str(seed), seed, seconds=2.0)
+    out = tmp_path / "world.safetensors"
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        asked = ("--policy", "world-model", "--image-size", "32", "--steps", "2")
+        status = status_of(
+            str(tmp_path / "flights"), "--out", str(out), *asked, "--batch-size", "4"
+        )
+    finally:
+        torch.set_num_threads(threads)
+    printed = capsys.readouterr()
+    assert status == 0, printed.err
+    assert "imagined to" in printed.out
+    model = load_world_model(out)
+    assert model.config.image_size == 32
+    assert model.config.contract.state_frame == "ned_frd"
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -79,6 +105,11 @@ def test_a_checkpoint_is_trained_and_loads_to_fly(
         (["flights", "--out", "no/a.safetensors"], "no folder no"),
         (["flights", "--out", "a.safetensors", "--start-from", "b.safetensors"], "no such file"),
         (["flights", "--out", "a.safetensors", "--backbone-weights", "b.pth"], "not a readable"),
+        ([*WORLD_MODEL, "--ages", "40:90"], "for policies"),
+        ([*WORLD_MODEL, "--start-from", "b.safetensors"], "for policies"),
+        ([*WORLD_MODEL, "--backbone-weights", "b.pth"], "for policies"),
+        ([*WORLD_MODEL, "--image-size", "40"], "multiple of 16"),
+        (WORLD_MODEL, "fly longer"),
     ],
 )
 def test_bad_input_is_one_message(

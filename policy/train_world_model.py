@@ -1,0 +1,176 @@
+"""What is optimised of a world model, the scales that it is told, and how well it foretells."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from policy.contract import STATE_DIM, VELOCITY
+from policy.dataset_samples import STICK_SIGNS, mirror_signs
+from policy.dataset_windows import Windows
+from policy.frame_autoencoder import to_unit
+from policy.latent_dynamics import Future, Past
+from policy.relative_state import MOTION_SCALE, context_features, motion_since
+from policy.train_batches import PooledStore
+from policy.train_parallel import StepLoss
+from policy.train_report import WorldValidation
+from policy.train_world_batches import FrameBatch, WindowBatch
+from policy.world_model import WorldModel
+
+SQUARED_WEIGHT = 5.0
+"""Of the squared error beside the absolute one, which alone is content with a picture without the
+small things in it."""
+GRADIENT_WEIGHT = 1.0
+"""Of the error of differences between neighbouring pixels: a gate is a few pixels of edge."""
+KL_WEIGHT = 3e-4
+"""Per latent: enough that latents near one another look alike, too little to blur."""
+MOTION_WEIGHT, ACTION_WEIGHT = 0.5, 0.5
+MIN_MOTION_STD = 0.05
+"""Of ``MOTION_SCALE``: what hardly changes does not count more than this makes it."""
+MIN_STICK_STD = 0.1
+SCALE_SAMPLES = 4096
+"""Frames and windows from which scales are taken."""
+VALIDATION_STEPS = 4
+"""Denoising steps of imagined futures."""
+
+
+def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
+    """Errors of pixels and of their differences, and a little KL."""
+    images = to_unit(batch.images)
+    mean, log_variance = model.autoencoder.posterior(images)
+    latents = mean + (0.5 * log_variance).exp() * batch.noise
+    made = model.autoencoder.reconstruct(latents).float()
+    pixels, edges = reconstruction_errors(made, images)
+    mean, log_variance = mean.float(), log_variance.float()
+    kl = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).mean()
+    loss = pixels + GRADIENT_WEIGHT * edges + KL_WEIGHT * kl
+    return StepLoss(total=loss, told={"loss": loss, "pixels": pixels, "edges": edges, "kl": kl})
+
+
+def reconstruction_errors(made: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Of [B, 3, H, W] in [-1, 1]: L2 and L1 [], and L1 of the differences between neighbours."""
+    error = made - images
+    edges = error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
+    return SQUARED_WEIGHT * error.square().mean() + error.abs().mean(), edges
+
+
+def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
+    """Squared errors of what was denoised, which has about unit scale."""
+    config = model.config
+    context = config.context_frames
+    latents = _normalised_latents(model, batch.latents)
+    past_states, states = batch.states[:, :context], batch.states[:, context:]
+    motion = motion_since(past_states[:, -1:], states)
+    clean = Future(
+        latents=latents[:, context:],
+        motion=model.normalise_motion(motion),
+        actions=model.normalise_actions(batch.actions),
+    )
+    past = Past(
+        latents=latents[:, :context] + batch.context_noise,
+        features=context_features(past_states, config.contract),
+        knows_actions=batch.knows_actions,
+    )
+    add, timestep = config.schedule.add_noise, batch.timestep
+    knows = batch.knows_actions.view(-1, 1, 1)
+    noisy = Future(
+        latents=add(clean.latents, batch.latent_noise, timestep),
+        motion=add(clean.motion, batch.motion_noise, timestep),
+        actions=torch.where(knows, clean.actions, add(clean.actions, batch.action_noise, timestep)),
+    )
+    made = model.denoise(noisy, timestep, past)
+    picture = (made.latents.float() - clean.latents).square().mean()
+    vehicle = (made.motion.float() - clean.motion).square().mean()
+    # Known sticks are told as they are given: no error.
+    sticks = (made.actions.float() - clean.actions).square().mean()
+    loss = picture + MOTION_WEIGHT * vehicle + ACTION_WEIGHT * sticks
+    return StepLoss(
+        total=loss, told={"loss": loss, "latents": picture, "motion": vehicle, "sticks": sticks}
+    )
+
+
+def _normalised_latents(model: WorldModel, latents: Tensor) -> Tensor:
+    flat = model.autoencoder.normalise(latents.flatten(0, 1))
+    return flat.reshape(latents.shape)
+
+
+@torch.no_grad()
+def set_scales(model: WorldModel, windows: Windows, latents: PooledStore, *, mirrors: bool) -> None:
+    """Tell the model the mean and spread of latents, motions and sticks of the flights."""
+    config, coder = model.config, model.autoencoder
+    total = len(latents.frames)
+    frames = latents.frames[np.linspace(0, total - 1, min(SCALE_SAMPLES, total)).astype(np.int64)]
+    rows = torch.from_numpy(latents.read(frames, np.zeros(len(frames), bool)))
+    values = rows.reshape(len(frames), config.latent_channels, -1).transpose(0, 1).flatten(1)
+    coder.latent_mean.copy_(values.mean(dim=1))
+    coder.latent_std.copy_(values.std(dim=1).clamp_min(1e-3))
+    chosen = windows.spread(SCALE_SAMPLES)
+    samples = chosen.samples(np.arange(len(chosen)))
+    states, actions = torch.from_numpy(samples.states), torch.from_numpy(samples.actions)
+    if mirrors:
+        signs = torch.from_numpy(mirror_signs(STATE_DIM))
+        states = torch.cat([states, states * signs])
+        actions = torch.cat([actions, actions * torch.from_numpy(STICK_SIGNS)])
+    now = states[:, config.context_frames - 1 : config.context_frames]
+    motion = motion_since(now, states[:, config.context_frames :])
+    least = MIN_MOTION_STD * torch.tensor(MOTION_SCALE)
+    model.motion_mean.copy_(motion.mean(dim=0))
+    model.motion_std.copy_(torch.maximum(motion.std(dim=0, correction=0), least))
+    model.action_mean.copy_(actions.mean(dim=(0, 1)))
+    model.action_std.copy_(actions.std(dim=(0, 1), correction=0).clamp_min(MIN_STICK_STD))
+
+
+@torch.no_grad()
+def validate_autoencoder(model: WorldModel, images: Tensor) -> WorldValidation:
+    """How well frames [N, H, W, 3] survive being coded; the loss is that of the pixels."""
+    made = model.decode(model.encode(images))
+    pixels, edges = reconstruction_errors(to_unit(made), to_unit(images))
+    return WorldValidation(
+        loss=float(pixels + GRADIENT_WEIGHT * edges),
+        reconstruction_psnr_db=float(psnr_db(made, images).mean()),
+    )
+
+
+@torch.no_grad()
+def validate_world_model(
+    model: WorldModel, batches: Sequence[WindowBatch], frames: Tensor
+) -> WorldValidation:
+    """Losses over all ``batches``, and how well the first of them is imagined.
+
+    Args:
+        model: in eval mode.
+        batches: of held-out windows.
+        frames: [B, K + T, H, W, 3] uint8, those of the first batch as they were seen.
+    """
+    losses = [float(dynamics_loss(model, batch).told["loss"]) for batch in batches]
+    context, first = model.config.context_frames, batches[0]
+    latents, states = _normalised_latents(model, first.latents), first.states
+    imagined = model.sample(
+        latents[:, :context],
+        states[:, :context],
+        first.actions,
+        ddim_steps=min(VALIDATION_STEPS, model.config.schedule.num_train_timesteps),
+        noise_seed=0,
+        sim_mode=True,
+        decode_video=True,
+    )
+    if imagined.video is None:
+        raise RuntimeError("sample made no video")
+    future, last = frames[:, context:], frames[:, context - 1 : context]
+    coded = model.decode(latents[:, context])
+    end, now = states[:, -1, VELOCITY], states[:, context - 1, VELOCITY]
+    return WorldValidation(
+        loss=sum(losses) / len(losses),
+        reconstruction_psnr_db=float(psnr_db(coded, frames[:, context]).mean()),
+        psnr_db=float(psnr_db(imagined.video, future).mean()),
+        copy_psnr_db=float(psnr_db(last.expand_as(future), future).mean()),
+        velocity_error_mps=float((imagined.states[:, -1, VELOCITY] - end).norm(dim=-1).mean()),
+        held_velocity_error_mps=float((now - end).norm(dim=-1).mean()),
+    )
+
+
+def psnr_db(made: Tensor, true: Tensor) -> Tensor:
+    """Peak signal to noise ratio [...] of frames [..., H, W, 3] uint8; 99 where they are equal."""
+    squared = (made.float() - true.float()).square().mean(dim=(-3, -2, -1))
+    return (10 * torch.log10(255.0**2 / squared)).clamp_max(99.0)
