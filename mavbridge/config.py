@@ -273,8 +273,8 @@ class TrainConfig:
     """How long to train; 45 if neither this nor --steps is given."""
     steps: int | None = None
     """How many optimiser steps to train, in place of --minutes."""
-    batch_size: int = 32
-    """Images a step while the encoder learns."""
+    batch_size: int | None = None
+    """Images a step while the encoder learns; 32, or 8 for a world model, if not given."""
     seed: int = 0
     """Of weights, order and noise."""
     device: str = "cpu"
@@ -312,7 +312,8 @@ class TrainConfig:
             raise UserError("--minutes and --steps contradict each other: give one of them")
         if self.image_size is not None:
             _check("image-size", self.image_size, 32, 1024, "pixels")
-        _check("batch-size", self.batch_size, 2, 4096, "")
+        if self.batch_size is not None:
+            _check("batch-size", self.batch_size, 2, 4096, "")
         _check("seed", self.seed, 0, 2**63 - 1, "")
         _check("validation-fraction", self.validation_fraction, 0, 0.9, "")
         _check("gate-weight", self.gate_weight, 0, 100, "")

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 FACTOR = 8
 """Pixels of a side for one latent."""
 MAX_LOG_VARIANCE = 4.0
+_QUIET = 0.3
 _FIRST_LOG_VARIANCE = -4.0
 """Of a new encoder: at 0 the noise would drown what little its latents say at first."""
 
@@ -42,17 +43,32 @@ class FrameAutoencoder(nn.Module):
             down += [nn.Conv2d(width, deeper, 3, stride=2, padding=1), ResidualConv(deeper)]
         self.encoder = nn.Sequential(*down, nn.SiLU())
         self.moments = nn.Conv2d(last, 2 * latent_channels, 1)
-        nn.init.constant_(self.moments.bias[latent_channels:], _FIRST_LOG_VARIANCE)  # type: ignore[index]
         up: list[nn.Module] = [nn.Conv2d(latent_channels, last, 3, padding=1), ResidualConv(last)]
         for width, shallower in pairwise(reversed(widths)):
             up += [nn.Conv2d(width, 4 * shallower, 3, padding=1), nn.PixelShuffle(2)]
             up += [ResidualConv(shallower)]
-        up += [nn.SiLU(), nn.Conv2d(first, 4 * 3, 3, padding=1), nn.PixelShuffle(2)]
-        self.decoder = nn.Sequential(*up)
+        out = nn.Conv2d(first, 4 * 3, 3, padding=1)
+        self.decoder = nn.Sequential(*up, nn.SiLU(), out, nn.PixelShuffle(2))
+        self._initialise(out)
         self.latent_mean: Tensor
         self.latent_std: Tensor
         self.register_buffer("latent_mean", torch.zeros(latent_channels))
         self.register_buffer("latent_std", torch.ones(latent_channels))
+
+    def _initialise(self, out: nn.Conv2d) -> None:
+        """Signals of one size all the way, and shortcuts that hardly differ from straight ones.
+
+        torch's own start lets them shrink by half from layer to layer, and learns more slowly.
+        """
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(_bias(module))
+        quiet = [m.conv2 for m in self.modules() if isinstance(m, ResidualConv)]
+        for conv in (*quiet, out):
+            conv.weight.data.mul_(_QUIET)
+        _, log_variance = _bias(self.moments).data.chunk(2)
+        log_variance.fill_(_FIRST_LOG_VARIANCE)
 
     def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """[N, 3, H, W] in [-1, 1] -> mean and log variance [N, C, h, w], not normalised."""
@@ -71,6 +87,12 @@ class FrameAutoencoder(nn.Module):
     def denormalise(self, latents: Tensor) -> Tensor:
         """The inverse of ``normalise``."""
         return latents * _per_channel(self.latent_std) + _per_channel(self.latent_mean)
+
+
+def _bias(conv: nn.Conv2d) -> Tensor:
+    if conv.bias is None:
+        raise TypeError("all convolutions here have a bias")
+    return conv.bias
 
 
 def to_unit(images: Tensor) -> Tensor:

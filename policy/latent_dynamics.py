@@ -71,8 +71,6 @@ class LatentDynamics(nn.Module):
         self.condition = nn.Sequential(
             nn.Linear(TIME_DIM + features + 1, width),
             nn.SiLU(),
-            nn.Linear(width, width),
-            nn.SiLU(),
             nn.Linear(width, MODULATIONS * width),
         )
         self.layers = nn.ModuleList([_Layer(width) for _ in range(depth)])

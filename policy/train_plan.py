@@ -178,9 +178,12 @@ class WorldTrainSettings(RunSettings):
 
     model: WorldModelConfig
     """Its contract's ``state_frame`` must be the flights'."""
-    window_batch_size: int = 16
+    batch_size: int = 8
+    """Frames a step while the autoencoder learns: a CPU is no faster with more at a time."""
+    learning_rate: float = 2e-3
+    window_batch_size: int = 8
     """Windows a step while the dynamics learns."""
-    autoencoder_share: float = 0.3
+    autoencoder_share: float = 0.25
     """Of the budget; the dynamics has the rest."""
     decision_share: float = 0.3
     """Of the windows, those in which the actions are to be found."""

@@ -33,7 +33,7 @@ class WorldModelConfig:
 
     image_size: int = 64
     """Side of the square frames, px."""
-    latent_channels: int = 4
+    latent_channels: int = 8
     frames: int = 16
     """Frames, states and actions in one imagined future."""
     context_frames: int = 2

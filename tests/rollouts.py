@@ -31,7 +31,11 @@ from recordings import make_meta
 
 SIZE = 32
 TINY = WorldModelConfig(
-    image_size=SIZE, autoencoder_widths=(4, 4, 4), dynamics_width=32, dynamics_depth=1
+    image_size=SIZE,
+    latent_channels=4,
+    autoencoder_widths=(4, 4, 4),
+    dynamics_width=32,
+    dynamics_depth=1,
 )
 
 

@@ -30,6 +30,7 @@ from steered_flights import steered_flight
 
 MODEL = WorldModelConfig(
     image_size=32,
+    latent_channels=4,
     frames=4,
     autoencoder_widths=(8, 8, 16),
     dynamics_width=32,

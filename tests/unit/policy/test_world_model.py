@@ -15,6 +15,7 @@ from policy.world_model import Imagined, WorldModel, WorldModelConfig
 
 SMALL = WorldModelConfig(
     image_size=32,
+    latent_channels=4,
     frames=4,
     autoencoder_widths=(8, 8, 8),
     dynamics_width=32,
