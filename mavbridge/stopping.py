@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
+INTERRUPTED = 130
+"""What shells report of a program ended by Ctrl-C."""
+
 
 class StopRequest:
     """Set once, from a signal handler; waited for by the main thread.

@@ -31,8 +31,6 @@ from policy.train_state import Position, RunFolder
 VALIDATION_SAMPLES = 256
 FINE_TUNE = 1 / 3
 """Of the learning rate, for weights that were trained before."""
-ENCODING_SHARE = 0.4
-"""Of the head's time, the most that goes into encoding images for it."""
 
 
 def train(
@@ -187,12 +185,7 @@ class _Run:
                 encoder.refresh_norms()
             loop.average.load_state_dict(trainee.state_dict())
         trainee.policy.backbone.requires_grad_(requires_grad=False).eval()
-        begun = loop.fraction
-
-        def go_on(done: float) -> bool:
-            loop.doing(f"encoding, {done:.0%}")
-            return loop.fraction - begun < ENCODING_SHARE * (stage.end - begun)
-
+        go_on = loop.encoding_in(stage)
         self._pooled = encoder.encode_all(
             self._folder.pooled, mirror=settings.mirror, seed=settings.seed, go_on=go_on
         )

@@ -20,6 +20,8 @@ from policy.train_state import Position, RunFolder, TrainingError, identity_of
 LOG_STEPS = 20
 """Steps between two lines of the log."""
 GRADIENT_LIMIT = 1.0
+ENCODING_SHARE = 0.4
+"""Of the time of a stage on kept features, the most that goes into encoding images for it."""
 
 
 def open_run(settings: RunSettings, episodes: Sequence[Episode]) -> RunFolder:
@@ -162,6 +164,16 @@ class Loop(Generic[M]):
         self.trainee.load_state_dict(state["trainee"])
         self.average.load_state_dict(state["average"])
         self._optimiser.load_state_dict(state["optimiser"])
+
+    def encoding_in(self, stage: Span) -> Callable[[float], bool]:
+        """Whether there is time to go on encoding for ``stage``, asked with the part done."""
+        begun = self.fraction
+
+        def go_on(done: float) -> bool:
+            self.doing(f"encoding, {done:.0%}")
+            return self.fraction - begun < ENCODING_SHARE * (stage.end - begun)
+
+        return go_on
 
     def tell(self, stage: Span, validation: Held) -> None:
         """A validation, to the person and the log."""

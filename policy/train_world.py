@@ -40,8 +40,6 @@ VALIDATION_FRAMES = 128
 VALIDATION_WINDOWS = 128
 IMAGINED_WINDOWS = 16
 """Of them, those that are imagined frame by frame."""
-ENCODING_SHARE = 0.4
-"""Of the time of the dynamics, the most that goes into encoding frames for it."""
 
 
 def train_world_model(
@@ -192,11 +190,7 @@ class _Run:
         loop, settings, stage = self._loop, self._settings, self._settings.stages[DYNAMICS]
         if is_new:
             loop.trainee.load_state_dict(loop.average.state_dict())
-        begun = loop.fraction
-
-        def go_on(done: float) -> bool:
-            loop.doing(f"encoding, {done:.0%}")
-            return loop.fraction - begun < ENCODING_SHARE * (stage.end - begun)
+        go_on = loop.encoding_in(stage)
 
         @torch.no_grad()
         def encode(frames: Indices, is_mirrored: bool) -> Tensor:

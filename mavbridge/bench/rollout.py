@@ -21,11 +21,12 @@ from mavbridge.bench.rollout_results import (
     trial_from_json,
     typical,
 )
-from mavbridge.bench.run import INTERRUPTED, PIPED_WIDTH, machine, require_folder, sayer
+from mavbridge.bench.run import PIPED_WIDTH, machine, require_folder, sayer
 from mavbridge.bench.tables import number
 from mavbridge.config import RolloutBenchConfig
-from mavbridge.errors import UserError
+from mavbridge.plots import needs_matplotlib
 from mavbridge.rollout.run import SHIPPED
+from mavbridge.stopping import INTERRUPTED
 from policy.world_model_checkpoint import load_world_model
 
 FRAMES, EXE_STEPS = 16, 1
@@ -142,14 +143,8 @@ def _run(way: Way, device: str, iterations: int, steps: int, weights: Path | Non
 
 def _drawing(path: Path) -> Callable[[RolloutBench], None]:
     """What draws the figure to ``path``; looked for before the run."""
-    try:
+    with needs_matplotlib():
         from mavbridge.bench.rollout_figure import draw
-    except ModuleNotFoundError as error:
-        if error.name != "matplotlib":
-            raise
-        raise UserError(
-            "--plot needs the package matplotlib: pip install 'mavbridge[bench]'"
-        ) from error
     return lambda result: draw(result, path)
 
 

@@ -20,6 +20,8 @@ from mavbridge.bench.tables import print_result
 from mavbridge.clock import MonotonicClock
 from mavbridge.config import BenchConfig
 from mavbridge.errors import UserError
+from mavbridge.plots import needs_matplotlib
+from mavbridge.stopping import INTERRUPTED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +36,6 @@ class _Plan:
     attitudes: int
 
 
-INTERRUPTED = 130
-"""What shells report of a program ended by Ctrl-C."""
 PIPED_WIDTH = 120
 """Columns of the tables where there is no terminal to ask."""
 FULL = _Plan(
@@ -126,14 +126,8 @@ def _flights(plan: _Plan, say: Callable[[str], None]) -> tuple[Flight, ...]:
 
 def _drawing(path: Path) -> Callable[[BenchResult], None]:
     """What draws the figure to ``path``; looked for before the run."""
-    try:
+    with needs_matplotlib():
         from mavbridge.bench.figure import draw
-    except ModuleNotFoundError as error:
-        if error.name != "matplotlib":
-            raise
-        raise UserError(
-            "--plot needs the package matplotlib: pip install 'mavbridge[bench]'"
-        ) from error
     return lambda result: draw(result, path)
 
 

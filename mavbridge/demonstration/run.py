@@ -19,11 +19,8 @@ from mavbridge.demonstration.flight import Outcome, demonstrate_once
 from mavbridge.errors import UserError
 from mavbridge.recording.folder import META, prepare_folder
 from mavbridge.recording.meta import FlightError, read_meta
-from mavbridge.stopping import stop_on_signals
+from mavbridge.stopping import INTERRUPTED, stop_on_signals
 from policy.contract import Contract
-
-INTERRUPTED = 130
-"""What shells report of a program ended by Ctrl-C."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,8 @@ from mavbridge.evaluation.realtime import fly_realtime
 from mavbridge.evaluation.results import Evaluation, to_json
 from mavbridge.evaluation.tables import print_evaluation
 from mavbridge.lockstep.referee import EpisodeInterruptedError
-from mavbridge.stopping import stop_on_signals
-
-INTERRUPTED = 130
-"""What shells report of a program ended by Ctrl-C."""
+from mavbridge.plots import needs_matplotlib
+from mavbridge.stopping import INTERRUPTED, stop_on_signals
 
 
 def evaluate(config: EvaluateConfig) -> int:
@@ -104,14 +102,8 @@ def _one_by_one(jobs: Iterable[Job], should_stop: Callable[[], bool]) -> Iterato
 
 def _drawing(path: Path) -> Callable[[Evaluation], None]:
     """What draws the figure to ``path``; looked for before the run."""
-    try:
+    with needs_matplotlib():
         from mavbridge.evaluation.figure import draw
-    except ModuleNotFoundError as error:
-        if error.name != "matplotlib":
-            raise
-        raise UserError(
-            "--plot needs the package matplotlib: pip install 'mavbridge[bench]'"
-        ) from error
     return lambda evaluation: draw(evaluation, path)
 
 

@@ -25,12 +25,10 @@ from mavbridge.rollout.progress import RolloutProgress
 from mavbridge.rollout.sampling import Sampler
 from mavbridge.rollout.start import RealFrames, Start, read_start
 from mavbridge.rollout.streamed import StreamedOutput
-from mavbridge.stopping import stop_on_signals
+from mavbridge.stopping import INTERRUPTED, stop_on_signals
 from policy.world_model import WorldModel
 from policy.world_model_checkpoint import load_world_model
 
-INTERRUPTED = 130
-"""What shells report of a program ended by Ctrl-C."""
 SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 
 

@@ -95,15 +95,15 @@ class _SpreadSolve:
         # Copies: the caller may write to its arrays before the last segment reads them.
         self._inputs = encoded.copy(), state.copy(), history.copy()
         self._noisy = solve.noise
-        self._segments = iter(solve.segments)
-        self._left = len(solve.segments)
+        self._segments = solve.segments
+        self._done = 0
         self.age_s = 0.0
 
     def run_segment(self) -> FloatArray | None:
         """The chunk, if that was the last segment."""
-        self._noisy = next(self._segments)(*self._inputs, self._noisy)
-        self._left -= 1
-        return None if self._left else self._noisy
+        self._noisy = self._segments[self._done](*self._inputs, self._noisy)
+        self._done += 1
+        return self._noisy if self._done == len(self._segments) else None
 
 
 class WarmStart:
