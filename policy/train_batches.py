@@ -102,9 +102,15 @@ class PooledStore:
         """
         self._rows = np.memmap(path, np.float16, mode="r").reshape(-1, dim)
         self._row_of = row_of
-        self.frames = np.flatnonzero(row_of[0] >= 0)
-        """Images that were encoded."""
+        self.frames = np.flatnonzero((row_of >= 0).any(axis=0))
+        """Images that were encoded, one way or both."""
         self.has_mirrored = bool((row_of[1, self.frames] >= 0).all())
+        """All of them."""
+
+    def ways(self, frames: Indices, is_mirrored: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """``is_mirrored`` [B], but the other way where only that one was encoded."""
+        is_there = self._row_of[is_mirrored.astype(int), frames] >= 0
+        return np.where(is_there, is_mirrored, ~is_mirrored)
 
     def read(self, frames: Indices, is_mirrored: NDArray[np.bool_]) -> FloatArray:
         """[B, D]"""
@@ -162,7 +168,7 @@ class Batches:
         """Training of the head alone."""
         random = np.random.default_rng([self._seed, step])
         frames = next_of(pooled.frames, step, count, self._seed)
-        is_mirrored = self._mirrored(random, count) & pooled.has_mirrored
+        is_mirrored = pooled.ways(frames, self._mirrored(random, count))
         rows = pooled.read(frames, is_mirrored)
         return self._batch(random, frames, is_mirrored, 1, pooled=rows)
 

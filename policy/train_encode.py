@@ -1,7 +1,8 @@
 """From the end of the encoder's training to kept features for the head's."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -51,8 +52,9 @@ class Encoder:
             DatasetError: no room on the disk.
         """
         frames = np.random.default_rng([seed, 3]).permutation(self._batches.frames)
+        jobs = one_way_first(frames, mirror=mirror)
         dim = self._trainee.policy.backbone.out_dim
-        return encode_rows(path, frames, self._encode(), dim=dim, mirror=mirror, go_on=go_on)
+        return encode_rows(path, jobs, self._encode(), dim=dim, go_on=go_on)
 
     def _encode(self) -> Callable[[Indices, bool], Tensor]:
         """(frames, are they mirrored) -> [B, D]"""
@@ -79,37 +81,61 @@ class Encoder:
         return normalise_image(images.permute(0, 3, 1, 2).float() / 255, contract)
 
 
+Job: TypeAlias = tuple[tuple[Indices, bool], ...]
+"""Images to encode before it is asked whether to go on, each part as it is or mirrored."""
+
+
+def both_ways(frames: Indices, *, mirror: bool) -> list[Job]:
+    """Jobs that encode each image both ways at a time, or none of them mirrored."""
+    ways = (False, True) if mirror else (False,)
+    return [tuple((part, way) for way in ways) for part in _parts(frames)]
+
+
+def one_way_first(frames: Indices, *, mirror: bool) -> list[Job]:
+    """Jobs that encode each image one way, and when all are done the other way.
+
+    Where time is short, two images teach more than one image both ways.
+    """
+    parts = _parts(frames)
+    jobs: list[Job] = [((part, mirror and index % 2 == 1),) for index, part in enumerate(parts)]
+    if mirror:
+        jobs += [((part, index % 2 == 0),) for index, part in enumerate(parts)]
+    return jobs
+
+
+def _parts(frames: Indices) -> list[Indices]:
+    return [frames[start : start + ENCODE_BATCH] for start in range(0, len(frames), ENCODE_BATCH)]
+
+
 def encode_rows(
     path: Path,
-    frames: Indices,
+    jobs: Sequence[Job],
     encode: Callable[[Indices, bool], Tensor],
     *,
     dim: int,
-    mirror: bool,
     go_on: Callable[[float], bool],
 ) -> PooledStore:
     """Encode images to ``path``, in float16 to save half the disk, while there is time.
 
     Args:
         path: the file.
-        frames: of the images, in this order.
+        jobs: of the images, in this order.
         encode: some images, as they are or all mirrored -> [B, dim].
         dim: of what it makes.
-        mirror: whether to encode each image both ways.
         go_on: of the part done; False ends it.
 
     Raises:
         DatasetError: no room on the disk.
     """
-    row_of = np.full((2, int(frames.max()) + 1), -1, np.int64)
+    most = max(int(part.max()) for job in jobs for part, _ in job)
+    row_of = np.full((2, most + 1), -1, np.int64)
     rows = 0
     try:
         with path.open("wb") as file:
-            for start in range(0, len(frames), ENCODE_BATCH):
-                if start and not go_on(start / len(frames)):
+            for index, job in enumerate(jobs):
+                if index and not go_on(index / len(jobs)):
                     break
-                part = frames[start : start + ENCODE_BATCH]
-                for is_mirrored in (False, True)[: 2 if mirror else 1]:
+                for part, is_mirrored in job:
                     encoded = encode(part, is_mirrored).to(torch.float16)
                     file.write(encoded.cpu().numpy().tobytes())
                     row_of[int(is_mirrored), part] = rows + np.arange(len(part))

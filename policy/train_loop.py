@@ -56,7 +56,7 @@ class Loop(Generic[M]):
         self.trainee, self.folder, self.position = trainee, folder, Position()
         self.device = torch.device(settings.device)
         self.bf16 = uses_bf16(settings.precision, self.device)
-        self._settings, self._learning_rate = settings, learning_rate
+        self._settings, self.learning_rate = settings, learning_rate
         self._now_s, self._report, self._begun_s = now_s, report, now_s()
         self._ema = Ema(trainee, settings.ema_decay)
         self._optimiser = self._new_optimiser()
@@ -76,8 +76,9 @@ class Loop(Generic[M]):
         """Time used, that before a resume included."""
         return self.position.spent_s + self._now_s() - self._begun_s
 
-    def begin_phase(self) -> None:
-        """What may move has changed: a new optimiser and learning rate."""
+    def begin_phase(self, learning_rate: float) -> None:
+        """What may move has changed: a new optimiser, and a learning rate that rises and falls."""
+        self.learning_rate = learning_rate
         self.position.phase_step, self.position.phase_start = self.position.step, self.fraction
         self.trainee.zero_grad()  # of what stands still from now on, too: they would be clipped
         self._optimiser = self._new_optimiser()
@@ -197,14 +198,14 @@ class Loop(Generic[M]):
         start = position.phase_start
         along = (self.fraction - start) / max(phase_end - start, 1e-9)
         for group in self._optimiser.param_groups:
-            group["lr"] = self._learning_rate * learning_rate_factor(along)
+            group["lr"] = self.learning_rate * learning_rate_factor(along)
         torch.nn.utils.clip_grad_norm_(self.trainee.parameters(), GRADIENT_LIMIT)
         self._optimiser.step()
         position.step += 1
         self._ema.update(self.trainee, position.step - position.phase_step)
 
     def _new_optimiser(self) -> torch.optim.AdamW:
-        return make_optimiser(self.trainee, self._learning_rate, self._settings.weight_decay)
+        return make_optimiser(self.trainee, self.learning_rate, self._settings.weight_decay)
 
     def _save(self) -> None:
         position = self.position

@@ -1,7 +1,7 @@
 """What is optimised: a policy, a head for the gates that is not shipped, and their losses."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -21,6 +21,13 @@ GATE_LABELS = 10
 log distance of the gate after it."""
 MIN_STICK_STD = 0.1
 """A stick that hardly moves in the flights does not count more than this makes it."""
+DENOISED = 4
+"""One in so many samples passes through the denoiser in training, where there are many. Its pass
+costs four times as much as all that is before it, and what is hard to learn is before it: which
+sticks a feature and a state ask for. That, all samples teach by what the head reads off the
+condition."""
+LEAST_DENOISED = 16
+"""Samples a step through the denoiser."""
 VALIDATION_STEPS = 10
 """Denoising steps of the sticks that are compared with the flown ones."""
 
@@ -31,6 +38,8 @@ class Losses:
 
     sticks: Tensor
     """Squared error over the variance of the flown sticks: 1 is the mean stick."""
+    direct: Tensor
+    """The same of the sticks that are read off the condition."""
     gate: Tensor
     """Smooth L1 of the gate labels; 0 where no image has one."""
 
@@ -61,6 +70,11 @@ class Trainee(nn.Module):
             pooled: Tensor = self.policy.backbone(image)
         return pooled
 
+    @torch.no_grad()
+    def pooled(self, batch: Batch) -> Batch:
+        """The batch with its images encoded."""
+        return replace(batch, pooled=self.pool(batch), images=None, grain=None)
+
     def condition(self, visual: Tensor, batch: Batch) -> Tensor:
         """Projected images [B, C], each for its samples -> conditions [S, C]."""
         visual = visual.repeat_interleave(len(batch.state) // len(visual), dim=0)
@@ -71,14 +85,29 @@ class Trainee(nn.Module):
     def forward(self, batch: Batch, stick_scale: Tensor) -> Losses:
         """Losses of a batch; ``stick_scale`` [4] is the spread of each flown stick."""
         visual = self.policy.visual_projection(self.pool(batch))
-        noisy = self.schedule.add_noise(batch.chunk, batch.noise, batch.timestep)
-        made = self.policy.denoise(noisy, batch.timestep, self.condition(visual, batch)).float()
+        condition = self.condition(visual, batch)
+        direct = self.policy.head.read(condition).float()
+        return Losses(
+            sticks=self._denoising_loss(condition, batch, stick_scale),
+            direct=_squared((direct - batch.chunk) / stick_scale, batch.known),
+            gate=gate_loss(self.gate_head(visual).float(), batch.gate),
+        )
+
+    def _denoising_loss(self, condition: Tensor, batch: Batch, stick_scale: Tensor) -> Tensor:
+        """Of all samples in eval mode, in training of one in ``DENOISED``."""
+        every = max(1, min(DENOISED, len(condition) // LEAST_DENOISED)) if self.training else 1
+        chunk, timestep = batch.chunk[::every], batch.timestep[::every]
+        noise = batch.noise[::every]
+        noisy = self.schedule.add_noise(chunk, noise, timestep)
+        made = self.policy.denoise(noisy, timestep, condition[::every]).float()
         if self.schedule.prediction == "sample":
-            error = (made - batch.chunk) / stick_scale
-        else:
-            error = made - batch.noise
-        squared = error.square().mean(dim=-1)[batch.known].mean()
-        return Losses(sticks=squared, gate=gate_loss(self.gate_head(visual).float(), batch.gate))
+            return _squared((made - chunk) / stick_scale, batch.known[::every])
+        return _squared(made - noise, batch.known[::every])
+
+
+def _squared(error: Tensor, known: Tensor) -> Tensor:
+    """Mean square of errors [S, horizon, 4] where ``known`` [S, horizon]."""
+    return error.square().mean(dim=-1)[known].mean()
 
 
 def gate_labels(gate: Tensor) -> Tensor:
@@ -123,7 +152,7 @@ def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
 
 
 @torch.no_grad()
-def validate(trainee: Trainee, batches: Iterator[Batch], spread: "StickSpread") -> Validation:
+def validate(trainee: Trainee, batches: Iterable[Batch], spread: "StickSpread") -> Validation:
     """Losses and stick errors over all ``batches``, weighted by their size."""
     totals, weight = torch.zeros(5, dtype=torch.float64), 0
     for batch in batches:

@@ -17,7 +17,7 @@ from policy.dataset_time import Indices
 from policy.dataset_windows import Windows, find_windows
 from policy.frame_autoencoder import to_unit
 from policy.train_batches import PooledStore
-from policy.train_encode import encode_rows
+from policy.train_encode import both_ways, encode_rows
 from policy.train_loop import Loop, open_run
 from policy.train_parallel import computing_in
 from policy.train_plan import WorldTrainSettings
@@ -202,10 +202,9 @@ class _Run:
         held, kept = np.unique(self._held.frames), np.unique(self._windows.frames)
         latents = encode_rows(
             self._folder.pooled,
-            np.concatenate([held, kept]),
+            both_ways(np.concatenate([held, kept]), mirror=settings.mirror),
             encode,
             dim=self._model.latent_channels * self._model.latent_side**2,
-            mirror=settings.mirror,
             go_on=go_on,
         )
         total = len(self._windows)
@@ -221,7 +220,7 @@ class _Run:
             set_scales(loop.trainee, self._windows, latents, mirrors=settings.mirror)
             loop.average.load_state_dict(loop.trainee.state_dict())
             _learn(loop.trainee, DYNAMICS)
-            loop.begin_phase()
+            loop.begin_phase(settings.learning_rate)
         return latents
 
     # ---- the dynamics ----

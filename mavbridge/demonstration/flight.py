@@ -34,6 +34,9 @@ SETTLE_NS = 300 * NS_PER_MS
 """After a start in the air: until the last frame and state from the ground are gone."""
 KEPT_TRUTHS = 64
 """Exposures that may wait for their frame to be seen."""
+STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
+"""Where a student flies, the expert takes over now and then: a student that crashes at the first
+gate would otherwise be taught nothing of the others (Ross et al. 2011 mix the two by chance)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +108,8 @@ def demonstrate_once(
         seed: of the course and of everything random.
         speed_mps: of the expert.
         contract: of the policy that will learn from this: image size, horizon.
-        student: flies instead of the expert, who only labels (DAgger).
+        student: flies most of the time; the expert labels all of it, and takes over now and then so
+            that the flight goes on (DAgger).
 
     Raises:
         MavbridgeError, PolicyError: it cannot be flown, or not recorded.
@@ -177,6 +181,7 @@ class _Pilot:
         self._noise = StickDisturbance(
             drawn.seed, strength=drawn.disturbance, from_ground=not drawn.starts_airborne
         )
+        self._turns = _Turns(drawn.seed)
         self._expert: Expert | None = None
         self.opinion: Sticks | None = None
         """What the expert would hold; None before the first action."""
@@ -189,7 +194,7 @@ class _Pilot:
             engine="numpy",
             dual_rate=True,
             encode=lambda _: np.zeros((1, 1), np.float32),
-            act=self._expert_chunk,
+            act=self._act,
         )
         self.executable = replace(flies, act=self._act)
 
@@ -209,8 +214,12 @@ class _Pilot:
                 now_ns / NS_PER_S,
             )
         )
-        act = self._expert_chunk if self._student is None else self._student.act
-        return act(encoded, state, history, elapsed_s)
+        demonstrated = self._expert_chunk()
+        if self._student is None:
+            return demonstrated
+        # Asked at every tick, also where it is not its turn: it may hold state of its own.
+        chunk = self._student.act(encoded, state, history, elapsed_s)
+        return chunk if self._turns.is_students(now_ns / NS_PER_S) else demonstrated
 
     def _begin(self, now_ns: int) -> Expert:
         """At the first action, so that the sticks are ours when the vehicle is in the air.
@@ -226,12 +235,34 @@ class _Pilot:
         self.records_from_ns = now_ns + SETTLE_NS
         return Expert(self._episode.course, self._speed_mps, next_gate=start.next_gate)
 
-    def _expert_chunk(self, *_: object) -> FloatArray:
+    def _expert_chunk(self) -> FloatArray:
         if self.opinion is None:
             raise RuntimeError("the expert flies what it was asked for")
         now_s = self._episode.clock.now_ns() / NS_PER_S
         flown = self._noise.flown(Sticks4(*self.opinion), now_s)
         return np.tile(np.array(flown, np.float32), (1, self._contract.horizon, 1))
+
+
+class _Turns:
+    """Whose sticks are flown, student's or expert's, in turns of random length."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = np.random.Generator(np.random.PCG64((seed, 5)))
+        self._is_students = bool(self._random.random() < 0.5)
+        self._end_s: float | None = None
+
+    def is_students(self, t_s: float) -> bool:
+        """At ``t_s``; ask in order of time."""
+        if self._end_s is None:
+            self._end_s = t_s + self._length_s()
+        while t_s >= self._end_s:
+            self._is_students = not self._is_students
+            self._end_s += self._length_s()
+        return self._is_students
+
+    def _length_s(self) -> float:
+        turn_s = STUDENT_TURN_S if self._is_students else EXPERT_TURN_S
+        return float(self._random.uniform(*turn_s))
 
 
 class _Notes:

@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from policy.action_head import DiffusionHead, size_dims
 from policy.contract import ACTION_DIM, FloatArray
 from policy.diffusion import DdimStep, NoiseSchedule
-from policy.encoders import Fusion, HistoryEncoder
-from policy.engines.openvino_layers import Layer, Node, constant, conv, ints, layer, same
+from policy.engines.openvino_layers import Layer, Node, conv, ints, layer, same
 from policy.preprocess import egocentric_scale
 from policy.resnet_unet import ResnetUnet
 from policy.toge import Toge
@@ -50,8 +49,9 @@ def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
     noisy = _parameter("noisy", 1, policy.contract.horizon, ACTION_DIM)
     films = _parameter("films", count, unet.film_dim)
     updates = _parameter("updates", count, 4)
-    film = ops.add(layer(unet.film_condition)(_condition(policy, *inputs)), films)
-    denoise = _UNetGraph(unet)
+    condition = _condition(policy, *inputs)
+    film = ops.add(layer(unet.film_condition)(condition), films)
+    denoise = _with_read(_UNetGraph(unet), policy.head, condition)
     sample = ops.unsqueeze(ops.transpose(noisy, ints(0, 2, 1)), ints(2))
     for film_of_step, update in zip(
         _split(film, 0, [1] * count), _split(updates, 0, [1] * count), strict=True
@@ -102,33 +102,25 @@ def _parameter(name: str, *shape: int) -> Node:
 def _condition(policy: Toge | ResnetUnet, feature: Node, state: Node, history: Node) -> Node:
     token = layer(policy.state_encoder.mlp)(state)
     if isinstance(policy, Toge):
-        return _fuse(
-            policy.fusion, feature, token, _history_tokens(policy.history_encoder, history)
-        )
+        past = layer(policy.history_encoder)(history)
+        return layer(policy.fusion.mlp)(ops.concat([feature, token, past], axis=1))
     flat = ops.reshape(history, ints(1, -1), special_zero=False)
     return layer(policy.fuse)(ops.concat([feature, token, flat], axis=1))
 
 
-def _history_tokens(encoder: HistoryEncoder, history: Node) -> Node:
-    tokens = ops.add(layer(encoder.embed)(history), constant(encoder.position))
-    return layer(encoder.attention)(tokens)
-
-
-def _fuse(fusion: Fusion, feature: Node, state_token: Node, history: Node) -> Node:
-    visual, state, past = fusion.modality
-    tokens = [
-        ops.add(ops.unsqueeze(feature, ints(1)), constant(visual)),
-        ops.add(ops.unsqueeze(state_token, ints(1)), constant(state)),
-        ops.add(history, constant(past)),
-    ]
-    attended = layer(fusion.attention)(ops.concat(tokens, axis=1))
-    read = ops.gather(attended, ints(0, 1), ints(1))
-    return layer(fusion.project)(
-        layer(fusion.norm)(ops.reshape(read, ints(1, -1), special_zero=False))
-    )
-
-
 # --- the sampler
+
+
+def _with_read(
+    unet: Callable[[Node, Node], Node], head: DiffusionHead, condition: Node
+) -> Callable[[Node, Node], Node]:
+    """The net: ``unet`` plus what the head reads off the condition, where it does."""
+    if not head.reads_condition:
+        return unet
+    flat = layer(head.direct)(condition)
+    chunk = ops.reshape(flat, ints(1, 1, -1, ACTION_DIM), special_zero=False)
+    rows = ops.transpose(chunk, ints(0, 3, 1, 2))
+    return lambda noisy, film: ops.add(unet(noisy, film), rows)
 
 
 def _one_at_every_scale(unet: UNet1d) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from policy.convnext import ChannelNorm, ConvNextBlock, ConvNextTiny, Permute
 from policy.efficientnet import EfficientNetB3, MBConv, SqueezeExcitation
-from policy.encoders import HEADS, AttentionBlock
+from policy.encoders import HEADS, AttentionBlock, HistoryEncoder
 from policy.pooling import MOMENTS, moment_weights
 from policy.resnet import BasicBlock, Bottleneck, ResNet
 from policy.unet1d import Conv
@@ -286,5 +286,16 @@ def _(module: AttentionBlock) -> Layer:
         rows = ops.transpose(ops.squeeze(mixed, ints(0)), ints(0, 2, 1, 3))
         tokens = ops.add(tokens, project(ops.reshape(rows, ints(1, count, dim), False)))
         return ops.add(tokens, mlp(norm2(tokens)))
+
+    return apply
+
+
+@layer.register
+def _(module: HistoryEncoder) -> Layer:
+    embed, attention, position = layer(module.embed), layer(module.attention), module.position
+
+    def apply(history: Node) -> Node:
+        tokens = attention(ops.add(embed(history), constant(position)))
+        return ops.reshape(tokens, ints(1, -1), special_zero=False)
 
     return apply

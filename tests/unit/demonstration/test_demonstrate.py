@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mavbridge.config import DemonstrateConfig, PolicyConfig
-from mavbridge.demonstration.flight import draw
+from mavbridge.demonstration.flight import _Turns, draw
 from mavbridge.demonstration.run import demonstrate
 from mavbridge.errors import UserError
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
@@ -108,3 +108,18 @@ def test_flights_differ() -> None:
     assert 5 < sum(one.starts_airborne for one in drawn) < 40
     assert 5 < sum(one.disturbance == 0.0 for one in drawn) < 40
     assert len({one.conditions for one in drawn}) > 30
+
+
+def test_student_and_expert_fly_in_turns_and_the_seed_decides_whose_it_is() -> None:
+    def flown(seed: int) -> list[bool]:
+        turns = _Turns(seed)
+        return [turns.is_students(5.0 + tick / 100) for tick in range(4_000)]
+
+    flights = [flown(seed) for seed in range(12)]
+    assert flown(0) == flights[0]
+    assert {one[0] for one in flights} == {True, False}
+    for one in flights:
+        lengths = np.diff(np.flatnonzero(np.diff(one))) / 100
+        assert lengths.min() >= 0.39
+        assert lengths.max() <= 6.01
+        assert 0.55 < np.mean(one) < 0.95

@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from policy.action_head import DiffusionHead
 from policy.checkpoint import BuiltinPolicy
 from policy.contract import (
     Contract,
@@ -11,7 +12,7 @@ from policy.contract import (
     SingleRatePolicy,
     WarmStartPolicy,
 )
-from policy.diffusion import NoiseSchedule
+from policy.diffusion import NoiseSchedule, Prediction
 from policy.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.toge import Toge, TogeConfig
 
@@ -221,3 +222,23 @@ def test_reference_network_at_its_real_size() -> None:
     assert feature.shape == (1, 256)
     assert chunk.shape == (1, 16, 4)
     assert torch.isfinite(chunk).all()
+
+
+def test_no_history_is_one_of_centred_sticks(small_toge: Toge) -> None:
+    image, state, history = sample()
+    without = small_toge.predict(image, state, None, 2)
+    assert torch.equal(without, small_toge.predict(image, state, torch.zeros_like(history), 2))
+
+
+@pytest.mark.parametrize("prediction", ["sample", "epsilon"])
+def test_a_u_net_without_an_opinion_leaves_the_sticks_to_what_is_read_off_the_condition(
+    prediction: Prediction,
+) -> None:
+    torch.manual_seed(0)
+    head = DiffusionHead("small", Contract(), NoiseSchedule(prediction=prediction)).eval()
+    torch.nn.init.zeros_(head.unet.out.weight)
+    torch.nn.init.zeros_(head.unet.out.bias)
+    condition = torch.randn(2, 256)
+    read = head.read(condition).clamp(-1, 1)
+    is_read = [torch.allclose(head.sample(condition, steps), read) for steps in (1, 3)]
+    assert is_read == [prediction == "sample"] * 2

@@ -16,10 +16,13 @@ from policy.checkpoint import TRAINING_KEY, load_checkpoint
 from policy.contract import Contract, PolicyError
 from policy.dataset import DatasetError, Episode
 from policy.dataset_flights import read_flight
+from policy.dataset_frames import store_frames
+from policy.dataset_samples import Timeline
 from policy.resnet_unet import ResnetUnetConfig
-from policy.toge import TogeConfig
+from policy.toge import Toge, TogeConfig
 from policy.train import train
-from policy.train_model import gate_labels, gate_loss
+from policy.train_batches import Batches
+from policy.train_model import Trainee, gate_labels, gate_loss
 from policy.train_plan import Budget, TrainSettings, learning_rate_factor, make_stages
 from policy.train_report import Progress, TrainResult
 from policy.train_state import Position, RunFolder, TrainingError
@@ -180,6 +183,24 @@ def test_a_frozen_encoder_stays_and_the_head_learns(
     assert not any(stage.startswith("encoder") for stage in stages)
     with pytest.raises(PolicyError, match="--start-from"):
         replace(made, start_from=None)
+
+
+def test_in_training_the_denoiser_sees_a_part_of_many_samples(tmp_path: Path) -> None:
+    episode = read_flight(write_spot_flight(tmp_path / "flight", 0, seconds=1.5))
+    store = store_frames(
+        [episode], height=32, width=32, folder=tmp_path / "frames", progress=lambda _: None
+    )
+    timeline = Timeline([episode], CONTRACT, np.array([40_000_000]))
+    batches = Batches(timeline, store, timesteps=100, seed=0, mirrors=True)
+    trainee = Trainee(Toge(TogeConfig(backbone="resnet18", contract=CONTRACT)))
+    rows: list[int] = []
+    trainee.policy.head.unet.register_forward_hook(lambda _, args, out: rows.append(len(out)))
+    for images in (4, 16, 64):
+        batch = batches.with_images(0, count=images, repeats=2, size=(32, 32))
+        for is_training in (True, False):
+            trainee.train(is_training)
+            trainee(batch, torch.ones(4))
+    assert rows == [8, 8, 16, 32, 32, 128]
 
 
 def test_a_packed_checkpoint_is_smaller_and_flies_alike(

@@ -17,7 +17,7 @@ from policy.dataset import DatasetError, Episode
 from policy.dataset_windows import find_windows
 from policy.relative_state import context_features, motion_since
 from policy.train_batches import PooledStore
-from policy.train_encode import encode_rows
+from policy.train_encode import both_ways, encode_rows
 from policy.train_plan import Budget, WorldTrainSettings
 from policy.train_report import Progress, TrainResult, WorldValidation
 from policy.train_state import TrainingError
@@ -191,7 +191,8 @@ def latents_of(windows_frames: int, path: Path, *, mirror: bool) -> PooledStore:
         return sign * torch.from_numpy(frames)[:, None].float().expand(-1, 64)
 
     frames = np.arange(windows_frames)
-    return encode_rows(path, frames, encode, dim=64, mirror=mirror, go_on=lambda done: True)
+    jobs = both_ways(frames, mirror=mirror)
+    return encode_rows(path, jobs, encode, dim=64, go_on=lambda done: True)
 
 
 def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(
