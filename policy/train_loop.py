@@ -248,14 +248,19 @@ class Ema(Generic[M]):
 
     @torch.no_grad()
     def update(self, trainee: M, updates: int) -> None:
-        """Move towards ``trainee``, faster in the first of ``updates``; counters are copied."""
+        """Move towards ``trainee``, faster in the first of ``updates``; counters are copied.
+
+        Weights that do not move are the same in both, and are left alone.
+        """
         weight = 1.0 - min(self._decay, (1 + updates) / (10 + updates))
-        mine, its = dict(self.average.state_dict()), trainee.state_dict()
-        names = [name for name, value in mine.items() if value.is_floating_point()]
+        still = {name for name, one in trainee.named_parameters() if not one.requires_grad}
+        its = {name: one for name, one in trainee.state_dict().items() if name not in still}
+        mine = self.average.state_dict()
+        names = [name for name, value in its.items() if value.is_floating_point()]
         torch._foreach_lerp_(  # one call for some thousand tensors
             [mine[name] for name in names], [its[name] for name in names], weight
         )
-        for name in mine.keys() - set(names):
+        for name in its.keys() - set(names):
             mine[name].copy_(its[name])
 
 
