@@ -33,7 +33,8 @@ class Obedience:
 
     axis: Axis
     reference: Reference
-    """stick: times the yaw rate of a full stick."""
+    """stick: times the yaw rate of a full stick, whatever its dead zone and expo. Roll and pitch
+    sticks ask for angles, not rates, in the modes that are flown: no row has them."""
     teller: Teller
     """Frames: recovered from pixels, so "real frames" says what that method itself is worth."""
     slope: float | None

@@ -139,8 +139,9 @@ class _Evaluation:
             exe_steps=self._exe_steps,
             latents=windows.latents,
         )
-        self._score_windows(windows)
-        self._score_chains(drift)
+        if self._flights and not self._should_stop():
+            self._score_windows(windows)
+            self._score_chains(drift)
         return Quality(
             given=self._given(),
             windows=windows.windows,
@@ -209,6 +210,8 @@ class _Evaluation:
         index = 0
         steps = chain_steps(self._model, self._exe_steps, iterations)
         for flight, chosen in zip(self._flights, rows, strict=True):
+            if self._should_stop():
+                return
             runs = read_runs(flight.survey.folder, self._model, steps, chosen)
             for run, images in self._seen(runs, scorer.wanted(iterations)):
                 scorer.add(run, images, index=index)

@@ -10,6 +10,8 @@ import pytest
 
 from mavbridge.__main__ import main
 from mavbridge.rollout.sampling import Sampler
+from mavbridge.rollout_evaluation import run
+from mavbridge.rollout_evaluation.runs import survey
 from panoramas import write_turning_flight
 from policy.contract import Contract
 from policy.world_model_checkpoint import save_world_model
@@ -47,7 +49,7 @@ def evaluate(
     """Exit status and output, from inside the folder."""
     monkeypatch.chdir(folder)
 
-    def run(*arguments: str) -> tuple[int, str]:
+    def evaluated(*arguments: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as stopped:
             main(["imagine", "--evaluate", *arguments])
         captured = capsys.readouterr()
@@ -55,7 +57,7 @@ def evaluate(
         assert isinstance(stopped.value.code, int)
         return stopped.value.code, " ".join((captured.out + captured.err).split())
 
-    return run
+    return evaluated
 
 
 def test_everything_is_told_and_written(evaluate: Evaluate, tmp_path: Path) -> None:
@@ -121,6 +123,19 @@ def test_ctrl_c_tells_what_there_is(
     told = json.loads(out.read_text())
     assert told["windows"] == 2
     assert told["drift"] == []
+
+
+def test_ctrl_c_before_the_first_window_is_no_error(
+    evaluate: Evaluate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(folder: Path, *arguments: object, **named: object) -> object:
+        os.kill(os.getpid(), signal.SIGINT)
+        return survey(folder, *arguments, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(run, "survey", interrupted)
+    status, text = evaluate("flights/short", "flights/a", *QUICK)
+    assert status == 130, text
+    assert "0 windows of 0 flights" in text
 
 
 @pytest.mark.parametrize(
