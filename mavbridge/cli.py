@@ -16,6 +16,7 @@ from mavbridge.config import (
     ExportConfig,
     FlyConfig,
     ImagineConfig,
+    ImagineEvaluateConfig,
     RolloutBenchConfig,
     TrainConfig,
 )
@@ -63,7 +64,11 @@ def bench_rollout(config: RolloutBenchConfig | None = None) -> int:
     return run_bench(RolloutBenchConfig() if config is None else config)
 
 
-@cli.command
+imagine_cli = App(name="imagine")
+cli.command(imagine_cli)
+
+
+@imagine_cli.default
 def imagine(config: ImagineConfig) -> int:
     """Let a policy and a world model imagine a flight, from the start of a recorded one."""
     from mavbridge.recording.folder import require_extra
@@ -73,6 +78,25 @@ def imagine(config: ImagineConfig) -> int:
     from mavbridge.rollout.run import imagine as run_rollout  # torch: not for --help
 
     return run_rollout(config)
+
+
+@imagine_cli.command(name="--evaluate")
+def imagine_evaluate(*flights: Path, config: ImagineEvaluateConfig | None = None) -> int:
+    """Say how good a world model is, on recorded flights; comes right after imagine.
+
+    Args:
+        flights: flight folders, or folders of them, that the model was not trained on.
+        config: the settings.
+    """
+    from mavbridge.recording.folder import require_extra
+
+    require_extra("imagine --evaluate")
+    if not flights:
+        raise UserError("name the flights to imagine: mavbridge imagine --evaluate DIR...")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as for train
+    from mavbridge.rollout_evaluation.run import evaluate_imagination  # torch: not for --help
+
+    return evaluate_imagination(flights, config or ImagineEvaluateConfig())
 
 
 @cli.command

@@ -382,6 +382,47 @@ class ImagineConfig:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
+class ImagineEvaluateConfig:
+    """How good a world model is, on recorded flights."""
+
+    world_model: Path | None = None
+    """Weights of the world model; by default those that come with mavbridge."""
+    ddim_steps: int = 4
+    """DDIM steps of the world model."""
+    windows: int = 64
+    """Runs of frames to imagine, evenly spaced over the flights."""
+    chains: int = 16
+    """Runs of 10 iterations, each going on from the last imagined frames, evenly spaced, too."""
+    exe_steps: int | None = None
+    """Frames of a chain's iteration; by default all that the model imagines."""
+    fov: float = 90.0
+    """Horizontal field of view in degrees, of flights that do not tell theirs."""
+    camera_tilt: float = 10.0
+    """Degrees that the camera looks up, of flights that do not tell theirs."""
+    yaw_rate: float = 202.5
+    """Degrees a second at full yaw stick, of flights that do not tell theirs."""
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1, mps."""
+    seed: int = 0
+    """Of the noise that the imagination starts from."""
+    json: Path | None = None
+    """Write all figures here as JSON."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be evaluated."""
+        _check("ddim-steps", self.ddim_steps, 1, 1000, "")
+        _check("windows", self.windows, 1, 10_000, "")
+        _check("chains", self.chains, 1, 10_000, "")
+        if self.exe_steps is not None:
+            _check("exe-steps", self.exe_steps, 1, 256, "")
+        _check("fov", self.fov, 10, 170, "degrees")
+        _check("camera-tilt", self.camera_tilt, -90, 90, "degrees")
+        _check("yaw-rate", self.yaw_rate, 1, 2000, "degrees/s")
+        _check("seed", self.seed, 0, 2**63 - 1, "")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class RolloutBenchConfig:
     """One benchmark of rollouts."""
 

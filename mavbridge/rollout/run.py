@@ -49,7 +49,8 @@ def imagine(config: ImagineConfig) -> int:
     )
     prepare_out(config.out)
     flight = open_flight(config.start)
-    model = _load_model(config, plan)
+    model = load_model(config.world_model, ddim_steps=plan.ddim_steps, device=config.policy.device)
+    _require_frames(plan, model)
     start = read_start(flight, model.config, config.start_at)
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=config.serial, clock=clock)
     decider = _decider(config, sampler, clock, console)
@@ -125,26 +126,39 @@ def run_rollout(
         raise
 
 
-def _load_model(config: ImagineConfig, plan: RolloutPlan) -> WorldModel:
-    path = config.world_model or SHIPPED
-    if config.world_model is None and not path.exists():
+def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> WorldModel:
+    """A world model on its device.
+
+    Args:
+        world_model: weights; None = those that come with mavbridge.
+        ddim_steps: that it will be asked for.
+        device: of torch.
+
+    Raises:
+        UserError: none comes with mavbridge, or there is no such device.
+        PolicyError: the weights cannot be used, or not with so many steps.
+    """
+    path = world_model or SHIPPED
+    if world_model is None and not path.exists():
         raise UserError(
             f"no world model comes with this build ({path} is not there): give --world-model FILE"
         )
     model = load_world_model(path)
-    if plan.frames > model.config.frames:
-        raise UserError(
-            f"--frames {plan.frames} is more than the {model.config.frames} that {path} imagines: "
-            "lower it"
-        )
-    model.config.schedule.ddim_steps(plan.ddim_steps)  # refuses what it cannot do
-    device = config.policy.device
+    model.config.schedule.ddim_steps(ddim_steps)  # refuses what it cannot do
     try:
         return model.to(torch.device(device)).eval()
     except (RuntimeError, AssertionError) as error:
         raise UserError(
             f"--device {device} is not available: {str(error).splitlines()[0]}"
         ) from error
+
+
+def _require_frames(plan: RolloutPlan, model: WorldModel) -> None:
+    if plan.frames > model.config.frames:
+        raise UserError(
+            f"--frames {plan.frames} is more than the {model.config.frames} that the world model "
+            "imagines: lower it"
+        )
 
 
 def _decider(config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console) -> Decider:
