@@ -120,7 +120,9 @@ class Timeline:
         if len(ticks_ns):
             has_tick &= ticks_ns[any_tick] <= high
         has_past = self._attitude.covers(self.captured_ns) & self._velocity.covers(self.captured_ns)
-        usable = np.flatnonzero(has_tick & has_past)
+        # Whoever labelled the sticks knew of a gate behind the camera; one image does not show it.
+        is_behind = self.gate[:, 0] < 0
+        usable = np.flatnonzero(has_tick & has_past & ~is_behind)
         if len(usable) == 0:
             low_ms, high_ms = self._ages_ns[[0, -1]] / 1e6
             raise DatasetError(

@@ -197,6 +197,14 @@ def test_a_history_in_training_is_often_gone_and_never_exact() -> None:
     assert np.quantile(np.abs(newest - plain[0, -1, 0]), 0.5) > HISTORY_NOISE / 4
 
 
+def test_images_of_a_gate_behind_the_camera_are_left_out() -> None:
+    usable = timeline(flown()).frames
+    gate = np.full((len(flown().captured_ns), 7), np.nan, np.float32)
+    gate[usable[2], 0], gate[usable[3], 0] = -0.5, 0.5
+    left = timeline(flown(gate=gate)).frames
+    assert left.tolist() == np.delete(usable, 2).tolist()
+
+
 def test_images_and_ticks_of_two_clocks_are_refused() -> None:
     episode = flown()
     shifted = replace(episode, captured_ns=episode.captured_ns + 10**13)
