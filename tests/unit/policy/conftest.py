@@ -33,15 +33,16 @@ def trained_toge() -> Toge:
         policy.backbone.requires_grad_(False)
         learning = [weight for weight in policy.parameters() if weight.requires_grad]
         optimiser = torch.optim.AdamW(learning, lr=1e-3)
-        for _ in range(80):
-            loss = _denoising_loss(policy, batch=32)
+        for _ in range(100):
+            loss = _loss(policy, batch=512)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
     return policy.eval()
 
 
-def _denoising_loss(policy: Toge, batch: int) -> Tensor:
+def _loss(policy: Toge, batch: int) -> Tensor:
+    """As in training: all samples for what is read off the condition, few for the denoiser."""
     state, feature = torch.randn(batch, 13), torch.randn(batch, policy.contract.feature_dim)
     state[:, QUATERNION] = F.normalize(state[:, QUATERNION], dim=1)
     history = torch.rand(batch, 4, 4) * 2 - 1
@@ -52,7 +53,9 @@ def _denoising_loss(policy: Toge, batch: int) -> Tensor:
     timestep = torch.randint(0, 100, (batch,))
     noisy = policy.head.schedule.add_noise(chunk, torch.randn(chunk.shape), timestep)
     condition = policy.encode_and_fuse(feature, state, history)
-    return (policy.denoise(noisy, timestep, condition) - chunk).square().mean()
+    read = policy.head.read(condition)
+    denoised = policy.denoise(noisy[:32], timestep[:32], condition[:32])
+    return (denoised - chunk[:32]).square().mean() + (read - chunk).square().mean()
 
 
 @pytest.fixture

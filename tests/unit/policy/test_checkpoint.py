@@ -124,7 +124,7 @@ def test_torch_files_load_in_their_usual_forms(
     state = small_toge.state_dict()
     torch.save({key: state, "epoch": 3} if key else state, path)
     loaded = load_checkpoint(path, fallback=small_toge.config)
-    assert torch.equal(loaded.state_dict()["fusion.modality"], state["fusion.modality"])
+    assert torch.equal(loaded.state_dict()["fusion.mlp.0.weight"], state["fusion.mlp.0.weight"])
 
 
 def test_a_torch_file_may_carry_the_header(small_toge: Toge, saved: Path, tmp_path: Path) -> None:
@@ -210,9 +210,9 @@ def test_nan_weights_are_refused_on_both_ways(
     small_toge: Toge, saved: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.safetensors"
-    poisoned = {"fine": torch.zeros(2), "fusion.modality": torch.tensor([1.0, float("nan")])}
+    poisoned = {"fine": torch.zeros(2), "fusion.mlp.0.weight": torch.tensor([1.0, float("nan")])}
     save_file(poisoned, path, metadata=header_of(saved))
-    with pytest.raises(CheckpointError, match=r"NaN.*fusion\.modality"):
+    with pytest.raises(CheckpointError, match=r"NaN.*fusion\.mlp\.0\.weight"):
         load_checkpoint(path, fallback=small_toge.config)
     policy = build_policy(small_toge.config)
     with torch.no_grad():
@@ -224,9 +224,9 @@ def test_nan_weights_are_refused_on_both_ways(
 @pytest.mark.parametrize(
     ("name", "tensor", "message"),
     [
-        ("fusion.modality", None, r"missing 'fusion\.modality'"),
+        ("fusion.mlp.0.bias", None, r"missing 'fusion\.mlp\.0\.bias'"),
         ("surprise", torch.zeros(3), "unexpected 'surprise'"),
-        ("fusion.modality", torch.zeros(3, 7), r"is \[3, 7\], must be \[3, 256\]"),
+        ("fusion.mlp.0.bias", torch.zeros(3, 7), r"is \[3, 7\], must be \[512\]"),
     ],
 )
 def test_weights_that_do_not_fit_are_named(
