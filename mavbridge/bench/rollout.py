@@ -21,7 +21,7 @@ from mavbridge.bench.rollout_results import (
     trial_from_json,
     typical,
 )
-from mavbridge.bench.run import PIPED_WIDTH, machine, require_folder, sayer
+from mavbridge.bench.run import machine, require_folder, sayer, table_console
 from mavbridge.bench.tables import number
 from mavbridge.config import RolloutBenchConfig
 from mavbridge.plots import needs_matplotlib
@@ -74,9 +74,7 @@ def bench_rollout(config: RolloutBenchConfig) -> int:
     weights = config.world_model or (SHIPPED if SHIPPED.exists() else None)
     if weights is not None:
         load_world_model(weights)  # refused now, and in words
-    console = Console()
-    if not console.is_terminal:
-        console.width = PIPED_WIDTH
+    console = table_console()
     try:
         result = measure(QUICK if config.quick else FULL, weights, config.quick, sayer())
     except KeyboardInterrupt:

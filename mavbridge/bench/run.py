@@ -38,6 +38,16 @@ class _Plan:
 
 PIPED_WIDTH = 120
 """Columns of the tables where there is no terminal to ask."""
+
+
+def table_console(*, highlight: bool = True) -> Console:
+    """Where tables are told: as wide as the terminal, or wide enough."""
+    console = Console(highlight=highlight)
+    if not console.is_terminal:
+        console.width = PIPED_WIDTH
+    return console
+
+
 FULL = _Plan(
     kernels=kernels.Effort(repeats=5, block_s=1.5),
     flight_s=60.0,
@@ -69,9 +79,7 @@ def bench(config: BenchConfig) -> int:
     for path in (config.json, config.plot):
         if path is not None:
             require_folder(path)
-    console = Console()
-    if not console.is_terminal:
-        console.width = PIPED_WIDTH
+    console = table_console()
     try:
         result = measure(QUICK if config.quick else FULL, is_quick=config.quick, say=sayer())
     except KeyboardInterrupt:

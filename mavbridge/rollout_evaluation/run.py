@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from mavbridge.bench.run import PIPED_WIDTH, require_folder
+from mavbridge.bench.run import require_folder, table_console
 from mavbridge.clock import MonotonicClock
 from mavbridge.config import ImagineEvaluateConfig
 from mavbridge.errors import UserError
@@ -59,10 +59,7 @@ def evaluate_imagination(flights: Sequence[Path], config: ImagineEvaluateConfig)
     with stop_on_signals() as stop, _Bar(errors) as bar:
         quality = _Evaluation(flights, config, sampler, bar, stop.is_set).quality()
         was_stopped = stop.is_set()
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = PIPED_WIDTH
-    print_quality(quality, console)
+    print_quality(quality, table_console(highlight=False))
     if config.json is not None:
         config.json.write_text(to_json(quality))
     if was_stopped:
