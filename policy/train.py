@@ -195,12 +195,19 @@ class _Run:
         if (left := len(self._batches.frames) - len(self._pooled.frames)) > 0:
             loop.note(f"{left} images were not encoded for lack of time: the head sees the rest")
         if is_new:
-            loop.begin_phase(HEAD_RATE * settings.learning_rate)
+            loop.begin_phase(self._head_rate)
+            if self._check is None:
+                loop.position.best = None  # it was judged on other samples
 
     def _freeze_again(self, position: Position) -> None:
         if not self._stages[position.stage].trains_encoder:
             self._loop.trainee.policy.backbone.requires_grad_(requires_grad=False)
-            self._loop.learning_rate = HEAD_RATE * self._settings.learning_rate
+            self._loop.learning_rate = self._head_rate
+
+    @property
+    def _head_rate(self) -> float:
+        """Learning rate of the head alone."""
+        return HEAD_RATE * self._settings.learning_rate
 
     # ---- what is kept ----
 

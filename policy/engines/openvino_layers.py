@@ -18,7 +18,7 @@ from policy.convnext import ChannelNorm, ConvNextBlock, ConvNextTiny, Permute
 from policy.efficientnet import EfficientNetB3, MBConv, SqueezeExcitation
 from policy.encoders import HEADS, AttentionBlock, HistoryEncoder
 from policy.pooling import MOMENTS, moment_weights
-from policy.resnet import BasicBlock, Bottleneck, ResNet
+from policy.resnet import RESNET8_CELLS, BasicBlock, Bottleneck, ResNet, ResNet8
 from policy.unet1d import Conv
 
 Node: TypeAlias = Any
@@ -243,6 +243,19 @@ def _(module: ResNet) -> Layer:
     stages = (module.layer1, module.layer2, module.layer3, module.layer4)
     features = _sequence(*[layer(part) for part in (*stem, *stages)])
     return lambda x: ops.reshape(_moments(features(x)), ints(1, -1), False)
+
+
+@layer.register
+def _(module: ResNet8) -> Layer:
+    parts = (module.conv1, module.bn1, module.relu, module.layers, module.conv2, module.bn2)
+    features = _sequence(*[layer(part) for part in parts], ops.relu)
+    fc = layer(module.fc)
+
+    def apply(x: Node) -> Node:
+        cells = ops.adaptive_avg_pool(features(x), ints(RESNET8_CELLS, RESNET8_CELLS))
+        return ops.relu(fc(ops.reshape(cells, ints(1, -1), special_zero=False)))
+
+    return apply
 
 
 @layer.register
