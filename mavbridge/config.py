@@ -32,6 +32,9 @@ STATE_HZ = 50.0
 """Least rate of telemetry to ask for, however slow the actions are: ages are limits in seconds."""
 SIM_CAMERA_HZ = 30.0
 """Frames a second of the simulated camera, unless the visual rate asks for more."""
+SIM_CAMERA_PX = 224
+"""Least side of its frames, as ``python -m sitl`` sends them: what a policy wants smaller is made
+smaller by the bridge, as in a real flight, and not drawn smaller."""
 STATUS_HZ = 5.0
 """Terminal refresh."""
 
@@ -303,8 +306,8 @@ class TrainConfig:
     """Mirror half of the samples; --no-mirror for a camera that does not look straight ahead."""
     since_exposure: bool = True
     """Tell the policy its image's age and how it moved since; --no-since-exposure to leave out."""
-    gate_weight: float = 0.2
-    """Weight of the loss that asks the encoder where the gates are; 0 = off."""
+    gate_weight: float = 100.0
+    """Weight of the loss that asks the encoder where the gates are, in flights that say so; 0 = off."""
 
     def __post_init__(self) -> None:
         """Refuse values that no run could use."""
@@ -316,7 +319,7 @@ class TrainConfig:
             _check("batch-size", self.batch_size, 2, 4096, "")
         _check("seed", self.seed, 0, 2**63 - 1, "")
         _check("validation-fraction", self.validation_fraction, 0, 0.9, "")
-        _check("gate-weight", self.gate_weight, 0, 100, "")
+        _check("gate-weight", self.gate_weight, 0, 10_000, "")
         _check("check-flights", self.check_flights, 0, MAX_EPISODES, "")
         if self.minutes is not None:
             _check("minutes", self.minutes, 0.01, 100_000, "minutes")

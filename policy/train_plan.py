@@ -141,8 +141,9 @@ class TrainSettings(RunSettings):
     """Moments after its exposure for which one encoded image is used."""
     head_batch_size: int = 256
     """Samples a step while the head learns alone."""
-    gate_weight: float = 0.2
-    """Of the auxiliary loss that asks the feature for the gates; 0 = off."""
+    gate_weight: float = 100.0
+    """Of the loss that asks the feature for the gates; 0 = off. High, for the encoder: where the gates
+    are is what it has to find out, and the sticks of a few flights teach it their courses instead."""
     ages_ns: Nanoseconds | None = None
     """Measured ages of images to train for; None = those measured in the flights."""
     start_from: Path | None = None

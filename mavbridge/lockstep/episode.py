@@ -15,6 +15,7 @@ from mavbridge.assembly import (
 )
 from mavbridge.config import (
     SIM_CAMERA_HZ,
+    SIM_CAMERA_PX,
     STATE_HZ,
     FlyConfig,
     Limits,
@@ -184,7 +185,9 @@ class Episode:
 
     def _make_camera(self, executable: Executable, *, camera_hz: float) -> LockstepCamera:
         camera_period_ns = period_ns(camera_hz)
-        width, height = executable.contract.image_width, executable.contract.image_height
+        contract = executable.contract
+        width = max(contract.image_width, SIM_CAMERA_PX)
+        height = max(contract.image_height, SIM_CAMERA_PX)
         draw = self._setup.draw_images
         camera = LockstepCamera(
             self.clock,

@@ -49,7 +49,7 @@ class Scene:
     """With one link, and with ``course`` in its log."""
     course: Course
     make_renderer: Callable[[int, int], Renderer]
-    """(width, height) in pixels, which the policy decides."""
+    """(width, height) in pixels."""
 
 
 class BuildScene(Protocol):
