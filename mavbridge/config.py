@@ -307,7 +307,7 @@ class TrainConfig:
     since_exposure: bool = True
     """Tell the policy its image's age and how it moved since; --no-since-exposure to leave out."""
     gate_weight: float = 100.0
-    """Weight of the loss that asks the encoder where the gates are, in flights that say so; 0 = off."""
+    """Weight of the loss that asks the encoder for the gates, in flights that know; 0 = off."""
 
     def __post_init__(self) -> None:
         """Refuse values that no run could use."""

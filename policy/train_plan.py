@@ -142,8 +142,8 @@ class TrainSettings(RunSettings):
     head_batch_size: int = 256
     """Samples a step while the head learns alone."""
     gate_weight: float = 100.0
-    """Of the loss that asks the feature for the gates; 0 = off. High, for the encoder: where the gates
-    are is what it has to find out, and the sticks of a few flights teach it their courses instead."""
+    """Of the loss that asks the feature for the gates; 0 = off. High, because the sticks of a few
+    flights teach an encoder the courses of those flights, and not where gates are."""
     ages_ns: Nanoseconds | None = None
     """Measured ages of images to train for; None = those measured in the flights."""
     start_from: Path | None = None

@@ -1,6 +1,7 @@
 """Whole flights in memory: the real loops and link against the real simulator."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -238,6 +239,17 @@ def test_exposures_and_steps_tell_the_truth_behind_each_frame() -> None:
     bodies = [exposures[vision.frame_id].body for vision in sink.visions]
     assert bodies[-1].position_ned_m[2] < -0.2
     assert not np.array_equal(sink.visions[0].rgb, sink.visions[-1].rgb)
+
+
+@pytest.mark.parametrize(("wanted", "drawn"), [(96, 224), (256, 256)])
+def test_the_camera_is_not_smaller_for_a_policy_that_looks_at_less(wanted: int, drawn: int) -> None:
+    pilot = steady(lambda: CLIMB)
+    contract = replace(pilot.contract, image_height=wanted, image_width=wanted)
+    sink = ListSink()
+    Episode(course_seed=3, seed=0).fly(
+        replace(pilot, contract=contract), max_time_s=0.2, sinks=(sink,)
+    )
+    assert {vision.rgb.shape for vision in sink.visions} == {(drawn, drawn, 3)}
 
 
 def test_an_image_is_encoded_once_and_only_for_an_action() -> None:
