@@ -55,7 +55,7 @@ def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
     pixels, edges = reconstruction_errors(made, images)
     mean, log_variance = mean.float(), log_variance.float()
     kl = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).mean()
-    change = mean.unflatten(0, (-1, 2)).diff(dim=1).square().mean()
+    change = mean.reshape(-1, 2, *mean.shape[1:]).diff(dim=1).square().mean()
     unsteady = change / mean.var(dim=(0, 2, 3)).mean().clamp_min(1e-3)
     loss = pixels + GRADIENT_WEIGHT * edges + KL_WEIGHT * kl + UNSTEADY_WEIGHT * unsteady
     told = {"loss": loss, "pixels": pixels, "edges": edges, "kl": kl, "unsteady": unsteady}
