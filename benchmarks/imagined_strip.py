@@ -18,7 +18,7 @@ from mavbridge.rollout.sampling import Sampler
 from mavbridge.rollout_evaluation.runs import Run, read_runs, survey, with_images
 from policy.contract import ACTION_NAMES
 
-STEPS = (1, 2, 4, 8, 12, 16)
+STEPS = (1, 4, 8, 16)
 SCALE = 2
 MARGIN_PX, HEADER_PX, LABEL_PX = 4, 22, 128
 
@@ -45,7 +45,7 @@ def strip(sampler: Sampler, run: Run, images: dict[int, ImageArray]) -> ImageArr
         _write(canvas, name, 4, top + side // 2)
         for column, frame in enumerate(frames):
             left = LABEL_PX + column * pitch
-            large = cv2.resize(frame, (side, side), interpolation=cv2.INTER_CUBIC)
+            large = cv2.resize(frame, (side, side), interpolation=cv2.INTER_NEAREST)
             canvas[top : top + side, left : left + side] = large
     return canvas
 
@@ -87,7 +87,9 @@ def main() -> None:
     runs = read_runs(args.flight, config, config.frames, rows)
     steps = range(config.context_frames + config.frames)
     run, images = next(with_images(runs, steps, config.image_size))
-    cv2.imwrite(str(args.out), strip(sampler, run, images)[..., ::-1])
+    cv2.imwrite(
+        str(args.out), strip(sampler, run, images)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9]
+    )
 
 
 if __name__ == "__main__":
