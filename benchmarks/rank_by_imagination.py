@@ -7,12 +7,13 @@ The numbers beside a checkpoint are its diffusion steps and its real score with 
 ``mavbridge evaluate --dual-rate --num-diffusion-steps N`` counts. The imagined one is
 the share of gates that it passes in the world model, from moments of demonstrations a little before
 a gate, of those that the expert passed there in the same time. Where the gates are, the
-demonstrations tell; the path is the sum of the imagined velocities.
+demonstrations tell; the path is the sum of the imagined velocities. Two rows say what the figures
+are worth: the expert's own sticks, and sticks that stay centred.
 """
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -25,15 +26,17 @@ from mavbridge.assembly import load_configured_policy
 from mavbridge.clock import NS_PER_S, MonotonicClock
 from mavbridge.config import PolicyConfig
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.records import FloatArray
 from mavbridge.rollout.deciders import Decider, PolicyDecider
 from mavbridge.rollout.loop import rollout
+from mavbridge.rollout.observation import ObservationQueue
 from mavbridge.rollout.plan import RolloutPlan
 from mavbridge.rollout.run import load_model
 from mavbridge.rollout.sampling import Sampler
 from mavbridge.rollout.start import Start, read_start
 from mavbridge.rollout_evaluation.metrics import spearman
 from policy import rotation
-from policy.contract import VELOCITY
+from policy.contract import ACTION_DIM, VELOCITY, Contract
 from policy.dataset_flights import find_flights, is_exemplary
 
 ITERATIONS, EXE_STEPS = 8, 4
@@ -74,13 +77,33 @@ class Case:
     expert_gates: int
     """That the expert passed in the time of a rollout."""
     expert_end_ned_m: Points
+    expert_sticks: FloatArray
+    """[steps, 4] that the expert's flight was sent, the mean of each step."""
+
+
+@dataclass(kw_only=True)
+class Replay:
+    """Gives sticks [steps, 4] that are known beforehand; a ``Decider`` for one case."""
+
+    sticks: FloatArray
+    frames: int
+    contract: Contract = field(default_factory=Contract)
+    images: int = 0
+    steps_given: int = 0
+
+    def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
+        """Those of the next steps [frames, 4]; centred after the last."""
+        chosen = np.zeros((self.frames, ACTION_DIM), np.float32)
+        ahead = self.sticks[self.steps_given :][: self.frames]
+        chosen[: len(ahead)] = ahead
+        self.steps_given += EXE_STEPS
+        return chosen
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
     """Of one candidate."""
 
-    real: float
     passed: int
     end_error_m: float
     """From where the expert was at the end, mean."""
@@ -133,9 +156,19 @@ def cases_of(flight: RecordedFlight, sampler: Sampler) -> list[Case]:
                 gates=tuple(gates[number] for number in ahead),
                 expert_gates=last - now["next_gate"],
                 expert_end_ned_m=np.array(end["position_ned_m"]),
+                expert_sticks=sticks_of(flight, start.newest_ns, config.frame_dt_s),
             )
         )
     return cases
+
+
+def sticks_of(flight: RecordedFlight, from_ns: int, dt_s: float) -> FloatArray:
+    """What was sent [steps, 4] in each step of a rollout from a moment on."""
+    known = [row.tick for row in flight.tick_rows() if row.tick.sent is not None]
+    step = np.array([(tick.sent_ns - from_ns) / (dt_s * NS_PER_S) for tick in known])
+    sent = np.array([tick.sent for tick in known], np.float32)
+    means = [sent[(step >= k) & (step < k + 1)].mean(axis=0) for k in range(ITERATIONS * EXE_STEPS)]
+    return np.stack(means)
 
 
 def path_of(sampler: Sampler, decider: Decider, case: Case, seed: int) -> Points:
@@ -162,19 +195,25 @@ def gates_passed(path_m: Points, gates: Sequence[Gate]) -> int:
     return passed
 
 
-def score(
-    sampler: Sampler, checkpoint: Path, steps: int, real: float, cases: Sequence[Case]
-) -> Score:
-    """Fly every case in imagination."""
+def policy_decider(sampler: Sampler, checkpoint: Path, steps: int) -> PolicyDecider:
+    """A candidate."""
     wanted = PolicyConfig(checkpoint=checkpoint, dual_rate=True, num_diffusion_steps=steps)
-    executable = load_configured_policy(wanted, MonotonicClock()).executable
-    decider = PolicyDecider(executable, sampler)
+    return PolicyDecider(load_configured_policy(wanted, MonotonicClock()).executable, sampler)
+
+
+def always(decider: Decider) -> Callable[[Case], Decider]:
+    """The same for every case."""
+    return lambda _: decider
+
+
+def score(sampler: Sampler, decider_for: Callable[[Case], Decider], cases: Sequence[Case]) -> Score:
+    """Fly every case in imagination."""
     passed, errors_m = 0, []
     for seed, case in enumerate(cases):
-        path_m = path_of(sampler, decider, case, seed)
+        path_m = path_of(sampler, decider_for(case), case, seed)
         passed += min(gates_passed(path_m, case.gates), case.expert_gates)
         errors_m.append(float(np.linalg.norm(path_m[-1] - case.expert_end_ned_m)))
-    return Score(real=real, passed=passed, end_error_m=float(np.mean(errors_m)))
+    return Score(passed=passed, end_error_m=float(np.mean(errors_m)))
 
 
 def main() -> None:
@@ -184,7 +223,7 @@ def main() -> None:
     )
     parser.add_argument("flights", type=Path, nargs="+", help="demonstrations, held out")
     names = ("CHECKPOINT", "STEPS", "REAL")
-    parser.add_argument("--candidate", nargs=3, action="append", required=True, metavar=names)
+    parser.add_argument("--candidate", nargs=3, action="append", default=[], metavar=names)
     parser.add_argument("--world-model", type=Path)
     parser.add_argument("--starts", type=int, default=24)
     args = parser.parse_args()
@@ -195,17 +234,26 @@ def main() -> None:
     chosen = np.linspace(0, len(every) - 1, min(args.starts, len(every))).astype(int)
     cases = [every[row] for row in chosen]
     total = sum(case.expert_gates for case in cases)
-    scores = []
+    frames = sampler.config.frames
+    controls: dict[str, Callable[[Case], Decider]] = {
+        "the expert's sticks": lambda case: Replay(sticks=case.expert_sticks, frames=frames),
+        "centred sticks": lambda case: Replay(sticks=0 * case.expert_sticks, frames=frames),
+    }
     table = Table(
         "checkpoint", "steps", "real score", f"gates imagined, of {total}", "off the expert, m"
     )
-    for name, steps, real in args.candidate:
-        scores.append(one := score(sampler, Path(name), int(steps), float(real), cases))
-        table.add_row(name, steps, f"{one.real:g}", str(one.passed), f"{one.end_error_m:.1f}")
+    for name, control in controls.items():
+        one = score(sampler, control, cases)
+        table.add_row(name, "-", "-", str(one.passed), f"{one.end_error_m:.1f}")
+    scores, real = [], [float(given) for _, _, given in args.candidate]
+    for name, steps, given in args.candidate:
+        decider = policy_decider(sampler, Path(name), int(steps))
+        scores.append(one := score(sampler, always(decider), cases))
+        table.add_row(name, steps, given, str(one.passed), f"{one.end_error_m:.1f}")
     console = Console(highlight=False)
     console.print(table)
-    by_gates = spearman([s.real for s in scores], [float(s.passed) for s in scores])
-    by_error = spearman([s.real for s in scores], [-s.end_error_m for s in scores])
+    by_gates = spearman(real, [float(one.passed) for one in scores])
+    by_error = spearman(real, [-one.end_error_m for one in scores])
     console.print(
         f"{len(scores)} candidates, {len(cases)} starts in {len(folders)} flights; Spearman with "
         f"gates imagined: {by_gates}, with nearness to the expert: {by_error}",
