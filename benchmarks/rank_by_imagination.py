@@ -249,14 +249,15 @@ def main() -> None:
     for name, steps, given in args.candidate:
         decider = policy_decider(sampler, Path(name), int(steps))
         scores.append(one := score(sampler, always(decider), cases))
-        table.add_row(name, steps, given, str(one.passed), f"{one.end_error_m:.1f}")
+        table.add_row(Path(name).stem, steps, given, str(one.passed), f"{one.end_error_m:.1f}")
     console = Console(highlight=False)
     console.print(table)
     by_gates = spearman(real, [float(one.passed) for one in scores])
     by_error = spearman(real, [-one.end_error_m for one in scores])
+    told = [f"{value:+.2f}" if value is not None else "none" for value in (by_gates, by_error)]
     console.print(
         f"{len(scores)} candidates, {len(cases)} starts in {len(folders)} flights; Spearman with "
-        f"gates imagined: {by_gates}, with nearness to the expert: {by_error}",
+        f"gates imagined {told[0]}, with nearness to the expert {told[1]}",
         soft_wrap=True,
     )
 
