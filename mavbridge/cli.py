@@ -64,7 +64,8 @@ def bench_rollout(config: RolloutBenchConfig | None = None) -> int:
     return run_bench(RolloutBenchConfig() if config is None else config)
 
 
-imagine_cli = App(name="imagine")
+IMAGINE, EVALUATE = "imagine", "--evaluate"
+imagine_cli = App(name=IMAGINE)
 cli.command(imagine_cli)
 
 
@@ -80,9 +81,9 @@ def imagine(config: ImagineConfig) -> int:
     return run_rollout(config)
 
 
-@imagine_cli.command(name="--evaluate")
+@imagine_cli.command(name=EVALUATE)
 def imagine_evaluate(*flights: Path, config: ImagineEvaluateConfig | None = None) -> int:
-    """Say how good a world model is, on recorded flights; comes right after imagine.
+    """Say how good a world model is, on recorded flights.
 
     Args:
         flights: flight folders, or folders of them, that the model was not trained on.
@@ -182,8 +183,16 @@ def with_config(
     if config is not None:
         _check_toml(config)
     cli.config = [] if config is None else [Toml(config, use_commands_as_keys=False)]
-    status: int | None = cli(tokens)
+    status: int | None = cli(_command_first(tokens))
     return status or 0
+
+
+def _command_first(tokens: tuple[str, ...]) -> tuple[str, ...]:
+    """``--evaluate`` is a command and looks like a flag: it may come wherever a flag may."""
+    if tokens[:1] != (IMAGINE,) or EVALUATE not in tokens:
+        return tokens
+    rest = [token for token in tokens[1:] if token != EVALUATE]
+    return IMAGINE, EVALUATE, *rest
 
 
 def _check_toml(path: Path) -> None:

@@ -451,6 +451,8 @@ class DemonstrateConfig:
     """Flights in all."""
     speed: float = 5.0
     """Of the expert along the course, in m/s."""
+    max_time: float = 40.0
+    """Seconds after which a flight ends, on the course or not; a short one can start a rollout."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     """With --checkpoint the policy flies most of the time, and the expert says what it would do
     (DAgger)."""
@@ -461,6 +463,7 @@ class DemonstrateConfig:
         """Refuse what cannot be flown."""
         _check("episodes", self.episodes, 1, MAX_EPISODES, "")
         _check("speed", self.speed, 1.5, 10, "m/s")
+        _check("max-time", self.max_time, 1, 3600, "s")
         _check("workers", self.workers, 1, 64, "")
         _check("seed", self.policy.seed, 0, CHECK_COURSE_SEED // MAX_EPISODES - 1, "")
 

@@ -158,10 +158,10 @@ class _Run:
         def make(step: int) -> FrameBatch:
             return frame_batch(
                 self._store,
-                self._frames,
+                self._windows,
                 self._model,
                 step,
-                count=settings.batch_size,
+                count=settings.batch_size // 2,
                 seed=settings.seed,
                 mirrors=settings.mirror,
             )

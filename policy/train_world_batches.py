@@ -24,6 +24,8 @@ from policy.world_model import WorldModelConfig
 CONTEXT_NOISE = 0.2
 """Largest sigma on the latents of the past, of their unit scale: in a rollout the past is itself
 imagined, and a net that has only seen true ones drifts off."""
+LOOKED_AT = 2
+"""Frames of a window that are decoded in a step of the dynamics: all would double its time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +33,9 @@ class FrameBatch:
     """Frames, and what is random about a step."""
 
     images: Tensor
-    """[B, H, W, 3] uint8"""
+    """[B, 2, H, W, 3] uint8: neighbours in a window."""
     noise: Tensor
-    """[B, C, h, w] of unit scale, for the latents."""
+    """[B, 2, C, h, w] of unit scale, for the latents."""
 
     def to(self, device: torch.device) -> "FrameBatch":
         """The same on a device."""
@@ -70,6 +72,8 @@ class WindowBatch:
     """[B] int64"""
     knows_actions: Tensor
     """[B] bool"""
+    looked_at: Tensor
+    """[B, LOOKED_AT] int64: frames of the future that are compared as pixels, too."""
 
     def to(self, device: torch.device) -> "WindowBatch":
         """The same on a device."""
@@ -86,7 +90,7 @@ class WindowBatch:
 
 def frame_batch(
     store: FrameStore,
-    among: Indices,
+    windows: Windows,
     config: WorldModelConfig,
     step: int,
     *,
@@ -94,12 +98,16 @@ def frame_batch(
     seed: int,
     mirrors: bool,
 ) -> FrameBatch:
-    """Those of the frames ``among`` that are next in a step of the autoencoder."""
+    """Two neighbours of each of the ``windows`` that are next in a step of the autoencoder."""
     random = np.random.default_rng([seed, step])
-    images = _read(store, next_of(among, step, count, seed), config.image_size)
+    rows = next_of(np.arange(len(windows)), step, count, seed)
+    first = random.integers(0, windows.frames.shape[1] - 1, count)
+    pairs = np.stack([windows.frames[rows, first], windows.frames[rows, first + 1]], axis=1)
+    images = _read(store, pairs.ravel(), config.image_size)
+    images = images.reshape(count, 2, *images.shape[1:])
     is_mirrored = (random.random(count) < 0.5) & mirrors
-    images[is_mirrored] = images[is_mirrored, :, ::-1]
-    shape = (count, config.latent_channels, config.latent_side, config.latent_side)
+    images[is_mirrored] = images[is_mirrored, :, :, ::-1]
+    shape = (count, 2, config.latent_channels, config.latent_side, config.latent_side)
     noise = random.standard_normal(shape, dtype=np.float32)
     return FrameBatch(images=torch.from_numpy(images), noise=torch.from_numpy(noise))
 
@@ -182,5 +190,6 @@ class WindowBatches:
             "action_noise": drawn(config.frames, samples.actions.shape[-1]),
             "timestep": random.integers(0, config.schedule.num_train_timesteps, count),
             "knows_actions": knows_actions,
+            "looked_at": random.integers(0, config.frames, (count, LOOKED_AT)),
         }
         return WindowBatch(**{name: torch.from_numpy(array) for name, array in arrays.items()})

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from policy.contract import STATE_DIM, VELOCITY
 from policy.dataset_samples import STICK_SIGNS, mirror_signs
+from policy.dataset_time import Indices
 from policy.dataset_windows import Windows
 from policy.frame_autoencoder import to_unit
 from policy.latent_dynamics import Future, Past
@@ -23,29 +24,42 @@ SQUARED_WEIGHT = 5.0
 small things in it."""
 GRADIENT_WEIGHT = 1.0
 """Of the error of differences between neighbouring pixels: a gate is a few pixels of edge."""
-KL_WEIGHT = 3e-4
-"""Per latent: enough that latents near one another look alike, too little to blur."""
+KL_WEIGHT = 1e-4
+"""Per latent: keeps them in bounds. More of it gives each the same spread, and so the ground's
+texture, which nobody can foretell, as much of a say as the gates."""
+UNSTEADY_WEIGHT = 0.03
+"""Of the change of the latents from frame to frame, over their spread. Without it copying the last
+latent is off by half of their variance one frame on; pixels are hardly the worse for it."""
+LOOKED_AT_WEIGHT = 10.0
+"""Of the squared error of decoded pixels, full scale 2: not all errors of latents can be seen."""
 MOTION_WEIGHT, ACTION_WEIGHT = 0.5, 0.5
 MIN_MOTION_STD = 0.05
 """Of ``MOTION_SCALE``: what hardly changes does not count more than this makes it."""
 MIN_STICK_STD = 0.1
 SCALE_SAMPLES = 4096
 """Frames and windows from which scales are taken."""
+CHANGE_SAMPLES = 1024
+"""Windows of them whose latents are read."""
+MIN_CHANGE_STD = 0.05
+"""Of unit scale, as ``MIN_MOTION_STD``."""
 VALIDATION_STEPS = 4
 """Denoising steps of imagined futures."""
 
 
 def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
-    """Errors of pixels and of their differences, and a little KL."""
-    images = to_unit(batch.images)
+    """Errors of pixels and of their differences, unsteadiness, and a little KL."""
+    images = to_unit(batch.images.flatten(0, 1))
     mean, log_variance = model.autoencoder.posterior(images)
-    latents = mean + (0.5 * log_variance).exp() * batch.noise
+    latents = mean + (0.5 * log_variance).exp() * batch.noise.flatten(0, 1)
     made = model.autoencoder.reconstruct(latents).float()
     pixels, edges = reconstruction_errors(made, images)
     mean, log_variance = mean.float(), log_variance.float()
     kl = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).mean()
-    loss = pixels + GRADIENT_WEIGHT * edges + KL_WEIGHT * kl
-    return StepLoss(total=loss, told={"loss": loss, "pixels": pixels, "edges": edges, "kl": kl})
+    change = mean.reshape(-1, 2, *mean.shape[1:]).diff(dim=1).square().mean()
+    unsteady = change / mean.var(dim=(0, 2, 3)).mean().clamp_min(1e-3)
+    loss = pixels + GRADIENT_WEIGHT * edges + KL_WEIGHT * kl + UNSTEADY_WEIGHT * unsteady
+    told = {"loss": loss, "pixels": pixels, "edges": edges, "kl": kl, "unsteady": unsteady}
+    return StepLoss(total=loss, told=told)
 
 
 def reconstruction_errors(made: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -56,7 +70,11 @@ def reconstruction_errors(made: Tensor, images: Tensor) -> tuple[Tensor, Tensor]
 
 
 def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
-    """Squared errors of what was denoised, which has about unit scale."""
+    """Squared errors of what was denoised, and of some of its frames as pixels.
+
+    Those of latents are over the change since the last frame: 1 is what copying it would give at
+    every step, so that the first steps, from which a rollout goes on, count as much as the last.
+    """
     config = model.config
     context = config.context_frames
     latents = _normalised_latents(model, batch.latents)
@@ -80,14 +98,23 @@ def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
         actions=torch.where(knows, clean.actions, add(clean.actions, batch.action_noise, timestep)),
     )
     made = model.denoise(noisy, timestep, past)
-    picture = (made.latents.float() - clean.latents).square().mean()
+    picture = ((made.latents.float() - clean.latents) / model.change_std).square().mean()
+    pixels = _seen_error(model, made.latents, clean.latents, batch.looked_at)
     vehicle = (made.motion.float() - clean.motion).square().mean()
     # Known sticks are told as they are given: no error.
     sticks = (made.actions.float() - clean.actions).square().mean()
-    loss = picture + MOTION_WEIGHT * vehicle + ACTION_WEIGHT * sticks
-    return StepLoss(
-        total=loss, told={"loss": loss, "latents": picture, "motion": vehicle, "sticks": sticks}
-    )
+    loss = picture + MOTION_WEIGHT * vehicle + ACTION_WEIGHT * sticks + LOOKED_AT_WEIGHT * pixels
+    told = {"loss": loss, "latents": picture, "pixels": pixels, "motion": vehicle, "sticks": sticks}
+    return StepLoss(total=loss, told=told)
+
+
+def _seen_error(model: WorldModel, made: Tensor, clean: Tensor, looked_at: Tensor) -> Tensor:
+    """Squared error [] of the frames ``looked_at`` [B, n] of two futures, full scale 2."""
+    coder, window = model.autoencoder, torch.arange(len(made), device=made.device)[:, None]
+    ours, theirs = (x[window, looked_at].flatten(0, 1) for x in (made, clean))
+    with torch.no_grad():
+        true = coder.reconstruct(coder.denormalise(theirs))
+    return (coder.reconstruct(coder.denormalise(ours)).float() - true.float()).square().mean()
 
 
 def _normalised_latents(model: WorldModel, latents: Tensor) -> Tensor:
@@ -107,6 +134,7 @@ def set_scales(model: WorldModel, windows: Windows, latents: PooledStore, *, mir
     coder.latent_std.copy_(values.std(dim=1).clamp_min(1e-3))
     chosen = windows.spread(SCALE_SAMPLES)
     samples = chosen.samples(np.arange(len(chosen)))
+    model.change_std.copy_(_change_std(model, chosen.spread(CHANGE_SAMPLES).frames, latents))
     states, actions = torch.from_numpy(samples.states), torch.from_numpy(samples.actions)
     if mirrors:
         signs = torch.from_numpy(mirror_signs(STATE_DIM))
@@ -119,6 +147,19 @@ def set_scales(model: WorldModel, windows: Windows, latents: PooledStore, *, mir
     model.motion_std.copy_(torch.maximum(motion.std(dim=0, correction=0), least))
     model.action_mean.copy_(actions.mean(dim=(0, 1)))
     model.action_std.copy_(actions.std(dim=(0, 1), correction=0).clamp_min(MIN_STICK_STD))
+
+
+def _change_std(model: WorldModel, frames: Indices, latents: PooledStore) -> Tensor:
+    """Spread [T, C, 1, 1] of the change of normalised latents in windows of frames [W, K + T]."""
+    config = model.config
+    rows = torch.from_numpy(latents.read(frames.ravel(), np.zeros(frames.size, bool)))
+    side = config.latent_side
+    raw = rows.reshape(*frames.shape, config.latent_channels, side, side)
+    windows = _normalised_latents(model, raw)
+    now = windows[:, config.context_frames - 1 : config.context_frames]
+    change = windows[:, config.context_frames :] - now
+    std = change.square().mean(dim=(0, 3, 4), keepdim=True).sqrt()
+    return std[0].clamp_min(MIN_CHANGE_STD)
 
 
 @torch.no_grad()

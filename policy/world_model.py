@@ -143,10 +143,12 @@ class WorldModel(nn.Module):
         self.motion_std: Tensor
         self.action_mean: Tensor
         self.action_std: Tensor
+        self.change_std: Tensor
         self.register_buffer("motion_mean", torch.zeros(config.frames, MOTION_DIM))
         self.register_buffer("motion_std", torch.tensor(MOTION_SCALE).repeat(config.frames, 1))
         self.register_buffer("action_mean", torch.zeros(ACTION_DIM))
         self.register_buffer("action_std", torch.full((ACTION_DIM,), 0.5))
+        self.register_buffer("change_std", torch.ones(config.frames, config.latent_channels, 1, 1))
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
@@ -249,9 +251,10 @@ class WorldModel(nn.Module):
     def denoise(self, noisy: Future, timestep: Tensor, past: Past) -> Future:
         """One network call: the estimate of the clean future, x_0.
 
-        The net tells latents as a change of the last frame's. Given the actions most of a future is
-        no matter of chance, so x_0 is what it can tell best at every level of noise, and few steps
-        lose little.
+        The net tells latents as a change of the last frame's, in units of how much they change in
+        so many steps: one that knows nothing says that nothing moves. Given the actions most of a
+        future is no matter of chance, so x_0 is what it can tell best at every level of noise, and
+        few steps lose little.
 
         Args:
             noisy: the future as ``Future`` has it; known actions in it are clean.
@@ -260,7 +263,7 @@ class WorldModel(nn.Module):
         """
         output = self.dynamics(noisy, timestep, past)
         return Future(
-            latents=past.latents[:, -1:] + output.latents,
+            latents=past.latents[:, -1:] + self.change_std * output.latents,
             motion=output.motion,
             actions=torch.where(past.knows_actions.view(-1, 1, 1), noisy.actions, output.actions),
         )

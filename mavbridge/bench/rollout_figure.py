@@ -23,7 +23,7 @@ def draw(result: RolloutBench, path: Path) -> None:
         here = result.machine
         figure.text(
             *(0.012, 0.015),
-            f"{here.cpu}, {here.cores} cores, {result.torch_threads} torch threads; "
+            f"{here.cpu}, cores: {here.cores}, threads of torch: {result.torch_threads}; "
             f"{result.world_model}, {result.frames} frames an iteration",
             color=MUTED,
             fontsize=8.5,
@@ -54,8 +54,7 @@ def _draw_speed_up(axes: Axes, result: RolloutBench) -> None:
             label=f"Amdahl's bound, {device}",
         )
     axes.axhline(1.0, color=MUTED, linewidth=0.8)
-    axes.set_xscale("log", base=2)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    _mark(axes, [pair.serial.ddim_steps for pair in result.by_steps])
     axes.set_xlabel("DDIM steps of a sample")
     axes.set_ylim(bottom=0)
     axes.set_title("Speed-up over the serial path")
@@ -79,8 +78,17 @@ def _draw_memory(axes: Axes, result: RolloutBench) -> None:
         color=OURS[1],
         label="ours",
     )
+    _mark(axes, iterations)
     axes.set_xlabel("iterations")
     axes.set_ylabel("peak RSS, MB")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(bottom=0, top=1.2 * axes.get_ylim()[1])
     axes.set_title("Memory of the process with the nets")
-    axes.legend(loc="best")
+    axes.legend(loc="lower right")
+
+
+def _mark(axes: Axes, measured: list[int]) -> None:
+    """What was measured, and nothing else, on a logarithmic axis."""
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(sorted(set(measured)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.minorticks_off()

@@ -23,7 +23,6 @@ from sitl.disturbance import StickDisturbance, random_start
 from sitl.expert import Expert, Sticks4
 from sitl.truth import gate_truth
 
-MAX_TIME_S = 40.0
 NOMINAL_SHARE = 0.25
 """Flights without randomised conditions: what most people will fly first."""
 AIRBORNE_SHARE = 0.35
@@ -98,6 +97,7 @@ def demonstrate_once(
     seed: int,
     *,
     speed_mps: float,
+    max_time_s: float,
     contract: Contract,
     student: Executable | None = None,
 ) -> Outcome:
@@ -107,6 +107,7 @@ def demonstrate_once(
         folder: from ``prepare_folder``.
         seed: of the course and of everything random.
         speed_mps: of the expert.
+        max_time_s: after which the flight ends wherever it is.
         contract: of the policy that will learn from this: image size, horizon.
         student: flies most of the time; the expert labels all of it, and takes over now and then so
             that the flight goes on (DAgger).
@@ -130,7 +131,7 @@ def demonstrate_once(
     )
     notes = _Notes(episode, pilot, writer)
     try:
-        result = episode.fly(pilot.executable, max_time_s=MAX_TIME_S, sinks=(notes,))
+        result = episode.fly(pilot.executable, max_time_s=max_time_s, sinks=(notes,))
     except BaseException:
         writer.close()
         raise

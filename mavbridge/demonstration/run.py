@@ -131,5 +131,10 @@ def _fly_job(job: _Job) -> Outcome:
         size = config.policy.image_size
         contract = replace(contract, image_height=size, image_width=size)
     return demonstrate_once(
-        job.folder, job.seed, speed_mps=config.speed, contract=contract, student=student
+        job.folder,
+        job.seed,
+        speed_mps=config.speed,
+        max_time_s=config.max_time,
+        contract=contract,
+        student=student,
     )

@@ -14,9 +14,15 @@ from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 SIZE = 48
 
 
-def config(out: Path, *, episodes: int = 1, seed: int = 3) -> DemonstrateConfig:
+def config(
+    out: Path, *, episodes: int = 1, seed: int = 3, max_time: float = 40.0
+) -> DemonstrateConfig:
     return DemonstrateConfig(
-        out=out, episodes=episodes, speed=6.0, policy=PolicyConfig(image_size=SIZE, seed=seed)
+        out=out,
+        episodes=episodes,
+        speed=6.0,
+        max_time=max_time,
+        policy=PolicyConfig(image_size=SIZE, seed=seed),
     )
 
 
@@ -92,7 +98,19 @@ def test_a_folder_of_somebody_elses_is_left_alone(tmp_path: Path) -> None:
         demonstrate(config(tmp_path))
 
 
-@pytest.mark.parametrize("change", [{"episodes": 0}, {"speed": 40.0}, {"workers": 0}])
+def test_a_flight_that_is_to_be_short_is_whole_and_no_success(tmp_path: Path) -> None:
+    assert demonstrate(config(tmp_path, max_time=1.0)) == 0
+    cut = open_flight(tmp_path / "000000")
+    sent_ns = cut.ticks["sent_ns"].to_pylist()
+    # It starts in the air, where the first moment is left out.
+    assert 0.5e9 < sent_ns[-1] - sent_ns[0] < 1.1e9
+    assert cut.meta.finished
+    assert cut.meta.success is False
+
+
+@pytest.mark.parametrize(
+    "change", [{"episodes": 0}, {"speed": 40.0}, {"workers": 0}, {"max_time": 0.1}]
+)
 def test_what_cannot_be_flown_is_refused(tmp_path: Path, change: dict[str, float]) -> None:
     with pytest.raises(UserError):
         DemonstrateConfig(out=tmp_path, **change)  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ from safetensors import safe_open
 from policy.checkpoint import TRAINING_KEY
 from policy.contract import QUATERNION, VELOCITY, Contract, PolicyError
 from policy.dataset import DatasetError, Episode
+from policy.dataset_frames import store_frames
 from policy.dataset_windows import find_windows
 from policy.relative_state import context_features, motion_since
 from policy.train_batches import PooledStore
@@ -22,8 +23,8 @@ from policy.train_plan import Budget, WorldTrainSettings
 from policy.train_report import Progress, TrainResult, WorldValidation
 from policy.train_state import TrainingError
 from policy.train_world import train_world_model
-from policy.train_world_batches import CONTEXT_NOISE, WindowBatches
-from policy.train_world_model import dynamics_loss, psnr_db, set_scales
+from policy.train_world_batches import CONTEXT_NOISE, WindowBatches, frame_batch
+from policy.train_world_model import autoencoder_loss, dynamics_loss, psnr_db, set_scales
 from policy.world_model import WorldModel, WorldModelConfig
 from policy.world_model_checkpoint import load_world_model
 from steered_flights import steered_flight
@@ -270,6 +271,39 @@ def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
         assert (float(told["sticks"]) > 0) == decides
         assert float(told["motion"]) > 0
         assert float(told["latents"]) > 0
+
+
+def test_a_net_that_says_nothing_copies_the_last_frame_at_a_loss_of_one(tmp_path: Path) -> None:
+    windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
+    latents = latents_of(91, tmp_path / "latents", mirror=False)
+    model = WorldModel(MODEL)
+    set_scales(model, windows, latents, mirrors=False)
+    model.dynamics.out_patch.weight.data.zero_()
+    every = WindowBatches(windows, latents, MODEL, seed=0, mirrors=False, decision_share=0.0)
+    with torch.inference_mode():
+        told = dynamics_loss(model, every.validation(len(windows))[0]).told
+    assert float(told["latents"]) == pytest.approx(1.0, abs=1e-3)
+    assert float(told["pixels"]) > 0
+
+
+def test_the_autoencoder_sees_neighbours_and_pays_for_what_changes(tmp_path: Path) -> None:
+    flight = steered_flight(0)
+    windows = find_windows([flight], context_frames=2, frames=4, frame_dt_s=0.1)
+    size = MODEL.image_size
+    store = store_frames(
+        [flight], height=size, width=size, folder=tmp_path, progress=lambda _: None
+    )
+    batch = frame_batch(store, windows, MODEL, 3, count=4, seed=0, mirrors=True)
+    assert batch.images.shape == (4, 2, size, size, 3)
+    assert (batch.images[:, 0] != batch.images[:, 1]).any()
+    still = replace(batch, images=batch.images[:, :1].expand_as(batch.images))
+    model = WorldModel(MODEL)
+    with torch.inference_mode():
+        unsteady, steady = (
+            float(autoencoder_loss(model, one).told["unsteady"]) for one in (batch, still)
+        )
+    assert unsteady > steady
+    assert steady == pytest.approx(0.0, abs=1e-6)
 
 
 def test_psnr_is_that_of_the_mean_squared_error() -> None:

@@ -60,6 +60,15 @@ def evaluate(
     return evaluated
 
 
+@pytest.mark.usefixtures("evaluate")
+def test_it_may_come_after_the_flights_too(capsys: pytest.CaptureFixture[str]) -> None:
+    counts = ("--windows", "2", "--chains", "1")
+    with pytest.raises(SystemExit) as stopped:
+        main(["imagine", "flights", *QUICK, *counts, "--evaluate"])
+    assert stopped.value.code == 0
+    assert "action swap" in capsys.readouterr().out
+
+
 def test_everything_is_told_and_written(evaluate: Evaluate, tmp_path: Path) -> None:
     out = tmp_path / "new" / "quality.json"
     flags = ("--windows", "4", "--chains", "2", "--exe-steps", "4", "--json", str(out))
