@@ -95,8 +95,7 @@ class ResNet8(nn.Module):
     """Image [B, 3, H, W] -> feature [B, 256], in the manner of DroNet (Loquercio et al. 2018).
 
     Three residual blocks, and a layer that sees every cell of the last map. Small enough to learn
-    from nothing on two cores: a minute of one core teaches it where gates are to 4 degrees, for
-    which EfficientNet-B3 takes an hour.
+    where gates are from nothing, in some ten minutes of one core.
     """
 
     classifier_keys = ()
