@@ -3,7 +3,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from examples import RESULT, make_flight
+from bench_results import RESULT, make_flight
 
 from mavbridge.bench.budget import ratios, read_budget, violations
 from mavbridge.errors import UserError

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from examples import RESULT
+from bench_results import RESULT
 
 from mavbridge.bench.results import BenchResult
 

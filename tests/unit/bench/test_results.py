@@ -3,7 +3,7 @@ from collections.abc import Callable
 from io import StringIO
 
 import pytest
-from examples import RESULT, all_equal
+from bench_results import RESULT, all_equal
 from rich.console import Console
 
 from mavbridge.bench.results import (

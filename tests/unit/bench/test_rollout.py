@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from examples import RESULT
+from bench_results import RESULT
 from rich.console import Console
 
 from mavbridge.bench.rollout import print_result

@@ -3,7 +3,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from examples import RESULT
+from bench_results import RESULT
 
 from mavbridge.bench import run
 from mavbridge.bench.results import BenchResult
