@@ -33,8 +33,8 @@ STATE_HZ = 50.0
 SIM_CAMERA_HZ = 30.0
 """Frames a second of the simulated camera, unless the visual rate asks for more."""
 SIM_CAMERA_PX = 224
-"""Least side of its frames, as ``python -m sitl`` sends them: what a policy wants smaller is made
-smaller by the bridge, as in a real flight, and not drawn smaller."""
+"""Side of its frames, as ``python -m sitl`` sends them: what a policy wants smaller is made smaller
+by the bridge, as in a real flight, and not drawn smaller."""
 STATUS_HZ = 5.0
 """Terminal refresh."""
 

@@ -196,8 +196,6 @@ class _Run:
             loop.note(f"{left} images were not encoded for lack of time: the head sees the rest")
         if is_new:
             loop.begin_phase(self._head_rate)
-            if self._check is None:
-                loop.position.best = None  # it was judged on other samples
 
     def _freeze_again(self, position: Position) -> None:
         if not self._stages[position.stage].trains_encoder:
@@ -229,13 +227,12 @@ class _Run:
         return validation
 
     def _held_batches(self, held: Batches, stage: Stage) -> Iterable[Batch]:
-        """Those of the validation; once the encoder stands still, more, and encoded once."""
+        """Always the same samples; once the encoder stands still, encoded once."""
         if self._held_pooled is not None:
             return self._held_pooled
         loop = self._loop
-        samples = VALIDATION_SAMPLES * (1 if stage.trains_encoder else 2)
         size, count = stage.image_size, self._settings.batch_size
-        batches = held.validation(samples=samples, count=count, size=size)
+        batches = held.validation(samples=VALIDATION_SAMPLES, count=count, size=size)
         moved: Iterable[Batch] = (batch.to(loop.device) for batch in batches)
         if not stage.trains_encoder:
             with computing_in(loop.device, loop.bf16):

@@ -119,7 +119,7 @@ def demonstrate_once(
     episode = Episode(
         course_seed=seed,
         seed=seed,
-        setup=Setup(rates=Rates(), limits=Limits(), delays=drawn.delays),
+        setup=_setup(drawn.delays, is_seen=student is not None),
         build_scene=varied_scene(drawn.conditions),
     )
     pilot = _Pilot(episode, drawn, speed_mps=speed_mps, contract=contract, student=student)
@@ -141,6 +141,12 @@ def demonstrate_once(
         replace(writer.meta, autopilot="sitl", success=success, gates_passed=result.gates_passed)
     )
     return Outcome(success=success, gates_passed=result.gates_passed, ticks=writer.ticks)
+
+
+def _setup(delays: Delays, *, is_seen: bool) -> Setup:
+    """The expert looks at no image: they are recorded in the size that was asked for."""
+    setup = Setup(rates=Rates(), limits=Limits(), delays=delays)
+    return setup if is_seen else replace(setup, least_camera_px=1)
 
 
 def _meta(

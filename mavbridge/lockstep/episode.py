@@ -59,6 +59,8 @@ class Setup:
     delays: Delays = field(default_factory=Delays)
     draw_images: bool = True
     """False: nobody looks at the images, neither the policy nor a sink; they stay black."""
+    least_camera_px: int = SIM_CAMERA_PX
+    """Least side of the frames that are drawn, however small the policy wants them."""
 
 
 def run_episode(
@@ -185,9 +187,8 @@ class Episode:
 
     def _make_camera(self, executable: Executable, *, camera_hz: float) -> LockstepCamera:
         camera_period_ns = period_ns(camera_hz)
-        contract = executable.contract
-        width = max(contract.image_width, SIM_CAMERA_PX)
-        height = max(contract.image_height, SIM_CAMERA_PX)
+        contract, least_px = executable.contract, self._setup.least_camera_px
+        width, height = max(contract.image_width, least_px), max(contract.image_height, least_px)
         draw = self._setup.draw_images
         camera = LockstepCamera(
             self.clock,

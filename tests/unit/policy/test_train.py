@@ -57,6 +57,7 @@ def settings(out: Path, **changes: object) -> TrainSettings:
         ema_decay=0.95,
         precision="f32",
         validations=2,
+        gate_weight=0.2,  # of so few steps the sticks need most
     )
     return replace(made, **changes)  # type: ignore[arg-type]
 

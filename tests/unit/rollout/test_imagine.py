@@ -170,7 +170,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
         (["--world-model", "none.safetensors"], "none.safetensors"),
         (["--world-model", "taken.mp4"], "taken.mp4"),
         (["--world-model", "broken.safetensors"], "imagined NaN or infinity"),
-        (["--decider", "toge"], "--checkpoint"),
+        (["--decider", "toge", "--policy", "toge:medium"], "--checkpoint"),
         (["--checkpoint", "a.safetensors"], "add --decider toge"),
         (["--decider", "pilot"], "pilot"),
         (["--start", "enu", "--world-model", "enu.safetensors", *TOGE], "enu_flu"),
