@@ -3,6 +3,8 @@
 ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
 """
 
+from itertools import pairwise
+
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -103,15 +105,14 @@ class ResNet8(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        stem, *widths = RESNET8_CHANNELS
-        self.conv1 = nn.Conv2d(3, stem, 5, stride=2, padding=2, bias=False)
-        self.bn1 = nn.BatchNorm2d(stem)
+        first, last = RESNET8_CHANNELS[0], RESNET8_CHANNELS[-1]
+        self.conv1 = nn.Conv2d(3, first, 5, stride=2, padding=2, bias=False)
+        self.bn1 = nn.BatchNorm2d(first)
         self.relu = nn.ReLU(inplace=True)
-        channels = (stem, *widths)
         self.layers = nn.Sequential(
-            *(BasicBlock(into, out, 2) for into, out in zip(channels, widths, strict=False))
+            *(BasicBlock(into, out, 2) for into, out in pairwise(RESNET8_CHANNELS))
         )
-        self.conv2 = nn.Conv2d(widths[-1], RESNET8_CELL_CHANNELS, 1, bias=False)
+        self.conv2 = nn.Conv2d(last, RESNET8_CELL_CHANNELS, 1, bias=False)
         self.bn2 = nn.BatchNorm2d(RESNET8_CELL_CHANNELS)
         self.fc = nn.Linear(RESNET8_CELL_CHANNELS * RESNET8_CELLS**2, self.out_dim)
 

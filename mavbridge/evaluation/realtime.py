@@ -16,7 +16,7 @@ from mavbridge.app import fly_executable
 from mavbridge.assembly import load_configured_policy
 from mavbridge.bench.processes import END_TIMEOUT_S, end, free_udp_port, running, wait
 from mavbridge.clock import NS_PER_S, MonotonicClock
-from mavbridge.config import CameraConfig, FlyConfig, LinkConfig
+from mavbridge.config import SIM_CAMERA_PX, CameraConfig, FlyConfig, LinkConfig
 from mavbridge.errors import MavbridgeError, PeerError, UserError
 from mavbridge.evaluation.jobs import Flown, Job
 from mavbridge.lockstep.episode import MODE
@@ -26,7 +26,6 @@ from policy.contract import PolicyError
 STARTING_S = 90.0
 """Most that a flight may take beside its time: imports, compiling an engine, arming."""
 _POLL_S = 0.1
-_IMAGE_SIZE = 224
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +74,7 @@ def _fly(job: Job, folder: Path, should_stop: Callable[[], bool]) -> Flown | Non
         *(sys.executable, "-m", "sitl", "--camera", camera, "--end-with-course"),
         *("--connect", f"udpout:127.0.0.1:{port}", "--report", str(report)),
         *("--course", str(job.course_seed)),
-        *("--image-size", str(job.policy.image_size or _IMAGE_SIZE)),
+        *("--image-size", str(job.policy.image_size or SIM_CAMERA_PX)),
         *(() if job.conditions_seed is None else ("--conditions", str(job.conditions_seed))),
     )
     with running(*command, log=log) as vehicle:
