@@ -27,9 +27,8 @@ from mavbridge.bench.results import Flight, to_json
 from mavbridge.camera.open import open_camera
 from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.timing import Histogram
-from policy.checkpoint import build_policy
 from policy.preprocess import image_to_input
-from policy.toge import Toge, TogeConfig
+from policy.toge import TogeConfig
 
 STREAMS = (
     mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
@@ -44,11 +43,8 @@ class NaiveRunner:
 
     def __init__(self, args: argparse.Namespace) -> None:
         self._args = args
-        torch.manual_seed(engines.SEED)
-        policy = build_policy(TogeConfig(size="small")).eval()
-        if not isinstance(policy, Toge):
-            raise TypeError("TogeConfig builds a Toge")
-        policy.reset(engines.SEED)
+        shipped = args.policy == engines.SHIPPED_POLICY
+        policy = engines.shipped_toge() if shipped else engines.eager_toge(TogeConfig(size="small"))
         self._policy = policy
         self._clock = MonotonicClock()
         size = policy.contract.image_height
@@ -94,7 +90,8 @@ class NaiveRunner:
         with torch.no_grad():
             feature = self._policy.encode_visual(image)
             history = torch.from_numpy(self._history)
-            self._policy.predict_fast(feature, torch.zeros(1, 13), history, engines.STEPS)
+            state = torch.zeros(1, contract.state_dim)
+            self._policy.predict_fast(feature, state, history, engines.STEPS)
 
     def _connect(self) -> None:
         self._connection.wait_heartbeat()
@@ -164,7 +161,10 @@ class NaiveRunner:
         return True
 
     def _state(self) -> np.ndarray | None:
-        """[1, 13] of the newest message of each kind that the connection has parsed."""
+        """[1, 13] of the newest message of each kind that the connection has parsed.
+
+        A policy that asks how old its image is gets zeros for that: this runner does not know.
+        """
         found = self._connection.messages
         try:
             q, p, i = found["ATTITUDE_QUATERNION"], found["LOCAL_POSITION_NED"], found["RAW_IMU"]
@@ -175,7 +175,9 @@ class NaiveRunner:
             *(p.vx, p.vy, p.vz, q.q1, q.q2, q.q3, q.q4),
             *(q.rollspeed, q.pitchspeed, q.yawspeed, i.xacc * g, i.yacc * g, i.zacc * g),
         )
-        return np.array([values], np.float32)
+        state = np.zeros((1, self._policy.contract.state_dim), np.float32)
+        state[0, : len(values)] = values
+        return state
 
     def _send(self, action: list[float]) -> None:
         throttle, yaw, pitch, roll = action
@@ -222,6 +224,7 @@ class NaiveRunner:
         ticks = len(self._stamps_ns)
         return Flight(
             runner=NAIVE_NAME,
+            policy=args.policy,
             engine=engines.EAGER,
             asked_action_hz=args.action_hz,
             asked_vision_hz=args.vision_hz,

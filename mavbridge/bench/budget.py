@@ -38,10 +38,11 @@ def _kernel_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
 
 
 def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
-    naive = next((flight for flight in result.flights if flight.runner == NAIVE_NAME), None)
+    usual = {flight.policy: flight for flight in result.flights if flight.runner == NAIVE_NAME}
     for flight in result.flights:
         if flight.runner != OURS_NAME or not flight.action_hz:
             continue
+        naive = usual.get(flight.policy)
         name = f"flight: {flight.label}"
         yield f"{name} period / asked period", flight.asked_action_hz / flight.action_hz
         if naive is None or not naive.action_hz:

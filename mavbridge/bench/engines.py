@@ -1,9 +1,13 @@
 """The engines that are compared: the one list, how a policy is loaded on each, what is asked."""
 
+import torch
+
 from mavbridge.clock import NS_PER_S, MonotonicClock
+from policy.checkpoint import BuiltinPolicy, build_policy, load_checkpoint
 from policy.contract import Executable
 from policy.engines.executable import EngineName
-from policy.loading import load_policy
+from policy.loading import SHIPPED, load_policy
+from policy.toge import Toge, TogeConfig
 
 EAGER: EngineName = "torch"
 ENGINES: tuple[EngineName, ...] = (EAGER, "openvino")
@@ -15,10 +19,12 @@ SEED = 0
 STEPS = 10
 """DDIM steps of a chunk."""
 FLIGHT_POLICY = "toge:small"
+SHIPPED_POLICY = "toge"
+"""The trained weights that ``--policy toge`` is."""
 
 
 def load(policy: str, engine: EngineName, *, head_steps: int | None = None) -> Executable:
-    """A policy with seeded random weights, in dual rate, on one engine.
+    """A policy in dual rate on one engine; all but the shipped one have seeded random weights.
 
     Raises:
         PolicyError: the engine cannot run here.
@@ -27,7 +33,7 @@ def load(policy: str, engine: EngineName, *, head_steps: int | None = None) -> E
     executable = load_policy(
         policy,
         checkpoint=None,
-        allow_untrained=True,
+        allow_untrained=policy != SHIPPED_POLICY,
         engine=engine,
         device="cpu",
         dual_rate=True,
@@ -40,3 +46,22 @@ def load(policy: str, engine: EngineName, *, head_steps: int | None = None) -> E
     if not executable.engine.startswith(engine):  # it may name its precisions, too
         raise ValueError(f"asked for the engine {engine}, got {executable.engine}")
     return executable
+
+
+def eager_toge(config: TogeConfig) -> Toge:
+    """The network alone, with seeded random weights."""
+    torch.manual_seed(SEED)
+    return _toge(build_policy(config))
+
+
+def shipped_toge() -> Toge:
+    """The network of ``SHIPPED_POLICY`` alone."""
+    return _toge(load_checkpoint(SHIPPED, fallback=TogeConfig()))
+
+
+def _toge(policy: BuiltinPolicy) -> Toge:
+    if not isinstance(policy, Toge):
+        raise TypeError(f"not a Toge: {type(policy).__name__}")
+    policy.eval()
+    policy.reset(SEED)
+    return policy

@@ -40,9 +40,7 @@ def main() -> None:
     """Fly once and write the figures."""
     args = arguments(__doc__)
     clock = MonotonicClock()
-    executable = level_climb(
-        engines.load(engines.FLIGHT_POLICY, args.engine, head_steps=args.head_steps)
-    )
+    executable = level_climb(engines.load(args.policy, args.engine, head_steps=args.head_steps))
     meter = FlightMeter(action_hz=args.action_hz, vision_hz=args.vision_hz)
     with GcWatch(clock) as collector:
         witness = Witness(
@@ -65,6 +63,8 @@ def arguments(description: str | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=description, allow_abbrev=False)
     parser.add_argument("--port", type=int, required=True, help="UDP, where the vehicle sends")
     parser.add_argument("--camera", required=True, help="shm:NAME")
+    policies = (engines.FLIGHT_POLICY, engines.SHIPPED_POLICY)
+    parser.add_argument("--policy", default=engines.FLIGHT_POLICY, choices=policies)
     parser.add_argument("--engine", default=engines.EAGER, choices=engines.ENGINES)
     parser.add_argument("--head-steps", type=int, help="of a warm start")
     parser.add_argument("--action-hz", type=float, required=True)
@@ -90,7 +90,7 @@ def level_climb(executable: Executable) -> Executable:
 def _config(args: argparse.Namespace) -> FlyConfig:
     return FlyConfig(
         link=LinkConfig(connect=f"udp:127.0.0.1:{args.port}"),
-        policy=PolicyConfig(policy=engines.FLIGHT_POLICY, dual_rate=True),
+        policy=PolicyConfig(policy=args.policy, dual_rate=True),
         camera=CameraConfig(camera=args.camera),
         rates=Rates(visual_rate=args.vision_hz, action_rate=args.action_hz),
         limits=Limits(max_feature_age=MAX_FEATURE_AGE_S),
@@ -106,6 +106,7 @@ def _flight(
     action, vision = report.action, report.vision
     return Flight(
         runner=OURS_NAME,
+        policy=args.policy,
         engine=report.engine,
         asked_action_hz=args.action_hz,
         asked_vision_hz=args.vision_hz,

@@ -7,8 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from mavbridge.bench.engines import FLIGHT_POLICY
 from mavbridge.bench.processes import end, free_udp_port, running, wait
-from mavbridge.bench.results import Flight, RateTrial, TopRate, Vehicle, flight_from_json
+from mavbridge.bench.results import (
+    Flight,
+    RateTrial,
+    TopRate,
+    Vehicle,
+    flight_from_json,
+    flight_label,
+)
 from mavbridge.errors import UserError
 
 OURS = "mavbridge.bench.flight_process"
@@ -30,14 +38,15 @@ class Runner:
 
     module: str
     engine: str
+    policy: str = FLIGHT_POLICY
     head_steps: int | None = None
     """Steps of a warm start; None = every chunk is solved in full."""
 
     @property
     def label(self) -> str:
         """For a person."""
-        warm = "" if self.head_steps is None else f", warm start of {self.head_steps}"
-        return f"{OURS_NAME if self.module == OURS else NAIVE_NAME}, {self.engine}{warm}"
+        name = OURS_NAME if self.module == OURS else NAIVE_NAME
+        return f"{name}, {flight_label(self.policy, self.engine, self.head_steps)}"
 
 
 def fly(runner: Runner, *, action_hz: float, duration_s: float) -> Flight:
@@ -58,7 +67,8 @@ def fly(runner: Runner, *, action_hz: float, duration_s: float) -> Flight:
         )
         runner_command: tuple[str, ...] = (
             *(sys.executable, "-m", runner.module, "--port", str(port), "--camera", camera),
-            *("--engine", runner.engine, "--duration", str(duration_s)),
+            *("--policy", runner.policy, "--engine", runner.engine),
+            *("--duration", str(duration_s)),
             *("--action-hz", str(action_hz), "--vision-hz", str(VISION_HZ)),
             *("--out", str(figures)),
         )

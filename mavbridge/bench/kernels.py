@@ -17,12 +17,12 @@ from mavbridge.bench.roofline import PRECISIONS, Work, count_work, roofline
 from mavbridge.clock import NS_PER_S, Clock
 from mavbridge.records import Percentiles
 from mavbridge.timing import Histogram
-from policy.checkpoint import build_policy
 from policy.contract import ACTION_DIM, Executable
 from policy.engines.executable import EngineName
 from policy.toge import Toge, TogeConfig
 
 ENCODE = "encode one image (EfficientNet-B3)"
+ENCODE_SHIPPED = "encode one image (ResNet-8)"
 WARM_ELAPSED_S = 0.01
 """Between two chunks at 100 Hz."""
 SAMPLE = {
@@ -85,6 +85,8 @@ def _cases(engine: EngineName) -> list[_Case]:
         warm = engines.load(policy, engine, head_steps=engines.WARM_STEPS)
         name = f"{work}, warm start of {engines.WARM_STEPS} steps"
         cases.append(_Case(work=name, engine=engine, call=_act_call(warm, WARM_ELAPSED_S)))
+    encode = _encode_call(engines.load(engines.SHIPPED_POLICY, engine))
+    cases.append(_Case(work=ENCODE_SHIPPED, engine=engine, call=encode))
     return cases
 
 
@@ -119,21 +121,21 @@ def _block(call: Callable[[], object], block_s: float, clock: Clock) -> Percenti
 
 
 def _all_work() -> list[Work]:
-    works: list[Work] = []
-    for policy, name in SAMPLE.items():
-        net = build_policy(TogeConfig(size="small" if policy == "toge:small" else "medium")).eval()
-        if not isinstance(net, Toge):
-            raise TypeError("TogeConfig builds a Toge")
-        if not works:
-            works.append(_encode_work(net))
-        works.append(_sample_work(name, net))
-    return works
+    nets = {
+        policy: engines.eager_toge(TogeConfig(size="small" if policy == "toge:small" else "medium"))
+        for policy in SAMPLE
+    }
+    return [
+        _encode_work(ENCODE, nets["toge:small"]),
+        *[_sample_work(name, nets[policy]) for policy, name in SAMPLE.items()],
+        _encode_work(ENCODE_SHIPPED, engines.shipped_toge()),
+    ]
 
 
-def _encode_work(net: Toge) -> Work:
+def _encode_work(name: str, net: Toge) -> Work:
     image = torch.zeros(1, 3, net.contract.image_height, net.contract.image_width)
     modules: dict[nn.Module, int] = {net.backbone: 1, net.visual_projection: 1}
-    return count_work(ENCODE, lambda: net.encode_visual(image), modules)
+    return count_work(name, lambda: net.encode_visual(image), modules)
 
 
 def _sample_work(name: str, net: Toge) -> Work:

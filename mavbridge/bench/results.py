@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from statistics import median
 from typing import Any
 
+from mavbridge.bench.engines import SHIPPED_POLICY
 from mavbridge.records import Percentiles
 
 
@@ -64,6 +65,7 @@ class Flight:
     """Both loops against the vehicle, from the first action of the policy to the last."""
 
     runner: str
+    policy: str
     engine: str
     asked_action_hz: float
     asked_vision_hz: float
@@ -91,16 +93,21 @@ class Flight:
 
     @property
     def label(self) -> str:
-        """Engine and kind of solve."""
-        if self.head_steps is None:
-            return self.engine
-        return f"{self.engine}, warm start of {self.head_steps}"
+        """Engine and kind of solve, and the policy if it is the one that ships."""
+        return flight_label(self.policy, self.engine, self.head_steps)
 
     @property
     def missed_fraction(self) -> float:
         """Missed over asked slots."""
         asked = self.asked_action_hz * self.duration_s
         return self.missed_slots / asked if asked > 0 else 1.0
+
+
+def flight_label(policy: str, engine: str, head_steps: int | None) -> str:
+    """What flies, for a person."""
+    warm = "" if head_steps is None else f", warm start of {head_steps}"
+    shipped = "policy that ships, " if policy == SHIPPED_POLICY else ""
+    return f"{shipped}{engine}{warm}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -13,7 +13,7 @@ from rich.text import Text
 
 from mavbridge.bench import flights, kernels, link
 from mavbridge.bench.budget import ratios, read_budget, violations
-from mavbridge.bench.engines import EAGER, WARM_STEPS
+from mavbridge.bench.engines import EAGER, SHIPPED_POLICY, WARM_STEPS
 from mavbridge.bench.processes import require_source_tree
 from mavbridge.bench.results import BenchResult, Flight, Machine, to_json
 from mavbridge.bench.tables import print_result
@@ -110,7 +110,10 @@ def measure(plan: _Plan, *, is_quick: bool, say: Callable[[str], None]) -> Bench
         kernels=kernels.measure(plan.kernels, clock, say),
         rooflines=kernels.rooflines(clock),
         flights=_flights(plan, say),
-        top_rates=(flights.top_rate(_WARM, plan.rates_hz, plan.rate_trial_s, say),),
+        top_rates=tuple(
+            flights.top_rate(runner, plan.rates_hz, plan.rate_trial_s, say)
+            for runner in (_SHIPPED, _WARM)
+        ),
         links=link.measure(
             contenders, repeats=plan.link_repeats, attitudes=plan.attitudes, say=say
         ),
@@ -122,11 +125,13 @@ _EAGER = flights.Runner(module=flights.OURS, engine=EAGER)
 _FULL = flights.Runner(module=flights.OURS, engine="openvino")
 _WARM = flights.Runner(module=flights.OURS, engine="openvino", head_steps=WARM_STEPS)
 _NAIVE = flights.Runner(module=flights.NAIVE, engine=EAGER)
+_SHIPPED = replace(_WARM, policy=SHIPPED_POLICY)
+_NAIVE_SHIPPED = replace(_NAIVE, policy=SHIPPED_POLICY)
 
 
 def _flights(plan: _Plan, say: Callable[[str], None]) -> tuple[Flight, ...]:
     found = []
-    for runner in (_WARM, _FULL, _EAGER, _NAIVE):
+    for runner in (_SHIPPED, _NAIVE_SHIPPED, _WARM, _FULL, _EAGER, _NAIVE):
         say(f"flight of {plan.flight_s:g} s: {runner.label}")
         found.append(flights.fly(runner, action_hz=flights.ACTION_HZ, duration_s=plan.flight_s))
     return tuple(found)

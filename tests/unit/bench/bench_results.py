@@ -23,6 +23,7 @@ def make_flight(
 ) -> Flight:
     return Flight(
         runner=runner,
+        policy="toge:small",
         engine=engine,
         asked_action_hz=100.0,
         asked_vision_hz=30.0,
