@@ -4,11 +4,11 @@
         --candidate a.safetensors 1 5.2 --candidate b.safetensors 10 1.3
 
 The numbers beside a checkpoint are its diffusion steps and its real score with them, the gates that
-``mavbridge evaluate --dual-rate --num-diffusion-steps N`` counts. The imagined one is
-the share of gates that it passes in the world model, from moments of demonstrations a little before
-a gate, of those that the expert passed there in the same time. Where the gates are, the
-demonstrations tell; the path is the sum of the imagined velocities. Two rows say what the figures
-are worth: the expert's own sticks, and sticks that stay centred.
+``mavbridge evaluate --dual-rate --num-diffusion-steps N`` counts. The imagined one is the share of
+gates that it passes in the world model, from moments of demonstrations a little before a gate, of
+those that the expert passed there in the same time. The course is the demonstration's own, the path
+is the sum of the imagined velocities, and gates are counted as in a real flight. Two rows say what
+the figures are worth: the expert's own sticks, and sticks that stay centred.
 """
 
 import argparse
@@ -35,35 +35,15 @@ from mavbridge.rollout.run import load_model
 from mavbridge.rollout.sampling import Sampler
 from mavbridge.rollout.start import Start, read_start
 from mavbridge.rollout_evaluation.metrics import spearman
-from policy import rotation
 from policy.contract import ACTION_DIM, VELOCITY, Contract
 from policy.dataset_flights import find_flights, is_exemplary
+from sitl.course import Course, GateCounter, make_course
 
 ITERATIONS, EXE_STEPS = 8, 4
 """3.2 s, with a decision every 0.4 s: at 5 m/s that is two gates."""
 BEFORE_GATE_S = 1.2
-HALF_OPENING_M = 1.2
 
 Points = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Gate:
-    """An opening of the course."""
-
-    center_ned_m: Points
-    along_ned: Points
-    """[3] unit vector of the passage, level."""
-
-    def crossing(self, before_m: Points, after_m: Points) -> bool | None:
-        """Whether a step [3] -> [3] leads through the opening; None where it ends before it."""
-        start, end = ((p - self.center_ned_m) @ self.along_ned for p in (before_m, after_m))
-        if start >= 0 or end < 0:
-            return None
-        offset_m = before_m + (after_m - before_m) * start / (start - end) - self.center_ned_m
-        aside_m = offset_m - offset_m @ self.along_ned * self.along_ned
-        across_m, down_m = np.linalg.norm(aside_m[:2]), abs(aside_m[2])
-        return bool(max(across_m, down_m) < HALF_OPENING_M)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +52,8 @@ class Case:
 
     start: Start
     position_ned_m: Points
-    gates: tuple[Gate, ...]
-    """From the next one on."""
+    course: Course
+    next_gate: int
     expert_gates: int
     """That the expert passed in the time of a rollout."""
     expert_end_ned_m: Points
@@ -109,28 +89,13 @@ class Score:
     """From where the expert was at the end, mean."""
 
 
-def gates_of(flight: RecordedFlight) -> dict[int, Gate]:
-    """The gates that a demonstration headed for, by number."""
-    found: dict[int, Gate] = {}
-    for row in flight.frames.to_pylist():
-        if row["next_gate"] is None or row["next_gate"] in found:
-            continue
-        to_body = np.array(row["ned_from_body_wxyz"])
-        ahead = rotation.rotate(to_body, np.array([1.0, 0.0, 0.0]))
-        yaw_rad = np.arctan2(ahead[1], ahead[0]) + row["gate_yaw_rad"]
-        offset_m = rotation.rotate(to_body, np.array(row["gate_body_m"]))
-        found[row["next_gate"]] = Gate(
-            center_ned_m=np.array(row["position_ned_m"]) + offset_m,
-            along_ned=np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0.0]),
-        )
-    return found
-
-
 def cases_of(flight: RecordedFlight, sampler: Sampler) -> list[Case]:
-    """One a gate, where the flight goes on for long enough."""
+    """One a gate, where the flight goes on for long enough; none if its course is not known."""
+    if flight.meta.course_seed is None:
+        return []
     rows = flight.frames.to_pylist()
     stamps_ns = np.array([row["captured_ns"] for row in rows])
-    gates, config = gates_of(flight), sampler.config
+    course, config = make_course(flight.meta.course_seed), sampler.config
     first_ns = flight.ticks["attitude_ns"].drop_null()[0].as_py()
     first_ns = stamps_ns[stamps_ns >= first_ns][0]
     context_ns = round((config.context_frames - 1) * config.frame_dt_s * NS_PER_S)
@@ -147,13 +112,13 @@ def cases_of(flight: RecordedFlight, sampler: Sampler) -> list[Case]:
         end = rows[int(np.searchsorted(stamps_ns, start.newest_ns + length_ns)) - 1]
         if now["next_gate"] != before["next_gate"]:
             continue
-        ahead = sorted(number for number in gates if number >= now["next_gate"])
-        last = len(gates) + min(gates) if end["next_gate"] is None else end["next_gate"]
+        last = len(course.gates) if end["next_gate"] is None else end["next_gate"]
         cases.append(
             Case(
                 start=start,
                 position_ned_m=np.array(now["position_ned_m"]),
-                gates=tuple(gates[number] for number in ahead),
+                course=course,
+                next_gate=now["next_gate"],
                 expert_gates=last - now["next_gate"],
                 expert_end_ned_m=np.array(end["position_ned_m"]),
                 expert_sticks=sticks_of(flight, start.newest_ns, config.frame_dt_s),
@@ -184,15 +149,12 @@ def path_of(sampler: Sampler, decider: Decider, case: Case, seed: int) -> Points
     return path_m + case.position_ned_m
 
 
-def gates_passed(path_m: Points, gates: Sequence[Gate]) -> int:
-    """In order, up to the first that is passed beside its opening."""
-    passed = 0
-    for before_m, after_m in pairwise(path_m):
-        through = gates[passed].crossing(before_m, after_m) if passed < len(gates) else None
-        if through is False:
-            break
-        passed += through is True
-    return passed
+def gates_passed(path_m: Points, course: Course, first: int) -> int:
+    """From gate ``first`` on, along straight steps between points [steps + 1, 3]."""
+    counter = GateCounter(course, first=first)
+    for step, (north_m, east_m, down_m) in enumerate(path_m.tolist()):
+        counter.update((north_m, east_m, down_m), float(step))
+    return len(counter.passed)
 
 
 def policy_decider(sampler: Sampler, checkpoint: Path, steps: int) -> PolicyDecider:
@@ -211,7 +173,7 @@ def score(sampler: Sampler, decider_for: Callable[[Case], Decider], cases: Seque
     passed, errors_m = 0, []
     for seed, case in enumerate(cases):
         path_m = path_of(sampler, decider_for(case), case, seed)
-        passed += min(gates_passed(path_m, case.gates), case.expert_gates)
+        passed += min(gates_passed(path_m, case.course, case.next_gate), case.expert_gates)
         errors_m.append(float(np.linalg.norm(path_m[-1] - case.expert_end_ned_m)))
     return Score(passed=passed, end_error_m=float(np.mean(errors_m)))
 

@@ -1,9 +1,11 @@
 """What makes a checkpoint fly well or badly: one setting changed at a time, the same courses.
 
-    python -m benchmarks.study --episodes 25 --json docs/study.json --plot docs/study.png
+    python -m benchmarks.study --episodes 25 --json docs/study.json --plot docs/study.png \\
+        --checkpoint fast.safetensors --untold fast_untold.safetensors
 
-Each row is a ``mavbridge evaluate`` of its own. Rows that the JSON holds for the same checkpoint
-and as many episodes are not flown again: an interrupted study goes on.
+Each row is a ``mavbridge evaluate`` of its own. Rows that the JSON holds for the same checkpoints
+and as many episodes are not flown again: an interrupted study goes on. ``--untold`` is a checkpoint
+made by the same training with ``--no-since-exposure``: late images are asked of both.
 """
 
 import argparse
@@ -26,6 +28,10 @@ BASE = "30 images, 100 actions a second"
 DELAYS_MS = (0, 30, 60, 100, 150)
 OLD_IMAGES = ("--max-feature-age", "0.5")
 """So that a late image is flown by, and not refused."""
+EAGER_RATES = ("--visual-rate", "14", "--action-rate", "32")
+EAGER_DELAY_MS = "55"
+"""That eager torch encodes an image slower than 11 ms, at 14 images a second."""
+LATE, LATE_UNTOLD = "late images", "late images, age not told"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +42,11 @@ class Question:
     name: str
     flags: tuple[str, ...]
 
+    @property
+    def is_untold(self) -> bool:
+        """Whether it is asked of the checkpoint that is not told how old its image is."""
+        return self.group == LATE_UNTOLD
+
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
@@ -44,6 +55,7 @@ class Answer:
     group: str
     name: str
     command: str
+    checkpoint_sha256: str
     episodes: int
     success: float
     success_low: float
@@ -53,12 +65,17 @@ class Answer:
     stick_rate_per_s: float
 
 
-def questions() -> tuple[Question, ...]:
+def questions(*, with_untold: bool) -> tuple[Question, ...]:
     """In the order of the table."""
-    eager = ("--dual-rate", "--visual-rate", "14", "--action-rate", "32")
+    eager = ("--dual-rate", *EAGER_RATES)
     rows = [
         ("rates", BASE, DUAL),
-        ("rates", "14 and 32, what eager torch reached", eager),
+        ("rates", "14 and 32", eager),
+        (
+            "rates",
+            "14 and 32, encoding 55 ms longer: eager torch",
+            (*eager, *OLD_IMAGES, "--vision-delay", EAGER_DELAY_MS),
+        ),
         ("rates", "single rate, 30", ("--rate", "30")),
         ("rates", "50 actions", (*DUAL, "--action-rate", "50")),
         ("rates", "250 actions", (*DUAL, "--action-rate", "250")),
@@ -71,11 +88,16 @@ def questions() -> tuple[Question, ...]:
         ("smoothing", "no smoothing", (*DUAL, "--tau", "0", "--max-slew", "1000")),
         ("vehicle", "other vehicles, firmware, wind, light", (*DUAL, "--conditions", "random")),
     ]
-    made = [Question(group=group, name=name, flags=flags) for group, name, flags in rows]
-    for delay_ms in DELAYS_MS:
-        flags = (*DUAL, *OLD_IMAGES, "--vision-delay", str(delay_ms))
-        made.append(Question(group="delay", name=f"images {delay_ms} ms later", flags=flags))
-    return tuple(made)
+    for group in (LATE, LATE_UNTOLD) if with_untold else (LATE,):
+        rows += [
+            (
+                group,
+                f"images {delay_ms} ms later" + (", age not told" if group == LATE_UNTOLD else ""),
+                (*DUAL, *OLD_IMAGES, "--vision-delay", str(delay_ms)),
+            )
+            for delay_ms in DELAYS_MS
+        ]
+    return tuple(Question(group=group, name=name, flags=flags) for group, name, flags in rows)
 
 
 def ask(question: Question, checkpoint: Path, episodes: int, workers: int) -> Answer:
@@ -95,6 +117,7 @@ def ask(question: Question, checkpoint: Path, episodes: int, workers: int) -> An
         group=question.group,
         name=question.name,
         command=f"mavbridge evaluate {' '.join(flags)}",
+        checkpoint_sha256=_sha256(checkpoint),
         episodes=episodes,
         success=summary["success_rate"]["value"],
         success_low=summary["success_rate"]["low"],
@@ -127,8 +150,7 @@ def draw(answers: Sequence[Answer], path: Path) -> None:
 
     from mavbridge.evaluation.figure import BLUE, DOTS_PER_INCH, MUTED, SIZE_INCHES, STYLE
 
-    late = [one for one in answers if one.group == "delay"]
-    others = [one for one in answers if one.group != "delay"][::-1]
+    others = [one for one in answers if one.group not in (LATE, LATE_UNTOLD)][::-1]
     with rc_context(STYLE):
         figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor="white")
         left, right = figure.subplots(1, 2, width_ratios=(3, 2))
@@ -140,15 +162,29 @@ def draw(answers: Sequence[Answer], path: Path) -> None:
             left.plot(ends, (row, row), color=MUTED, linewidth=1.5)
         left.set_xlim(0, 115)
         left.set_title("Held-out courses flown, %, with 95 % interval")
-        delays_ms = list(DELAYS_MS[: len(late)])
-        low, high = ([100 * getattr(o, f"success_{end}") for o in late] for end in ("low", "high"))
-        right.fill_between(delays_ms, low, high, color=BLUE, alpha=0.15, linewidth=0)
-        right.plot(delays_ms, [100 * one.success for one in late], "o-", color=BLUE)
+        for group, color, name in ((LATE, BLUE, "told the age"), (LATE_UNTOLD, MUTED, "not told")):
+            late = [one for one in answers if one.group == group]
+            delays_ms = list(DELAYS_MS[: len(late)])
+            low, high = (
+                [100 * getattr(one, f"success_{end}") for one in late] for end in ("low", "high")
+            )
+            right.fill_between(delays_ms, low, high, color=color, alpha=0.15, linewidth=0)
+            shown = [100 * one.success for one in late]
+            right.plot(delays_ms, shown, "o-", color=color, label=name if late else None)
         right.set_ylim(-3, 103)
         right.set_xlabel("ms added to the encoding of each image")
         right.set_title("Late images")
+        right.legend(loc="lower left")
         figure.tight_layout(w_pad=3)
         figure.savefig(path)
+
+
+def _stored(path: Path) -> list[Answer]:
+    return [Answer(**one) for one in json.loads(path.read_text())] if path.exists() else []
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def main() -> None:
@@ -157,23 +193,26 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--checkpoint", type=Path, default=SHIPPED)
+    parser.add_argument("--untold", type=Path, help="a checkpoint without --since-exposure")
     parser.add_argument("--episodes", type=int, default=25)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--plot", type=Path)
     args = parser.parse_args()
-    digest = hashlib.sha256(args.checkpoint.read_bytes()).hexdigest()
-    stored = json.loads(args.json.read_text()) if args.json.exists() else {}
-    known = stored.get("answers", []) if stored.get("checkpoint_sha256") == digest else []
-    answers = [Answer(**one) for one in known if one["episodes"] == args.episodes]
-    asked = {one.name: one for one in answers}
-    for question in questions():
+    asked = {
+        answer.name: answer
+        for answer in _stored(args.json)
+        if answer.checkpoint_sha256 in map(_sha256, filter(None, (args.checkpoint, args.untold)))
+        and answer.episodes == args.episodes
+    }
+    rows: list[Answer] = []
+    for question in questions(with_untold=args.untold is not None):
+        checkpoint = args.untold if question.is_untold else args.checkpoint
         if question.name not in asked:
-            asked[question.name] = ask(question, args.checkpoint, args.episodes, args.workers)
-        rows = [asked[q.name] for q in questions() if q.name in asked]
-        document = {"checkpoint_sha256": digest, "answers": [asdict(row) for row in rows]}
-        args.json.write_text(json.dumps(document, indent=2) + "\n")
-        print_answers(rows[-1:])
+            asked[question.name] = ask(question, checkpoint, args.episodes, args.workers)
+            print_answers([asked[question.name]])
+        rows.append(asked[question.name])
+        args.json.write_text(json.dumps([asdict(one) for one in asked.values()], indent=2) + "\n")
     print_answers(rows)
     if args.plot is not None:
         draw(rows, args.plot)

@@ -12,7 +12,7 @@ from pathlib import Path
 from mavbridge.bench.engines import EAGER
 from mavbridge.bench.flights import NAIVE_NAME, OURS_NAME
 from mavbridge.bench.link import BARE
-from mavbridge.bench.results import BenchResult, Flight
+from mavbridge.bench.results import BenchResult, Flight, flight_label
 from mavbridge.errors import UserError
 
 
@@ -43,7 +43,9 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
         if flight.runner != OURS_NAME or not flight.action_hz:
             continue
         naive = usual.get(flight.policy)
-        name = f"flight: {flight.label}"
+        # Without the precision, which is the processor's: one budget serves them all.
+        engine = flight.engine.partition("-")[0]
+        name = f"flight: {flight_label(flight.policy, engine, flight.head_steps)}"
         yield f"{name} period / asked period", flight.asked_action_hz / flight.action_hz
         if naive is None or not naive.action_hz:
             continue

@@ -19,6 +19,7 @@ from mavbridge.records import Percentiles
 from mavbridge.timing import Histogram
 from policy.contract import ACTION_DIM, Executable
 from policy.engines.executable import EngineName
+from policy.engines.openvino_cpu import precisions
 from policy.toge import Toge, TogeConfig
 
 ENCODE = "encode one image (EfficientNet-B3)"
@@ -68,10 +69,14 @@ def measure(effort: Effort, clock: Clock, say: Callable[[str], None]) -> tuple[K
 
 
 def rooflines(clock: Clock) -> tuple[Roofline, ...]:
-    """The bound of every piece of work in every precision."""
+    """The bound of every piece of work in every precision that this processor computes in."""
     torch.set_num_threads(1)
+    usable = {precision for pair in precisions() for precision in pair}
     return tuple(
-        roofline(work, precision, clock) for work in _all_work() for precision in PRECISIONS
+        roofline(work, precision, clock)
+        for work in _all_work()
+        for precision in PRECISIONS
+        if precision in usable
     )
 
 

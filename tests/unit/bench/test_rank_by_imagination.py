@@ -2,36 +2,29 @@
 
 import numpy as np
 
-from benchmarks.rank_by_imagination import Gate, gates_passed
+from benchmarks.rank_by_imagination import gates_passed
+from sitl.course import make_course
+
+COURSE = make_course(3)
 
 
-def gate(north_m: float, east_m: float = 0.0, heading_rad: float = 0.0) -> Gate:
-    return Gate(
-        center_ned_m=np.array([north_m, east_m, -2.0]),
-        along_ned=np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0]),
-    )
+def through(first: int, last: int, *, east_m: float = 0.0) -> np.ndarray:
+    """Straight from gate to gate, from a little before each to a little behind it."""
+    points = []
+    for gate in COURSE.gates[first : last + 1]:
+        ahead = np.array([np.cos(gate.yaw_rad), np.sin(gate.yaw_rad), 0.0])
+        right = np.array([-np.sin(gate.yaw_rad), np.cos(gate.yaw_rad), 0.0])
+        center = np.array(gate.center_ned_m) + east_m * right
+        points += [center - ahead, center + ahead]
+    return np.array(points)
 
 
-def path(*points: tuple[float, float, float]) -> np.ndarray:
-    return np.array(points, dtype=np.float64)
+def test_a_path_through_the_openings_passes_them() -> None:
+    assert gates_passed(through(0, 3), COURSE, 0) == 4
+    assert gates_passed(through(2, 3), COURSE, 2) == 2
 
 
-def test_a_path_through_the_openings_passes_them_in_order() -> None:
-    gates = (gate(5), gate(10, 1), gate(20))
-    assert gates_passed(path((0, 0, -2), (4, 0, -2), (9, 0.5, -2.5), (12, 1, -2)), gates) == 2
-
-
-def test_it_ends_at_a_gate_that_is_passed_beside_above_or_below_its_opening() -> None:
-    gates = (gate(5), gate(10))
-    for missed in ((5.0, 1.4, -2.0), (5.0, 0.0, -3.4), (5.0, 0.0, -0.7)):
-        assert gates_passed(path((0, 0, -2), missed, (6, 0, -2), (11, 0, -2)), gates) == 0
-    through = path((0, 0, -2), (5.0, 1.1, -2.9), (6, 0, -2), (11, 0, -2))
-    assert gates_passed(through, gates) == 2
-
-
-def test_where_a_step_crosses_is_between_its_ends() -> None:
-    askew = gate(0, 0, heading_rad=np.pi / 2)  # flown eastwards
-    assert askew.crossing(*path((-3, -1, -2), (3, 1, -2))) is True
-    assert askew.crossing(*path((-3, -1, -2), (1, 1, -2))) is True
-    assert askew.crossing(*path((1, -1, -2), (3, 1, -2))) is False
-    assert askew.crossing(*path((0, 1, -2), (0, -1, -2))) is None  # the wrong way
+def test_gates_beside_the_path_or_out_of_order_do_not_count() -> None:
+    assert gates_passed(through(0, 3, east_m=1.4), COURSE, 0) == 0
+    assert gates_passed(through(2, 3), COURSE, 0) == 0
+    assert gates_passed(through(2, 2)[::-1], COURSE, 2) == 0
