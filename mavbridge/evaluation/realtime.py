@@ -74,7 +74,7 @@ def _fly(job: Job, folder: Path, should_stop: Callable[[], bool]) -> Flown | Non
         *(sys.executable, "-m", "sitl", "--camera", camera, "--end-with-course"),
         *("--connect", f"udpout:127.0.0.1:{port}", "--report", str(report)),
         *("--course", str(job.course_seed)),
-        *("--image-size", str(job.policy.image_size or SIM_CAMERA_PX)),
+        *("--image-size", str(max(SIM_CAMERA_PX, job.policy.image_size or 0))),
         *(() if job.conditions_seed is None else ("--conditions", str(job.conditions_seed))),
     )
     with running(*command, log=log) as vehicle:
