@@ -24,13 +24,14 @@ from rich.table import Table
 from policy.loading import SHIPPED
 
 DUAL = ("--dual-rate", "--head-steps", "2")
-BASE = "30 images, 100 actions a second"
+BASE = "30 images, 100 actions a second; 2 of 10 steps"
 DELAYS_MS = (0, 30, 60, 100, 150)
 OLD_IMAGES = ("--max-feature-age", "0.5")
 """So that a late image is flown by, and not refused."""
 EAGER_RATES = ("--visual-rate", "14", "--action-rate", "32")
 EAGER_DELAY_MS = "55"
 """That eager torch encodes an image slower than 11 ms, at 14 images a second."""
+SIZE_INCHES = (12.0, 5.2)
 LATE, LATE_UNTOLD = "late images", "late images, age not told"
 
 
@@ -79,12 +80,16 @@ def questions(*, with_untold: bool) -> tuple[Question, ...]:
         ("rates", "single rate, 30", ("--rate", "30")),
         ("rates", "50 actions", (*DUAL, "--action-rate", "50")),
         ("rates", "250 actions", (*DUAL, "--action-rate", "250")),
-        ("steps", "10 steps, each solve from noise", ("--dual-rate",)),
+        ("steps", "10 steps, from noise", ("--dual-rate",)),
         *[
-            ("steps", f"{n} steps", ("--dual-rate", "--num-diffusion-steps", str(n)))
+            (
+                "steps",
+                f"{n} step{'s' * (n > 1)}, from noise",
+                ("--dual-rate", "--num-diffusion-steps", str(n)),
+            )
             for n in (4, 2, 1)
         ],
-        ("steps", "1 of 10, warm start", ("--dual-rate", "--head-steps", "1")),
+        ("steps", "1 of 10 steps, warm start", ("--dual-rate", "--head-steps", "1")),
         ("smoothing", "no smoothing", (*DUAL, "--tau", "0", "--max-slew", "1000")),
         ("vehicle", "other vehicles, firmware, wind, light", (*DUAL, "--conditions", "random")),
     ]
@@ -148,18 +153,18 @@ def draw(answers: Sequence[Answer], path: Path) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    from mavbridge.evaluation.figure import BLUE, DOTS_PER_INCH, MUTED, SIZE_INCHES, STYLE
+    from mavbridge.evaluation.figure import BLUE, DOTS_PER_INCH, MUTED, STYLE
 
     others = [one for one in answers if one.group not in (LATE, LATE_UNTOLD)][::-1]
     with rc_context(STYLE):
         figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor="white")
         left, right = figure.subplots(1, 2, width_ratios=(3, 2))
         shares = [100 * one.success for one in others]
-        bars = left.barh([one.name for one in others], shares, 0.6, color=BLUE)
-        left.bar_label(bars, [f"{share:.0f} %" for share in shares], padding=4)
+        left.barh([one.name for one in others], shares, 0.6, color=BLUE)
         for row, one in enumerate(others):
             ends = (100 * one.success_low, 100 * one.success_high)
             left.plot(ends, (row, row), color=MUTED, linewidth=1.5)
+            left.text(103, row, f"{shares[row]:.0f} %", va="center")
         left.set_xlim(0, 115)
         left.set_title("Held-out courses flown, %, with 95 % interval")
         for group, color, name in ((LATE, BLUE, "told the age"), (LATE_UNTOLD, MUTED, "not told")):
