@@ -31,6 +31,10 @@ OLD_IMAGES = ("--max-feature-age", "0.5")
 EAGER_RATES = ("--visual-rate", "14", "--action-rate", "32")
 EAGER_DELAY_MS = "55"
 """That eager torch encodes an image slower than 11 ms, at 14 images a second."""
+USUAL_RATES = ("--visual-rate", "5", "--action-rate", "10")
+USUAL_DELAY_MS = "170"
+"""Of the usual runner with EfficientNet-B3 on two cores without AVX-512 (``make bench``), less its
+backlog of states."""
 SIZE_INCHES = (12.0, 5.2)
 LATE, LATE_UNTOLD = "late images", "late images, age not told"
 
@@ -76,6 +80,14 @@ def questions(*, with_untold: bool) -> tuple[Question, ...]:
             "rates",
             "14 and 32, encoding 55 ms longer: eager torch",
             (*eager, *OLD_IMAGES, "--vision-delay", EAGER_DELAY_MS),
+        ),
+        (
+            "rates",
+            "5 and 10, encoding 170 ms longer: usual runner",
+            (
+                *("--dual-rate", *USUAL_RATES),
+                *("--max-feature-age", "1", "--vision-delay", USUAL_DELAY_MS),
+            ),
         ),
         ("rates", "single rate, 30", ("--rate", "30")),
         ("rates", "50 actions", (*DUAL, "--action-rate", "50")),
