@@ -45,7 +45,7 @@ def train_policy(flights: Sequence[Path], config: TrainConfig, out: Path) -> int
     _require_device(config.device)
     is_world_model = config.policy == WORLD_MODEL
     if is_world_model:
-        _refuse_what_is_for_policies(config)
+        _refuse_what_no_world_model_takes(config)
     episodes = _read_episodes(flights, config.camera_key)
     clock = MonotonicClock()
 
@@ -140,7 +140,7 @@ def _world_model_settings(
     )
 
 
-def _refuse_what_is_for_policies(config: TrainConfig) -> None:
+def _refuse_what_no_world_model_takes(config: TrainConfig) -> None:
     for flag, value in (
         ("--ages", config.ages),
         ("--backbone-weights", config.backbone_weights),
