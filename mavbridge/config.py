@@ -292,9 +292,11 @@ class TrainConfig:
     camera_key: str | None = None
     """Camera of a LeRobot dataset that has several, e.g. observation.images.front."""
     start_from: Path | None = None
-    """Checkpoint to go on from, e.g. after more flights were added."""
+    """Checkpoint to go on from, e.g. after more flights were added. Of a world model only the
+    autoencoder can be kept: give --freeze-encoder too."""
     freeze_encoder: bool = False
-    """Train the head alone, on what the encoder of --start-from makes of the images."""
+    """Train the head alone, on what the encoder of --start-from makes of the images; for a world
+    model, the dynamics alone and anew."""
     backbone_weights: Path | None = None
     """torchvision's ImageNet weights of the encoder (.pth)."""
     pack: bool = False

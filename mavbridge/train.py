@@ -22,7 +22,7 @@ from policy.train_plan import Budget, Check, TrainSettings, WorldTrainSettings
 from policy.train_report import Progress as TrainProgress
 from policy.train_report import TrainResult
 from policy.train_world import train_world_model
-from policy.world_model import WorldModelConfig
+from policy.world_model_config import WorldModelConfig
 
 MINUTES = 45.0
 IMAGE_SIZE = 224
@@ -45,7 +45,7 @@ def train_policy(flights: Sequence[Path], config: TrainConfig, out: Path) -> int
     _require_device(config.device)
     is_world_model = config.policy == WORLD_MODEL
     if is_world_model:
-        _refuse_what_is_for_policies(config)
+        _refuse_what_no_world_model_takes(config)
     episodes = _read_episodes(flights, config.camera_key)
     clock = MonotonicClock()
 
@@ -136,20 +136,24 @@ def _world_model_settings(
         device=config.device,
         resume=config.resume,
         validation_fraction=config.validation_fraction,
+        autoencoder_of=config.start_from,
     )
 
 
-def _refuse_what_is_for_policies(config: TrainConfig) -> None:
+def _refuse_what_no_world_model_takes(config: TrainConfig) -> None:
     for flag, value in (
         ("--ages", config.ages),
-        ("--start-from", config.start_from),
         ("--backbone-weights", config.backbone_weights),
-        ("--freeze-encoder", config.freeze_encoder),
         ("--check-flights", config.check_flights),
         ("--pack", config.pack),
     ):
         if value:
             raise UserError(f"{flag} is for policies: leave it out for a world model")
+    if config.freeze_encoder != (config.start_from is not None):
+        raise UserError(
+            "a world model takes --start-from and --freeze-encoder together: the autoencoder of "
+            "the one is kept as it is, and the dynamics learns anew"
+        )
 
 
 def _budget(config: TrainConfig) -> Budget:

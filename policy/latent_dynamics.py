@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM
-from policy.relative_state import MOTION_DIM
+from policy.relative_state import MOTION_DIM, features_dim
 from policy.unet1d import TIME_DIM, sinusoid_frequencies
 
 HEAD_DIM = 32
@@ -36,7 +36,7 @@ class Future:
 
 @dataclass(frozen=True, kw_only=True)
 class Past:
-    """What the denoiser is told of the past and of its role."""
+    """What the denoiser is told: of the past, of its role, and of what follows from both."""
 
     latents: Tensor
     """[B, K, C, h, w], oldest first."""
@@ -44,6 +44,12 @@ class Past:
     """[B, D], see ``relative_state.context_features``."""
     knows_actions: Tensor
     """[B] bool: the future's actions are given, not noise."""
+    foreseen: Tensor
+    """[B, T, MOTION_DIM] a first guess of the motion, of about unit scale."""
+    carried: Tensor
+    """[B, T, C, h, w] the newest frame, moved by that motion."""
+    in_view: Tensor
+    """[B, T, 1, h, w] how much of each of its cells was in view, 0 to 1."""
 
 
 class LatentDynamics(nn.Module):
@@ -63,9 +69,9 @@ class LatentDynamics(nn.Module):
         super().__init__()
         self._patch, self._grid = patch, latent_side // patch
         per_patch = latent_channels * patch * patch
-        features = 12 + MOTION_DIM * (context_frames - 1)
-        self.embed_patch = nn.Linear((1 + context_frames) * per_patch, width)
-        self.embed_vehicle = nn.Linear(MOTION_DIM + 2 * ACTION_DIM + 1, width)
+        features = features_dim(context_frames)
+        self.embed_patch = nn.Linear((2 + context_frames) * per_patch + patch * patch, width)
+        self.embed_vehicle = nn.Linear(2 * (MOTION_DIM + ACTION_DIM) + 1, width)
         self.frame_position = nn.Parameter(_SMALL * torch.randn(frames, 1, width))
         self.slot_position = nn.Parameter(_SMALL * torch.randn(self._grid**2 + 1, width))
         self.condition = nn.Sequential(
@@ -91,11 +97,14 @@ class LatentDynamics(nn.Module):
         told = torch.cat([angle.sin(), angle.cos(), past.features, known], dim=-1)
         modulation = self.condition(told).unflatten(-1, (MODULATIONS, -1))
         given = past.latents.flatten(1, 2).unsqueeze(1).expand(-1, frames, -1, -1, -1)
-        patches = self.embed_patch(self._patches(torch.cat([noisy.latents, given], dim=2)))
+        seen = torch.cat([noisy.latents, given, past.carried, past.in_view], dim=2)
+        patches = self.embed_patch(self._patches(seen))
         known_of_frame = known.unsqueeze(1).expand(-1, frames, -1)
         # Sticks are rates: what they add up to is nearly what they do.
         so_far = noisy.actions.cumsum(dim=1) / frames**0.5
-        vehicle = torch.cat([noisy.motion, noisy.actions, so_far, known_of_frame], dim=-1)
+        vehicle = torch.cat(
+            [noisy.motion, past.foreseen, noisy.actions, so_far, known_of_frame], dim=-1
+        )
         tokens = torch.cat([patches, self.embed_vehicle(vehicle).unsqueeze(2)], dim=2)
         tokens = tokens + self.frame_position + self.slot_position
         for layer in self.layers:

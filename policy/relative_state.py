@@ -56,11 +56,40 @@ def state_after(now: Tensor, motion: Tensor) -> Tensor:
     return torch.cat([velocity, quaternion, rates, force], dim=-1)
 
 
+def poses_after(now: Tensor, motion: Tensor, dt_s: float) -> tuple[Tensor, Tensor]:
+    """Where motions [B, T, 15] lead, each ``dt_s`` after the one before, in the body axes of now.
+
+    Args:
+        now: [B, 13], SI units; the first motion is ``dt_s`` later.
+        motion: from ``now``.
+        dt_s: s.
+
+    Returns:
+        Rotations [B, T, 3, 3] to the axes of now from those of then, and positions [B, T, 3] in m.
+    """
+    to_body = _matrix(now[:, QUATERNION]).transpose(-1, -2)
+    start_mps = (to_body @ now[:, VELOCITY, None]).transpose(-1, -2)
+    ends_mps = start_mps + motion[..., VELOCITY]
+    begins_mps = torch.cat([start_mps, ends_mps[:, :-1]], dim=1)
+    position_m = dt_s * (0.5 * (begins_mps + ends_mps)).cumsum(dim=1)
+    return _orthonormal(motion[..., _ROTATION]), position_m
+
+
+def vertical_in_body(states: Tensor) -> Tensor:
+    """States [..., 13] -> the third axis of their world [..., 3], in body axes."""
+    return _matrix(states[..., QUATERNION])[..., 2, :]
+
+
+def features_dim(context_frames: int) -> int:
+    """Of ``context_features``."""
+    return 12 + MOTION_DIM * (context_frames - 1)
+
+
 def context_features(states: Tensor, contract: Contract) -> Tensor:
     """The last states [B, K, 13], oldest first -> what a net is told of them, of size about 1.
 
     The newest as ``preprocess.egocentric`` makes it, then the motions back to the older ones:
-    [B, 12 + 15 (K - 1)].
+    [B, features_dim(K)].
     """
     now = states[:, -1:]
     scale = now.new_tensor(egocentric_scale(contract)[:12])

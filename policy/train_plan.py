@@ -16,7 +16,7 @@ from policy.contract import PolicyError
 from policy.dataset import Nanoseconds
 from policy.resnet_unet import ResnetUnetConfig
 from policy.toge import TogeConfig
-from policy.world_model import WorldModelConfig
+from policy.world_model_config import WorldModelConfig
 
 Precision = Literal["auto", "bf16", "f32"]
 Check: TypeAlias = Callable[[Path], float]
@@ -185,7 +185,9 @@ class WorldTrainSettings(RunSettings):
     window_batch_size: int = 8
     """Windows a step while the dynamics learns."""
     autoencoder_share: float = 0.25
-    """Of the budget; the dynamics has the rest."""
+    """Of the budget; the dynamics has the rest, or with ``autoencoder_of`` all of it."""
+    autoencoder_of: Path | None = None
+    """A world model whose autoencoder is kept as it is; the dynamics learns anew."""
     decision_share: float = 0.3
     """Of the windows, those in which the actions are to be found."""
 
@@ -202,7 +204,7 @@ class WorldTrainSettings(RunSettings):
     @property
     def stages(self) -> tuple[Span, Span]:
         """Of the run, in order."""
-        turn = self.autoencoder_share
+        turn = self.autoencoder_share if self.autoencoder_of is None else 0.0
         return (
             Span(name="autoencoder", start=0.0, end=turn),
             Span(name="dynamics", start=turn, end=1.0),

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from policy.contract import PolicyError
 from policy.dataset import DatasetError, Episode, common_frame, hold_out
 from policy.dataset_frames import store_frames
 from policy.dataset_time import Indices
@@ -32,7 +33,7 @@ from policy.train_world_model import (
     validate_world_model,
 )
 from policy.world_model import WorldModel
-from policy.world_model_checkpoint import save_world_model
+from policy.world_model_checkpoint import load_world_model, save_world_model
 
 AUTOENCODER, DYNAMICS = 0, 1
 """Stages, in the order of ``WorldTrainSettings.stages``."""
@@ -60,6 +61,7 @@ def train_world_model(
     Raises:
         DatasetError: flights that cannot be learned from.
         TrainingError: a run that cannot be resumed, kept, or that diverged.
+        PolicyError: an autoencoder to keep that does not fit.
     """
     folder = open_run(settings, episodes)
     if (frame := common_frame(list(episodes))) != settings.model.contract.state_frame:
@@ -285,6 +287,7 @@ class _Run:
             "seed": settings.seed,
             "mirror": settings.mirror,
             "decision_share": settings.decision_share,
+            "autoencoder": "trained" if settings.autoencoder_of is None else "kept",
             "validation": position.kept,
         }
         training = json.dumps(card, sort_keys=True)
@@ -292,14 +295,27 @@ class _Run:
 
 
 def _new_model(settings: WorldTrainSettings) -> WorldModel:
-    """Random weights of the seed; the process's random stream stays as it was."""
+    """Random weights of the seed, but for an autoencoder that is kept.
+
+    The process's random stream stays as it was.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         model = WorldModel(settings.model)
+    if (path := settings.autoencoder_of) is not None:
+        kept = load_world_model(path)
+        for name in ("image_size", "latent_channels", "autoencoder_widths"):
+            its, ours = (getattr(config, name) for config in (kept.config, settings.model))
+            if its != ours:
+                raise PolicyError(
+                    f"--start-from {path}: its autoencoder has {name} {its}, this model {ours}: "
+                    "ask for the same, or leave out --start-from"
+                )
+        model.autoencoder.load_state_dict(kept.autoencoder.state_dict())
     return model.to(settings.device)
 
 
 def _learn(model: WorldModel, stage: int) -> None:
     """Only what is trained in a stage may move."""
+    model.requires_grad_(stage == DYNAMICS)
     model.autoencoder.requires_grad_(stage == AUTOENCODER)
-    model.dynamics.requires_grad_(stage == DYNAMICS)

@@ -19,7 +19,7 @@ from policy.dataset_windows import Windows
 from policy.relative_state import MOTION_DIM
 from policy.train_batches import VALIDATION_KEY, PooledStore, next_of
 from policy.train_parallel import row_parts
-from policy.world_model import WorldModelConfig
+from policy.world_model_config import WorldModelConfig
 
 CONTEXT_NOISE = 0.2
 """Largest sigma on the latents of the past, of their unit scale: in a rollout the past is itself

@@ -6,13 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from policy.carried_view import Poses, View
 from policy.contract import STATE_DIM, VELOCITY
 from policy.dataset_samples import STICK_SIGNS, mirror_signs
 from policy.dataset_time import Indices
 from policy.dataset_windows import Windows
 from policy.frame_autoencoder import to_unit
-from policy.latent_dynamics import Future, Past
-from policy.relative_state import MOTION_SCALE, context_features, motion_since
+from policy.latent_dynamics import Future
+from policy.relative_state import MOTION_SCALE, motion_since
 from policy.train_batches import PooledStore
 from policy.train_parallel import StepLoss
 from policy.train_report import WorldValidation
@@ -33,6 +34,10 @@ latent is off by half of their variance one frame on; pixels are hardly the wors
 LOOKED_AT_WEIGHT = 10.0
 """Of the squared error of decoded pixels, full scale 2: not all errors of latents can be seen."""
 MOTION_WEIGHT, ACTION_WEIGHT = 0.5, 0.5
+FORESEEN_WEIGHT = 0.5
+"""Of the squared error of the motion that is foreseen before anything is denoised."""
+CARRIED_WEIGHT = 1.0
+"""Of the absolute error of pixels of frames moved by the true motion: what nearness learns from."""
 MIN_MOTION_STD = 0.05
 """Of ``MOTION_SCALE``: what hardly changes does not count more than this makes it."""
 MIN_STICK_STD = 0.1
@@ -79,17 +84,16 @@ def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
     context = config.context_frames
     latents = _normalised_latents(model, batch.latents)
     past_states, states = batch.states[:, :context], batch.states[:, context:]
-    motion = motion_since(past_states[:, -1:], states)
+    with torch.autocast(states.device.type, enabled=False):  # angles need all their digits
+        motion = motion_since(past_states[:, -1:], states)
     clean = Future(
         latents=latents[:, context:],
         motion=model.normalise_motion(motion),
         actions=model.normalise_actions(batch.actions),
     )
-    past = Past(
-        latents=latents[:, :context] + batch.context_noise,
-        features=context_features(past_states, config.contract),
-        knows_actions=batch.knows_actions,
-    )
+    past_latents = latents[:, :context] + batch.context_noise
+    view = model.view(past_latents[:, -1], past_states[:, -1])
+    past = model.foresee(view, past_latents, past_states, clean.actions, batch.knows_actions)
     add, timestep = config.schedule.add_noise, batch.timestep
     knows = batch.knows_actions.view(-1, 1, 1)
     noisy = Future(
@@ -99,22 +103,46 @@ def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
     )
     made = model.denoise(noisy, timestep, past)
     picture = ((made.latents.float() - clean.latents) / model.change_std).square().mean()
-    pixels = _seen_error(model, made.latents, clean.latents, batch.looked_at)
+    true = _seen(model, clean.latents, batch.looked_at).detach()
+    pixels = (_seen(model, made.latents, batch.looked_at) - true).square().mean()
+    poses = model.poses(past_states[:, -1], motion).of(batch.looked_at)
+    carried = _carried_error(model, view, poses, true)
     vehicle = (made.motion.float() - clean.motion).square().mean()
+    foreseen = (past.foreseen - clean.motion).square().mean()
     # Known sticks are told as they are given: no error.
     sticks = (made.actions.float() - clean.actions).square().mean()
-    loss = picture + MOTION_WEIGHT * vehicle + ACTION_WEIGHT * sticks + LOOKED_AT_WEIGHT * pixels
-    told = {"loss": loss, "latents": picture, "pixels": pixels, "motion": vehicle, "sticks": sticks}
+    loss = (
+        picture
+        + LOOKED_AT_WEIGHT * pixels
+        + CARRIED_WEIGHT * carried
+        + MOTION_WEIGHT * vehicle
+        + FORESEEN_WEIGHT * foreseen
+        + ACTION_WEIGHT * sticks
+    )
+    told = {
+        "loss": loss,
+        "latents": picture,
+        "pixels": pixels,
+        "carried": carried,
+        "motion": vehicle,
+        "foreseen": foreseen,
+        "sticks": sticks,
+    }
     return StepLoss(total=loss, told=told)
 
 
-def _seen_error(model: WorldModel, made: Tensor, clean: Tensor, looked_at: Tensor) -> Tensor:
-    """Squared error [] of the frames ``looked_at`` [B, n] of two futures, full scale 2."""
-    coder, window = model.autoencoder, torch.arange(len(made), device=made.device)[:, None]
-    ours, theirs = (x[window, looked_at].flatten(0, 1) for x in (made, clean))
-    with torch.no_grad():
-        true = coder.reconstruct(coder.denormalise(theirs))
-    return (coder.reconstruct(coder.denormalise(ours)).float() - true.float()).square().mean()
+def _seen(model: WorldModel, latents: Tensor, looked_at: Tensor) -> Tensor:
+    """Frames [B, n, 3, H, W] with numbers [B, n] of futures [B, T, C, h, w]; full scale 2."""
+    coder, window = model.autoencoder, torch.arange(len(latents), device=latents.device)[:, None]
+    chosen = latents[window, looked_at]
+    seen = coder.reconstruct(coder.denormalise(chosen.flatten(0, 1)))
+    return seen.float().reshape(*chosen.shape[:2], *seen.shape[1:])
+
+
+def _carried_error(model: WorldModel, view: View, poses: Poses, true: Tensor) -> Tensor:
+    """Absolute error [] of the newest frame moved to other poses, where it was in view."""
+    made, in_view = model.moved(view, poses)
+    return ((made - true).abs().mean(dim=2) * in_view).mean()
 
 
 def _normalised_latents(model: WorldModel, latents: Tensor) -> Tensor:

@@ -4,108 +4,36 @@
 
 Two frames and states are the context. One net plays both roles: *simulation*, where the actions are
 given and latents and states are denoised, and *decision*, where the actions are denoised too.
+
+Before it denoises, the model foresees the motion and moves the newest frame by it: what was in view
+already is carried along, sharp as it is, and the denoiser has to paint the rest.
 """
 
-import json
-import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy.contract import ACTION_DIM, STATE_DIM, Contract, PolicyError
-from policy.diffusion import DdimStep, NoiseSchedule
+from policy.carried_view import CarriedView, Poses, View
+from policy.contract import ACTION_DIM, STATE_DIM, PolicyError
+from policy.diffusion import DdimStep
+from policy.foresight import Foresight
 from policy.frame_autoencoder import FACTOR, FrameAutoencoder, to_bytes, to_unit
-from policy.latent_dynamics import HEAD_DIM, Future, LatentDynamics, Past
-from policy.relative_state import MOTION_DIM, MOTION_SCALE, context_features, state_after
+from policy.latent_dynamics import Future, LatentDynamics, Past
+from policy.relative_state import (
+    MOTION_DIM,
+    MOTION_SCALE,
+    context_features,
+    features_dim,
+    poses_after,
+    state_after,
+    vertical_in_body,
+)
+from policy.world_model_config import WorldModelConfig
 
 LIMIT = 6.0
 """Estimates of what has unit scale are clipped to so many standard deviations."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class WorldModelConfig:
-    """Shape of a world model.
-
-    Raises:
-        PolicyError: a field is out of its range.
-    """
-
-    image_size: int = 64
-    """Side of the square frames, px."""
-    latent_channels: int = 8
-    frames: int = 16
-    """Frames, states and actions in one imagined future."""
-    context_frames: int = 2
-    """Frames and states of the past, the newest of them now."""
-    frame_dt_s: float = 0.1
-    """Time between two frames. Action k is the mean stick from frame k - 1 (the last of the context
-    for k = 0) to frame k, state k is that at the exposure of frame k."""
-    autoencoder_widths: tuple[int, int, int] = (24, 40, 56)
-    patch: int = 2
-    """Latents on a side of one token."""
-    dynamics_width: int = 128
-    dynamics_depth: int = 5
-    contract: Contract = field(default_factory=Contract)
-    """Its ``state_frame`` is the states'; a model and a policy of two frames do not go together.
-    What else it says is about policies: ``image_size`` and ``frame_dt_s`` are the model's own."""
-    schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be built."""
-        for name, low, high in (
-            ("image_size", 16, 1024),
-            ("latent_channels", 1, 64),
-            ("frames", 1, 256),
-            ("context_frames", 1, 16),
-            ("patch", 1, 8),
-            ("dynamics_width", HEAD_DIM, 4096),
-            ("dynamics_depth", 1, 64),
-        ):
-            value = getattr(self, name)
-            if not isinstance(value, int) or not low <= value <= high:
-                raise PolicyError(f"{name} must be an integer in {low}..{high}, got {value!r}")
-        if self.image_size % (FACTOR * self.patch):
-            raise PolicyError(
-                f"image_size must be a multiple of {FACTOR * self.patch} ({FACTOR} pixels a "
-                f"latent, {self.patch} latents a token), got {self.image_size}"
-            )
-        if self.dynamics_width % HEAD_DIM:
-            raise PolicyError(f"dynamics_width must be a multiple of {HEAD_DIM}")
-        if len(self.autoencoder_widths) != 3 or min(self.autoencoder_widths) < 1:
-            raise PolicyError(f"autoencoder_widths must be three, got {self.autoencoder_widths}")
-        if not (math.isfinite(self.frame_dt_s) and 0.01 <= self.frame_dt_s <= 1):
-            raise PolicyError(f"frame_dt_s must be 0.01 to 1 second, got {self.frame_dt_s}")
-        if self.schedule.prediction != "sample":
-            raise PolicyError("the schedule of a world model must predict the sample")
-
-    @property
-    def latent_side(self) -> int:
-        """Latents on a side of a frame."""
-        return self.image_size // FACTOR
-
-    def to_json(self) -> str:
-        """Header form of a checkpoint, without the contract."""
-        data = {name: value for name, value in asdict(self).items() if name != "contract"}
-        return json.dumps(data, sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str, contract: Contract) -> "WorldModelConfig":
-        """Read the header form.
-
-        Raises:
-            PolicyError: not of this form, or values out of range.
-        """
-        try:
-            data = json.loads(text)
-            known = {each.name for each in fields(cls)} - {"contract"}
-            if set(data) != known:
-                raise PolicyError(f"it must hold {sorted(known)}, not {sorted(data)}")
-            data["schedule"] = NoiseSchedule(**data["schedule"])
-            data["autoencoder_widths"] = tuple(data["autoencoder_widths"])
-            return cls(contract=contract, **data)
-        except (TypeError, ValueError, RecursionError) as error:  # JSON's error is a ValueError
-            raise PolicyError(f"malformed world model {text[:200]!r}: {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +67,17 @@ class WorldModel(nn.Module):
             width=config.dynamics_width,
             depth=config.dynamics_depth,
         )
+        self.foresight = Foresight(
+            features=features_dim(config.context_frames), frames=config.frames
+        )
+        self.carried_view = CarriedView(
+            latent_channels=config.latent_channels,
+            latent_side=config.latent_side,
+            image_size=config.image_size,
+            horizontal_fov_rad=config.horizontal_fov_rad,
+            camera_tilt_rad=config.camera_tilt_rad,
+            state_frame=config.contract.state_frame,
+        )
         self.motion_mean: Tensor
         self.motion_std: Tensor
         self.action_mean: Tensor
@@ -167,7 +106,7 @@ class WorldModel(nn.Module):
             )
         coder = self.autoencoder
         # A contiguous copy of each: kernels are chosen by the strides, which tell of the batch.
-        means = [coder.posterior(_alone(to_unit(image[None])))[0] for image in images]
+        means = [coder.posterior(_in_one_layout(to_unit(image[None])))[0] for image in images]
         if not means:
             return torch.empty(0, *self._latent_shape, device=images.device)
         return coder.normalise(torch.cat(means))
@@ -189,7 +128,7 @@ class WorldModel(nn.Module):
             )
         coder = self.autoencoder
         frames = [
-            to_bytes(coder.reconstruct(_alone(coder.denormalise(latent[None]))))
+            to_bytes(coder.reconstruct(_in_one_layout(coder.denormalise(latent[None]))))
             for latent in latents
         ]
         if not frames:
@@ -231,11 +170,9 @@ class WorldModel(nn.Module):
             noisy = Future(
                 latents=noisy.latents, motion=noisy.motion, actions=self.normalise_actions(actions)
             )
-        past = Past(
-            latents=latents,
-            features=context_features(states, self.config.contract),
-            knows_actions=torch.full((batch,), sim_mode, device=device),
-        )
+        knows_actions = torch.full((batch,), sim_mode, device=device)
+        view = self.view(latents[:, -1], states[:, -1])
+        past = self.foresee(view, latents, states, noisy.actions, knows_actions)
         for step in steps:
             noisy = self._ddim_update(step, noisy, past)
         motion = noisy.motion * self.motion_std + self.motion_mean
@@ -248,13 +185,72 @@ class WorldModel(nn.Module):
             video=None if video is None else video.reshape(batch, -1, *video.shape[1:]),
         )
 
+    def foresee(
+        self,
+        view: View,
+        latents: Tensor,
+        states: Tensor,
+        actions: Tensor,
+        knows_actions: Tensor,
+    ) -> Past:
+        """What is known before anything is denoised: the same for every step of a sample.
+
+        Takes about as long as two of these steps: each frame that was moved is encoded.
+
+        Args:
+            view: the newest frame.
+            latents: [B, context_frames, C, h, w] of the last frames, oldest first.
+            states: [B, context_frames, 13] at their exposures, SI units, the contract's frame.
+            actions: [B, frames, 4] of about unit scale; anything where they are not known.
+            knows_actions: [B] bool.
+        """
+        with torch.autocast(latents.device.type, enabled=False):  # angles need all their digits
+            features = context_features(states, self.config.contract)
+            foreseen = self.foresight(features, actions, knows_actions)
+        with torch.no_grad():
+            motion = foreseen * self.motion_std + self.motion_mean
+            poses = self.poses(states[:, -1], motion)
+            carried, in_view = self._carried(view, poses)
+        return Past(
+            latents=latents,
+            features=features,
+            knows_actions=knows_actions,
+            foreseen=foreseen,
+            carried=carried,
+            in_view=in_view,
+        )
+
+    def view(self, latents: Tensor, state: Tensor) -> View:
+        """The newest frame [B, C, h, w], seen in state [B, 13], as ``CarriedView`` moves it."""
+        coder = self.autoencoder
+        with torch.no_grad():
+            pixels = coder.reconstruct(_in_one_layout(coder.denormalise(latents)))
+        with torch.autocast(latents.device.type, enabled=False):
+            vertical = vertical_in_body(state)
+            return self.carried_view.view(pixels.float().clamp(-1.0, 1.0), latents, vertical)
+
+    def poses(self, state: Tensor, motion: Tensor) -> Poses:
+        """Where motions [B, frames, 15] in SI units lead from a state [B, 13]."""
+        with torch.autocast(state.device.type, enabled=False):
+            rotation, position_m = poses_after(state, motion, self.config.frame_dt_s)
+        progress = torch.arange(1, motion.shape[1] + 1, device=state.device) / motion.shape[1]
+        return Poses(
+            rotation=rotation, position_m=position_m, progress=progress.expand(len(state), -1)
+        )
+
+    def moved(self, view: View, poses: Poses) -> tuple[Tensor, Tensor]:
+        """Frames [B, N, 3, H, W], and where in them was in view [B, N, H, W] bool."""
+        with torch.autocast(view.pixels.device.type, enabled=False):
+            return self.carried_view.moved(view, poses)
+
     def denoise(self, noisy: Future, timestep: Tensor, past: Past) -> Future:
         """One network call: the estimate of the clean future, x_0.
 
-        The net tells latents as a change of the last frame's, in units of how much they change in
-        so many steps: one that knows nothing says that nothing moves. Given the actions most of a
-        future is no matter of chance, so x_0 is what it can tell best at every level of noise, and
-        few steps lose little.
+        The net tells latents as a change of the frame that was carried along, in units of how much
+        they change in so many steps, and the motion as a change of what was foreseen: one that
+        knows nothing says that all is as it seemed. Given the actions most of a future is no matter
+        of chance, so x_0 is what it can tell best at every level of noise, and few steps lose
+        little.
 
         Args:
             noisy: the future as ``Future`` has it; known actions in it are clean.
@@ -263,8 +259,8 @@ class WorldModel(nn.Module):
         """
         output = self.dynamics(noisy, timestep, past)
         return Future(
-            latents=past.latents[:, -1:] + self.change_std * output.latents,
-            motion=output.motion,
+            latents=past.carried + self.change_std * output.latents,
+            motion=past.foreseen + output.motion,
             actions=torch.where(past.knows_actions.view(-1, 1, 1), noisy.actions, output.actions),
         )
 
@@ -280,6 +276,14 @@ class WorldModel(nn.Module):
     def _latent_shape(self) -> tuple[int, int, int]:
         side = self.config.latent_side
         return self.config.latent_channels, side, side
+
+    def _carried(self, view: View, poses: Poses) -> tuple[Tensor, Tensor]:
+        """Latents of the moved frames, and how much of each of their cells was in view."""
+        pixels, in_view = self.moved(view, poses)
+        mean, _ = self.autoencoder.posterior(_in_one_layout(pixels.flatten(0, 1)))
+        latents = self.autoencoder.normalise(mean.float())
+        share = F.avg_pool2d(in_view.float(), FACTOR)
+        return latents.reshape(*pixels.shape[:2], *self._latent_shape), share.unsqueeze(2)
 
     def _ddim_update(self, step: DdimStep, noisy: Future, past: Past) -> Future:
         timestep = torch.full((len(noisy.latents),), step.timestep, device=noisy.latents.device)
@@ -331,6 +335,6 @@ class WorldModel(nn.Module):
                 raise PolicyError(f"{name} must be {list(wanted[name])}, got {list(array.shape)}")
 
 
-def _alone(image: Tensor) -> Tensor:
-    """A copy of [1, C, H, W] in the one memory layout that the convolutions are run in."""
-    return image.clone(memory_format=torch.channels_last)
+def _in_one_layout(images: Tensor) -> Tensor:
+    """A copy of [N, C, H, W] in the one memory layout that the convolutions are run in."""
+    return images.clone(memory_format=torch.channels_last)

@@ -14,7 +14,8 @@ from policy.checkpoint_file import (
     write_tensors,
 )
 from policy.contract import Contract, PolicyError
-from policy.world_model import WorldModel, WorldModelConfig
+from policy.world_model import WorldModel
+from policy.world_model_config import WorldModelConfig
 
 WORLD_MODEL_KEY = "world_model"
 """Of the header; a policy's file has ``architecture`` in its place."""

@@ -26,7 +26,8 @@ from mavbridge.rollout.sampling import Sampler
 from mavbridge.rollout.start import Start, read_start
 from mavbridge.rollout.streamed import StreamedOutput
 from policy.contract import Contract, Executable
-from policy.world_model import WorldModel, WorldModelConfig
+from policy.world_model import WorldModel
+from policy.world_model_config import WorldModelConfig
 from recordings import make_meta
 
 SIZE = 32

@@ -21,8 +21,9 @@ from mavbridge.rollout.run import make_output, run_rollout
 from mavbridge.rollout.sampling import Sampler
 from mavbridge.rollout.start import Start
 from policy.contract import QUATERNION, STATE_DIM
-from policy.world_model import WorldModel, WorldModelConfig
+from policy.world_model import WorldModel
 from policy.world_model_checkpoint import load_world_model
+from policy.world_model_config import WorldModelConfig
 
 MB = 1 << 20
 

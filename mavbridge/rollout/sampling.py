@@ -10,7 +10,8 @@ from torch import Tensor
 from mavbridge.clock import NS_PER_S, Clock
 from mavbridge.errors import MavbridgeError
 from mavbridge.records import FloatArray
-from policy.world_model import WorldModel, WorldModelConfig
+from policy.world_model import WorldModel
+from policy.world_model_config import WorldModelConfig
 
 
 class ImaginationError(MavbridgeError):

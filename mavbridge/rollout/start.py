@@ -14,7 +14,7 @@ from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import TickRow
 from mavbridge.records import FloatArray, ImageArray, Sticks
 from policy.preprocess import resize
-from policy.world_model import WorldModelConfig
+from policy.world_model_config import WorldModelConfig
 
 MAX_STATE_AGE_NS = 100_000_000
 """A frame whose last state is older starts nothing."""

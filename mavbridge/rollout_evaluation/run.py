@@ -34,7 +34,7 @@ from mavbridge.rollout_evaluation.runs import (
 from mavbridge.rollout_evaluation.tables import print_quality
 from mavbridge.rollout_evaluation.windows import WindowScorer
 from mavbridge.stopping import INTERRUPTED, stop_on_signals
-from policy.world_model import WorldModelConfig
+from policy.world_model_config import WorldModelConfig
 
 ShouldStop = Callable[[], bool]
 _YAW_RATE = "pilot_yaw_rate_degps"

@@ -16,7 +16,7 @@ from policy.dataset import DatasetError, Episode
 from policy.dataset_flights import find_flights, is_exemplary, read_flight
 from policy.dataset_windows import Windows, find_windows
 from policy.preprocess import resize
-from policy.world_model import WorldModelConfig
+from policy.world_model_config import WorldModelConfig
 
 Indices = NDArray[np.int64]
 

@@ -25,8 +25,9 @@ from policy.train_state import TrainingError
 from policy.train_world import train_world_model
 from policy.train_world_batches import CONTEXT_NOISE, WindowBatches, frame_batch
 from policy.train_world_model import autoencoder_loss, dynamics_loss, psnr_db, set_scales
-from policy.world_model import WorldModel, WorldModelConfig
+from policy.world_model import WorldModel
 from policy.world_model_checkpoint import load_world_model
+from policy.world_model_config import WorldModelConfig
 from steered_flights import steered_flight
 
 MODEL = WorldModelConfig(
@@ -111,6 +112,8 @@ def test_sticks_tell_how_the_vehicle_will_move(
         losses = [line["loss"] for line in log if line["stage"] == stage and "loss" in line]
         assert losses[-1] < 0.7 * losses[0]
     assert {"latents", "motion", "sticks", "learning_rate", "spent_s"} <= set(log[-2])
+    foretold = [line["foreseen"] for line in log if "foreseen" in line]
+    assert foretold[-1] < 0.5 * foretold[0]
     assert [path.name for path in made.work_folder.iterdir()] == ["log.jsonl"]
 
 
@@ -172,6 +175,24 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(
 def _weights(path: Path) -> dict[str, bytes]:
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name).numpy().tobytes() for name in file.keys()}  # noqa: SIM118
+
+
+def test_an_autoencoder_that_is_kept_stays_as_it_is(
+    episodes: list[Episode], whole: TrainResult, tmp_path: Path
+) -> None:
+    stages: set[str] = set()
+    made = settings(tmp_path, autoencoder_of=whole.checkpoint)
+    result = run(episodes, made, lambda progress: stages.add(progress.stage))
+    assert result.steps == 6
+    assert "dynamics" in stages
+    assert "autoencoder" not in stages
+    before, after = (_weights(path) for path in (whole.checkpoint, result.checkpoint))
+    kept = [name for name in before if name.startswith(("autoencoder.enc", "autoencoder.dec"))]
+    assert kept
+    assert all(before[name] == after[name] for name in kept)
+    assert any(before[name] != after[name] for name in before if name.startswith("dynamics"))
+    with pytest.raises(PolicyError, match="latent_channels 4, this model 8"):
+        run(episodes, replace(made, model=replace(MODEL, latent_channels=8)))
 
 
 def test_a_budget_of_time_ends_with_a_checkpoint(episodes: list[Episode], tmp_path: Path) -> None:
@@ -273,17 +294,20 @@ def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
         assert float(told["latents"]) > 0
 
 
-def test_a_net_that_says_nothing_copies_the_last_frame_at_a_loss_of_one(tmp_path: Path) -> None:
+def test_the_change_of_latents_is_in_units_of_what_copying_the_last_frame_costs(
+    tmp_path: Path,
+) -> None:
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
     latents = latents_of(91, tmp_path / "latents", mirror=False)
     model = WorldModel(MODEL)
     set_scales(model, windows, latents, mirrors=False)
-    model.dynamics.out_patch.weight.data.zero_()
     every = WindowBatches(windows, latents, MODEL, seed=0, mirrors=False, decision_share=0.0)
+    batch = every.validation(len(windows))[0]
+    normal = model.autoencoder.normalise(batch.latents.flatten(0, 1)).unflatten(0, (-1, 6))
+    cost = ((normal[:, 2:] - normal[:, 1:2]) / model.change_std).square().mean()
+    assert float(cost) == pytest.approx(1.0, abs=1e-3)
     with torch.inference_mode():
-        told = dynamics_loss(model, every.validation(len(windows))[0]).told
-    assert float(told["latents"]) == pytest.approx(1.0, abs=1e-3)
-    assert float(told["pixels"]) > 0
+        assert float(dynamics_loss(model, batch).told["pixels"]) > 0
 
 
 def test_the_autoencoder_sees_neighbours_and_pays_for_what_changes(tmp_path: Path) -> None:

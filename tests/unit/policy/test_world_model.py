@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional
 
 from policy.contract import QUATERNION, Contract, PolicyError
 from policy.diffusion import NoiseSchedule
-from policy.latent_dynamics import Future, Past
-from policy.relative_state import MOTION_DIM, context_features
-from policy.world_model import Imagined, WorldModel, WorldModelConfig
+from policy.latent_dynamics import Future
+from policy.relative_state import MOTION_DIM
+from policy.world_model import Imagined, WorldModel
+from policy.world_model_config import WorldModelConfig
 
 SMALL = WorldModelConfig(
     image_size=32,
@@ -138,23 +140,92 @@ def test_gradient_reaches_every_weight() -> None:
         motion=torch.randn(2, 4, MOTION_DIM),
         actions=torch.randn(2, 4, 4),
     )
-    past = Past(
-        latents=latents,
-        features=context_features(states, SMALL.contract),
-        knows_actions=torch.tensor([True, False]),
-    )
+    known = torch.tensor([True, False])
+    view = model.view(latents[:, -1], states[:, -1])
+    past = model.foresee(view, latents, states, noisy.actions, known)
     made = model.denoise(noisy, torch.tensor([3, 99]), past)
     assert torch.equal(made.actions[0], noisy.actions[0])
     loss = loss + sum(part.square().mean() for part in vars(made).values())
+    poses = model.poses(states[:, -1], torch.ones(2, 4, MOTION_DIM))
+    loss = loss + model.moved(view, poses)[0].square().mean()
     loss.backward()
     for name, weight in model.named_parameters():
         assert weight.grad is not None, name
         assert weight.grad.abs().sum() > 0, name
 
 
-def test_the_shipped_size_fits_in_three_megabytes() -> None:
+def test_what_is_not_known_of_the_sticks_is_not_looked_at(model: WorldModel) -> None:
+    latents, states = context(2)
+    view = model.view(latents[:, -1], states[:, -1])
+    known, unknown = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool)
+
+    def foreseen(knows: Tensor, given: Tensor) -> Tensor:
+        return model.foresee(view, latents, states, given, knows).carried
+
+    given, other = actions(2), -actions(2)
+    assert torch.equal(foreseen(unknown, given), foreseen(unknown, other))
+    assert not torch.equal(foreseen(known, given), foreseen(known, other))
+
+
+class CellCoder(nn.Module):
+    """In place of an autoencoder: each latent is the colour of its cell."""
+
+    def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        return functional.avg_pool2d(images, 8), images
+
+    def reconstruct(self, latents: Tensor) -> Tensor:
+        return functional.interpolate(latents, scale_factor=8)
+
+    def normalise(self, latents: Tensor) -> Tensor:
+        return latents
+
+    denormalise = normalise
+
+
+class Prophet(nn.Module):
+    """In place of a foresight: knows the yaw of each frame, of unit scale as it is given."""
+
+    def __init__(self, yaw_rad: Tensor) -> None:
+        super().__init__()
+        self._yaw_rad = yaw_rad
+
+    def forward(self, features: Tensor, actions: Tensor, knows_actions: Tensor) -> Tensor:
+        motion = torch.zeros(len(features), len(self._yaw_rad), MOTION_DIM)
+        motion[..., 3], motion[..., 4] = self._yaw_rad.cos() - 1, self._yaw_rad.sin()
+        motion[..., 6], motion[..., 7] = -self._yaw_rad.sin(), self._yaw_rad.cos() - 1
+        return motion
+
+
+def test_a_net_that_says_nothing_shows_the_last_frame_turned_as_was_foreseen() -> None:
+    config = replace(SMALL, image_size=64, latent_channels=3, camera_tilt_rad=0.0)
+    model = WorldModel(config).eval()
+    # By the first yaw, a column of cells comes to where its left neighbour was, in the middle.
+    yaw_rad = torch.tensor([0.0, 1.0, -1.0, 3.0]) * torch.tensor(8 / 32).atan()
+    model.autoencoder, model.foresight = CellCoder(), Prophet(yaw_rad)  # type: ignore[assignment]
+    model.motion_std.fill_(1.0)
+    for out in (model.dynamics.out_patch, model.dynamics.out_vehicle):
+        out.weight.data.zero_()
+    latents = torch.zeros(1, 2, 3, 8, 8)
+    latents[:, 1, 0, :, 4] = 1.0  # right of the middle
+    states = torch.zeros(1, 2, 13)
+    states[..., QUATERNION.start] = 1.0
+    made = model.sample(
+        latents, states, actions(1), ddim_steps=2, noise_seed=0, sim_mode=True
+    ).latents[0, :, 0]
+    torch.testing.assert_close(made[0], latents[0, 1, 0], atol=1e-4, rtol=0)
+    assert (made[1, 3:5].argmax(dim=-1) == 3).all()
+    assert (made[2, 3:5].argmax(dim=-1) == 5).all()
+    view = model.view(latents[:, -1], states[:, -1])
+    known = torch.ones(1, dtype=torch.bool)
+    in_view = model.foresee(view, latents, states, actions(1), known).in_view[0, :, 0]
+    assert (in_view[0] == 1).all()
+    assert (in_view[3, :, -1] == 0).all()  # has come in from the right
+    assert (in_view[3, 3:5, 0] == 1).all()
+
+
+def test_the_shipped_size_fits_in_four_megabytes() -> None:
     weights = sum(weight.numel() for weight in WorldModel(WorldModelConfig()).parameters())
-    assert 2 * weights < 3_000_000
+    assert 2 * weights < 4_000_000
 
 
 def test_inputs_that_do_not_fit_are_refused(model: WorldModel) -> None:
@@ -198,6 +269,8 @@ def test_shapes_that_cannot_be_built_are_refused() -> None:
         ({"dynamics_width": 48}, "multiple of 32"),
         ({"frame_dt_s": float("nan")}, "frame_dt_s"),
         ({"autoencoder_widths": (8, 8)}, "autoencoder_widths"),
+        ({"horizontal_fov_rad": 90.0}, "rad, got 90"),
+        ({"camera_tilt_rad": float("nan")}, "camera_tilt_rad"),
         ({"schedule": NoiseSchedule(prediction="epsilon")}, "predict the sample"),
     ):
         with pytest.raises(PolicyError, match=says):
