@@ -26,23 +26,27 @@ def status_of(*arguments: str) -> int:
     return stopped.value.code
 
 
-def test_a_checkpoint_is_trained_and_loads_to_fly(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def trained(folder: Path, *asked: str, seconds: float) -> Path:
+    """Train on two short flights, on one thread."""
     for seed in range(2):
-        write_spot_flight(tmp_path / "flights" / str(seed), seed, seconds=0.5)
-    out = tmp_path / "trained.safetensors"
+        write_spot_flight(folder / "flights" / str(seed), seed, seconds=seconds)
+    out = folder / "trained.safetensors"
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        asked = ("--policy", "toge:small:resnet18", "--image-size", "32", "--steps", "3")
-        status = status_of(
-            str(tmp_path / "flights"), "--out", str(out), *asked, "--batch-size", "4"
-        )
+        status = status_of(str(folder / "flights"), "--out", str(out), *asked, "--batch-size", "4")
     finally:
         torch.set_num_threads(threads)
+    assert status == 0
+    return out
+
+
+def test_a_checkpoint_is_trained_and_loads_to_fly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("--policy", "toge:small:resnet18", "--image-size", "32", "--steps", "3")
+    out = trained(tmp_path, *asked, seconds=0.5)
     printed = capsys.readouterr()
-    assert status == 0, printed.err
     assert "held-out loss" in printed.out
     assert "stick error" in printed.out
     loaded = load_policy(
@@ -68,20 +72,9 @@ def test_a_checkpoint_is_trained_and_loads_to_fly(
 def test_a_world_model_is_trained_by_the_same_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for seed in range(2):
-        write_spot_flight(tmp_path / "flights" / str(seed), seed, seconds=2.0)
-    out = tmp_path / "world.safetensors"
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        asked = ("--policy", "world-model", "--image-size", "32", "--steps", "2")
-        status = status_of(
-            str(tmp_path / "flights"), "--out", str(out), *asked, "--batch-size", "4"
-        )
-    finally:
-        torch.set_num_threads(threads)
+    asked = ("--policy", "world-model", "--image-size", "32", "--steps", "2")
+    out = trained(tmp_path, *asked, seconds=2.0)
     printed = capsys.readouterr()
-    assert status == 0, printed.err
     assert "imagined to" in printed.out
     model = load_world_model(out)
     assert model.config.image_size == 32

@@ -26,6 +26,7 @@ from policy.train_model import Trainee, gate_labels, gate_loss
 from policy.train_plan import Budget, TrainSettings, learning_rate_factor, make_stages
 from policy.train_report import Progress, TrainResult
 from policy.train_state import Position, RunFolder, TrainingError
+from training_runs import check_resuming, weights_of
 
 CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
 
@@ -112,24 +113,15 @@ def whole(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> 
 def test_a_killed_run_goes_on_as_if_it_had_not_been(
     episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int
 ) -> None:
-    def kill(progress: Progress) -> None:
-        if progress.validation is not None and progress.step == killed_at:
-            raise KeyboardInterrupt
+    def train_there(
+        episodes: list[Episode],
+        *,
+        resume: bool = False,
+        report: Callable[[Progress], None] = lambda _: None,
+    ) -> TrainResult:
+        return run(episodes, short_run(tmp_path, resume=resume), report)
 
-    with pytest.raises(KeyboardInterrupt):
-        run(episodes, short_run(tmp_path), kill)
-    with pytest.raises(TrainingError, match="--resume"):
-        run(episodes, short_run(tmp_path))
-    with pytest.raises(TrainingError, match="other flights or settings"):
-        run(episodes[:2], short_run(tmp_path, resume=True))
-    resumed = run(episodes, short_run(tmp_path, resume=True))
-    assert resumed == replace(whole, checkpoint=resumed.checkpoint)
-    assert _weights(resumed.checkpoint) == _weights(whole.checkpoint)
-
-
-def _weights(path: Path) -> dict[str, bytes]:
-    with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name).numpy().tobytes() for name in file.keys()}  # noqa: SIM118
+    check_resuming(train_there, episodes, whole, killed_at=killed_at)
 
 
 def test_resnet_unet_trains_too_and_an_ablation_is_a_weight_of_zero(
@@ -160,8 +152,8 @@ def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(
     further = replace(
         made, start_from=result.checkpoint, out=tmp_path / "next.safetensors", learning_rate=0.0
     )
-    again = _weights(run(episodes[:2], further).checkpoint)
-    before = _weights(result.checkpoint)
+    again = weights_of(run(episodes[:2], further).checkpoint)
+    before = weights_of(result.checkpoint)
     same = [name for name in before if before[name] == again[name]]
     assert "head.unet.out.weight" in same
     other = replace(further, policy=TogeConfig(backbone="resnet50", contract=CONTRACT))
@@ -177,7 +169,7 @@ def test_a_frozen_encoder_stays_and_the_head_learns(
     )
     stages: list[str] = []
     result = run(episodes, made, lambda progress: stages.append(progress.stage))
-    before, after = _weights(whole.checkpoint), _weights(result.checkpoint)
+    before, after = weights_of(whole.checkpoint), weights_of(result.checkpoint)
     encoder = [name for name in before if name.startswith("backbone.")]
     assert [name for name in encoder if before[name] != after[name]] == []
     assert before["head.unet.out.weight"] != after["head.unet.out.weight"]

@@ -29,6 +29,7 @@ from policy.world_model import WorldModel
 from policy.world_model_checkpoint import load_world_model
 from policy.world_model_config import WorldModelConfig
 from steered_flights import steered_flight
+from training_runs import check_resuming, weights_of
 
 MODEL = WorldModelConfig(
     image_size=32,
@@ -157,24 +158,15 @@ def whole(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> 
 def test_a_killed_run_goes_on_as_if_it_had_not_been(
     episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int
 ) -> None:
-    def kill(progress: Progress) -> None:
-        if progress.validation is not None and progress.step == killed_at:
-            raise KeyboardInterrupt
+    def train_there(
+        episodes: list[Episode],
+        *,
+        resume: bool = False,
+        report: Callable[[Progress], None] = lambda _: None,
+    ) -> TrainResult:
+        return run(episodes, settings(tmp_path, resume=resume), report)
 
-    with pytest.raises(KeyboardInterrupt):
-        run(episodes, settings(tmp_path), kill)
-    with pytest.raises(TrainingError, match="--resume"):
-        run(episodes, settings(tmp_path))
-    with pytest.raises(TrainingError, match="other flights or settings"):
-        run(episodes[:2], settings(tmp_path, resume=True))
-    resumed = run(episodes, settings(tmp_path, resume=True))
-    assert resumed == replace(whole, checkpoint=resumed.checkpoint)
-    assert _weights(resumed.checkpoint) == _weights(whole.checkpoint)
-
-
-def _weights(path: Path) -> dict[str, bytes]:
-    with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name).numpy().tobytes() for name in file.keys()}  # noqa: SIM118
+    check_resuming(train_there, episodes, whole, killed_at=killed_at)
 
 
 def test_an_autoencoder_that_is_kept_stays_as_it_is(
@@ -186,7 +178,7 @@ def test_an_autoencoder_that_is_kept_stays_as_it_is(
     assert result.steps == 6
     assert "dynamics" in stages
     assert "autoencoder" not in stages
-    before, after = (_weights(path) for path in (whole.checkpoint, result.checkpoint))
+    before, after = (weights_of(path) for path in (whole.checkpoint, result.checkpoint))
     kept = [name for name in before if name.startswith(("autoencoder.enc", "autoencoder.dec"))]
     assert kept
     assert all(before[name] == after[name] for name in kept)
