@@ -125,7 +125,7 @@ def _draw_rates(axes: Axes, result: BenchResult) -> None:
     axes.set_xlim(0, 1.25 * max((flight.asked_action_hz for flight in flights), default=1))
     axes.set_xlabel("Hz; red: what was asked for")
     best = max((top.action_hz for top in result.top_rates if top.action_hz), default=None)
-    axes.set_title("Flying: rates" + (f" ({best:g} with < 0.1 % missed)" if best else ""))
+    axes.set_title("Rates" + (f" ({best:g} Hz with < 0.1 % missed)" if best else ""))
 
 
 def _flight_label(flight: Flight) -> str:
