@@ -103,7 +103,6 @@ def measure(effort: Effort, weights: Path | None, is_quick: bool, say: Say) -> R
             by_steps.append(_compare(device, iterations, steps, effort.repeats, weights))
     return RolloutBench(
         machine=machine(),
-        torch_threads=torch.get_num_threads(),
         quick=is_quick,
         world_model="random weights" if weights is None else weights.name,
         frames=FRAMES,
@@ -151,8 +150,8 @@ def print_result(result: RolloutBench, console: Console) -> None:
     here = result.machine
     console.print(
         Text(
-            f"{here.cpu}, {here.cores} cores, torch {here.torch} with {result.torch_threads} "
-            f"threads; world model: {result.world_model}; {result.frames} frames an iteration, "
+            f"{here.cpu}, {here.cores} cores, torch {here.torch}; world model: "
+            f"{result.world_model}; {result.frames} frames an iteration, "
             f"{result.exe_steps} executed"
         )
     )
@@ -173,6 +172,7 @@ def trial_table(result: RolloutBench) -> Table:
     columns = [
         "way",
         "iterations",
+        "threads",
         "decoded",
         "start",
         "wall",
@@ -185,7 +185,8 @@ def trial_table(result: RolloutBench) -> Table:
         table.add_column(name, justify="left" if name == "way" else "right")
     for trial in trials:
         cells = [
-            *(trial.way, str(trial.iterations), str(trial.frames_decoded)),
+            *(trial.way, str(trial.iterations), str(trial.torch_threads)),
+            str(trial.frames_decoded),
             *(number(trial.start_s, 2), number(trial.wall_s, 2), number(trial.sample_s, 2)),
             *(number(trial.decode_s, 2), number(trial.write_s, 2)),
             *(number(trial.peak_rss_mb, 0), number(trial.writer_rss_mb, 0)),

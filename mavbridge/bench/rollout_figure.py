@@ -23,7 +23,7 @@ def draw(result: RolloutBench, path: Path) -> None:
         here = result.machine
         figure.text(
             *(0.012, 0.015),
-            f"{here.cpu}, cores: {here.cores}, threads of torch: {result.torch_threads}; "
+            f"{here.cpu}, cores: {here.cores}; "
             f"{result.world_model}, {result.frames} frames an iteration",
             color=MUTED,
             fontsize=8.5,

@@ -19,6 +19,8 @@ class Trial:
     device: str
     iterations: int
     ddim_steps: int
+    torch_threads: int
+    """Of an operation: the plain way takes every core, ours leaves some for the decoder."""
     frames: int
     """In the video."""
     frames_decoded: int
@@ -70,7 +72,6 @@ class RolloutBench:
     """One run."""
 
     machine: Machine
-    torch_threads: int
     quick: bool
     world_model: str
     frames: int

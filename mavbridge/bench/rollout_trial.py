@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +19,7 @@ from mavbridge.rollout.deciders import WorldModelDecider
 from mavbridge.rollout.loop import rollout
 from mavbridge.rollout.plan import RolloutPlan
 from mavbridge.rollout.run import make_output, run_rollout
-from mavbridge.rollout.sampling import Sampler
+from mavbridge.rollout.sampling import Sampler, cores_left_free
 from mavbridge.rollout.start import Start
 from policy.contract import QUATERNION, STATE_DIM
 from policy.world_model import WorldModel
@@ -36,7 +37,9 @@ def main() -> None:
     if args.world_model is not None:
         model = load_world_model(args.world_model)
     model = model.to(args.device).eval()
-    with TemporaryDirectory(prefix="mavbridge-bench-") as folder:
+    # The plain way does one thing at a time: every core is for that.
+    cores = nullcontext() if args.way == "serial" else cores_left_free()
+    with cores, TemporaryDirectory(prefix="mavbridge-bench-") as folder:
         trial = _measure(model, args, Path(folder) / "rollout.mp4")
     args.out.write_text(json.dumps(asdict(trial)))
 
@@ -51,8 +54,8 @@ def _measure(model: WorldModel, args: argparse.Namespace, out: Path) -> Trial:
         seed=0,
     )
     start = _start(model.config)
-    _warm_up(model, plan, start)
     is_serial = args.way == "serial"
+    _warm_up(model, plan, start)
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=is_serial, clock=clock)
     decider = WorldModelDecider(sampler, from_pixels=False)
     writer_rss_mb: list[float | None] = []
@@ -81,6 +84,7 @@ def _measure(model: WorldModel, args: argparse.Namespace, out: Path) -> Trial:
         device=args.device,
         iterations=plan.iterations,
         ddim_steps=plan.ddim_steps,
+        torch_threads=torch.get_num_threads(),
         frames=output.frames,
         frames_decoded=sampler.meter.frames_decoded + output.frames_decoded,
         wall_s=(end_ns - start_ns) / NS_PER_S,

@@ -22,7 +22,7 @@ from mavbridge.rollout.loop import rollout
 from mavbridge.rollout.output import OnFrame, Output, ignore
 from mavbridge.rollout.plan import RolloutPlan
 from mavbridge.rollout.progress import RolloutProgress
-from mavbridge.rollout.sampling import Sampler
+from mavbridge.rollout.sampling import Sampler, cores_left_free
 from mavbridge.rollout.start import RealFrames, Start, read_start
 from mavbridge.rollout.streamed import StreamedOutput
 from mavbridge.stopping import INTERRUPTED, stop_on_signals
@@ -54,7 +54,8 @@ def imagine(config: ImagineConfig) -> int:
     start = read_start(flight, model.config, config.start_at)
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=config.serial, clock=clock)
     decider = _decider(config, sampler, clock, console)
-    with _onlooker(config, flight, sampler, start) as on_frame:
+    # Serially, too: how a sum is split up decides how it is rounded.
+    with cores_left_free(), _onlooker(config, flight, sampler, start) as on_frame:
         output = make_output(
             config.out,
             sampler,

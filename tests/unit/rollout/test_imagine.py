@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 
 from mavbridge.__main__ import main
 from mavbridge.recording.video_file import count_frames
-from mavbridge.rollout import run
+from mavbridge.rollout import run, sampling
 from mavbridge.rollout.files import read_rows
 from mavbridge.rollout.sampling import Sampler
 from policy.contract import Contract
@@ -88,6 +88,20 @@ def test_ours_and_serial_print_the_same_digest(
         assert count_frames(out) == read_rows(out).num_rows == 48
         digests.append(digest(text))
     assert digests[0] == digests[1]
+
+
+def test_sampling_leaves_the_other_cores_to_decoding_in_either_way(
+    imagine: Imagine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(sampling.torch, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(sampling.torch, "set_num_threads", asked.append)
+    for way in ((), ("--serial",)):
+        status, text = imagine("--out", str(tmp_path / f"{len(way)}.mp4"), "--n-iter", "1", *way)
+        assert status == 0, text
+        assert asked[0] == 3
+        assert asked[-1] == 8, "what it was before"
+        asked.clear()
 
 
 def test_without_a_video_there_are_rows_and_nothing_is_decoded(
