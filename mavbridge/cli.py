@@ -58,7 +58,6 @@ def bench_rollout(config: RolloutBenchConfig | None = None) -> int:
     from mavbridge.recording.folder import require_extra
 
     require_extra("bench rollout")
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as for train
     from mavbridge.bench.rollout import bench_rollout as run_bench  # torch: not for --help
 
     return run_bench(RolloutBenchConfig() if config is None else config)
@@ -75,7 +74,6 @@ def imagine(config: ImagineConfig) -> int:
     from mavbridge.recording.folder import require_extra
 
     require_extra("imagine")
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as for train
     from mavbridge.rollout.run import imagine as run_rollout  # torch: not for --help
 
     return run_rollout(config)
@@ -94,7 +92,6 @@ def imagine_evaluate(*flights: Path, config: ImagineEvaluateConfig | None = None
     require_extra("imagine --evaluate")
     if not flights:
         raise UserError("name the flights to imagine: mavbridge imagine --evaluate DIR...")
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as for train
     from mavbridge.rollout_evaluation.run import evaluate_imagination  # torch: not for --help
 
     return evaluate_imagination(flights, config or ImagineEvaluateConfig())
