@@ -20,7 +20,7 @@ class Trial:
     iterations: int
     ddim_steps: int
     torch_threads: int
-    """Of an operation: the plain way takes every core, ours leaves some for the decoder."""
+    """Of an operation: the plain way takes every core, ours leaves one for the decoder."""
     frames: int
     """In the video."""
     frames_decoded: int

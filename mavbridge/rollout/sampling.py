@@ -22,14 +22,30 @@ class ImaginationError(MavbridgeError):
 
 @contextmanager
 def cores_left_free() -> Iterator[None]:
-    """Meanwhile torch samples on a part of a CPU's cores.
+    """Meanwhile torch samples on all of a CPU's cores but one, which is for the decoder.
 
-    Decoding has as many of its own, and the writer process one. Torch's threads wait for each other
-    at the end of every operation, spinning: with more of them than cores a rollout takes twice the
-    time. These nets are small, and more threads would gain little (a second one a sixth).
+    Torch's threads wait for each other at the end of every operation, spinning: with more of them
+    than cores a rollout takes twice the time.
     """
+    with _threads(torch.get_num_threads() - 1):
+        yield
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Meanwhile torch works in this thread alone.
+
+    Frames are decoded so wherever it happens: how a sum is split up decides how it is rounded. One
+    frame alone gains nothing from a second core.
+    """
+    with _threads(1):
+        yield
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(max(1, (before - 1) // 2))
+    torch.set_num_threads(max(1, count))
     try:
         yield
     finally:
@@ -109,7 +125,7 @@ class Sampler:
 
     def decode(self, latents: Tensor) -> NDArray[np.uint8]:
         """Latents [N, C, h, w] -> images [N, H, W, 3], now."""
-        with torch.inference_mode(), self.meter.decode:
+        with torch.inference_mode(), one_core(), self.meter.decode:
             pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
         self.meter.frames_decoded += len(pixels)
         return pixels

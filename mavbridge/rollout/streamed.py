@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 
-import torch
-
 from mavbridge.clock import NS_PER_S, Clock
 from mavbridge.recording.video_writer import VideoWriter
 from mavbridge.records import ImageArray, RolloutFrame
@@ -17,7 +15,7 @@ from mavbridge.rollout.loop import Segment
 from mavbridge.rollout.output import FrameDigest, OnFrame, frame_row
 from mavbridge.rollout.pixels import Latents, make_frame_source
 from mavbridge.rollout.plan import RolloutPlan
-from mavbridge.rollout.sampling import Sampler
+from mavbridge.rollout.sampling import Sampler, one_core
 from mavbridge.workers import HungError, Worker
 
 QUEUED_SEGMENTS = 2
@@ -69,7 +67,6 @@ class StreamedOutput:
         self._frame_dt_s = sampler.config.frame_dt_s
         self._meter = sampler.meter
         self._source = make_frame_source(sampler.model)
-        self._torch_threads = torch.get_num_threads()
         self._clock = clock
         self._on_frame = on_frame
         self._digest = FrameDigest()
@@ -176,15 +173,15 @@ class StreamedOutput:
 
     def _serve(self, stop: Event) -> None:
         """The thread."""
-        torch.set_num_threads(self._torch_threads)  # sums are rounded by how they are split up
-        while not stop.is_set():
-            try:
-                job = self._jobs.get(timeout=_POLL_S)
-            except queue.Empty:
-                continue
-            if job is None:
-                return
-            self._write(job, stop)
+        with one_core():
+            while not stop.is_set():
+                try:
+                    job = self._jobs.get(timeout=_POLL_S)
+                except queue.Empty:
+                    continue
+                if job is None:
+                    return
+                self._write(job, stop)
 
     def _write(self, job: _Job, stop: Event) -> None:
         # First: after a crash there may be rows without a frame, but no frame without a row.
