@@ -1,7 +1,7 @@
 """``mavbridge train``: flight folders in, a checkpoint out, and what a person sees meanwhile."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -10,17 +10,20 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.config import TrainConfig
 from mavbridge.errors import UserError
+from mavbridge.stopping import INTERRUPTED, stop_on_signals
 from policy.contract import Contract
 from policy.dataset import Episode, Nanoseconds, common_frame
 from policy.loading import builtin_config
 from policy.train import train
 from policy.train_plan import Budget, Check, TrainSettings, WorldTrainSettings
 from policy.train_report import Progress as TrainProgress
-from policy.train_report import TrainResult
+from policy.train_report import Report, TrainResult
+from policy.train_state import TrainingStoppedError
 from policy.train_world import train_world_model
 from policy.world_model_config import WorldModelConfig
 
@@ -31,7 +34,7 @@ WORLD_MODEL = "world-model"
 
 
 def train_policy(flights: Sequence[Path], config: TrainConfig, out: Path) -> int:
-    """Train as the config says; 0 when the checkpoint is written.
+    """Train as the config says; 0 when the checkpoint is written, 130 if interrupted.
 
     Args:
         flights: flight folders, folders of them, or LeRobot datasets.
@@ -43,25 +46,47 @@ def train_policy(flights: Sequence[Path], config: TrainConfig, out: Path) -> int
         PolicyError: flights, weights or a run that cannot be used.
     """
     _require_device(config.device)
-    is_world_model = config.policy == WORLD_MODEL
-    if is_world_model:
+    if config.policy == WORLD_MODEL:
         _refuse_what_no_world_model_takes(config)
     episodes = _read_episodes(flights, config.camera_key)
+    try:
+        with stop_on_signals() as stop, _Display() as display:
+            result = _train(episodes, config, out, display.show, stop.is_set)
+    except TrainingStoppedError as stopped:
+        Console(stderr=True, highlight=False).print(Text(str(stopped), style="yellow"))
+        return INTERRUPTED
+    _print_result(result)
+    return 0
+
+
+def _train(
+    episodes: list[Episode],
+    config: TrainConfig,
+    out: Path,
+    report: Report,
+    should_stop: Callable[[], bool],
+) -> TrainResult:
     clock = MonotonicClock()
 
     def now_s() -> float:
         return clock.now_ns() / NS_PER_S
 
-    with _Display() as display:
-        if is_world_model:
-            model_settings = _world_model_settings(config, out, episodes)
-            result = train_world_model(episodes, model_settings, now_s=now_s, report=display.show)
-        else:
-            settings = _settings(config, out, episodes)
-            check = _check(config)
-            result = train(episodes, settings, now_s=now_s, report=display.show, check=check)
-    _print_result(result)
-    return 0
+    if config.policy == WORLD_MODEL:
+        return train_world_model(
+            episodes,
+            _world_model_settings(config, out, episodes),
+            now_s=now_s,
+            report=report,
+            should_stop=should_stop,
+        )
+    return train(
+        episodes,
+        _settings(config, out, episodes),
+        now_s=now_s,
+        report=report,
+        should_stop=should_stop,
+        check=_check(config),
+    )
 
 
 def _read_episodes(paths: Sequence[Path], camera_key: str | None) -> list[Episode]:

@@ -41,6 +41,7 @@ def train(
     *,
     now_s: Callable[[], float],
     report: Report,
+    should_stop: Callable[[], bool] = lambda: False,
     check: Check | None = None,
 ) -> TrainResult:
     """Train, and write the best weights on held-out flights to ``settings.out``.
@@ -51,14 +52,16 @@ def train(
         now_s: monotonic seconds, for a budget in time.
         report: called with progress, losses and notes.
         check: flies a checkpoint in closed loop; decides in place of the validation loss.
+        should_stop: asked after every step; True ends the run, to be resumed.
 
     Raises:
         DatasetError: flights that cannot be learned from.
         TrainingError: a run that cannot be resumed, kept, or that diverged.
+        TrainingStoppedError: ``should_stop`` said so.
         PolicyError: weights to start from that do not fit.
     """
     folder = open_run(settings, episodes)
-    run = _Run(list(episodes), settings, folder, now_s, report, check)
+    run = _Run(list(episodes), settings, folder, now_s, report, should_stop, check)
     return run.finish()
 
 
@@ -72,6 +75,7 @@ class _Run:
         folder: RunFolder,
         now_s: Callable[[], float],
         report: Report,
+        should_stop: Callable[[], bool],
         check: Check | None,
     ) -> None:
         self._settings, self._folder, self._check = settings, folder, check
@@ -81,7 +85,15 @@ class _Run:
         trainee = starting_trainee(settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         rate = settings.learning_rate * (1.0 if settings.start_from is None else FINE_TUNE)
-        self._loop = Loop(trainee, settings, folder, learning_rate=rate, now_s=now_s, report=report)
+        self._loop = Loop(
+            trainee,
+            settings,
+            folder,
+            learning_rate=rate,
+            now_s=now_s,
+            report=report,
+            should_stop=should_stop,
+        )
         self._load(episodes)
         self._pooled: PooledStore | None = None
         self._held_pooled: list[Batch] | None = None

@@ -15,7 +15,13 @@ from policy.train_batches import ahead
 from policy.train_parallel import B, Gradients, M, StepLoss
 from policy.train_plan import RunSettings, Span, learning_rate_factor
 from policy.train_report import Held, Progress, Report
-from policy.train_state import Position, RunFolder, TrainingError, identity_of
+from policy.train_state import (
+    Position,
+    RunFolder,
+    TrainingError,
+    TrainingStoppedError,
+    identity_of,
+)
 
 LOG_STEPS = 20
 """Steps between two lines of the log."""
@@ -52,12 +58,14 @@ class Loop(Generic[M]):
         learning_rate: float,
         now_s: Callable[[], float],
         report: Report,
+        should_stop: Callable[[], bool],
     ) -> None:
         self.trainee, self.folder, self.position = trainee, folder, Position()
         self.device = torch.device(settings.device)
         self.bf16 = uses_bf16(settings.precision, self.device)
         self._settings, self.learning_rate = settings, learning_rate
         self._now_s, self._report, self._begun_s = now_s, report, now_s()
+        self._should_stop = should_stop
         self._ema = Ema(trainee, settings.ema_decay)
         self._optimiser = self._new_optimiser()
 
@@ -105,6 +113,7 @@ class Loop(Generic[M]):
 
         Raises:
             TrainingError: the loss is no longer finite, or there is no room for the log.
+            TrainingStoppedError: somebody wants the run to end; its state is kept.
         """
         position, count = self.position, self._settings.validation_count
         sums: dict[str, Tensor] = {}
@@ -127,6 +136,9 @@ class Loop(Generic[M]):
                 if position.validations < due < count:
                     position.validations = due
                     look_back()
+                if self._should_stop():
+                    self._save()
+                    raise self._stopped()
 
     def offer(
         self,
@@ -188,9 +200,15 @@ class Loop(Generic[M]):
         self._report(Progress(stage="", fraction=0.0, step=0, note=text))
 
     def doing(self, what: str) -> None:
-        """What is done in place of steps."""
+        """What is done in place of steps.
+
+        Raises:
+            TrainingStoppedError: somebody wants the run to end.
+        """
         told = Progress(stage=what, fraction=self.fraction, step=self.position.step)
         self._report(told)
+        if self._should_stop():
+            raise self._stopped()
 
     def _step(self, phase_end: float) -> None:
         """Along the gradients that are there."""
@@ -206,6 +224,11 @@ class Loop(Generic[M]):
 
     def _new_optimiser(self) -> torch.optim.AdamW:
         return make_optimiser(self.trainee, self.learning_rate, self._settings.weight_decay)
+
+    def _stopped(self) -> TrainingStoppedError:
+        if not self.folder.has_state:
+            return TrainingStoppedError("stopped before anything was learned")
+        return TrainingStoppedError("stopped: the same command with --resume goes on from here")
 
     def _save(self) -> None:
         position = self.position

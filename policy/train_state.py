@@ -24,6 +24,10 @@ class TrainingError(PolicyError):
     """A run that cannot start, go on or be kept; the message says what to do."""
 
 
+class TrainingStoppedError(PolicyError):
+    """Somebody wanted the run to end; the message says how it goes on."""
+
+
 @dataclass(kw_only=True)
 class Position:
     """Where a run is."""

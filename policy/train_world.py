@@ -49,6 +49,7 @@ def train_world_model(
     *,
     now_s: Callable[[], float],
     report: Report,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> TrainResult:
     """Train, and write the best weights on held-out flights to ``settings.out``.
 
@@ -57,10 +58,12 @@ def train_world_model(
         settings: what to train and how long.
         now_s: monotonic seconds, for a budget in time.
         report: called with progress, losses and notes.
+        should_stop: asked after every step; True ends the run, to be resumed.
 
     Raises:
         DatasetError: flights that cannot be learned from.
         TrainingError: a run that cannot be resumed, kept, or that diverged.
+        TrainingStoppedError: ``should_stop`` said so.
         PolicyError: an autoencoder to keep that does not fit.
     """
     folder = open_run(settings, episodes)
@@ -69,7 +72,7 @@ def train_world_model(
             f"the flights hold {frame} states, the world model is to take "
             f"{settings.model.contract.state_frame}"
         )
-    return _Run(list(episodes), settings, folder, now_s, report).finish()
+    return _Run(list(episodes), settings, folder, now_s, report, should_stop).finish()
 
 
 class _Run:
@@ -82,6 +85,7 @@ class _Run:
         folder: RunFolder,
         now_s: Callable[[], float],
         report: Report,
+        should_stop: Callable[[], bool],
     ) -> None:
         self._settings, self._folder, self._model = settings, folder, settings.model
         trainee = _new_model(settings)
@@ -93,6 +97,7 @@ class _Run:
             learning_rate=settings.learning_rate,
             now_s=now_s,
             report=report,
+            should_stop=should_stop,
         )
         self._load(episodes)
         self._latents: PooledStore | None = None

@@ -10,7 +10,7 @@ from safetensors import safe_open
 
 from policy.dataset import Episode
 from policy.train_report import Progress, TrainResult
-from policy.train_state import TrainingError
+from policy.train_state import TrainingError, TrainingStoppedError
 
 
 class Training(Protocol):
@@ -22,8 +22,9 @@ class Training(Protocol):
         *,
         resume: bool = False,
         report: Callable[[Progress], None] = lambda _: None,
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> TrainResult:
-        """Train to the end, or until ``report`` raises."""
+        """Train to the end, or until ``report`` raises or ``should_stop`` says so."""
         ...
 
 
@@ -42,9 +43,34 @@ def check_resuming(
         train(episodes)
     with pytest.raises(TrainingError, match="other flights or settings"):
         train(episodes[:2], resume=True)
-    resumed = train(episodes, resume=True)
-    assert resumed == replace(whole, checkpoint=resumed.checkpoint)
-    assert weights_of(resumed.checkpoint) == weights_of(whole.checkpoint)
+    check_same(train(episodes, resume=True), whole)
+
+
+def check_stopping(
+    train: Training, episodes: list[Episode], whole: TrainResult, *, validated_at: int
+) -> None:
+    """Stop it a step after a validation, and go on."""
+    polls_left: int | None = None
+
+    def wait(progress: Progress) -> None:
+        nonlocal polls_left
+        if progress.validation is not None and progress.step == validated_at:
+            polls_left = 2
+
+    def is_over() -> bool:
+        nonlocal polls_left
+        polls_left = None if polls_left is None else polls_left - 1
+        return polls_left == 0
+
+    with pytest.raises(TrainingStoppedError, match="--resume"):
+        train(episodes, report=wait, should_stop=is_over)
+    check_same(train(episodes, resume=True), whole)
+
+
+def check_same(result: TrainResult, whole: TrainResult) -> None:
+    """All but the name of the checkpoint."""
+    assert result == replace(whole, checkpoint=result.checkpoint)
+    assert weights_of(result.checkpoint) == weights_of(whole.checkpoint)
 
 
 def weights_of(path: Path) -> dict[str, bytes]:

@@ -11,7 +11,7 @@ from rich.text import Text
 from mavbridge.assembly import load_for_episodes
 from mavbridge.clock import MonotonicClock
 from mavbridge.config import EvaluateConfig
-from mavbridge.errors import UserError
+from mavbridge.errors import MavbridgeError, UserError
 from mavbridge.evaluation.cluster import fly_on_ray
 from mavbridge.evaluation.jobs import Flown, Job, fly_job, make_jobs
 from mavbridge.evaluation.realtime import fly_realtime
@@ -20,6 +20,7 @@ from mavbridge.evaluation.tables import print_evaluation
 from mavbridge.lockstep.referee import EpisodeInterruptedError
 from mavbridge.plots import needs_matplotlib
 from mavbridge.stopping import INTERRUPTED, stop_on_signals
+from policy.contract import PolicyError
 
 
 def evaluate(config: EvaluateConfig) -> int:
@@ -34,25 +35,43 @@ def evaluate(config: EvaluateConfig) -> int:
         if path is not None:
             _require_writable(path)
     console = Console(stderr=True, emoji=False)
+    flown: list[Flown] = []
+    failure: MavbridgeError | PolicyError | None = None
     with stop_on_signals() as stop:
-        evaluation = _fly(config, console, stop.is_set)
+        try:
+            _fly(config, console, flown, stop.is_set)
+        except (MavbridgeError, PolicyError) as error:
+            failure = error  # what was flown before is not lost by it
         was_stopped = stop.is_set()
+    if flown or failure is None:
+        _tell(_evaluation(config, flown), config, draw)
+    if failure is not None or was_stopped:
+        ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
+        console.print(Text(f"{ended}{config.episodes} episodes", style="yellow"))
+    if failure is not None:
+        raise failure
+    return INTERRUPTED if was_stopped else 0
+
+
+def _tell(
+    evaluation: Evaluation, config: EvaluateConfig, draw: Callable[[Evaluation], None] | None
+) -> None:
+    """Print, draw and write."""
     if evaluation.episodes:
         print_evaluation(evaluation, Console())
         if draw is not None:
             draw(evaluation)
     if config.json is not None:
         config.json.write_text(to_json(evaluation))
-    if not was_stopped:
-        return 0
-    done = len(evaluation.episodes)
-    console.print(Text(f"interrupted after {done} of {config.episodes} episodes", style="yellow"))
-    return INTERRUPTED
 
 
-def _fly(config: EvaluateConfig, console: Console, should_stop: Callable[[], bool]) -> Evaluation:
-    """Every episode, until somebody says stop; an error ends it, too."""
-    flown: list[Flown] = []
+def _fly(
+    config: EvaluateConfig,
+    console: Console,
+    flown: list[Flown],
+    should_stop: Callable[[], bool],
+) -> None:
+    """Every episode, until somebody says stop; an error ends it, too. Adds to ``flown``."""
     progress = Progress(
         TextColumn("flying"),
         BarColumn(),
@@ -67,6 +86,9 @@ def _fly(config: EvaluateConfig, console: Console, should_stop: Callable[[], boo
             flown.append(one)
             finished = sum(other.result.has_finished for other in flown)
             progress.update(bar, advance=1, score=f"{finished} of {len(flown)} finished")
+
+
+def _evaluation(config: EvaluateConfig, flown: list[Flown]) -> Evaluation:
     flown.sort(key=lambda one: one.index)
     return Evaluation(
         policy=config.policy.policy,

@@ -1,6 +1,8 @@
 """``mavbridge train``, from the command line to the checkpoint that flies."""
 
+import signal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +12,12 @@ from flight_folders import write_meta, write_spot_flight
 from mavbridge.__main__ import main
 from mavbridge.config import TrainConfig
 from mavbridge.errors import UserError
+from mavbridge.stopping import INTERRUPTED
 from mavbridge.train import _ages, _settings
 from policy.dataset_flights import read_ages, read_flight
 from policy.loading import load_policy
 from policy.toge import TogeConfig
+from policy.train_loop import Loop
 from policy.world_model_checkpoint import load_world_model
 
 WORLD_MODEL = ["flights", "--out", "a.safetensors", "--policy", "world-model"]
@@ -121,6 +125,26 @@ def test_bad_input_is_one_message(
     printed = capsys.readouterr().err
     assert says in printed
     assert "Traceback" not in printed
+
+
+def test_ctrl_c_keeps_the_run_and_says_how_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_spot_flight(tmp_path / "flights" / "0", 0, seconds=0.5)
+    command = (str(tmp_path / "flights"), "--out", str(tmp_path / "a.safetensors"))
+    asked = ("--policy", "toge:small:resnet18", "--image-size", "32", "--batch-size", "4")
+    step = Loop._step
+
+    def step_and_interrupt(self: Loop[Any], phase_end: float) -> None:
+        step(self, phase_end)
+        if self.position.step == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Loop, "_step", step_and_interrupt)
+    assert status_of(*command, *asked, "--steps", "3") == INTERRUPTED
+    assert "--resume" in capsys.readouterr().err
+    assert status_of(*command, *asked, "--steps", "3", "--resume") == 0
+    assert (tmp_path / "a.safetensors").is_file()
 
 
 def test_ages_are_a_range_or_those_of_a_flight(tmp_path: Path) -> None:

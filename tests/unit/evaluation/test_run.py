@@ -20,7 +20,7 @@ from mavbridge.config import (
     PolicyConfig,
     Variety,
 )
-from mavbridge.errors import UserError
+from mavbridge.errors import PeerError, UserError
 from mavbridge.evaluation import jobs, run
 from mavbridge.evaluation.jobs import fly_job, make_jobs
 from mavbridge.evaluation.run import INTERRUPTED, evaluate
@@ -122,6 +122,23 @@ def test_ctrl_c_ends_with_the_results_so_far(
     assert evaluate(config) == INTERRUPTED
     assert len(json.loads(path.read_text())["episodes"]) == 1
     assert "interrupted after 1 of 5 episodes" in capsys.readouterr().err
+
+
+def test_an_error_costs_no_result_that_was_there_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fly_two(job: jobs.Job, should_stop: Any) -> jobs.Flown:
+        if job.index == 2:
+            raise PeerError("the vehicle is gone")
+        return fly_job(job, should_stop)
+
+    monkeypatch.setattr(run, "fly_job", fly_two)
+    path = tmp_path / "some.json"
+    config = EvaluateConfig(policy=CIRCLE, episodes=5, max_time=1.0, json=path)
+    with pytest.raises(PeerError, match="the vehicle is gone"):
+        evaluate(config)
+    assert len(json.loads(path.read_text())["episodes"]) == 2
+    assert "ended after 2 of 5 episodes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from policy.train_model import Trainee, gate_labels, gate_loss
 from policy.train_plan import Budget, TrainSettings, learning_rate_factor, make_stages
 from policy.train_report import Progress, TrainResult
 from policy.train_state import Position, RunFolder, TrainingError
-from training_runs import check_resuming, weights_of
+from training_runs import check_resuming, check_stopping, weights_of
 
 CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
 
@@ -68,9 +68,17 @@ def run(
     settings: TrainSettings,
     report: Callable[[Progress], None] = lambda progress: None,
     check: Callable[[Path], float] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> TrainResult:
     ticking = count()
-    return train(episodes, settings, now_s=lambda: next(ticking) * 0.1, report=report, check=check)
+    return train(
+        episodes,
+        settings,
+        now_s=lambda: next(ticking) * 0.1,
+        report=report,
+        should_stop=should_stop,
+        check=check,
+    )
 
 
 def test_learns_where_the_image_says_to_go(tmp_path: Path) -> None:
@@ -109,19 +117,23 @@ def whole(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> 
     return run(episodes, short_run(tmp_path_factory.mktemp("whole")))
 
 
-@pytest.mark.parametrize("killed_at", [4, 6])  # with a state of the encoder; of the head
-def test_a_killed_run_goes_on_as_if_it_had_not_been(
-    episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int
+@pytest.mark.parametrize("killed_at", [4, 6, None])  # in the encoder; in the head; stopped
+def test_a_run_that_was_ended_goes_on_as_if_it_had_not_been(
+    episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int | None
 ) -> None:
     def train_there(
         episodes: list[Episode],
         *,
         resume: bool = False,
         report: Callable[[Progress], None] = lambda _: None,
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> TrainResult:
-        return run(episodes, short_run(tmp_path, resume=resume), report)
+        return run(episodes, short_run(tmp_path, resume=resume), report, should_stop=should_stop)
 
-    check_resuming(train_there, episodes, whole, killed_at=killed_at)
+    if killed_at is None:
+        check_stopping(train_there, episodes, whole, validated_at=4)
+    else:
+        check_resuming(train_there, episodes, whole, killed_at=killed_at)
 
 
 def test_resnet_unet_trains_too_and_an_ablation_is_a_weight_of_zero(

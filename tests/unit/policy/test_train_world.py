@@ -29,7 +29,7 @@ from policy.world_model import WorldModel
 from policy.world_model_checkpoint import load_world_model
 from policy.world_model_config import WorldModelConfig
 from steered_flights import steered_flight
-from training_runs import check_resuming, weights_of
+from training_runs import check_resuming, check_stopping, weights_of
 
 MODEL = WorldModelConfig(
     image_size=32,
@@ -78,9 +78,16 @@ def run(
     episodes: list[Episode],
     settings: WorldTrainSettings,
     report: Callable[[Progress], None] = lambda progress: None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> TrainResult:
     ticking = count()
-    return train_world_model(episodes, settings, now_s=lambda: next(ticking) * 0.1, report=report)
+    return train_world_model(
+        episodes,
+        settings,
+        now_s=lambda: next(ticking) * 0.1,
+        report=report,
+        should_stop=should_stop,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -154,19 +161,23 @@ def whole(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> 
     return run(episodes, settings(tmp_path_factory.mktemp("whole")))
 
 
-@pytest.mark.parametrize("killed_at", [4, 6])  # with a state of the autoencoder; of the dynamics
-def test_a_killed_run_goes_on_as_if_it_had_not_been(
-    episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int
+@pytest.mark.parametrize("killed_at", [4, 6, None])  # in the autoencoder; in the dynamics; stopped
+def test_a_run_that_was_ended_goes_on_as_if_it_had_not_been(
+    episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int | None
 ) -> None:
     def train_there(
         episodes: list[Episode],
         *,
         resume: bool = False,
         report: Callable[[Progress], None] = lambda _: None,
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> TrainResult:
-        return run(episodes, settings(tmp_path, resume=resume), report)
+        return run(episodes, settings(tmp_path, resume=resume), report, should_stop=should_stop)
 
-    check_resuming(train_there, episodes, whole, killed_at=killed_at)
+    if killed_at is None:
+        check_stopping(train_there, episodes, whole, validated_at=4)
+    else:
+        check_resuming(train_there, episodes, whole, killed_at=killed_at)
 
 
 def test_an_autoencoder_that_is_kept_stays_as_it_is(
