@@ -60,8 +60,8 @@ class TableWriter:
         self._sink.close()
 
 
-_GROUP_ROWS = 16_384
-"""Rows of a Parquet row group: two to three minutes of ticks."""
+_GROUP_ROWS = 2_048
+"""Rows of a Parquet row group: twenty seconds of ticks. Encoding 16,384 at once took 27 MB."""
 
 
 def to_parquet(stream: Path, parquet: Path) -> None:
