@@ -54,8 +54,8 @@ def _measure(model: WorldModel, args: argparse.Namespace, out: Path) -> Trial:
         seed=0,
     )
     start = _start(model.config)
-    is_serial = args.way == "serial"
     _warm_up(model, plan, start)
+    is_serial = args.way == "serial"
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=is_serial, clock=clock)
     decider = WorldModelDecider(sampler, from_pixels=False)
     writer_rss_mb: list[float | None] = []

@@ -1,7 +1,7 @@
 """The world model as the loop calls it: numpy at the edge, no gradients, every second counted."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,26 +20,22 @@ class ImaginationError(MavbridgeError):
     """A world model that imagines no numbers."""
 
 
-@contextmanager
-def cores_left_free() -> Iterator[None]:
+def cores_left_free() -> AbstractContextManager[None]:
     """Meanwhile torch samples on all of a CPU's cores but one, which is for the decoder.
 
     Torch's threads wait for each other at the end of every operation, spinning: with more of them
     than cores a rollout takes twice the time.
     """
-    with _threads(torch.get_num_threads() - 1):
-        yield
+    return _threads(torch.get_num_threads() - 1)
 
 
-@contextmanager
-def one_core() -> Iterator[None]:
+def one_core() -> AbstractContextManager[None]:
     """Meanwhile torch works in this thread alone.
 
     Frames are decoded so wherever it happens: how a sum is split up decides how it is rounded. One
-    frame alone gains nothing from a second core.
+    frame alone gains little from a second core.
     """
-    with _threads(1):
-        yield
+    return _threads(1)
 
 
 @contextmanager

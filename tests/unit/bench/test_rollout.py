@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -73,6 +74,8 @@ def test_the_tables_show_both_ways_and_no_gpu_where_there_is_none() -> None:
     text = shown(ROLLOUTS)
     for part in ("serial", "streamed", "321", "123", "1.25", "1.67", "threads", "1024"):
         assert part in text
+    assert re.search(r"serial +│ +8 │ +2 │ +256 ", text), "two threads"
+    assert re.search(r"streamed +│ +8 │ +1 │ +128 ", text), "one thread"
     assert "all 4 pairs have the same frames" in text
     assert "GPU" not in text
 
