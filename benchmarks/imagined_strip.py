@@ -11,11 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mavbridge.clock import MonotonicClock
-from mavbridge.records import FloatArray, ImageArray
-from mavbridge.rollout.run import load_model
-from mavbridge.rollout.sampling import Sampler
-from mavbridge.rollout_evaluation.runs import Run, read_runs, survey, with_images
+from mavbridge.commands.evaluate_imagination.runs import Run, read_runs, survey, with_images
+from mavbridge.commands.imagine.run import load_model
+from mavbridge.commands.imagine.sampling import Sampler
+from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.records import FloatArray, ImageArray
 from policy.contract import ACTION_NAMES
 
 STEPS = (1, 4, 8, 16)

@@ -17,9 +17,9 @@ from dataclasses import asdict
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from mavbridge.mavlink.transport import UdpTransport
-from mavbridge.timing import Histogram
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.histogram import Histogram
+from mavbridge.mavlink.transport.sockets import UdpTransport
 
 ATTITUDE_HZ = 97.0
 """Not 100: the phase against a client with a 100 Hz clock of its own then takes every value."""

@@ -19,16 +19,16 @@ import torch
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from mavbridge.bench import engines
-from mavbridge.bench.flight_process import arguments
-from mavbridge.bench.flights import NAIVE_NAME
-from mavbridge.bench.meter import since_ms, stolen_ns
-from mavbridge.bench.results import Flight, to_json
 from mavbridge.camera.open import open_camera
-from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from mavbridge.timing import Histogram
+from mavbridge.commands.bench import engines
+from mavbridge.commands.bench.flight_process import arguments
+from mavbridge.commands.bench.flights import NAIVE_NAME
+from mavbridge.commands.bench.meter import since_ms, stolen_ns
+from mavbridge.commands.bench.results import Flight, to_json
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.histogram import Histogram
+from policy.nets.toge import TogeConfig
 from policy.preprocess import image_to_input
-from policy.toge import TogeConfig
 
 STREAMS = (
     mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,

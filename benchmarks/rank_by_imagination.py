@@ -22,22 +22,22 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from mavbridge.assembly import load_configured_policy
-from mavbridge.clock import NS_PER_S, MonotonicClock
-from mavbridge.config import PolicyConfig
+from mavbridge.commands.evaluate_imagination.metrics import spearman
+from mavbridge.commands.imagine.deciders import Decider, PolicyDecider
+from mavbridge.commands.imagine.loop import rollout
+from mavbridge.commands.imagine.observation import ObservationQueue
+from mavbridge.commands.imagine.plan import RolloutPlan
+from mavbridge.commands.imagine.run import load_model
+from mavbridge.commands.imagine.sampling import Sampler
+from mavbridge.commands.imagine.start import Start, read_start
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.records import FloatArray
+from mavbridge.flight.assembly import load_configured_policy
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-from mavbridge.records import FloatArray
-from mavbridge.rollout.deciders import Decider, PolicyDecider
-from mavbridge.rollout.loop import rollout
-from mavbridge.rollout.observation import ObservationQueue
-from mavbridge.rollout.plan import RolloutPlan
-from mavbridge.rollout.run import load_model
-from mavbridge.rollout.sampling import Sampler
-from mavbridge.rollout.start import Start, read_start
-from mavbridge.rollout_evaluation.metrics import spearman
 from policy.contract import ACTION_DIM, VELOCITY, Contract
-from policy.dataset_flights import find_flights, is_exemplary
-from sitl.course import Course, GateCounter, make_course
+from policy.data.flight_folders import find_flights, is_exemplary
+from sitl.course.course import Course, GateCounter, make_course
 
 ITERATIONS, EXE_STEPS = 8, 4
 """3.2 s, with a decision every 0.4 s: at 5 m/s that is two gates."""

@@ -165,7 +165,7 @@ def draw(answers: Sequence[Answer], path: Path) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    from mavbridge.evaluation.figure import BLUE, DOTS_PER_INCH, MUTED, STYLE
+    from mavbridge.commands.evaluate.figure import BLUE, DOTS_PER_INCH, MUTED, STYLE
 
     others = [one for one in answers if one.group not in (LATE, LATE_UNTOLD)][::-1]
     with rc_context(STYLE):

@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from mavbridge.cli import cli
-from mavbridge.errors import MavbridgeError
-from policy.contract import PolicyError
+from mavbridge.core.errors import MavbridgeError
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -18,7 +17,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(cli.meta(arguments))
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
-    except (MavbridgeError, PolicyError) as error:
+    except MavbridgeError as error:
         console = Console(stderr=True, highlight=False, emoji=False)
         console.print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(1)

@@ -9,18 +9,14 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
-from mavbridge.config import (
-    BenchConfig,
-    DemonstrateConfig,
-    EvaluateConfig,
-    ExportConfig,
-    FlyConfig,
-    ImagineConfig,
-    ImagineEvaluateConfig,
-    RolloutBenchConfig,
-    TrainConfig,
-)
-from mavbridge.errors import UserError
+from mavbridge.config.bench import BenchConfig, RolloutBenchConfig
+from mavbridge.config.demonstrate import DemonstrateConfig
+from mavbridge.config.evaluate import EvaluateConfig
+from mavbridge.config.export import ExportConfig
+from mavbridge.config.flight import FlyConfig
+from mavbridge.config.imagine import ImagineConfig, ImagineEvaluateConfig
+from mavbridge.config.train import TrainConfig
+from mavbridge.core.errors import UserError
 
 cli = App(
     name="mavbridge",
@@ -35,7 +31,7 @@ def fly(config: FlyConfig | None = None) -> int:
     """Fly. Nothing is armed and no mode is changed unless asked."""
     if config is None or not config.link.connect:
         raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
-    from mavbridge.app import fly as run_flight  # torch and OpenCV: not for --help
+    from mavbridge.flight.app import fly as run_flight
 
     return run_flight(config)
 
@@ -47,7 +43,7 @@ cli.command(bench_cli)
 @bench_cli.default
 def bench(config: BenchConfig | None = None) -> int:
     """Measure this machine: engines, loops against a simulated vehicle, the link, the peers."""
-    from mavbridge.bench.run import bench as run_bench  # torch: not for --help
+    from mavbridge.commands.bench.run import bench as run_bench
 
     return run_bench(BenchConfig() if config is None else config)
 
@@ -58,7 +54,7 @@ def bench_rollout(config: RolloutBenchConfig | None = None) -> int:
     from mavbridge.recording.folder import require_extra
 
     require_extra("bench rollout")
-    from mavbridge.bench.rollout import bench_rollout as run_bench  # torch: not for --help
+    from mavbridge.commands.bench.rollout import bench_rollout as run_bench
 
     return run_bench(RolloutBenchConfig() if config is None else config)
 
@@ -74,7 +70,7 @@ def imagine(config: ImagineConfig) -> int:
     from mavbridge.recording.folder import require_extra
 
     require_extra("imagine")
-    from mavbridge.rollout.run import imagine as run_rollout  # torch: not for --help
+    from mavbridge.commands.imagine.run import imagine as run_rollout
 
     return run_rollout(config)
 
@@ -92,7 +88,7 @@ def imagine_evaluate(*flights: Path, config: ImagineEvaluateConfig | None = None
     require_extra("imagine --evaluate")
     if not flights:
         raise UserError("name the flights to imagine: mavbridge imagine --evaluate DIR...")
-    from mavbridge.rollout_evaluation.run import evaluate_imagination  # torch: not for --help
+    from mavbridge.commands.evaluate_imagination.run import evaluate_imagination
 
     return evaluate_imagination(flights, config or ImagineEvaluateConfig())
 
@@ -101,7 +97,7 @@ def imagine_evaluate(*flights: Path, config: ImagineEvaluateConfig | None = None
 def evaluate(config: EvaluateConfig | None = None) -> int:
     """Fly a policy over many simulated gate courses, and say how well it does."""
     try:
-        from mavbridge.evaluation.run import evaluate as run_evaluation  # torch: not for --help
+        from mavbridge.commands.evaluate.run import evaluate as run_evaluation
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
             raise
@@ -118,7 +114,7 @@ def demonstrate(config: DemonstrateConfig) -> int:
 
     require_extra("demonstrate")
     try:
-        from mavbridge.demonstration.run import demonstrate as run_demonstrations
+        from mavbridge.commands.demonstrate.run import demonstrate as run_demonstrations
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
             raise
@@ -143,7 +139,7 @@ def train(*flights: Path, config: TrainConfig | None = None) -> int:
     # torch's threads else spin at every barrier: on a core that somebody else uses too, ten times
     # the time. OpenMP reads it once, as torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    from mavbridge.train import train_policy  # torch: not for --help
+    from mavbridge.commands.train.run import train_policy
 
     return train_policy(flights, config, config.out)
 
@@ -159,7 +155,7 @@ def export(*flights: Path, config: ExportConfig) -> int:
     from mavbridge.recording.folder import require_extra
 
     require_extra("export")
-    from mavbridge.export.run import export as run_export  # PyAV and pyarrow: not for --help
+    from mavbridge.commands.export.run import export as run_export
 
     if not flights:
         raise UserError("name the flights to export: mavbridge export DIR... --out DIR")

@@ -13,6 +13,8 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from policy.errors import ContractError
+
 CONTRACT_VERSION = 1
 
 STATE_NAMES = (
@@ -48,14 +50,6 @@ IMAGENET_STD_RGB = (0.229, 0.224, 0.225)
 FloatArray = NDArray[np.float32]
 StateFrame = Literal["ned_frd", "enu_flu"]
 Arrays = Literal["numpy", "torch"]
-
-
-class PolicyError(ValueError):
-    """A policy, contract or checkpoint that cannot be used; the message says what to do."""
-
-
-class ContractError(PolicyError):
-    """A contract that is malformed or that the bridge cannot keep."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,20 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from policy.contract import (
-    Contract,
-    DualRatePolicy,
-    Executable,
-    PolicyError,
-    SingleRatePolicy,
-    WarmStartPolicy,
-)
+from policy.contract import Contract, DualRatePolicy, Executable, SingleRatePolicy, WarmStartPolicy
 from policy.engines.executable import EngineName, Settings
+from policy.errors import PolicyError
 from policy.scripted import ScriptedPolicy
 from policy.user_code import user_code
 
 if TYPE_CHECKING:
-    from policy.checkpoint import BuiltinConfig, BuiltinPolicy
+    from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
 
 SHIPPED = Path(__file__).parent / "weights" / "toge.safetensors"
 """Flown by ``toge`` where no other weights are named; its card is beside it."""
@@ -175,10 +169,10 @@ def _scripted(
 
 def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinConfig":
     """What the spec asks for; a checkpoint that says more overrules it."""
-    from policy.action_head import SIZE_NAMES
-    from policy.backbones import BACKBONE_NAMES
-    from policy.resnet_unet import ResnetUnetConfig
-    from policy.toge import TogeConfig
+    from policy.nets.action_head import SIZE_NAMES
+    from policy.nets.backbones import BACKBONE_NAMES
+    from policy.nets.resnet_unet import ResnetUnetConfig
+    from policy.nets.toge import TogeConfig
 
     rest: list[Any] = list(options)
     chosen_size: Any = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
@@ -199,7 +193,7 @@ def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinCo
 def _trained(
     config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
 ) -> tuple["BuiltinPolicy", list[str]]:
-    from policy.checkpoint import load_checkpoint
+    from policy.checkpoints.policy_file import load_checkpoint
 
     policy = load_checkpoint(checkpoint, fallback=config)
     parts = (policy.config.size, getattr(policy.config, "backbone", "resnet18"))
@@ -228,7 +222,7 @@ def _assumptions(checkpoint: Path, policy: "BuiltinPolicy") -> str:
 def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
     import torch
 
-    from policy.checkpoint import build_policy
+    from policy.checkpoints.policy_file import build_policy
 
     with torch.random.fork_rng(devices=[]):  # the process's own random stream stays as it was
         torch.manual_seed(seed)

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import Contract, FloatArray, PolicyError
+from policy.contract import Contract, FloatArray
+from policy.errors import PolicyError
 
 STATE_SCALE = (
     *(5.0, 5.0, 5.0),  # m/s: a brisk pace through gates

@@ -12,16 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policy.contract import (
-    ACTION_DIM,
-    QUATERNION,
-    RATE,
-    STATE_DIM,
-    VELOCITY,
-    Contract,
-    FloatArray,
-    PolicyError,
-)
+from policy.contract import ACTION_DIM, QUATERNION, RATE, STATE_DIM, VELOCITY, Contract, FloatArray
+from policy.errors import PolicyError
 
 FEATURE_DIM = 8
 DEFAULT_CONTRACT = Contract()

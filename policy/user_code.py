@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from policy.contract import PolicyError
+from policy.errors import PolicyError
 
 _OURS = Path(__file__).parent
 

@@ -7,16 +7,16 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from sitl.autopilot import STEP_NS, VehicleConfig
-from sitl.camera import FpvRenderer
+from sitl.camera.fpv import FpvRenderer
+from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, MonotonicClock
-from sitl.course import Course, make_course
+from sitl.course.course import Course, make_course
 from sitl.errors import UsageError
+from sitl.link.transport import Transport, open_transport
 from sitl.report import write_report
-from sitl.shm import FramePublisher
+from sitl.simulated_vehicle import Vehicle
 from sitl.stopping import StopRequest, stop_on_signal
-from sitl.transport import Transport, open_transport
-from sitl.vehicle import Vehicle
+from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.vehicle import Vehicle
+from sitl.simulated_vehicle import Vehicle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from contextlib import closing
 from typing import Protocol, TypeAlias
 
-from sitl.camera import FpvRenderer
+from sitl.camera.fpv import FpvRenderer
+from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, MonotonicClock
-from sitl.course import make_course
+from sitl.course.course import make_course
 from sitl.errors import UsageError
-from sitl.onlooker import Onlooker
-from sitl.shm import FramePublisher
+from sitl.link.pose_listener import Onlooker
 from sitl.stopping import StopRequest
 
 Address: TypeAlias = tuple[str, int]

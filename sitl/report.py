@@ -22,7 +22,7 @@ All times are seconds since the vehicle's start (``t_s``). Keys:
     crash                {t_s, hit: "ground" or "gate N", speed_mps} of the first; null for none
     impact_speed_mps     of the hardest touch; 0.0 if it never left the ground
     gates                {total, passed: [{index, t_s}, ...]} or null without a course
-    conditions           every number of `sitl.conditions.Conditions` that this flight had
+    conditions           every number of `sitl.vehicle.conditions.Conditions` that this flight had
     modes                [{t_s, mode}, ...] from the first
     statustexts          [{t_s, text}, ...]; at most the first 200
     final                {mode, armed, landed, position_ned_m, velocity_ned_mps, roll_pitch_yaw_deg}
@@ -36,11 +36,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sitl.autopilot import Autopilot
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.collision import Crash, struck_gate
-from sitl.course import Course, GateCounter, GatePass
+from sitl.course.collision import Crash, struck_gate
+from sitl.course.course import Course, GateCounter, GatePass
 from sitl.rotation import Vec3, cos_tilt, to_euler
+from sitl.vehicle.autopilot import Autopilot
 
 CRASH_SPEED_MPS = 3.5
 """ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash."""

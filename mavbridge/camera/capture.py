@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from mavbridge.camera.grabber import Image
-from mavbridge.clock import NS_PER_MS, NS_PER_S, Clock
-from mavbridge.errors import CameraError
-from mavbridge.records import ImageArray
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.errors import CameraError
+from mavbridge.core.records import ImageArray
 
 OPEN_TIMEOUT_MS = 5000
 READ_TIMEOUT_MS = 2000

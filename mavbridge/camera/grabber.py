@@ -4,9 +4,9 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from mavbridge.clock import NS_PER_S, Clock
-from mavbridge.errors import CameraError
-from mavbridge.records import Frame, ImageArray
+from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.errors import CameraError
+from mavbridge.core.records import Frame, ImageArray
 
 STALL_NS = 2 * NS_PER_S
 FIRST_FRAME_NS = 10 * NS_PER_S
@@ -83,7 +83,7 @@ class Grabber:
             return self._dropped_frames
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.ports.Camera`."""
+        """See `mavbridge.core.ports.Camera`."""
         with self._changed:
             self._changed.wait_for(self._has_news, timeout_ns / NS_PER_S)
             frame, self._newest = self._newest, None

@@ -7,9 +7,9 @@ from mavbridge.camera.capture import DeviceSource, StreamSource
 from mavbridge.camera.grabber import Grabber
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
-from mavbridge.clock import Clock
-from mavbridge.errors import UserError
-from mavbridge.ports import Camera
+from mavbridge.core.clock import Clock
+from mavbridge.core.errors import UserError
+from mavbridge.core.ports import Camera
 
 STREAM_SCHEMES = ("rtsp://", "udp://", "tcp://", "http://", "https://")
 FORMS = (

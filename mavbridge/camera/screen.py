@@ -8,9 +8,9 @@ import numpy as np
 from mss.exception import ScreenShotError
 
 from mavbridge.camera.x11 import Region, Window, X11Screen
-from mavbridge.clock import NS_PER_S, Clock
-from mavbridge.errors import CameraError, MavbridgeError, UserError
-from mavbridge.records import Frame
+from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.errors import CameraError, MavbridgeError, UserError
+from mavbridge.core.records import Frame
 
 INTERVAL_NS = NS_PER_S // 60
 """Screens change no faster, and a capture costs milliseconds."""
@@ -53,7 +53,7 @@ class ScreenCamera:
         return 0
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.ports.Camera`; at most 60 frames a second."""
+        """See `mavbridge.core.ports.Camera`; at most 60 frames a second."""
         deadline_ns = self._clock.now_ns() + timeout_ns
         self._clock.sleep_until_ns(min(self._next_ns, deadline_ns))
         if self._next_ns > deadline_ns:

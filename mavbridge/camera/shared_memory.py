@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mavbridge.clock import NS_PER_MS, NS_PER_S, Clock
-from mavbridge.errors import CameraError, UserError
-from mavbridge.records import Frame, ImageArray
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.errors import CameraError, UserError
+from mavbridge.core.records import Frame, ImageArray
 
 MAGIC = b"MBSHM\0\0\1"
 HEADER = struct.Struct("<8sIIII")
@@ -72,7 +72,7 @@ class SharedMemoryCamera:
         return self._dropped_frames
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.ports.Camera`. Dead = no fresh frame for STALL_NS (START_NS at first)."""
+        """See `ports.Camera`. Dead: no fresh frame for STALL_NS (START_NS at first)."""
         deadline_ns = self._clock.now_ns() + timeout_ns
         while True:
             frame = self._take()

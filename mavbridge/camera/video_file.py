@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 
 from mavbridge.camera.capture import retrieve_rgb
-from mavbridge.clock import NS_PER_MS, NS_PER_S, Clock
-from mavbridge.errors import CameraError
-from mavbridge.records import Frame, ImageArray
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.errors import CameraError
+from mavbridge.core.records import Frame, ImageArray
 
 DEFAULT_FPS = 30.0
 """For files without stamps and without a rate."""
@@ -49,7 +49,7 @@ class VideoFileCamera:
         return self._dropped_frames
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.ports.Camera`."""
+        """See `mavbridge.core.ports.Camera`."""
         now_ns = self._clock.now_ns()
         deadline_ns = now_ns + timeout_ns
         if self._start_ns is None:

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from mavbridge.errors import CameraError
+from mavbridge.core.errors import CameraError
 
 HEADER_BYTES = 32
 LENGTH_AT = 4

@@ -2,29 +2,23 @@
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.clock import NS_PER_MS, NS_PER_S, Clock
-from mavbridge.config import HEARTBEAT_HZ, LinkConfig, period_ns
-from mavbridge.errors import PeerError
-from mavbridge.mavlink import params
-from mavbridge.mavlink.calibration import RcCalibration
-from mavbridge.mavlink.codec import Codec, manual_control_sticks, pwm_of
-from mavbridge.mavlink.messages import CommandAck, Heartbeat, StatusText, Timesync
-from mavbridge.mavlink.requests import AskCommand, AskParam, Request
-from mavbridge.mavlink.roster import Peer, Roster
-from mavbridge.mavlink.stats import LinkCounters
-from mavbridge.mavlink.tap import PacketTap
-from mavbridge.mavlink.timesync import TimesyncFilter
-from mavbridge.mavlink.transport import Transport
-from mavbridge.mavlink.vehicle import Vehicle
-from mavbridge.mavlink.wire import Arrival, Wire
-from mavbridge.records import (
-    Decision,
-    LinkSnapshot,
-    LinkStats,
-    Release,
-    Sticks,
-    Telemetry,
-)
+from mavbridge.config.flight import LinkConfig
+from mavbridge.config.rates import HEARTBEAT_HZ, period_ns
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.errors import PeerError
+from mavbridge.core.records import Decision, LinkSnapshot, LinkStats, Release, Sticks, Telemetry
+from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.messages import CommandAck, Heartbeat, StatusText, Timesync
+from mavbridge.mavlink.codec.requests import AskCommand, AskParam, Request
+from mavbridge.mavlink.codec.sticks import Codec, manual_control_sticks, pwm_of
+from mavbridge.mavlink.session import params
+from mavbridge.mavlink.session.roster import Peer, Roster
+from mavbridge.mavlink.session.stats import LinkCounters
+from mavbridge.mavlink.session.timesync import TimesyncFilter
+from mavbridge.mavlink.session.vehicle import Vehicle
+from mavbridge.mavlink.transport.sockets import Transport
+from mavbridge.mavlink.transport.tap import PacketTap
+from mavbridge.mavlink.transport.wire import Arrival, Wire
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 RELEASE_REPEATS = 10

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mavbridge.core.records import ImageArray
 from mavbridge.recording.folder import FRAMES, TICKS, VIDEO
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
 from mavbridge.recording.rows import FrameRow, TickRow
@@ -12,8 +13,7 @@ from mavbridge.recording.schema import FRAMES as FRAMES_SCHEMA
 from mavbridge.recording.schema import TICKS as TICKS_SCHEMA
 from mavbridge.recording.schema import read_frames, read_ticks
 from mavbridge.recording.tables import read_table
-from mavbridge.recording.video_file import count_frames, read_video
-from mavbridge.records import ImageArray
+from mavbridge.recording.video.file import count_frames, read_video
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from mavbridge.core.records import Packet, Tick, VisionTick
 from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
 from mavbridge.recording.meta import FlightMeta, write_meta
 from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow
@@ -12,8 +13,7 @@ from mavbridge.recording.schema import DEMONSTRATION_TICKS, ticks_batch
 from mavbridge.recording.schema import TICKS as TICKS_SCHEMA
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.tlog import TlogWriter
-from mavbridge.recording.video_writer import Pressure, VideoWriter, WriterDiedError
-from mavbridge.records import Packet, Tick, VisionTick
+from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError
 
 FLUSH_NS = 500_000_000
 """Longest span of events that a crash may take with it."""

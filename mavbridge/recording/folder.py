@@ -3,7 +3,7 @@
 import importlib.util
 from pathlib import Path
 
-from mavbridge.errors import UserError
+from mavbridge.core.errors import UserError
 
 META = "meta.json"
 TICKS = "ticks"

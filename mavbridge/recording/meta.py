@@ -6,9 +6,10 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from mavbridge.errors import MavbridgeError
+from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.folder import META
-from policy.contract import Contract, ContractError
+from policy.contract import Contract
+from policy.errors import ContractError
 
 FORMAT = "mavbridge-flight"
 VERSION = 1

@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mavbridge.observers import ObserverThread
-from mavbridge.ports import PacketSource
+from mavbridge.core.observers import ObserverThread
+from mavbridge.core.ports import PacketSource
+from mavbridge.core.records import Event, Tick
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
-from mavbridge.records import Event, Tick
 
 CAPACITY = 6000
 """Ticks that may wait: a minute at 100 Hz."""

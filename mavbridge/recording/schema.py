@@ -6,8 +6,8 @@ from typing import Any, TypeVar
 import numpy as np
 import pyarrow as pa
 
+from mavbridge.core.records import Sticks, StickTrace, Tick, VehicleState
 from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow
-from mavbridge.records import Sticks, StickTrace, Tick, VehicleState
 from policy.contract import ACTION_DIM, STATE_DIM
 
 _STICKS = pa.list_(pa.float32(), ACTION_DIM)

@@ -7,7 +7,7 @@ from typing import IO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mavbridge.errors import MavbridgeError
+from mavbridge.core.errors import MavbridgeError
 
 READ_ERRORS = (pa.ArrowException, OSError)
 

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Iterable
 from pathlib import Path
 
-from mavbridge.records import Packet
+from mavbridge.core.records import Packet
 
 _STAMP = struct.Struct(">Q")
 _LINK_MASK = 0b11

@@ -11,12 +11,13 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 
-from policy.contract import Executable, FloatArray, PolicyError, SingleRatePolicy
+from policy.contract import Executable, FloatArray, SingleRatePolicy
 from policy.engines.executable import EngineName, Precision, Settings
+from policy.engines.parity import Probe, disagreement, make_probe
 from policy.engines.torch_eager import make_torch_executable
-from policy.parity import Probe, disagreement, make_probe
-from policy.resnet_unet import ResnetUnet
-from policy.toge import Toge
+from policy.errors import PolicyError
+from policy.nets.resnet_unet import ResnetUnet
+from policy.nets.toge import Toge
 
 BUILTIN = (Toge, ResnetUnet)
 PROBE_ELAPSED_S = 0.02

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from policy.contract import ACTION_DIM, Executable, FloatArray, PolicyError
+from policy.contract import ACTION_DIM, Executable, FloatArray
 from policy.engines.executable import Settings, always_full, assemble, warm_started
-from policy.resnet_unet import ResnetUnet
-from policy.toge import Toge
+from policy.errors import PolicyError
+from policy.nets.resnet_unet import ResnetUnet
+from policy.nets.toge import Toge
 
 NAME = "cuda-graph"
 WARM_UP_CALLS = 3

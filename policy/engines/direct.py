@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from policy.contract import Executable, FloatArray, PolicyError, SingleRatePolicy
+from policy.contract import Executable, FloatArray, SingleRatePolicy
 from policy.engines.executable import Settings, make_executable
+from policy.errors import PolicyError
 
 NAME = "numpy"
 

@@ -14,11 +14,11 @@ from policy.contract import (
     DualRatePolicy,
     Executable,
     FloatArray,
-    PolicyError,
     SingleRatePolicy,
     WarmStartPolicy,
 )
 from policy.engines.warm_start import Segment, Solve, WarmStart, segment_spans
+from policy.errors import PolicyError
 from policy.preprocess import image_to_input
 from policy.user_code import user_code
 

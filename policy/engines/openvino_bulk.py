@@ -8,8 +8,8 @@ from policy.engines.executable import Precision
 from policy.engines.openvino_cpu import DEVICE
 from policy.engines.openvino_graph import backbone_graph
 from policy.engines.signal_stack import signal_stack_kept
-from policy.resnet_unet import ResnetUnet
-from policy.toge import Toge
+from policy.nets.resnet_unet import ResnetUnet
+from policy.nets.toge import Toge
 
 
 class BulkEncoder:

@@ -12,21 +12,16 @@ from pathlib import Path
 import numpy as np
 import openvino as ov
 
-from policy.contract import Executable, FloatArray, PolicyError
+from policy.contract import Executable, FloatArray
 from policy.engines.compile_cache import CompileCache, user_cache_folder
-from policy.engines.executable import (
-    Precision,
-    Settings,
-    always_full,
-    assemble,
-    warm_started,
-)
+from policy.engines.executable import Precision, Settings, always_full, assemble, warm_started
 from policy.engines.openvino_graph import denoise_graph, step_inputs, vision_graph
 from policy.engines.signal_stack import signal_stack_kept
 from policy.engines.warm_start import Segment
+from policy.errors import PolicyError
+from policy.nets.resnet_unet import ResnetUnet
+from policy.nets.toge import Toge
 from policy.preprocess import egocentric
-from policy.resnet_unet import ResnetUnet
-from policy.toge import Toge
 
 NAME = "openvino"
 DEVICE = "CPU"

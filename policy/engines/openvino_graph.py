@@ -14,14 +14,14 @@ import torch
 from openvino import opset15 as ops
 from torch import Tensor, nn
 
-from policy.action_head import DiffusionHead, size_dims
 from policy.contract import ACTION_DIM, FloatArray
-from policy.diffusion import DdimStep, NoiseSchedule
 from policy.engines.openvino_layers import Layer, Node, conv, ints, layer, same
+from policy.nets.action_head import DiffusionHead, size_dims
+from policy.nets.diffusion import DdimStep, NoiseSchedule
+from policy.nets.resnet_unet import ResnetUnet
+from policy.nets.toge import Toge
+from policy.nets.unet1d import ResidualBlock, UNet1d
 from policy.preprocess import egocentric_scale
-from policy.resnet_unet import ResnetUnet
-from policy.toge import Toge
-from policy.unet1d import ResidualBlock, UNet1d
 
 
 def backbone_graph(policy: Toge | ResnetUnet) -> ov.Model:

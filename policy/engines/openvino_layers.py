@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 from openvino import opset15 as ops
 from torch import Tensor, nn
 
-from policy.convnext import ChannelNorm, ConvNextBlock, ConvNextTiny, Permute
-from policy.efficientnet import EfficientNetB3, MBConv, SqueezeExcitation
-from policy.encoders import HEADS, AttentionBlock, HistoryEncoder
-from policy.pooling import MOMENTS, moment_weights
-from policy.resnet import RESNET8_CELLS, BasicBlock, Bottleneck, ResNet, ResNet8
-from policy.unet1d import Conv
+from policy.nets.convnext import ChannelNorm, ConvNextBlock, ConvNextTiny, Permute
+from policy.nets.efficientnet import EfficientNetB3, MBConv, SqueezeExcitation
+from policy.nets.encoders import HEADS, AttentionBlock, HistoryEncoder
+from policy.nets.pooling import MOMENTS, moment_weights
+from policy.nets.resnet import RESNET8_CELLS, BasicBlock, Bottleneck, ResNet, ResNet8
+from policy.nets.unet1d import Conv
 
 Node: TypeAlias = Any
 """openvino's Node and Output, which have no types."""

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.contract import Executable, FloatArray, PolicyError, SingleRatePolicy
+from policy.contract import Executable, FloatArray, SingleRatePolicy
 from policy.engines.executable import Run, Settings, make_executable
+from policy.errors import PolicyError
 
 NAME = "torch"
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from policy.contract import FloatArray, PolicyError
+from policy.contract import FloatArray
+from policy.errors import PolicyError
 
 FULL_EVERY_S = 1.0
 """Between the starts of full solves, and the age of a guess that is none any more; in seconds of

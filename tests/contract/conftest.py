@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.autopilot import VehicleConfig
 from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from sitl.vehicle import Vehicle
+from sitl.simulated_vehicle import Vehicle
+from sitl.vehicle.autopilot import VehicleConfig
 
 GCS = 255
 TICK_NS = 5 * NS_PER_MS

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 
 from sitl.clock import NS_PER_S, MonotonicClock
-from sitl.params import Params
+from sitl.vehicle.params import Params
 
 PEERS = Path(__file__).parents[2] / ".venv-peers" / "bin"
-CLIENT = Path(__file__).with_name("mavsdk_client.py")
+CLIENT = Path(__file__).parents[1] / "helpers" / "mavsdk_client.py"
 DEADLINE_S = 40.0
 
 pytestmark = pytest.mark.peers

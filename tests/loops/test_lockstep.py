@@ -7,22 +7,24 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fakes import ListSink
-from mavbridge.assembly import load_configured_policy
-from mavbridge.clock import NS_PER_MS, NS_PER_S
-from mavbridge.config import PolicyConfig, Rates
-from mavbridge.errors import PeerError, UserError
-from mavbridge.lockstep.delays import Delays, Fixed
-from mavbridge.lockstep.episode import Episode, Setup, run_episode
-from mavbridge.lockstep.referee import EpisodeInterruptedError
-from mavbridge.lockstep.result import EpisodeResult
-from mavbridge.lockstep.wire import MemoryTransport
-from mavbridge.lockstep.world import Exposure, Scene, nominal_scene
-from mavbridge.records import Tick
-from pilots import pursuit, single_rate, steady
-from policy.contract import Executable, FloatArray, PolicyError
-from sitl.autopilot import STEP_NS, VehicleConfig
-from sitl.vehicle import Vehicle
+from helpers.fakes import ListSink
+from helpers.pilots import pursuit, single_rate, steady
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.rates import Rates
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.records import Tick
+from mavbridge.flight.assembly import load_configured_policy
+from mavbridge.simulation.delays import Delays, Fixed
+from mavbridge.simulation.episode import Episode, Setup, run_episode
+from mavbridge.simulation.referee import EpisodeInterruptedError
+from mavbridge.simulation.result import EpisodeResult
+from mavbridge.simulation.wire import MemoryTransport
+from mavbridge.simulation.world import Exposure, Scene, nominal_scene
+from policy.contract import Executable, FloatArray
+from policy.errors import PolicyError
+from sitl.simulated_vehicle import Vehicle
+from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 MS = NS_PER_MS
 HOVER = (0.0, 0.0, 0.0, 0.0)

@@ -8,11 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fakes import START_NS, FakeClock, FakeLink, ListSink, ScriptedCamera, level_telemetry
-from mavbridge.action_loop import NEUTRAL_NS, NEUTRAL_SPACING_NS, ActionLoop, ActionSettings
-from mavbridge.clock import NS_PER_MS, NS_PER_S, GridPacer
-from mavbridge.feature_cache import FeatureCache
-from mavbridge.records import (
+from helpers.fakes import START_NS, FakeClock, FakeLink, ListSink, ScriptedCamera, level_telemetry
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, GridPacer
+from mavbridge.core.records import (
     IDLE,
     NEUTRAL,
     Command,
@@ -24,10 +22,12 @@ from mavbridge.records import (
     Release,
     Sticks,
 )
-from mavbridge.safety import Engagement
-from mavbridge.smoothing import Smoothing, StickSmoother
-from mavbridge.state import Freshness
-from mavbridge.vision_loop import VisionLoop
+from mavbridge.flight.action_loop import NEUTRAL_NS, NEUTRAL_SPACING_NS, ActionLoop, ActionSettings
+from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.state import Freshness
+from mavbridge.flight.vision_loop import VisionLoop
+from mavbridge.gate.engagement import Engagement
+from mavbridge.gate.smoothing import Smoothing, StickSmoother
 
 MS = NS_PER_MS
 FRAME_NS = NS_PER_S // 30

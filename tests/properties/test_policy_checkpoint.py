@@ -8,9 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save
 
-from policy.checkpoint import CheckpointError, load_checkpoint
+from policy.checkpoints.policy_file import CheckpointError, load_checkpoint
 from policy.contract import Contract
-from policy.toge import TogeConfig
+from policy.nets.toge import TogeConfig
 
 FALLBACK = TogeConfig(
     backbone="resnet18", contract=Contract(image_height=32, image_width=32, horizon=4)

@@ -2,7 +2,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policy.diffusion import NoiseSchedule, ddim_solve
+from policy.nets.diffusion import NoiseSchedule, ddim_solve
 
 SCHEDULES = st.builds(
     NoiseSchedule,

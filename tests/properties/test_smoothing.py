@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavbridge.clock import NS_PER_S
-from mavbridge.records import NEUTRAL, Sticks
-from mavbridge.smoothing import Smoothing, StickSmoother
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import NEUTRAL, Sticks
+from mavbridge.gate.smoothing import Smoothing, StickSmoother
 
 SETTINGS = Smoothing(max_slew_per_s=8.0, tau_s=0.05)
 DURATION_S = 2.0

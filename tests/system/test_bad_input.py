@@ -4,8 +4,8 @@ import socket
 from pathlib import Path
 
 import pytest
-from stand import free_udp_port
 
+from helpers.stand import free_udp_port
 from mavbridge.__main__ import main
 
 pytestmark = pytest.mark.system

@@ -1,6 +1,6 @@
 import pytest
 
-from mavbridge.bench.link import clients, trial
+from mavbridge.commands.bench.link import clients, trial
 
 pytestmark = pytest.mark.system
 

@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.bench import processes
-from mavbridge.bench.processes import end, require_source_tree, running, wait
-from mavbridge.errors import UserError
+from mavbridge.commands.bench import processes
+from mavbridge.commands.bench.processes import end, require_source_tree, running, wait
+from mavbridge.core.errors import UserError
 
 pytestmark = pytest.mark.system
 FOR_EVER = "import threading; print('here', flush=True); threading.Event().wait()"

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from helpers.rollouts import TinyWorld
 from mavbridge.__main__ import main
-from mavbridge.bench import rollout
-from mavbridge.bench.rollout import Effort
-from policy.world_model_checkpoint import save_world_model
-from rollouts import TinyWorld
+from mavbridge.commands.bench import rollout
+from mavbridge.commands.bench.rollout import Effort
+from policy.checkpoints.world_model_file import save_world_model
 
 pytestmark = pytest.mark.system
 

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.config import EvaluateConfig, PolicyConfig
-from mavbridge.evaluation.cluster import fly_on_ray
-from mavbridge.evaluation.jobs import Flown, Job, fly_job, make_jobs
-from mavbridge.evaluation.realtime import fly_realtime
+from mavbridge.commands.evaluate.cluster import fly_on_ray
+from mavbridge.commands.evaluate.jobs import Flown, Job, fly_job, make_jobs
+from mavbridge.commands.evaluate.realtime import fly_realtime
+from mavbridge.config.evaluate import EvaluateConfig
+from mavbridge.config.policy import PolicyConfig
 
 pytestmark = pytest.mark.system
 

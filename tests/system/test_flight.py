@@ -4,7 +4,8 @@ import signal
 from pathlib import Path
 
 import pytest
-from stand import Flight, Override, flight
+
+from helpers.stand import Flight, Override, flight
 
 pytestmark = pytest.mark.system
 
@@ -54,7 +55,7 @@ def test_a_signal_hands_the_sticks_back(tmp_path: Path, number: signal.Signals) 
 
 def test_an_exception_in_the_policy_hands_the_sticks_back(tmp_path: Path) -> None:
     with flight(tmp_path) as flown:
-        flown.start(*FLY, "--policy", "user_policies:Exploding")
+        flown.start(*FLY, "--policy", "helpers.user_policies:Exploding")
         status, output = flown.end()
     assert status == 1
     assert_handed_back(flown)
@@ -65,7 +66,7 @@ def test_an_exception_in_the_policy_hands_the_sticks_back(tmp_path: Path) -> Non
 
 def test_a_policy_that_hangs_loses_the_sticks_for_good(tmp_path: Path) -> None:
     with flight(tmp_path) as flown:
-        flown.start(*FLY, "--policy", "user_policies:Hanging")
+        flown.start(*FLY, "--policy", "helpers.user_policies:Hanging")
         status, output = flown.end()
     assert status == 1
     assert "the action loop has hung" in output

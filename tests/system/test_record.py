@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 from pymavlink import mavutil
-from stand import Flight, Override, flight
 
+from helpers.stand import Flight, Override, flight
+from mavbridge.core.records import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-from mavbridge.records import Sticks
 
 pytestmark = pytest.mark.system
 

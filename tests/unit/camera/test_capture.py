@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from fakes import START_NS, FakeClock
+from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import capture
 from mavbridge.camera.capture import DeviceSource, StreamSource, device_mode, exposure_ns
 from mavbridge.camera.grabber import Grabber
-from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from mavbridge.errors import CameraError
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.errors import CameraError
 
 NOW_NS = 1_000 * NS_PER_S
 

@@ -6,10 +6,10 @@ import threading
 import numpy as np
 import pytest
 
-from fakes import START_NS, FakeClock
+from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera.grabber import FIRST_FRAME_NS, STALL_NS, Grabber, Image
-from mavbridge.clock import NS_PER_S
-from mavbridge.errors import CameraError
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import CameraError
 
 WAIT_NS = 10 * NS_PER_S
 """Deadline of waits that succeed at once unless something is broken."""

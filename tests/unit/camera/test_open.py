@@ -5,13 +5,13 @@ import cv2
 import numpy as np
 import pytest
 
-from fakes import FakeClock
+from helpers.fakes import FakeClock
 from mavbridge.camera import open as camera_open
 from mavbridge.camera.open import open_camera
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
-from mavbridge.errors import CameraError, UserError
-from sitl.shm import FramePublisher
+from mavbridge.core.errors import CameraError, UserError
+from sitl.camera.shm import FramePublisher
 
 
 class NotOpenedError(Exception):

@@ -9,9 +9,9 @@ import sys
 import numpy as np
 import pytest
 
-from fakes import START_NS, FakeClock
-from mavbridge.clock import NS_PER_MS, NS_PER_S
-from mavbridge.errors import CameraError, UserError
+from helpers.fakes import START_NS, FakeClock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import CameraError, UserError
 
 if importlib.util.find_spec("mss") is None:
     pytest.skip("needs the package mss", allow_module_level=True)

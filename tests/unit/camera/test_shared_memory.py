@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fakes import START_NS, FakeClock
+from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import shared_memory
 from mavbridge.camera.shared_memory import SharedMemoryCamera
-from mavbridge.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from mavbridge.errors import CameraError, UserError
-from sitl.shm import FramePublisher
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.errors import CameraError, UserError
+from sitl.camera.shm import FramePublisher
 
 pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
 
@@ -313,7 +313,7 @@ def test_the_simulators_writer_is_understood(path, clock):
 SOLID_FRAMES = """
 import sys, time
 import numpy as np
-from sitl.shm import FramePublisher
+from sitl.camera.shm import FramePublisher
 publisher = FramePublisher(sys.argv[1], 320, 240)
 print("ready", flush=True)
 sys.stdin.readline()

@@ -2,10 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
-from fakes import START_NS, FakeClock
+from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera.video_file import VideoFileCamera
-from mavbridge.clock import NS_PER_MS, NS_PER_S
-from mavbridge.errors import CameraError
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import CameraError
 
 FPS = 20
 FRAMES = 10

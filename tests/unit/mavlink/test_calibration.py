@@ -2,16 +2,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavbridge.mavlink.calibration import RcCalibration, RcChannel
-from mavbridge.records import IDLE, NEUTRAL, Sticks
-
-ARDUPILOT = RcCalibration(
-    throttle=RcChannel(number=3, min_us=1100, trim_us=1100, max_us=1900),
-    yaw=RcChannel(number=4, min_us=1100, trim_us=1500, max_us=1900),
-    pitch=RcChannel(number=2, min_us=1100, trim_us=1500, max_us=1900),
-    roll=RcChannel(number=1, min_us=1100, trim_us=1500, max_us=1900),
-    throttle_floor_us=985,
-)
+from helpers.wire import ARDUPILOT
+from mavbridge.core.records import IDLE, NEUTRAL, Sticks
+from mavbridge.mavlink.codec.calibration import RcCalibration, RcChannel
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from test_calibration import ARDUPILOT
-from wire import WireEnd
 
-from mavbridge.mavlink.codec import Codec, CommandRefusedError, manual_control_sticks, pwm_of
-from mavbridge.mavlink.messages import (
+from helpers.wire import ARDUPILOT, WireEnd
+from mavbridge.core.records import IDLE, NEUTRAL, Sticks
+from mavbridge.mavlink.codec.messages import (
     Attitude,
     AutopilotVersion,
     Body,
@@ -23,7 +22,7 @@ from mavbridge.mavlink.messages import (
     StatusText,
     Timesync,
 )
-from mavbridge.records import IDLE, NEUTRAL, Sticks
+from mavbridge.mavlink.codec.sticks import Codec, CommandRefusedError, manual_control_sticks, pwm_of
 
 TARGET = Source(1, 1)
 m = dialect.MAVLink(None)

@@ -4,9 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.mavlink.codec import Codec
-from mavbridge.mavlink.fast_packets import decode_state_packet, pack_override
-from mavbridge.mavlink.messages import Incoming, Source
+from mavbridge.mavlink.codec.fast_packets import decode_state_packet, pack_override
+from mavbridge.mavlink.codec.messages import Incoming, Source
+from mavbridge.mavlink.codec.sticks import Codec
 
 byte = st.integers(0, 255)
 pwm = st.integers(0, 65535)

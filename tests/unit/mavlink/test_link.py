@@ -5,17 +5,16 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from test_parts import CALIBRATION
-from wire import WireEnd
 
-from fakes import FakeClock
-from mavbridge.clock import NS_PER_MS, NS_PER_S
-from mavbridge.config import LinkConfig
-from mavbridge.errors import PeerError
+from helpers.fakes import FakeClock
+from helpers.wire import CALIBRATION, WireEnd
+from mavbridge.config.flight import LinkConfig
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import PeerError
+from mavbridge.core.records import IDLE, Command, LinkSnapshot, Release, Sticks
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.tap import PacketTap
-from mavbridge.mavlink.transport import Address, Chunk, TransportDownError
-from mavbridge.records import IDLE, Command, LinkSnapshot, Release, Sticks
+from mavbridge.mavlink.transport.sockets import Address, Chunk, TransportDownError
+from mavbridge.mavlink.transport.tap import PacketTap
 
 MS = NS_PER_MS
 PARAMS = CALIBRATION | {"MAV_GCS_SYSID": 255.0, "RC_OVERRIDE_TIME": 3.0}

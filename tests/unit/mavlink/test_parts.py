@@ -3,11 +3,10 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.clock import NS_PER_MS, NS_PER_S
-from mavbridge.errors import PeerError, UserError
-from mavbridge.mavlink import params, streams
-from mavbridge.mavlink.echo import NUDGE_US, EchoCheck
-from mavbridge.mavlink.messages import (
+from helpers.wire import CALIBRATION
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import PeerError, UserError
+from mavbridge.mavlink.codec.messages import (
     Attitude,
     CommandAck,
     Heartbeat,
@@ -16,12 +15,14 @@ from mavbridge.mavlink.messages import (
     SpecificForce,
     Timesync,
 )
-from mavbridge.mavlink.modes import ModeTable
-from mavbridge.mavlink.requests import AskCommand, AskStream
-from mavbridge.mavlink.roster import Roster
-from mavbridge.mavlink.stats import LinkCounters
-from mavbridge.mavlink.telemetry import TelemetryJoiner
-from mavbridge.mavlink.timesync import TimesyncFilter
+from mavbridge.mavlink.codec.requests import AskCommand, AskStream
+from mavbridge.mavlink.session import params, streams
+from mavbridge.mavlink.session.echo import NUDGE_US, EchoCheck
+from mavbridge.mavlink.session.modes import ModeTable
+from mavbridge.mavlink.session.roster import Roster
+from mavbridge.mavlink.session.stats import LinkCounters
+from mavbridge.mavlink.session.telemetry import TelemetryJoiner
+from mavbridge.mavlink.session.timesync import TimesyncFilter
 
 S = NS_PER_S
 
@@ -146,19 +147,6 @@ def test_a_parameter_that_does_not_exist_is_given_up() -> None:
     assert asked == 4
     assert reader.done
     assert reader.missing == {"NONE"}
-
-
-CALIBRATION = {
-    **dict(
-        zip(("RCMAP_ROLL", "RCMAP_PITCH", "RCMAP_THROTTLE", "RCMAP_YAW"), (1, 2, 3, 4), strict=True)
-    ),
-    **{
-        f"RC{n}_{part}": value
-        for n in range(1, 5)
-        for part, value in (("MIN", 1100), ("TRIM", 1500), ("MAX", 1900), ("REVERSED", 0))
-    },
-    "FS_THR_VALUE": 975,
-}
 
 
 def test_calibration_comes_from_the_vehicle() -> None:

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from pymavlink import mavutil
 from pymavlink.dialects.v10 import ardupilotmega as dialect1
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from wire import WireEnd
 
-from mavbridge.mavlink import tap
-from mavbridge.mavlink.tap import Framer, PacketTap
-from mavbridge.mavlink.transport import Chunk
+from helpers.wire import WireEnd
+from mavbridge.core.records import Packet
+from mavbridge.mavlink.transport import tap
+from mavbridge.mavlink.transport.sockets import Chunk
+from mavbridge.mavlink.transport.tap import Framer, PacketTap
 from mavbridge.recording.tlog import TlogWriter
-from mavbridge.records import Packet
 
 PEER = ("127.0.0.1", 14550)
 

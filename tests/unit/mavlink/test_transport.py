@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from fakes import FakeClock
-from mavbridge.clock import MonotonicClock
-from mavbridge.errors import UserError
-from mavbridge.mavlink.transport import (
+from helpers.fakes import FakeClock
+from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.errors import UserError
+from mavbridge.mavlink.transport.sockets import (
     TCP_SILENCE_NS,
     SerialTransport,
     TcpTransport,

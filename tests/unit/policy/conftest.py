@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from policy.contract import QUATERNION, Contract, Executable, FloatArray
-from policy.toge import Toge, TogeConfig
+from policy.nets.toge import Toge, TogeConfig
 
 
 @pytest.fixture(scope="session")

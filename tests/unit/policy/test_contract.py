@@ -10,8 +10,8 @@ from policy.contract import (
     STATE_NAMES,
     VELOCITY_CHANGE,
     Contract,
-    ContractError,
 )
+from policy.errors import ContractError
 
 
 def test_round_trips_through_its_header_form() -> None:

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from policy.checkpoint import build_policy, save_checkpoint
-from policy.contract import Contract, PolicyError
+from policy.checkpoints.policy_file import build_policy, save_checkpoint
+from policy.contract import Contract
+from policy.errors import PolicyError
 from policy.loading import LoadedPolicy, load_policy
-from policy.resnet_unet import ResnetUnetConfig
-from policy.toge import Toge
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import Toge
 
 RGB = np.full((48, 64, 3), 90, np.uint8)
 STATE = np.eye(1, 13, 3, dtype=np.float32)

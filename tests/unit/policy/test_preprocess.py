@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from policy.contract import Contract, PolicyError
+from policy.contract import Contract
+from policy.errors import PolicyError
 from policy.preprocess import image_to_input
 
 CONTRACT = Contract(image_height=32, image_width=48)

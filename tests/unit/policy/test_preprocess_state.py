@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from policy import rotation
 from policy.contract import QUATERNION, VELOCITY, Contract
-from policy.encoders import StateEncoder
+from policy.nets.encoders import StateEncoder
 from policy.preprocess import egocentric
 
 angle = st.floats(-3.1, 3.1)

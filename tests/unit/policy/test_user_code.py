@@ -3,9 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from policy.contract import Contract, PolicyError
+from policy.contract import Contract
 from policy.engines.direct import make_numpy_executable
 from policy.engines.executable import Settings
+from policy.errors import PolicyError
 from policy.user_code import user_code
 
 

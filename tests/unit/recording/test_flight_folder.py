@@ -4,15 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from factories import make_tick
-from mavbridge.errors import MavbridgeError, UserError
+from helpers.factories import make_tick
+from helpers.recordings import make_frame, make_meta, number_of
+from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.records import Sticks
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.rows import FrameTruth, TickLabels
-from mavbridge.records import Sticks
-from recordings import make_frame, make_meta, number_of
 
 
 def record(folder: Path, *, ticks: int = 30, frames: int = 10) -> FlightWriter:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from factories import make_tick
+from helpers.factories import make_tick
+from helpers.recordings import make_frame, make_meta, number_of, send_signal
+from mavbridge.core.records import Packet
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.recorder import Recorder
-from mavbridge.records import Packet
-from recordings import make_frame, make_meta, number_of, send_signal
 
 DEADLINE_S = 30.0
 

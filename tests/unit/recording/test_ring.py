@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavbridge.recording import ring as ring_module
-from mavbridge.recording.ring import MAX_BYTES, MAX_SLOTS, MIN_SLOTS, FrameRing
+from mavbridge.recording.video import ring as ring_module
+from mavbridge.recording.video.ring import MAX_BYTES, MAX_SLOTS, MIN_SLOTS, FrameRing
 
 
 def shm_file(ring: FrameRing) -> Path:

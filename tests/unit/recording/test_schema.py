@@ -5,7 +5,9 @@ import pyarrow as pa
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factories import make_released_tick, make_state, make_tick, make_trace
+from helpers.factories import make_released_tick, make_state, make_tick, make_trace
+from helpers.recordings import make_row
+from mavbridge.core.records import Sticks, Tick, VehicleState
 from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow
 from mavbridge.recording.schema import (
     DEMONSTRATION_FRAMES,
@@ -17,8 +19,6 @@ from mavbridge.recording.schema import (
     read_ticks,
     ticks_batch,
 )
-from mavbridge.records import Sticks, Tick, VehicleState
-from recordings import make_row
 
 floats = st.floats(-1e3, 1e3, width=32)
 sticks = st.builds(Sticks, *(st.floats(-1, 1, width=32),) * 4)

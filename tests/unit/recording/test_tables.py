@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers.recordings import make_row
 from mavbridge.recording.schema import FRAMES, TICKS, frames_batch
 from mavbridge.recording.tables import TableError, TableWriter, read_table
-from recordings import make_row
 
 SCHEMA_BYTES = FRAMES.serialize().size
 

@@ -4,9 +4,9 @@ import av
 import numpy as np
 import pytest
 
-from factories import FRAME_NS, START_NS
-from mavbridge.recording.video_file import FragmentedMp4, VideoError, count_frames, read_video
-from recordings import number_of, picture
+from helpers.factories import FRAME_NS, START_NS
+from helpers.recordings import number_of, picture
+from mavbridge.recording.video.file import FragmentedMp4, VideoError, count_frames, read_video
 
 
 def write(path: Path, count: int) -> FragmentedMp4:

@@ -15,21 +15,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavbridge.recording import ring
-from mavbridge.recording.messages import Finish, VideoJob
-from mavbridge.recording.ring import MIN_SLOTS
+from helpers.recordings import make_row, number_of, picture, send_signal
 from mavbridge.recording.schema import DEMONSTRATION_FRAMES, FRAMES, read_frames
 from mavbridge.recording.tables import read_table
-from mavbridge.recording.video_file import count_frames, read_video
-from mavbridge.recording.video_writer import (
+from mavbridge.recording.video import ring
+from mavbridge.recording.video.file import count_frames, read_video
+from mavbridge.recording.video.messages import Finish, VideoJob
+from mavbridge.recording.video.ring import MIN_SLOTS
+from mavbridge.recording.video.writer import (
     FrameSender,
     Pressure,
     VideoWriter,
     WriterDiedError,
     WriterError,
 )
-from mavbridge.recording.writer_process import WriterService
-from recordings import make_row, number_of, picture, send_signal
+from mavbridge.recording.video.writer_process import WriterService
 
 DEADLINE_S = 30.0
 
@@ -219,8 +219,8 @@ def test_ctrl_c_is_not_for_the_writer(tmp_path: Path) -> None:
 PRODUCER = """
 import os, signal, sys
 from pathlib import Path
-from mavbridge.recording.video_writer import VideoWriter
-from recordings import make_row, picture
+from mavbridge.recording.video.writer import VideoWriter
+from helpers.recordings import make_row, picture
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])

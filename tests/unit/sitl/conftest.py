@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import pytest
 
-from sitl.autopilot import STEP_NS, Autopilot, VehicleConfig
 from sitl.clock import NS_PER_S
-from sitl.modes import Mode
-from sitl.params import Params
 from sitl.rotation import to_euler
+from sitl.vehicle.autopilot import STEP_NS, Autopilot, VehicleConfig
+from sitl.vehicle.modes import Mode
+from sitl.vehicle.params import Params
 
 STEPS_PER_STICK_UPDATE = 8
 

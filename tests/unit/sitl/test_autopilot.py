@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from sitl.modes import Mode
+from sitl.vehicle.modes import Mode
 
 
 def test_alt_hold_holds_the_height_within_30_cm(pilot):

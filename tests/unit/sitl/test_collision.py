@@ -1,11 +1,11 @@
 import pytest
 
-from sitl.autopilot import STEP_NS, VehicleConfig
-from sitl.collision import VEHICLE_RADIUS_M, struck_gate
-from sitl.course import BAR_M, DEPTH_M, Course, Gate, Start
-from sitl.modes import Mode
+from sitl.course.collision import VEHICLE_RADIUS_M, struck_gate
+from sitl.course.course import BAR_M, DEPTH_M, Course, Gate, Start
 from sitl.rotation import IDENTITY
-from sitl.vehicle import Vehicle
+from sitl.simulated_vehicle import Vehicle
+from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
+from sitl.vehicle.modes import Mode
 
 GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0)
 FAR_GATE = Gate(center_ned_m=(20.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=1)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.course import (
+from sitl.course.course import (
     ALTITUDE_M,
     CLIMB_M,
     FIRST_LEG_M,

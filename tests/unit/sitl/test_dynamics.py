@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sitl import rotation
-from sitl.dynamics import (
+from sitl.vehicle.dynamics import (
     GRAVITY_MPS2,
     MASS_KG,
     MAX_MOTOR_THRUST_N,

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from course_flights import fly_course
-from sitl.camera import body_from_camera
-from sitl.conditions import random_conditions
-from sitl.course import Start, in_gate_axes, make_course
-from sitl.disturbance import StickDisturbance, random_start
+from helpers.course_flights import fly_course
+from sitl.camera.fpv import body_from_camera
+from sitl.course.course import Start, in_gate_axes, make_course
+from sitl.course.truth import gate_truth
 from sitl.errors import UsageError
-from sitl.expert import Expert
-from sitl.guidance import Knot, least_acceleration
+from sitl.expert.disturbance import StickDisturbance, random_start
+from sitl.expert.expert import Expert
+from sitl.expert.guidance import Knot, least_acceleration
 from sitl.rotation import IDENTITY, from_euler
-from sitl.truth import gate_truth
+from sitl.vehicle.conditions import random_conditions
 
 
 @pytest.fixture(scope="module")

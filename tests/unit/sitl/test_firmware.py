@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from course_flights import fly_course, pwm_us
-from sitl.autopilot import STEP_NS, VehicleConfig
+from helpers.course_flights import fly_course, pwm_us
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.conditions import NOMINAL, random_conditions
-from sitl.course import Start, make_course
-from sitl.expert import Expert, Sticks4
-from sitl.params import Params
+from sitl.course.course import Start, make_course
+from sitl.expert.expert import Expert, Sticks4
+from sitl.link.streams import Streams
 from sitl.rotation import IDENTITY, to_euler
-from sitl.streams import Streams
-from sitl.vehicle import Vehicle
+from sitl.simulated_vehicle import Vehicle
+from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
+from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.params import Params
 
 ALOFT = Start(
     position_ned_m=(0.0, 0.0, -30.0),

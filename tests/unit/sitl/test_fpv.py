@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl import scenery
-from sitl.camera import NEAR_M, TILT_UP_RAD, FpvRenderer, clip_near
-from sitl.course import Course, Gate, make_course
+from sitl.camera import scenery
+from sitl.camera.fpv import NEAR_M, TILT_UP_RAD, FpvRenderer, clip_near
+from sitl.course.course import Course, Gate, make_course
 from sitl.errors import UsageError
 from sitl.rotation import IDENTITY, from_euler
 

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl import sticks as pilot_sticks
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.params import Params
-from sitl.rc import IDLE_RECEIVER_US, RcEngine
-from sitl.sticks import Sticks, read_sticks
+from sitl.vehicle import sticks as pilot_sticks
+from sitl.vehicle.params import Params
+from sitl.vehicle.rc import IDLE_RECEIVER_US, RcEngine
+from sitl.vehicle.sticks import Sticks, read_sticks
 
 KEEP = 65535
 

@@ -10,9 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.faults import FaultyLink, LinkFaults, Reboot, SensorFreeze, VehicleFaults
-from sitl.messages import BUILDERS
-from sitl.streams import Streams
-from sitl.vehicle import Vehicle
+from sitl.link.messages import BUILDERS
+from sitl.link.streams import Streams
+from sitl.simulated_vehicle import Vehicle
 
 STEP_NS = 2_500_000
 

@@ -14,15 +14,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
 from sitl.app import RunOptions, filming, fly
-from sitl.autopilot import STEP_NS, VehicleConfig
 from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from sitl.collision import Crash
-from sitl.course import Course, make_course
-from sitl.modes import Mode
+from sitl.course.collision import Crash
+from sitl.course.course import Course, make_course
+from sitl.link.transport import Received
 from sitl.report import FlightLog, write_report
+from sitl.simulated_vehicle import Vehicle
 from sitl.stopping import StopRequest, stop_on_signal
-from sitl.transport import Received
-from sitl.vehicle import Vehicle
+from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
+from sitl.vehicle.modes import Mode
 
 
 class FakeClock:

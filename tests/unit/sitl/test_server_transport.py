@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_S, MonotonicClock
 from sitl.errors import UsageError
-from sitl.transport import MAX_PEERS, open_transport, split_frames
+from sitl.link.transport import MAX_PEERS, open_transport, split_frames
 
 DEADLINE_S = 5.0
 UNREAD_NS = 80_000_000

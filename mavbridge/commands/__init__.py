@@ -1,0 +1,1 @@
+"""The programs beside the flight, one package a command."""

@@ -1,0 +1,167 @@
+"""The world model as the loop calls it: numpy at the edge, no gradients, every second counted."""
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.records import FloatArray
+from policy.world_model.config import WorldModelConfig
+from policy.world_model.model import WorldModel
+
+
+class ImaginationError(MavbridgeError):
+    """A world model that imagines no numbers."""
+
+
+def cores_left_free() -> AbstractContextManager[None]:
+    """Meanwhile torch samples on all of a CPU's cores but one, which is for the decoder.
+
+    Torch's threads wait for each other at the end of every operation, spinning: with more of them
+    than cores a rollout takes twice the time.
+    """
+    return _threads(torch.get_num_threads() - 1)
+
+
+def one_core() -> AbstractContextManager[None]:
+    """Meanwhile torch works in this thread alone.
+
+    Frames are decoded so wherever it happens: how a sum is split up decides how it is rounded. One
+    frame alone gains little from a second core.
+    """
+    return _threads(1)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, count))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class Stopwatch:
+    """Adds up the time of its ``with`` blocks; not to be nested."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._started_ns = 0
+        self.seconds = 0.0
+
+    def __enter__(self) -> None:
+        """Start."""
+        self._started_ns = self._clock.now_ns()
+
+    def __exit__(self, *_: object) -> None:
+        """Stop."""
+        self.seconds += (self._clock.now_ns() - self._started_ns) / NS_PER_S
+
+
+class Meter:
+    """Where the loop's own thread spends its time; written by that thread alone."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.sample = Stopwatch(clock)
+        """Inside the world model."""
+        self.decode = Stopwatch(clock)
+        """Waiting for pixels: its own decodes, and room in the decode queue."""
+        self.write = Stopwatch(clock)
+        """Waiting for the files: its own writing, or the end of somebody else's."""
+        self.frames_decoded = 0
+        """By that thread."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampled:
+    """One sample of the world model."""
+
+    latents: Tensor
+    """[frames, C, h, w], on the model's device."""
+    states: FloatArray
+    """[frames, 13]"""
+    actions: FloatArray
+    """[frames, 4]"""
+    pixels: NDArray[np.uint8] | None
+    """[frames, H, W, 3], where everything is decoded at once."""
+
+
+class Sampler:
+    """One world model in both of its roles; used by the loop's thread."""
+
+    def __init__(
+        self, model: WorldModel, *, ddim_steps: int, decode_all: bool, clock: Clock
+    ) -> None:
+        """Adapt a model.
+
+        Args:
+            model: on its device.
+            ddim_steps: of every sample.
+            decode_all: every sample's frames at once, as the plain path does it.
+            clock: of the meter.
+        """
+        self.model = model
+        self.config: WorldModelConfig = model.config
+        self.meter = Meter(clock)
+        self._ddim_steps = ddim_steps
+        self._decode_all = decode_all
+        self._device = next(model.parameters()).device
+
+    def encode(self, images: NDArray[np.uint8]) -> Tensor:
+        """Images [N, H, W, 3] -> latents [N, C, h, w]."""
+        with torch.inference_mode():
+            return self.model.encode(torch.from_numpy(images).to(self._device))
+
+    def decode(self, latents: Tensor) -> NDArray[np.uint8]:
+        """Latents [N, C, h, w] -> images [N, H, W, 3], now."""
+        with torch.inference_mode(), one_core(), self.meter.decode:
+            pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
+        self.meter.frames_decoded += len(pixels)
+        return pixels
+
+    def sample(
+        self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
+    ) -> Sampled:
+        """Decide (actions None) or simulate.
+
+        Args:
+            latents: [1, context_frames, C, h, w]
+            states: [1, context_frames, 13]
+            actions: [frames, 4] to simulate, or None.
+            seed: of the noise, and of nothing else.
+
+        Raises:
+            ImaginationError: what came out is not finite.
+        """
+        with torch.inference_mode(), self.meter.sample:
+            imagined = self.model.sample(
+                latents,
+                self._tensor(states),
+                None if actions is None else self._tensor(actions[None]),
+                ddim_steps=self._ddim_steps,
+                noise_seed=seed,
+                sim_mode=actions is not None,
+            )
+            sampled_states = imagined.states[0].float().cpu().numpy()
+            sampled_actions = imagined.actions[0].float().cpu().numpy()
+        if not (np.isfinite(sampled_states).all() and np.isfinite(sampled_actions).all()):
+            raise ImaginationError(
+                "the world model imagined NaN or infinity: its weights are damaged, or it has left "
+                "what it was trained on; try more --ddim-steps, or another checkpoint"
+            )
+        return Sampled(
+            latents=imagined.latents[0],
+            states=sampled_states,
+            actions=sampled_actions,
+            pixels=self.decode(imagined.latents[0]) if self._decode_all else None,
+        )
+
+    def _tensor(self, values: FloatArray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)

@@ -1,0 +1,1 @@
+"""``mavbridge train``: flight folders in, a checkpoint out."""

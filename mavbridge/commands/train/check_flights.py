@@ -1,0 +1,24 @@
+"""What a training run flies to see how well its policy does: a few courses, in lockstep."""
+
+from pathlib import Path
+
+from mavbridge.config.courses import CHECK_COURSE_SEED
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import MonotonicClock
+from mavbridge.flight.assembly import load_configured_policy
+from mavbridge.simulation.episode import run_episode
+
+
+def share_of_gates(checkpoint: Path, policy: str, flights: int) -> float:
+    """Fly a checkpoint at two rates over ``flights`` courses; the share of gates passed, 0 to 1.
+
+    Raises:
+        MavbridgeError, PolicyError: it cannot be flown.
+    """
+    wanted = PolicyConfig(policy=policy, checkpoint=checkpoint, dual_rate=True)
+    executable = load_configured_policy(wanted, MonotonicClock()).executable
+    passed = total = 0
+    for index in range(flights):
+        result = run_episode(executable, course_seed=CHECK_COURSE_SEED + index, seed=index)
+        passed, total = passed + result.gates_passed, total + result.gates_total
+    return passed / total

@@ -1,0 +1,1 @@
+"""Settings, one module a command: a field is a flag, its docstring the help text."""

@@ -1,0 +1,54 @@
+"""Settings that choose a policy and what runs it; shared by every command that flies one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from cyclopts import Parameter
+
+from mavbridge.config.checks import check_range
+
+Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class PolicyConfig:
+    """What flies."""
+
+    policy: str = "toge"
+    """toge[:small|medium|large[:BACKBONE]], resnet-unet, scripted[:hover|square|circle|yaw],
+    or your own package.module:Class."""
+    checkpoint: Path | None = None
+    """Weights: .safetensors with the contract in its header, or .pt; toge has shipped ones."""
+    dual_rate: bool = False
+    """Encode images in their own thread and sample actions faster from the cached feature."""
+    num_diffusion_steps: int = 10
+    """DDIM steps of the action head."""
+    head_steps: int | None = None
+    """DDIM steps from the last chunk, moved to now (dual rate, toge); by default every solve has
+    all steps, from noise."""
+    allow_untrained: bool = False
+    """Fly TOGE with seeded random weights: for timing and bring-up only."""
+    image_size: int | None = None
+    """Pixels a side into the encoder; by default what the policy's contract says (224)."""
+    engine: Engine = "auto"
+    """What runs the network; auto takes the fastest that computes what torch computes."""
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1, mps."""
+    vision_device: str | None = None
+    """Device of the image encoder, if it is another one."""
+    action_device: str | None = None
+    """Device of the action head, if it is another one."""
+    seed: int = 0
+    """Seed of random weights and of the flight's initial diffusion noise; evaluate: of courses and
+    delays, too."""
+
+    def __post_init__(self) -> None:
+        """Refuse what the scheduler and encoders cannot serve."""
+        check_range("num-diffusion-steps", self.num_diffusion_steps, 1, 100, "steps")
+        if self.head_steps is not None:
+            check_range("head-steps", self.head_steps, 1, self.num_diffusion_steps, "steps")
+        if self.image_size is not None:
+            check_range("image-size", self.image_size, 32, 1024, "pixels")
+        check_range("seed", self.seed, 0, 2**63 - 1, "")

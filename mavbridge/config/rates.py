@@ -1,0 +1,98 @@
+"""Every rate of the flight in Hz, and the only place that holds one."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from cyclopts import Parameter
+
+from mavbridge.config.checks import check_range
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import UserError
+
+HEARTBEAT_HZ = 1.0
+"""MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
+
+
+RC_CHANNELS_HZ = 20.0
+"""RC_CHANNELS for the echo check and the pilot's sticks; the check needs 10 Hz or more."""
+
+
+TIMESYNC_HZ = 2.0
+"""TIMESYNC requests; the minimum-delay filter wants a few a second."""
+
+
+AUTO_VISUAL_HZ = (10.0, 60.0)
+"""Limits of --visual-rate auto where none are given."""
+
+
+STATE_HZ = 50.0
+"""Least rate of telemetry to ask for, however slow the actions are: ages are limits in seconds."""
+
+
+SIM_CAMERA_HZ = 30.0
+"""Frames a second of the simulated camera, unless the visual rate asks for more."""
+
+
+SIM_CAMERA_PX = 224
+"""Side of its frames, as ``python -m sitl`` sends them: what a policy wants smaller is made smaller
+by the bridge, as in a real flight, and not drawn smaller."""
+
+
+STATUS_HZ = 5.0
+"""Terminal refresh."""
+
+
+Pace = Literal["clock", "state"]
+
+
+def period_ns(rate_hz: float) -> int:
+    """Period of a rate in integer nanoseconds."""
+    return round(NS_PER_S / rate_hz)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Rates:
+    """Loop rates in Hz."""
+
+    visual_rate: float | str = 30.0
+    """Most frames a second through the image encoder (dual rate); auto[:MIN:MAX] looks more often
+    when the vehicle turns or the image changes."""
+    action_rate: float = 100.0
+    """Commands a second (dual rate)."""
+    rate: float = 30.0
+    """Commands a second in single-rate mode, each with the newest image."""
+    realtime: bool = True
+    """Real-time scheduling of the action loop (SCHED_FIFO), where the system permits it."""
+    action_cpu: int | None = None
+    """Run the action loop on this CPU alone."""
+    vision_cpu: int | None = None
+    """Run the vision loop on this CPU alone."""
+    pace: Pace = "clock"
+    """clock: ticks on a fixed grid. state: a tick on each fresh attitude message, by the clock when
+    none comes."""
+
+    def __post_init__(self) -> None:
+        """Refuse rates that no autopilot serves."""
+        low_hz, high_hz = self.visual_limits_hz
+        check_range("visual-rate", low_hz, 0.5, high_hz, "Hz")
+        check_range("visual-rate", high_hz, low_hz, 240, "Hz")
+        check_range("action-rate", self.action_rate, 10, 500, "Hz")
+        check_range("rate", self.rate, 10, 500, "Hz")
+
+    @property
+    def visual_limits_hz(self) -> tuple[float, float]:
+        """Least and most frames a second; equal where the rate is fixed."""
+        if isinstance(self.visual_rate, float | int):
+            return self.visual_rate, self.visual_rate
+        kind, *limits = self.visual_rate.split(":")
+        try:
+            low_hz, high_hz = map(float, limits) if limits else AUTO_VISUAL_HZ
+        except ValueError:
+            low_hz, high_hz = math.nan, math.nan
+        if kind != "auto" or math.isnan(low_hz) or math.isnan(high_hz):
+            raise UserError(
+                f"--visual-rate {self.visual_rate} is neither a rate in Hz nor auto[:MIN:MAX]"
+            )
+        return low_hz, high_hz

@@ -1,0 +1,1 @@
+"""Values, ports, clock, errors and threads: what everything else may know."""

@@ -1,0 +1,75 @@
+"""Durations counted into percentiles, in constant memory."""
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import Percentiles
+
+_SUB_BITS = 7
+"""128 bins an octave: a bin is at most 1/128 = 0.8 % wide."""
+_SUB_BINS = 1 << _SUB_BITS
+_LARGEST_NS = (1 << 42) - 1
+"""73 minutes; longer values share the last bin."""
+_BINS = (43 - _SUB_BITS) * _SUB_BINS
+
+
+class Histogram:
+    """Distribution of durations in constant memory: percentiles within 0.4 %, exact extremes.
+
+    Bins are linear within an octave and doubled from one to the next, which takes a shift instead
+    of a logarithm (G. Tene, HdrHistogram). One thread adds; another may read at any time.
+    """
+
+    def __init__(self) -> None:
+        self._counts = [0] * _BINS
+        self.count = 0
+        self.min_ns: int | None = None
+        self.max_ns: int | None = None
+
+    def add(self, value_ns: int) -> None:
+        """Count one duration; what is below zero falls in the first bin."""
+        clamped = 0 if value_ns < 0 else min(value_ns, _LARGEST_NS)
+        shift = clamped.bit_length() - (_SUB_BITS + 1)
+        if shift < 0:
+            shift = 0
+        self._counts[(shift << _SUB_BITS) + (clamped >> shift)] += 1
+        if self.min_ns is None or self.max_ns is None:
+            self.min_ns = self.max_ns = value_ns
+        elif value_ns > self.max_ns:
+            self.max_ns = value_ns
+        elif value_ns < self.min_ns:
+            self.min_ns = value_ns
+        self.count += 1
+
+    def quantile_ns(self, fraction: float) -> float | None:
+        """Nearest-rank quantile: the middle of its bin, never beyond the extremes; None if empty.
+
+        Args:
+            fraction: in (0, 1].
+        """
+        if self.min_ns is None or self.max_ns is None:
+            return None
+        rank = fraction * sum(self._counts)
+        seen = 0
+        for index, count in enumerate(self._counts):
+            seen += count
+            if count and seen >= rank:
+                return min(max(_bin_middle(index), self.min_ns), self.max_ns)
+        return self.max_ns
+
+    def percentiles_ms(self) -> Percentiles | None:
+        """p50, p99, p99.9 and the exact maximum in milliseconds; None if empty."""
+        p50, p99, p999 = (self.quantile_ns(fraction) for fraction in (0.5, 0.99, 0.999))
+        if p50 is None or p99 is None or p999 is None or self.max_ns is None:
+            return None
+        return Percentiles(p50=_ms(p50), p99=_ms(p99), p999=_ms(p999), max=_ms(self.max_ns))
+
+
+def _bin_middle(index: int) -> float:
+    octave = index >> _SUB_BITS
+    shift = max(octave - 1, 0)
+    low = (index - (shift << _SUB_BITS)) << shift
+    return low + ((1 << shift) - 1) / 2
+
+
+def _ms(value_ns: float) -> float:
+    """Milliseconds, to the microsecond."""
+    return round(value_ns / NS_PER_MS, 3)

@@ -1,0 +1,169 @@
+"""Observers hang off the loops by bounded queues: they may drop events, never delay a loop."""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import Protocol
+
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.ports import TickSink
+from mavbridge.core.records import Event, Tick
+
+BATCH_PERIOD_S = 0.1
+"""Time between hand-overs. Polled, since waking a thread from ``emit`` would cost the loop a
+system call and a fight for the interpreter lock."""
+BATCH_EVENTS = 256
+"""Most events of a kind in one hand-over, so that a backlog does not become one long stretch of
+work."""
+
+_log = logging.getLogger(__name__)
+
+
+class Consumer(Protocol):
+    """What an observer does with the events; called by its own thread alone."""
+
+    def consume(self, batch: Sequence[Event]) -> None:
+        """Take events: all ticks in order, then all vision ticks in order.
+
+        Raises:
+            MavbridgeError, OSError: cannot go on; no further batch will come.
+        """
+        ...
+
+    def close(self) -> None:
+        """Finish; called once, after the last batch, also when ``consume`` has raised."""
+        ...
+
+
+class _Lane:
+    """A bounded queue with one producer and one consumer; needs no lock under either.
+
+    Each counter has one writer.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        if capacity < 1:
+            raise ValueError(f"capacity must be at least 1, got {capacity}")
+        self._capacity = capacity
+        self._events: deque[Event] = deque()
+        self.refused = 0
+
+    def __len__(self) -> int:
+        return len(self._events)
+
+    def put(self, event: Event) -> None:
+        """Producer: take the event, or count it."""
+        if len(self._events) < self._capacity:
+            self._events.append(event)
+        else:
+            self.refused += 1
+
+    def take(self) -> list[Event]:
+        """Consumer: up to ``BATCH_EVENTS`` of the oldest."""
+        return [self._events.popleft() for _ in range(min(len(self._events), BATCH_EVENTS))]
+
+
+class ObserverThread:
+    """A ``TickSink`` that hands events in batches to a consumer on a thread of its own.
+
+    Ticks and vision ticks queue separately, so images, which are large and slow to treat, drop
+    first and never push a tick out. Each kind must be emitted by one thread. The observer's thread
+    is a daemon: a consumer that hangs cannot keep the process alive.
+    """
+
+    def __init__(
+        self, name: str, consumer: Consumer, *, capacity: int, image_capacity: int = 16
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            name: of the thread, and of the observer in messages.
+            consumer: used by the thread alone from here on.
+            capacity: most ticks waiting.
+            image_capacity: most vision ticks waiting; each holds an image.
+        """
+        self._name = name
+        self._consumer = consumer
+        self._ticks = _Lane(capacity)
+        self._visions = _Lane(image_capacity)
+        self._closing = threading.Event()
+        self._out_of_time = threading.Event()
+        self._open = True
+        self._failure: str | None = None
+        self._in_flight = 0
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def emit(self, event: Event) -> None:
+        """Queue the event, or drop and count it; never blocks, never raises."""
+        lane = self._ticks if type(event) is Tick else self._visions
+        if self._open:
+            lane.put(event)
+        else:
+            lane.refused += 1
+
+    @property
+    def dropped(self) -> int:
+        """Events that the consumer never got, or failed on."""
+        refused = self._ticks.refused + self._visions.refused
+        if self._thread.is_alive() and not self._out_of_time.is_set():
+            return refused
+        return refused + len(self._ticks) + len(self._visions) + self._in_flight
+
+    @property
+    def failure(self) -> str | None:
+        """Why the observer stopped before it was closed, or None."""
+        return self._failure
+
+    def close(self, timeout_s: float) -> None:
+        """Let the consumer work off the queue and finish, for at most ``timeout_s``."""
+        self._open = False
+        self._closing.set()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self._out_of_time.set()
+            self._fail(f"did not finish within {timeout_s:g} s")
+
+    def _run(self) -> None:
+        try:
+            self._serve()
+        except (MavbridgeError, OSError) as error:
+            self._fail(str(error))
+        except Exception as bug:
+            self._fail(f"bug: {bug!r}")
+            raise
+        finally:
+            self._open = False
+            try:
+                self._consumer.close()
+            except (MavbridgeError, OSError) as error:
+                self._fail(str(error))
+
+    def _serve(self) -> None:
+        while not self._out_of_time.is_set():
+            last_round = self._closing.wait(BATCH_PERIOD_S)
+            batch = self._ticks.take() + self._visions.take()
+            if batch:
+                self._in_flight = len(batch)
+                self._consumer.consume(batch)
+                self._in_flight = 0
+            elif last_round:
+                return
+
+    def _fail(self, reason: str) -> None:
+        if self._failure is None:
+            self._failure = reason
+            _log.warning("%s stopped: %s; the flight goes on without it", self._name, reason)
+
+
+class FanOut:
+    """A ``TickSink`` in front of several."""
+
+    def __init__(self, sinks: Iterable[TickSink]) -> None:
+        self._sinks = tuple(sinks)
+
+    def emit(self, event: Event) -> None:
+        """Give the event to every sink, in order."""
+        for sink in self._sinks:
+            sink.emit(event)

@@ -1,0 +1,53 @@
+"""Named threads whose failure is not lost."""
+
+import threading
+from collections.abc import Callable
+
+from mavbridge.core.errors import MavbridgeError
+
+
+class HungError(MavbridgeError):
+    """A thread that did not stop when it was told to."""
+
+
+class Worker:
+    """A thread that keeps what its target raised, for whoever joins it."""
+
+    def __init__(self, name: str, target: Callable[[threading.Event], None]) -> None:
+        self._target = target
+        self._stop = threading.Event()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def _run(self) -> None:
+        try:
+            self._target(self._stop)
+        except BaseException as failure:  # noqa: BLE001 - raised again by join
+            self._failure = failure
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    @property
+    def is_alive(self) -> bool:
+        """Still at work."""
+        return self._thread.is_alive()
+
+    def ends_within(self, timeout_s: float) -> bool:
+        """Wait for it without telling it to stop; whether it has ended."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def join(self, timeout_s: float) -> None:
+        """Tell the thread to stop, wait for it, and raise what it raised.
+
+        Raises:
+            HungError: it did not stop in time.
+        """
+        self._stop.set()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            raise HungError(f"thread {self._thread.name} did not stop within {timeout_s:g} s")
+        if self._failure is not None:
+            raise self._failure

@@ -1,5 +1,0 @@
-"""``mavbridge export``: flights as a LeRobot dataset of format v3.0.
-
-flights --policy.dataset_flights--> Episode --rows--> Stretch --dataset--> data/*.parquet, meta/*
-                                                         `--video--> videos/*.mp4
-"""

@@ -1,0 +1,1 @@
+"""One flight: camera image -> feature -> chunk of actions -> sticks."""

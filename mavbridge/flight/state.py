@@ -1,0 +1,90 @@
+"""Telemetry -> the 13-D state of the contract, or the reason why there is none."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import Reading, Release, Telemetry, VehicleState
+
+StateFrame = Literal["ned_frd", "enu_flu"]
+
+_HALF_SQRT2 = math.sqrt(0.5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Freshness:
+    """Oldest acceptable reading of each kind."""
+
+    attitude_ns: int
+    """Attitude and body rates."""
+    velocity_ns: int
+    """Velocity and specific force."""
+
+
+def build_state(
+    telemetry: Telemetry, now_ns: int, *, frame: StateFrame, freshness: Freshness
+) -> VehicleState | Release:
+    """Join the newest readings; a part that is missing or too old is a reason, never a zero."""
+    attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
+    velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
+    if attitude is None or now_ns - attitude.arrived_ns > freshness.attitude_ns:
+        return _stale(attitude, "attitude", freshness.attitude_ns)
+    if rate is None or now_ns - rate.arrived_ns > freshness.attitude_ns:
+        return _stale(rate, "body rates", freshness.attitude_ns)
+    if velocity is None or now_ns - velocity.arrived_ns > freshness.velocity_ns:
+        return _stale(velocity, "velocity", freshness.velocity_ns)
+    if force is None or now_ns - force.arrived_ns > freshness.velocity_ns:
+        return _stale(force, "acceleration", freshness.velocity_ns)
+    v, q, w, a = velocity.values, attitude.values, rate.values, force.values
+    if frame == "enu_flu":
+        v, q, w, a = _to_enu_flu(v, q, w, a)
+    values = np.array((*v, *_unit_positive(q), *w, *a), dtype=np.float32)
+    values.setflags(write=False)
+    return VehicleState(
+        values=values,
+        attitude_ns=attitude.arrived_ns,
+        rate_ns=rate.arrived_ns,
+        velocity_ns=velocity.arrived_ns,
+        specific_force_ns=force.arrived_ns,
+    )
+
+
+def _stale(reading: Reading | None, what: str, limit_ns: int) -> Release:
+    if reading is None:
+        return Release(f"no {what} from the vehicle yet")
+    # The limit, not the age: a reason that changes every tick could not be compared.
+    return Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
+
+
+_Parts = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+
+
+def _to_enu_flu(
+    v: tuple[float, ...], q: tuple[float, ...], w: tuple[float, ...], a: tuple[float, ...]
+) -> _Parts:
+    """NED/FRD -> ENU/FLU (REP 103).
+
+    World: enu = (n_east, n_north, -n_down). Body: flu = (x, -y, -z). Attitude:
+    ``enu_from_flu = enu_from_ned * ned_from_frd * frd_from_flu`` with
+    ``enu_from_ned = (0, r, r, 0)``, ``r = sqrt(1/2)`` and ``frd_from_flu = (0, 1, 0, 0)``,
+    multiplied out: ``r * (w + z, x + y, x - y, w - z)`` up to the common sign.
+    """
+    qw, qx, qy, qz = q
+    r = _HALF_SQRT2
+    return (
+        (v[1], v[0], -v[2]),
+        (r * (qw + qz), r * (qx + qy), r * (qx - qy), r * (qw - qz)),
+        (w[0], -w[1], -w[2]),
+        (a[0], -a[1], -a[2]),
+    )
+
+
+def _unit_positive(q: tuple[float, ...]) -> tuple[float, ...]:
+    """Unit length and w >= 0: q and -q are one attitude, and a net should see one of them."""
+    w, x, y, z = q
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    scale = (-1.0 if w < 0 else 1.0) / norm
+    return w * scale, x * scale, y * scale, z * scale

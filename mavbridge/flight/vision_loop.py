@@ -1,0 +1,100 @@
+"""The slow path: newest frame -> encoder -> cache, in a thread of its own."""
+
+import threading
+from collections.abc import Callable
+
+from mavbridge.core.clock import NS_PER_MS, Clock
+from mavbridge.core.ports import Camera, TickSink
+from mavbridge.core.records import FeatureFrame, FloatArray, ImageArray, VisionTick
+from mavbridge.flight.feature_cache import FeatureCache
+
+READ_TIMEOUT_NS = 100 * NS_PER_MS
+"""How often a starving loop looks at the stop flag."""
+
+
+class VisionLoop:
+    """Encodes frames as they come, at most at the visual rate, and publishes the result.
+
+    It is driven by the camera, not by a grid: a frame is used when it arrives. Frames that come
+    faster than the visual rate are passed over, with a quarter of a period of tolerance for the
+    camera's own jitter.
+    """
+
+    def __init__(
+        self,
+        *,
+        camera: Camera,
+        encode: Callable[[ImageArray], FloatArray],
+        cache: FeatureCache,
+        sink: TickSink,
+        clock: Clock,
+        period_ns: Callable[[], int],
+    ) -> None:
+        self._camera = camera
+        self._encode = encode
+        self._cache = cache
+        self._sink = sink
+        self._clock = clock
+        self._period_ns = period_ns
+        self._used_ns: int | None = None
+        """Slot of the last frame that was used."""
+        self._frames = 0
+
+    def run(self, stop: threading.Event) -> None:
+        """Encode until told to stop.
+
+        Raises:
+            CameraError: the camera has died.
+        """
+        while not stop.is_set():
+            self.step()
+
+    def step(self) -> None:
+        """Wait a moment for one frame and take it through.
+
+        Raises:
+            CameraError: the camera has died.
+        """
+        frame = self._camera.read(READ_TIMEOUT_NS)
+        started_ns = self._clock.now_ns()
+        if frame is None:
+            return
+        # A stamp from the future would make the feature look fresh for too long.
+        captured_ns = min(frame.captured_ns, started_ns)
+        if not self._is_due(captured_ns):
+            return
+        value = self._encode(frame.rgb)
+        value.setflags(write=False)
+        ready_ns = self._clock.now_ns()
+        self._cache.publish(
+            FeatureFrame(
+                frame_id=frame.frame_id,
+                captured_ns=captured_ns,
+                ready_ns=ready_ns,
+                value=value,
+            )
+        )
+        self._sink.emit(
+            VisionTick(
+                serial=self._frames,
+                frame_id=frame.frame_id,
+                captured_ns=captured_ns,
+                started_ns=started_ns,
+                ready_ns=ready_ns,
+                dropped_frames=self._camera.dropped_frames,
+                rgb=frame.rgb,
+            )
+        )
+        self._frames += 1
+
+    def _is_due(self, captured_ns: int) -> bool:
+        if self._used_ns is None:
+            self._used_ns = captured_ns
+            return True
+        period_ns = self._period_ns()
+        due_ns = self._used_ns + period_ns
+        if captured_ns < due_ns - period_ns // 4:
+            return False
+        # Keep the grid through jitter; after a gap start a new one.
+        self._used_ns = max(due_ns, captured_ns - period_ns // 2)
+        return True

@@ -1,0 +1,82 @@
+"""How often to look: as fast as the scene moves, within what the encoder can sustain."""
+
+import math
+
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import Event, ImageArray, Tick, VisionTick
+from policy.contract import RATE
+
+FULL_TURN_RADPS = 1.5
+"""Turn rate that asks for the highest rate; at 10 Hz it is 9 degrees from frame to frame."""
+FULL_CHANGE_PER_S = 1.0
+"""Mean change of the image, in full scales a second, that asks for the highest rate."""
+BUDGET = 0.8
+"""Share of one core that the encoder may take."""
+CALM_TAU_S = 0.5
+"""Demand rises at once and falls with this time constant: motion that pauses is not over."""
+_GRID = 16
+"""The image change is measured on about this many pixels a side."""
+
+
+class AdaptiveRate:
+    """A ``TickSink`` that turns motion into the vision loop's next period.
+
+    Turn rate comes with the ticks, image change and encoding time with the vision ticks; the two
+    threads that emit write different fields.
+    """
+
+    def __init__(self, *, min_hz: float, max_hz: float) -> None:
+        self._min_hz = min_hz
+        self._max_hz = max_hz
+        self._turn_radps = 0.0
+        self._demand = 1.0  # until something is known, look often
+        self._encode_s = 0.0
+        self._last: tuple[int, ImageArray] | None = None
+
+    @property
+    def is_adaptive(self) -> bool:
+        """The limits leave room; otherwise nothing needs to be emitted here."""
+        return self._max_hz > self._min_hz
+
+    def emit(self, event: Event) -> None:
+        """Take the motion out of the event."""
+        if isinstance(event, Tick):
+            if event.state is not None:
+                self._turn_radps = math.hypot(*event.state.values[RATE].tolist())
+        else:
+            self._see(event)
+
+    def _see(self, vision: VisionTick) -> None:
+        encode_s = (vision.ready_ns - vision.started_ns) / NS_PER_S
+        # Slower at once, faster slowly: the budget must hold for the next frame, too.
+        self._encode_s = max(encode_s, self._encode_s + 0.1 * (encode_s - self._encode_s))
+        small = _thin(vision.rgb)
+        last, self._last = self._last, (vision.captured_ns, small)
+        if last is None or last[1].shape != small.shape:
+            return
+        gap_s = max((vision.captured_ns - last[0]) / NS_PER_S, 1e-3)
+        change = np.abs(small.astype(np.int16) - last[1]).mean() / 255 / gap_s
+        wanted = min(
+            1.0, max(self._turn_radps / FULL_TURN_RADPS, float(change) / FULL_CHANGE_PER_S)
+        )
+        calmed = self._demand * math.exp(-gap_s / CALM_TAU_S)
+        self._demand = max(wanted, calmed)
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second to encode now, always within the limits."""
+        wanted_hz = self._min_hz + self._demand * (self._max_hz - self._min_hz)
+        if self._encode_s > 0:
+            wanted_hz = min(wanted_hz, BUDGET / self._encode_s)
+        return min(max(wanted_hz, self._min_hz), self._max_hz)
+
+    def period_ns(self) -> int:
+        """Time to the next frame to encode."""
+        return round(NS_PER_S / self.rate_hz)
+
+
+def _thin(rgb: ImageArray) -> ImageArray:
+    height, width = rgb.shape[:2]
+    return rgb[:: max(1, height // _GRID), :: max(1, width // _GRID)]

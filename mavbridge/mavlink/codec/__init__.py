@@ -1,0 +1,1 @@
+"""Bytes of MAVLink to values and back, without I/O."""

@@ -1,0 +1,105 @@
+"""Sticks <-> PWM with the vehicle's own radio calibration: the one table of signs and channels."""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from mavbridge.core.records import Sticks
+
+Pwm: TypeAlias = tuple[int, int, int, int]
+"""Throttle, yaw, pitch, roll in us."""
+
+PWM_SIGN = Sticks(throttle=1.0, yaw=1.0, pitch=-1.0, roll=1.0)
+"""ArduPilot: stick forward (+pitch, nose down) is PWM below trim; the others rise with it."""
+
+FS_THR_MARGIN_US = 10
+"""ArduPilot's own arming check wants RC3_MIN this far above FS_THR_VALUE."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RcChannel:
+    """One channel as RCn_* and RCMAP_* describe it; PWM in microseconds."""
+
+    number: int
+    """1-based."""
+    min_us: int
+    trim_us: int
+    max_us: int
+    is_reversed: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse a calibration that no stick can be mapped with."""
+        if not 1 <= self.number <= 8:
+            raise ValueError(f"channel {self.number} is not one of 1..8")
+        if not 500 <= self.min_us < self.max_us <= 2500:
+            raise ValueError(
+                f"RC{self.number}_MIN {self.min_us} and RC{self.number}_MAX {self.max_us} "
+                "must lie in 500..2500 us, in this order"
+            )
+
+    def to_us(self, stick: float, *, centre_us: float) -> int:
+        """Piecewise linear: -1 -> one end, 0 -> centre, +1 -> the other end."""
+        signed = -stick if self.is_reversed else stick
+        span_us = self.max_us - centre_us if signed >= 0 else centre_us - self.min_us
+        return min(max(round(centre_us + signed * span_us), self.min_us), self.max_us)
+
+    def to_stick(self, pwm_us: int, *, centre_us: float) -> float:
+        """Inverse of ``to_us``, clipped to [-1, 1]."""
+        span_us = self.max_us - centre_us if pwm_us >= centre_us else centre_us - self.min_us
+        signed = (pwm_us - centre_us) / span_us if span_us else 0.0
+        signed = min(max(signed, -1.0), 1.0)
+        return -signed if self.is_reversed else signed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RcCalibration:
+    """The four stick channels of one vehicle."""
+
+    throttle: RcChannel
+    yaw: RcChannel
+    pitch: RcChannel
+    roll: RcChannel
+    throttle_floor_us: int = 0
+    """Lowest throttle that is not a radio failsafe (FS_THR_VALUE and a margin)."""
+
+    def __post_init__(self) -> None:
+        """Refuse two sticks on one channel."""
+        numbers = [channel.number for channel in self.channels]
+        if len(set(numbers)) != 4:
+            raise ValueError(f"RCMAP_* puts two sticks on one channel: {numbers}")
+        if self.throttle_floor_us >= self.throttle.max_us:
+            raise ValueError(
+                f"FS_THR_VALUE leaves no throttle below RC{self.throttle.number}_MAX "
+                f"{self.throttle.max_us}"
+            )
+
+    @property
+    def channels(self) -> tuple[RcChannel, RcChannel, RcChannel, RcChannel]:
+        """In the order of ``Sticks``."""
+        return self.throttle, self.yaw, self.pitch, self.roll
+
+    def _centres_us(self) -> tuple[float, float, float, float]:
+        # Throttle is a range channel: its centre is the middle, whatever RCn_TRIM says.
+        throttle, yaw, pitch, roll = self.channels
+        middle_us = (throttle.min_us + throttle.max_us) / 2
+        return middle_us, yaw.trim_us, pitch.trim_us, roll.trim_us
+
+    def to_pwm_us(self, sticks: Sticks) -> Pwm:
+        """PWM of throttle, yaw, pitch, roll, inside the calibrated range."""
+        throttle, yaw, pitch, roll = [
+            channel.to_us(stick * sign, centre_us=centre_us)
+            for channel, stick, sign, centre_us in zip(
+                self.channels, sticks, PWM_SIGN, self._centres_us(), strict=True
+            )
+        ]
+        return max(throttle, self.throttle_floor_us), yaw, pitch, roll
+
+    def to_sticks(self, pwm_us: Pwm) -> Sticks:
+        """Sticks that these PWM values stand for."""
+        return Sticks(
+            *(
+                channel.to_stick(value, centre_us=centre_us) * sign
+                for channel, value, sign, centre_us in zip(
+                    self.channels, pwm_us, PWM_SIGN, self._centres_us(), strict=True
+                )
+            )
+        )

@@ -1,0 +1,1 @@
+"""The conversation with one vehicle, without I/O: handshake, parameters, streams, echo."""

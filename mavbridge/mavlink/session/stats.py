@@ -1,0 +1,58 @@
+"""What the link counts over one flight."""
+
+from collections import Counter
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.histogram import Histogram
+from mavbridge.core.records import LinkStats
+
+
+class LinkCounters:
+    """Messages, losses and round trips of the chosen vehicle."""
+
+    def __init__(self) -> None:
+        self._by_name: Counter[str] = Counter()
+        self._last_sequence: int | None = None
+        self._lost = 0
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._round_trips = Histogram()
+        self.sent = 0
+
+    def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
+        """Count one message; a gap in its 8-bit sequence is that many lost (modulo 256)."""
+        self._by_name[name] += 1
+        if self._last_sequence is not None:
+            self._lost += (sequence - self._last_sequence - 1) % 256
+        self._last_sequence = sequence
+        self._first_ns = arrived_ns if self._first_ns is None else self._first_ns
+        self._last_ns = arrived_ns
+
+    def new_sequence(self) -> None:
+        """The sender starts its sequence anew: what follows is no gap."""
+        self._last_sequence = None
+
+    def round_trip(self, round_trip_ns: int | None) -> None:
+        """Count one TIMESYNC exchange, if it was ours."""
+        if round_trip_ns is not None:
+            self._round_trips.add(round_trip_ns)
+
+    def stats(
+        self, *, echo_confirmed: bool | None, unusable_packets: int, clock_offset_ns: int | None
+    ) -> LinkStats:
+        """The totals so far."""
+        received = self._by_name.total()
+        span_ns = self._last_ns - (self._first_ns or 0)
+        return LinkStats(
+            messages_per_s=tuple(
+                (name, count * NS_PER_S / span_ns)
+                for name, count in sorted(self._by_name.items())
+                if span_ns > 0
+            ),
+            lost_fraction=self._lost / (self._lost + received) if received else None,
+            rtt_ms=self._round_trips.percentiles_ms(),
+            sent_overrides=self.sent,
+            echo_confirmed=echo_confirmed if self.sent else None,
+            unusable_packets=unusable_packets,
+            vehicle_clock_offset_ns=clock_offset_ns,
+        )

@@ -1,0 +1,47 @@
+"""The vehicle's clock against ours, by TIMESYNC."""
+
+from collections import deque
+
+from mavbridge.config.rates import TIMESYNC_HZ, period_ns
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.mavlink.codec.messages import Timesync
+
+_WINDOW = 20
+_OUTSTANDING = 8
+
+
+class TimesyncFilter:
+    """Keeps the offset of the fastest recent exchange (the one with the least queueing in it).
+
+    Only answers to our own outstanding requests count: replies are broadcast, and another station's
+    would pass for absurd round trips.
+    """
+
+    def __init__(self) -> None:
+        self._outstanding: deque[int] = deque(maxlen=_OUTSTANDING)
+        self._samples: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
+        self._next_ns = 0
+
+    def request(self, now_ns: int) -> int | None:
+        """ts1 of the request that is due, if any."""
+        if now_ns < self._next_ns:
+            return None
+        self._next_ns = now_ns + period_ns(TIMESYNC_HZ)
+        self._outstanding.append(now_ns)
+        return now_ns
+
+    def receive(self, reply: Timesync, arrived_ns: int) -> int | None:
+        """Round trip of a reply to us in ns; None for anybody else's, and for requests."""
+        if reply.tc1 == 0 or reply.ts1 not in self._outstanding:
+            return None
+        self._outstanding.remove(reply.ts1)
+        round_trip_ns = arrived_ns - reply.ts1
+        if not 0 <= round_trip_ns < NS_PER_S:
+            return None
+        self._samples.append((round_trip_ns, reply.tc1 - (reply.ts1 + arrived_ns) // 2))
+        return round_trip_ns
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Vehicle clock minus ours; None before the first exchange."""
+        return min(self._samples)[1] if self._samples else None

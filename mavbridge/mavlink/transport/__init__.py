@@ -1,0 +1,1 @@
+"""Where MAVLink bytes come from and go to: UDP, TCP, serial."""

@@ -1,0 +1,1 @@
+"""Who watches a flight: timing, terminal, Rerun. None of them can delay it."""

@@ -1,0 +1,389 @@
+"""A flight in the Rerun viewer; the only module that imports rerun.
+
+Runs as the consumer of an ``ObserverThread``. The SDK blocks its caller while a viewer does not
+keep up, at the end of the flight too; here the caller is that thread, whose queue then drops and
+counts, and whose ``close`` has a deadline. Each batch becomes one ``send_columns`` a plot, which
+costs a tenth of one ``log`` a value.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+from uuid import uuid4
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.records import Event, ImageArray, Sticks, Tick, VisionTick
+from mavbridge.observe.rerun_target import RrdFile, prepare_target
+
+JPEG_QUALITY = 85
+MAX_IMAGE_WIDTH = 640
+"""Wider images are scaled down: the viewer shows them no larger."""
+RC_CHANNELS_SHOWN = 4
+"""The sticks' channels, unless RCMAP_* says otherwise; the stick plots show the mapped echo."""
+
+CAMERA = "camera"
+EVENTS = "events"
+
+FloatColumn: TypeAlias = NDArray[np.float64]
+_STICKS_GAP = Sticks(math.nan, math.nan, math.nan, math.nan)
+
+_Rgb: TypeAlias = tuple[int, int, int]
+_BLUE: _Rgb = (86, 180, 233)
+_ORANGE: _Rgb = (240, 160, 40)
+_GREEN: _Rgb = (60, 200, 140)
+_PINK: _Rgb = (225, 120, 180)
+_YELLOW: _Rgb = (240, 228, 66)
+_WHITE: _Rgb = (235, 235, 235)
+_GREY: _Rgb = (135, 135, 135)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Series:
+    name: str
+    color: _Rgb
+    width: float = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Plot:
+    """One entity: series that share their stamps."""
+
+    path: str
+    series: tuple[_Series, ...]
+
+
+AGE = _Plot(
+    path="age",
+    series=(
+        _Series(name="feature age", color=_BLUE),
+        _Series(name="state age", color=_ORANGE),
+    ),
+)
+ACTION_PERIOD = _Plot(path="period/action", series=(_Series(name="action", color=_BLUE),))
+VISION_PERIOD = _Plot(path="period/vision", series=(_Series(name="vision", color=_ORANGE),))
+ACTION_JITTER = _Plot(path="jitter/action", series=(_Series(name="action", color=_BLUE),))
+VISION_JITTER = _Plot(path="jitter/vision", series=(_Series(name="vision", color=_ORANGE),))
+PREDICT = _Plot(path="compute/action", series=(_Series(name="predict", color=_BLUE),))
+ENCODE = _Plot(path="compute/vision", series=(_Series(name="encode", color=_ORANGE),))
+MISSED = _Plot(path="missed/action", series=(_Series(name="missed slots", color=_BLUE),))
+DROPPED = _Plot(path="missed/vision", series=(_Series(name="dropped frames", color=_ORANGE),))
+STICKS = tuple(  # the echo lies under what it should match
+    _Plot(
+        path=f"sticks/{axis}",
+        series=(
+            _Series(name="vehicle's echo", color=_GREEN, width=4),
+            _Series(name="raw", color=_GREY),
+            _Series(name="clipped", color=_PINK),
+            _Series(name="slewed", color=_YELLOW),
+            _Series(name="smoothed", color=_BLUE),
+            _Series(name="sent", color=_WHITE),
+        ),
+    )
+    for axis in Sticks._fields
+)
+RC = _Plot(
+    path="rc",
+    series=tuple(
+        _Series(name=f"channel {number}", color=color)
+        for number, color in zip(
+            range(1, RC_CHANNELS_SHOWN + 1), (_BLUE, _ORANGE, _GREEN, _PINK), strict=True
+        )
+    ),
+)
+_EVENT_COLUMNS = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
+"""The viewer's own time column is too narrow to read: the text starts with the time."""
+PLOTS = (
+    *(AGE, ACTION_PERIOD, VISION_PERIOD, ACTION_JITTER, VISION_JITTER),
+    *(PREDICT, ENCODE, MISSED, DROPPED, *STICKS, RC),
+)
+
+
+def flight_blueprint() -> rrb.Blueprint:
+    """What the viewer opens on: the scene, what it costs, the loops, the sticks."""
+    scene = rrb.Vertical(
+        rrb.Spatial2DView(origin=CAMERA, name="Camera: what the policy sees"),
+        rrb.TextLogView(origin=EVENTS, name="Events", columns=_EVENT_COLUMNS),
+        row_shares=[3, 2],
+    )
+    freshness = rrb.Vertical(
+        _time_series("Age when sent [ms]", AGE),
+        _time_series("Time to compute [ms]", PREDICT, ENCODE),
+        _time_series("RC echo from the vehicle [us]", RC),
+    )
+    loops = rrb.Vertical(
+        _time_series("Period of the loops [ms]", ACTION_PERIOD, VISION_PERIOD),
+        _time_series("Jitter: |period - target| [ms]", ACTION_JITTER, VISION_JITTER),
+        _time_series("Missed slots, dropped frames [since start]", MISSED, DROPPED),
+    )
+    sticks = rrb.Vertical(
+        *(
+            _time_series(
+                f"Stick: {axis}", plot, legend=plot is STICKS[0], value_range=(-1.05, 1.05)
+            )
+            for axis, plot in zip(Sticks._fields, STICKS, strict=True)
+        ),
+        row_shares=[4, 3, 3, 3],  # the first has the legend of all
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(scene, freshness, loops, sticks),
+        rrb.TimePanel(state="collapsed", timeline="time"),
+        collapse_panels=True,
+    )
+
+
+def _time_series(
+    name: str,
+    *plots: _Plot,
+    legend: bool = True,
+    value_range: tuple[float, float] | None = None,
+) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name=name,
+        contents=[f"/{plot.path}" for plot in plots],
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        axis_y=None if value_range is None else rrb.ScalarAxis(range=value_range),
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
+    )
+
+
+def _style(plot: _Plot) -> rr.SeriesLines:
+    """Names and colours; zoomed out, a line shows its extremes: an average would hide a stall."""
+    return rr.SeriesLines(
+        names=[series.name for series in plot.series],
+        colors=[series.color for series in plot.series],
+        widths=[series.width for series in plot.series],
+        aggregation_policy="MinMax",
+    )
+
+
+class RerunView:
+    """Consumer that shows ticks and vision ticks, on the timelines ``time`` and ``tick``.
+
+    A row of a tick is stamped with its wake-up, numbers of a frame with the end of its encoding,
+    the image with its exposure; ``time`` is zero at the first tick. What was not measured is a gap
+    in its line.
+    """
+
+    def __init__(self, target: str, *, action_hz: float, vision_hz: float) -> None:
+        """Check the target; every call that can block is left to ``consume`` and ``close``.
+
+        Args:
+            target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
+            action_hz: what the action loop is asked for; jitter is measured against it.
+            vision_hz: what the vision loop is asked for.
+
+        Raises:
+            MavbridgeError: as ``rerun_target.prepare_target``.
+        """
+        self._target = prepare_target(target)
+        rr.unregister_shutdown()  # its atexit hook waits for ever for a viewer that stalls
+        self._recording = rr.RecordingStream("mavbridge", recording_id=uuid4())
+        self._is_open = False
+        self._action_periods = _Periods(action_hz)
+        self._vision_periods = _Periods(vision_hz)
+        self._origin_ns: int | None = None
+        self._last_tick: Tick | None = None
+        self._missed_slots = 0
+
+    def consume(self, batch: Sequence[Event]) -> None:
+        """Send one batch; blocks while the viewer does not keep up."""
+        self._open()
+        ticks = [event for event in batch if isinstance(event, Tick)]
+        visions = [event for event in batch if isinstance(event, VisionTick)]
+        if self._origin_ns is None:
+            self._origin_ns = ticks[0].woke_ns if ticks else visions[0].captured_ns
+        if visions:
+            self._send_visions(visions, ticks)
+        if ticks:
+            self._send_ticks(ticks)
+            self._send_events(ticks)
+            self._last_tick = ticks[-1]
+
+    def close(self) -> None:
+        """Deliver what is left and let go of the file or viewer; blocks until it has taken all.
+
+        Raises:
+            MavbridgeError: the viewer is gone.
+        """
+        self._open()
+        try:
+            self._recording.flush()
+        except RuntimeError as error:
+            raise MavbridgeError(f"the viewer did not take the whole flight: {error}") from error
+        self._recording.disconnect()
+
+    def _open(self) -> None:
+        if self._is_open:
+            return
+        self._is_open = True
+        blueprint = flight_blueprint()
+        if isinstance(self._target, RrdFile):
+            self._recording.save(self._target.path, default_blueprint=blueprint)
+        else:
+            self._recording.connect_grpc(self._target.url, default_blueprint=blueprint)
+        for plot in PLOTS:
+            self._recording.log(plot.path, _style(plot), static=True, strict=True)
+
+    def _send_ticks(self, ticks: list[Tick]) -> None:
+        woke_ns = [tick.woke_ns for tick in ticks]
+        index = self._index(woke_ns, [tick.index for tick in ticks])
+        period_ms, jitter_ms = self._action_periods.extend(woke_ns)
+        missed = self._missed_slots + np.cumsum([tick.missed_slots for tick in ticks])
+        self._missed_slots = int(missed[-1])
+        self._send(AGE, index, _ms([_ages_ns(tick) for tick in ticks]))
+        self._send(ACTION_PERIOD, index, period_ms)
+        self._send(ACTION_JITTER, index, jitter_ms)
+        self._send(PREDICT, index, _ms([_or_gap(tick.predict_ns) for tick in ticks]))
+        self._send(MISSED, index, missed)
+        stages = np.array([_stick_stages(tick) for tick in ticks])
+        for axis, plot in enumerate(STICKS):
+            self._send(plot, index, stages[:, :, axis])
+        self._send(RC, index, np.array([_rc_channels(tick) for tick in ticks]))
+
+    def _send_visions(self, visions: list[VisionTick], ticks: list[Tick]) -> None:
+        ready_ns = [vision.ready_ns for vision in visions]
+        index = self._index(ready_ns, self._tick_indexes_at(ready_ns, ticks))
+        period_ms, jitter_ms = self._vision_periods.extend([v.started_ns for v in visions])
+        self._send(VISION_PERIOD, index, period_ms)
+        self._send(VISION_JITTER, index, jitter_ms)
+        self._send(ENCODE, index, _ms([vision.ready_ns - vision.started_ns for vision in visions]))
+        self._send(DROPPED, index, np.array([vision.dropped_frames for vision in visions]))
+        captured_ns = [vision.captured_ns for vision in visions]
+        self._recording.send_columns(
+            CAMERA,
+            self._index(captured_ns, self._tick_indexes_at(captured_ns, ticks)),
+            rr.EncodedImage.columns(
+                blob=[_jpeg(vision.rgb) for vision in visions],
+                media_type=["image/jpeg"] * len(visions),
+            ),
+            strict=True,
+        )
+
+    def _send_events(self, ticks: list[Tick]) -> None:
+        before = [self._last_tick, *ticks[:-1]]
+        changes = [
+            (tick, change)
+            for last, tick in zip(before, ticks, strict=True)
+            for change in _changes(last, tick)
+        ]
+        if not changes:
+            return
+        self._recording.send_columns(
+            EVENTS,
+            self._index([t.woke_ns for t, _ in changes], [t.index for t, _ in changes]),
+            rr.TextLog.columns(
+                text=[f"{self._since_s(tick):6.2f} s  {change.text}" for tick, change in changes],
+                level=[change.level for _, change in changes],
+                color=[change.color for _, change in changes],
+            ),
+            strict=True,
+        )
+
+    def _tick_indexes_at(self, stamps_ns: list[int], ticks: list[Tick]) -> list[int]:
+        """Index of the last tick that had woken at each stamp, as far as this batch tells."""
+        known = [tick for tick in (self._last_tick, *ticks) if tick is not None]
+        if not known:
+            return [0] * len(stamps_ns)
+        after = np.searchsorted([tick.woke_ns for tick in known], stamps_ns, side="right")
+        return [known[max(position - 1, 0)].index for position in after]
+
+    def _index(self, stamps_ns: list[int], tick_indexes: list[int]) -> list[rr.TimeColumn]:
+        since_ns = np.array(stamps_ns) - (self._origin_ns or 0)
+        return [
+            rr.TimeColumn("time", duration=since_ns.astype("timedelta64[ns]")),
+            rr.TimeColumn("tick", sequence=tick_indexes),
+        ]
+
+    def _since_s(self, tick: Tick) -> float:
+        return (tick.woke_ns - (self._origin_ns or 0)) / NS_PER_S
+
+    def _send(self, plot: _Plot, index: list[rr.TimeColumn], values: NDArray[Any]) -> None:
+        columns = rr.Scalars.columns(scalars=values.reshape(-1, len(plot.series)))
+        self._recording.send_columns(plot.path, index, columns, strict=True)
+
+
+class _Periods:
+    """Differences of a series of stamps that comes in batches."""
+
+    def __init__(self, target_hz: float) -> None:
+        self._target_ms = 1e3 / target_hz
+        self._last_ns: int | None = None
+
+    def extend(self, stamps_ns: list[int]) -> tuple[FloatColumn, FloatColumn]:
+        """(period, |period - target|) in ms; a gap for the very first stamp."""
+        first_ns = math.nan if self._last_ns is None else stamps_ns[0] - self._last_ns
+        period_ms = _ms([first_ns, *np.diff(stamps_ns)])
+        self._last_ns = stamps_ns[-1]
+        return period_ms, np.abs(period_ms - self._target_ms)
+
+
+def _ms(values_ns: Sequence[float] | Sequence[tuple[float, ...]]) -> FloatColumn:
+    return np.array(values_ns, dtype=np.float64) / NS_PER_MS
+
+
+def _or_gap(value: float | None) -> float:
+    """NaN breaks the line; a zero would lie."""
+    return math.nan if value is None else value
+
+
+def _ages_ns(tick: Tick) -> tuple[float, float]:
+    feature_ns = tick.feature_captured_ns
+    return (
+        math.nan if feature_ns is None else tick.sent_ns - feature_ns,
+        math.nan if tick.state is None else tick.sent_ns - tick.state.attitude_ns,
+    )
+
+
+def _stick_stages(tick: Tick) -> tuple[Sticks, ...]:
+    """The series of a stick plot in their order, each with all four axes."""
+    echo, trace, sent = tick.rc_sticks or _STICKS_GAP, tick.trace, tick.sent or _STICKS_GAP
+    if trace is None:
+        return (echo, *(_STICKS_GAP,) * 4, sent)
+    return echo, trace.raw, trace.clipped, trace.slewed, trace.smoothed, sent
+
+
+def _rc_channels(tick: Tick) -> tuple[float, ...]:
+    shown = tick.rc_channels_us[:RC_CHANNELS_SHOWN]
+    return shown + (math.nan,) * (RC_CHANNELS_SHOWN - len(shown))
+
+
+@dataclass(frozen=True, slots=True)
+class _Change:
+    text: str
+    level: str = "INFO"
+    color: _Rgb = _WHITE
+
+
+def _changes(before: Tick | None, now: Tick) -> Iterator[_Change]:
+    """What a person should know of this tick and did not know before."""
+    if before is None or before.activity != now.activity:
+        if now.release_reason is None:
+            yield _Change(now.activity, color=_GREEN if now.trace else _WHITE)
+        else:
+            yield _Change(now.activity, "WARN", _ORANGE)
+    if now.mode is not None and (before is None or before.mode != now.mode):
+        yield _Change(f"mode {now.mode}")
+    if before is None or before.armed != now.armed:
+        yield _Change("armed" if now.armed else "disarmed")
+    for text in now.texts:
+        yield _Change(text)
+
+
+def _jpeg(rgb: ImageArray) -> bytes:
+    height, width = rgb.shape[:2]
+    if width > MAX_IMAGE_WIDTH:
+        size = (MAX_IMAGE_WIDTH, max(1, round(height * MAX_IMAGE_WIDTH / width)))
+        shown = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    else:
+        shown = rgb
+    bgr = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return encoded.tobytes()

@@ -1,0 +1,118 @@
+"""A rollout in the Rerun viewer: imagined and real frames side by side, states and sticks.
+
+Offline, unlike a flight's view: a viewer that does not keep up slows the rollout down, and an error
+of it ends the rollout.
+"""
+
+from collections.abc import Callable
+from uuid import uuid4
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.records import ImageArray, RolloutFrame
+from mavbridge.observe.rerun_target import RrdFile, prepare_target
+from policy.contract import ACTION_NAMES, QUATERNION, RATE, SPECIFIC_FORCE, STATE_NAMES, VELOCITY
+
+IMAGINED, REAL, STICKS = "imagined", "real", "sticks"
+STATES = {
+    "state/velocity": ("World velocity [m/s]", VELOCITY),
+    "state/attitude": ("Attitude, world from body", QUATERNION),
+    "state/rate": ("Body rates [rad/s]", RATE),
+    "state/force": ("Specific force [m/s^2]", SPECIFIC_FORCE),
+}
+
+
+def rollout_blueprint() -> rrb.Blueprint:
+    """What the viewer opens on."""
+    plots = [
+        rrb.TimeSeriesView(origin=path, name=name, plot_legend=rrb.PlotLegend(corner="LeftTop"))
+        for path, name in [(STICKS, "Sticks"), *((path, STATES[path][0]) for path in STATES)]
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                rrb.Horizontal(
+                    rrb.Spatial2DView(origin=IMAGINED, name="Imagined"),
+                    rrb.Spatial2DView(origin=REAL, name="Real, at the same time"),
+                ),
+                plots[0],
+                row_shares=[2, 1],
+            ),
+            rrb.Vertical(*plots[1:]),
+        ),
+        rrb.TimePanel(state="collapsed", timeline="frame"),
+        collapse_panels=True,
+    )
+
+
+class RolloutView:
+    """Shows frames as they come, on the timelines ``frame`` (in the video) and ``time``.
+
+    Where iterations overlap, ``time`` goes back with each, and the viewer shows the last one.
+    """
+
+    def __init__(self, target: str, *, real: Callable[[int], ImageArray | None]) -> None:
+        """Open the file or viewer.
+
+        Args:
+            target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
+            real: what the camera really saw at a step, [H, W, 3]; None if it did not.
+
+        Raises:
+            MavbridgeError: as ``rerun_target.prepare_target``.
+        """
+        self._real = real
+        where = prepare_target(target)
+        rr.unregister_shutdown()  # its atexit hook waits for ever for a viewer that stalls
+        self._recording = rr.RecordingStream("mavbridge-rollout", recording_id=uuid4())
+        blueprint = rollout_blueprint()
+        if isinstance(where, RrdFile):
+            self._recording.save(where.path, default_blueprint=blueprint)
+        else:
+            self._recording.connect_grpc(where.url, default_blueprint=blueprint)
+        self._name_lines(STICKS, list(ACTION_NAMES))
+        for path, (_, columns) in STATES.items():
+            self._name_lines(path, list(STATE_NAMES[columns]))
+
+    def _name_lines(self, path: str, names: list[str]) -> None:
+        self._recording.log(path, rr.SeriesLines(names=names), static=True, strict=True)
+
+    def show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
+        """Send one frame; blocks while the viewer does not keep up. For one thread.
+
+        Raises:
+            VideoError: the real flight's video is damaged.
+        """
+        recording = self._recording
+        recording.set_time("frame", sequence=frame.number)
+        recording.set_time("time", duration=frame.time_s)
+        if rgb is not None:
+            recording.log(IMAGINED, _png(rgb), strict=True)
+        real = self._real(frame.step)
+        # Past the flight's end there is nothing to compare with: the last image must not stay.
+        recording.log(REAL, rr.Clear(recursive=False) if real is None else _png(real), strict=True)
+        recording.log(STICKS, rr.Scalars(frame.action), strict=True)
+        for path, (_, columns) in STATES.items():
+            recording.log(path, rr.Scalars(frame.state[columns]), strict=True)
+
+    def close(self) -> None:
+        """Deliver what is left; blocks until it is taken.
+
+        Raises:
+            MavbridgeError: the viewer is gone.
+        """
+        try:
+            self._recording.flush()
+        except RuntimeError as error:
+            raise MavbridgeError(f"the viewer did not take the whole rollout: {error}") from error
+        self._recording.disconnect()
+
+
+def _png(rgb: ImageArray) -> rr.EncodedImage:
+    """Lossless: these images are small, and what is looked at is how good they are."""
+    _, encoded = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2BGR))
+    return rr.EncodedImage(contents=encoded.tobytes(), media_type="image/png")

@@ -1,0 +1,1 @@
+"""Video files, and the process that encodes them."""

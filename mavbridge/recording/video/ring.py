@@ -1,0 +1,98 @@
+"""Frames from one process to another through shared memory: a fixed number of slots.
+
+Who may use which slot is not kept here but told over the pipe of the two processes, whose messages
+also order the accesses. A slot belongs to the producer until ``Submit`` names it, and again from
+``Written`` on.
+"""
+
+import os
+from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mavbridge.core.records import ImageArray
+
+MAX_SLOTS = 32
+MIN_SLOTS = 4
+MAX_BYTES = 32 << 20
+"""Beyond the least number of slots: a container may have no more than 64 MB of shared memory."""
+
+
+class RingShape(NamedTuple):
+    """What the other process needs to find the frames."""
+
+    name: str
+    slots: int
+    height: int
+    width: int
+
+
+class FrameRing:
+    """Slots of [H, W, 3] uint8, mapped."""
+
+    def __init__(self, memory: SharedMemory, shape: RingShape) -> None:
+        """See ``create`` and ``attach``."""
+        self.shape = shape
+        self._memory = memory
+        self._is_linked = False
+        self._frames: ImageArray | None = np.ndarray(
+            (shape.slots, shape.height, shape.width, 3), np.uint8, memory.buf
+        )
+
+    @classmethod
+    def create(cls, height: int, width: int) -> "FrameRing":
+        """Producer: acquire the memory.
+
+        Raises:
+            OSError: there is not enough.
+        """
+        frame_bytes = height * width * 3
+        slots = max(MIN_SLOTS, min(MAX_SLOTS, MAX_BYTES // frame_bytes))
+        memory = SharedMemory(create=True, size=slots * frame_bytes)
+        try:
+            _reserve(memory)
+        except OSError:
+            memory.close()
+            memory.unlink()
+            raise
+        ring = cls(memory, RingShape(memory.name, slots, height, width))
+        ring._is_linked = True
+        return ring
+
+    @classmethod
+    def attach(cls, shape: RingShape) -> "FrameRing":
+        """Consumer: map the memory.
+
+        Raises:
+            OSError: it is gone.
+        """
+        return cls(SharedMemory(name=shape.name), shape)
+
+    def slot(self, index: int) -> ImageArray:
+        """View of one slot, [H, W, 3]; not to be kept beyond ``close``."""
+        if self._frames is None:
+            raise ValueError("the ring is closed")
+        frame: ImageArray = self._frames[index]
+        return frame
+
+    def unlink(self) -> None:
+        """Producer: take the name away, so that nothing stays whoever is killed."""
+        if self._is_linked:
+            self._is_linked = False
+            self._memory.unlink()
+
+    def close(self) -> None:
+        """Unmap; the producer's end also takes the name away. May be called twice."""
+        self._frames = None
+        self._memory.close()
+        self.unlink()
+
+
+def _reserve(memory: SharedMemory) -> None:
+    """Take the pages now: a page that is not there when it is first written ends the process."""
+    path = Path("/dev/shm") / memory.name.lstrip("/")  # noqa: S108 - where Linux keeps them
+    if path.exists():
+        with path.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, memory.size)

@@ -1,0 +1,84 @@
+"""What an episode came to: frozen values that go into JSON and between processes."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import Event, Sticks, Tick
+
+Outcome = Literal["finished", "crashed", "disarmed", "timed out"]
+"""All gates passed; hit the ground; motors stopped by themselves; none of these in time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeResult:
+    """One flight of one course; times count from the policy's first action."""
+
+    course_seed: int
+    seed: int
+    outcome: Outcome
+    gates_total: int
+    gate_times_s: tuple[float, ...]
+    """When each gate was passed, in order."""
+    flown_s: float
+    """To the end of the episode: one second after the last gate, the crash, or the time limit."""
+    distance_m: float
+    """Along the path, over that time."""
+    stick_rate_per_s: float | None
+    """Mean over the four sticks of |change| per second, as sent; full deflection is 1. None = the
+    policy never had the sticks for two actions in a row."""
+
+    @property
+    def has_finished(self) -> bool:
+        """All gates in order, and no crash."""
+        return self.outcome == "finished"
+
+    @property
+    def gates_passed(self) -> int:
+        """In order."""
+        return len(self.gate_times_s)
+
+    @property
+    def mean_speed_mps(self) -> float:
+        """Over the whole flight, take-off included."""
+        return self.distance_m / self.flown_s if self.flown_s > 0 else 0.0
+
+    @property
+    def course_s(self) -> float | None:
+        """First action to last gate; None unless finished."""
+        return self.gate_times_s[-1] if self.has_finished and self.gate_times_s else None
+
+
+class StickMeter:
+    """A ``TickSink``: how much the policy moves the sticks, and since when it has them."""
+
+    def __init__(self) -> None:
+        self.engaged_ns: int | None = None
+        """First tick of the policy."""
+        self._last: tuple[int, Sticks] | None = None
+        self._travel = 0.0
+        self._moved_ns = 0
+
+    def emit(self, event: Event) -> None:
+        """Take the sticks out of a tick."""
+        if not isinstance(event, Tick):
+            return
+        if event.trace is None or event.sent is None:
+            self._last = None
+            return
+        if self.engaged_ns is None:
+            self.engaged_ns = event.woke_ns
+        last, self._last = self._last, (event.sent_ns, event.sent)
+        if last is not None:
+            self._moved_ns += event.sent_ns - last[0]
+            self._travel += math.fsum(
+                abs(now - before) for now, before in zip(event.sent, last[1], strict=True)
+            )
+
+    @property
+    def rate_per_s(self) -> float | None:
+        """Mean over the sticks of |change| per second; None before two actions in a row."""
+        if not self._moved_ns:
+            return None
+        return self._travel / len(Sticks._fields) / (self._moved_ns / NS_PER_S)

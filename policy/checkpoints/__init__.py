@@ -1,0 +1,1 @@
+"""Weights on disk, with their contract in the header."""

@@ -1,0 +1,290 @@
+"""Weights on disk: the only module of the flight path that touches files.
+
+``.safetensors`` holds the contract and the architecture in its header, so the file alone says what
+it is. It also holds a test vector, inputs and the chunks that plain torch made of them where it was
+saved: weights that no longer make them are refused. ``.pt`` and ``.pth`` hold weights; they are
+read without executing pickles, and what they do not say is taken from the caller.
+"""
+
+import copy
+import json
+import pickle
+import struct
+import warnings
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from policy.checkpoints.packing import pack, unpack
+from policy.checkpoints.tensors import (
+    CheckpointError,
+    read_tensors,
+    require_file,
+    require_finite,
+    require_fit,
+    write_tensors,
+)
+from policy.contract import Contract, FloatArray
+from policy.engines.parity import Probe, disagreement, make_probe
+from policy.errors import PolicyError
+from policy.nets.diffusion import NoiseSchedule
+from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
+from policy.nets.toge import Toge, TogeConfig
+from policy.preprocess import image_to_input
+
+BuiltinPolicy: TypeAlias = Toge | ResnetUnet
+BuiltinConfig: TypeAlias = TogeConfig | ResnetUnetConfig
+
+CONTRACT_KEY = "contract"
+ARCHITECTURE_KEY = "architecture"
+TRAINING_KEY = "training"
+HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
+VECTOR_PREFIX = "test_vector."
+BACKBONE_PREFIX = "backbone."
+VECTOR_NAMES = ("rgb", "state", "history", "chunks")
+VECTOR_STEPS = 10
+"""Denoising steps of a test vector, or all if the schedule has fewer; its noise is reset(0)'s."""
+SUFFIXES = (".safetensors", ".pt", ".pth")
+
+_DAMAGED = (
+    *(OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError),
+    *(AssertionError, ArithmeticError, MemoryError, struct.error),
+)
+"""What torch.load raises on flipped bytes: its reader interprets them before it checks them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Contents:
+    """What a file held; None where it does not say."""
+
+    state: dict[str, Tensor]
+    vector: dict[str, Tensor]
+    """Empty, or the test vector by ``VECTOR_NAMES``."""
+    contract: str | None
+    architecture: str | None
+
+
+def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
+    """The network of ``config``, with random weights of torch's global generator."""
+    return Toge(config) if isinstance(config, TogeConfig) else ResnetUnet(config)
+
+
+def save_checkpoint(
+    path: Path, policy: BuiltinPolicy, *, training: str | None = None, packed: bool = False
+) -> None:
+    """Write weights, contract, architecture and a test vector; replaces ``path`` at once or not.
+
+    Args:
+        path: a ``.safetensors`` file.
+        policy: whose weights.
+        training: JSON that says how it was trained, for people and reports; no runtime reads it.
+        packed: a third of the size, rounded as ``packing`` says; the test vector is of the rounded.
+
+    Raises:
+        CheckpointError: weights that are not finite, or a path that cannot be written.
+    """
+    state = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
+    require_finite(path, state)
+    if packed:
+        state = pack(state, coarse=BACKBONE_PREFIX)
+        policy = copy.deepcopy(policy)
+        policy.load_state_dict(unpack(state))
+    for name, value in _make_vector(policy).items():
+        state[VECTOR_PREFIX + name] = value
+    header = {
+        CONTRACT_KEY: policy.contract.to_json(),
+        ARCHITECTURE_KEY: _architecture_to_json(policy.config),
+    }
+    if training is not None:
+        header[TRAINING_KEY] = training
+    write_tensors(path, state, header)
+
+
+def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
+    """Read a checkpoint into the network that it was made for, on the CPU, in eval mode.
+
+    Args:
+        path: a ``.safetensors``, ``.pt`` or ``.pth`` file.
+        fallback: the policy asked for; its kind must be the file's, and its values serve for what
+            a ``.pt`` does not say.
+
+    Raises:
+        CheckpointError: missing, corrupt, of another policy or contract version, not finite, or
+            it no longer makes the chunks of its test vector.
+    """
+    contents = _read(path)
+    require_finite(path, contents.state)
+    try:
+        policy = build_policy(_config_of(contents, fallback))
+    except PolicyError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    require_fit(path, policy, contents.state)
+    policy.load_state_dict(contents.state)
+    policy.eval()
+    if contents.vector:
+        _require_reproduced(path, policy, contents.vector)
+    return policy
+
+
+def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
+    """Inputs and what plain torch in float32 on a CPU makes of them."""
+    reference = copy.deepcopy(policy).cpu().eval()
+    probe = make_probe(policy.contract)
+    arrays = (probe.rgb, probe.state, probe.history, _chunks(reference, probe))
+    return {
+        name: torch.from_numpy(np.ascontiguousarray(array))  # safetensors takes no other
+        for name, array in zip(VECTOR_NAMES, arrays, strict=True)
+    }
+
+
+@torch.inference_mode()
+def _chunks(policy: BuiltinPolicy, probe: Probe) -> FloatArray:
+    policy.reset(0)
+    images = np.concatenate([image_to_input(rgb, policy.contract) for rgb in probe.rgb])
+    steps = min(VECTOR_STEPS, policy.config.schedule.num_train_timesteps)
+    image, state, history = map(torch.from_numpy, (images, probe.state, probe.history))
+    chunks: FloatArray = policy.predict(image, state, history, steps).numpy()
+    return chunks
+
+
+def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Tensor]) -> None:
+    damaged = f"{path}: its test vector is damaged"
+    if set(vector) != set(VECTOR_NAMES):
+        raise CheckpointError(f"{damaged}: it must hold {list(VECTOR_NAMES)}, not {sorted(vector)}")
+    rgb, state, history, chunks = (vector[name].numpy() for name in VECTOR_NAMES)
+    try:
+        made = _chunks(policy, Probe(rgb=rgb, state=state, history=history))
+    except (PolicyError, RuntimeError, ValueError) as error:
+        raise CheckpointError(f"{damaged}: {error}; copy the file again") from error
+    if (reason := disagreement(chunks, made)) is not None:
+        raise CheckpointError(
+            f"{path}: these weights do not make the sticks that they made where they were saved: "
+            f"{reason}. The file is damaged, or of another version: copy or export it again"
+        )
+
+
+def _config_of(contents: _Contents, fallback: BuiltinConfig) -> BuiltinConfig:
+    contract = fallback.contract
+    try:
+        if contents.contract is not None:
+            contract = Contract.from_json(contents.contract)
+        if contents.architecture is None:
+            return replace(fallback, contract=contract)
+        config = _architecture_from_json(contents.architecture, contract)
+    except RecursionError as error:
+        raise CheckpointError("the header is not JSON that any build of ours wrote") from error
+    if type(config) is not type(fallback):
+        raise CheckpointError(
+            f"it holds a {_kind(config)!r} policy, not a {_kind(fallback)!r} one: "
+            f"ask for it with --policy {_kind(config)}"
+        )
+    return config
+
+
+def _kind(config: BuiltinConfig) -> str:
+    return "toge" if isinstance(config, TogeConfig) else "resnet-unet"
+
+
+def _architecture_to_json(config: BuiltinConfig) -> str:
+    data = {name: value for name, value in asdict(config).items() if name != "contract"}
+    return json.dumps({"policy": _kind(config), **data}, sort_keys=True)
+
+
+def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
+    try:
+        data: Any = json.loads(text)
+        kind = data.pop("policy")
+        schedule = NoiseSchedule(**data.pop("schedule"))
+        if kind == "toge":
+            return TogeConfig(contract=contract, schedule=schedule, **data)
+        if kind == "resnet-unet":
+            return ResnetUnetConfig(contract=contract, schedule=schedule, **data)
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"malformed architecture {text[:200]!r} ({error}): export the checkpoint again"
+        ) from error
+    raise CheckpointError(f"policy {kind!r} is unknown; this build knows 'toge', 'resnet-unet'")
+
+
+def _read(path: Path) -> _Contents:
+    if path.suffix not in SUFFIXES:
+        raise CheckpointError(f"{path}: not a checkpoint; use one of {', '.join(SUFFIXES)}")
+    require_file(path, SUFFIXES)
+    return _read_safetensors(path) if path.suffix == ".safetensors" else _read_torch(path)
+
+
+def _read_safetensors(path: Path) -> _Contents:
+    header, state = read_tensors(path)
+    for key in HEADER_KEYS:
+        if key not in header:
+            raise CheckpointError(
+                f"{path}: no {key!r} in the header (it holds {sorted(header)}), so it was not "
+                "written by this project; load the weights as .pt and save them with "
+                "policy.checkpoints.policy_file.save_checkpoint"
+            )
+    vector = {
+        name.removeprefix(VECTOR_PREFIX): state.pop(name)
+        for name in list(state)
+        if name.startswith(VECTOR_PREFIX)
+    }
+    require_finite(path, vector)
+    return _Contents(
+        state=unpack(state),
+        vector=vector,
+        contract=header[CONTRACT_KEY],
+        architecture=header[ARCHITECTURE_KEY],
+    )
+
+
+def _read_torch(path: Path) -> _Contents:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of file formats; what matters is refused below
+            loaded: object = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(
+            f"{path}: refused. It is damaged, or a pickle that holds more than tensors, and "
+            "loading that could run any program. Save only model.state_dict() where it was trained"
+        ) from error
+    except _DAMAGED as error:
+        reason = str(error).partition("\n")[0] or "empty file"
+        raise CheckpointError(
+            f"{path}: not a readable torch file ({reason}); it may be cut short: copy it again"
+        ) from error
+    if not isinstance(loaded, dict):
+        raise CheckpointError(
+            f"{path}: holds a {type(loaded).__name__}, not a dict of weights; "
+            "save model.state_dict()"
+        )
+    return _Contents(
+        state=_weights(path, loaded),
+        vector={},
+        contract=_text_or_none(path, loaded, CONTRACT_KEY),
+        architecture=_text_or_none(path, loaded, ARCHITECTURE_KEY),
+    )
+
+
+def _weights(path: Path, loaded: dict[Any, Any]) -> dict[str, Tensor]:
+    """The state dict in what torch.load returned: under a usual key, or the dict itself."""
+    state = {name: value for name, value in loaded.items() if name not in HEADER_KEYS}
+    for key in ("model_state_dict", "state_dict"):
+        if isinstance(loaded.get(key), dict):
+            state = loaded[key]
+            break
+    if state and all(isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()):
+        return state
+    raise CheckpointError(
+        f"{path}: no weights found; it must hold 'model_state_dict' or 'state_dict', or be a state "
+        f"dict itself, and holds {sorted(map(str, loaded))[:8]}"
+    )
+
+
+def _text_or_none(path: Path, loaded: dict[Any, Any], key: str) -> str | None:
+    value = loaded.get(key)
+    if value is None or isinstance(value, str):
+        return value
+    raise CheckpointError(f"{path}: {key!r} must be JSON text, got {type(value).__name__}")

@@ -1,0 +1,95 @@
+"""Files of weights, whatever the network: read, written, and refused in the same words."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from policy.errors import PolicyError
+
+
+class CheckpointError(PolicyError):
+    """A checkpoint that cannot be read, or does not fit; the message says what to do."""
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
+    """Write a ``.safetensors`` file; replaces ``path`` at once or not at all.
+
+    Raises:
+        CheckpointError: of another suffix, or a path that cannot be written.
+    """
+    if path.suffix != ".safetensors":
+        raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
+    partial = path.with_name(path.name + ".partial")
+    try:
+        save_file(dict(tensors), partial, metadata=dict(header))
+        partial.replace(path)
+    except (OSError, SafetensorError) as error:
+        partial.unlink(missing_ok=True)
+        raise CheckpointError(f"cannot write {path}: {error}") from error
+
+
+def read_tensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Header and tensors of a ``.safetensors`` file.
+
+    Raises:
+        CheckpointError: damaged, or of another format.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(
+            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
+        ) from error
+
+
+def require_file(path: Path, suffixes: Sequence[str]) -> None:
+    """Refuse a path without a file, and say what is there.
+
+    Raises:
+        CheckpointError: no such file.
+    """
+    if not path.is_file():
+        near = sorted(p.name for p in path.parent.glob("*") if p.suffix in suffixes)
+        there = f"its folder holds {near}" if near else "its folder holds no checkpoint"
+        raise CheckpointError(f"{path}: no such file; {there}")
+
+
+def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
+    """Refuse weights that no run could use.
+
+    Raises:
+        CheckpointError: NaN or infinity among them.
+    """
+    bad = [name for name, value in state.items() if not torch.isfinite(value).all()]
+    if bad:
+        raise CheckpointError(
+            f"{path}: {len(bad)} tensors hold NaN or infinity, the first is {bad[0]!r}: "
+            "training diverged; take an earlier checkpoint"
+        )
+
+
+def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor]) -> None:
+    """Name the first few weights that do not fit; torch's own message lists hundreds.
+
+    Raises:
+        CheckpointError: other names or shapes than the network's.
+    """
+    wanted = {name: list(value.shape) for name, value in policy.state_dict().items()}
+    problems = [f"missing {name!r}" for name in wanted if name not in state]
+    problems += [f"unexpected {name!r}" for name in state if name not in wanted]
+    problems += [
+        f"{name!r} is {list(state[name].shape)}, must be {shape}"
+        for name, shape in wanted.items()
+        if name in state and list(state[name].shape) != shape
+    ]
+    if problems:
+        raise CheckpointError(
+            f"{path}: does not fit this policy in {len(problems)} places: "
+            f"{'; '.join(problems[:4])}. Choose the size and backbone that it was trained with"
+        )

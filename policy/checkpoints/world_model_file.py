@@ -1,0 +1,77 @@
+"""A world model on disk: ``.safetensors`` with its configuration in the header."""
+
+from pathlib import Path
+
+import torch
+
+from policy.checkpoints.policy_file import ARCHITECTURE_KEY, CONTRACT_KEY, TRAINING_KEY
+from policy.checkpoints.tensors import (
+    CheckpointError,
+    read_tensors,
+    require_file,
+    require_finite,
+    require_fit,
+    write_tensors,
+)
+from policy.contract import Contract
+from policy.errors import PolicyError
+from policy.world_model.config import WorldModelConfig
+from policy.world_model.model import WorldModel
+
+WORLD_MODEL_KEY = "world_model"
+"""Of the header; a policy's file has ``architecture`` in its place."""
+_SUFFIX = ".safetensors"
+
+
+def save_world_model(
+    path: Path, model: WorldModel, *, training: str | None = None, half: bool = True
+) -> None:
+    """Write weights and configuration; replaces ``path`` at once or not at all.
+
+    Args:
+        path: a ``.safetensors`` file.
+        model: whose weights.
+        training: JSON that says how it was trained, for people and reports.
+        half: whether to store float16, at half the size and some thousandth of rounding.
+
+    Raises:
+        CheckpointError: weights that are not finite, also in float16, or a path that cannot be
+            written.
+    """
+    dtype = torch.float16 if half else torch.float32
+    state = {
+        name: value.detach().to(dtype).cpu().contiguous()
+        for name, value in model.state_dict().items()
+    }
+    require_finite(path, state)
+    config = model.config
+    header = {WORLD_MODEL_KEY: config.to_json(), CONTRACT_KEY: config.contract.to_json()}
+    if training is not None:
+        header[TRAINING_KEY] = training
+    write_tensors(path, state, header)
+
+
+def load_world_model(path: Path) -> WorldModel:
+    """Read a world model, in float32 on the CPU and in eval mode.
+
+    Raises:
+        CheckpointError: missing, damaged, of another kind or version, or not finite.
+    """
+    if path.suffix != _SUFFIX:
+        raise CheckpointError(f"{path}: world models are stored as {_SUFFIX}")
+    require_file(path, (_SUFFIX,))
+    header, state = read_tensors(path)
+    if WORLD_MODEL_KEY not in header or CONTRACT_KEY not in header:
+        held = "a policy" if ARCHITECTURE_KEY in header else f"no world model ({sorted(header)})"
+        raise CheckpointError(
+            f"{path} holds {held}: name a file of mavbridge train --policy world-model"
+        )
+    require_finite(path, state)
+    try:
+        contract = Contract.from_json(header[CONTRACT_KEY])
+        model = WorldModel(WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract))
+    except PolicyError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    require_fit(path, model, state)
+    model.load_state_dict(state)
+    return model.eval()

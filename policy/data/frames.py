@@ -1,0 +1,139 @@
+"""Images of all flights, decoded once, as arrays on disk."""
+
+import errno
+import hashlib
+import shutil
+from collections.abc import Callable, Sequence
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from policy.data.episodes import DatasetError, Episode, ImageArray
+from policy.preprocess import resize
+
+_SPARE_BYTES = 1 << 30
+"""Left free on the disk for checkpoints and logs."""
+
+
+class FrameStore:
+    """Images of episodes [N, height, width, 3] uint8, counted over all of them in their order."""
+
+    def __init__(self, arrays: Sequence[ImageArray]) -> None:
+        self._arrays = arrays
+        self._starts = np.cumsum([0, *(len(array) for array in arrays)])
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    @property
+    def counts(self) -> list[int]:
+        """Images of each episode."""
+        return [len(array) for array in self._arrays]
+
+    def only(self, episodes: Sequence[int]) -> "FrameStore":
+        """The images of some episodes, counted anew."""
+        return FrameStore([self._arrays[index] for index in episodes])
+
+    def read(
+        self, frames: NDArray[np.int64], size: tuple[int, int], shifts: NDArray[np.int64]
+    ) -> ImageArray:
+        """[B, height, width, 3] at ``size``, moved by ``shifts`` [B, 2] pixels down and right.
+
+        A shifted image repeats its edge.
+        """
+        out = np.empty((len(frames), *size, 3), np.uint8)
+        episodes = np.searchsorted(self._starts, frames, side="right") - 1
+        for row, (frame, episode) in enumerate(zip(frames, episodes, strict=True)):
+            image = np.asarray(self._arrays[episode][frame - self._starts[episode]])
+            out[row] = resize(_shift(image, shifts[row]), *size)
+        return out
+
+
+def _shift(image: ImageArray, shift: NDArray[np.int64]) -> ImageArray:
+    down, right = int(shift[0]), int(shift[1])
+    if down == 0 and right == 0:
+        return image
+    pad = max(abs(down), abs(right))
+    padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
+    height, width = image.shape[:2]
+    top, left = pad - down, pad - right
+    moved = padded[top : top + height, left : left + width]
+    return moved.astype(np.uint8, copy=False)
+
+
+def store_frames(
+    episodes: Sequence[Episode],
+    *,
+    height: int,
+    width: int,
+    folder: Path,
+    progress: Callable[[float], None],
+) -> FrameStore:
+    """Decode and resize, as in flight, what ``folder`` does not hold yet.
+
+    Args:
+        episodes: whose images.
+        height: of the stored images, px.
+        width: of the stored images, px.
+        folder: one file an episode, named by the content of its video and the size.
+        progress: called with the fraction done.
+
+    Raises:
+        DatasetError: no image in a flight, or no room on the disk.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = [_path(folder, episode, height, width) for episode in episodes]
+        missing = {p: e for p, e in zip(paths, episodes, strict=True) if not p.is_file()}
+        need = sum(len(e.captured_ns) for e in missing.values()) * height * width * 3
+        free = shutil.disk_usage(folder).free
+        if need + _SPARE_BYTES > free:
+            raise DatasetError(
+                f"{folder}: the decoded images take {need / 1e9:.1f} GB and {free / 1e9:.1f} GB "
+                "are free: choose a smaller --image-size, fewer flights, or an --out elsewhere"
+            )
+        for index, (path, episode) in enumerate(missing.items()):
+            _decode(path, episode, height, width)
+            progress((index + 1) / len(missing))
+    except OSError as error:
+        raise disk_error(folder, error) from error
+    return FrameStore([_load(path, height, width) for path in paths])
+
+
+def disk_error(path: Path, error: OSError) -> DatasetError:
+    """What to say of a file that could not be written."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return DatasetError(f"{path}: the disk is full: make room, or write --out elsewhere")
+    return DatasetError(f"{path}: {error.strerror or error}")
+
+
+def _path(folder: Path, episode: Episode, height: int, width: int) -> Path:
+    key = f"{episode.fingerprint} {len(episode.captured_ns)}"
+    name = hashlib.sha256(key.encode()).hexdigest()[:20]
+    return folder / f"{name}.{height}x{width}.rgb"
+
+
+def _decode(path: Path, episode: Episode, height: int, width: int) -> None:
+    """All images that have a row, or those before the video breaks off.
+
+    Written, not mapped: a disk that fills up under a map would kill the process.
+    """
+    partial = path.with_suffix(".partial")
+    count = 0
+    try:
+        with partial.open("wb") as file:
+            for image in islice(episode.decode(), len(episode.captured_ns)):
+                file.write(np.ascontiguousarray(resize(image, height, width)).data)
+                count += 1
+        if count == 0:
+            raise DatasetError(f"{episode.name}: no frame of its video can be read")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _load(path: Path, height: int, width: int) -> ImageArray:
+    return np.memmap(path, np.uint8, mode="r").reshape(-1, height, width, 3)

@@ -1,0 +1,353 @@
+"""Reads LeRobot datasets of format v3 with the contract's features into episodes."""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import av
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from policy.contract import ACTION_NAMES, SPECIFIC_FORCE, STATE_NAMES, FloatArray, StateFrame
+from policy.data import lerobot_format as names
+from policy.data.episodes import GATE_DIM, DatasetError, Episode, ImageArray, Nanoseconds
+
+NS_PER_S = 1_000_000_000
+_CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
+
+
+def is_lerobot(folder: Path) -> bool:
+    """Whether the folder is a LeRobot dataset, of whatever version."""
+    return (folder / names.INFO).is_file()
+
+
+def read_dataset(folder: Path, camera_key: str | None = None) -> list[Episode]:
+    """All episodes of a dataset.
+
+    The stamps are those that ``mavbridge export`` adds; without them every row has its
+    ``timestamp`` for the image, the state and the action. A LeRobot dataset does not say how old
+    an image was when a policy acted on it: ``age_ns`` is empty.
+
+    Args:
+        folder: the dataset, with ``meta/info.json``.
+        camera_key: the feature with the images; by default the only one.
+
+    Raises:
+        DatasetError: another version, other features, or damaged; the message says what to do.
+    """
+    info = _read_info(folder)
+    camera = _camera(info, camera_key)
+    rows = _read_episodes(folder, info, camera)
+    digests = _digests({row.video for row in rows})
+    stamps = [name for name in names.STAMPS if name in info.features]
+    has_sent = names.SENT in info.features and names.SENT_AT in stamps
+    columns = [
+        *("episode_index", "timestamp", names.STATE_KEY, names.ACTION_KEY),
+        *stamps,
+        *([names.SENT] if has_sent else []),
+    ]
+    episodes = []
+    for path, inside in _by_file(rows):
+        table = _read_table(path, columns)
+        index = table["episode_index"].to_numpy()
+        for row in inside:
+            part = table.filter(pa.array(index == row.episode_index))
+            if part.num_rows != row.length:
+                raise DatasetError(
+                    f"{row.name}: {path} holds {part.num_rows} rows of it, meta/episodes says "
+                    f"{row.length}: the dataset is incomplete"
+                )
+            episodes.append(_episode(info, row, part, digests[row.video]))
+    return episodes
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Info:
+    """What is needed of ``meta/info.json``."""
+
+    folder: Path
+    fps: float
+    features: Mapping[str, Mapping[str, Any]]
+    data_path: str
+    video_path: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Camera:
+    key: str
+    is_video: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row:
+    """What is needed of a row of ``meta/episodes``."""
+
+    name: str
+    episode_index: int
+    length: int
+    data: Path
+    camera: _Camera
+    video: Path
+    """The same as ``data`` where the images are in the table."""
+    from_s: float
+
+
+def _read_info(folder: Path) -> _Info:
+    path = folder / names.INFO
+    try:
+        data: Any = json.loads(path.read_text())
+    except OSError as error:
+        raise DatasetError(f"{path}: {error.strerror}: is it a LeRobot dataset?") from error
+    except ValueError as error:
+        raise DatasetError(f"{path} is not JSON: {error}") from error
+    version = data.get("codebase_version") if isinstance(data, dict) else None
+    if not isinstance(version, str) or not version.startswith("v3."):
+        raise DatasetError(
+            f"{folder}: a LeRobot dataset of version {version}, this build reads v3: convert one "
+            f"of v2.1 with lerobot itself ({_CONVERT})"
+        )
+    fps, features = data.get("fps"), data.get("features")
+    if not isinstance(fps, int | float) or not 0 < fps < math.inf:
+        raise DatasetError(f"{path}: fps must be a positive number, got {fps!r}")
+    if not isinstance(features, dict) or not all(isinstance(f, dict) for f in features.values()):
+        raise DatasetError(f"{path} describes no features")
+    _require_vector(folder, features, names.STATE_KEY, STATE_NAMES)
+    _require_vector(folder, features, names.ACTION_KEY, ACTION_NAMES)
+    return _Info(
+        folder=folder,
+        fps=float(fps),
+        features=features,
+        data_path=str(data.get("data_path") or names.DATA),
+        video_path=str(data.get("video_path") or names.VIDEO),
+    )
+
+
+def _require_vector(
+    folder: Path, features: Mapping[str, Mapping[str, Any]], key: str, wanted: Sequence[str]
+) -> None:
+    feature = features.get(key)
+    if feature is None:
+        raise DatasetError(f"{folder}: no feature {key}; it has {sorted(features)}")
+    shape = feature.get("shape")
+    if shape != [len(wanted)]:
+        raise DatasetError(
+            f"{folder}: {key} has shape {shape}, the policy takes [{len(wanted)}]: {list(wanted)}"
+        )
+    got = feature.get("names")
+    if isinstance(got, dict) and len(got) == 1:  # {"motors": [...]}, as older datasets have it
+        got = next(iter(got.values()))
+    if not isinstance(got, list) or [str(name) for name in got] != list(wanted):
+        raise DatasetError(
+            f"{folder}: {key} is named {got}, the policy takes {list(wanted)} in this order: put "
+            "the columns so, and say so in meta/info.json"
+        )
+
+
+def _camera(info: _Info, asked: str | None) -> _Camera:
+    kinds = {key: f.get("dtype") for key, f in info.features.items()}
+    cameras = sorted(key for key, kind in kinds.items() if kind in ("video", "image"))
+    if not cameras:
+        raise DatasetError(f"{info.folder}: no camera: no feature is a video or image")
+    if asked is None and len(cameras) > 1:
+        raise DatasetError(f"{info.folder}: several cameras {cameras}: name one by --camera-key")
+    key = cameras[0] if asked is None else asked
+    if key not in cameras:
+        raise DatasetError(f"{info.folder}: no camera {key}; it has {cameras}")
+    return _Camera(key=key, is_video=kinds[key] == "video")
+
+
+def _read_episodes(folder: Path, info: _Info, camera: _Camera) -> list[_Row]:
+    files = sorted((folder / "meta" / "episodes").glob("*/*.parquet"))
+    if not files:
+        raise DatasetError(f"{folder}: no meta/episodes/*/*.parquet: the dataset is incomplete")
+    columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
+    prefix = f"videos/{camera.key}/"
+    if camera.is_video:
+        columns += [f"{prefix}{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    table = pa.concat_tables([_read_table(file, columns) for file in files])
+    if table.num_rows == 0:
+        raise DatasetError(f"{folder}: no episodes in it")
+    return [_row(info, camera, values) for values in table.to_pylist()]
+
+
+def _row(info: _Info, camera: _Camera, values: Mapping[str, Any]) -> _Row:
+    number = values["episode_index"]
+    name = f"{info.folder}, episode {number}"
+    prefix = f"videos/{camera.key}/"
+    try:
+        data = info.folder / info.data_path.format(
+            chunk_index=values["data/chunk_index"], file_index=values["data/file_index"]
+        )
+        video = data
+        if camera.is_video:
+            video = info.folder / info.video_path.format(
+                video_key=camera.key,
+                chunk_index=values[f"{prefix}chunk_index"],
+                file_index=values[f"{prefix}file_index"],
+            )
+        from_s = float(values[f"{prefix}from_timestamp"]) if camera.is_video else 0.0
+        length = int(values["length"])
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise DatasetError(f"{name}: meta does not say where its files are: {error!r}") from error
+    if not video.is_file():
+        raise DatasetError(f"{name}: {video} is not there: copy the dataset again, whole")
+    return _Row(
+        name=name,
+        episode_index=number,
+        length=length,
+        data=data,
+        camera=camera,
+        video=video,
+        from_s=from_s,
+    )
+
+
+def _by_file(rows: Sequence[_Row]) -> list[tuple[Path, list[_Row]]]:
+    """Episodes of each data file, each file read once."""
+    files: dict[Path, list[_Row]] = {}
+    for row in rows:
+        files.setdefault(row.data, []).append(row)
+    return list(files.items())
+
+
+def _read_table(path: Path, columns: Sequence[str]) -> pa.Table:
+    try:
+        has = pq.read_schema(path).names
+        if missing := [name for name in columns if name not in has]:
+            raise DatasetError(f"{path} lacks {missing}, which meta/info.json promises")
+        return pq.read_table(path, columns=list(columns), partitioning=None)
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is not there: copy the dataset again, whole") from error
+    except (pa.ArrowException, OSError) as error:
+        raise DatasetError(f"{path} cannot be read: {error}") from error
+
+
+def _episode(info: _Info, row: _Row, table: pa.Table, digest: str) -> Episode:
+    state = _vectors(row, table, names.STATE_KEY, len(STATE_NAMES))
+    action = _vectors(row, table, names.ACTION_KEY, len(ACTION_NAMES))
+    seconds = _numbers(row, table, "timestamp", np.float64)
+    if not np.isfinite(seconds).all():
+        raise DatasetError(f"{row.name}: timestamp holds NaN or infinity")
+    timestamp_ns = np.round(seconds * NS_PER_S).astype(np.int64)
+
+    def stamps(name: str) -> Nanoseconds:
+        if name not in table.column_names:
+            return timestamp_ns
+        return _numbers(row, table, name, np.int64).astype(np.int64)
+
+    has_sent = names.SENT in table.column_names
+    sent = _vectors(row, table, names.SENT, len(ACTION_NAMES)) if has_sent else action
+    return Episode(
+        name=row.name,
+        state_frame=_state_frame(info, row, state),
+        tick_ns=stamps(names.TICK),
+        state=state,
+        attitude_ns=stamps(names.ATTITUDE),
+        velocity_ns=stamps(names.VELOCITY),
+        target_ns=stamps(names.ACTED),
+        target=action,
+        sent_ns=stamps(names.SENT_AT if has_sent else names.ACTED),
+        sent=sent,
+        age_ns=np.array([], dtype=np.int64),
+        captured_ns=stamps(names.CAPTURED),
+        gate=np.full((row.length, GATE_DIM), np.nan, dtype=np.float32),
+        fingerprint=f"{digest} {row.camera.key} {row.episode_index}",
+        decode=partial(_decode, row, info.fps),
+    )
+
+
+def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
+    """As the dataset says; else by gravity: what is not falling pushes up, -z in FRD, +z in FLU."""
+    about = info.features[names.STATE_KEY].get("info")
+    said = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
+    if said is None:
+        up = float(np.median(state[:, SPECIFIC_FORCE][:, 2]))
+        return "ned_frd" if up < 0 else "enu_flu"
+    if said not in get_args(StateFrame):
+        raise DatasetError(f"{row.name}: its state is in a frame that we do not know: {said!r}")
+    return cast(StateFrame, said)
+
+
+def _numbers(row: _Row, table: pa.Table, name: str, kind: type[np.generic]) -> np.ndarray:
+    column = table[name]
+    if column.null_count:
+        raise DatasetError(f"{row.name}: {name} is missing in {column.null_count} rows")
+    values = column.to_numpy()
+    if values.ndim != 1 or values.dtype.kind not in "if":
+        raise DatasetError(f"{row.name}: {name} must hold a number a row")
+    return np.asarray(values, dtype=kind)
+
+
+def _vectors(row: _Row, table: pa.Table, name: str, width: int) -> FloatArray:
+    """List column -> [rows, width] float32, every one of them finite."""
+    column = table[name].combine_chunks()
+    try:
+        flat = column.flatten().to_numpy(zero_copy_only=False).astype(np.float32)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise DatasetError(f"{row.name}: {name} must hold {width} numbers a row") from error
+    if column.null_count or flat.size != table.num_rows * width:
+        raise DatasetError(f"{row.name}: {name} must hold {width} numbers a row")
+    values: FloatArray = flat.reshape(-1, width)
+    if (bad := np.flatnonzero(~np.isfinite(values).all(axis=1))).size:
+        raise DatasetError(f"{row.name}: {name} holds NaN or infinity in row {bad[0]}")
+    return values
+
+
+def _digests(paths: set[Path]) -> dict[Path, str]:
+    out = {}
+    for path in paths:
+        with path.open("rb") as file:
+            out[path] = hashlib.file_digest(file, "sha256").hexdigest()
+    return out
+
+
+def _decode(row: _Row, fps: float) -> Iterator[ImageArray]:
+    images = _decode_video(row, fps) if row.camera.is_video else _decode_table(row)
+    count = 0
+    for image in images:
+        yield image
+        count += 1
+    if count != row.length:
+        raise DatasetError(f"{row.name}: {row.video} ends after {count} of {row.length} images")
+
+
+def _decode_video(row: _Row, fps: float) -> Iterator[ImageArray]:
+    """Image k is the frame nearest to ``from_timestamp + k / fps``, as for LeRobot's reader."""
+    try:
+        with av.open(str(row.video)) as container:
+            stream = container.streams.video[0]
+            tick_s = float(stream.time_base or 0)
+            container.seek(max(0, round(row.from_s / tick_s) - 1), backward=True, stream=stream)
+            wanted = 0
+            for frame in container.decode(stream):
+                if frame.pts is None:
+                    continue
+                number = round((frame.pts * tick_s - row.from_s) * fps)
+                if number > wanted:
+                    raise DatasetError(f"{row.name}: {row.video} has no frame for row {wanted}")
+                if number < wanted:
+                    continue
+                yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
+                wanted += 1
+                if wanted == row.length:
+                    return
+    except (av.FFmpegError, OSError, IndexError, ZeroDivisionError) as error:
+        raise DatasetError(f"{row.video}: not a readable video ({error})") from error
+
+
+def _decode_table(row: _Row) -> Iterator[ImageArray]:
+    table = _read_table(row.data, ["episode_index", row.camera.key])
+    index = table["episode_index"].to_numpy()
+    for value in table.filter(pa.array(index == row.episode_index))[row.camera.key]:
+        encoded = value.as_py().get("bytes") if value.is_valid else None
+        bgr = cv2.imdecode(np.frombuffer(encoded or b"", np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise DatasetError(f"{row.name}: {row.data} holds an image that cannot be decoded")
+        yield cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)

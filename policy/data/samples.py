@@ -1,0 +1,277 @@
+"""From stamped flights to what a net is told, for any pair of an image and a later moment.
+
+What is computed here is what the runtime computes in flight, on arrays: the history as
+``SentHistory.resample`` makes it, the chunk as ``sample_chunk`` reads it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policy import rotation
+from policy.contract import (
+    ACTION_DIM,
+    AGE,
+    QUATERNION,
+    RATE,
+    ROTATION,
+    SPECIFIC_FORCE,
+    STATE_DIM,
+    VELOCITY,
+    VELOCITY_CHANGE,
+    Contract,
+    FloatArray,
+)
+from policy.data.episodes import GATE_DIM, DatasetError, Episode, Nanoseconds
+from policy.data.interpolation import NS_PER_S, Indices, Knots, covered
+
+TICK_TOLERANCE_NS = 20_000_000
+"""How far the nearest tick may be from the moment that was drawn: two ticks at 100 Hz."""
+HISTORY_JITTER_S = 0.005
+"""Slots of the history are taken so much earlier or later: half a tick at 100 Hz."""
+FRESH_START_SHARE = 0.15
+"""Samples that look like a policy just engaged: the older part of the history is neutral."""
+BLIND_SHARE = 0.4
+"""Samples without any history. Sticks change slowly, so a net that sees the last ones learns to
+copy them and not to look (de Haan et al., "Causal Confusion in Imitation Learning", 2019), and then
+drifts off in flight, however small its error on the data."""
+HISTORY_NOISE = 0.1
+"""Standard deviation of an offset on the sticks of a history, against the same."""
+
+_BETWEEN_NS = 10 * NS_PER_S
+"""Put between two flights on the common axis of time: far beyond every gap that is bridged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Samples:
+    """A batch; ``B`` pairs of an image and a later tick."""
+
+    frame: Indices
+    """[B] of the image, counted over all flights."""
+    state: FloatArray
+    """[B, state_dim]"""
+    history: FloatArray
+    """[B, K, 4]"""
+    chunk: FloatArray
+    """[B, horizon, 4]; where the flight ends inside, its last stick is held."""
+    known: NDArray[np.bool_]
+    """[B, horizon]: what of the chunk was flown."""
+    gate: FloatArray
+    """[B, 7] of the image, NaN where unknown."""
+
+
+class Timeline:
+    """All flights on one axis of time, seconds apart, so that one search serves a batch."""
+
+    def __init__(
+        self, episodes: Sequence[Episode], contract: Contract, ages_ns: Nanoseconds
+    ) -> None:
+        """Lay out the flights.
+
+        Args:
+            episodes: in the order in which their images are counted.
+            contract: says what a sample holds.
+            ages_ns: sorted; an image's age in a sample is drawn from these.
+
+        Raises:
+            DatasetError: not one image has a tick at any such age.
+        """
+        self.contract = contract
+        self._ages_ns = ages_ns
+        offsets = _offsets(episodes)
+
+        def stamps(name: str) -> Nanoseconds:
+            parts = [getattr(e, name) + o for e, o in zip(episodes, offsets, strict=True)]
+            return np.concatenate(parts).astype(np.int64)
+
+        state = np.concatenate([episode.state for episode in episodes])
+        known = ~np.isnan(state).any(axis=1)
+        self.tick_ns, self._attitude_ns = stamps("tick_ns")[known], stamps("attitude_ns")[known]
+        self._state = state[known]
+        self._attitude = Knots(self._attitude_ns, self._state[:, QUATERNION])
+        self._velocity_ns = stamps("velocity_ns")[known]
+        self._velocity = Knots(self._velocity_ns, self._state[:, VELOCITY])
+        self._target_ns = stamps("target_ns")
+        self._target = np.concatenate([episode.target for episode in episodes])
+        # Before its first stick, a flight's sticks were neutral.
+        starts = [_start_ns(e) + o - NS_PER_S for e, o in zip(episodes, offsets, strict=True)]
+        sent_ns = [
+            np.concatenate([[start], e.sent_ns + o])
+            for e, o, start in zip(episodes, offsets, starts, strict=True)
+        ]
+        neutral = np.zeros((1, ACTION_DIM), np.float32)
+        self._sent_ns = np.concatenate(sent_ns).astype(np.int64)
+        self._sent = np.concatenate([part for e in episodes for part in (neutral, e.sent)])
+        self.captured_ns = stamps("captured_ns")
+        self.gate = np.concatenate([episode.gate for episode in episodes]).reshape(-1, GATE_DIM)
+        self._usable_ticks = np.flatnonzero(self.chunks(np.arange(len(self.tick_ns)))[1][:, 0])
+        self.frames, self._any_tick = self._usable_frames()
+
+    def _usable_frames(self) -> tuple[Indices, Indices]:
+        """Images with a tick at some age and an attitude at the exposure; such a tick of each."""
+        ticks_ns = self.tick_ns[self._usable_ticks]
+        low = self.captured_ns + self._ages_ns[0] - TICK_TOLERANCE_NS
+        high = self.captured_ns + self._ages_ns[-1] + TICK_TOLERANCE_NS
+        first = np.searchsorted(ticks_ns, np.maximum(low, self.captured_ns), side="left")
+        has_tick = first < len(ticks_ns)
+        any_tick = np.minimum(first, max(len(ticks_ns) - 1, 0))
+        if len(ticks_ns):
+            has_tick &= ticks_ns[any_tick] <= high
+        has_past = self._attitude.covers(self.captured_ns) & self._velocity.covers(self.captured_ns)
+        # Whoever labelled the sticks knew of a gate behind the camera; one image does not show it.
+        is_behind = self.gate[:, 0] < 0
+        usable = np.flatnonzero(has_tick & has_past & ~is_behind)
+        if len(usable) == 0:
+            low_ms, high_ms = self._ages_ns[[0, -1]] / 1e6
+            raise DatasetError(
+                f"none of {len(self.captured_ns)} images has a tick with a state and sticks to "
+                f"imitate {low_ms:.0f} to {high_ms:.0f} ms after it: are camera and ticks of one "
+                "flight and one clock?"
+            )
+        return usable, any_tick
+
+    def draw_ticks(self, frames: Indices, random: np.random.Generator) -> Indices:
+        """A tick for each image: the nearest to its exposure plus a measured age."""
+        ages = self._ages_ns[random.integers(len(self._ages_ns), size=len(frames))]
+        wanted = self.captured_ns[frames] + ages
+        ticks_ns = self.tick_ns[self._usable_ticks]
+        after = np.clip(np.searchsorted(ticks_ns, wanted), 1, max(len(ticks_ns) - 1, 1))
+        after = np.minimum(after, len(ticks_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.where(wanted - ticks_ns[before] <= ticks_ns[after] - wanted, before, after)
+        misses = (np.abs(ticks_ns[nearest] - wanted) > TICK_TOLERANCE_NS) | (
+            ticks_ns[nearest] < self.captured_ns[frames]
+        )
+        chosen: Indices = self._usable_ticks[np.where(misses, self._any_tick[frames], nearest)]
+        return chosen
+
+    def samples(
+        self, frames: Indices, ticks: Indices, random: np.random.Generator | None = None
+    ) -> Samples:
+        """What the net is told at ``ticks`` with the images ``frames``; jittered by ``random``."""
+        chunk, known = self.chunks(ticks)
+        return Samples(
+            frame=frames,
+            state=self.states(frames, ticks),
+            history=self.histories(ticks, random),
+            chunk=chunk,
+            known=known,
+            gate=self.gate[frames],
+        )
+
+    def states(self, frames: Indices, ticks: Indices) -> FloatArray:
+        """[B, state_dim]: the state at the tick and, if asked for, what happened since exposure."""
+        state: FloatArray = self._state[ticks]
+        if not self.contract.since_exposure:
+            return state
+        captured_ns, attitude_ns = self.captured_ns[frames], self._attitude_ns[ticks]
+        # An image newer than the attitude: in flight nothing later is known, so nothing has moved.
+        turned_from = self._attitude.rotations_at(np.minimum(captured_ns, attitude_ns))
+        moved_from = self._velocity.vectors_at(np.minimum(captured_ns, self._velocity_ns[ticks]))
+        then = rotation.conjugate(turned_from)
+        turned = rotation.multiply(then, state[:, QUATERNION].astype(np.float64))
+        out = np.empty((len(ticks), self.contract.state_dim), np.float32)
+        out[:, :STATE_DIM] = state
+        out[:, AGE] = (attitude_ns - captured_ns)[:, None] / NS_PER_S
+        out[:, ROTATION] = rotation.rotation_vector(turned)
+        out[:, VELOCITY_CHANGE] = rotation.rotate(then, state[:, VELOCITY] - moved_from)
+        return out
+
+    def histories(self, ticks: Indices, random: np.random.Generator | None = None) -> FloatArray:
+        """[B, K, 4] sticks as they were sent, oldest first, held until the next one."""
+        count = self.contract.history_len
+        back_s = np.arange(count, 0, -1) * self.contract.history_dt_s
+        at_s = np.broadcast_to(back_s, (len(ticks), count))
+        if random is not None:
+            at_s = at_s + random.uniform(-HISTORY_JITTER_S, HISTORY_JITTER_S, at_s.shape)
+        at_ns = self.tick_ns[ticks][:, None] - np.round(at_s * NS_PER_S).astype(np.int64)
+        # Flights are seconds apart, so a time before the first stick finds the neutral row.
+        row = np.maximum(np.searchsorted(self._sent_ns, at_ns, side="right") - 1, 0)
+        history: FloatArray = self._sent[row]
+        if random is not None:
+            offset = random.normal(0.0, HISTORY_NOISE, (len(ticks), 1, ACTION_DIM))
+            history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
+            chance = random.random(len(ticks))
+            is_fresh = chance < FRESH_START_SHARE
+            neutral = np.where(is_fresh, random.integers(1, count + 1, len(ticks)), 0)
+            neutral = np.where(chance > 1 - BLIND_SHARE, count, neutral)
+            history = np.where(
+                (np.arange(count) < neutral[:, None])[..., None], np.float32(0), history
+            )
+        return history
+
+    def chunks(self, ticks: Indices) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Sticks [B, horizon, 4] to imitate, and which of them [B, horizon] are known."""
+        horizon = self.contract.horizon
+        step_ns = round(self.contract.chunk_dt_s * NS_PER_S)
+        at_ns = self._attitude_ns[ticks][:, None] + np.arange(horizon) * step_ns
+        known = np.logical_and.accumulate(covered(self._target_ns, at_ns), axis=1)
+        flat = at_ns.ravel()
+        columns = [np.interp(flat, self._target_ns, column) for column in self._target.T]
+        chunk = np.stack(columns, axis=-1).reshape(len(ticks), horizon, ACTION_DIM)
+        last = np.maximum(known.sum(axis=1) - 1, 0)
+        held = np.minimum(np.arange(horizon), last[:, None])
+        filled = np.take_along_axis(chunk, held[..., None], axis=1)
+        return filled.astype(np.float32), known
+
+
+def _start_ns(episode: Episode) -> int:
+    stamps = (episode.tick_ns, episode.attitude_ns, episode.velocity_ns, episode.target_ns)
+    firsts = [s.min() for s in (*stamps, episode.sent_ns, episode.captured_ns) if len(s)]
+    return int(min(firsts))
+
+
+def _offsets(episodes: Sequence[Episode]) -> list[int]:
+    """What to add to the stamps of each flight."""
+    offsets, end = [], 0
+    for episode in episodes:
+        offset = end + _BETWEEN_NS - _start_ns(episode)
+        lists = (episode.tick_ns, episode.target_ns, episode.sent_ns, episode.captured_ns)
+        end = offset + max(int(stamps.max()) for stamps in lists if len(stamps))
+        offsets.append(offset)
+    return offsets
+
+
+_VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
+STICK_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
+"""What a mirror makes of sticks: yaw and roll change their sign."""
+
+
+def mirror_signs(state_dim: int) -> FloatArray:
+    """What a mirror makes of a state [state_dim], as factors of 1 and -1."""
+    signs = np.ones(state_dim, np.float32)
+    signs[VELOCITY] = signs[SPECIFIC_FORCE] = _VECTOR
+    signs[RATE] = signs[QUATERNION.start + 1 : QUATERNION.stop] = _AXIAL
+    if state_dim > STATE_DIM:
+        signs[ROTATION] = _AXIAL
+        signs[VELOCITY_CHANGE] = _VECTOR
+    return signs
+
+
+def mirrored(values: FloatArray, signs: FloatArray, is_mirrored: NDArray[np.bool_]) -> FloatArray:
+    """``values`` [B, ..., D], times ``signs`` [D] where ``is_mirrored`` [B]."""
+    chosen = is_mirrored.reshape(-1, *[1] * (values.ndim - 1))
+    return np.where(chosen, values * signs, values).astype(np.float32)
+
+
+def mirror(samples: Samples, is_mirrored: NDArray[np.bool_]) -> Samples:
+    """The flight in a mirror, left and right exchanged, where ``is_mirrored`` [B].
+
+    The mirror is the plane of the first and third axis, of the world and of the body: true vectors
+    lose the sign of y, rotations those of x and z. It holds in both state frames.
+    """
+    gate = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
+
+    def where(values: FloatArray, factor: FloatArray) -> FloatArray:
+        return mirrored(values, factor, is_mirrored)
+
+    return Samples(
+        frame=samples.frame,
+        state=where(samples.state, mirror_signs(samples.state.shape[1])),
+        history=where(samples.history, STICK_SIGNS),
+        chunk=where(samples.chunk, STICK_SIGNS),
+        known=samples.known,
+        gate=where(samples.gate, gate),
+    )

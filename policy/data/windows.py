@@ -1,0 +1,156 @@
+"""What a world model learns from: runs of frames at an even pace, states and sticks beside them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, VELOCITY, FloatArray
+from policy.data.episodes import DatasetError, Episode, Nanoseconds
+from policy.data.interpolation import NS_PER_S, Indices, Knots
+
+TOLERANCE = 0.25
+"""Of the time between two frames: how far a frame may be from its place in a window. A frame in
+three that was dropped leaves a place that no neighbour can take."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WindowSamples:
+    """``B`` windows of ``K`` frames of context and ``T`` of future."""
+
+    frames: Indices
+    """[B, K + T], counted over all flights."""
+    states: FloatArray
+    """[B, K + T, 13] at the exposures."""
+    actions: FloatArray
+    """[B, T, 4] mean stick that was sent from the frame before to each frame of the future."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Windows:
+    """All windows of some flights; made by ``find_windows``."""
+
+    frames: Indices
+    """[W, K + T]"""
+    states: FloatArray
+    """[N, 13] at each exposure."""
+    sent: NDArray[np.float64]
+    """[N, 4] time integral of the sticks from the start of the flight to each exposure, stick s."""
+    captured_ns: Nanoseconds
+    """[N]"""
+    context_frames: int
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def among(self, frames: Indices) -> "Windows":
+        """The windows that need no others than ``frames``; there may be none."""
+        is_there = np.zeros(len(self.states), bool)
+        is_there[frames] = True
+        return replace(self, frames=self.frames[is_there[self.frames].all(axis=1)])
+
+    def spread(self, count: int) -> "Windows":
+        """At most ``count`` of them, evenly over all flights."""
+        rows = np.linspace(0, len(self) - 1, min(count, len(self))).astype(np.int64)
+        return replace(self, frames=self.frames[rows])
+
+    def samples(self, rows: Indices) -> WindowSamples:
+        """Windows [B] by their number."""
+        frames = self.frames[rows]
+        ends = frames[:, self.context_frames - 1 :]
+        elapsed_s = np.diff(self.captured_ns[ends], axis=1)[..., None] / NS_PER_S
+        mean = np.diff(self.sent[ends], axis=1) / elapsed_s
+        return WindowSamples(
+            frames=frames,
+            states=self.states[frames],
+            actions=np.clip(mean, -1.0, 1.0).astype(np.float32),
+        )
+
+
+def find_windows(
+    episodes: Sequence[Episode], *, context_frames: int, frames: int, frame_dt_s: float
+) -> Windows:
+    """Every run of ``context_frames + frames`` frames, ``frame_dt_s`` apart, of one flight.
+
+    No window crosses a gap: each of its frames is near its place, and has a state.
+
+    Raises:
+        DatasetError: there is none.
+    """
+    dt_ns = round(frame_dt_s * NS_PER_S)
+    states, sent, windows, first = [], [], [], 0
+    for episode in episodes:
+        state, known = _states_at_exposures(episode)
+        found = _evenly_spaced(episode.captured_ns, known, context_frames + frames, dt_ns)
+        states.append(state)
+        sent.append(_sent_until(episode, episode.captured_ns))
+        windows.append(found + first)
+        first += len(state)
+    every = np.concatenate(windows)
+    if len(every) == 0:
+        gaps_ms = np.concatenate([np.diff(e.captured_ns) for e in episodes]) / 1e6
+        pace = (
+            f"their frames are {np.median(gaps_ms):.0f} ms apart" if len(gaps_ms) else "no frames"
+        )
+        raise DatasetError(
+            f"none of {len(episodes)} flights holds {context_frames + frames} frames with states, "
+            f"{1e3 * frame_dt_s:.0f} ms apart ({pace}): fly longer, or choose another frame_dt_s"
+        )
+    return Windows(
+        frames=every,
+        states=np.concatenate(states),
+        sent=np.concatenate(sent),
+        captured_ns=np.concatenate([episode.captured_ns for episode in episodes]),
+        context_frames=context_frames,
+    )
+
+
+def _states_at_exposures(episode: Episode) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """State [N, 13] between the ticks around each exposure, and where it is known."""
+    captured_ns = episode.captured_ns
+    state = np.zeros((len(captured_ns), STATE_DIM), np.float32)
+    rows = ~np.isnan(episode.state).any(axis=1)
+    if not rows.any():
+        return state, np.zeros(len(captured_ns), bool)
+    flown = episode.state[rows]
+    # Body rates come with the attitude; the specific force is as old, give or take a tick.
+    attitude_ns, velocity_ns = episode.attitude_ns[rows], episode.velocity_ns[rows]
+    body = Knots(attitude_ns, flown[:, QUATERNION.stop :])
+    attitude = Knots(attitude_ns, flown[:, QUATERNION])
+    velocity = Knots(velocity_ns, flown[:, VELOCITY])
+    quaternion = attitude.rotations_at(captured_ns)
+    state[:, VELOCITY] = velocity.vectors_at(captured_ns)
+    state[:, QUATERNION] = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+    state[:, QUATERNION.stop :] = body.vectors_at(captured_ns)
+    return state, attitude.covers(captured_ns) & velocity.covers(captured_ns)
+
+
+def _sent_until(episode: Episode, at_ns: Nanoseconds) -> NDArray[np.float64]:
+    """Time integral [N, 4] of the sticks up to each time; a stick is held until the next one."""
+    stamps, sticks = episode.sent_ns, episode.sent.astype(np.float64)
+    if len(stamps) == 0:
+        return np.zeros((len(at_ns), ACTION_DIM))
+    held_s = np.diff(stamps)[:, None] / NS_PER_S
+    before = np.concatenate([np.zeros((1, ACTION_DIM)), np.cumsum(sticks[:-1] * held_s, axis=0)])
+    row = np.searchsorted(stamps, at_ns, side="right") - 1
+    since_s = (at_ns - stamps[np.maximum(row, 0)])[:, None] / NS_PER_S
+    integral = before[np.maximum(row, 0)] + sticks[np.maximum(row, 0)] * since_s
+    return np.where(row[:, None] >= 0, integral, 0.0)  # neutral before the first
+
+
+def _evenly_spaced(
+    captured_ns: Nanoseconds, usable: NDArray[np.bool_], count: int, dt_ns: int
+) -> Indices:
+    """Runs [W, count] of usable frames, each near its place after the first."""
+    if len(captured_ns) < count:
+        return np.zeros((0, count), np.int64)
+    wanted = captured_ns[:, None] + dt_ns * np.arange(count)
+    after = np.clip(np.searchsorted(captured_ns, wanted), 1, len(captured_ns) - 1)
+    before = after - 1
+    is_before = wanted - captured_ns[before] <= captured_ns[after] - wanted
+    nearest = np.where(is_before, before, after)
+    misses = np.abs(captured_ns[nearest] - wanted) > TOLERANCE * dt_ns
+    is_window = (~misses & usable[nearest]).all(axis=1) & (np.diff(nearest, axis=1) > 0).all(axis=1)
+    runs: Indices = nearest[is_window]
+    return runs

@@ -1,0 +1,1 @@
+"""Network architectures: image encoders, condition encoders, the diffusion head."""

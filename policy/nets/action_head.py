@@ -1,0 +1,143 @@
+"""The diffusion action head: a condition vector in, a chunk of stick positions out."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from policy.contract import ACTION_DIM, Contract
+from policy.errors import PolicyError
+from policy.nets.diffusion import NoiseSchedule, ddim_solve
+from policy.nets.unet1d import UNet1d, UNet1dConfig
+
+Size = Literal["small", "medium", "large"]
+SIZE_NAMES: tuple[Size, ...] = get_args(Size)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SizeDims:
+    """Dimensions that go with a size."""
+
+    base_dim: int
+    """Of the feature, the tokens and the condition."""
+    widths: tuple[int, ...]
+    """Of the U-Net's levels."""
+
+
+def size_dims(size: Size) -> SizeDims:
+    """Dimensions of a size: heads of about 3, 12 and 40 million parameters.
+
+    On a CPU every diffusion step reads all weights once: 100 Hz with 10 steps leaves room for about
+    3 million of them on one core.
+
+    Raises:
+        PolicyError: the size is unknown.
+    """
+    match size:
+        case "small":
+            return SizeDims(base_dim=256, widths=(96, 160, 256))
+        case "medium":
+            return SizeDims(base_dim=384, widths=(192, 320, 512))
+        case "large":
+            return SizeDims(base_dim=512, widths=(320, 640, 960))
+        case _:
+            raise PolicyError(f"size {size!r} is unknown; use one of {list(SIZE_NAMES)}")
+
+
+class DiffusionHead(nn.Module):
+    """Denoiser, noise schedule and initial noise.
+
+    Where the net predicts the clean chunk, it is the sum of what a linear layer reads off the
+    condition and of what the U-Net makes of the noisy chunk. The first learns the mean chunk within
+    minutes, and what is left to the second is how flights differ from it; at the noisiest step that
+    is nothing. So few steps of a head that was trained for little time still steer.
+
+    The initial noise is fixed for a flight: the same inputs then give the same sticks, and chunks
+    do not jitter from sample to sample. It is not part of a checkpoint.
+    """
+
+    def __init__(self, size: Size, contract: Contract, schedule: NoiseSchedule) -> None:
+        super().__init__()
+        dims = size_dims(size)
+        self.schedule = schedule
+        self.unet = UNet1d(
+            UNet1dConfig(
+                horizon=contract.horizon,
+                action_dim=ACTION_DIM,
+                condition_dim=dims.base_dim,
+                widths=dims.widths,
+            )
+        )
+        self.direct = nn.Linear(dims.base_dim, contract.horizon * ACTION_DIM)
+        self._timesteps: Tensor
+        timesteps = torch.arange(schedule.num_train_timesteps)
+        self.register_buffer("_timesteps", timesteps, persistent=False)
+        self.initial_noise: Tensor
+        noise = torch.empty(1, contract.horizon, ACTION_DIM)
+        self.register_buffer("initial_noise", noise, persistent=False)
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Draw the initial noise of a flight, the same for the same seed on every device."""
+        generator = torch.Generator().manual_seed(seed)
+        self.initial_noise.copy_(torch.randn(self.initial_noise.shape, generator=generator))
+
+    def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
+        """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
+        film = self.unet.film_of_timestep(timestep) + self.unet.film_of_condition(condition)
+        prediction: Tensor = self.unet(noisy, film)
+        return prediction + self.read(condition) if self.reads_condition else prediction
+
+    @property
+    def reads_condition(self) -> bool:
+        """Whether ``read`` is part of the net's prediction: it is, of the clean chunk."""
+        return self.schedule.prediction == "sample"
+
+    def read(self, condition: Tensor) -> Tensor:
+        """Condition [B, C] -> mean chunk [B, horizon, 4]."""
+        chunk: Tensor = self.direct(condition)
+        return chunk.reshape(condition.shape[0], -1, ACTION_DIM)
+
+    def sample(self, condition: Tensor, num_diffusion_steps: int) -> Tensor:
+        """Condition [B, C] -> chunk [B, horizon, 4] in [-1, 1].
+
+        Raises:
+            PolicyError: the number of steps is not one that the schedule has.
+        """
+        noise = self.initial_noise.expand(condition.shape[0], -1, -1)
+        return self.denoise_steps(condition, noise, num_diffusion_steps, 0, num_diffusion_steps)
+
+    def denoise_steps(
+        self, condition: Tensor, noisy: Tensor, num_diffusion_steps: int, first: int, count: int
+    ) -> Tensor:
+        """``count`` steps of a solve from step ``first`` on, bit for bit as within the whole one.
+
+        Args:
+            condition: [B, C].
+            noisy: [B, horizon, 4], as step ``first`` starts with it.
+            num_diffusion_steps: of the whole solve.
+            first: counted from 0, the noisiest step.
+            count: how many steps.
+
+        Raises:
+            PolicyError: the schedule or the solve has no such steps.
+        """
+        steps = self.schedule.ddim_steps(num_diffusion_steps)
+        if not 0 <= first < first + count <= num_diffusion_steps:
+            raise PolicyError(
+                f"a solve of {num_diffusion_steps} steps has no {count} from step {first} on"
+            )
+        # Picked on the device: a capture of a CUDA graph allows no copy from the host.
+        timesteps = torch.stack([self._timesteps[step.timestep] for step in steps])
+        # Both shares of FiLM are outside the loop. That of all timesteps is one product, also where
+        # few are wanted: a product of fewer rows may round otherwise.
+        film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)[first : first + count]
+        film_of_condition = self.unet.film_of_condition(condition)
+        read = self.read(condition) if self.reads_condition else 0.0
+
+        def denoise(index: int, noisy: Tensor) -> Tensor:
+            prediction: Tensor = self.unet(noisy, film_of_step[index] + film_of_condition)
+            return prediction + read
+
+        return ddim_solve(self.schedule, steps[first : first + count], denoise, noisy)

@@ -1,0 +1,64 @@
+"""The image encoders to choose from, and how ImageNet weights get into them.
+
+Written here rather than imported, with torchvision's parameter names: a torchvision state dict
+loads as it is, but for the 1000-class layer at its end, which ``load_imagenet_state`` leaves out.
+"""
+
+from collections.abc import Mapping
+from typing import Literal, TypeAlias, get_args
+
+from torch import Tensor, nn
+
+from policy.errors import PolicyError
+from policy.nets.convnext import ConvNextTiny
+from policy.nets.efficientnet import EfficientNetB3
+from policy.nets.resnet import BasicBlock, Bottleneck, ResNet, ResNet8
+
+BackboneName = Literal["efficientnet_b3", "convnext_tiny", "resnet8", "resnet18", "resnet50"]
+BACKBONE_NAMES: tuple[BackboneName, ...] = get_args(BackboneName)
+
+Backbone: TypeAlias = EfficientNetB3 | ConvNextTiny | ResNet | ResNet8
+"""Image [B, 3, H, W] normalised -> feature [B, out_dim]."""
+
+
+def build_backbone(name: BackboneName) -> Backbone:
+    """A backbone with random weights."""
+    backbone: Backbone
+    match name:
+        case "efficientnet_b3":
+            backbone = EfficientNetB3()
+        case "convnext_tiny":
+            backbone = ConvNextTiny()
+        case "resnet8":
+            backbone = ResNet8()
+        case "resnet18":
+            backbone = ResNet(BasicBlock, (2, 2, 2, 2))
+        case "resnet50":
+            backbone = ResNet(Bottleneck, (3, 4, 6, 3))
+    _initialise(backbone)
+    return backbone
+
+
+def _initialise(backbone: Backbone) -> None:
+    """He et al. 2015, fan-in: the signal survives the depth before any batch norm has statistics.
+
+    With torch's own default an untrained EfficientNet-B3 maps every image to about 1e-13.
+    """
+    for module in backbone.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, mode="fan_in", nonlinearity="relu")
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+
+
+def load_imagenet_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
+    """Load torchvision's state dict of the same architecture; its classifier is left out.
+
+    Raises:
+        PolicyError: names or shapes do not fit.
+    """
+    kept = {name: value for name, value in state.items() if name not in backbone.classifier_keys}
+    try:
+        backbone.load_state_dict(kept)
+    except RuntimeError as error:
+        raise PolicyError(f"these weights are not of this backbone: {error}") from error

@@ -1,0 +1,184 @@
+"""The diffusion process: the training noise schedule and its exact deterministic DDIM solver.
+
+Forward process, DDPM (Ho et al. 2020, eq. 4), with a_t the cumulated product of ``1 - beta``:
+
+    x_t = sqrt(a_t) x_0 + sqrt(1 - a_t) eps
+
+Reverse step from t to s < t, DDIM with eta = 0 (Song et al. 2021, eq. 12):
+
+    x_s = sqrt(a_s) x_0 + sqrt(1 - a_s) eps,   with the net's estimate of x_0 and eps
+
+The last step goes to a_s = 1, so that a sample is the net's last estimate of x_0.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from policy.errors import PolicyError
+
+BetaSchedule = Literal["squared_cosine", "linear"]
+Prediction = Literal["sample", "epsilon"]
+
+TRAIN_TIMESTEPS = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DdimStep:
+    """One reverse step: where it starts, and the coefficients of the state before and after it.
+
+    Plain floats, so that a tracer folds them to constants and float64 stays float64.
+    """
+
+    timestep: int
+    signal: float
+    """sqrt(a_t)"""
+    noise: float
+    """sqrt(1 - a_t)"""
+    next_signal: float
+    next_noise: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseSchedule:
+    """How noise was added in training, and what the net was trained to predict.
+
+    Raises:
+        PolicyError: a field is out of its range.
+    """
+
+    num_train_timesteps: int = TRAIN_TIMESTEPS
+    betas: BetaSchedule = "squared_cosine"
+    prediction: Prediction = "sample"
+    """``sample``: the net returns x_0; ``epsilon``: the noise. At the first steps x_0 from epsilon
+    is divided by sqrt(a_t), which is 5e-4 at t = 99: with few steps ``sample`` is the safer one."""
+
+    def __post_init__(self) -> None:
+        """Refuse what has no schedule."""
+        if not (
+            isinstance(self.num_train_timesteps, int) and 1 <= self.num_train_timesteps <= 1000
+        ):
+            raise PolicyError(
+                f"num_train_timesteps must be an integer in 1..1000, got {self.num_train_timesteps}"
+            )
+        if self.betas not in ("squared_cosine", "linear"):
+            raise PolicyError(f"betas {self.betas!r} is unknown; use 'squared_cosine' or 'linear'")
+        if self.prediction not in ("sample", "epsilon"):
+            raise PolicyError(
+                f"prediction {self.prediction!r} is unknown; use 'sample' or 'epsilon'"
+            )
+
+    def signal_power(self) -> tuple[float, ...]:
+        """a_t for every training timestep, falling from almost 1 to almost 0."""
+        return _signal_power(self.num_train_timesteps, self.betas)
+
+    def ddim_steps(self, count: int) -> tuple[DdimStep, ...]:
+        """The reverse steps of a solve with ``count`` network calls, noisiest first.
+
+        Timesteps are spaced evenly and end at the noisiest one ("trailing", Lin et al. 2024), so
+        that every count starts from pure noise, and count 1 is the net's x_0 of pure noise.
+
+        Raises:
+            PolicyError: count is not in 1..num_train_timesteps.
+        """
+        total = self.num_train_timesteps
+        if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= total:
+            raise PolicyError(
+                f"num_diffusion_steps must be an integer in 1..{total} (the schedule that the "
+                f"policy was trained on), got {count!r}; 10 is a good start"
+            )
+        return _ddim_steps(total, self.betas, count)
+
+    def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
+        """Forward process, for training.
+
+        Args:
+            clean: [B, horizon, 4] actions in [-1, 1].
+            noise: standard normal, same shape.
+            timestep: [B] int64 in 0..num_train_timesteps-1.
+
+        Raises:
+            PolicyError: shapes or timesteps do not fit.
+        """
+        if clean.shape != noise.shape or timestep.shape != clean.shape[:1]:
+            raise PolicyError(
+                f"add_noise needs clean and noise of one shape and a timestep per sample, got "
+                f"{list(clean.shape)}, {list(noise.shape)}, {list(timestep.shape)}"
+            )
+        if timestep.min() < 0 or timestep.max() >= self.num_train_timesteps:
+            raise PolicyError(f"timesteps must be in 0..{self.num_train_timesteps - 1}")
+        power = torch.tensor(self.signal_power(), dtype=torch.float64, device=clean.device)
+        at = power[timestep].reshape(-1, *[1] * (clean.ndim - 1))
+        return at.sqrt().to(clean.dtype) * clean + (1 - at).sqrt().to(clean.dtype) * noise
+
+    def ddim_update(
+        self, step: DdimStep, noisy: Tensor, output: Tensor, *, limit: float = 1.0
+    ) -> Tensor:
+        """One reverse step from the net's output.
+
+        x_0 is clipped to [-limit, limit], by default the range of an action, and eps is then
+        recomputed, so that both still explain ``noisy``.
+        """
+        if self.prediction == "sample":
+            clean = output
+        else:
+            clean = (noisy - step.noise * output) / step.signal
+        clean = clean.clamp(-limit, limit)
+        if step.next_noise == 0.0:
+            return clean
+        noise = (noisy - step.signal * clean) / step.noise
+        return step.next_signal * clean + step.next_noise * noise
+
+
+def ddim_solve(
+    schedule: NoiseSchedule,
+    steps: Sequence[DdimStep],
+    denoise: Callable[[int, Tensor], Tensor],
+    noise: Tensor,
+) -> Tensor:
+    """Run reverse ``steps`` from ``noise``; ``denoise(i, noisy)`` is the net at ``steps[i]``."""
+    sample = noise
+    for index, step in enumerate(steps):
+        sample = schedule.ddim_update(step, sample, denoise(index, sample))
+    return sample
+
+
+@lru_cache(maxsize=16)
+def _signal_power(total: int, betas: BetaSchedule) -> tuple[float, ...]:
+    """Schedules of Nichol & Dhariwal 2021: section 3.2, and Ho's linear one scaled to ``total``."""
+    power, powers = 1.0, []
+    for t in range(total):
+        if betas == "linear":
+            # 1e-4..0.02 is made for 1000 steps; the same noise in fewer steps needs larger ones.
+            beta = (1e-4 + (0.02 - 1e-4) * t / max(total - 1, 1)) * 1000 / total
+        else:
+            beta = 1 - _cosine_power((t + 1) / total) / _cosine_power(t / total)
+        power *= 1 - min(beta, 0.999)
+        powers.append(power)
+    return tuple(powers)
+
+
+def _cosine_power(fraction: float) -> float:
+    return math.cos((fraction + 0.008) / 1.008 * math.pi / 2) ** 2
+
+
+@lru_cache(maxsize=256)
+def _ddim_steps(total: int, betas: BetaSchedule, count: int) -> tuple[DdimStep, ...]:
+    power = _signal_power(total, betas)
+    timesteps = [total * (count - i) // count - 1 for i in range(count)]
+    after = [power[t] for t in timesteps[1:]] + [1.0]
+    return tuple(
+        DdimStep(
+            timestep=t,
+            signal=math.sqrt(power[t]),
+            noise=math.sqrt(1 - power[t]),
+            next_signal=math.sqrt(next_power),
+            next_noise=math.sqrt(1 - next_power),
+        )
+        for t, next_power in zip(timesteps, after, strict=True)
+    )

@@ -1,0 +1,121 @@
+"""EfficientNet-B3 (Tan & Le 2019) with torchvision's parameter names.
+
+Stochastic depth and dropout are left out: they hold no parameters and do nothing in flight.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from policy.nets.pooling import MOMENTS, moments
+
+STEM_CHANNELS = 40
+# expand ratio, kernel, stride, channels out, depth: B0's table at width 1.2 and depth 1.4
+STAGES = (
+    (1, 3, 1, 24, 2),
+    (6, 3, 2, 32, 3),
+    (6, 5, 2, 48, 3),
+    (6, 3, 2, 96, 5),
+    (6, 5, 1, 136, 5),
+    (6, 5, 2, 232, 6),
+    (6, 3, 1, 384, 2),
+)
+OUT_CHANNELS = 1536
+
+
+class SqueezeExcitation(nn.Module):
+    """Scale each channel by a gate of the pooled channels; [B, C, H, W] -> the same."""
+
+    def __init__(self, channels: int, squeezed: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Conv2d(channels, squeezed, 1)
+        self.fc2 = nn.Conv2d(squeezed, channels, 1)
+        self.activation = nn.SiLU(inplace=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Gated ``x``."""
+        pooled = x.mean(dim=(2, 3), keepdim=True)
+        return x * torch.sigmoid(self.fc2(self.activation(self.fc1(pooled))))
+
+
+class MBConv(nn.Module):
+    """Expand, filter per channel, gate, project; shortcut where the shape allows."""
+
+    def __init__(
+        self, channels_in: int, channels_out: int, *, expand: int, kernel: int, stride: int
+    ) -> None:
+        super().__init__()
+        hidden = channels_in * expand
+        layers: list[nn.Module] = []
+        if expand != 1:
+            layers.append(_conv_norm(channels_in, hidden, 1))
+        layers += [
+            _conv_norm(hidden, hidden, kernel, stride=stride, groups=hidden),
+            SqueezeExcitation(hidden, max(1, channels_in // 4)),
+            _conv_norm(hidden, channels_out, 1, activation=False),
+        ]
+        self.block = nn.Sequential(*layers)
+        self.has_shortcut = stride == 1 and channels_in == channels_out
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C_in, H, W] -> [B, C_out, H/stride, W/stride]."""
+        out: Tensor = self.block(x)
+        return out + x if self.has_shortcut else out
+
+
+class EfficientNetB3(nn.Module):
+    """Image [B, 3, H, W] -> moments [B, 3 * 1536]; torchvision's ``classifier`` is left out."""
+
+    classifier_keys = ("classifier.1.weight", "classifier.1.bias")
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [_conv_norm(3, STEM_CHANNELS, 3, stride=2)]
+        channels = STEM_CHANNELS
+        for expand, kernel, stride, channels_out, depth in STAGES:
+            blocks = []
+            for index in range(depth):
+                blocks.append(
+                    MBConv(
+                        channels,
+                        channels_out,
+                        expand=expand,
+                        kernel=kernel,
+                        stride=stride if index == 0 else 1,
+                    )
+                )
+                channels = channels_out
+            layers.append(nn.Sequential(*blocks))
+        layers.append(_conv_norm(channels, OUT_CHANNELS, 1))
+        self.features = nn.Sequential(*layers)
+        self.out_dim = MOMENTS * OUT_CHANNELS
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``pooling.moments`` of the last map, flat."""
+        pooled: Tensor = moments(self.features(image)).flatten(1)
+        return pooled
+
+
+def _conv_norm(
+    channels_in: int,
+    channels_out: int,
+    kernel: int,
+    *,
+    stride: int = 1,
+    groups: int = 1,
+    activation: bool = True,
+) -> nn.Sequential:
+    layers: list[nn.Module] = [
+        nn.Conv2d(
+            channels_in,
+            channels_out,
+            kernel,
+            stride=stride,
+            padding=kernel // 2,
+            groups=groups,
+            bias=False,
+        ),
+        nn.BatchNorm2d(channels_out),
+    ]
+    if activation:
+        layers.append(nn.SiLU(inplace=True))
+    return nn.Sequential(*layers)

@@ -1,0 +1,146 @@
+"""ResNet-18 and ResNet-50 (He et al. 2016) with torchvision's parameter names, and ResNet-8.
+
+ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
+"""
+
+from itertools import pairwise
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from policy.nets.pooling import MOMENTS, moments
+
+RESNET8_CHANNELS = (24, 48, 96, 128)
+"""Of the first convolution and of the three blocks."""
+RESNET8_CELLS = 6
+"""Cells on a side of the map that the last layer sees: what an image of 96 pixels has."""
+RESNET8_CELL_CHANNELS = 32
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions around a shortcut."""
+
+    expansion = 1
+
+    def __init__(self, channels_in: int, width: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels_in, width, 3, stride=stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.downsample = _shortcut(channels_in, width, stride)
+        self.relu = nn.ReLU(inplace=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C_in, H, W] -> [B, width, H/stride, W/stride]."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        hidden = self.relu(self.bn1(self.conv1(x)))
+        out: Tensor = self.relu(self.bn2(self.conv2(hidden)) + shortcut)
+        return out
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1 convolutions around a shortcut."""
+
+    expansion = 4
+
+    def __init__(self, channels_in: int, width: int, stride: int) -> None:
+        super().__init__()
+        channels_out = width * self.expansion
+        self.conv1 = nn.Conv2d(channels_in, width, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, stride=stride, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, channels_out, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(channels_out)
+        self.downsample = _shortcut(channels_in, channels_out, stride)
+        self.relu = nn.ReLU(inplace=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C_in, H, W] -> [B, 4 * width, H/stride, W/stride]."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        hidden = self.relu(self.bn1(self.conv1(x)))
+        hidden = self.relu(self.bn2(self.conv2(hidden)))
+        out: Tensor = self.relu(self.bn3(self.conv3(hidden)) + shortcut)
+        return out
+
+
+class ResNet(nn.Module):
+    """Image [B, 3, H, W] -> moments [B, out_dim]; torchvision's ``fc`` is left out."""
+
+    classifier_keys = ("fc.weight", "fc.bias")
+
+    def __init__(
+        self, block: type[BasicBlock] | type[Bottleneck], depths: tuple[int, int, int, int]
+    ) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.relu = nn.ReLU(inplace=True)
+        self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        wide = block.expansion
+        self.layer1 = _layer(block, 64, 64, depths[0], stride=1)
+        self.layer2 = _layer(block, 64 * wide, 128, depths[1], stride=2)
+        self.layer3 = _layer(block, 128 * wide, 256, depths[2], stride=2)
+        self.layer4 = _layer(block, 256 * wide, 512, depths[3], stride=2)
+        self.out_dim = MOMENTS * 512 * wide
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``pooling.moments`` of the last map, flat."""
+        x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
+        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
+        pooled: Tensor = moments(x).flatten(1)
+        return pooled
+
+
+class ResNet8(nn.Module):
+    """Image [B, 3, H, W] -> feature [B, 256], in the manner of DroNet (Loquercio et al. 2018).
+
+    Three residual blocks, and a layer that sees every cell of the last map. Small enough to learn
+    where gates are from nothing, in some ten minutes of one core.
+    """
+
+    classifier_keys = ()
+    out_dim = 256
+
+    def __init__(self) -> None:
+        super().__init__()
+        first, last = RESNET8_CHANNELS[0], RESNET8_CHANNELS[-1]
+        self.conv1 = nn.Conv2d(3, first, 5, stride=2, padding=2, bias=False)
+        self.bn1 = nn.BatchNorm2d(first)
+        self.relu = nn.ReLU(inplace=True)
+        self.layers = nn.Sequential(
+            *(BasicBlock(into, out, 2) for into, out in pairwise(RESNET8_CHANNELS))
+        )
+        self.conv2 = nn.Conv2d(last, RESNET8_CELL_CHANNELS, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(RESNET8_CELL_CHANNELS)
+        self.fc = nn.Linear(RESNET8_CELL_CHANNELS * RESNET8_CELLS**2, self.out_dim)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """What a fully connected layer makes of the cells of the last map."""
+        x = self.layers(self.relu(self.bn1(self.conv1(image))))
+        cells = F.adaptive_avg_pool2d(self.relu(self.bn2(self.conv2(x))), RESNET8_CELLS)
+        feature: Tensor = self.relu(self.fc(cells.flatten(1)))
+        return feature
+
+
+def _layer(
+    block: type[BasicBlock] | type[Bottleneck],
+    channels_in: int,
+    width: int,
+    depth: int,
+    *,
+    stride: int,
+) -> nn.Sequential:
+    first = block(channels_in, width, stride)
+    rest = [block(width * block.expansion, width, 1) for _ in range(depth - 1)]
+    return nn.Sequential(first, *rest)
+
+
+def _shortcut(channels_in: int, channels_out: int, stride: int) -> nn.Sequential | None:
+    if stride == 1 and channels_in == channels_out:
+        return None
+    return nn.Sequential(
+        nn.Conv2d(channels_in, channels_out, 1, stride=stride, bias=False),
+        nn.BatchNorm2d(channels_out),
+    )

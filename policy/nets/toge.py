@@ -1,0 +1,176 @@
+"""TOGE, the dual-rate vision policy: a slow image path, a fast action path, one condition.
+
+    image --backbone, projection--> feature --.
+    state [B, 13 or 20] ----------------------+--MLP--> condition --diffusion head--> chunk
+    action history [B, K, 4] --attention------'
+
+Everything left of the feature runs at the camera's rate, the rest at the action rate.
+"""
+
+from dataclasses import dataclass, field, replace
+
+from torch import Tensor, nn
+
+from policy.contract import ACTION_DIM, Contract
+from policy.errors import ContractError, PolicyError
+from policy.nets.action_head import DiffusionHead, Size, size_dims
+from policy.nets.backbones import BACKBONE_NAMES, BackboneName, build_backbone
+from policy.nets.diffusion import NoiseSchedule
+from policy.nets.encoders import Fusion, HistoryEncoder, StateEncoder, require_shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class TogeConfig:
+    """All that fixes TOGE's architecture.
+
+    Raises:
+        PolicyError: a value is unknown, or the contract is not one that this size can keep.
+    """
+
+    size: Size = "small"
+    backbone: BackboneName = "efficientnet_b3"
+    contract: Contract = field(default_factory=Contract)
+    """``feature_dim`` 0 stands for the size's own."""
+    schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
+
+    def __post_init__(self) -> None:
+        """Refuse a contract of another network."""
+        if self.backbone not in BACKBONE_NAMES:
+            raise PolicyError(
+                f"backbone {self.backbone!r} is unknown; use one of {list(BACKBONE_NAMES)}"
+            )
+        feature_dim = size_dims(self.size).base_dim
+        if self.contract.feature_dim not in (0, feature_dim):
+            raise ContractError(
+                f"the contract says feature_dim {self.contract.feature_dim}, but TOGE "
+                f"{self.size} has {feature_dim}: choose the size that the checkpoint was made with"
+            )
+        if self.contract.arrays != "torch":
+            raise ContractError(
+                f"TOGE takes torch arrays, the contract says {self.contract.arrays}"
+            )
+
+
+class Toge(nn.Module):
+    """The policy protocol of ``contract.DualRatePolicy``, on torch tensors.
+
+    Images are normalised by ``preprocess.image_to_input``, states are in SI units.
+    """
+
+    def __init__(self, config: TogeConfig) -> None:
+        super().__init__()
+        dim = size_dims(config.size).base_dim
+        self.contract = replace(config.contract, feature_dim=dim)
+        self.config = replace(config, contract=self.contract)
+        self.backbone = build_backbone(config.backbone)
+        # The norm gives every backbone the same scale beside the other tokens.
+        self.visual_projection = nn.Sequential(
+            nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
+        )
+        self.state_encoder = StateEncoder(dim, self.contract)
+        self.history_encoder = HistoryEncoder(dim // 4, self.contract.history_len)
+        self.fusion = Fusion(dim, self.history_encoder.out_dim)
+        self.head = DiffusionHead(config.size, self.contract, config.schedule)
+
+    def reset(self, seed: int) -> None:
+        """Start a flight: fixes the initial noise of all samples to come."""
+        self.head.reset(seed)
+
+    def encode_visual(self, image: Tensor) -> Tensor:
+        """Image [B, 3, H, W] -> feature [B, F]: the slow path.
+
+        Raises:
+            PolicyError: the image is not of the contract's size.
+        """
+        require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
+        feature: Tensor = self.visual_projection(self.backbone(image))
+        return feature
+
+    def encode_and_fuse(
+        self, feature: Tensor, state: Tensor, action_history: Tensor | None
+    ) -> Tensor:
+        """Feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
+
+        No history is the same as sticks that were centred all the time: training shows both so.
+
+        Raises:
+            PolicyError: a shape is not the contract's.
+        """
+        require_shape("feature", feature, self.contract.feature_dim)
+        require_shape("state", state, self.contract.state_dim)
+        if action_history is None:
+            action_history = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
+        require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
+        condition: Tensor = self.fusion(
+            feature, self.state_encoder(state), self.history_encoder(action_history)
+        )
+        return condition
+
+    def encode_observation(
+        self, image: Tensor, state: Tensor, action_history: Tensor | None
+    ) -> Tensor:
+        """``encode_visual`` and ``encode_and_fuse`` in sequence -> condition [B, C]."""
+        return self.encode_and_fuse(self.encode_visual(image), state, action_history)
+
+    def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
+        """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
+        return self.head.denoise(noisy, timestep, condition)
+
+    def predict_fast(
+        self,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor | None,
+        num_diffusion_steps: int = 10,
+    ) -> Tensor:
+        """Cached feature, newest state and history -> chunk [B, horizon, 4] in [-1, 1].
+
+        Raises:
+            PolicyError: a shape is not the contract's, or the steps are not 1..100.
+        """
+        condition = self.encode_and_fuse(feature, state, action_history)
+        return self.head.sample(condition, num_diffusion_steps)
+
+    @property
+    def initial_noise(self) -> Tensor:
+        """[1, horizon, 4]: what every solve of a flight starts from."""
+        return self.head.initial_noise
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with.
+
+        Raises:
+            PolicyError: the steps are not 1..100.
+        """
+        step = self.head.schedule.ddim_steps(num_diffusion_steps)[first]
+        return step.signal, step.noise
+
+    def denoise_fast(
+        self,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor | None,
+        noisy: Tensor,
+        num_diffusion_steps: int,
+        first: int,
+        count: int,
+    ) -> Tensor:
+        """Steps ``first`` to ``first + count`` of ``predict_fast``: [B, horizon, 4] -> the same.
+
+        Raises:
+            PolicyError: a shape is not the contract's, or the solve has no such steps.
+        """
+        require_shape("noisy", noisy, self.contract.horizon, ACTION_DIM)
+        condition = self.encode_and_fuse(feature, state, action_history)
+        return self.head.denoise_steps(condition, noisy, num_diffusion_steps, first, count)
+
+    def predict(
+        self,
+        image: Tensor,
+        state: Tensor,
+        action_history: Tensor | None,
+        num_diffusion_steps: int = 10,
+    ) -> Tensor:
+        """The image is encoded once, then as ``predict_fast``: bit for bit the same chunk."""
+        feature = self.encode_visual(image)
+        return self.predict_fast(feature, state, action_history, num_diffusion_steps)

@@ -1,0 +1,176 @@
+"""The denoiser: a 1-D U-Net over the actions of a chunk, conditioned by FiLM.
+
+FiLM (Perez et al. 2018) scales and shifts the channels of every residual block. Here the parameters
+of all blocks are one vector, and it is a sum of two independent parts:
+
+    film = film_of_timestep(t) + film_of_condition(c)            [B, film_dim]
+
+So the condition's part is computed once for a whole solve, the timestep's part is a constant of the
+weights and the number of steps, and an engine can fold it and fuse the rest into one product.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from policy.errors import PolicyError
+
+GROUPS = 8
+TIME_DIM = 128
+
+
+@dataclass(frozen=True, kw_only=True)
+class UNet1dConfig:
+    """Shape of the denoiser.
+
+    Raises:
+        PolicyError: the horizon cannot be halved once per level.
+    """
+
+    horizon: int
+    action_dim: int
+    condition_dim: int
+    widths: tuple[int, ...]
+    """Channels of each level, a multiple of 8; the length halves from one level to the next."""
+    taps: int = 5
+    """Length of the convolutions' kernels, odd."""
+
+    def __post_init__(self) -> None:
+        """Refuse a horizon that would come back with another length."""
+        factor = 2 ** (len(self.widths) - 1)
+        if self.horizon % factor:
+            raise PolicyError(
+                f"a horizon of {self.horizon} does not suit {len(self.widths)} U-Net levels; "
+                f"use a multiple of {factor}"
+            )
+
+
+class Conv(nn.Module):
+    """Convolution over a short sequence as one matrix product; [B, L, C_in] -> [B, L', C_out].
+
+    The same function as ``nn.Conv1d`` with padding ``taps // 2`` and its weight laid out as
+    [C_out, taps * C_in]. Over at most 16 positions a convolution is bound by reading its weights,
+    and torch's CPU kernels do that up to 4 times slower than its matrix product.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int, taps: int, *, stride: int = 1) -> None:
+        super().__init__()
+        self.taps, self.stride = taps, stride
+        self.linear = nn.Linear(taps * channels_in, channels_out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Taps side by side, then the product."""
+        length, pad = x.shape[1], self.taps // 2
+        padded = F.pad(x, (0, 0, pad, pad))
+        columns = [padded[:, tap : tap + length : self.stride] for tap in range(self.taps)]
+        out: Tensor = self.linear(torch.cat(columns, dim=-1))
+        return out
+
+
+class Norm(nn.GroupNorm):
+    """GroupNorm of [B, L, C] over each group's channels and the whole length."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, L, C] -> [B, L, C]."""
+        return super().forward(x.transpose(1, 2)).transpose(1, 2)
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions with FiLM between them, around a shortcut; [B, L, C_in] -> [B, L, C_out]."""
+
+    def __init__(self, channels_in: int, channels_out: int, taps: int) -> None:
+        super().__init__()
+        self.conv1 = Conv(channels_in, channels_out, taps)
+        self.norm1 = Norm(GROUPS, channels_out)
+        self.conv2 = Conv(channels_out, channels_out, taps)
+        self.norm2 = Norm(GROUPS, channels_out)
+        self.shortcut: nn.Module = nn.Identity()
+        if channels_in != channels_out:
+            self.shortcut = nn.Linear(channels_in, channels_out)
+
+    def forward(self, x: Tensor, film: Tensor) -> Tensor:
+        """``film`` [B, 2 * C_out]: scale (about 1) and shift."""
+        scale, shift = film.unsqueeze(1).chunk(2, dim=-1)
+        hidden = F.silu(self.norm1(self.conv1(x)))
+        hidden = hidden * (1 + scale) + shift
+        hidden = F.silu(self.norm2(self.conv2(hidden)))
+        out: Tensor = hidden + self.shortcut(x)
+        return out
+
+
+class UNet1d(nn.Module):
+    """Denoiser over [B, horizon, action_dim]."""
+
+    def __init__(self, config: UNet1dConfig) -> None:
+        super().__init__()
+        self.config = config
+        widths, taps = config.widths, config.taps
+        self.down, self.downsample = nn.ModuleList(), nn.ModuleList()
+        self.up, self.upsample = nn.ModuleList(), nn.ModuleList()
+        channels = config.action_dim
+        for width in widths[:-1]:
+            self.down.append(ResidualBlock(channels, width, taps))
+            self.downsample.append(Conv(width, width, 3, stride=2))
+            channels = width
+        self.mid = nn.ModuleList(
+            [ResidualBlock(channels, widths[-1], taps), ResidualBlock(widths[-1], widths[-1], taps)]
+        )
+        channels = widths[-1]
+        for width in reversed(widths[:-1]):
+            self.upsample.append(Conv(channels, width, 3))
+            self.up.append(ResidualBlock(2 * width, width, taps))
+            channels = width
+        self.out = nn.Linear(channels, config.action_dim)
+
+        widths_of_blocks = (*widths[:-1], widths[-1], widths[-1], *reversed(widths[:-1]))
+        self.film_sizes = [2 * width for width in widths_of_blocks]
+        self.film_dim = sum(self.film_sizes)
+        self.time_mlp = nn.Sequential(
+            nn.Linear(TIME_DIM, 2 * TIME_DIM),
+            nn.SiLU(),
+            nn.Linear(2 * TIME_DIM, TIME_DIM),
+            nn.SiLU(),
+        )
+        self.film_time = nn.Linear(TIME_DIM, self.film_dim)
+        self.film_condition = nn.Sequential(
+            nn.SiLU(), nn.Linear(config.condition_dim, self.film_dim, bias=False)
+        )
+        self._frequencies: Tensor
+        self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
+
+    def film_of_timestep(self, timestep: Tensor) -> Tensor:
+        """Timesteps [M] of any numeric type -> their share of FiLM [M, film_dim]."""
+        angle = timestep.to(self._frequencies.dtype).unsqueeze(-1) * self._frequencies
+        film: Tensor = self.film_time(self.time_mlp(torch.cat([angle.sin(), angle.cos()], dim=-1)))
+        return film
+
+    def film_of_condition(self, condition: Tensor) -> Tensor:
+        """Condition [B, C] -> its share of FiLM [B, film_dim]."""
+        film: Tensor = self.film_condition(condition)
+        return film
+
+    def forward(self, noisy: Tensor, film: Tensor) -> Tensor:
+        """Noisy actions [B, horizon, action_dim] and FiLM [B, film_dim] -> the net's prediction."""
+        films = iter(torch.split(film, self.film_sizes, dim=-1))
+        x = noisy
+        skips = []
+        for block, downsample in zip(self.down, self.downsample, strict=True):
+            x = block(x, next(films))
+            skips.append(x)
+            x = downsample(x)
+        for block in self.mid:
+            x = block(x, next(films))
+        for block, upsample in zip(self.up, self.upsample, strict=True):
+            x = upsample(x.repeat_interleave(2, dim=1))
+            x = block(torch.cat([x, skips.pop()], dim=-1), next(films))
+        out: Tensor = self.out(x)
+        return out
+
+
+def sinusoid_frequencies(dim: int) -> Tensor:
+    """Geometric frequencies 1..1e-4 of the sinusoidal embedding (Vaswani et al. 2017)."""
+    half = dim // 2
+    return torch.exp(-math.log(10_000.0) * torch.arange(half) / (half - 1))

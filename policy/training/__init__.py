@@ -1,0 +1,1 @@
+"""Training of policies and world models from recorded flights."""

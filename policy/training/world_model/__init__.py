@@ -1,0 +1,1 @@
+"""Training of a world model: autoencoder first, then dynamics."""

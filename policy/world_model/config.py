@@ -1,0 +1,106 @@
+"""The shape of a world model, and what it takes for granted."""
+
+import json
+import math
+from dataclasses import asdict, dataclass, field, fields
+
+from policy.contract import Contract
+from policy.errors import PolicyError
+from policy.nets.diffusion import NoiseSchedule
+from policy.world_model.autoencoder import FACTOR
+from policy.world_model.dynamics import HEAD_DIM
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelConfig:
+    """Shape of a world model.
+
+    Raises:
+        PolicyError: a field is out of its range.
+    """
+
+    image_size: int = 64
+    """Side of the square frames, px."""
+    latent_channels: int = 8
+    frames: int = 16
+    """Frames, states and actions in one imagined future."""
+    context_frames: int = 2
+    """Frames and states of the past, the newest of them now."""
+    frame_dt_s: float = 0.1
+    """Time between two frames. Action k is the mean stick from frame k - 1 (the last of the context
+    for k = 0) to frame k, state k is that at the exposure of frame k."""
+    horizontal_fov_rad: float = math.radians(90.0)
+    """Of the camera: a pinhole without distortion, straight ahead, whose images were squares."""
+    camera_tilt_rad: float = math.radians(10.0)
+    """Upwards. The defaults of both are the simulator's nominal camera."""
+    autoencoder_widths: tuple[int, int, int] = (24, 40, 56)
+    patch: int = 2
+    """Latents on a side of one token."""
+    dynamics_width: int = 128
+    dynamics_depth: int = 5
+    contract: Contract = field(default_factory=Contract)
+    """Its ``state_frame`` is the states'; a model and a policy of two frames do not go together.
+    What else it says is about policies: ``image_size`` and ``frame_dt_s`` are the model's own."""
+    schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be built."""
+        for name, low, high in (
+            ("image_size", 16, 1024),
+            ("latent_channels", 1, 64),
+            ("frames", 1, 256),
+            ("context_frames", 1, 16),
+            ("patch", 1, 8),
+            ("dynamics_width", HEAD_DIM, 4096),
+            ("dynamics_depth", 1, 64),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, int) or not low <= value <= high:
+                raise PolicyError(f"{name} must be an integer in {low}..{high}, got {value!r}")
+        if self.image_size % (FACTOR * self.patch):
+            raise PolicyError(
+                f"image_size must be a multiple of {FACTOR * self.patch} ({FACTOR} pixels a "
+                f"latent, {self.patch} latents a token), got {self.image_size}"
+            )
+        if self.dynamics_width % HEAD_DIM:
+            raise PolicyError(f"dynamics_width must be a multiple of {HEAD_DIM}")
+        if len(self.autoencoder_widths) != 3 or min(self.autoencoder_widths) < 1:
+            raise PolicyError(f"autoencoder_widths must be three, got {self.autoencoder_widths}")
+        if not (math.isfinite(self.frame_dt_s) and 0.01 <= self.frame_dt_s <= 1):
+            raise PolicyError(f"frame_dt_s must be 0.01 to 1 second, got {self.frame_dt_s}")
+        if not 0.2 <= self.horizontal_fov_rad <= 2.8:
+            raise PolicyError(
+                f"horizontal_fov_rad must be 0.2 to 2.8 rad, got {self.horizontal_fov_rad}"
+            )
+        if not -1.5 <= self.camera_tilt_rad <= 1.5:
+            raise PolicyError(f"camera_tilt_rad must be -1.5 to 1.5, got {self.camera_tilt_rad}")
+        if self.schedule.prediction != "sample":
+            raise PolicyError("the schedule of a world model must predict the sample")
+
+    @property
+    def latent_side(self) -> int:
+        """Latents on a side of a frame."""
+        return self.image_size // FACTOR
+
+    def to_json(self) -> str:
+        """Header form of a checkpoint, without the contract."""
+        data = {name: value for name, value in asdict(self).items() if name != "contract"}
+        return json.dumps(data, sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str, contract: Contract) -> "WorldModelConfig":
+        """Read the header form.
+
+        Raises:
+            PolicyError: not of this form, or values out of range.
+        """
+        try:
+            data = json.loads(text)
+            known = {each.name for each in fields(cls)} - {"contract"}
+            if set(data) != known:
+                raise PolicyError(f"it must hold {sorted(known)}, not {sorted(data)}")
+            data["schedule"] = NoiseSchedule(**data["schedule"])
+            data["autoencoder_widths"] = tuple(data["autoencoder_widths"])
+            return cls(contract=contract, **data)
+        except (PolicyError, TypeError, ValueError, RecursionError) as error:
+            raise PolicyError(f"malformed world model {text[:200]!r}: {error}") from error

@@ -1,0 +1,174 @@
+"""The denoiser of the world model: a small factorised space-time transformer.
+
+Each imagined frame is a few tokens: one for each patch of its latents, and one for the vehicle, its
+motion and the stick that led to it. A layer looks back in time at each place, then around within
+each frame, then thinks. Time is causal: a stick changes what comes after it, never what was before,
+however well a pilot's later sticks would give away what he saw.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from policy.contract import ACTION_DIM
+from policy.nets.unet1d import TIME_DIM, sinusoid_frequencies
+from policy.world_model.relative_state import MOTION_DIM, features_dim
+
+HEAD_DIM = 32
+MODULATIONS = 6
+"""Scale and shift of each of a layer's three norms."""
+_SMALL = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class Future:
+    """What is denoised, or an estimate of it; every part has about unit scale."""
+
+    latents: Tensor
+    """[B, T, C, h, w]"""
+    motion: Tensor
+    """[B, T, MOTION_DIM]"""
+    actions: Tensor
+    """[B, T, 4]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Past:
+    """What the denoiser is told: of the past, of its role, and of what follows from both."""
+
+    latents: Tensor
+    """[B, K, C, h, w], oldest first."""
+    features: Tensor
+    """[B, D], see ``relative_state.context_features``."""
+    knows_actions: Tensor
+    """[B] bool: the future's actions are given, not noise."""
+    foreseen: Tensor
+    """[B, T, MOTION_DIM] a first guess of the motion, of about unit scale."""
+    carried: Tensor
+    """[B, T, C, h, w] the newest frame, moved by that motion."""
+    in_view: Tensor
+    """[B, T, 1, h, w] how much of each of its cells was in view, 0 to 1."""
+
+
+class LatentDynamics(nn.Module):
+    """The network alone; what its output means is ``WorldModel.denoise``'s business."""
+
+    def __init__(
+        self,
+        *,
+        frames: int,
+        context_frames: int,
+        latent_channels: int,
+        latent_side: int,
+        patch: int,
+        width: int,
+        depth: int,
+    ) -> None:
+        super().__init__()
+        self._patch, self._grid = patch, latent_side // patch
+        per_patch = latent_channels * patch * patch
+        features = features_dim(context_frames)
+        self.embed_patch = nn.Linear((2 + context_frames) * per_patch + patch * patch, width)
+        self.embed_vehicle = nn.Linear(2 * (MOTION_DIM + ACTION_DIM) + 1, width)
+        self.frame_position = nn.Parameter(_SMALL * torch.randn(frames, 1, width))
+        self.slot_position = nn.Parameter(_SMALL * torch.randn(self._grid**2 + 1, width))
+        self.condition = nn.Sequential(
+            nn.Linear(TIME_DIM + features + 1, width),
+            nn.SiLU(),
+            nn.Linear(width, MODULATIONS * width),
+        )
+        self.layers = nn.ModuleList([_Layer(width) for _ in range(depth)])
+        self.norm = nn.LayerNorm(width)
+        self.out_patch = nn.Linear(width, per_patch)
+        self.out_vehicle = nn.Linear(width, MOTION_DIM + ACTION_DIM)
+        for out in (self.out_patch, self.out_vehicle):  # a new net hardly changes its guess
+            nn.init.normal_(out.weight, std=_SMALL)
+            nn.init.zeros_(out.bias)
+        self._frequencies: Tensor
+        self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
+
+    def forward(self, noisy: Future, timestep: Tensor, past: Past) -> Future:
+        """Noisy future, timestep [B] and past -> the net's outputs, shaped as the future."""
+        frames = noisy.latents.shape[1]
+        known = past.knows_actions.to(noisy.motion.dtype).view(-1, 1)
+        angle = timestep.to(self._frequencies.dtype).unsqueeze(-1) * self._frequencies
+        told = torch.cat([angle.sin(), angle.cos(), past.features, known], dim=-1)
+        modulation = self.condition(told).unflatten(-1, (MODULATIONS, -1))
+        given = past.latents.flatten(1, 2).unsqueeze(1).expand(-1, frames, -1, -1, -1)
+        seen = torch.cat([noisy.latents, given, past.carried, past.in_view], dim=2)
+        patches = self.embed_patch(self._patches(seen))
+        known_of_frame = known.unsqueeze(1).expand(-1, frames, -1)
+        # Sticks are rates: what they add up to is nearly what they do.
+        so_far = noisy.actions.cumsum(dim=1) / frames**0.5
+        vehicle = torch.cat(
+            [noisy.motion, past.foreseen, noisy.actions, so_far, known_of_frame], dim=-1
+        )
+        tokens = torch.cat([patches, self.embed_vehicle(vehicle).unsqueeze(2)], dim=2)
+        tokens = tokens + self.frame_position + self.slot_position
+        for layer in self.layers:
+            tokens = layer(tokens, modulation)
+        tokens = self.norm(tokens)
+        motion, actions = self.out_vehicle(tokens[:, :, -1]).split([MOTION_DIM, ACTION_DIM], dim=-1)
+        latents = self._unpatched(self.out_patch(tokens[:, :, :-1]))
+        return Future(latents=latents, motion=motion, actions=actions)
+
+    def _patches(self, latents: Tensor) -> Tensor:
+        """[B, T, C, h, w] -> [B, T, patches, C * patch * patch]."""
+        batch, frames, channels, _, _ = latents.shape
+        grid, patch = self._grid, self._patch
+        split = latents.reshape(batch, frames, channels, grid, patch, grid, patch)
+        return split.permute(0, 1, 3, 5, 2, 4, 6).reshape(batch, frames, grid * grid, -1)
+
+    def _unpatched(self, patches: Tensor) -> Tensor:
+        batch, frames = patches.shape[:2]
+        grid, patch = self._grid, self._patch
+        split = patches.reshape(batch, frames, grid, grid, -1, patch, patch)
+        merged = split.permute(0, 1, 4, 2, 5, 3, 6)
+        return merged.reshape(batch, frames, -1, grid * patch, grid * patch)
+
+
+class _Layer(nn.Module):
+    """Attention over time, attention over a frame, and an MLP; [B, T, S, width] -> the same."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.time, self.space = _Attention(width), _Attention(width)
+        self.mlp = nn.Sequential(
+            nn.Linear(width, 2 * width), nn.GELU(approximate="tanh"), nn.Linear(2 * width, width)
+        )
+        self.modulation = nn.Parameter(_SMALL * torch.randn(MODULATIONS, width))
+        self._shape = (width,)
+
+    def forward(self, tokens: Tensor, modulation: Tensor) -> Tensor:
+        """``modulation`` [B, 6, width] is added to the layer's own."""
+        table = (self.modulation + modulation)[:, :, None, None]
+        scales, shifts = table[:, ::2], table[:, 1::2]
+
+        def normed(index: int) -> Tensor:
+            x = F.layer_norm(tokens, self._shape)
+            return x * (1 + scales[:, index]) + shifts[:, index]
+
+        over_time = self.time(normed(0).transpose(1, 2), is_causal=True)
+        tokens = tokens + over_time.transpose(1, 2)
+        tokens = tokens + self.space(normed(1), is_causal=False)
+        out: Tensor = tokens + self.mlp(normed(2))
+        return out
+
+
+class _Attention(nn.Module):
+    """Self-attention over the last but one axis of [B, N, L, width]."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.qkv, self.project = nn.Linear(width, 3 * width), nn.Linear(width, width)
+
+    def forward(self, tokens: Tensor, *, is_causal: bool) -> Tensor:
+        """Tokens that have looked at each other, or only at earlier ones."""
+        batch, count, length, width = tokens.shape
+        qkv = self.qkv(tokens).reshape(batch * count, length, 3, width // HEAD_DIM, HEAD_DIM)
+        query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)
+        attended = F.scaled_dot_product_attention(query, key, value, is_causal=is_causal)
+        out: Tensor = self.project(attended.transpose(1, 2).reshape(tokens.shape))
+        return out

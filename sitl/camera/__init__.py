@@ -1,0 +1,1 @@
+"""The simulated camera: the gate course as the vehicle sees it."""

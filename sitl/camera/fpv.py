@@ -1,0 +1,202 @@
+"""What a camera on the vehicle sees of a gate course, drawn with OpenCV.
+
+Frames: NED world; FRD body; camera x right, y down, z along the optical axis. The camera sits at
+the body's origin and looks forward, tilted up, unless the conditions shift it. Pinhole, square
+pixels, no distortion; integer pixel coordinates are pixel centres.
+"""
+
+import math
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.camera import scenery
+from sitl.camera.imager import Imager
+from sitl.course.course import Course
+from sitl.errors import UsageError
+from sitl.rotation import Quat, Vec3, from_euler, rotate
+from sitl.vehicle.conditions import NOMINAL, Conditions
+
+FloatArray: TypeAlias = NDArray[np.float64]
+Image: TypeAlias = NDArray[np.uint8]
+
+TILT_UP_RAD = NOMINAL.camera_tilt_rad
+NEAR_M = 0.05
+"""What is nearer than this, or behind, is cut off before it is projected."""
+LOWEST_EYE_M = 0.12
+"""The eye is drawn at least this high, so that a vehicle on the ground sees ground."""
+GATE_HAZE_M = 90.0
+"""Distance at which a gate has lost 63 % of its contrast."""
+GROUND_FADE_M = 14.0
+"""Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
+SUBPIXEL_BITS = 4
+"""Corners are rounded to 1/16 pixel."""
+
+
+class FpvRenderer:
+    """Draws the view from any pose; holds what course, image size and conditions determine.
+
+    Only image noise, where the conditions ask for it, depends on how many frames came before.
+    """
+
+    def __init__(
+        self, course: Course, width: int, height: int, conditions: Conditions = NOMINAL
+    ) -> None:
+        if min(width, height) < 16:
+            raise UsageError(f"the image must have at least 16x16 pixels, got {width}x{height}")
+        self._focal_px = width / 2 / math.tan(conditions.horizontal_fov_rad / 2)
+        self._center_px = np.array([(width - 1) / 2, (height - 1) / 2])
+        self._ray_from_pixel = (
+            np.array(
+                [
+                    [1.0, 0.0, -self._center_px[0]],
+                    [0.0, 1.0, -self._center_px[1]],
+                    [0.0, 0.0, self._focal_px],
+                ]
+            )
+            / self._focal_px
+        )
+        self._u_px = np.arange(width, dtype=np.float32)
+        self._v_px = np.arange(height, dtype=np.float32)[:, None]
+        self._body_from_camera = body_from_camera(conditions)
+        self._offset_body_m = conditions.camera_offset_body_m
+        self._backdrop = scenery.backdrop_colours(conditions)
+        self._haze_rgb = scenery.tinted(scenery.HAZE_RGB, conditions.sky_tint)
+        self._ridge_rgb = scenery.tinted(scenery.RIDGE_RGB, conditions.sky_tint)
+        self._ground = scenery.ground_tile(conditions)
+        self._ridge = scenery.ridge_directions(course.seed)
+        self._faces = scenery.gate_faces(course, conditions)
+        self._imager = Imager(conditions, width, height)
+        self._centers_ned_m = np.array([gate.center_ned_m for gate in course.gates])
+
+    def render(self, position_ned_m: Vec3, ned_from_body_wxyz: Quat) -> Image:
+        """The view as [H, W, 3] uint8 RGB, a new array."""
+        eye_ned_m = np.array(position_ned_m, dtype=np.float64)
+        if any(self._offset_body_m):
+            eye_ned_m += rotate(ned_from_body_wxyz, self._offset_body_m)
+        eye_ned_m[2] = min(eye_ned_m[2], -LOWEST_EYE_M)
+        ned_from_camera = rotation_matrix(ned_from_body_wxyz) @ self._body_from_camera
+        image = self._draw_backdrop(eye_ned_m, ned_from_camera)
+        ridge = self._ridge @ ned_from_camera
+        self._fill(image, ridge, np.tile(self._ridge_rgb, (len(ridge), 1)), cv2.LINE_8)
+        self._draw_gates(image, eye_ned_m, ned_from_camera)
+        return self._imager.expose(image)
+
+    def _draw_backdrop(self, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> Image:
+        """Sky and ground. A ray of unit depth falls by a linear function of the pixel."""
+        ned_ray_from_pixel = ned_from_camera @ self._ray_from_pixel
+        per_u, per_v, offset = ned_ray_from_pixel[2].astype(np.float32)
+        falls = per_u * self._u_px + (per_v * self._v_px + offset)
+        rises = cv2.convertScaleAbs(np.clip(1 - falls, 0, 2), alpha=127.5)
+        image = np.asarray(cv2.applyColorMap(rises, self._backdrop), dtype=np.uint8)
+        has_ground = np.maximum(falls[:, 0], falls[:, -1]) > 0
+        if has_ground.any():
+            top = int(has_ground.argmax())
+            self._draw_ground(image[top:], falls[top:], eye_ned_m, ned_ray_from_pixel @ _rows(top))
+        return image
+
+    def _draw_ground(
+        self,
+        image: Image,
+        falls: NDArray[np.float32],
+        eye_ned_m: FloatArray,
+        ned_ray_from_pixel: FloatArray,
+    ) -> None:
+        """Blend the ground's texture in, the less the farther it is."""
+        height_m = -eye_ned_m[2]
+        weight = np.maximum(falls, 0)
+        weight /= weight + np.float32(height_m / GROUND_FADE_M)
+        weight *= weight
+        # Where a ray meets the ground is a homography of the pixel; modulo the tile keeps it small.
+        north_east_m = np.mod(eye_ned_m[:2], scenery.GROUND_TILE_M)
+        tile_from_pixel = ned_ray_from_pixel.copy()
+        tile_from_pixel[:2] *= height_m
+        tile_from_pixel[:2] += np.outer(north_east_m, ned_ray_from_pixel[2])
+        tile_from_pixel[:2] *= scenery.GROUND_TILE_PX / scenery.GROUND_TILE_M
+        ground = cv2.warpPerspective(
+            self._ground,
+            tile_from_pixel,
+            (image.shape[1], image.shape[0]),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_WRAP,
+        )
+        image[:] = cv2.blendLinear(ground, image, weight, 1 - weight)
+
+    def _draw_gates(self, image: Image, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> None:
+        """Far gates first; within a gate, in the order of its faces."""
+        faces = self._faces
+        from_eye_m = faces.corners_ned_m - eye_ned_m
+        facing = np.einsum("nk,nk->n", faces.normals_ned, from_eye_m[:, 0]) <= 0
+        distance_m = np.linalg.norm(self._centers_ned_m - eye_ned_m, axis=1)[faces.gate]
+        order = np.argsort(-distance_m, kind="stable")
+        order = order[facing[order]]
+        haze = 1 - np.exp(-distance_m[order, None] / GATE_HAZE_M)
+        rgb = faces.rgb[order] * (1 - haze) + self._haze_rgb * haze
+        self._fill(image, from_eye_m[order] @ ned_from_camera, rgb, cv2.LINE_AA)
+
+    def _fill(self, image: Image, corners_m: FloatArray, rgb: FloatArray, line_type: int) -> None:
+        """Paint quadrilaterals [N, 4, 3] in camera axes, in this order, with colours [N, 3]."""
+        seen = self._in_view(corners_m)
+        corners_m = corners_m[seen]
+        cut = corners_m[:, :, 2].min(axis=1) < NEAR_M
+        whole_px = self._project(np.where(cut[:, None, None], 1.0, corners_m))
+        colours = rgb[seen].round().astype(int).tolist()
+        for index, colour in enumerate(colours):
+            fixed = self._project(clip_near(corners_m[index])) if cut[index] else whole_px[index]
+            cv2.fillConvexPoly(image, fixed, colour, line_type, SUBPIXEL_BITS)
+
+    def _project(self, points_m: FloatArray) -> NDArray[np.int32]:
+        """Pixel coordinates [..., 2] in units of 1/16 pixel."""
+        points_px = self._center_px + self._focal_px * points_m[..., :2] / points_m[..., 2:]
+        return np.rint(points_px * (1 << SUBPIXEL_BITS)).astype(np.int32)
+
+    def _in_view(self, corners_m: FloatArray) -> NDArray[np.bool_]:
+        """Which of [N, 4, 3] are not wholly behind the near plane or outside one image border."""
+        x, y, z = np.moveaxis(corners_m, -1, 0)
+        half_width, half_height = (self._center_px + 1) / self._focal_px
+        outside = np.stack(
+            [
+                z < NEAR_M,
+                x > half_width * z,
+                x < -half_width * z,
+                y > half_height * z,
+                y < -half_height * z,
+            ]
+        )
+        return np.asarray(~outside.all(axis=2).any(axis=0))
+
+
+def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
+    """[3, 3] from camera axes (x right, y down, z forward) to FRD body axes."""
+    sine, cosine = math.sin(conditions.camera_tilt_rad), math.cos(conditions.camera_tilt_rad)
+    tilted = np.array([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
+    roll_rad, yaw_rad = conditions.camera_roll_rad, conditions.camera_yaw_rad
+    if roll_rad == 0.0 and yaw_rad == 0.0:
+        return tilted
+    about_axis = rotation_matrix(from_euler(0.0, 0.0, roll_rad))
+    about_down = rotation_matrix(from_euler(0.0, 0.0, yaw_rad))
+    return np.asarray(about_down @ tilted @ about_axis)
+
+
+def _rows(top: int) -> FloatArray:
+    """Pixel of the whole image from a pixel of its part that starts at row ``top``."""
+    return np.array([[1.0, 0.0, 0.0], [0.0, 1.0, top], [0.0, 0.0, 1.0]])
+
+
+def clip_near(corners_m: FloatArray) -> FloatArray:
+    """The part of a convex polygon [N, 3] with z >= NEAR_M (Sutherland and Hodgman)."""
+    kept = []
+    for start, end in zip(corners_m, np.roll(corners_m, -1, axis=0), strict=True):
+        if start[2] >= NEAR_M:
+            kept.append(start)
+        if (start[2] >= NEAR_M) != (end[2] >= NEAR_M):
+            fraction = (NEAR_M - start[2]) / (end[2] - start[2])
+            kept.append(start + fraction * (end - start))
+    return np.array(kept)
+
+
+def rotation_matrix(wxyz: Quat) -> FloatArray:
+    """[3, 3]: its columns are the rotated unit vectors."""
+    return np.array([rotate(wxyz, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]).T

@@ -1,0 +1,1 @@
+"""Gate courses, the referee that counts gates, and collisions."""

@@ -1,0 +1,1 @@
+"""A demonstrator that flies gate courses from the true pose."""

@@ -1,0 +1,124 @@
+"""Mistakes to learn from: starts off the course and sticks that are not the demonstrator's.
+
+What is flown differs from what the demonstrator would hold; what it would hold stays the label, so
+that the way back from a mistake is in the data (Laskey et al., "DART: Noise Injection for Robust
+Imitation Learning", 2017). Everything follows from a seed.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from sitl.course.course import Course, Start
+from sitl.expert.expert import CENTRED, Sticks4
+from sitl.rotation import from_euler
+from sitl.vehicle.control import clamp
+
+QUIET_S = (1.0, 5.0)
+NOISY_S = (0.5, 2.0)
+PULSE_S = (0.15, 0.5)
+NOISE_TIME_S = 0.25
+"""Correlation time of the noise: about as fast as a thumb."""
+NOISE_RMS = Sticks4(throttle=0.25, yaw=0.12, pitch=0.25, roll=0.25)
+PULSE_MAX = Sticks4(throttle=0.6, yaw=0.4, pitch=0.6, roll=0.6)
+START_AWAY_M = (3.0, 5.5)
+"""Before a gate: behind the one before it, whose leg is at least 7 m long."""
+LATE_CHANCE = 0.3
+LATE_S = (0.2, 2.0)
+
+
+class _Stretch(NamedTuple):
+    kind: Literal["quiet", "noise", "pulse", "late"]
+    end_s: float
+    offset: Sticks4
+
+
+class StickDisturbance:
+    """Stretches of correlated noise and held pulses on the sticks, with quiet ones in between.
+
+    ``strength`` scales amplitudes; 0 never disturbs. One flight each; ask it at every tick, in
+    order of time. Time counts from the first call. From the ground some flights start late.
+    """
+
+    def __init__(self, seed: int, *, strength: float = 1.0, from_ground: bool = True) -> None:
+        self._random = np.random.Generator(np.random.PCG64(seed))
+        self._strength = strength
+        self._start_s: float | None = None
+        self._last_s = 0.0
+        self._noise = np.zeros(4)
+        late = from_ground and self._random.random() < LATE_CHANCE * strength
+        end_s = float(self._random.uniform(*(LATE_S if late else QUIET_S)))
+        self._stretch = _Stretch("late" if late else "quiet", end_s, CENTRED)
+
+    @property
+    def active(self) -> bool:
+        """What the last call returned is not what the demonstrator asked for."""
+        return self._strength > 0.0 and self._stretch.kind != "quiet"
+
+    def flown(self, wanted: Sticks4, t_s: float) -> Sticks4:
+        """What to fly at ``t_s`` where the demonstrator wants ``wanted``; within [-1, 1]."""
+        if self._start_s is None:
+            self._start_s = t_s
+        t_s -= self._start_s
+        dt_s, self._last_s = t_s - self._last_s, t_s
+        while t_s >= self._stretch.end_s:
+            self._stretch = self._next(self._stretch)
+        self._wander(dt_s)
+        if not self.active:
+            return wanted
+        if self._stretch.kind == "late":
+            return CENTRED
+        offset = self._noise if self._stretch.kind == "noise" else self._stretch.offset
+        disturbed = [
+            max(-1.0, min(1.0, stick + self._strength * float(off)))
+            for stick, off in zip(wanted, offset, strict=True)
+        ]
+        return Sticks4(*disturbed)
+
+    def _next(self, ended: _Stretch) -> _Stretch:
+        if ended.kind != "quiet":
+            return _Stretch("quiet", ended.end_s + float(self._random.uniform(*QUIET_S)), CENTRED)
+        if self._random.random() < 0.5:
+            self._noise[:] = 0.0
+            return _Stretch("noise", ended.end_s + float(self._random.uniform(*NOISY_S)), CENTRED)
+        # A pulse is on one or two sticks, as a slip of the thumb is.
+        held = self._random.uniform(-1.0, 1.0, 4) * np.array(PULSE_MAX)
+        held *= self._random.permutation([1.0, 1.0, 0.0, 0.0])
+        length_s = float(self._random.uniform(*PULSE_S))
+        return _Stretch("pulse", ended.end_s + length_s, Sticks4(*held.tolist()))
+
+    def _wander(self, dt_s: float) -> None:
+        """An Ornstein-Uhlenbeck process, exact for any step."""
+        kept = math.exp(-max(dt_s, 0.0) / NOISE_TIME_S)
+        fresh = math.sqrt(1.0 - kept * kept) * self._random.standard_normal(4)
+        self._noise = kept * self._noise + fresh * np.array(NOISE_RMS)
+
+
+def random_start(course: Course, seed: int, *, speed_mps: float, strength: float = 1.0) -> Start:
+    """Somewhere before a random gate, off the line to it, moving and facing roughly along it."""
+    random = np.random.Generator(np.random.PCG64(seed))
+    gate = course.gates[int(random.integers(len(course.gates)))]
+    away_m = float(random.uniform(*START_AWAY_M))
+    side_m = clamp(float(random.normal(0.0, 1.2 * strength)), 0.4 * away_m)
+    up_m = float(random.normal(0.0, 0.5 * strength))
+    heading_rad = gate.yaw_rad + float(random.normal(0.0, 0.2 * strength))
+    track_rad = gate.yaw_rad + float(random.normal(0.0, 0.25 * strength))
+    pace_mps = speed_mps * float(random.uniform(0.2, 1.0))
+    lean_rad = random.normal(0.0, 0.12 * strength, 2).tolist()
+    north_m, east_m, down_m = gate.center_ned_m
+    cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
+    return Start(
+        position_ned_m=(
+            north_m - away_m * cos_yaw - side_m * sin_yaw,
+            east_m - away_m * sin_yaw + side_m * cos_yaw,
+            min(-1.2, down_m - up_m),
+        ),
+        velocity_ned_mps=(
+            pace_mps * math.cos(track_rad),
+            pace_mps * math.sin(track_rad),
+            float(random.normal(0.0, 0.5 * strength)),
+        ),
+        ned_from_body_wxyz=from_euler(lean_rad[0], lean_rad[1] - 0.05, heading_rad),
+        next_gate=gate.index,
+    )

@@ -1,0 +1,144 @@
+"""Which message is due when on one link: ArduPilot's rounding, caps and buckets."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.clock import NS_PER_MS
+from sitl.vehicle.conditions import NOMINAL, Conditions
+
+HEARTBEAT_INTERVAL_MS = 1000
+MAX_INTERVAL_US = 60_000_000
+MAX_DISTINCT_INTERVALS = 10
+PARAM_SLOWDOWN = 4
+"""All streams are this much slower while a parameter list is being sent."""
+
+STREAM_GROUPS: dict[int, tuple[int, ...]] = {
+    mav.MAV_DATA_STREAM_RAW_SENSORS: (
+        mav.MAVLINK_MSG_ID_RAW_IMU,
+        mav.MAVLINK_MSG_ID_SCALED_IMU2,
+    ),
+    mav.MAV_DATA_STREAM_EXTENDED_STATUS: (
+        mav.MAVLINK_MSG_ID_SYS_STATUS,
+        mav.MAVLINK_MSG_ID_GPS_RAW_INT,
+    ),
+    mav.MAV_DATA_STREAM_RC_CHANNELS: (
+        mav.MAVLINK_MSG_ID_RC_CHANNELS,
+        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
+    ),
+    mav.MAV_DATA_STREAM_POSITION: (
+        mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    ),
+    mav.MAV_DATA_STREAM_EXTRA1: (mav.MAVLINK_MSG_ID_ATTITUDE,),
+    mav.MAV_DATA_STREAM_EXTRA2: (mav.MAVLINK_MSG_ID_VFR_HUD,),
+    mav.MAV_DATA_STREAM_EXTRA3: (
+        mav.MAVLINK_MSG_ID_SYSTEM_TIME,
+        mav.MAVLINK_MSG_ID_BATTERY_STATUS,
+        mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+    ),
+}
+
+
+@dataclass(slots=True, kw_only=True)
+class _Stream:
+    interval_ms: int
+    due_ns: int
+    """On the stream's own grid."""
+    late_ns: int = 0
+    """By how much the next one is sent later than that."""
+
+
+class Streams:
+    """The message intervals of one link; stamps are the vehicle's clock, intervals whole ms.
+
+    What the conditions add to them (a slow link, jitter, phases) is not in what MESSAGE_INTERVAL
+    reports, as on the firmware.
+    """
+
+    def __init__(
+        self, known: Collection[int], now_ns: int, conditions: Conditions = NOMINAL
+    ) -> None:
+        self._known = known
+        self._slowdown_ms = conditions.stream_slowdown_ms
+        self._jitter_ns = conditions.stream_jitter_ms * NS_PER_MS
+        self._phase_spread = conditions.stream_phase_spread
+        self._random = np.random.Generator(np.random.PCG64((conditions.seed, 5)))
+        self._streams: dict[int, _Stream] = {}
+        self._start(mav.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_INTERVAL_MS, now_ns)
+
+    def set_interval(
+        self, message_id: int, interval_us: int, *, loop_hz: float, now_ns: int
+    ) -> str | None:
+        """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the default.
+
+        Returns:
+            None if accepted, else the reason of the refusal; the old interval is kept then.
+        """
+        if message_id not in self._known:
+            return f"No ap_message for mavlink id ({message_id})"
+        interval_ms = self._rounded_ms(message_id, interval_us)
+        if 0 < interval_ms < shortest_ms(loop_hz):
+            return f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE"
+        self._start(message_id, interval_ms, now_ns)
+        return None
+
+    def set_group(self, group: int, rate_hz: int, *, loop_hz: float, now_ns: int) -> None:
+        """Apply REQUEST_DATA_STREAM; it overrules earlier intervals. Rate 0 stops the group."""
+        interval_ms = max(1000 // rate_hz, shortest_ms(loop_hz)) if rate_hz > 0 else 0
+        for one in STREAM_GROUPS if group == mav.MAV_DATA_STREAM_ALL else (group,):
+            for message_id in STREAM_GROUPS.get(one, ()):
+                self._start(message_id, interval_ms, now_ns)
+
+    def interval_us(self, message_id: int) -> int:
+        """As MESSAGE_INTERVAL reports it: 0 = unknown message, -1 = not streamed."""
+        if message_id not in self._known:
+            return 0
+        stream = self._streams.get(message_id)
+        return stream.interval_ms * 1000 if stream else -1
+
+    def due(self, now_ns: int, slowdown: int) -> list[int]:
+        """Ids to send now. Slots that were missed are dropped: a late message is sent once."""
+        ready = [
+            key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
+        ]
+        for message_id in ready:
+            stream = self._streams[message_id]
+            period_ns = (stream.interval_ms + self._slowdown_ms) * NS_PER_MS * slowdown
+            stream.due_ns += period_ns * ((now_ns - stream.due_ns) // period_ns + 1)
+            stream.late_ns = self._below(self._jitter_ns)
+        return ready
+
+    def _below(self, most_ns: float) -> int:
+        """From 0 to ``most_ns``, at random."""
+        return int(self._random.uniform(0.0, most_ns)) if most_ns else 0
+
+    @staticmethod
+    def _rounded_ms(message_id: int, interval_us: int) -> int:
+        if interval_us < 0:
+            return 0
+        if interval_us == 0:
+            return HEARTBEAT_INTERVAL_MS if message_id == mav.MAVLINK_MSG_ID_HEARTBEAT else 0
+        return max(1, min(interval_us, MAX_INTERVAL_US) // 1000)
+
+    def _start(self, message_id: int, interval_ms: int, now_ns: int) -> None:
+        self._streams.pop(message_id, None)
+        if interval_ms > 0:
+            interval_ms = self._bucket(interval_ms)
+            period_ns = (interval_ms + self._slowdown_ms) * NS_PER_MS
+            due_ns = now_ns + period_ns - self._below(self._phase_spread * period_ns)
+            self._streams[message_id] = _Stream(interval_ms=interval_ms, due_ns=due_ns)
+
+    def _bucket(self, interval_ms: int) -> int:
+        """The firmware keeps ten distinct intervals a link; an eleventh joins the nearest."""
+        taken = {stream.interval_ms for stream in self._streams.values()}
+        if interval_ms in taken or len(taken) < MAX_DISTINCT_INTERVALS:
+            return interval_ms
+        return min(taken, key=lambda other: abs(other - interval_ms))
+
+
+def shortest_ms(loop_hz: float) -> int:
+    """The fastest stream is 0.8 of the main loop, in whole milliseconds: 3 ms at 400 Hz."""
+    return int(1000.0 / (0.8 * max(50.0, loop_hz)))

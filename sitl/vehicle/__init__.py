@@ -1,0 +1,1 @@
+"""The simulated quadrotor: physics, flight controller, parameters, radio."""

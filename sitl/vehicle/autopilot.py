@@ -1,0 +1,287 @@
+"""The flight controller without its wire: sticks in, physics out, one step of 2.5 ms at a time.
+
+It is ArduCopter as a pilot and a companion computer see it: modes, arming, failsafes, and the words
+that it says about them. Nothing here knows about MAVLink, sockets or the host's time.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from sitl.clock import NS_PER_S
+from sitl.rotation import Quat, Vec3, cos_tilt
+from sitl.vehicle.air import Air, SensorNoise
+from sitl.vehicle.arming import prearm_refusal, stick_refusal
+from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.dynamics import PHYSICS_STEP_NS, BodyState, Quadrotor
+from sitl.vehicle.failsafe import GcsFailsafe, RadioFailsafe
+from sitl.vehicle.flight import STOPPED, FlightControl
+from sitl.vehicle.modes import Mode
+from sitl.vehicle.params import Params
+from sitl.vehicle.rc import IDLE_RECEIVER_US, RcEngine
+from sitl.vehicle.sticks import read_sticks
+
+SUBSTEPS = 2
+STEP_NS = SUBSTEPS * PHYSICS_STEP_NS
+LOOP_HZ = NS_PER_S // STEP_NS
+GPS_PERIOD_NS = NS_PER_S // 5
+
+LANDED_AFTER_NS = NS_PER_S
+LANDED_SPEED_MPS = 0.3
+CRASH_TILT_COS = 0.7
+CRASH_AFTER_NS = NS_PER_S
+SEVERITY_CRITICAL, SEVERITY_WARNING, SEVERITY_INFO = 2, 4, 6
+
+FAILSAFE_LAND = {"FS_THR_ENABLE": 3, "FS_GCS_ENABLE": 5}
+"""The value of each parameter that asks for LAND; any other value but 0 means RTL."""
+FS_OPTION_PILOT_CONTINUES = 16
+
+
+class StatusText(NamedTuple):
+    """A line for the ground station, with MAVLink's severity (2 critical, 4 warning, 6 info)."""
+
+    severity: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleConfig:
+    """What differs between one simulated vehicle and another."""
+
+    receiver: bool = True
+    """An RC receiver with an idle transmitter; without one the sticks latch and the radio fails."""
+    estimator_ready_s: float = 3.0
+    """From boot until arming is possible (about 23 s on the real firmware)."""
+    position_ready_s: float = 5.0
+    """From boot until the estimator has a position (about 40 s on the real firmware)."""
+    conditions: Conditions = NOMINAL
+    """Airframe, air and sensors; what concerns the camera is for `sitl.camera.fpv.FpvRenderer`."""
+
+
+class Autopilot:
+    """One boot of the vehicle; stamps are nanoseconds of the caller's clock, from ``boot_ns``."""
+
+    def __init__(self, params: Params, config: VehicleConfig, boot_ns: int) -> None:
+        self.params = params
+        self.config = config
+        self.boot_ns = boot_ns
+        self.now_ns = boot_ns
+        self.mode = Mode.STABILIZE
+        self.armed = False
+        self.landed = True
+        self.rc = RcEngine(params, IDLE_RECEIVER_US if config.receiver else None)
+        self.radio_failsafe = RadioFailsafe(params, boot_ns)
+        self.gcs_failsafe = GcsFailsafe(params)
+        self.texts: list[StatusText] = []
+        """Said since the last time somebody emptied the list."""
+        self.motor_commands: tuple[float, ...] = STOPPED
+        self.sensors_frozen = False
+        """Fault: telemetry and control keep the last state, the world goes on."""
+        self._control = FlightControl(params)
+        self._quad = Quadrotor(config.conditions)
+        self._air = Air(config.conditions, STEP_NS / NS_PER_S)
+        self._noise = SensorNoise(config.conditions)
+        self._physics = self._quad.at_rest()
+        self.sensed = self._physics.body
+        self.gps = self._physics.body
+        """As of the last 5 Hz fix."""
+        self._gps_due_ns = boot_ns
+        self._still_since_ns: int | None = boot_ns
+        self._tipped_since_ns: int | None = None
+        self._idle_since_ns = boot_ns
+
+    @property
+    def truth(self) -> BodyState:
+        """Where the vehicle really is, whatever its sensors say."""
+        return self._physics.body
+
+    @property
+    def uptime_ns(self) -> int:
+        """Time since boot: the clock of all telemetry."""
+        return self.now_ns - self.boot_ns
+
+    @property
+    def estimator_ready(self) -> bool:
+        """Attitude is aligned: arming is possible."""
+        return self.uptime_ns >= self.config.estimator_ready_s * NS_PER_S
+
+    @property
+    def position_ready(self) -> bool:
+        """The estimator has a position: LOCAL_POSITION_NED flows, RTL is possible."""
+        return self.uptime_ns >= self.config.position_ready_s * NS_PER_S
+
+    def prearm_refusal(self) -> str | None:
+        """Why the vehicle is not ready to be armed, whatever the mode and the sticks; or None."""
+        return prearm_refusal(
+            self.rc,
+            self.params,
+            estimator_ready=self.estimator_ready,
+            radio_failsafe=self.radio_failsafe.active,
+        )
+
+    def arm(self, *, force: bool) -> bool:
+        """Start the motors; a refusal is said as a text. True if armed afterwards."""
+        if self.armed:
+            return True
+        refusal = self.prearm_refusal() or stick_refusal(
+            self.mode, read_sticks(self.rc, self.params), self.rc, self.params
+        )
+        if refusal is not None and not force:
+            self._say(SEVERITY_CRITICAL, f"Arm: {refusal}")
+            return False
+        self.armed = True
+        self._idle_since_ns = self.now_ns
+        self._control.reset(self.sensed)
+        self._say(SEVERITY_INFO, "Arming motors")
+        return True
+
+    def disarm(self, *, force: bool) -> bool:
+        """Stop the motors; refused in flight unless forced. True if disarmed afterwards."""
+        if self.armed and not (self.landed or force):
+            return False
+        if self.armed:
+            self.armed = False
+            self._say(SEVERITY_INFO, "Disarming motors")
+        return True
+
+    def set_mode(self, mode: Mode) -> bool:
+        """Change the flight mode; a refusal is said as a text. True if in that mode afterwards."""
+        if mode is self.mode:
+            return True
+        refusal = None
+        if mode.manual_throttle and self.radio_failsafe.active:
+            refusal = "in RC failsafe"
+        elif mode is Mode.RTL and not self.position_ready:
+            refusal = "requires position"
+        if refusal is not None:
+            self._say(SEVERITY_WARNING, f"Mode change to {mode.name} failed: {refusal}")
+            return False
+        self.mode = mode
+        self._control.reset(self.sensed)
+        return True
+
+    def step(self) -> None:
+        """Advance everything by one control period."""
+        self.now_ns += STEP_NS
+        self._read_radio()
+        if self.gcs_failsafe.update(self.now_ns):
+            self._on_gcs_change()
+        self.motor_commands = self._motors()
+        self._physics = self._quad.step(
+            self._physics, self.motor_commands, SUBSTEPS, self._air.step()
+        )
+        if not self.sensors_frozen:
+            self.sensed = self._noise.sense(self._physics.body)
+            if self.now_ns >= self._gps_due_ns:
+                self._gps_due_ns += GPS_PERIOD_NS
+                self.gps = self.sensed
+        self._detect_landing()
+        self._detect_crash()
+
+    def launch(
+        self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
+    ) -> None:
+        """Be flying in this state from now on, armed and in ALT_HOLD, without having taken off.
+
+        What the sticks say counts from the next step: an idle receiver asks for a descent.
+        """
+        self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
+        self.sensed = self.gps = self._physics.body
+        self.armed = True
+        self.landed = False
+        self.mode = Mode.ALT_HOLD
+        self._idle_since_ns = self.now_ns
+        self._still_since_ns = self._tipped_since_ns = None
+        self._control.reset(self.sensed)
+
+    def _motors(self) -> tuple[float, ...]:
+        if not self.armed:
+            return STOPPED
+        sticks = read_sticks(self.rc, self.params)
+        if self.landed:
+            if not self._control.wants_takeoff(self.mode, sticks):
+                self._disarm_when_idle()
+                return self._control.idle(self.sensed)
+            self.landed = False
+            self._still_since_ns = None
+        self._idle_since_ns = self.now_ns
+        return self._control.fly(
+            self.mode,
+            sticks,
+            self.sensed,
+            has_position=self.position_ready,
+            dt_s=STEP_NS / NS_PER_S,
+        )
+
+    def _disarm_when_idle(self) -> None:
+        """LAND and RTL stop the motors on touchdown, the pilot's modes after DISARM_DELAY."""
+        delay_s = self.params["DISARM_DELAY"]
+        waited = delay_s > 0.0 and self.now_ns - self._idle_since_ns >= delay_s * NS_PER_S
+        if waited or not self.mode.piloted:
+            self.disarm(force=False)
+
+    def _detect_landing(self) -> None:
+        body = self.sensed
+        hover = self.params["MOT_THST_HOVER"]
+        slow = max(abs(v) for v in body.velocity_ned_mps) < LANDED_SPEED_MPS
+        pushing = self.armed and self._control.collective > 0.5 * hover
+        if not (body.touching and slow) or pushing:
+            self._still_since_ns = None
+        elif self._still_since_ns is None:
+            self._still_since_ns = self.now_ns
+        elif not self.landed and self.now_ns - self._still_since_ns >= LANDED_AFTER_NS:
+            self.landed = True
+
+    def _detect_crash(self) -> None:
+        """Lying on its side with motors running."""
+        tilt = cos_tilt(self.sensed.ned_from_body_wxyz)
+        if not (self.armed and self.sensed.touching and tilt < CRASH_TILT_COS):
+            self._tipped_since_ns = None
+        elif self._tipped_since_ns is None:
+            self._tipped_since_ns = self.now_ns
+        elif self.now_ns - self._tipped_since_ns >= CRASH_AFTER_NS:
+            self._say(SEVERITY_CRITICAL, "Crash: Disarming")
+            self.disarm(force=True)
+
+    def _read_radio(self) -> None:
+        new_input = self.rc.update(self.now_ns)
+        changed = self.radio_failsafe.update(
+            new_input=new_input,
+            throttle_us=self.rc.channels_us[self.rc.index_of("THROTTLE")],
+            has_receiver=self.config.receiver,
+            armed=self.armed,
+            now_ns=self.now_ns,
+        )
+        if not changed:
+            return
+        if self.radio_failsafe.active:
+            self._fail_over("Radio", "FS_THR_ENABLE")
+        else:
+            self._say(SEVERITY_WARNING, "Radio Failsafe Cleared")
+
+    def _on_gcs_change(self) -> None:
+        if not self.gcs_failsafe.active:
+            self._say(SEVERITY_WARNING, "GCS Failsafe Cleared")
+            return
+        self.rc.clear_overrides()
+        continues = self.params.integer("FS_OPTIONS") & FS_OPTION_PILOT_CONTINUES
+        if self.armed and self.mode.piloted and continues:
+            self._say(SEVERITY_WARNING, "GCS Failsafe - Continuing Pilot Control")
+        else:
+            self._fail_over("GCS", "FS_GCS_ENABLE")
+
+    def _fail_over(self, who: str, parameter: str) -> None:
+        """Bring the vehicle down or home; the mode stays when the cause goes away."""
+        if self.armed and self.landed:
+            self._say(SEVERITY_WARNING, f"{who} Failsafe - Disarming")
+            self.disarm(force=True)
+            return
+        self._say(SEVERITY_WARNING, f"{who} Failsafe")
+        if not self.armed:
+            return
+        if self.params.integer(parameter) == FAILSAFE_LAND[parameter] or not self.position_ready:
+            self.set_mode(Mode.LAND)
+        elif self.mode is not Mode.LAND:
+            self.set_mode(Mode.RTL)
+
+    def _say(self, severity: int, text: str) -> None:
+        self.texts.append(StatusText(severity, text))

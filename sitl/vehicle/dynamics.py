@@ -1,0 +1,185 @@
+"""A 1.2 kg quadrotor as a MuJoCo free body: motors with lag, rotor drag, air drag, a ground to hit.
+
+MuJoCo works in north-west-up with a forward-left-up body; everything outside this module is NED and
+FRD. The two differ by a half turn about x on both sides, so vectors flip y and z, and the vector
+part of the quaternion does the same: ``_flip`` is the only conversion there is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.rotation import Quat, Vec3, cos_tilt
+from sitl.vehicle.conditions import NOMINAL, Conditions
+
+GRAVITY_MPS2 = 9.80665
+MASS_KG = 1.2
+INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
+MOTOR_ARM_M = 0.12
+"""Motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase."""
+MAX_MOTOR_THRUST_N = 7.54
+"""Hover at 0.39 of full thrust, which is ArduCopter's learned-hover order of magnitude."""
+YAW_TORQUE_PER_THRUST_M = 0.016
+MOTOR_LAG_S = 0.028
+ROTOR_DRAG_NSPM = 0.15
+"""Linear drag of spinning rotors, about 0.1 1/s of mass at this size; body drag is MuJoCo's own
+quadratic model on the equivalent inertia box."""
+AIR_DENSITY_KGPM3 = 1.225
+REST_HEIGHT_M = 0.06
+
+PHYSICS_STEP_NS = 1_250_000
+
+_BODY = 1
+"""After the world."""
+_FULL_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+def _model_xml(conditions: Conditions) -> str:
+    """The model, compiled anew for other masses: MuJoCo derives more from them than it shows.
+
+    Motor order and directions are ArduCopter's quad X: front right and rear left turn anticlockwise
+    seen from above, so they push the nose to the right.
+    """
+    density = AIR_DENSITY_KGPM3 * conditions.drag_factor
+    thrust_n = MAX_MOTOR_THRUST_N * conditions.thrust_factor
+    inertia_kgm2 = [conditions.mass_factor * moment for moment in INERTIA_KGM2]
+    return f"""
+<mujoco>
+  <option timestep="{PHYSICS_STEP_NS / 1e9}" gravity="0 0 -{GRAVITY_MPS2}" density="{density}"
+          integrator="implicitfast"/>
+  <default>
+    <general dyntype="filterexact" dynprm="{MOTOR_LAG_S}" gainprm="{thrust_n}"
+             ctrlrange="0 1" ctrllimited="true"/>
+  </default>
+  <worldbody>
+    <geom type="plane" pos="0 0 {-REST_HEIGHT_M}" size="0 0 1"/>
+    <body>
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{MASS_KG * conditions.mass_factor}"
+                diaginertia="{" ".join(map(str, inertia_kgm2))}"/>
+      <geom type="sphere" size="0.02" pos="0.12 0.12 -0.04"/>
+      <geom type="sphere" size="0.02" pos="0.12 -0.12 -0.04"/>
+      <geom type="sphere" size="0.02" pos="-0.12 0.12 -0.04"/>
+      <geom type="sphere" size="0.02" pos="-0.12 -0.12 -0.04"/>
+      <geom type="box" size="0.14 0.14 0.03" pos="0 0 0.01"/>
+      <site name="imu"/>
+      <site name="front_right" pos="{MOTOR_ARM_M} {-MOTOR_ARM_M} 0"/>
+      <site name="rear_left" pos="{-MOTOR_ARM_M} {MOTOR_ARM_M} 0"/>
+      <site name="front_left" pos="{MOTOR_ARM_M} {MOTOR_ARM_M} 0"/>
+      <site name="rear_right" pos="{-MOTOR_ARM_M} {-MOTOR_ARM_M} 0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <general site="front_right" gear="0 0 1 0 0 -{YAW_TORQUE_PER_THRUST_M}"/>
+    <general site="rear_left" gear="0 0 1 0 0 -{YAW_TORQUE_PER_THRUST_M}"/>
+    <general site="front_left" gear="0 0 1 0 0 {YAW_TORQUE_PER_THRUST_M}"/>
+    <general site="rear_right" gear="0 0 1 0 0 {YAW_TORQUE_PER_THRUST_M}"/>
+  </actuator>
+  <sensor><accelerometer site="imu"/></sensor>
+</mujoco>
+"""
+
+
+class BodyState(NamedTuple):
+    """The vehicle at one instant, NED world and FRD body."""
+
+    position_ned_m: Vec3
+    ned_from_body_wxyz: Quat
+    velocity_ned_mps: Vec3
+    rate_body_radps: Vec3
+    specific_force_body_mps2: Vec3
+    """What an accelerometer reads: (0, 0, -9.8) at rest."""
+    motors: tuple[float, ...]
+    """Thrust of each motor as a fraction of full, in ArduCopter's quad X order."""
+    touching: bool
+    """Some part of the frame is on the ground."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhysicsState:
+    """All that MuJoCo needs to continue, and the same instant in the terms of the rest of us."""
+
+    integration: NDArray[np.float64]
+    body: BodyState
+
+
+def _flip(v: Sequence[float]) -> Vec3:
+    """A vector between NWU and NED, or between FLU and FRD: the same in both directions."""
+    return (v[0], -v[1], -v[2])
+
+
+class Quadrotor:
+    """The model; its MuJoCo data is scratch space, all state is in the argument and the result."""
+
+    def __init__(self, conditions: Conditions = NOMINAL) -> None:
+        self._model = mujoco.MjModel.from_xml_string(_model_xml(conditions))
+        self._mass_kg = MASS_KG * conditions.mass_factor
+        self._max_motor_thrust_n = MAX_MOTOR_THRUST_N * conditions.thrust_factor
+        self._rotor_drag_nspm = ROTOR_DRAG_NSPM * conditions.drag_factor
+        self._model.dof_damping[:3] = self._rotor_drag_nspm
+        self._data = mujoco.MjData(self._model)
+        self._state_size = mujoco.mj_stateSize(self._model, _FULL_STATE)
+
+    def at_rest(self) -> PhysicsState:
+        """On the ground at the origin, heading north, motors stopped."""
+        mujoco.mj_resetData(self._model, self._data)
+        mujoco.mj_forward(self._model, self._data)
+        return self._capture()
+
+    def airborne(
+        self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
+    ) -> PhysicsState:
+        """In the air and not turning, motors at the thrust that carries the weight."""
+        mujoco.mj_resetData(self._model, self._data)
+        w, *vector = ned_from_body_wxyz
+        self._data.qpos[:] = (*_flip(position_ned_m), w, *_flip(vector))
+        self._data.qvel[:3] = _flip(velocity_ned_mps)
+        tilt = max(0.5, cos_tilt(ned_from_body_wxyz))
+        self._data.act[:] = min(
+            1.0, self._mass_kg * GRAVITY_MPS2 / (4.0 * self._max_motor_thrust_n * tilt)
+        )
+        mujoco.mj_forward(self._model, self._data)
+        return self._capture()
+
+    def step(
+        self,
+        state: PhysicsState,
+        motor_commands: Sequence[float],
+        substeps: int,
+        wind_ned_mps: Vec3 = (0.0, 0.0, 0.0),
+    ) -> PhysicsState:
+        """The state ``substeps`` physics steps later, with the four commands (0..1) and wind held.
+
+        MuJoCo's body drag knows the wind; its damping, the rotors' drag, is against the ground, so
+        what the moving air adds to it is a force.
+        """
+        mujoco.mj_setState(self._model, self._data, state.integration, _FULL_STATE)
+        self._data.ctrl[:] = motor_commands
+        wind = _flip(wind_ned_mps)
+        self._model.opt.wind[:] = wind
+        self._data.xfrc_applied[_BODY, :3] = [self._rotor_drag_nspm * speed for speed in wind]
+        mujoco.mj_step(self._model, self._data, nstep=substeps)
+        return self._capture()
+
+    def _capture(self) -> PhysicsState:
+        data = self._data
+        integration = np.empty(self._state_size)
+        mujoco.mj_getState(self._model, data, integration, _FULL_STATE)
+        qpos = data.qpos.tolist()
+        qvel = data.qvel.tolist()
+        return PhysicsState(
+            integration=integration,
+            body=BodyState(
+                position_ned_m=_flip(qpos[0:3]),
+                ned_from_body_wxyz=(qpos[3], *_flip(qpos[4:7])),
+                velocity_ned_mps=_flip(qvel[0:3]),
+                rate_body_radps=_flip(qvel[3:6]),
+                specific_force_body_mps2=_flip(data.sensordata.tolist()),
+                motors=tuple(data.act.tolist()),
+                touching=data.ncon > 0,
+            ),
+        )

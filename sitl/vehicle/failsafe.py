@@ -1,0 +1,70 @@
+"""When the pilot's sticks or the ground station count as lost; what follows is not decided here."""
+
+from sitl.clock import NS_PER_S
+from sitl.vehicle.params import Params
+
+LOW_READS_TO_FAIL = 3
+GCS_CHECK_PERIOD_NS = NS_PER_S // 3
+"""ArduCopter looks at the ground station in its 3 Hz loop."""
+
+
+class RadioFailsafe:
+    """No sticks for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
+
+    def __init__(self, params: Params, now_ns: int) -> None:
+        self._params = params
+        self._last_input_ns = now_ns
+        self._low_reads = 0
+        self.active = False
+
+    def update(
+        self, *, new_input: bool, throttle_us: int, has_receiver: bool, armed: bool, now_ns: int
+    ) -> bool:
+        """Account for one RC update; True if ``active`` has changed."""
+        was_active = self.active
+        if not self._params["FS_THR_ENABLE"]:
+            self._last_input_ns, self._low_reads, self.active = now_ns, 0, False
+        elif new_input:
+            self._last_input_ns = now_ns
+            self._judge_throttle(throttle_us, can_fail=has_receiver or armed)
+        elif (has_receiver or armed) and now_ns - self._last_input_ns >= self._timeout_ns():
+            self.active = True
+        return self.active != was_active
+
+    def _timeout_ns(self) -> int:
+        return int(max(0.1, self._params["RC_FS_TIMEOUT"]) * NS_PER_S)
+
+    def _judge_throttle(self, throttle_us: int, *, can_fail: bool) -> None:
+        if throttle_us < self._params["FS_THR_VALUE"]:
+            self._low_reads = min(LOW_READS_TO_FAIL, self._low_reads + can_fail)
+            self.active = self.active or self._low_reads == LOW_READS_TO_FAIL
+        else:
+            self._low_reads = max(0, self._low_reads - 1)
+            self.active = self.active and self._low_reads > 0
+
+
+class GcsFailsafe:
+    """No heartbeat and no override of the ground station for FS_GCS_TIMEOUT."""
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+        self._last_contact_ns: int | None = None
+        self._due_ns = 0
+        self.active = False
+
+    def seen(self, now_ns: int) -> None:
+        """A heartbeat, override or manual control of MAV_GCS_SYSID has come in."""
+        self._last_contact_ns = now_ns
+
+    def update(self, now_ns: int) -> bool:
+        """Check the timer where it is due; True if ``active`` has changed."""
+        if now_ns < self._due_ns:
+            return False
+        self._due_ns = now_ns + GCS_CHECK_PERIOD_NS
+        was_active = self.active
+        self.active = (
+            self._params["FS_GCS_ENABLE"] != 0.0
+            and self._last_contact_ns is not None
+            and now_ns - self._last_contact_ns > self._params["FS_GCS_TIMEOUT"] * NS_PER_S
+        )
+        return self.active != was_active

@@ -1,0 +1,138 @@
+"""What each mode makes of the sticks: one law a mode, from sticks and state to motor commands."""
+
+import math
+
+from sitl.rotation import Vec3, cos_tilt, to_euler, wrap_pi
+from sitl.vehicle import sticks as pilot
+from sitl.vehicle.control import AttitudeController, HeightController, mix, thrust_for
+from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
+from sitl.vehicle.modes import Mode
+from sitl.vehicle.params import Params
+from sitl.vehicle.sticks import Sticks
+
+STOPPED = (0.0, 0.0, 0.0, 0.0)
+IDLE = (0.03, 0.03, 0.03, 0.03)
+"""Armed on the ground, throttle down."""
+
+FAST_DESCENT_MPS = 1.5
+"""LAND above SLOW_DESCENT_HEIGHT_M (WPNAV_SPEED_DN); LAND_SPEED below it."""
+SLOW_DESCENT_HEIGHT_M = 10.0
+RTL_SPEED_MPS = 5.0
+RTL_ARRIVED_M = 1.0
+POSITION_GAIN_PER_S = 0.8
+VELOCITY_GAIN_PER_S = 2.0
+TRAINER_GAIN_PER_S = 5.0
+
+
+class FlightControl:
+    """The laws of all modes, and the controllers that they share."""
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+        self._attitude = AttitudeController(params)
+        self._height = HeightController()
+        self._home_reached = False
+        self.collective = 0.0
+        """Mean thrust asked for, as a fraction of full."""
+
+    def reset(self, body: BodyState) -> None:
+        """Forget the targets: before flight and at each mode change."""
+        self._attitude.reset(body)
+        self._height.reset(body)
+        self._home_reached = False
+        self.collective = 0.0
+
+    def idle(self, body: BodyState) -> tuple[float, ...]:
+        """Motors of an armed vehicle that stays on the ground."""
+        self.reset(body)
+        return IDLE
+
+    def wants_takeoff(self, mode: Mode, sticks: Sticks) -> bool:
+        """The pilot asks a landed vehicle for thrust."""
+        if mode.manual_throttle:
+            return sticks.throttle > 0.0
+        return mode is Mode.ALT_HOLD and pilot.climb_rate_mps(sticks, self._params) > 0.0
+
+    def fly(
+        self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool, dt_s: float
+    ) -> tuple[float, ...]:
+        """Motor commands of a flying vehicle, each in [0, 1]."""
+        if mode is Mode.ACRO:
+            turn = self._attitude.rates(body, self._acro_rates(sticks, body), dt_s)
+            self.collective = pilot.manual_thrust(sticks, self._params)
+            return mix(self.collective, turn)
+        if mode in (Mode.STABILIZE, Mode.ALT_HOLD):
+            roll, pitch = pilot.lean_angles(sticks, self._params)
+        else:
+            roll, pitch = self._lean_home(mode, body) if has_position else (0.0, 0.0)
+        yaw_rate = pilot.yaw_rate_radps(sticks, self._params) if mode.piloted else 0.0
+        turn = self._attitude.lean(body, roll, pitch, yaw_rate, dt_s)
+        if mode is Mode.STABILIZE:
+            self.collective = pilot.manual_thrust(sticks, self._params)
+        else:
+            self.collective = self._hold_climb(self._climb_mps(mode, sticks, body), body, dt_s)
+        return mix(self.collective, turn)
+
+    def _hold_climb(self, climb_mps: float, body: BodyState, dt_s: float) -> float:
+        limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
+        accel = self._height.update(body, climb_mps, limit, dt_s)
+        tilt = cos_tilt(body.ned_from_body_wxyz)
+        return thrust_for(accel, tilt, self._params["MOT_THST_HOVER"])
+
+    def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
+        if mode is Mode.ALT_HOLD:
+            return pilot.climb_rate_mps(sticks, self._params)
+        height = -body.position_ned_m[2]
+        if mode is Mode.RTL and not self._home_reached:
+            return max(0.0, min(2.5, self._params["RTL_ALT"] / 100.0 - height))
+        if height > SLOW_DESCENT_HEIGHT_M:
+            return -FAST_DESCENT_MPS
+        return -self._params["LAND_SPEED"] / 100.0
+
+    def _lean_home(self, mode: Mode, body: BodyState) -> tuple[float, float]:
+        """Lean that stops the drift, or in RTL flies home once the return height is reached."""
+        north, east, down = body.position_ned_m
+        wanted_n = wanted_e = 0.0
+        if mode is Mode.RTL and not self._home_reached:
+            distance = math.hypot(north, east)
+            if distance < RTL_ARRIVED_M:
+                self._home_reached = True
+            elif -down > self._params["RTL_ALT"] / 100.0 - RTL_ARRIVED_M:
+                speed = min(RTL_SPEED_MPS, POSITION_GAIN_PER_S * distance)
+                wanted_n, wanted_e = -north / distance * speed, -east / distance * speed
+        return self._lean_for(
+            VELOCITY_GAIN_PER_S * (wanted_n - body.velocity_ned_mps[0]),
+            VELOCITY_GAIN_PER_S * (wanted_e - body.velocity_ned_mps[1]),
+            body,
+        )
+
+    def _lean_for(
+        self, accel_n_mps2: float, accel_e_mps2: float, body: BodyState
+    ) -> tuple[float, float]:
+        limit = GRAVITY_MPS2 * math.tan(math.radians(self._params["ANGLE_MAX"] / 100.0))
+        scale = limit / max(limit, math.hypot(accel_n_mps2, accel_e_mps2))
+        _, _, yaw = to_euler(body.ned_from_body_wxyz)
+        forward = scale * (accel_n_mps2 * math.cos(yaw) + accel_e_mps2 * math.sin(yaw))
+        right = scale * (accel_e_mps2 * math.cos(yaw) - accel_n_mps2 * math.sin(yaw))
+        return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)
+
+    def _acro_rates(self, sticks: Sticks, body: BodyState) -> Vec3:
+        """Stick rates, bent back towards level by ACRO_TRAINER."""
+        roll_rate, pitch_rate, yaw_rate = pilot.acro_rates_radps(sticks, self._params)
+        trainer = self._params.integer("ACRO_TRAINER")
+        if trainer == 0:
+            return roll_rate, pitch_rate, yaw_rate
+        roll, pitch, _ = to_euler(body.ned_from_body_wxyz)
+        roll_rate -= self._params["ACRO_BAL_ROLL"] * wrap_pi(roll)
+        pitch_rate -= self._params["ACRO_BAL_PITCH"] * pitch
+        if trainer == 2:
+            limit = math.radians(self._params["ANGLE_MAX"] / 100.0)
+            roll_rate = _stay_within(roll, limit, roll_rate)
+            pitch_rate = _stay_within(pitch, limit, pitch_rate)
+        return roll_rate, pitch_rate, yaw_rate
+
+
+def _stay_within(angle: float, limit: float, rate: float) -> float:
+    """The rate, braked so that the angle comes to rest at the limit."""
+    lowest, highest = -limit - angle, limit - angle
+    return max(TRAINER_GAIN_PER_S * lowest, min(TRAINER_GAIN_PER_S * highest, rate))

@@ -1,0 +1,169 @@
+"""Whose sticks the vehicle acts on: the receiver's, or overrides that came over MAVLink.
+
+Channel rules, timers and their quirks are ArduCopter 4.7's as measured on the firmware: per-channel
+expiry after RC_OVERRIDE_TIME, no range check, sticks that stay latched where no receiver exists.
+"""
+
+from collections.abc import Sequence
+
+from sitl.clock import NS_PER_S
+from sitl.vehicle.params import RC_CHANNELS_WITH_PARAMS, Params
+
+CHANNELS = 16
+PRIMARY_CHANNELS = 8
+"""Channels 1-8 and 9-16 differ in what 0 and the highest values mean."""
+IGNORE = 65535
+RELEASE_ON_AUX = 65534
+"""Releases channels 9-16; on 1-8 it is a value like any other."""
+RELEASE = 0
+"""Releases channels 1-8; on 9-16 it means "ignore"."""
+AXIS_ABSENT = 32767
+"""MANUAL_CONTROL axis that the sender does not drive."""
+IDLE_RECEIVER_US = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
+"""A transmitter that lies on the table: throttle down, the rest centred."""
+
+_RECEIVER_PERIOD_NS = NS_PER_S // 50
+_OPTION_OVERRIDE_SWITCH = 46
+_OPTIONS_IGNORE_RECEIVER = 1
+_OPTIONS_IGNORE_OVERRIDES = 2
+
+
+class RcEngine:
+    """Merges receiver and overrides, channel by channel; stamps are nanoseconds of one clock."""
+
+    def __init__(self, params: Params, receiver_us: Sequence[int] | None) -> None:
+        self._params = params
+        self._receiver_us = receiver_us
+        self._override_us = [RELEASE] * CHANNELS
+        self._override_ns = [0] * CHANNELS
+        self._fresh_override = False
+        self._next_receiver_ns = 0
+        self._switch = _OverrideSwitch()
+        self.channels_us = [0] * CHANNELS
+        """What RC_CHANNELS shows and the modes act on; 0 = never had a value."""
+        self.found = receiver_us is not None
+        """There is a receiver, or an override has come."""
+
+    def override(self, raw_us: Sequence[int], now_ns: int) -> None:
+        """Take the 18 fields of one RC_CHANNELS_OVERRIDE."""
+        for index, value in enumerate(raw_us[:CHANNELS]):
+            if index < PRIMARY_CHANNELS:
+                if value != IGNORE:
+                    self._set(index, value, now_ns)
+            elif value == RELEASE_ON_AUX:
+                self._set(index, RELEASE, now_ns)
+            elif value not in (RELEASE, IGNORE):
+                self._set(index, value, now_ns)
+
+    def manual_control(self, *, x: int, y: int, z: int, r: int, now_ns: int) -> None:
+        """Take a MANUAL_CONTROL: -1000..1000 (z 0..1000); +x is forward, hence a lower PWM."""
+        if z < 0:
+            return
+        axes = (("ROLL", y, 1), ("PITCH", x, -1), ("YAW", r, 1))
+        for axis, value, sign in axes:
+            index = self.index_of(axis)
+            released = value == AXIS_ABSENT
+            self._set(
+                index, RELEASE if released else self._pwm(index, sign * value + 1000, 2000), now_ns
+            )
+        index = self.index_of("THROTTLE")
+        self._set(index, RELEASE if z == AXIS_ABSENT else self._pwm(index, z, 1000), now_ns)
+
+    def clear_overrides(self) -> None:
+        """Drop every override at once."""
+        self._override_us = [RELEASE] * CHANNELS
+
+    def index_of(self, axis: str) -> int:
+        """Zero-based channel of ROLL, PITCH, THROTTLE or YAW by RCMAP_*."""
+        mapped = self._params.integer(f"RCMAP_{axis}")
+        return min(max(mapped, 1), RC_CHANNELS_WITH_PARAMS) - 1
+
+    def update(self, now_ns: int) -> bool:
+        """Refresh ``channels_us``; True if anything supplied a value (the link is alive)."""
+        frame = self._receiver_us is not None and now_ns >= self._next_receiver_ns
+        if not (frame or self._fresh_override):
+            self._watch_switch(now_ns)
+            return False
+        self._fresh_override = False
+        if frame:
+            self._next_receiver_ns = now_ns + _RECEIVER_PERIOD_NS
+        supplied = False
+        for index in range(CHANNELS):
+            value = self._source(index, now_ns)
+            if value is not None:
+                self.channels_us[index] = value
+                supplied = True
+        self._watch_switch(now_ns)
+        return supplied
+
+    def _source(self, index: int, now_ns: int) -> int | None:
+        options = self._params.integer("RC_OPTIONS")
+        if self._is_overridden(index, now_ns) and not options & _OPTIONS_IGNORE_OVERRIDES:
+            return self._override_us[index]
+        if self._receiver_us is None or options & _OPTIONS_IGNORE_RECEIVER:
+            return None
+        return self._receiver_us[index] if index < len(self._receiver_us) else 0
+
+    def _is_overridden(self, index: int, now_ns: int) -> bool:
+        if self._override_us[index] == RELEASE:
+            return False
+        lifetime_s = self._params["RC_OVERRIDE_TIME"]
+        return lifetime_s < 0.0 or now_ns - self._override_ns[index] < lifetime_s * NS_PER_S
+
+    def _set(self, index: int, value_us: int, now_ns: int) -> None:
+        if not self._switch.enabled:
+            return
+        self._override_us[index] = value_us
+        self._override_ns[index] = now_ns
+        self._fresh_override = True
+        self.found = True
+
+    def _pwm(self, index: int, numerator: int, denominator: int) -> int:
+        low = self._params.integer(f"RC{index + 1}_MIN")
+        high = self._params.integer(f"RC{index + 1}_MAX")
+        return low + (high - low) * numerator // denominator
+
+    def _watch_switch(self, now_ns: int) -> None:
+        for channel in range(1, RC_CHANNELS_WITH_PARAMS + 1):
+            if self._params.integer(f"RC{channel}_OPTION") == _OPTION_OVERRIDE_SWITCH:
+                if self._switch.update(self.channels_us[channel - 1], now_ns):
+                    self.clear_overrides()
+                return
+
+
+class _OverrideSwitch:
+    """RCn_OPTION 46: high allows overrides, low forbids them, the middle changes nothing.
+
+    Read at 10 Hz and debounced for 0.2 s, so a flip acts after 0.2 to 0.3 s (0.38 s was measured).
+    """
+
+    _PERIOD_NS = NS_PER_S // 10
+    _DEBOUNCE_NS = NS_PER_S // 5
+
+    def __init__(self) -> None:
+        self.enabled = True
+        self._due_ns = 0
+        self._candidate = "unknown"
+        self._since_ns = 0
+
+    def update(self, pwm_us: int, now_ns: int) -> bool:
+        """True when overrides have just been forbidden."""
+        if now_ns < self._due_ns:
+            return False
+        self._due_ns = now_ns + self._PERIOD_NS
+        position = self._position(pwm_us)
+        if position != self._candidate:
+            self._candidate, self._since_ns = position, now_ns
+            return False
+        if position in ("middle", "invalid") or now_ns - self._since_ns < self._DEBOUNCE_NS:
+            return False
+        was_enabled, self.enabled = self.enabled, position == "high"
+        return was_enabled and not self.enabled
+
+    @staticmethod
+    def _position(pwm_us: int) -> str:
+        if not 900 < pwm_us < 2200:
+            return "invalid"
+        if pwm_us < 1200:
+            return "low"
+        return "high" if pwm_us > 1800 else "middle"

@@ -1,0 +1,111 @@
+"""Flies gate courses in stepped time: vehicle and expert in one process, no wire in between."""
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from sitl.clock import NS_PER_S
+from sitl.course.course import Course, Start, in_gate_axes
+from sitl.expert.disturbance import StickDisturbance
+from sitl.expert.expert import Expert, Sticks4
+from sitl.simulated_vehicle import Pose, Vehicle
+from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
+from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.modes import Mode
+
+TICK_NS = NS_PER_S // 100
+REST_S = 3.0
+"""Flown on after the last gate."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tick:
+    pose: Pose
+    next_gate: int | None
+    label: Sticks4
+    flown: Sticks4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CourseFlight:
+    course: Course
+    vehicle: Vehicle
+    ticks: list[Tick]
+
+    @property
+    def succeeded(self) -> bool:
+        return self.vehicle.log.next_gate is None and not self.vehicle.log.crashed
+
+    @property
+    def labels(self):
+        return np.array([tick.label for tick in self.ticks])
+
+    def mean_speed_mps(self) -> float:
+        """Along the straight legs between the first gate passed and the last."""
+        passed = self.vehicle.log.summary(self.vehicle.ap, 0)["gates"]["passed"]
+        centers = [self.course.gates[entry["index"]].center_ned_m for entry in passed]
+        way_m = sum(math.dist(a, b) for a, b in pairwise(centers))
+        return way_m / (passed[-1]["t_s"] - passed[0]["t_s"]) if len(passed) > 1 else math.nan
+
+    def misses_m(self) -> list[float]:
+        """How far from the centre, sideways or up, each gate was passed."""
+        misses = []
+        for before, after in pairwise(self.ticks):
+            if after.next_gate != before.next_gate:
+                gate = self.course.gates[before.next_gate]
+                _, right_m, down_m = in_gate_axes(gate, after.pose.body.position_ned_m)
+                misses.append(max(abs(right_m), abs(down_m)))
+        return misses
+
+
+def pwm_us(sticks: Sticks4) -> list[int]:
+    """RC_CHANNELS_OVERRIDE of the default calibration; pitch is reversed."""
+    throttle, yaw, pitch, roll = sticks
+    axes = (roll, -pitch, throttle, yaw)
+    return [round(1500 + 500 * axis) for axis in axes] + [65535] * 4
+
+
+def fly_course(
+    course: Course,
+    speed_mps: float,
+    *,
+    conditions: Conditions = NOMINAL,
+    start: Start | None = None,
+    disturbance: StickDisturbance | None = None,
+    limit_s: float = 60.0,
+) -> CourseFlight:
+    config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0, conditions=conditions)
+    vehicle = Vehicle(links=1, boot_ns=0, config=config, course=course)
+    if start is None:
+        vehicle.step(50 * STEP_NS)
+        assert vehicle.ap.set_mode(Mode.ALT_HOLD)
+        assert vehicle.ap.arm(force=False), vehicle.ap.texts
+    else:
+        vehicle.launch(start)
+    next_gate = start.next_gate if start else 0
+    expert = Expert(course, speed_mps, next_gate=next_gate, params=vehicle.params)
+    ticks: list[Tick] = []
+    over_ns = None
+    begin_ns = now_ns = vehicle.ap.now_ns
+    while not vehicle.log.crashed and now_ns - begin_ns < limit_s * NS_PER_S:
+        pose, next_gate = vehicle.pose, vehicle.log.next_gate
+        if next_gate is None:
+            over_ns = over_ns or now_ns + round(REST_S * NS_PER_S)
+            if now_ns >= over_ns:
+                break
+        body, t_s = pose.body, now_ns / NS_PER_S
+        label = expert.sticks(
+            body.position_ned_m,
+            body.velocity_ned_mps,
+            body.ned_from_body_wxyz,
+            body.rate_body_radps,
+            t_s,
+        )
+        flown = disturbance.flown(label, t_s) if disturbance else label
+        ticks.append(Tick(pose=pose, next_gate=next_gate, label=label, flown=flown))
+        vehicle.ap.rc.override(pwm_us(flown), now_ns)
+        now_ns += TICK_NS
+        vehicle.step(now_ns)
+    return CourseFlight(course=course, vehicle=vehicle, ticks=ticks)

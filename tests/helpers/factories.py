@@ -1,0 +1,90 @@
+"""Records with sensible defaults: a vehicle that flies well at 100 Hz with 30 Hz vision.
+
+Stamps follow from the index alone, so a series of ticks is a plausible flight; any field can be
+replaced by keyword.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.records import NEUTRAL, Sticks, StickTrace, Tick, VehicleState, VisionTick
+
+START_NS = 1_000 * NS_PER_S
+TICK_NS = 10 * NS_PER_MS
+FRAME_NS = NS_PER_S // 30
+HOVER = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.81)
+
+
+def make_state(at_ns: int = START_NS, **changes: Any) -> VehicleState:
+    """Level hover; every part arrived at ``at_ns``."""
+    values = np.array(HOVER, dtype=np.float32)
+    values.flags.writeable = False
+    state = VehicleState(
+        values=values,
+        attitude_ns=at_ns,
+        rate_ns=at_ns,
+        velocity_ns=at_ns,
+        specific_force_ns=at_ns,
+    )
+    return replace(state, **changes)
+
+
+def make_trace(sticks: Sticks = NEUTRAL) -> StickTrace:
+    """An action that no stage changes."""
+    return StickTrace(raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks)
+
+
+def make_tick(index: int = 0, **changes: Any) -> Tick:
+    """Tick ``index``: on time, 2 ms of prediction, 3 ms old attitude, 40 ms old feature, flying."""
+    due_ns = START_NS + index * TICK_NS
+    tick = Tick(
+        serial=index,
+        index=index,
+        due_ns=due_ns,
+        woke_ns=due_ns,
+        missed_slots=0,
+        predict_ns=2 * NS_PER_MS,
+        sent_ns=due_ns + 2 * NS_PER_MS,
+        feature_frame_id=1,
+        feature_captured_ns=due_ns - 38 * NS_PER_MS,
+        state=make_state(due_ns - NS_PER_MS),
+        trace=make_trace(),
+        sent=NEUTRAL,
+        release_reason=None,
+        mode="ALT_HOLD",
+        armed=True,
+        rc_channels_us=(1500,) * 8,
+        rc_sticks=NEUTRAL,
+    )
+    return replace(tick, **changes)
+
+
+def make_released_tick(index: int = 0, reason: str = "no feature yet", **changes: Any) -> Tick:
+    """Tick ``index`` of a vehicle that the pilot flies."""
+    released: dict[str, Any] = {
+        "predict_ns": None,
+        "trace": None,
+        "sent": None,
+        "release_reason": reason,
+    }
+    return make_tick(index, **(released | changes))
+
+
+def make_vision_tick(frame_id: int = 1, **changes: Any) -> VisionTick:
+    """Frame ``frame_id``: taken up 2 ms after exposure, encoded in 20 ms, no frame dropped."""
+    captured_ns = START_NS + (frame_id - 1) * FRAME_NS
+    rgb = np.zeros((24, 32, 3), dtype=np.uint8)
+    rgb.flags.writeable = False
+    vision = VisionTick(
+        serial=frame_id - 1,
+        frame_id=frame_id,
+        captured_ns=captured_ns,
+        started_ns=captured_ns + 2 * NS_PER_MS,
+        ready_ns=captured_ns + 22 * NS_PER_MS,
+        dropped_frames=0,
+        rgb=rgb,
+    )
+    return replace(vision, **changes)

@@ -1,0 +1,75 @@
+"""Flights to record: images that say which one they are, and a meta."""
+
+import os
+import signal
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from helpers.factories import START_NS, make_vision_tick
+from mavbridge.core.records import ImageArray, VisionTick
+from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.rows import FrameRow
+from policy.contract import Contract
+
+_BITS = 12
+_BLOCK = 16
+
+
+def picture(number: int, *, height: int = 48, width: int = 64) -> ImageArray:
+    """An image that still shows its number after H.264: one block a bit."""
+    rgb = np.full((height, width, 3), 128, np.uint8)
+    for bit in range(_BITS):
+        y, x = _BLOCK * (bit // 4), _BLOCK * (bit % 4)
+        rgb[y : y + _BLOCK, x : x + _BLOCK] = 255 * (number >> bit & 1)
+    return rgb
+
+
+def number_of(rgb: ImageArray) -> int:
+    """What ``picture`` was given."""
+    half = _BLOCK // 2
+    return sum(
+        int(rgb[_BLOCK * (bit // 4) + half, _BLOCK * (bit % 4) + half, 1] > 127) << bit
+        for bit in range(_BITS)
+    )
+
+
+def make_frame(number: int, **changes: Any) -> VisionTick:
+    """Frame ``number``, from 0, with its picture."""
+    return replace(make_vision_tick(number + 1, rgb=picture(number)), **changes)
+
+
+def make_row(number: int, **changes: Any) -> FrameRow:
+    """The row of frame ``number``."""
+    vision = make_vision_tick(number + 1)
+    row = FrameRow(
+        frame_id=number, captured_ns=vision.captured_ns, ready_ns=vision.ready_ns, dropped_before=0
+    )
+    return replace(row, **changes)
+
+
+def make_meta(**changes: Any) -> FlightMeta:
+    """A flight of 100 and 30 Hz."""
+    meta = FlightMeta(
+        started_at="2026-01-02T03:04:05+00:00",
+        start_ns=START_NS,
+        mavbridge_version="0.1.0",
+        source="flight",
+        policy="scripted:hover",
+        engine="torch",
+        mode="dual",
+        action_hz=100.0,
+        visual_hz=30.0,
+        contract=Contract(),
+    )
+    return replace(meta, **changes)
+
+
+def send_signal(pid: int, number: signal.Signals) -> None:
+    """Stop, kill or continue a child, and see it done: ``os.kill`` returns before that."""
+    os.kill(pid, number)
+    if number != signal.SIGCONT:
+        with suppress(ChildProcessError):  # its parent's other thread has seen to it
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WSTOPPED | os.WNOWAIT)

@@ -1,0 +1,219 @@
+"""A world model that is small and quick, flights to start from, and rollouts of both."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
+from helpers.recordings import make_meta
+from mavbridge.commands.imagine.collected import CollectedOutput
+from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
+from mavbridge.commands.imagine.loop import Segment, rollout
+from mavbridge.commands.imagine.output import OnFrame, ignore
+from mavbridge.commands.imagine.plan import RolloutPlan
+from mavbridge.commands.imagine.sampling import Sampler
+from mavbridge.commands.imagine.start import Start, read_start
+from mavbridge.commands.imagine.streamed import StreamedOutput
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.records import FloatArray, ImageArray, Sticks
+from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.recording.flight_writer import FlightWriter
+from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.video.file import FragmentedMp4
+from policy.contract import Contract, Executable
+from policy.world_model.config import WorldModelConfig
+from policy.world_model.model import WorldModel
+
+SIZE = 32
+TINY = WorldModelConfig(
+    image_size=SIZE,
+    latent_channels=4,
+    autoencoder_widths=(4, 4, 4),
+    dynamics_width=32,
+    dynamics_depth=1,
+)
+
+
+class InProcessWriter:
+    """Stands in for ``VideoWriter`` where its process is not what is tested: it takes seconds."""
+
+    def __init__(self, video: Path, *, pressure: str, hz: float) -> None:
+        assert pressure == "offline"
+        self._file = FragmentedMp4(video, height=SIZE, width=SIZE, hz=hz)
+        self._is_closed = False
+        self.written = self.lost = 0
+
+    def submit(self, rgb: ImageArray, row: FrameRow) -> bool:
+        assert row.frame_id == self.written
+        self._file.append(rgb, row.captured_ns)
+        self.written += 1
+        return True
+
+    def finish(self) -> None:
+        self.close()
+
+    def close(self) -> None:
+        if not self._is_closed:
+            self._is_closed = True
+            self._file.close()
+
+
+class TinyWorld(WorldModel):
+    """A real world model with random weights, that says which frames it decoded, and where."""
+
+    def __init__(self, config: WorldModelConfig = TINY) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            super().__init__(config)
+            for weights in self.parameters():  # a new net is near zero: let it say something
+                weights.data += 0.1 * torch.randn(weights.shape)
+        self.eval()
+        self.decoded: list[tuple[str, int]] = []
+        """Thread and number of frames of every call."""
+
+    def decode(self, latents: Tensor) -> Tensor:
+        self.decoded.append((threading.current_thread().name, len(latents)))
+        return super().decode(latents)
+
+    @property
+    def frames_decoded(self) -> int:
+        return sum(count for _, count in self.decoded)
+
+
+def noise_executable(contract: Contract | None = None) -> Executable:
+    """A policy whose sticks depend on every pixel, the state and the history."""
+    contract = contract or Contract(feature_dim=1, arrays="numpy")
+
+    def encode(rgb: ImageArray) -> FloatArray:
+        return np.array([[rgb.astype(np.int64).sum() % 9973]], np.float32)
+
+    def act(feature: FloatArray, state: FloatArray, history: FloatArray, _: object) -> FloatArray:
+        assert state.shape == (1, contract.state_dim)
+        assert history.shape == (1, contract.history_len, 4)
+        phase = feature[0, 0] + state.sum() + history.sum()
+        steps = np.arange(contract.horizon)[:, None] + np.arange(4)
+        return 0.8 * np.sin(phase + steps)[None].astype(np.float32)
+
+    return Executable(
+        contract=contract, name="noise", engine="numpy", dual_rate=True, encode=encode, act=act
+    )
+
+
+def make_start(config: WorldModelConfig = TINY) -> Start:
+    random = np.random.default_rng(0)
+    shape = (config.context_frames, config.image_size, config.image_size, 3)
+    return Start(
+        images=random.integers(0, 255, shape).astype(np.uint8),
+        states=np.stack([make_state().values] * config.context_frames),
+        newest_ns=START_NS,
+        sent=((START_NS - NS_PER_S, Sticks(0.1, 0.2, 0.3, 0.4)),),
+    )
+
+
+def make_plan(**changes: int) -> RolloutPlan:
+    plan = RolloutPlan(iterations=3, frames=16, exe_steps=1, ddim_steps=1, seed=7)
+    return replace(plan, **changes)
+
+
+DECIDERS = ("world-model", "world-model from pixels", "toge")
+
+
+def make_decider(name: str, sampler: Sampler) -> Decider:
+    if name == "toge":
+        return PolicyDecider(noise_executable(), sampler)
+    return WorldModelDecider(sampler, from_pixels="pixels" in name)
+
+
+def make_sampler(
+    model: WorldModel | None = None, *, serial: bool = False, steps: int = 1
+) -> Sampler:
+    return Sampler(
+        model or TinyWorld(), ddim_steps=steps, decode_all=serial, clock=MonotonicClock()
+    )
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a rollout left."""
+
+    sha256: str
+    model: TinyWorld
+    sampler: Sampler
+    output: StreamedOutput | CollectedOutput
+
+
+def run(
+    out: Path,
+    plan: RolloutPlan,
+    *,
+    decider: str = "world-model",
+    serial: bool = False,
+    decode_video: bool = True,
+    model: TinyWorld | None = None,
+    on_frame: OnFrame = ignore,
+) -> Finished:
+    model = model or TinyWorld()
+    sampler = make_sampler(model, serial=serial, steps=plan.ddim_steps)
+    kind = CollectedOutput if serial else StreamedOutput
+    output = kind(
+        out,
+        sampler,
+        plan,
+        decode_video=decode_video,
+        clock=MonotonicClock(),
+        on_frame=on_frame,
+    )
+    try:
+        for segment in segments(sampler, plan, decider):
+            output.put(segment)
+        output.finish()
+    except BaseException:
+        output.close()
+        raise
+    return Finished(output.sha256, model, sampler, output)
+
+
+def segments(sampler: Sampler, plan: RolloutPlan, decider: str) -> Iterator[Segment]:
+    return rollout(sampler, make_decider(decider, sampler), make_start(), plan)
+
+
+def write_flight(
+    folder: Path,
+    *,
+    seconds: float = 1.0,
+    camera_hz: float = 30.0,
+    ticks: bool = True,
+    meta: FlightMeta | None = None,
+) -> Path:
+    """A recorded flight: frame k is of ``grey(k)``, tick j has velocity x = j / 100."""
+    folder.mkdir(parents=True, exist_ok=True)
+    writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
+    writer_ticks = round(100 * seconds) if ticks else 0
+    for index in range(writer_ticks):
+        at_ns = START_NS + index * TICK_NS
+        values = make_state().values.copy()
+        values[0] = index / 100
+        sticks = Sticks(throttle=0.0, yaw=index / 1000, pitch=0.0, roll=0.0)
+        state = make_state(at_ns, values=values)
+        writer.tick(make_tick(index, state=state, sent=sticks, sent_ns=at_ns))
+    for k in range(round(camera_hz * seconds)):
+        rgb = np.full((48, 64, 3), grey(k), np.uint8)
+        captured_ns = START_NS + round(k / camera_hz * NS_PER_S)
+        writer.frame(make_vision_tick(k + 1, captured_ns=captured_ns, rgb=rgb))
+    writer.finish(writer.meta)
+    return folder
+
+
+def grey(frame: int) -> int:
+    return 20 + 7 * (frame % 30)
+
+
+def start_of(folder: Path, start_s: float = 0.0, config: WorldModelConfig = TINY) -> Start:
+    flight: RecordedFlight = open_flight(folder)
+    return read_start(flight, config, start_s)

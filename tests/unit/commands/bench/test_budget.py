@@ -1,0 +1,92 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from helpers.bench_results import RESULT, make_flight
+from mavbridge.commands.bench.budget import ratios, read_budget, violations
+from mavbridge.core.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("encode: torch / roofline f32", 3.0),
+        ("sample: torch / roofline f32", 6.0),
+        ("encode: quick / roofline f32", 0.75),
+        ("encode: quick / torch", 0.25),
+        ("flight: torch period / asked period", 2.0),
+        ("flight: torch period / usual runner", 0.5),
+        ("flight: torch cpu an action / usual runner", 0.5),
+        ("flight: torch state to wire / usual runner", 0.05),
+        ("link: mavbridge, 100 Hz clock work / bare pymavlink loop", 2.0),
+    ],
+)
+def test_ratios_compare_two_figures_of_one_run(name: str, value: float) -> None:
+    assert ratios(RESULT)[name] == pytest.approx(value)
+
+
+def test_there_are_no_other_ratios() -> None:
+    assert len(ratios(RESULT)) == 9
+
+
+def test_a_run_without_the_other_side_has_no_ratio_with_it() -> None:
+    alone = replace(RESULT, kernels=(), flights=RESULT.flights[:1], links=RESULT.links[:1])
+    assert ratios(alone) == {"flight: torch period / asked period": pytest.approx(2.0)}
+
+
+def test_a_flight_that_never_acted_has_no_ratio() -> None:
+    idle = make_flight("mavbridge", "torch", action_hz=None, cores=0.0, wire_ms=1.0)
+    grounded = replace(RESULT, kernels=(), links=(), flights=(idle, RESULT.flights[1]))
+    assert ratios(grounded) == {}
+
+
+def test_within_the_budget_nothing_is_said() -> None:
+    assert violations({"a": 1.0, "b": 2.0}, {"a": 1.0, "b": 2.5}) == ()
+
+
+def test_what_got_worse_is_named_with_both_figures() -> None:
+    (line,) = violations({"a": 1.5, "b": 2.0}, {"a": 1.0, "b": 2.5})
+    assert line.startswith("a: 1.5")
+    assert "1" in line.split("at most")[1]
+
+
+def test_a_ratio_that_was_not_measured_is_not_a_success() -> None:
+    (line,) = violations({"b": 2.0}, {"a": 1.0})
+    assert "a: not measured" in line
+    assert "b" in line
+
+
+def test_nan_is_over_every_budget() -> None:
+    assert violations({"a": float("nan")}, {"a": 1.0})
+
+
+def test_reads_what_the_repository_holds() -> None:
+    budget = read_budget(Path(__file__).parents[4] / "benchmarks" / "budget.json")
+    assert all(most > 0 for most in budget.values())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "[]", "{}", '{"ratios": {}}', '{"ratios": {"a": "1"}}', '{"ratios": {"a": true}}'),
+        *('{"ratios": {"a": 0}}', '{"ratios": {"a": NaN}}', '{"ratios": [1]}'),
+    ],
+)
+def test_refuses_what_is_no_budget(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "budget.json"
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"budget\.json"):
+        read_budget(path)
+
+
+def test_refuses_a_budget_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot read"):
+        read_budget(tmp_path / "none.json")
+
+
+def test_a_budget_survives_its_own_format(tmp_path: Path) -> None:
+    path = tmp_path / "budget.json"
+    path.write_text(json.dumps({"ratios": {"a": 2, "b": 0.5}}))
+    assert read_budget(path) == {"a": 2.0, "b": 0.5}

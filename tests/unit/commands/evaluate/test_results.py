@@ -1,0 +1,99 @@
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from helpers.evaluated_flights import crashed, finished
+from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
+from mavbridge.commands.evaluate.results import Evaluation, summarise, to_json
+from mavbridge.commands.evaluate.tables import print_evaluation
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import NEUTRAL, Sticks
+from mavbridge.simulation.result import EpisodeResult, StickMeter
+
+
+def evaluation(*episodes: EpisodeResult) -> Evaluation:
+    return Evaluation(
+        policy="toge",
+        engine="openvino",
+        mode="lockstep",
+        conditions="random",
+        vision_delay_ms=50.0,
+        seed=0,
+        asked_episodes=5,
+        episodes=episodes,
+    )
+
+
+def test_the_figures_of_three_flights() -> None:
+    summary = summarise([finished(), crashed(), finished(gate_times_s=(3.0, 6.0), flown_s=7.5)])
+    assert summary.success_rate.value == pytest.approx(2 / 3)
+    assert summary.gates_passed is not None
+    assert summary.gates_passed.value == pytest.approx(5 / 3)
+    assert summary.mean_speed_mps is not None
+    assert summary.mean_speed_mps.value == pytest.approx((3.0 + 6.0 + 4.0) / 3)
+    assert summary.flown_s is not None
+    assert summary.flown_s.value == pytest.approx(22.5 / 3)
+    assert summary.course_s is not None
+    assert (summary.course_s.value, summary.course_s.count) == (7.5, 2)
+    assert summary.stick_rate_per_s is not None
+    assert (summary.stick_rate_per_s.value, summary.stick_rate_per_s.count) == (0.5, 2)
+    assert summary.outcomes == (("finished", 2), ("crashed", 1))
+
+
+def test_a_flight_without_time_has_no_speed() -> None:
+    assert crashed(flown_s=0.0, distance_m=0.0).mean_speed_mps == 0.0
+    assert crashed().course_s is None
+
+
+def test_json_holds_the_summary_and_every_episode() -> None:
+    document = json.loads(to_json(evaluation(finished(), crashed())))
+    assert document["summary"]["success_rate"]["value"] == 0.5
+    assert document["summary"]["outcomes"] == {"finished": 1, "crashed": 1}
+    assert document["asked_episodes"] == 5
+    assert (document["conditions"], document["vision_delay_ms"]) == ("random", 50.0)
+    assert [episode["outcome"] for episode in document["episodes"]] == ["finished", "crashed"]
+    assert document["episodes"][0]["gate_times_s"] == [4.0, 9.0]
+
+
+def test_json_of_no_flight_at_all() -> None:
+    document = json.loads(to_json(evaluation()))
+    assert document["summary"] is None
+    assert document["episodes"] == []
+
+
+def test_the_table_shows_rate_interval_and_ends() -> None:
+    console = Console(width=100, record=True, file=Path("/dev/null").open("w"))  # noqa: SIM115
+    print_evaluation(evaluation(finished(), crashed()), console)
+    text = console.export_text()
+    console.file.close()
+    assert "50.0%" in text
+    assert "9.5% to 90.5%" in text  # Wilson's of 1 in 2
+    assert "2 flights: 1 finished, 1 crashed" in text
+    assert "lockstep, random conditions, images 50 ms later" in text
+
+
+def test_the_picture_is_drawn(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the extra bench")
+    from mavbridge.commands.evaluate.figure import draw
+
+    draw(evaluation(finished(), crashed(stick_rate_per_s=1.0)), tmp_path / "flights.png")
+    assert (tmp_path / "flights.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_stick_movement_counts_only_what_the_policy_sent_in_a_row() -> None:
+    meter = StickMeter()
+    full_yaw = Sticks(throttle=0.0, yaw=1.0, pitch=0.0, roll=0.0)
+    half = Sticks(throttle=0.5, yaw=0.5, pitch=0.5, roll=0.5)
+    meter.emit(make_released_tick(0))
+    assert meter.engaged_ns is None
+    assert meter.rate_per_s is None
+    meter.emit(make_tick(1, sent=NEUTRAL, trace=make_trace()))
+    meter.emit(make_vision_tick())
+    meter.emit(make_tick(2, sent=full_yaw, trace=make_trace(full_yaw)))  # 1 in 10 ms
+    meter.emit(make_released_tick(3))
+    meter.emit(make_tick(4, sent=half, trace=make_trace(half)))  # not compared across the release
+    meter.emit(make_tick(5, sent=half, trace=make_trace(half)))  # 0 in 10 ms
+    assert meter.engaged_ns == make_tick(1).woke_ns
+    assert meter.rate_per_s == pytest.approx(1 / 4 / (20 * NS_PER_MS / 1e9))

@@ -1,0 +1,184 @@
+"""``mavbridge imagine --evaluate`` from the command line."""
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from helpers.panoramas import write_turning_flight
+from helpers.recordings import make_meta
+from helpers.rollouts import TinyWorld, write_flight
+from mavbridge.__main__ import main
+from mavbridge.commands.evaluate_imagination import run
+from mavbridge.commands.evaluate_imagination.runs import survey
+from mavbridge.commands.imagine.sampling import Sampler
+from policy.checkpoints.world_model_file import save_world_model
+from policy.contract import Contract
+
+Evaluate = Callable[..., tuple[int, str]]
+QUICK = ("--world-model", "world.safetensors", "--ddim-steps", "1")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Flights, a world model, and things that are neither."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    write_turning_flight(folder / "flights" / "a", phase=0.0)
+    write_turning_flight(folder / "flights" / "b", phase=2.0, conditions={})
+    write_flight(folder / "flights" / "short", seconds=1.0)
+    failed = make_meta(source="demonstration", success=False)
+    write_flight(folder / "flights" / "failed", meta=failed)
+    enu = make_meta(contract=Contract(state_frame="enu_flu"))
+    write_flight(folder / "enu", seconds=3.0, meta=enu)
+    (folder / "empty").mkdir()
+    save_world_model(folder / "world.safetensors", TinyWorld(), half=False)
+    broken = TinyWorld()
+    for weight in broken.dynamics.parameters():
+        weight.data.fill_(1e30)  # finite, and nothing that it makes is
+    save_world_model(folder / "broken.safetensors", broken, half=False)
+    return folder
+
+
+@pytest.fixture
+def evaluate(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Evaluate:
+    """Exit status and output, from inside the folder."""
+    monkeypatch.chdir(folder)
+
+    def evaluated(*arguments: str) -> tuple[int, str]:
+        with pytest.raises(SystemExit) as stopped:
+            main(["imagine", "--evaluate", *arguments])
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err
+        assert isinstance(stopped.value.code, int)
+        return stopped.value.code, " ".join((captured.out + captured.err).split())
+
+    return evaluated
+
+
+@pytest.mark.usefixtures("evaluate")
+def test_it_may_come_after_the_flights_too(capsys: pytest.CaptureFixture[str]) -> None:
+    counts = ("--windows", "2", "--chains", "1")
+    with pytest.raises(SystemExit) as stopped:
+        main(["imagine", "flights", *QUICK, *counts, "--evaluate"])
+    assert stopped.value.code == 0
+    assert "action swap" in capsys.readouterr().out
+
+
+def test_everything_is_told_and_written(evaluate: Evaluate, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "quality.json"
+    flags = ("--windows", "4", "--chains", "2", "--exe-steps", "4", "--json", str(out))
+    status, text = evaluate("flights", *QUICK, *flags)
+    assert status == 0, text
+    assert "4 windows of 2 flights" in text
+    assert "1 too short, 1 demonstrations that failed" in text
+    assert "2 flights do not tell their field of view" in text
+    assert "1 flights do not tell the yaw rate" in text
+    for what in ("gyro warp", "imagined frames", "action swap", "drift"):
+        assert what in text
+    told = json.loads(out.read_text())
+    assert told["windows"] == 4
+    assert told["given"]["flights"] == 2
+    assert [row["step"] for row in told["frames"]] == [1, 4, 8, 16] * 4
+    psnr_db = {(row["method"], row["step"]): row["psnr_db"] for row in told["frames"]}
+    assert psnr_db["gyro warp", 4] > psnr_db["copy last", 4] + 3
+    real = [r for r in told["obedience"] if r["teller"] == "real frames" and r["axis"] == "yaw"]
+    assert [row["pairs"] for row in real] == [16, 16]
+    assert all(0.8 < row["slope"] < 1.2 and row["spearman"] > 0.9 for row in real)
+    assert told["own_actions_nearer"]["count"] == 4
+    assert [row["chains"] for row in told["drift"]] == [2] * 10
+    assert [row["scored"] for row in told["drift"]] == [2] * 6 + [0] * 4
+
+
+def test_the_same_seed_tells_the_same_and_another_one_does_not(
+    evaluate: Evaluate, tmp_path: Path
+) -> None:
+    told = []
+    for name, seed in (("a", "5"), ("b", "5"), ("c", "6")):
+        out = tmp_path / name
+        flags = ("--windows", "2", "--chains", "1", "--seed", seed, "--json", str(out))
+        assert evaluate("flights/a", *QUICK, *flags)[0] == 0
+        told.append(out.read_text())
+    assert told[0] == told[1]
+    assert json.loads(told[0])["frames"] != json.loads(told[2])["frames"]
+
+
+def test_one_window_cannot_be_swapped(evaluate: Evaluate) -> None:
+    status, text = evaluate("flights/a", *QUICK, "--windows", "1", "--chains", "1")
+    assert status == 0, text
+    assert "action swap" not in text
+
+
+def test_ctrl_c_tells_what_there_is(
+    evaluate: Evaluate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, calls = tmp_path / "quality.json", []
+    sample = Sampler.sample
+
+    def interrupted(self: Sampler, *arguments: object, **named: object) -> object:
+        calls.append(arguments)
+        if len(calls) == 3:  # in the second window, of two samples each
+            os.kill(os.getpid(), signal.SIGINT)
+        return sample(self, *arguments, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Sampler, "sample", interrupted)
+    status, text = evaluate("flights", *QUICK, "--windows", "50", "--json", str(out))
+    assert status == 130
+    assert "interrupted" in text
+    told = json.loads(out.read_text())
+    assert told["windows"] == 2
+    assert told["drift"] == []
+
+
+def test_ctrl_c_before_the_first_window_is_no_error(
+    evaluate: Evaluate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(folder: Path, *arguments: object, **named: object) -> object:
+        os.kill(os.getpid(), signal.SIGINT)
+        return survey(folder, *arguments, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(run, "survey", interrupted)
+    status, text = evaluate("flights/short", "flights/a", *QUICK)
+    assert status == 130, text
+    assert "0 windows of 0 flights" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([], "name the flights"),
+        (["nowhere"], "nowhere: no such folder"),
+        (["empty"], "empty: neither a flight"),
+        (["flights/short"], "no flight is long enough: 1 are too short"),
+        (["flights/failed"], "no flight is long enough"),
+        (["enu"], "states in enu_flu, the world model takes ned_frd"),
+        (["flights/a", "--exe-steps", "17"], "--exe-steps 17 is more than the 16"),
+        (["flights/a", "--windows", "0"], "windows must be between 1"),
+        (["flights/a", "--chains", "0"], "chains must be between 1"),
+        (["flights/a", "--fov", "180"], "fov must be between 10 and 170"),
+        (["flights/a", "--ddim-steps", "101"], "1..100"),
+        (["flights/a", "--world-model", "none.safetensors"], "none.safetensors"),
+        (["flights/a", "--world-model", "broken.safetensors"], "imagined NaN or infinity"),
+        (["flights/a", "--device", "cuda:9"], "cuda:9 is not available"),
+        (["flights/a", "--json", "empty"], "cannot write empty"),
+    ],
+)
+def test_bad_input_is_one_message(evaluate: Evaluate, arguments: list[str], told: str) -> None:
+    defaults = {"--world-model": "world.safetensors", "--ddim-steps": "1", "--windows": "2"}
+    given = [
+        part for key, value in defaults.items() if key not in arguments for part in (key, value)
+    ]
+    status, text = evaluate(*arguments, *given)
+    assert status == 1
+    assert told in text, text
+
+
+@pytest.mark.parametrize("flag", ["--start", "--out", "--decider"])
+def test_what_is_for_a_rollout_is_refused(evaluate: Evaluate, flag: str) -> None:
+    status, text = evaluate("flights/a", *QUICK, flag, "toge")
+    assert status == 2  # of the parser
+    assert f'Unknown option: "{flag}"' in text or f"Unknown option: {flag}" in text

@@ -1,0 +1,416 @@
+"""Flights to a LeRobot dataset and back, under the rules of lerobot's reader."""
+
+import json
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
+from helpers.lerobot_rules import broken_rules
+from mavbridge.__main__ import main
+from mavbridge.commands.export.run import Exported, export, write_dataset
+from mavbridge.config.export import ExportConfig
+from mavbridge.core.errors import MavbridgeError, UserError
+from policy.data.episodes import Episode
+from policy.data.flight_folders import read_flight
+from policy.data.lerobot import read_dataset
+
+START = 10**9
+SIZE = 48
+
+
+def fly(
+    folder: Path,
+    *,
+    frames: int = 30,
+    period_ms: float = 33.0,
+    expert: bool = True,
+    released: range = range(0),
+    video_frames: int | None = None,
+    size: int = SIZE,
+    number: int = 0,
+    **meta: object,
+) -> Path:
+    """A flight of 100 and 30 Hz in which every tick has a state and sticks of its own."""
+    captured = [START + 7 * MS + round(k * period_ms * MS) for k in range(frames)]
+    woke = list(range(START, captured[-1] + 50 * MS, 10 * MS))
+    count = len(woke)
+    state = [(0.01 * k, number, *LEVEL[2:]) for k in range(count)]
+    sent = [None if k in released else (-0.001 * k, 0.0, 0.0, 0.5) for k in range(count)]
+    labels = [(0.001 * k, 0.1, 0.2, 0.3) for k in range(count)] if expert else None
+    shown = frames if video_frames is None else video_frames
+    return write_flight(
+        folder,
+        ticks_table(
+            woke_ns=woke,
+            expert=labels,
+            sent=sent,
+            state=state,
+            attitude_lag_ns=2 * MS,
+            sent_lag_ns=1 * MS,
+        ),
+        captured_ns=captured,
+        images=[spot(size, 2 * k / frames - 1) for k in range(shown)],
+        **meta,
+    )
+
+
+def write(
+    flights: list[Path], out: Path, video_file_bytes: int = 10**9, data_file_bytes: int = 10**9
+) -> Exported:
+    out.mkdir()
+    return write_dataset(
+        [read_flight(flight) for flight in flights],
+        out,
+        ExportConfig(out=out, task="fly the gates"),
+        video_file_bytes=video_file_bytes,
+        data_file_bytes=data_file_bytes,
+    )
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    root = tmp_path_factory.mktemp("flights")
+    return [fly(root / str(k), frames=20 + 5 * k, number=k) for k in range(3)]
+
+
+@pytest.fixture(scope="module")
+def dataset(flights: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three episodes, all in one file."""
+    out = tmp_path_factory.mktemp("exported") / "dataset"
+    write(flights, out)
+    return out
+
+
+@pytest.fixture
+def copy(dataset: Path, tmp_path: Path) -> Path:
+    """To break."""
+    return Path(shutil.copytree(dataset, tmp_path / "copy"))
+
+
+def test_the_dataset_keeps_the_rules_of_the_reader(dataset: Path) -> None:
+    assert broken_rules(dataset) == []
+    files = [str(path.relative_to(dataset)) for path in dataset.rglob("*") if path.is_file()]
+    assert sorted(files) == [
+        "data/chunk-000/file-000.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+        "videos/observation.images.front/chunk-000/file-000.mp4",
+    ]
+
+
+def _row(flight: Episode, captured_ns: int) -> tuple[int, int, int]:
+    """Tick, label and sent sticks of a frame, found the slow way."""
+    arrived = [max(a, v) for a, v in zip(flight.attitude_ns, flight.velocity_ns, strict=True)]
+    return (
+        max(k for k, at in enumerate(arrived) if at <= captured_ns),
+        max(k for k, at in enumerate(flight.target_ns) if at <= captured_ns),
+        max((k for k, at in enumerate(flight.sent_ns) if at <= captured_ns), default=-1),
+    )
+
+
+def test_a_round_trip_keeps_states_sticks_and_stamps(flights: list[Path], dataset: Path) -> None:
+    for folder, back in zip(flights, read_dataset(dataset), strict=True):
+        flight = read_flight(folder)
+        assert back.state_frame == flight.state_frame
+        np.testing.assert_array_equal(back.captured_ns, flight.captured_ns)
+        for row, captured_ns in enumerate(flight.captured_ns.tolist()):
+            tick, label, sent = _row(flight, captured_ns)
+            np.testing.assert_array_equal(back.state[row], flight.state[tick])
+            np.testing.assert_array_equal(back.target[row], flight.target[label])
+            np.testing.assert_array_equal(back.sent[row], flight.sent[sent])
+            assert (back.tick_ns[row], back.attitude_ns[row], back.velocity_ns[row]) == (
+                *(flight.tick_ns[tick], flight.attitude_ns[tick], flight.velocity_ns[tick]),
+            )
+            assert back.target_ns[row] == flight.target_ns[label]
+            assert back.sent_ns[row] == flight.sent_ns[sent]
+
+
+def test_a_round_trip_keeps_the_images(flights: list[Path], dataset: Path) -> None:
+    for folder, back in zip(flights, read_dataset(dataset), strict=True):
+        before = np.stack(list(read_flight(folder).decode())).astype(int)
+        after = np.stack(list(back.decode())).astype(int)
+        assert after.shape == before.shape
+        # closer to its own image than to the next one, every one of them
+        own = np.abs(after - before).mean(axis=(1, 2, 3))
+        assert own.max() < 3.0
+        assert (own[:-1] < np.abs(after[:-1] - before[1:]).mean(axis=(1, 2, 3))).all()
+
+
+def test_what_was_sent_is_imitated_where_there_is_no_expert(tmp_path: Path) -> None:
+    write([fly(tmp_path / "a", expert=False, source="flight")], tmp_path / "out")
+    (back,) = read_dataset(tmp_path / "out")
+    np.testing.assert_array_equal(back.target, back.sent)
+    assert (back.target_ns <= back.captured_ns).all()
+
+
+def test_small_files_hold_an_episode_each(flights: list[Path], tmp_path: Path) -> None:
+    done = write(flights, tmp_path / "out", video_file_bytes=1, data_file_bytes=1)
+    assert done.episodes == 3
+    assert broken_rules(tmp_path / "out") == []
+    assert len(list(tmp_path.glob("out/videos/*/chunk-000/*.mp4"))) == 3
+    assert len(list(tmp_path.glob("out/data/chunk-000/*.parquet"))) == 3
+    back = read_dataset(tmp_path / "out")
+    assert [len(list(episode.decode())) for episode in back] == [20, 25, 30]
+    assert [episode.state[0, 1] for episode in back] == [0, 1, 2]
+
+
+def test_a_pause_makes_two_episodes(tmp_path: Path) -> None:
+    flight = fly(tmp_path / "a", expert=False, released=range(40, 60), source="flight")
+    write([flight], tmp_path / "out")
+    assert broken_rules(tmp_path / "out") == []
+    first, second = read_dataset(tmp_path / "out")
+    released = (START + 400 * MS, START + 600 * MS)
+    assert first.captured_ns[-1] <= released[0] + 33 * MS
+    assert second.captured_ns[0] >= released[1] - 33 * MS
+    images = list(read_flight(flight).decode())
+    skipped = len(images) - len(second.captured_ns)
+    error = np.abs(next(iter(second.decode())).astype(int) - images[skipped].astype(int))
+    assert error.mean() < 3.0
+
+
+def test_a_video_that_breaks_off_ends_its_episode(tmp_path: Path) -> None:
+    flights = [fly(tmp_path / "a", video_frames=12), fly(tmp_path / "b", number=1)]
+    done = write(flights, tmp_path / "out")
+    assert done.frames_lost == 18
+    assert broken_rules(tmp_path / "out") == []
+    assert [len(episode.captured_ns) for episode in read_dataset(tmp_path / "out")] == [12, 30]
+
+
+def test_statistics_are_those_of_the_data(dataset: Path) -> None:
+    stats = json.loads((dataset / "meta/stats.json").read_text())
+    back = read_dataset(dataset)
+    state = np.concatenate([episode.state for episode in back]).astype(np.float64)
+    found = stats["observation.state"]
+    np.testing.assert_allclose(found["mean"], state.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found["std"], state.std(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found["q90"], np.quantile(state, 0.9, axis=0), atol=1e-6)
+    assert found["count"] == [75]
+    images = np.concatenate([np.stack(list(episode.decode())) for episode in back]) / 255
+    colours = stats["observation.images.front"]
+    np.testing.assert_allclose(np.ravel(colours["mean"]), images.mean(axis=(0, 1, 2)), atol=0.02)
+    np.testing.assert_allclose(np.ravel(colours["std"]), images.std(axis=(0, 1, 2)), atol=0.02)
+    assert np.ravel(colours["q01"]).min() < np.ravel(colours["q50"]).min() < 0.4
+
+
+def status_of(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main([str(argument) for argument in arguments])
+    assert isinstance(stopped.value.code, int)
+    return stopped.value.code
+
+
+def test_the_command_exports_what_train_learns_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k in range(2):
+        fly(tmp_path / "flights" / str(k), number=k)
+    fly(tmp_path / "flights" / "failed", success=False)
+    out = tmp_path / "dataset"
+    assert status_of("export", tmp_path / "flights", "--out", out, "--task", "race") == 0
+    assert "1 of 3 flights" in capsys.readouterr().err
+    assert broken_rules(out) == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset", "flights"]
+    asked = ("--policy", "toge:small:resnet18", "--image-size", "32", "--steps", "2")
+    trained = tmp_path / "a.safetensors"
+    small = ("--batch-size", "4", "--out", trained)
+    assert status_of("train", out, *asked, *small) == 1
+    assert "--ages" in capsys.readouterr().err
+    assert status_of("train", out, "--ages", "20:60", *asked, *small) == 0
+    assert trained.is_file()
+
+
+def _two_sizes(root: Path) -> None:
+    fly(root / "flights" / "a")
+    fly(root / "flights" / "b", size=64)
+
+
+def _two_rates(root: Path) -> None:
+    fly(root / "flights" / "a")
+    fly(root / "flights" / "b", period_ms=66)
+
+
+def _two_frames(root: Path) -> None:
+    fly(root / "flights" / "a")
+    fly(root / "flights" / "b", contract={"state_frame": "enu_flu"})
+
+
+def _failed(root: Path) -> None:
+    fly(root / "flights" / "a", success=False)
+
+
+def _taken(root: Path) -> None:
+    fly(root / "flights" / "a")
+    (root / "out").mkdir()
+    (root / "out" / "diary.txt").touch()
+
+
+def _left_over(root: Path) -> None:
+    fly(root / "flights" / "a")
+    (root / "out.unfinished").mkdir()
+
+
+def _no_images(root: Path) -> None:
+    fly(root / "flights" / "a", video_frames=1)
+
+
+def _other_clock(root: Path) -> None:
+    folder = fly(root / "flights" / "a")
+    table = pq.read_table(folder / "frames.parquet")
+    late = pa.array([at + 10**12 for at in table["captured_ns"].to_pylist()], pa.int64())
+    pq.write_table(table.set_column(0, "captured_ns", late), folder / "frames.parquet")
+
+
+def _foreign(root: Path) -> None:
+    write_meta(root / "flights" / "a", format="something else")
+
+
+@pytest.mark.parametrize(
+    ("prepare", "says"),
+    [
+        (_two_sizes, "images of 64x64"),
+        (_two_rates, "export them apart"),
+        (_two_frames, "one kind at a time"),
+        (_failed, "all failed"),
+        (_taken, "not empty"),
+        (_left_over, "was killed"),
+        (_no_images, "not one image"),
+        (_other_clock, "of one clock"),
+        (_foreign, "not a flight of mavbridge"),
+    ],
+)
+def test_bad_input_is_one_message_and_leaves_nothing(
+    prepare: Callable[[Path], None],
+    says: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    prepare(tmp_path)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    assert status_of("export", tmp_path / "flights", "--out", tmp_path / "out") == 1
+    printed = capsys.readouterr().err
+    assert says in printed
+    assert "Traceback" not in printed
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_nothing_is_left_of_an_export_that_breaks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = fly(tmp_path / "a")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mavbridge.commands.export.dataset.pq.write_table", full)
+    with pytest.raises(UserError, match="No space left"):
+        export([flight], ExportConfig(out=tmp_path / "out"))
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = fly(tmp_path / "a")
+
+    def interrupted(folder: Path) -> Episode:
+        signal.raise_signal(signal.SIGINT)
+        return read_flight(folder)
+
+    monkeypatch.setattr("mavbridge.commands.export.run.read_flight", interrupted)
+    assert status_of("export", flight, "--out", tmp_path / "out") == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_flags_that_say_nothing_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MavbridgeError, match="--task"):
+        ExportConfig(out=tmp_path, task=" ")
+
+
+def _edit_info(root: Path, **changes: object) -> None:
+    path = root / "meta/info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def _edit_rows(root: Path, name: str, values: object) -> None:
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    place = table.column_names.index(name)
+    pq.write_table(
+        table.set_column(place, table.schema.field(name), pa.array(values, table[name].type)), path
+    )
+
+
+def _shift_episode(root: Path) -> None:
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    name = "videos/observation.images.front/from_timestamp"
+    moved = pa.array([at + 0.01 for at in table[name].to_pylist()], pa.float64())
+    pq.write_table(table.set_column(table.column_names.index(name), name, moved), path)
+
+
+def _forget_pandas(root: Path) -> None:
+    path = root / "meta/tasks.parquet"
+    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
+
+
+def _slow_video(root: Path) -> None:
+    """A frame less: its rows are not there any more."""
+    path = root / "videos/observation.images.front/chunk-000/file-000.mp4"
+    with av.open(str(path)) as container:
+        images = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"bf": "0"})
+        stream.height, stream.width, stream.pix_fmt = SIZE, SIZE, "yuv420p"
+        for image in images[:-1]:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda root: _edit_info(root, codebase_version="v2.1"), "codebase_version"),
+        (lambda root: _edit_info(root, fps=29.97), "fps"),
+        (lambda root: _edit_info(root, total_frames=1), "totals"),
+        (lambda root: _edit_rows(root, "timestamp", [0.0] * 75), "timestamp"),
+        (lambda root: _edit_rows(root, "index", list(range(1, 76))), "index is not"),
+        (lambda root: _edit_rows(root, "task_index", [1] * 75), "unknown task"),
+        (_shift_episode, "no frame within"),
+        (_forget_pandas, "not the index"),
+        (_slow_video, "ends before"),
+    ],
+)
+def test_the_rules_can_be_broken(spoil: Callable[[Path], None], says: str, copy: Path) -> None:
+    spoil(copy)
+    assert any(says in broken for broken in broken_rules(copy))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_lerobot_itself_reads_it(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    try:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    except (ImportError, RuntimeError, AttributeError) as error:
+        pytest.skip(f"lerobot cannot be imported here: {error}")
+    # Episodes that were read back above; here lerobot's own loader says the same.
+    lerobot = LeRobotDataset("local/test", root=dataset, video_backend="pyav")
+    assert (len(lerobot), lerobot.num_episodes, lerobot.fps) == (75, 3, 30)
+    row = 0
+    for episode in read_dataset(dataset):
+        for k, image in enumerate(episode.decode()):
+            item = lerobot[row]
+            np.testing.assert_array_equal(item["observation.state"].numpy(), episode.state[k])
+            np.testing.assert_array_equal(item["action"].numpy(), episode.target[k])
+            assert item["stamp.captured_ns"].item() == episode.captured_ns[k]
+            seen = item["observation.images.front"].numpy().transpose(1, 2, 0) * 255
+            np.testing.assert_allclose(seen, image, atol=1.0)
+            assert item["task"] == "fly the gates"
+            row += 1

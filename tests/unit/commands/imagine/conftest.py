@@ -1,0 +1,10 @@
+import pytest
+
+from helpers.rollouts import InProcessWriter
+from mavbridge.commands.imagine import streamed
+
+
+@pytest.fixture
+def in_process_writer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No writer process; the decode thread is there."""
+    monkeypatch.setattr(streamed, "VideoWriter", InProcessWriter)

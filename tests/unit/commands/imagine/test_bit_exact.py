@@ -1,0 +1,86 @@
+"""Decoding beside the loop gives the frames of the plain serial path, bit for bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.rollouts import DECIDERS, SIZE, make_plan, run
+from mavbridge.commands.imagine.files import read_rows
+from mavbridge.commands.imagine.plan import Stage
+from mavbridge.recording.video.file import count_frames, read_video
+
+
+@pytest.mark.parametrize("decider", DECIDERS)
+@pytest.mark.parametrize("exe_steps", [1, 2, 5, 16])
+@pytest.mark.usefixtures("in_process_writer")
+def test_both_paths_give_the_same_frames_rows_and_file(
+    tmp_path: Path, decider: str, exe_steps: int
+) -> None:
+    plan = make_plan(exe_steps=exe_steps, seed=exe_steps)
+    ours = run(tmp_path / "ours.mp4", plan, decider=decider)
+    plain = run(tmp_path / "plain.mp4", plan, decider=decider, serial=True)
+    assert ours.sha256 == plain.sha256
+    assert read_rows(tmp_path / "ours.mp4").equals(read_rows(tmp_path / "plain.mp4"))
+    assert (tmp_path / "ours.mp4").read_bytes() == (tmp_path / "plain.mp4").read_bytes()
+    assert ours.output.frames == plain.output.frames == 48
+
+
+@pytest.mark.usefixtures("in_process_writer")
+def test_every_seed_is_another_flight_and_the_same_each_time(tmp_path: Path) -> None:
+    found = []
+    for seed in (0, 1, 2, 2**63 - 1):
+        for again in range(2):
+            plan = make_plan(seed=seed, ddim_steps=2)
+            ours = run(tmp_path / f"{seed}-{again}.mp4", plan, decider="toge")
+            plain = run(tmp_path / f"{seed}-{again}s.mp4", plan, decider="toge", serial=True)
+            assert ours.sha256 == plain.sha256
+            found.append(ours.sha256)
+    assert found[::2] == found[1::2]
+    assert len(set(found)) == 4
+
+
+@pytest.mark.usefixtures("in_process_writer")
+def test_more_iterations_only_add_to_a_rollout(tmp_path: Path) -> None:
+    """A generator of its own for each iteration and stage: what follows changes nothing before."""
+    short, long = tmp_path / "short.mp4", tmp_path / "long.mp4"
+    run(short, make_plan(iterations=2, exe_steps=3))
+    run(long, make_plan(iterations=4, exe_steps=3))
+    assert read_rows(long).slice(0, 32).equals(read_rows(short))
+
+
+def test_stages_and_iterations_share_no_noise() -> None:
+    plans = [make_plan(seed=seed) for seed in (0, 1, 2**63 - 1)]
+    seeds = [plan.stage_seed(k, stage) for plan in plans for k in range(300) for stage in Stage]
+    assert len(set(seeds)) == len(seeds)
+    assert all(0 <= seed < 2**63 for seed in seeds)
+
+
+@pytest.mark.usefixtures("in_process_writer")
+def test_fewer_frames_are_the_first_of_each_segment(tmp_path: Path) -> None:
+    run(tmp_path / "all.mp4", make_plan(exe_steps=4))
+    run(tmp_path / "few.mp4", make_plan(exe_steps=4, frames=4))
+    rows = read_rows(tmp_path / "all.mp4")
+    executed = rows.filter(rows["executed"])
+    few = read_rows(tmp_path / "few.mp4")
+    assert few.equals(executed)
+    assert count_frames(tmp_path / "few.mp4") == 12
+    np.testing.assert_allclose(few["time_s"].to_pylist(), 0.1 * np.arange(1, 13))
+
+
+def test_a_frame_is_a_row(tmp_path: Path) -> None:
+    ours = run(tmp_path / "a.mp4", make_plan(exe_steps=2))  # with a real writer process
+    plain = run(tmp_path / "plain.mp4", make_plan(exe_steps=2), serial=True)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "plain.mp4").read_bytes()
+    assert ours.sha256 == plain.sha256
+    rows = read_rows(tmp_path / "a.mp4")
+    images = list(read_video(tmp_path / "a.mp4"))
+    assert len(images) == rows.num_rows == ours.output.frames == 48
+    assert images[0].shape == (SIZE, SIZE, 3)
+    assert rows["iteration"].to_pylist() == [k for k in range(3) for _ in range(16)]
+    assert rows["frame"].to_pylist() == list(range(16)) * 3
+    assert rows["executed"].to_pylist() == ([True] * 2 + [False] * 14) * 3
+    assert rows["time_s"][16].as_py() == pytest.approx(0.3)  # two steps were executed before
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        *("a.mp4", "a.parquet", "plain.mp4", "plain.parquet"),
+    ]

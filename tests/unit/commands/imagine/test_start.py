@@ -1,0 +1,126 @@
+"""From a recorded flight to what a rollout goes on from."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.factories import START_NS
+from helpers.rollouts import (
+    SIZE,
+    TINY,
+    grey,
+    make_sampler,
+    make_start,
+    noise_executable,
+    write_flight,
+)
+from mavbridge.commands.imagine.deciders import PolicyDecider
+from mavbridge.commands.imagine.observation import ObservationQueue
+from mavbridge.commands.imagine.start import RealFrames, read_start
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import UserError
+from mavbridge.core.records import FloatArray
+from mavbridge.recording.flight_folder import open_flight
+from policy.contract import Contract
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_flight(tmp_path_factory.mktemp("flight") / "a", seconds=1.0)
+
+
+def test_context_is_a_frame_each_frame_dt_with_the_state_at_its_exposure(flight: Path) -> None:
+    start = read_start(open_flight(flight), TINY, 0.4)
+    assert start.images.shape == (2, SIZE, SIZE, 3)
+    # 0.4 s and 0.5 s at 30 Hz
+    np.testing.assert_allclose(start.images.mean(axis=(1, 2, 3)), [grey(12), grey(15)], atol=3)
+    np.testing.assert_allclose(start.states[:, 0], [0.40, 0.50], atol=0.011)
+    assert start.newest_ns == START_NS + NS_PER_S // 2
+    at_ns, sticks = start.sent[-1]
+    assert START_NS + 490 * NS_PER_MS <= at_ns < start.newest_ns
+    assert sticks is not None
+    assert sticks.yaw == pytest.approx(0.049)
+
+
+def test_real_frames_follow_at_the_same_spacing_until_the_flight_ends(flight: Path) -> None:
+    opened = open_flight(flight)
+    real = RealFrames(opened, TINY, read_start(opened, TINY, 0.0).newest_ns)
+    for step in (1, 2, 3, 4, 2, 3, 4, 5):  # segments overlap
+        rgb = real.at(step)
+        assert rgb is not None
+        assert rgb.mean() == pytest.approx(grey(3 + 3 * step), abs=3)
+    assert real.at(8) is not None
+    assert real.at(9) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"), [({"ticks": False}, "no state"), ({"camera_hz": 0.0}, "no frames")]
+)
+def test_a_flight_without_states_or_frames_is_refused(
+    tmp_path: Path, changes: dict[str, object], told: str
+) -> None:
+    flight = open_flight(write_flight(tmp_path / "a", **changes))  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=told):
+        read_start(flight, TINY, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("contract", "start_s", "told"),
+    [
+        (Contract(), 0.95, "too short"),
+        (Contract(state_frame="enu_flu"), 0.0, "enu_flu"),
+        (None, 0.0, "unknown frame"),
+    ],
+)
+def test_a_flight_that_starts_nothing_is_refused(
+    flight: Path, contract: Contract | None, start_s: float, told: str
+) -> None:
+    opened = open_flight(flight)
+    changed = replace(opened, meta=replace(opened.meta, contract=contract))
+    with pytest.raises(UserError, match=told):
+        read_start(changed, TINY, start_s)
+
+
+def test_a_policy_of_another_frame_is_refused() -> None:
+    other = Contract(feature_dim=1, arrays="numpy", state_frame="enu_flu")
+    with pytest.raises(UserError, match=r"ned_frd.*enu_flu"):
+        PolicyDecider(noise_executable(other), make_sampler())
+
+
+def observe(contract: Contract) -> ObservationQueue:
+    sampler, start = make_sampler(), make_start()
+    latents = sampler.encode(start.images)
+    return ObservationQueue(start, latents, frame_dt_s=0.1, images=1, contract=contract)
+
+
+def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
+    ramp = noise_executable()
+    chunk = np.repeat(np.linspace(-0.8, 0.8, 16, dtype=np.float32)[None, :, None], 4, axis=2)
+
+    def act(*_: object) -> FloatArray:
+        return chunk
+
+    actions = PolicyDecider(replace(ramp, act=act), make_sampler()).decide(
+        observe(ramp.contract), 0
+    )
+    # rows of the chunk are 0.05 s apart, steps 0.1 s: their mean is the row between; then held
+    np.testing.assert_allclose(actions[:7, 0], chunk[0, 1:15:2, 0], atol=1e-6)
+    np.testing.assert_allclose(actions[8:], 0.8, atol=1e-6)
+
+
+def test_a_policy_that_asks_for_the_image_s_age_is_told_that_nothing_moved() -> None:
+    contract = Contract(feature_dim=1, arrays="numpy", since_exposure=True)
+    states = []
+    plain = noise_executable(contract)
+
+    def act(
+        feature: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        states.append(state)
+        return plain.act(feature, state, history, elapsed_s)
+
+    PolicyDecider(replace(plain, act=act), make_sampler()).decide(observe(contract), 0)
+    assert states[0].shape == (1, 20)
+    assert (states[0][0, 13:] == 0).all()

@@ -1,0 +1,250 @@
+"""The decode thread and the writer process when things go wrong or slow."""
+
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from helpers.recordings import send_signal
+from helpers.rollouts import TinyWorld, make_plan, make_sampler
+from mavbridge.commands.imagine.files import RolloutError, read_rows
+from mavbridge.commands.imagine.loop import Segment
+from mavbridge.commands.imagine.output import ignore
+from mavbridge.commands.imagine.streamed import QUEUED_SEGMENTS, StreamedOutput
+from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.workers import HungError
+from mavbridge.recording.tables import TableWriter
+from mavbridge.recording.video.file import count_frames, read_video
+from mavbridge.recording.video.writer import WriterDiedError, WriterError
+
+DEADLINE_S = 60.0
+PLAN = make_plan(iterations=1000)
+
+
+@contextmanager
+def output(out: Path, model: TinyWorld | None = None) -> Iterator[StreamedOutput]:
+    made = StreamedOutput(
+        out,
+        make_sampler(model),
+        PLAN,
+        decode_video=True,
+        clock=MonotonicClock(),
+        on_frame=ignore,
+    )
+    try:
+        yield made
+    finally:
+        made.close()
+    assert not made._worker.is_alive
+
+
+def make_segment(iteration: int) -> Segment:
+    generator = torch.Generator().manual_seed(iteration)
+    return Segment(
+        iteration=iteration,
+        latents=torch.randn(16, 4, 4, 4, generator=generator),
+        states=np.full((16, 13), iteration, np.float32),
+        actions=np.zeros((16, 4), np.float32),
+        decoded={},
+    )
+
+
+def pid_of(made: StreamedOutput) -> int:
+    assert made._video is not None
+    assert made._video.pid is not None
+    return made._video.pid
+
+
+def require_whole(out: Path, at_least: int) -> None:
+    """Readable to the end, and a row for each frame."""
+    frames = count_frames(out)
+    assert frames >= at_least
+    assert len(list(read_video(out))) == read_rows(out).num_rows == frames
+    assert read_rows(out)["iteration"].to_pylist() == [k // 16 for k in range(frames)]
+
+
+def put_all(made: StreamedOutput, first: int = 0) -> None:
+    for iteration in range(first, PLAN.iterations):
+        made.put(make_segment(iteration))
+
+
+def test_a_killed_writer_ends_the_rollout_and_leaves_a_readable_part(tmp_path: Path) -> None:
+    out = tmp_path / "a.mp4"
+    with output(out) as made:
+        iteration = 0
+        while count_frames(out) < 40 if out.exists() else True:
+            made.put(make_segment(iteration))
+            iteration += 1
+        os.kill(pid_of(made), signal.SIGKILL)
+        with pytest.raises(WriterDiedError, match="has died"):
+            put_all(made, iteration)
+        with pytest.raises(WriterDiedError, match="has died"):
+            made.finish()
+    require_whole(out, 39)
+    assert out.with_suffix(".arrows").exists()
+
+
+def test_a_slow_disk_holds_the_loop_up_and_nothing_is_lost(tmp_path: Path) -> None:
+    out = tmp_path / "a.mp4"
+    with output(out) as made:
+        made.put(make_segment(0))
+        send_signal(pid_of(made), signal.SIGSTOP)
+        put: list[int] = []
+        is_full = threading.Event()
+
+        def produce() -> None:
+            for iteration in range(1, 20):
+                made.put(make_segment(iteration))
+                put.append(iteration)
+                if made.decode_queue == QUEUED_SEGMENTS:
+                    is_full.set()
+
+        producer = threading.Thread(target=produce)
+        producer.start()
+        assert is_full.wait(DEADLINE_S)
+        # the ring of 32 frames, the segment in the thread's hands, the queue, the one being put
+        assert len(put) <= 2 + 1 + QUEUED_SEGMENTS + 1
+        send_signal(pid_of(made), signal.SIGCONT)
+        producer.join(DEADLINE_S)
+        assert len(put) == 19
+        made.finish()
+    assert out.with_suffix(".parquet").exists()
+    require_whole(out, 320)
+
+
+def test_a_full_disk_reaches_the_loop_and_leaves_a_readable_part(tmp_path: Path) -> None:
+    out = tmp_path / "a.mp4"
+    with output(out) as made:
+        resource.prlimit(pid_of(made), resource.RLIMIT_FSIZE, (60_000, 60_000))
+        with pytest.raises(WriterError, match="File too large"):
+            put_all(made)
+    require_whole(out, 10)
+
+
+def test_a_full_disk_under_the_rows_reaches_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, append = tmp_path / "a.mp4", TableWriter.append
+    appended = []
+
+    def fills_up(self: TableWriter, batch: object) -> None:
+        appended.append(batch)
+        if len(appended) > 3:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(self, batch)
+
+    monkeypatch.setattr(TableWriter, "append", fills_up)
+    with output(out) as made, pytest.raises(RolloutError, match=r"a\.arrows.*No space left"):
+        put_all(made)
+    require_whole(out, 48)
+    assert count_frames(out) == 48
+
+
+@pytest.mark.usefixtures("in_process_writer")
+def test_an_error_of_the_decoder_is_raised_in_the_loop(tmp_path: Path) -> None:
+    class Breaks(TinyWorld):
+        def decode(self, latents: Tensor) -> Tensor:
+            if self.frames_decoded == 20:
+                raise RuntimeError("out of memory")
+            return super().decode(latents)
+
+    with output(tmp_path / "a.mp4", Breaks()) as made:
+        with pytest.raises(RuntimeError, match="out of memory"):
+            put_all(made)
+        with pytest.raises(RuntimeError, match="out of memory"):
+            made.finish()
+
+
+@pytest.mark.usefixtures("in_process_writer")
+def test_a_decoder_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+
+    class Hangs(TinyWorld):
+        def decode(self, latents: Tensor) -> Tensor:
+            go_on.wait(DEADLINE_S)
+            return super().decode(latents)
+
+    monkeypatch.setattr("mavbridge.commands.imagine.streamed.STALL_S", 0.0)
+    with output(tmp_path / "a.mp4", Hangs()) as made:
+        with pytest.raises(HungError, match="no frame"):
+            put_all(made)
+        go_on.set()
+
+
+def test_files_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
+    out = tmp_path / "a.mp4"
+    out.write_text("precious")
+    with output(out) as made, pytest.raises(MavbridgeError, match="exists"):
+        put_all(made)
+    assert out.read_text() == "precious"
+    with pytest.raises(RolloutError, match="exists"):
+        StreamedOutput(  # the rows of the one before
+            out,
+            make_sampler(),
+            PLAN,
+            decode_video=False,
+            clock=MonotonicClock(),
+            on_frame=ignore,
+        )
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+
+
+def main():  # the writer process imports this script, too: nothing heavy outside
+    from mavbridge.core.clock import MonotonicClock
+    from mavbridge.commands.imagine.loop import rollout
+    from mavbridge.commands.imagine.streamed import StreamedOutput
+    from helpers.rollouts import make_decider, make_plan, make_sampler, make_start
+
+    def on_frame(frame, rgb):
+        if frame.number == 100:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    plan, sampler = make_plan(iterations=50), make_sampler()
+    output = StreamedOutput(
+        Path(sys.argv[1]),
+        sampler,
+        plan,
+        decode_video=True,
+        clock=MonotonicClock(),
+        on_frame=on_frame,
+    )
+    for segment in rollout(sampler, make_decider("toge", sampler), make_start(), plan):
+        output.put(segment)
+
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+def test_kill_9_of_the_main_process_leaves_all_that_was_decoded(tmp_path: Path) -> None:
+    script, out = tmp_path / "killed.py", tmp_path / "a.mp4"
+    script.write_text(KILLED)
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(out)],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    with process:
+        assert process.stdout is not None
+        process.stdout.read()  # the writer has inherited the output: its end is the writer's end
+        assert process.wait(DEADLINE_S) == -signal.SIGKILL
+    require_whole(out, 101)
+    assert count_frames(out) == 101
+    assert out.with_suffix(".arrows").exists()

@@ -1,0 +1,71 @@
+"""The check of a training run flies, on courses of its own."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mavbridge.commands.train import check_flights as train_check
+from mavbridge.config.courses import CHECK_COURSE_SEED, HELD_OUT_COURSE_SEED, MAX_EPISODES
+from mavbridge.simulation.result import EpisodeResult
+from policy.checkpoints.policy_file import save_checkpoint
+from policy.contract import Contract, Executable, FloatArray
+from policy.nets.toge import Toge, TogeConfig
+
+
+def save(path: Path, seed: int) -> Path:
+    torch.manual_seed(seed)
+    contract = Contract(image_height=32, image_width=32)
+    save_checkpoint(path, Toge(TogeConfig(backbone="resnet18", contract=contract)).eval())
+    return path
+
+
+def result(course_seed: int, seed: int, gates: int) -> EpisodeResult:
+    return EpisodeResult(
+        course_seed=course_seed,
+        seed=seed,
+        outcome="crashed",
+        gates_total=8,
+        gate_times_s=(1.0,) * gates,
+        flown_s=9.0,
+        distance_m=20.0,
+        stick_rate_per_s=None,
+    )
+
+
+def test_counts_the_gates_of_courses_that_nothing_else_flies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown: list[int] = []
+
+    def fly(executable: Executable, *, course_seed: int, seed: int) -> EpisodeResult:
+        assert executable.dual_rate
+        flown.append(course_seed)
+        return result(course_seed, seed, gates=2 * seed)
+
+    monkeypatch.setattr(train_check, "run_episode", fly)
+    checkpoint = save(tmp_path / "toge.safetensors", 0)
+    assert train_check.share_of_gates(checkpoint, "toge", 3) == pytest.approx((0 + 2 + 4) / 24)
+    assert flown == [CHECK_COURSE_SEED, CHECK_COURSE_SEED + 1, CHECK_COURSE_SEED + 2]
+    assert CHECK_COURSE_SEED + MAX_EPISODES <= HELD_OUT_COURSE_SEED
+
+
+def test_flies_the_weights_that_are_in_the_file_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    features: list[FloatArray] = []
+
+    def fly(executable: Executable, *, course_seed: int, seed: int) -> EpisodeResult:
+        features.append(executable.encode(np.full((32, 32, 3), 128, np.uint8)))
+        return result(course_seed, seed, gates=0)
+
+    monkeypatch.setattr(train_check, "run_episode", fly)
+    for seed in (0, 1):
+        train_check.share_of_gates(save(tmp_path / "toge.safetensors", seed), "toge", 1)
+    assert not np.allclose(features[0], features[1])
+
+
+def test_an_untrained_policy_passes_few_gates(tmp_path: Path) -> None:
+    share = train_check.share_of_gates(save(tmp_path / "toge.safetensors", 0), "toge", 1)
+    assert 0.0 <= share < 0.5

@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import NEUTRAL, Sticks
+from mavbridge.flight.history import SentHistory, sample_chunk
+
+CHUNK = np.array([[0, 0, 0, 0], [1, -1, 0.5, 0], [0, 0, 0, 1]], dtype=np.float32)
+
+
+@pytest.mark.parametrize(
+    ("at_s", "expected"),
+    [
+        (-1.0, (0, 0, 0, 0)),  # before the chunk: its first action
+        (0.0, (0, 0, 0, 0)),
+        (0.025, (0.5, -0.5, 0.25, 0)),
+        (0.05, (1, -1, 0.5, 0)),
+        (0.0875, (0.25, -0.25, 0.125, 0.75)),
+        (9.0, (0, 0, 0, 1)),  # after it: its last
+    ],
+)
+def test_a_chunk_is_read_by_time(at_s: float, expected: tuple[float, ...]) -> None:
+    assert sample_chunk(CHUNK, chunk_dt_s=0.05, at_s=at_s) == pytest.approx(expected)
+
+
+def stick(value: float) -> Sticks:
+    return Sticks(throttle=value, yaw=0.0, pitch=0.0, roll=0.0)
+
+
+@pytest.mark.parametrize("tick_ms", [5, 10, 20])
+def test_history_is_the_same_at_any_rate(tick_ms: int) -> None:
+    history = SentHistory(length=3, dt_s=0.02)
+    for at_ms in range(0, 200 + 1, tick_ms):
+        history.append(stick(at_ms / 1000), at_ms * NS_PER_MS)
+    now = history.resample(200 * NS_PER_MS)
+    assert now.shape == (1, 3, 4)
+    assert now[0, :, 0] == pytest.approx([0.14, 0.16, 0.18])
+
+
+def test_what_was_never_sent_and_what_was_released_is_neutral() -> None:
+    history = SentHistory(length=4, dt_s=0.01)
+    assert not history.resample(0).any()
+    history.append(stick(0.5), 0)
+    history.append(None, 15 * NS_PER_MS)
+    history.append(stick(0.7), 25 * NS_PER_MS)
+    assert history.resample(36 * NS_PER_MS)[0, :, 0] == pytest.approx([0, 0.5, 0, 0.7])
+    assert history.resample(36 * NS_PER_MS)[0, 2] == pytest.approx(NEUTRAL)
+
+
+def test_history_forgets_what_no_resample_can_reach() -> None:
+    history = SentHistory(length=4, dt_s=0.05)
+    for tick in range(100_000):
+        history.append(stick(0.0), tick * 10 * NS_PER_MS)
+    assert len(history._sent) <= 27

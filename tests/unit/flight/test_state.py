@@ -1,0 +1,126 @@
+from dataclasses import replace
+from math import pi, sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.fakes import level_telemetry, without
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import Reading, Release, Telemetry, VehicleState
+from mavbridge.flight.state import Freshness, StateFrame, build_state
+
+NOW_NS = 5_000_000_000
+LIMITS = Freshness(attitude_ns=50 * NS_PER_MS, velocity_ns=100 * NS_PER_MS)
+R = sqrt(0.5)
+
+
+def telemetry(
+    v: tuple[float, ...] = (0.0, 0.0, 0.0),
+    q: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0),
+    w: tuple[float, ...] = (0.0, 0.0, 0.0),
+    a: tuple[float, ...] = (0.0, 0.0, -9.81),
+) -> Telemetry:
+    return Telemetry(
+        velocity_ned_mps=Reading(NOW_NS, v),
+        ned_from_body_wxyz=Reading(NOW_NS, q),
+        rate_body_radps=Reading(NOW_NS, w),
+        specific_force_body_mps2=Reading(NOW_NS, a),
+    )
+
+
+def values(source: Telemetry, frame: StateFrame) -> list[float]:
+    state = build_state(source, NOW_NS, frame=frame, freshness=LIMITS)
+    assert isinstance(state, VehicleState)
+    return state.values.tolist()
+
+
+@pytest.mark.parametrize(
+    ("source", "frame", "expected"),
+    [
+        # level, facing north, 1 m/s north, 2 east, 3 down
+        (telemetry(v=(1, 2, 3)), "ned_frd", [1, 2, 3, 1, 0, 0, 0, 0, 0, 0, 0, 0, -9.81]),
+        # the same in ENU: east, north, up; facing north is a quarter turn left from east
+        (telemetry(v=(1, 2, 3)), "enu_flu", [2, 1, -3, R, 0, 0, R, 0, 0, 0, 0, 0, 9.81]),
+        # facing east is ENU's zero attitude
+        (telemetry(q=(R, 0, 0, R)), "enu_flu", [0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 9.81]),
+        # nose up 90 deg while facing north: in ENU/FLU a yaw of 90 then a pitch of -90 (FLU y is
+        # left): (R,0,0,R)*(R,0,-R,0) = (0.5, 0.5, -0.5, 0.5)
+        (
+            telemetry(q=(R, 0, R, 0)),
+            "enu_flu",
+            [0, 0, 0, 0.5, 0.5, -0.5, 0.5, 0, 0, 0, 0, 0, 9.81],
+        ),
+        # body axes: right and down become left and up
+        (
+            telemetry(w=(0.1, 0.2, 0.3), a=(1, 2, 3)),
+            "enu_flu",
+            [0, 0, 0, R, 0, 0, R, 0.1, -0.2, -0.3, 1, -2, -3],
+        ),
+        # q and -q are one attitude; lengths are corrected
+        (
+            telemetry(q=(-2 * R, 0, 0, -2 * R)),
+            "ned_frd",
+            [0, 0, 0, R, 0, 0, R, 0, 0, 0, 0, 0, -9.81],
+        ),
+    ],
+)
+def test_hand_computed_states(source: Telemetry, frame: StateFrame, expected: list[float]) -> None:
+    assert values(source, frame) == pytest.approx(expected, abs=1e-6)
+
+
+def rotation(q: list[float] | tuple[float, ...]) -> np.ndarray:
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+ENU_FROM_NED = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+FRD_FROM_FLU = np.diag([1, -1, -1])
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q) > 0.01))
+def test_enu_attitude_is_the_same_rotation_between_other_axes(q: tuple[float, ...]) -> None:
+    unit = np.array(q) / np.linalg.norm(q)
+    ours = rotation(values(telemetry(q=tuple(unit)), "enu_flu")[3:7])
+    assert ours == pytest.approx(ENU_FROM_NED @ rotation(tuple(unit)) @ FRD_FROM_FLU, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("field", "what"),
+    [
+        ("ned_from_body_wxyz", "attitude"),
+        ("rate_body_radps", "body rates"),
+        ("velocity_ned_mps", "velocity"),
+        ("specific_force_body_mps2", "acceleration"),
+    ],
+)
+def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
+    good = level_telemetry(NOW_NS)
+    missing = build_state(without(good, field), NOW_NS, frame="ned_frd", freshness=LIMITS)
+    assert missing == Release(f"no {what} from the vehicle yet")
+
+    limit_ns = LIMITS.attitude_ns if what in ("attitude", "body rates") else LIMITS.velocity_ns
+    reading = getattr(good, field)
+    at_limit = replace(good, **{field: Reading(NOW_NS - limit_ns, reading.values)})
+    old = replace(good, **{field: Reading(NOW_NS - limit_ns - 1, reading.values)})
+    assert isinstance(
+        build_state(at_limit, NOW_NS, frame="ned_frd", freshness=LIMITS), VehicleState
+    )
+    refused = build_state(old, NOW_NS, frame="ned_frd", freshness=LIMITS)
+    assert refused == Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
+
+
+def test_each_part_keeps_its_own_stamp_and_the_array_is_frozen() -> None:
+    source = replace(telemetry(), velocity_ned_mps=Reading(NOW_NS - 7, (0.0, 0.0, 0.0)))
+    state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
+    assert isinstance(state, VehicleState)
+    assert (state.velocity_ns, state.attitude_ns) == (NOW_NS - 7, NOW_NS)
+    with pytest.raises(ValueError, match="read-only"):
+        state.values[0] = pi

@@ -1,0 +1,117 @@
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mavbridge.core.errors import MavbridgeError, PeerError, UserError
+from mavbridge.observe import rerun_target
+from mavbridge.observe.rerun_target import RrdFile, Viewer, prepare_target, spawn_viewer
+
+LISTENS_UNTIL_KILLED = """
+import socket, sys
+server = socket.create_server(("127.0.0.1", int(sys.argv[sys.argv.index("--port") + 1])))
+while True:
+    server.accept()
+"""
+
+
+@pytest.fixture
+def bound_port() -> Iterator[int]:
+    """A port that nobody else can take, and on which nothing listens."""
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        yield bound.getsockname()[1]
+
+
+@pytest.fixture
+def free_port() -> int:
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        port: int = bound.getsockname()[1]
+        return port
+
+
+def test_a_file_is_created_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "flight.rrd"
+    assert prepare_target(str(path)) == RrdFile(path)
+    assert path.exists()
+
+
+def test_a_file_in_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="No such file or directory"):
+        prepare_target(str(tmp_path / "nowhere" / "flight.rrd"))
+
+
+def test_a_folder_called_rrd_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "flight.rrd"
+    folder.mkdir()
+    with pytest.raises(UserError, match="Is a directory"):
+        prepare_target(str(folder))
+
+
+@pytest.mark.parametrize("text", ["", "Spawn", "flight.mp4", "connected", "http://127.0.0.1:9876"])
+def test_an_unknown_target_is_refused_with_the_choices(text: str) -> None:
+    with pytest.raises(UserError, match=r"spawn, connect, connect=URL, FILE\.rrd, off"):
+        prepare_target(text)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "127.0.0.1:9876",
+        "http://127.0.0.1:9876/proxy",
+        "rerun+http://127.0.0.1/proxy",
+        "rerun+http://:9876/proxy",
+        "rerun+http://127.0.0.1:9876",
+        "rerun+http://127.0.0.1:99999/proxy",
+    ],
+)
+def test_a_malformed_url_is_refused_with_an_example(url: str) -> None:
+    with pytest.raises(UserError, match=r"looks like rerun\+http://127\.0\.0\.1:9876/proxy"):
+        prepare_target(f"connect={url}")
+
+
+def test_a_viewer_that_listens_is_accepted() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"rerun+http://127.0.0.1:{server.getsockname()[1]}/proxy"
+        assert prepare_target(f"connect={url}") == Viewer(url)
+
+
+def test_a_viewer_that_does_not_listen_is_named(bound_port: int) -> None:
+    with pytest.raises(PeerError, match=f"no Rerun viewer listens at .*:{bound_port}/proxy"):
+        prepare_target(f"connect=rerun+http://127.0.0.1:{bound_port}/proxy")
+
+
+def test_a_spawned_viewer_is_waited_for(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_target, "SETTLE_S", 0.05)
+    viewer = spawn_viewer([sys.executable, "-c", LISTENS_UNTIL_KILLED], port=free_port)
+    assert viewer.url == f"rerun+http://127.0.0.1:{free_port}/proxy"
+    assert viewer.process is not None
+    viewer.process.kill()
+    viewer.process.wait(10)
+
+
+def test_a_spawned_viewer_that_ends_is_reported_with_its_last_words(bound_port: int) -> None:
+    dies = "import sys; sys.exit('starting up\\nno display is set')"
+    with pytest.raises(MavbridgeError, match="ended at once: no display is set; record to a file"):
+        spawn_viewer([sys.executable, "-c", dies], port=bound_port)
+
+
+def test_a_spawned_viewer_that_never_listens_is_ended(
+    bound_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rerun_target, "SPAWN_TIMEOUT_S", 0.3)
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Recorded(subprocess.Popen[bytes]):
+        def __init__(self, *args: object, **kwargs: object) -> None:
+            super().__init__(*args, **kwargs)  # type: ignore[call-overload]
+            started.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Recorded)
+    with pytest.raises(MavbridgeError, match=r"did not listen within 0\.3 s"):
+        spawn_viewer([sys.executable, "-c", "import signal; signal.pause()"], port=bound_port)
+    assert started[0].returncode is not None

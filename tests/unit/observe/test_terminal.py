@@ -1,0 +1,277 @@
+import io
+
+import pytest
+from rich.console import Console, RenderableType
+
+from helpers.factories import (
+    START_NS,
+    TICK_NS,
+    make_released_tick,
+    make_state,
+    make_tick,
+    make_vision_tick,
+)
+from mavbridge.config.rates import STATUS_HZ
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import LinkStats, Percentiles, Tick
+from mavbridge.observe.terminal import (
+    PLAIN_PERIOD_S,
+    FlightScreen,
+    StatusLine,
+    timing_table,
+    verdicts,
+)
+from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
+
+ONE_UP_AND_ERASE = "\x1b[1A\x1b[2K"
+REFRESH_TICKS = round(100 / STATUS_HZ)
+
+
+def status_line(*, readonly: bool = False) -> StatusLine:
+    return StatusLine(action_hz=100, vision_hz=30, readonly=readonly)
+
+
+def rendered(what: RenderableType, width: int = 100) -> str:
+    console = Console(file=io.StringIO(), width=width, record=True)
+    console.print(what)
+    return console.export_text()
+
+
+def fly(status: StatusLine, *, ticks: int, first: int = 0) -> str:
+    """Emit ticks, and frames at 25 Hz, as they come between refreshes; the last line."""
+    line = ""
+    for index in range(first, first + ticks):
+        status.emit(make_tick(index))
+        if index % 4 == 0:
+            status.emit(make_vision_tick(index, ready_ns=START_NS + index * TICK_NS))
+        if index % REFRESH_TICKS == 0:
+            line = status.render().plain
+    return line
+
+
+def report_of(
+    *ticks: Tick, link: LinkStats | None = None, rerun_drops: int | None = None
+) -> TimingReport:
+    timing = FlightTiming(action_hz=100, vision_hz=30)
+    for tick in ticks:
+        timing.emit(tick)
+    return timing.report(
+        mode="dual",
+        engine="torch",
+        policy="toge-small",
+        autopilot="ardupilot",
+        link=link,
+        observer_drops=ObserverDrops(rerun=rerun_drops, recorder=None),
+    )
+
+
+def verdict_lines(report: TimingReport) -> list[str]:
+    return [verdict.plain for verdict in verdicts(report)]
+
+
+def test_the_line_of_a_good_flight() -> None:
+    assert fly(status_line(), ticks=201) == (
+        "FLYING  ALT_HOLD armed  action 100.0 Hz  vision 25.0 Hz"
+        "  feature 40 ms  state 3 ms  missed 0"
+    )
+
+
+def test_before_the_first_tick_the_line_says_so() -> None:
+    assert status_line().render().plain == "waiting for the first tick"
+
+
+@pytest.mark.parametrize(
+    ("tick", "expected"),
+    [
+        (make_released_tick(0, "no feature yet"), "RELEASED  ALT_HOLD armed"),
+        (make_tick(0, armed=False), "FLYING  ALT_HOLD disarmed"),
+        (make_tick(0, mode=None), "FLYING  mode unknown armed"),
+        (make_tick(0, feature_captured_ns=None), "feature - ms"),
+        (make_tick(0, state=None), "state - ms"),
+        (make_tick(0, missed_slots=7), "missed 7"),
+        (make_tick(0, state=make_state(START_NS - 118 * NS_PER_MS)), "state 120 ms"),
+    ],
+)
+def test_the_line_shows_what_the_newest_tick_says(tick: Tick, expected: str) -> None:
+    status = status_line()
+    status.emit(tick)
+    assert expected in status.render().plain
+
+
+def test_readonly_is_not_called_flying_and_a_release_stays_a_release() -> None:
+    status = status_line(readonly=True)
+    status.emit(make_tick(0, sent=None))
+    assert status.render().plain.startswith("READ-ONLY  ")
+    status.emit(make_released_tick(1, "no feature yet"))
+    line = status.render().plain
+    assert line.startswith("RELEASED  ")
+    assert line.endswith("  no feature yet")  # last, since it may be long
+
+
+def test_one_refresh_is_no_rate_yet() -> None:
+    status = status_line()
+    status.emit(make_tick(0))
+    assert "action - Hz  vision - Hz" in status.render().plain
+
+
+def test_a_loop_that_has_stopped_has_no_rate() -> None:
+    status = status_line()
+    assert "action 100.0 Hz" in fly(status, ticks=201)
+    lines = [status.render().plain for _ in range(2 * round(STATUS_HZ))]
+    assert "action - Hz  vision - Hz" in lines[-1]
+
+
+def test_the_rate_follows_within_the_window() -> None:
+    status = status_line()
+    fly(status, ticks=201)
+    line = ""
+    for number in range(1, 101):  # half the rate from here on
+        status.emit(make_tick(200 + 2 * number))
+        if number % (REFRESH_TICKS // 2) == 0:
+            line = status.render().plain
+    assert "action 50.0 Hz" in line
+
+
+def test_the_line_is_cut_not_wrapped_on_a_narrow_terminal() -> None:
+    out = io.StringIO()
+    console = Console(file=out, width=60, force_terminal=True, color_system=None)
+    screen = FlightScreen(console, action_hz=100, vision_hz=30, readonly=False)
+    with screen.live():
+        screen.emit(make_released_tick(0, "a very long reason " * 10))
+        screen.refresh()
+        shown = out.getvalue().split("RELEASED")[-1]
+    assert shown.rstrip().endswith("\N{HORIZONTAL ELLIPSIS}")
+    assert "\n" not in shown
+
+
+def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
+    out = io.StringIO()
+    screen = FlightScreen(Console(file=out, width=80), action_hz=100, vision_hz=30, readonly=False)
+    with screen.live():
+        screen.emit(make_tick(0))
+        for _ in range(2 * round(PLAIN_PERIOD_S * STATUS_HZ)):
+            screen.refresh()
+    news, *lines = out.getvalue().splitlines()
+    assert news == "FLYING: the policy has the sticks"
+    assert len(lines) == 2
+    assert lines[0].startswith("FLYING  ALT_HOLD armed")
+    assert lines[0].endswith("missed 0")  # not cut at 80 columns: it goes to a file
+
+
+def test_news_is_printed_once_in_order() -> None:
+    out = io.StringIO()
+    screen = FlightScreen(Console(file=out, width=80), action_hz=100, vision_hz=30, readonly=False)
+    screen.emit(make_released_tick(0, reason="no [bold] state", texts=("vehicle: Arming motors",)))
+    screen.emit(make_released_tick(1, reason="no [bold] state"))
+    screen.emit(make_tick(2, trace=None))
+    screen.emit(make_tick(3))
+    screen.emit(make_tick(4, sent=None))
+    for _ in range(2):
+        screen.refresh()
+    assert out.getvalue().splitlines() == [
+        "vehicle: Arming motors",
+        "RELEASED: no [bold] state",
+        "PREPARING: sticks idle",
+        "FLYING: the policy has the sticks",
+        "READ-ONLY: the policy runs, nothing is sent",
+    ]
+
+
+def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
+    out = io.StringIO()
+    console = Console(file=out, width=100, force_terminal=True, color_system=None)
+    screen = FlightScreen(console, action_hz=100, vision_hz=30, readonly=False)
+    with screen.live():
+        screen.emit(make_tick(0))
+        screen.refresh()
+        screen.refresh()
+    assert out.getvalue().count("FLYING") >= 2
+    assert out.getvalue().endswith(ONE_UP_AND_ERASE)
+
+
+def test_the_table_holds_the_numbers_in_milliseconds() -> None:
+    text = rendered(timing_table(report_of(*(make_tick(index) for index in range(11)))))
+    rows = {
+        cells[0]: cells[1:]
+        for line in text.splitlines()
+        if line.startswith("│")
+        for cells in [[cell.strip() for cell in line.strip("│").split("│")]]
+    }
+    assert rows["action period"] == ["10.00"] * 4
+    assert rows["predict"] == ["2.00"] * 4
+    assert rows["feature age at send"] == ["40.00"] * 4
+    assert rows["attitude age at send"] == ["3.00"] * 4
+    assert rows["vision encode"] == ["-"] * 4
+    assert rows["link round trip"] == ["-"] * 4
+
+
+def test_the_table_fits_eighty_columns() -> None:
+    slow = [make_tick(k, woke_ns=START_NS + k * 100_000 * NS_PER_MS) for k in range(3)]
+    assert max(len(line) for line in rendered(timing_table(report_of(*slow))).splitlines()) <= 80
+
+
+def test_verdicts_say_what_was_asked_and_what_came() -> None:
+    link = LinkStats(
+        messages_per_s=(),
+        lost_fraction=0.0,
+        rtt_ms=Percentiles(p50=1, p99=1, p999=1, max=1),
+        sent_overrides=11,
+        echo_confirmed=True,
+    )
+    report = report_of(*(make_tick(index) for index in range(11)), link=link, rerun_drops=0)
+    assert verdict_lines(report) == [
+        "action  100.0 of 100 Hz asked, 0 missed slots in 11 ticks",
+        "vision  - of 30 Hz asked, 0 frames dropped by the camera",
+        "link    11 stick messages sent, echo confirmed, 0.00% of the vehicle's messages lost",
+        "sticks  never released",
+    ]
+
+
+def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
+    reasons = ["a", "b", "c", "d"]
+    report = report_of(
+        *(make_released_tick(index, reason) for index, reason in enumerate(reasons)), rerun_drops=1
+    )
+    assert verdict_lines(report)[-2:] == [
+        "sticks  released 4 times, last for: b (0.0 s); c (0.0 s); d (0.0 s)",
+        "rerun   missed 1 event",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "lost", "expected"),
+    [
+        (False, 0.5, "NO ECHO from the vehicle, 50.00% of the vehicle's messages lost"),
+        (None, None, "echo not checked, loss not measured"),
+    ],
+)
+def test_the_link_verdict_is_honest(
+    confirmed: bool | None, lost: float | None, expected: str
+) -> None:
+    link = LinkStats(
+        messages_per_s=(),
+        lost_fraction=lost,
+        rtt_ms=None,
+        sent_overrides=1,
+        echo_confirmed=confirmed,
+    )
+    assert verdict_lines(report_of(make_tick(), link=link))[2] == (
+        f"link    1 stick message sent, {expected}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "style"),
+    [(TICK_NS, "green"), (TICK_NS * 105 // 100, "yellow"), (TICK_NS * 2, "red")],
+)
+def test_a_loop_that_misses_its_rate_is_not_green(period_ns: int, style: str) -> None:
+    ticks = [make_tick(k, woke_ns=START_NS + k * period_ns) for k in range(101)]
+    assert verdicts(report_of(*ticks))[0].spans[1].style == style
+
+
+def test_show_report_prints_table_and_verdicts() -> None:
+    out = io.StringIO()
+    screen = FlightScreen(Console(file=out, width=100), action_hz=100, vision_hz=30, readonly=False)
+    screen.show_report(report_of(*(make_tick(index) for index in range(11))))
+    assert "toge-small on torch, ardupilot" in out.getvalue()
+    assert "100.0 of 100 Hz asked" in out.getvalue()

@@ -1,0 +1,275 @@
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.factories import (
+    START_NS,
+    TICK_NS,
+    make_released_tick,
+    make_state,
+    make_tick,
+    make_vision_tick,
+)
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.histogram import Histogram
+from mavbridge.core.records import LinkStats, Percentiles, Tick
+from mavbridge.observe.timing import (
+    MAX_RELEASES,
+    FlightTiming,
+    ObserverDrops,
+    ReleaseEvent,
+    TimingReport,
+    report_json,
+)
+
+NO_DROPS = ObserverDrops(rerun=None, recorder=None)
+LINK = LinkStats(
+    messages_per_s=(("ATTITUDE_QUATERNION", 99.9), ("RC_CHANNELS", 20.0)),
+    lost_fraction=0.001,
+    rtt_ms=None,
+    sent_overrides=6000,
+    echo_confirmed=True,
+)
+
+
+def report_of(timing: FlightTiming, link: LinkStats | None = None) -> TimingReport:
+    return timing.report(
+        mode="dual",
+        engine="torch",
+        policy="scripted",
+        autopilot="ardupilot",
+        link=link,
+        observer_drops=NO_DROPS,
+    )
+
+
+def timed(*ticks: Tick) -> TimingReport:
+    timing = FlightTiming(action_hz=100, vision_hz=30)
+    for tick in ticks:
+        timing.emit(tick)
+    return report_of(timing)
+
+
+def all_equal(value: float) -> Percentiles:
+    return Percentiles(p50=value, p99=value, p999=value, max=value)
+
+
+@given(
+    st.lists(st.integers(min_value=0, max_value=10 * 60 * NS_PER_S), min_size=1, max_size=200),
+    st.floats(min_value=0.001, max_value=1.0),
+)
+def test_quantiles_are_nearest_rank_within_the_resolution(
+    values: list[int], fraction: float
+) -> None:
+    histogram = Histogram()
+    for value in values:
+        histogram.add(value)
+    exact = sorted(values)[max(math.ceil(fraction * len(values)) - 1, 0)]
+    assert histogram.quantile_ns(fraction) == pytest.approx(exact, rel=0.004, abs=0)
+    assert histogram.count == len(values)
+    assert (histogram.min_ns, histogram.max_ns) == (min(values), max(values))
+
+
+@pytest.mark.parametrize("value_ns", [0, 1, 255, 256, 511, 512, NS_PER_MS, NS_PER_S])
+def test_one_value_is_every_percentile_exactly(value_ns: int) -> None:
+    histogram = Histogram()
+    histogram.add(value_ns)
+    assert histogram.quantile_ns(0.5) == value_ns
+    assert histogram.quantile_ns(1.0) == value_ns
+
+
+def test_one_outlier_in_a_thousand_shows_in_p999_and_max_only() -> None:
+    histogram = Histogram()
+    for _ in range(998):
+        histogram.add(10 * NS_PER_MS)
+    histogram.add(50 * NS_PER_MS)
+    histogram.add(50 * NS_PER_MS)
+    measured = histogram.percentiles_ms()
+    assert measured is not None
+    assert measured.p50 == pytest.approx(10, rel=0.004)
+    assert measured.p99 == pytest.approx(10, rel=0.004)
+    assert measured.p999 == pytest.approx(50, rel=0.004)
+    assert measured.max == 50
+
+
+def test_values_beyond_the_bins_keep_their_extremes() -> None:
+    histogram = Histogram()
+    histogram.add(-5)
+    histogram.add(2**50)
+    assert (histogram.min_ns, histogram.max_ns) == (-5, 2**50)
+    assert histogram.quantile_ns(0.5) == 0
+
+
+def test_an_empty_histogram_has_no_percentiles() -> None:
+    assert Histogram().quantile_ns(0.5) is None
+    assert Histogram().percentiles_ms() is None
+
+
+def test_a_perfect_flight() -> None:
+    report = timed(*(make_tick(index) for index in range(101)))
+    assert report.duration_s == 1.0
+    assert report.action.rate_hz == 100.0
+    assert report.action.ticks == 101
+    assert report.action.missed_slots == 0
+    assert report.action.period_ms == all_equal(10.0)
+    assert report.action.jitter_ms == all_equal(0.0)
+    assert report.action.predict_ms == all_equal(2.0)
+    assert report.feature_age_ms == all_equal(40.0)
+    assert report.state_age_ms == all_equal(3.0)
+    assert report.state_to_wire_ms == all_equal(3.0)
+    assert report.releases == ()
+
+
+def test_a_stall_counts_its_slots_and_is_the_largest_period_and_jitter() -> None:
+    report = timed(make_tick(0), make_tick(1), make_tick(7, missed_slots=5), make_tick(8))
+    assert report.action.missed_slots == 5
+    assert report.action.period_ms is not None
+    assert report.action.period_ms.max == 60.0
+    assert report.action.jitter_ms is not None
+    assert report.action.jitter_ms.max == 50.0
+
+
+def test_waking_early_and_late_are_both_jitter() -> None:
+    late = make_tick(1, woke_ns=START_NS + TICK_NS + 2 * NS_PER_MS)
+    report = timed(make_tick(0), late, make_tick(2))
+    assert report.action.jitter_ms == all_equal(2.0)
+    assert report.action.period_ms is not None
+    assert report.action.period_ms.max == 12.0
+
+
+def test_only_the_first_send_of_an_attitude_counts_as_state_to_wire() -> None:
+    state = make_state(START_NS)
+    report = timed(make_tick(0, state=state), make_tick(1, state=state), make_tick(2, state=state))
+    assert report.state_to_wire_ms == all_equal(2.0)
+    assert report.state_age_ms is not None
+    assert report.state_age_ms.max == 22.0
+
+
+def test_ages_of_what_was_not_flown_are_not_counted() -> None:
+    report = timed(*(make_released_tick(index) for index in range(5)))
+    assert report.feature_age_ms is None
+    assert report.state_age_ms is None
+    assert report.state_to_wire_ms is None
+    assert report.action.predict_ms is None
+    assert report.action.period_ms is None
+    assert report.action.rate_hz is None
+
+
+def test_a_loop_that_waits_fast_and_flies_slowly_is_reported_slow() -> None:
+    waiting = [make_released_tick(index) for index in range(500)]
+    flying = [make_tick(500 + 5 * index, missed_slots=4) for index in range(11)]
+    action = timed(*waiting, *flying, *(make_released_tick(600 + k) for k in range(9))).action
+    assert action.rate_hz == 20.0
+    assert action.flying_s == 0.5
+    assert (action.ticks, action.missed_slots) == (11, 40)
+    assert action.period_ms == all_equal(50.0)
+
+
+def test_readonly_has_ages_but_nothing_on_the_wire() -> None:
+    report = timed(make_tick(0, sent=None), make_tick(1, sent=None))
+    assert report.state_to_wire_ms is None
+    assert report.state_age_ms == all_equal(3.0)
+
+
+def test_releases_are_transitions_since_the_first_tick() -> None:
+    report = timed(
+        make_released_tick(0, "no feature yet"),
+        make_released_tick(1, "no feature yet"),
+        make_tick(2),
+        make_released_tick(3, "feature too old"),
+        make_released_tick(4, "pilot's mode"),
+        make_tick(5),
+        make_released_tick(6, "pilot's mode"),
+    )
+    assert report.releases == (
+        ReleaseEvent(t_s=0.0, reason="no feature yet"),
+        ReleaseEvent(t_s=0.03, reason="feature too old"),
+        ReleaseEvent(t_s=0.04, reason="pilot's mode"),
+        ReleaseEvent(t_s=0.06, reason="pilot's mode"),
+    )
+    assert report.release_count == 4
+
+
+def test_the_release_list_is_bounded_and_the_count_is_not() -> None:
+    report = timed(
+        *(make_released_tick(index, f"reason {index}") for index in range(MAX_RELEASES + 7))
+    )
+    assert len(report.releases) == MAX_RELEASES
+    assert report.releases[-1].reason == f"reason {MAX_RELEASES - 1}"
+    assert report.release_count == MAX_RELEASES + 7
+
+
+def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
+    timing = FlightTiming(action_hz=100, vision_hz=30)
+    for number in range(1, 32):
+        timing.emit(make_vision_tick(number, dropped_frames=40 + number // 10))
+    vision = report_of(timing).vision
+    assert vision.frames == 31
+    assert vision.rate_hz == pytest.approx(30.0, abs=0.01)
+    assert vision.dropped_frames == 3
+    assert vision.encode_ms == all_equal(20.0)
+
+
+def test_a_flight_without_a_tick_measured_nothing() -> None:
+    report = timed()
+    assert report.duration_s == 0.0
+    assert report.action.rate_hz is None
+    assert report.action.period_ms is None
+    assert report.vision.rate_hz is None
+    assert report.vision.encode_ms is None
+
+
+def test_one_tick_has_no_rate_and_no_period() -> None:
+    report = timed(make_tick(0))
+    assert report.action.rate_hz is None
+    assert report.action.period_ms is None
+
+
+@pytest.mark.parametrize("action_hz", [50.0, 100.0, 250.0])
+def test_jitter_is_against_the_rate_that_was_asked_for(action_hz: float) -> None:
+    timing = FlightTiming(action_hz=action_hz, vision_hz=30)
+    timing.emit(make_tick(0))
+    timing.emit(make_tick(1))
+    jitter_ms = abs(10 - 1000 / action_hz)
+    assert report_of(timing).action.jitter_ms == all_equal(jitter_ms)
+
+
+def test_json_has_the_keys_of_the_report_in_order() -> None:
+    timing = FlightTiming(action_hz=100, vision_hz=30)
+    timing.emit(make_released_tick(0))
+    timing.emit(make_tick(1))
+    document = json.loads(report_json(report_of(timing, LINK)))
+    assert list(document) == [
+        *("duration_s", "mode", "engine", "policy", "autopilot", "action", "vision"),
+        *("feature_age_ms", "state_age_ms", "state_to_wire_ms", "link", "releases"),
+        *("release_count", "observer_drops"),
+    ]
+    assert list(document["action"]) == [
+        *("target_hz", "rate_hz", "flying_s", "ticks", "missed_slots"),
+        *("period_ms", "jitter_ms", "predict_ms"),
+    ]
+    vision_keys = ["target_hz", "rate_hz", "frames", "dropped_frames", "encode_ms"]
+    assert list(document["vision"]) == vision_keys
+    assert list(document["feature_age_ms"]) == ["p50", "p99", "p999", "max"]
+    assert document["link"] == {
+        "unusable_packets": 0,
+        "vehicle_clock_offset_ns": None,
+        "messages_per_s": {"ATTITUDE_QUATERNION": 99.9, "RC_CHANNELS": 20.0},
+        "lost_fraction": 0.001,
+        "rtt_ms": None,
+        "sent_overrides": 6000,
+        "echo_confirmed": True,
+    }
+    assert document["releases"] == [{"t_s": 0.0, "reason": "no feature yet"}]
+    assert document["observer_drops"] == {"rerun": None, "recorder": None}
+
+
+def test_json_says_null_for_what_was_not_measured() -> None:
+    document = json.loads(report_json(timed()))
+    assert document["link"] is None
+    for key in ("feature_age_ms", "state_age_ms", "state_to_wire_ms"):
+        assert document[key] is None
+    assert document["action"]["rate_hz"] is None

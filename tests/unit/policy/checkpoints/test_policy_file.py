@@ -1,0 +1,319 @@
+import json
+import os
+import pickle
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from policy.checkpoints.policy_file import (
+    CheckpointError,
+    build_policy,
+    load_checkpoint,
+    save_checkpoint,
+)
+from policy.contract import Contract
+from policy.errors import PolicyError
+from policy.nets.diffusion import NoiseSchedule
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import Toge, TogeConfig
+
+SMALL = Contract(image_height=32, image_width=32)
+
+
+@pytest.fixture(scope="module")
+def saved(small_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good checkpoint; not to be changed by a test."""
+    path = tmp_path_factory.mktemp("checkpoint") / "toge.safetensors"
+    save_checkpoint(path, small_toge)
+    return path
+
+
+def header_of(path: Path) -> dict[str, str]:
+    with safe_open(path, framework="pt") as file:
+        return dict(file.metadata())
+
+
+def with_header(path: Path, header: dict[str, str]) -> Path:
+    """A file with this header and next to no weights: the header is looked at first."""
+    save_file({"weight": torch.zeros(1)}, path, metadata=header)
+    return path
+
+
+def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
+    config = TogeConfig(
+        size="small",
+        backbone="resnet18",
+        contract=Contract(
+            image_height=32, image_width=48, state_frame="enu_flu", horizon=8, since_exposure=True
+        ),
+        schedule=NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50),
+    )
+    policy = build_policy(config).eval()
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, policy)
+    loaded = load_checkpoint(path, fallback=TogeConfig())
+    assert loaded.config == policy.config
+    assert not loaded.training
+    for name, value in policy.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value), name
+    assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def contents_of(path: Path) -> dict[str, torch.Tensor]:
+    with safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+def test_a_test_vector_is_carried_and_kept(small_toge: Toge, saved: Path) -> None:
+    contents = contents_of(saved)
+    assert contents["test_vector.rgb"].shape == (4, 32, 32, 3)
+    assert contents["test_vector.chunks"].shape == (4, 16, 4)
+    assert contents["test_vector.chunks"].abs().max() > 0.1
+    loaded = load_checkpoint(saved, fallback=small_toge.config)
+    assert not any(name.startswith("test_vector") for name in loaded.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"test_vector.chunks": lambda x: x + 0.02}, r"off by 0\.02.*damaged"),
+        ({"test_vector.chunks": lambda x: x[:2]}, "chunks of shape"),
+        ({"test_vector.chunks": lambda x: x * float("nan")}, "NaN"),
+        ({"test_vector.rgb": lambda x: x.flip(0)}, "do not make the sticks"),
+        ({"test_vector.rgb": lambda x: x.float()}, "test vector is damaged: an image must be"),
+        ({"test_vector.state": lambda x: x[:, :12]}, "test vector is damaged: state must be"),
+        ({"test_vector.history": lambda x: None}, "test vector is damaged: it must hold"),
+        ({"head.unet.out.weight": lambda x: -x}, "do not make the sticks that they made"),
+    ],
+)
+def test_weights_that_do_not_make_their_vector_are_refused(
+    small_toge: Toge, saved: Path, tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    contents = contents_of(saved)
+    for name, change in changes.items():
+        changed = change(contents.pop(name))
+        if changed is not None:
+            contents[name] = changed.contiguous()
+    path = tmp_path / "a.safetensors"
+    save_file(contents, path, metadata=header_of(saved))
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint(path, fallback=small_toge.config)
+
+
+@pytest.mark.parametrize("size", [(224, 224), (40, 64)])
+def test_a_vector_of_any_image_size_is_written(size: tuple[int, int], tmp_path: Path) -> None:
+    contract = Contract(image_height=size[0], image_width=size[1])
+    config = TogeConfig(backbone="resnet18", contract=contract)
+    save_checkpoint(tmp_path / "a.safetensors", build_policy(config).eval())
+    policy = load_checkpoint(tmp_path / "a.safetensors", fallback=config)
+    assert (policy.contract.image_height, policy.contract.image_width) == size
+
+
+def test_resnet_unet_round_trips(tmp_path: Path) -> None:
+    policy = build_policy(ResnetUnetConfig(contract=SMALL))
+    save_checkpoint(tmp_path / "a.safetensors", policy)
+    loaded = load_checkpoint(tmp_path / "a.safetensors", fallback=ResnetUnetConfig())
+    assert loaded.config == policy.config
+
+
+@pytest.mark.parametrize("key", ["model_state_dict", "state_dict", None])
+@pytest.mark.parametrize("suffix", [".pt", ".pth"])
+def test_torch_files_load_in_their_usual_forms(
+    small_toge: Toge, tmp_path: Path, key: str | None, suffix: str
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    state = small_toge.state_dict()
+    torch.save({key: state, "epoch": 3} if key else state, path)
+    loaded = load_checkpoint(path, fallback=small_toge.config)
+    assert torch.equal(loaded.state_dict()["fusion.mlp.0.weight"], state["fusion.mlp.0.weight"])
+
+
+def test_a_torch_file_may_carry_the_header(small_toge: Toge, saved: Path, tmp_path: Path) -> None:
+    header = header_of(saved)
+    path = tmp_path / "a.pt"
+    torch.save({**header, "state_dict": small_toge.state_dict()}, path)
+    assert load_checkpoint(path, fallback=TogeConfig(size="large")).config == small_toge.config
+    torch.save({**header, "contract": {"horizon": 16}, **small_toge.state_dict()}, path)
+    with pytest.raises(CheckpointError, match="'contract' must be JSON text"):
+        load_checkpoint(path, fallback=TogeConfig())
+
+
+class Malicious:
+    """Runs a program when unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.marker),)
+
+
+@pytest.mark.parametrize("protocol", [None, 0, 2, 4])
+def test_a_malicious_pickle_is_refused_and_not_run(
+    small_toge: Toge, tmp_path: Path, protocol: int | None
+) -> None:
+    marker, path = tmp_path / "ran", tmp_path / "a.pt"
+    content = {"state_dict": {"weight": Malicious(marker)}}
+    if protocol is None:
+        torch.save(content, path)
+    else:
+        path.write_bytes(pickle.dumps(content, protocol=protocol))
+    with pytest.raises(CheckpointError, match="could run any program"):
+        load_checkpoint(path, fallback=small_toge.config)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+@pytest.mark.parametrize("kept", [0.0, 0.001, 0.5, 0.999])
+def test_a_truncated_file_is_refused(
+    small_toge: Toge, saved: Path, tmp_path: Path, suffix: str, kept: float
+) -> None:
+    whole = saved
+    if suffix == ".pt":
+        whole = tmp_path / "whole.pt"
+        torch.save(small_toge.state_dict(), whole)
+    content = whole.read_bytes()
+    path = tmp_path / f"cut{suffix}"
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(CheckpointError, match=path.name):
+        load_checkpoint(path, fallback=small_toge.config)
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+@pytest.mark.parametrize(
+    "content",
+    [b"\x00" * 64, b"not a checkpoint", b"PK\x03\x04 not really a zip", b"\x80\x02]q\x00."],
+)
+def test_a_corrupt_file_is_refused(
+    small_toge: Toge, tmp_path: Path, suffix: str, content: bytes
+) -> None:
+    path = tmp_path / f"bad{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=path.name):
+        load_checkpoint(path, fallback=small_toge.config)
+
+
+def test_a_lying_header_length_is_refused(small_toge: Toge, tmp_path: Path) -> None:
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(struct.pack("<Q", 1 << 60) + b"{}")
+    with pytest.raises(CheckpointError, match="not a readable safetensors file"):
+        load_checkpoint(path, fallback=small_toge.config)
+
+
+def test_a_missing_file_names_what_is_there(small_toge: Toge, saved: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"no such file.*toge\.safetensors"):
+        load_checkpoint(saved.with_name("other.pt"), fallback=small_toge.config)
+    with pytest.raises(CheckpointError, match=r"\.safetensors, \.pt, \.pth"):
+        load_checkpoint(saved.with_suffix(".onnx"), fallback=small_toge.config)
+
+
+def test_nan_weights_are_refused_on_both_ways(
+    small_toge: Toge, saved: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.safetensors"
+    poisoned = {"fine": torch.zeros(2), "fusion.mlp.0.weight": torch.tensor([1.0, float("nan")])}
+    save_file(poisoned, path, metadata=header_of(saved))
+    with pytest.raises(CheckpointError, match=r"NaN.*fusion\.mlp\.0\.weight"):
+        load_checkpoint(path, fallback=small_toge.config)
+    policy = build_policy(small_toge.config)
+    with torch.no_grad():
+        policy.head.unet.out.weight[0, 0] = float("inf")
+    with pytest.raises(CheckpointError, match=r"head\.unet\.out\.weight"):
+        save_checkpoint(path, policy)
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "message"),
+    [
+        ("fusion.mlp.0.bias", None, r"missing 'fusion\.mlp\.0\.bias'"),
+        ("surprise", torch.zeros(3), "unexpected 'surprise'"),
+        ("fusion.mlp.0.bias", torch.zeros(3, 7), r"is \[3, 7\], must be \[512\]"),
+    ],
+)
+def test_weights_that_do_not_fit_are_named(
+    small_toge: Toge, tmp_path: Path, name: str, tensor: torch.Tensor | None, message: str
+) -> None:
+    state = {**small_toge.state_dict(), name: tensor}
+    path = tmp_path / "a.pt"
+    torch.save({key: value for key, value in state.items() if value is not None}, path)
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint(path, fallback=small_toge.config)
+
+
+@pytest.mark.parametrize(
+    ("key", "changes", "message"),
+    [
+        ("contract", {"version": 9}, "version 9 is not supported"),
+        ("contract", {"feature_dim": 384}, "feature_dim 384"),
+        ("contract", {"unknown": 1}, "unknown contract keys"),
+        ("architecture", {"size": "huge"}, "size 'huge' is unknown"),
+        ("architecture", {"size": ["small"]}, "is unknown"),
+        ("architecture", {"backbone": "vgg16"}, "backbone 'vgg16' is unknown"),
+        ("architecture", {"policy": "other"}, "policy 'other' is unknown"),
+        ("architecture", {"depth": 3}, "malformed architecture"),
+        ("architecture", {"schedule": 3}, "malformed architecture"),
+        ("architecture", {"schedule": {"betas": "quadratic"}}, "betas 'quadratic' is unknown"),
+    ],
+)
+def test_headers_of_another_build_are_refused(
+    saved: Path, tmp_path: Path, key: str, changes: dict[str, Any], message: str
+) -> None:
+    header = header_of(saved)
+    header[key] = json.dumps({**json.loads(header[key]), **changes})
+    path = with_header(tmp_path / "a.safetensors", header)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint(path, fallback=TogeConfig())
+    assert str(path) in str(caught.value)
+
+
+NONSENSE = ["[" * 100_000, "null", "[]", "{"]
+
+
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [*(("contract", text) for text in NONSENSE), *(("architecture", t) for t in [*NONSENSE, "{}"])],
+)
+def test_header_text_that_is_nonsense_is_refused(
+    saved: Path, tmp_path: Path, key: str, text: str
+) -> None:
+    path = with_header(tmp_path / "a.safetensors", {**header_of(saved), key: text})
+    with pytest.raises(CheckpointError, match=r"a\.safetensors"):
+        load_checkpoint(path, fallback=TogeConfig())
+
+
+@pytest.mark.parametrize("key", ["contract", "architecture"])
+def test_a_file_without_header_says_how_to_convert_it(
+    saved: Path, tmp_path: Path, key: str
+) -> None:
+    header = header_of(saved)
+    del header[key]
+    path = with_header(tmp_path / "a.safetensors", header)
+    with pytest.raises(CheckpointError, match="save_checkpoint"):
+        load_checkpoint(path, fallback=TogeConfig())
+
+
+def test_another_kind_of_policy_is_refused(saved: Path) -> None:
+    with pytest.raises(CheckpointError, match="--policy toge"):
+        load_checkpoint(saved, fallback=ResnetUnetConfig())
+
+
+@pytest.mark.parametrize("content", [[1, 2], {"epoch": 3}, {}, torch.zeros(3), {"state_dict": {}}])
+def test_a_torch_file_without_weights_is_refused(
+    small_toge: Toge, tmp_path: Path, content: Any
+) -> None:
+    path = tmp_path / "a.pt"
+    torch.save(content, path)
+    with pytest.raises(CheckpointError):
+        load_checkpoint(path, fallback=small_toge.config)
+
+
+def test_a_path_that_cannot_be_written_is_refused(small_toge: Toge, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="cannot write"):
+        save_checkpoint(tmp_path / "no" / "folder.safetensors", small_toge)
+    with pytest.raises(PolicyError, match="rename"):
+        save_checkpoint(tmp_path / "a.pt", small_toge)

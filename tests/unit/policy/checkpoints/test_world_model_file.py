@@ -1,0 +1,167 @@
+"""World models on disk, and every way in which a file can be the wrong one."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from policy.checkpoints.policy_file import save_checkpoint
+from policy.checkpoints.tensors import CheckpointError, read_tensors
+from policy.checkpoints.world_model_file import load_world_model, save_world_model
+from policy.contract import Contract
+from policy.nets.diffusion import NoiseSchedule
+from policy.nets.toge import Toge
+from policy.world_model.config import WorldModelConfig
+from policy.world_model.model import WorldModel
+
+CONFIG = WorldModelConfig(
+    image_size=32,
+    latent_channels=3,
+    frames=4,
+    frame_dt_s=0.2,
+    horizontal_fov_rad=1.2,
+    camera_tilt_rad=-0.1,
+    autoencoder_widths=(8, 8, 16),
+    dynamics_width=32,
+    dynamics_depth=1,
+    contract=Contract(state_frame="enu_flu", image_height=32, image_width=32),
+    schedule=NoiseSchedule(betas="linear"),
+)
+
+
+@pytest.fixture(scope="module")
+def model() -> WorldModel:
+    """Not to be changed by a test."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return WorldModel(CONFIG).eval()
+
+
+def test_a_file_alone_says_what_it_is(model: WorldModel, tmp_path: Path) -> None:
+    path = tmp_path / "world.safetensors"
+    save_world_model(path, model, training='{"flights": 3}', half=False)
+    loaded = load_world_model(path)
+    assert loaded.config == CONFIG
+    assert not loaded.training
+    for name, value in model.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value), name
+    assert read_tensors(path)[0]["training"] == '{"flights": 3}'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_half_precision_halves_the_file_and_hardly_changes_a_frame(
+    model: WorldModel, tmp_path: Path
+) -> None:
+    half, full = tmp_path / "half.safetensors", tmp_path / "full.safetensors"
+    save_world_model(half, model)
+    save_world_model(full, model, half=False)
+    assert half.stat().st_size < 0.7 * full.stat().st_size
+    loaded = load_world_model(half)
+    assert all(value.dtype == torch.float32 for value in loaded.state_dict().values())
+    latents = torch.randn(2, 3, 4, 4, generator=torch.Generator().manual_seed(0))
+    shown, wanted = loaded.decode(latents).float(), model.decode(latents).float()
+    assert (shown - wanted).abs().max() <= 1
+
+
+def test_the_shipped_size_is_below_four_megabytes(tmp_path: Path) -> None:
+    save_world_model(tmp_path / "a.safetensors", WorldModel(WorldModelConfig()))
+    assert (tmp_path / "a.safetensors").stat().st_size < 4_000_000
+
+
+def test_files_that_are_not_there_or_cut_short_are_refused(
+    model: WorldModel, tmp_path: Path
+) -> None:
+    path = tmp_path / "world.safetensors"
+    save_world_model(path, model)
+    with pytest.raises(CheckpointError, match=r"no such file.*world\.safetensors"):
+        load_world_model(tmp_path / "other.safetensors")
+    with pytest.raises(CheckpointError, match=r"stored as \.safetensors"):
+        load_world_model(tmp_path / "world.pt")
+    contents = path.read_bytes()
+    for length in (0, 7, 400, len(contents) - 1):
+        path.write_bytes(contents[:length])
+        with pytest.raises(CheckpointError, match="cut short"):
+            load_world_model(path)
+
+
+def test_a_policy_and_a_foreign_file_are_refused(
+    small_toge: Toge, model: WorldModel, tmp_path: Path
+) -> None:
+    path = tmp_path / "policy.safetensors"
+    save_checkpoint(path, small_toge)
+    with pytest.raises(CheckpointError, match="holds a policy"):
+        load_world_model(path)
+    save_file({name: value.contiguous() for name, value in model.state_dict().items()}, path)
+    with pytest.raises(CheckpointError, match="holds no world model"):
+        load_world_model(path)
+
+
+def test_weights_that_are_not_finite_or_do_not_fit_are_refused(
+    model: WorldModel, tmp_path: Path
+) -> None:
+    path = tmp_path / "world.safetensors"
+    sick = WorldModel(CONFIG)
+    sick.action_mean[1] = float("nan")
+    with pytest.raises(CheckpointError, match="action_mean"):
+        save_world_model(path, sick)
+    with torch.no_grad():
+        sick.action_mean[1] = 1e6  # no float16
+    with pytest.raises(CheckpointError, match="action_mean"):
+        save_world_model(path, sick)
+    assert not path.exists()
+    save_world_model(path, model)
+    header = read_tensors(path)[0]
+    state = load_file(path)
+    save_file({**state, "action_std": torch.full((4,), float("inf"))}, path, metadata=header)
+    with pytest.raises(CheckpointError, match="action_std"):
+        load_world_model(path)
+    del state["action_std"]
+    save_file(state, path, metadata=header)
+    with pytest.raises(CheckpointError, match="missing 'action_std'"):
+        load_world_model(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "says"),
+    [
+        ("world_model", "[", "malformed"),
+        ("world_model", "[" * 100_000, "malformed"),
+        ("world_model", "[1]", "must hold"),
+        ("world_model", "{}", "must hold"),
+        ("world_model", CONFIG.to_json().replace('"frames": 4', '"frames": 0'), "frames"),
+        ("world_model", CONFIG.to_json().replace('"frames": 4', '"frames": "4"'), "frames"),
+        ("contract", "{}x", "not JSON"),
+        ("contract", '{"version": 99}', "version 99"),
+    ],
+)
+def test_headers_of_another_make_are_refused(
+    model: WorldModel, tmp_path: Path, key: str, text: str, says: str
+) -> None:
+    path = tmp_path / "world.safetensors"
+    save_world_model(path, model)
+    header, state = read_tensors(path)
+    save_file(state, path, metadata={**header, key: text})
+    with pytest.raises(CheckpointError, match=says):
+        load_world_model(path)
+
+
+def test_a_path_that_cannot_be_written_leaves_the_old_file(
+    model: WorldModel, tmp_path: Path
+) -> None:
+    with pytest.raises(CheckpointError, match="cannot write"):
+        save_world_model(tmp_path / "missing" / "a.safetensors", model)
+    with pytest.raises(CheckpointError, match="rename"):
+        save_world_model(tmp_path / "a.pt", model)
+    path = tmp_path / "a.safetensors"
+    save_world_model(path, model)
+    before = path.read_bytes()
+    (tmp_path / "folder.safetensors").mkdir()
+    with pytest.raises(CheckpointError, match="cannot write"):
+        save_world_model(tmp_path / "folder.safetensors", model)
+    sick = WorldModel(CONFIG)
+    sick.action_mean[0] = float("inf")
+    with pytest.raises(CheckpointError, match="action_mean"):
+        save_world_model(path, sick)
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.safetensors", "folder.safetensors"]

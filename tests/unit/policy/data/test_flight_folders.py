@@ -1,0 +1,200 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from helpers.flight_folders import (
+    LEVEL,
+    MS,
+    spot,
+    ticks_table,
+    write_flight,
+    write_meta,
+    write_spot_flight,
+)
+from policy.data.episodes import DatasetError, common_frame, hold_out, measured_ages
+from policy.data.flight_folders import find_flights, is_exemplary, read_ages, read_flight
+
+WOKE = [0, 10 * MS, 20 * MS]
+STICK = (0.1, 0.2, 0.3, 0.4)
+
+
+def flight(folder: Path, ticks: pa.Table, frames: int = 2, **meta: object) -> Path:
+    captured_ns = [33 * MS * index for index in range(frames)]
+    images = [spot(32, 0.0)] * frames
+    return write_flight(folder, ticks, captured_ns=captured_ns, images=images, **meta)
+
+
+def test_expert_is_imitated_where_there_is_one(tmp_path: Path) -> None:
+    ticks = ticks_table(
+        woke_ns=WOKE,
+        expert=[STICK, None, STICK],
+        sent=[None, (0.5, 0, 0, 0), (0.6, 0, 0, 0)],
+        captured_ns=[None, 2 * MS, 5 * MS],
+        attitude_lag_ns=3 * MS,
+        sent_lag_ns=1 * MS,
+    )
+    episode = read_flight(flight(tmp_path / "a", ticks))
+    assert episode.target_ns.tolist() == [0, 20 * MS]
+    np.testing.assert_allclose(episode.target, [STICK, STICK])
+    assert episode.sent_ns.tolist() == [1 * MS, 11 * MS, 21 * MS]
+    np.testing.assert_allclose(episode.sent[:, 0], [0.0, 0.5, 0.6])  # released is neutral
+    assert np.isnan(episode.state).all(axis=1).tolist() == [False, True, False]
+    assert episode.attitude_ns[[0, 2]].tolist() == [-3 * MS, 17 * MS]
+    assert episode.age_ns.tolist() == [8 * MS, 15 * MS]
+    assert np.isnan(episode.gate).all()
+    assert [image.shape for image in episode.decode()] == [(32, 32, 3)] * 2
+
+
+def test_without_an_expert_what_was_sent_while_armed_is_imitated(tmp_path: Path) -> None:
+    ticks = ticks_table(
+        woke_ns=WOKE, expert=None, sent=[STICK] * 3, armed=[False, True, True], sent_lag_ns=MS
+    )
+    episode = read_flight(flight(tmp_path / "a", ticks))
+    assert episode.target_ns.tolist() == [11 * MS, 21 * MS]
+
+
+def test_in_a_read_only_flight_the_pilot_is_imitated(tmp_path: Path) -> None:
+    ticks = ticks_table(woke_ns=WOKE, expert=None, sent=[None] * 3, rc_sticks=[STICK] * 3)
+    episode = read_flight(flight(tmp_path / "a", ticks))
+    np.testing.assert_allclose(episode.target, [STICK] * 3)
+    np.testing.assert_allclose(episode.sent, [STICK] * 3)
+
+
+def test_a_flight_left_behind_by_a_crash_is_read_to_its_last_whole_batch(tmp_path: Path) -> None:
+    folder = write_spot_flight(tmp_path / "a", 0, seconds=0.5)
+    for stem in ("ticks", "frames"):
+        table = pq.read_table(folder / f"{stem}.parquet")
+        (folder / f"{stem}.parquet").unlink()
+        with pa.OSFile(str(folder / f"{stem}.arrows"), "wb") as file:
+            writer = pa.ipc.new_stream(file, table.schema)
+            for batch in table.to_batches(max_chunksize=10):
+                writer.write_batch(batch)
+            file.flush()
+        whole = (folder / f"{stem}.arrows").read_bytes()
+        (folder / f"{stem}.arrows").write_bytes(whole[:-40])
+    episode = read_flight(folder)
+    assert len(episode.tick_ns) == 40  # of 50
+    assert len(episode.captured_ns) == 10  # of 15
+
+
+def test_folders_of_flights_are_opened(tmp_path: Path) -> None:
+    for name in ("b", "a"):
+        write_meta(tmp_path / "flights" / name)
+    found = find_flights([tmp_path / "flights", tmp_path / "flights" / "a"])
+    assert [path.name for path in found] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("meta", "says"),
+    [
+        ({"format": "other"}, "not a flight of mavbridge"),
+        ({"version": 2}, "version 2"),
+        ({"contract": {}}, "no state frame"),
+        ({"contract": None}, "no state frame"),
+    ],
+)
+def test_a_foreign_folder_is_refused(tmp_path: Path, meta: dict[str, object], says: str) -> None:
+    write_meta(tmp_path, **meta)
+    with pytest.raises(DatasetError, match=says):
+        read_flight(tmp_path)
+
+
+def test_no_flights_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="name at least one"):
+        find_flights([])
+    with pytest.raises(DatasetError, match="no such folder"):
+        find_flights([tmp_path / "missing"])
+    with pytest.raises(DatasetError, match="neither a flight"):
+        find_flights([tmp_path])
+    write_meta(tmp_path)
+    with pytest.raises(DatasetError, match=r"neither ticks\.parquet nor"):
+        read_flight(tmp_path)
+
+
+def test_a_flight_without_frames_is_refused(tmp_path: Path) -> None:
+    ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3)
+    folder = flight(tmp_path / "a", ticks)
+    (folder / "camera.mp4").unlink()
+    with pytest.raises(DatasetError, match="no frames"):
+        read_flight(folder)
+
+
+def test_meta_that_is_not_json_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "meta.json").write_text("{")
+    with pytest.raises(DatasetError, match="not JSON"):
+        read_flight(tmp_path)
+    (tmp_path / "meta.json").write_text(json.dumps([]))
+    with pytest.raises(DatasetError, match="not a flight"):
+        read_flight(tmp_path)
+
+
+def test_numbers_that_are_none_are_refused(tmp_path: Path) -> None:
+    bad = (0.0, float("nan"), 0.0, 0.0)
+    ticks = ticks_table(woke_ns=WOKE, expert=[STICK, bad, STICK], sent=[STICK] * 3)
+    with pytest.raises(DatasetError, match="expert holds NaN or infinity in row 1"):
+        read_flight(flight(tmp_path / "a", ticks))
+    fast = (900.0, *LEVEL[1:])
+    ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3, state=[fast] * 3)
+    with pytest.raises(DatasetError, match="vx_mps reaches 900"):
+        read_flight(flight(tmp_path / "b", ticks))
+    ticks = ticks_table(woke_ns=WOKE, expert=[(2.0, 0, 0, 0)] * 3, sent=[STICK] * 3)
+    with pytest.raises(DatasetError, match="target must be sticks"):
+        read_flight(flight(tmp_path / "c", ticks))
+    ticks = ticks_table(woke_ns=[0, 20 * MS, 10 * MS], expert=[STICK] * 3, sent=[STICK] * 3)
+    with pytest.raises(DatasetError, match="runs backwards at row 2"):
+        read_flight(flight(tmp_path / "d", ticks))
+    ticks = ticks_table(woke_ns=WOKE, expert=[None] * 3, sent=[STICK] * 3)
+    with pytest.raises(DatasetError, match="nobody to learn from"):
+        read_flight(flight(tmp_path / "e", ticks))
+
+
+def test_two_kinds_of_flights_are_refused(tmp_path: Path) -> None:
+    ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3)
+    ned = read_flight(flight(tmp_path / "a", ticks))
+    enu = read_flight(flight(tmp_path / "b", ticks, contract={"state_frame": "enu_flu"}))
+    assert common_frame([enu]) == "enu_flu"
+    with pytest.raises(DatasetError, match="one kind at a time"):
+        common_frame([ned, enu])
+
+
+def test_ages_are_measured_where_a_policy_looked(tmp_path: Path) -> None:
+    seen = [None, 2 * MS, 5 * MS]
+    ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3, captured_ns=seen)
+    folder = flight(tmp_path / "a", ticks)
+    assert read_ages(folder).tolist() == [8 * MS, 15 * MS]
+    assert measured_ages([read_flight(folder)]).tolist() == [8 * MS, 15 * MS]
+    blind = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3)
+    with pytest.raises(DatasetError, match="no policy looked"):
+        read_ages(flight(tmp_path / "b", blind))
+
+
+def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
+    ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3)
+    episode = read_flight(flight(tmp_path / "a", ticks))
+    kept, held = hold_out([episode] * 10, 0.2, seed=3)
+    assert sorted(kept + held) == list(range(10))
+    assert len(held) == 2
+    assert hold_out([episode] * 10, 0.2, seed=3) == (kept, held)
+    assert len(hold_out([episode] * 2, 0.01, seed=0)[1]) == 1
+    assert hold_out([episode], 0.5, seed=0) == ([0], [])
+    assert hold_out([episode] * 3, 0.0, seed=0)[1] == []
+
+
+@pytest.mark.parametrize(
+    ("meta", "exemplary"),
+    [
+        ({"source": "demonstration", "success": False}, False),
+        ({"source": "demonstration", "success": True}, True),
+        ({"source": "dagger", "success": False}, True),
+        ({"source": "flight", "success": None}, True),
+    ],
+)
+def test_a_failed_demonstration_is_nothing_to_imitate(
+    tmp_path: Path, meta: dict[str, object], exemplary: bool
+) -> None:
+    write_meta(tmp_path / "flight", **meta)
+    assert is_exemplary(tmp_path / "flight") is exemplary

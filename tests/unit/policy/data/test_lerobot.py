@@ -1,0 +1,231 @@
+"""LeRobot datasets of somebody else: what is taken, what is refused and with which words."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from helpers.flight_folders import LEVEL, spot
+from policy.contract import ACTION_NAMES, STATE_NAMES
+from policy.data.episodes import DatasetError, measured_ages
+from policy.data.lerobot import is_lerobot, read_dataset
+
+FPS, SIZE = 25, 32
+LENGTHS = (12, 8)
+CAMERA = "observation.images.nose"
+
+
+def images_of(episode: int) -> list[np.ndarray]:
+    return [spot(SIZE, 2 * k / 12 - 1 + 0.1 * episode) for k in range(LENGTHS[episode])]
+
+
+def feature(dtype: str, shape: list[int], named: object) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": shape, "names": named}
+
+
+def write(root: Path, *, kind: str = "video", state: object = LEVEL) -> Path:
+    """A dataset without any column of ours."""
+    features = {
+        CAMERA: feature(kind, [SIZE, SIZE, 3], ["height", "width", "channels"]),
+        "observation.state": feature("float32", [13], list(STATE_NAMES)),
+        "action": feature("float32", [4], {"motors": list(ACTION_NAMES)}),
+        "timestamp": feature("float32", [1], None),
+    }
+    info = {"codebase_version": "v3.0", "fps": FPS, "features": features}
+    for folder in ("meta/episodes/chunk-000", "data/chunk-000", f"videos/{CAMERA}/chunk-000"):
+        (root / folder).mkdir(parents=True)
+    (root / "meta/info.json").write_text(json.dumps(info))
+    index = [e for e, length in enumerate(LENGTHS) for _ in range(length)]
+    place = [k for length in LENGTHS for k in range(length)]
+    rows = {
+        "observation.state": pa.array([state] * len(index), pa.list_(pa.float32(), 13)),
+        "action": pa.array([(k / 20, 0, 0, 0) for k in place], pa.list_(pa.float32(), 4)),
+        "timestamp": pa.array([k / FPS for k in place], pa.float32()),
+        "episode_index": pa.array(index, pa.int64()),
+    }
+    images = [image for episode in range(2) for image in images_of(episode)]
+    if kind == "image":
+        encoded = [cv2.imencode(".png", image[..., ::-1])[1].tobytes() for image in images]
+        rows[CAMERA] = pa.array([{"bytes": value, "path": None} for value in encoded])
+    else:
+        encode(root / f"videos/{CAMERA}/chunk-000/file-000.mp4", images)
+    pq.write_table(pa.table(rows), root / "data/chunk-000/file-000.parquet")
+    episodes = {
+        "episode_index": [0, 1],
+        "length": list(LENGTHS),
+        "data/chunk_index": [0, 0],
+        "data/file_index": [0, 0],
+        f"videos/{CAMERA}/chunk_index": [0, 0],
+        f"videos/{CAMERA}/file_index": [0, 0],
+        f"videos/{CAMERA}/from_timestamp": [0.0, LENGTHS[0] / FPS],
+    }
+    pq.write_table(pa.table(episodes), root / "meta/episodes/chunk-000/file-000.parquet")
+    return root
+
+
+def encode(path: Path, images: list[np.ndarray]) -> None:
+    with av.open(str(path), "w") as container:
+        # frames before and after, as other programs encode
+        stream = container.add_stream("libx264", rate=FPS, options={"crf": "12", "g": "10"})
+        stream.height, stream.width, stream.pix_fmt = SIZE, SIZE, "yuv420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))
+
+
+@pytest.mark.parametrize("kind", ["video", "image"])
+def test_a_foreign_dataset_has_its_timestamps_for_everything(kind: str, tmp_path: Path) -> None:
+    assert not is_lerobot(tmp_path)
+    assert is_lerobot(write(tmp_path / "a", kind=kind))
+    episodes = read_dataset(tmp_path / "a")
+    assert [len(episode.tick_ns) for episode in episodes] == list(LENGTHS)
+    assert len({episode.fingerprint for episode in episodes}) == 2
+    assert len(measured_ages(episodes)) == 0
+    for number, episode in enumerate(episodes):
+        for name in ("tick_ns", "attitude_ns", "velocity_ns", "target_ns", "sent_ns"):
+            np.testing.assert_array_equal(getattr(episode, name), episode.captured_ns)
+        np.testing.assert_allclose(np.diff(episode.captured_ns), 40_000_000, atol=100)
+        np.testing.assert_allclose(episode.target[:, 0], np.arange(LENGTHS[number]) / 20)
+        np.testing.assert_array_equal(episode.sent, episode.target)
+        after = np.stack(list(episode.decode())).astype(int)
+        assert np.abs(after - np.stack(images_of(number))).mean(axis=(1, 2, 3)).max() < 4.0
+
+
+def test_the_frame_of_the_state_is_where_gravity_says(tmp_path: Path) -> None:
+    flu = (*LEVEL[:-1], 9.8)
+    assert read_dataset(write(tmp_path / "a"))[0].state_frame == "ned_frd"
+    assert read_dataset(write(tmp_path / "b", state=flu))[0].state_frame == "enu_flu"
+
+
+Change = Callable[[dict[str, Any]], None]
+
+
+def _state(**changes: object) -> Change:
+    return lambda info: info["features"]["observation.state"].update(changes)
+
+
+def _second_camera(info: dict[str, Any]) -> None:
+    info["features"]["observation.images.tail"] = info["features"][CAMERA]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda info: info.update(codebase_version="v2.1"), "convert_dataset_v21_to_v30"),
+        (lambda info: info.pop("codebase_version"), "version None"),
+        (lambda info: info.update(fps=0), "fps"),
+        (lambda info: info.update(features=[]), "no features"),
+        (lambda info: info["features"].pop("observation.state"), "no feature observation.state"),
+        (_state(shape=[14]), r"shape \[14\]"),
+        (_state(names=None), "named None"),
+        (_state(names=list(STATE_NAMES[::-1])), "in this order"),
+        (_state(info={"state_frame": "body"}), "do not know: 'body'"),
+        (lambda info: info["features"].pop(CAMERA), "no camera"),
+        (_second_camera, "--camera-key"),
+        (lambda info: info.update(video_path="elsewhere/{video_key}.mp4"), "copy the dataset"),
+        (lambda info: info.update(video_path="{drone}.mp4"), "where its files are"),
+    ],
+)
+def test_another_kind_of_dataset_is_refused(change: Change, says: str, tmp_path: Path) -> None:
+    path = write(tmp_path / "a") / "meta/info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+    with pytest.raises(DatasetError, match=says):
+        read_dataset(tmp_path / "a")
+
+
+def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "a") / "meta/info.json"
+    info = json.loads(path.read_text())
+    _second_camera(info)
+    path.write_text(json.dumps(info))
+    assert len(read_dataset(tmp_path / "a", CAMERA)) == 2
+    with pytest.raises(DatasetError, match="no camera tail"):
+        read_dataset(tmp_path / "a", "tail")
+
+
+def _edit_rows(root: Path, name: str, change: Callable[[list[Any]], list[Any]]) -> None:
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    values = pa.array(change(table[name].to_pylist()), table[name].type)
+    pq.write_table(table.set_column(table.column_names.index(name), name, values), path)
+
+
+def _nan(values: list[Any]) -> list[Any]:
+    return [*values[:3], [np.nan] * len(values[3]), *values[4:]]
+
+
+def _drop_column(root: Path) -> None:
+    path = root / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(path).drop_columns(["action"]), path)
+
+
+def _drop_rows(root: Path) -> None:
+    path = root / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(path).slice(0, 15), path)
+
+
+def _scalar_state(root: Path) -> None:
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    flat = pa.array(np.zeros(table.num_rows, np.float32))
+    pq.write_table(table.set_column(0, "observation.state", flat), path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda root: _edit_rows(root, "observation.state", _nan), "NaN or infinity in row 3"),
+        (lambda root: _edit_rows(root, "action", _nan), "action holds NaN"),
+        (lambda root: _edit_rows(root, "timestamp", lambda v: v[::-1]), "runs backwards"),
+        (lambda root: _edit_rows(root, "timestamp", lambda v: [None, *v[1:]]), "missing in 1"),
+        (lambda root: _edit_rows(root, "action", lambda v: [[7.0] * 4] * len(v)), "sticks in"),
+        (_drop_column, "lacks .*action"),
+        (_drop_rows, "holds 3 rows"),
+        (_scalar_state, "13 numbers a row"),
+        (lambda root: (root / "data/chunk-000/file-000.parquet").unlink(), "is not there"),
+        (
+            lambda root: (root / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1"),
+            "cannot be read",
+        ),
+        (
+            lambda root: (root / "meta/episodes/chunk-000/file-000.parquet").unlink(),
+            "no meta/episodes",
+        ),
+        (lambda root: (root / "meta/info.json").write_text("{"), "not JSON"),
+    ],
+)
+def test_a_damaged_dataset_is_refused(
+    spoil: Callable[[Path], object], says: str, tmp_path: Path
+) -> None:
+    spoil(write(tmp_path / "a"))
+    with pytest.raises(DatasetError, match=says):
+        read_dataset(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("shown", "says"), [(14, "ends after 2 of 8"), (12, "ends after 0 of 8|not a readable video")]
+)
+def test_a_video_that_ends_early_is_refused(shown: int, says: str, tmp_path: Path) -> None:
+    root = write(tmp_path / "a")
+    images = [image for episode in range(2) for image in images_of(episode)]
+    encode(root / f"videos/{CAMERA}/chunk-000/file-000.mp4", images[:shown])
+    first, second = read_dataset(root)
+    assert len(list(first.decode())) == LENGTHS[0]
+    with pytest.raises(DatasetError, match=says):
+        list(second.decode())
+
+
+def test_a_file_that_is_no_video_is_refused(tmp_path: Path) -> None:
+    root = write(tmp_path / "a")
+    (root / f"videos/{CAMERA}/chunk-000/file-000.mp4").write_bytes(b"no video")
+    with pytest.raises(DatasetError, match="not a readable video"):
+        list(read_dataset(root)[0].decode())

@@ -1,0 +1,249 @@
+"""What the net is told in training is what the runtime tells it in flight."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mavbridge.core.records import Sticks, VehicleState
+from mavbridge.flight.ego_motion import EgoMotion
+from mavbridge.flight.history import SentHistory, sample_chunk
+from policy import rotation
+from policy.contract import QUATERNION, RATE, VELOCITY, Contract
+from policy.data.episodes import DatasetError, Episode
+from policy.data.samples import (
+    BLIND_SHARE,
+    FRESH_START_SHARE,
+    HISTORY_NOISE,
+    Samples,
+    Timeline,
+    mirror,
+)
+
+MS = 1_000_000
+CONTRACT = Contract(since_exposure=True, horizon=4)
+
+
+def no_images() -> Iterator[NDArray[np.uint8]]:
+    return iter(())
+
+
+def flown(start_ns: int = 10**12, ticks: int = 200, seed: int = 0, **changes: object) -> Episode:
+    """A restless flight at 100 Hz with true stamps that are never quite on the grid."""
+    random = np.random.default_rng(seed)
+    tick_ns = start_ns + np.arange(ticks) * 10 * MS + random.integers(0, MS, ticks)
+    angle = np.cumsum(random.normal(0, 0.02, ticks))
+    state = random.normal(0, 1, (ticks, 13)).astype(np.float32)
+    state[:, VELOCITY] = np.cumsum(random.normal(0, 0.05, (ticks, 3)), axis=0)
+    state[:, QUATERNION] = rotation.about_z(angle)
+    attitude_ns = tick_ns - random.integers(1, 5, ticks) * MS
+    captured_ns = start_ns + np.arange(ticks // 3) * 33 * MS
+    episode = Episode(
+        name="made up",
+        state_frame="ned_frd",
+        tick_ns=tick_ns,
+        state=state,
+        attitude_ns=attitude_ns,
+        velocity_ns=attitude_ns - MS,
+        target_ns=tick_ns,
+        target=np.cumsum(random.normal(0, 0.01, (ticks, 4)), axis=0).clip(-1, 1).astype("f4"),
+        sent_ns=tick_ns + 2 * MS,
+        sent=random.uniform(-1, 1, (ticks, 4)).astype(np.float32),
+        age_ns=np.array([40 * MS, 50 * MS, 90 * MS]),
+        captured_ns=captured_ns,
+        gate=np.full((len(captured_ns), 7), np.nan, np.float32),
+        fingerprint=str(seed),
+        decode=no_images,
+    )
+    return replace(episode, **changes)  # type: ignore[arg-type]
+
+
+def timeline(*episodes: Episode, contract: Contract = CONTRACT) -> Timeline:
+    return Timeline(episodes, contract, np.sort(episodes[0].age_ns))
+
+
+def test_history_is_what_the_runtime_resamples() -> None:
+    episode = flown(ticks=60)
+    made = timeline(flown(seed=1), episode).histories(np.arange(200, 260))
+    runtime = SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s)
+    for tick in range(60):
+        expected = runtime.resample(int(episode.tick_ns[tick]))
+        np.testing.assert_array_equal(made[tick], expected[0])
+        runtime.append(Sticks(*episode.sent[tick].tolist()), int(episode.sent_ns[tick]))
+
+
+def test_the_runtime_finds_the_expert_in_a_chunk() -> None:
+    """Sampled when the runtime samples it, a perfect chunk gives the expert's stick of then."""
+    episode = flown()
+    line = timeline(episode)
+    for tick in (20, 77, 130):
+        chunk, known = line.chunks(np.array([tick]))
+        assert known.all()
+        for k in range(CONTRACT.horizon):
+            at_s = k * CONTRACT.chunk_dt_s
+            stick = sample_chunk(chunk[0], chunk_dt_s=CONTRACT.chunk_dt_s, at_s=at_s)
+            then_ns = episode.attitude_ns[tick] + round(at_s * 1e9)
+            expert = [np.interp(then_ns, episode.target_ns, column) for column in episode.target.T]
+            np.testing.assert_allclose(stick, expert, atol=1e-6)
+
+
+def test_chunk_by_hand() -> None:
+    tick_ns = np.arange(5) * 100 * MS
+    sticks = np.zeros((5, 4), np.float32)
+    sticks[:, 1] = [0.0, 0.2, 0.4, 0.6, 0.8]
+    episode = flown(
+        tick_ns=tick_ns,
+        attitude_ns=tick_ns + 25 * MS,
+        velocity_ns=tick_ns,
+        state=flown().state[:5],
+        target_ns=tick_ns,
+        target=sticks,
+        captured_ns=np.array([50 * MS]),
+        gate=np.zeros((1, 7), np.float32),
+    )
+    line = timeline(episode)
+    chunk, known = line.chunks(np.array([1, 3]))
+    np.testing.assert_allclose(chunk[0, :, 1], [0.25, 0.35, 0.45, 0.55], atol=1e-6)
+    assert known.tolist() == [[True] * 4, [True, True, False, False]]
+    np.testing.assert_allclose(chunk[1, :, 1], [0.65, 0.75, 0.75, 0.75], atol=1e-6)  # held
+
+
+def test_sticks_far_apart_are_not_interpolated() -> None:
+    episode = flown()
+    keep = np.r_[0:100, 130:200]  # 300 ms without an expert
+    gappy = replace(episode, target_ns=episode.target_ns[keep], target=episode.target[keep])
+    known = timeline(gappy).chunks(np.arange(200))[1]
+    assert known[60:80].all()
+    assert not known[101:130].any(axis=1).any()
+    assert known[97].tolist() == [True, False, False, False]
+
+
+def test_since_exposure_by_hand() -> None:
+    """A quarter turn to the right in 100 ms, gathering 1 m/s northwards, nose east at exposure."""
+    tick_ns = np.arange(5) * 100 * MS
+    state = np.zeros((5, 13), np.float32)
+    state[:, QUATERNION] = rotation.about_z(np.array([0.0, 90, 180, 180, 180]) * np.pi / 180)
+    state[:, 0] = [0.0, 1.0, 2.0, 3.0, 4.0]
+    episode = flown(
+        tick_ns=tick_ns,
+        attitude_ns=tick_ns,
+        velocity_ns=tick_ns,
+        state=state,
+        target_ns=tick_ns,
+        target=np.zeros((5, 4), np.float32),
+        captured_ns=np.array([100 * MS, 150 * MS]),
+        gate=np.zeros((2, 7), np.float32),
+        age_ns=np.array([100 * MS]),
+    )
+    told = timeline(episode).states(np.array([0, 1]), np.array([2, 2]))[:, 13:]
+    # North is to the left (-y) of a body that looks east.
+    np.testing.assert_allclose(told[0], [0.1, 0, 0, np.pi / 2, 0, -1, 0], atol=1e-5)
+    half = np.sqrt(0.5) / 2
+    np.testing.assert_allclose(told[1], [0.05, 0, 0, np.pi / 4, -half, -half, 0], atol=1e-5)
+
+
+def test_the_runtime_tells_the_same_of_an_image() -> None:
+    episode = flown(ticks=60)
+    line = timeline(episode)
+    runtime = EgoMotion(span_ns=300 * MS)
+    frames = np.arange(3, 20)
+    for tick in range(60):
+        state = VehicleState(
+            values=episode.state[tick],
+            attitude_ns=int(episode.attitude_ns[tick]),
+            rate_ns=0,
+            velocity_ns=int(episode.velocity_ns[tick]),
+            specific_force_ns=0,
+        )
+        runtime.push(state)
+        age_ns = episode.tick_ns[tick] - episode.captured_ns[frames]
+        # Down to an image that is newer than the attitude of the tick.
+        for frame in frames[(age_ns >= 0) & (age_ns < 200 * MS)]:
+            expected = runtime.append_to(state, int(episode.captured_ns[frame]))
+            told = line.states(np.array([frame]), np.array([tick]))
+            np.testing.assert_allclose(told, expected, atol=2e-5)
+
+
+def test_without_since_exposure_the_state_has_13_numbers() -> None:
+    line = timeline(flown(), contract=Contract())
+    np.testing.assert_array_equal(line.states(line.frames[:1], np.array([50])), flown().state[[50]])
+
+
+def test_ticks_are_drawn_at_measured_ages() -> None:
+    line = timeline(flown(), flown(seed=1))
+    random = np.random.default_rng(0)
+    frames = np.repeat(line.frames, 20)
+    ticks = line.draw_ticks(frames, random)
+    age_ms = (line.tick_ns[ticks] - line.captured_ns[frames]) / MS
+    errors = np.abs(age_ms[:, None] - np.array([40, 50, 90])).min(axis=1)
+    assert np.quantile(errors, 0.95) <= 6  # ticks are 10 ms apart; a flight ends before some ages
+    assert age_ms.min() > 0
+    near = np.abs(age_ms[:, None] - np.array([40, 90])) < 6
+    assert near.mean(axis=0) == pytest.approx([1 / 3, 1 / 3], abs=0.08)
+
+
+def test_a_history_in_training_is_often_gone_and_never_exact() -> None:
+    line = timeline(flown())
+    ticks = np.full(4000, 100)
+    plain, told = line.histories(ticks[:1]), line.histories(ticks, np.random.default_rng(0))
+    newest_is_gone = (told[:, -1] == 0).all(axis=1)
+    oldest_is_gone = (told[:, 0] == 0).all(axis=1)
+    assert BLIND_SHARE < newest_is_gone.mean() < BLIND_SHARE + 0.1
+    assert oldest_is_gone.mean() == pytest.approx(BLIND_SHARE + FRESH_START_SHARE, abs=0.05)
+    newest = told[~oldest_is_gone][:, -1, 0]
+    assert len(np.unique(newest)) > len(newest) / 2  # jitter alone would give two or three values
+    assert np.quantile(np.abs(newest - plain[0, -1, 0]), 0.5) > HISTORY_NOISE / 4
+
+
+def test_images_of_a_gate_behind_the_camera_are_left_out() -> None:
+    usable = timeline(flown()).frames
+    gate = np.full((len(flown().captured_ns), 7), np.nan, np.float32)
+    gate[usable[2], 0], gate[usable[3], 0] = -0.5, 0.5
+    left = timeline(flown(gate=gate)).frames
+    assert left.tolist() == np.delete(usable, 2).tolist()
+
+
+def test_images_and_ticks_of_two_clocks_are_refused() -> None:
+    episode = flown()
+    shifted = replace(episode, captured_ns=episode.captured_ns + 10**13)
+    with pytest.raises(DatasetError, match="one clock"):
+        timeline(shifted)
+
+
+def test_a_mirrored_flight_is_a_flight() -> None:
+    """Its rates are those of its attitudes, its velocity in body axes is the mirrored one."""
+    random = np.random.default_rng(4)
+    q = random.normal(size=(30, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    state = random.normal(size=(30, 20)).astype(np.float32)
+    state[:, QUATERNION] = q
+    samples = Samples(
+        frame=np.arange(30),
+        state=state,
+        history=random.normal(size=(30, 4, 4)).astype(np.float32),
+        chunk=random.normal(size=(30, 4, 4)).astype(np.float32),
+        known=np.ones((30, 4), bool),
+        gate=random.normal(size=(30, 7)).astype(np.float32),
+    )
+    left = mirror(samples, np.arange(30) % 2 == 0)
+    np.testing.assert_array_equal(left.state[1::2], samples.state[1::2])
+    mirrored = left.state[::2]
+
+    def in_body(of: NDArray[np.float32]) -> NDArray[np.float64]:
+        back = rotation.conjugate(of[:, QUATERNION].astype(np.float64))
+        return rotation.rotate(back, of[:, VELOCITY].astype(np.float64))
+
+    flip = np.array([1.0, -1.0, 1.0])
+    np.testing.assert_allclose(in_body(mirrored), in_body(state[::2]) * flip, atol=1e-5)
+    # A turn from one attitude to the next, mirrored, is the turn between the mirrored attitudes.
+    a, b = (s[:, QUATERNION].astype(np.float64) for s in (state[::2][:-1], state[::2][1:]))
+    ma, mb = (s[:, QUATERNION].astype(np.float64) for s in (mirrored[:-1], mirrored[1:]))
+    turn = rotation.rotation_vector(rotation.multiply(rotation.conjugate(a), b))
+    mirrored_turn = rotation.rotation_vector(rotation.multiply(rotation.conjugate(ma), mb))
+    np.testing.assert_allclose(mirrored_turn, -turn * flip, atol=1e-5)
+    np.testing.assert_array_equal(mirrored[:, RATE], state[::2, RATE] * -flip.astype(np.float32))
+    np.testing.assert_array_equal(mirrored[:, 14:17], state[::2, 14:17] * -flip.astype("f4"))
+    np.testing.assert_array_equal(left.chunk[::2], samples.chunk[::2] * [1, -1, 1, -1])
+    np.testing.assert_array_equal(left.gate[::2], samples.gate[::2] * [1, -1, 1, -1, 1, -1, 1])

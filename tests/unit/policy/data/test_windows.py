@@ -1,0 +1,120 @@
+"""Windows of frames at an even pace, with the states and sticks that belong to them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.steered_flights import ACCELERATION_MPS2, MS, YAW_RATE_RADPS, steered_flight
+from policy.contract import QUATERNION, VELOCITY
+from policy.data.episodes import DatasetError, Episode
+from policy.data.windows import TOLERANCE, Windows, find_windows
+
+DT_NS = 100 * MS
+
+
+def windows_of(*episodes: Episode, dt_s: float = 0.1) -> Windows:
+    return find_windows(episodes, context_frames=2, frames=4, frame_dt_s=dt_s)
+
+
+def without(episode: Episode, *dropped: int) -> Episode:
+    kept = np.setdiff1d(np.arange(len(episode.captured_ns)), dropped)
+    return replace(episode, captured_ns=episode.captured_ns[kept], gate=episode.gate[kept])
+
+
+def test_every_frame_begins_a_window_until_the_flight_ends() -> None:
+    found = windows_of(steered_flight(0))
+    assert len(found) == 91 - 15  # 91 frames; the last of six is 15 frames after the first
+    np.testing.assert_array_equal(found.frames[0], [0, 3, 6, 9, 12, 15])
+    np.testing.assert_array_equal(found.frames[:, 0], np.arange(76))
+
+
+def test_windows_stay_in_one_flight_and_cross_no_gap() -> None:
+    first, second = steered_flight(0), steered_flight(1)
+    gap = range(40, 47)
+    found = windows_of(first, without(second, *gap))
+    starts = found.frames[:, 0] >= 91
+    assert (starts == (found.frames[:, -1] >= 91)).all()
+    assert 0 < starts.sum() < 76
+    steps = np.diff(found.captured_ns[found.frames], axis=1)
+    assert np.abs(steps - DT_NS).max() <= 2 * TOLERANCE * DT_NS
+    in_second = found.captured_ns[found.frames[starts]]
+    lost_ns = second.captured_ns[list(gap)].mean()
+    assert not ((in_second[:, 0] < lost_ns) & (in_second[:, -1] > lost_ns)).any()
+
+
+def test_a_single_dropped_frame_costs_only_the_windows_that_need_it() -> None:
+    flight = steered_flight(0)
+    found = windows_of(without(flight, 30))
+    assert len(found) == 75 - 6 + 1  # its own start, and it was wanted in five more places
+    assert (np.abs(np.diff(found.captured_ns[found.frames], axis=1) - DT_NS) <= 1 * MS).all()
+
+
+def test_a_window_needs_states_all_along() -> None:
+    flight = steered_flight(0)
+    state = flight.state.copy()
+    state[100:140] = np.nan  # 0.4 s in which nobody flew
+    found = windows_of(replace(flight, state=state))
+    covered = (found.captured_ns[found.frames] - flight.tick_ns[0]) / 1e9
+    assert 0 < len(found) < 76
+    assert not ((covered > 1.0) & (covered < 1.4)).any()
+
+
+def test_actions_are_the_mean_of_what_was_sent_between_the_frames() -> None:
+    flight = steered_flight(0)
+    samples = windows_of(flight).samples(np.array([0, 11]))
+    assert samples.actions.shape == (2, 4, 4)
+    for window in range(2):
+        for index in range(4):
+            start, stop = flight.captured_ns[samples.frames[window][index + 1 : index + 3]]
+            at = np.arange(start, stop, MS // 10)
+            sticks = flight.sent[np.searchsorted(flight.sent_ns, at, side="right") - 1]
+            told = samples.actions[window, index]
+            np.testing.assert_allclose(told, sticks.mean(axis=0), atol=2e-3)
+    assert np.abs(samples.actions[..., 1]).max() > 0.1
+
+
+def test_sticks_are_neutral_before_the_first_and_held_after_the_last() -> None:
+    flight = steered_flight(0)
+    late = replace(flight, sent_ns=flight.sent_ns[150:151], sent=np.ones((1, 4), np.float32))
+    found = windows_of(late)
+    actions = found.samples(np.arange(len(found))).actions
+    ends = found.captured_ns[found.frames[:, 2:]]
+    starts = found.captured_ns[found.frames[:, 1:-1]]
+    assert (actions[ends <= late.sent_ns[0]] == 0).all()
+    np.testing.assert_allclose(actions[starts >= late.sent_ns[0]], 1.0, atol=1e-6)
+
+
+def test_states_are_those_of_the_exposures_and_follow_the_actions() -> None:
+    found = windows_of(steered_flight(0))
+    samples = found.samples(np.arange(len(found)))
+    np.testing.assert_allclose(
+        np.linalg.norm(samples.states[..., QUATERNION], axis=-1), 1.0, atol=1e-5
+    )
+    assert (samples.states[..., QUATERNION.start] >= 0).all()
+    moved = np.diff(samples.states[:, 1:, VELOCITY], axis=1)
+    elapsed_s = np.diff(found.captured_ns[found.frames[:, 1:]], axis=1) / 1e9
+    foretold = np.abs(samples.actions[..., 2]) * elapsed_s * ACCELERATION_MPS2
+    met = np.abs(np.linalg.norm(moved, axis=-1) - foretold) < 0.01 * ACCELERATION_MPS2
+    assert met.mean() > 0.9  # not where it turns or changes its mind on the way
+    assert YAW_RATE_RADPS > np.abs(samples.states[..., 9]).max() > 0.5
+
+
+def test_among_keeps_what_needs_no_other_frame() -> None:
+    found = windows_of(steered_flight(0))
+    part = found.among(np.arange(20))
+    assert part.frames.max() < 20
+    assert len(part) == 5
+    assert len(found.among(np.arange(3))) == 0
+    assert len(found.spread(10)) == 10
+    assert len(part.spread(10)) == 5
+
+
+def test_flights_without_a_window_are_refused() -> None:
+    with pytest.raises(DatasetError, match="33 ms apart"):
+        windows_of(steered_flight(0, seconds=0.3))
+    with pytest.raises(DatasetError, match="choose another frame_dt_s"):
+        windows_of(steered_flight(0), dt_s=0.02)
+    nobody = replace(steered_flight(0), state=np.full((300, 13), np.nan, np.float32))
+    with pytest.raises(DatasetError, match="with states"):
+        windows_of(nobody)

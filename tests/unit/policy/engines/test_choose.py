@@ -1,0 +1,181 @@
+"""The parity gate: which engine flies, and what is said of the others."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from policy.contract import Contract, Executable, FloatArray
+from policy.engines.choose import Candidate, choose_executable, first_faithful, probe_chunks
+from policy.engines.executable import EngineName, Settings
+from policy.engines.openvino_cpu import make_openvino_executable, precisions
+from policy.engines.parity import MAX_STICK_ERROR, disagreement, make_probe
+from policy.engines.torch_eager import make_torch_executable
+from policy.errors import PolicyError
+from policy.nets.toge import Toge
+
+SETTINGS = Settings(name="toge", num_diffusion_steps=2, head_steps=1)
+
+
+def altered(policy: Toge, alter: Callable[[FloatArray], FloatArray]) -> Candidate:
+    """An engine that gets the chunks wrong."""
+
+    def make() -> Executable:
+        right = make_torch_executable(policy, SETTINGS)
+
+        def act(*arrays: Any) -> FloatArray:
+            return alter(right.act(*arrays))
+
+        return replace(right, engine="wrong", act=act)
+
+    return Candidate(label="wrong", make=make)
+
+
+def failing(error: Exception) -> Candidate:
+    def make() -> Executable:
+        raise error
+
+    return Candidate(label="broken", make=make)
+
+
+def one_bad_stick(chunk: FloatArray) -> FloatArray:
+    chunk = chunk.copy()
+    chunk[0, 7, 2] += 2 * MAX_STICK_ERROR
+    return chunk
+
+
+def shifted(chunk: FloatArray) -> FloatArray:
+    return np.roll(chunk, 1, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("alter", "reason"),
+    [
+        (one_bad_stick, r"a stick is off by 0\.02"),
+        (shifted, "a stick is off by"),
+        (np.zeros_like, r"the cosine is 0\.0"),
+        (lambda chunk: np.full_like(chunk, np.nan), "NaN or infinity"),
+        (lambda chunk: chunk[:, :8], r"chunks of shape \[8, 8, 4\]"),
+    ],
+)
+def test_a_wrong_engine_is_passed_over_with_its_reason(
+    small_toge: Toge, alter: Callable[[FloatArray], FloatArray], reason: str
+) -> None:
+    executable, notes = first_faithful(small_toge, [altered(small_toge, alter)], SETTINGS)
+    assert executable.engine == "torch"
+    assert len(notes) == 1
+    assert notes[0].startswith("warning: engine wrong is passed over: ")
+    assert re.search(reason, notes[0])
+
+
+@pytest.mark.parametrize(
+    "error",
+    [RuntimeError("no memory\nat x.cpp:3"), PolicyError("no memory"), TypeError("no memory")],
+)
+def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception) -> None:
+    right = altered(small_toge, lambda chunk: chunk)
+    executable, notes = first_faithful(small_toge, [failing(error), right], SETTINGS)
+    assert executable.engine == "wrong"  # by name only
+    assert "engine broken is passed over" in notes[0]
+    assert notes[0].endswith("no memory")
+    assert "agrees with torch" in notes[1]
+
+
+def test_an_engine_that_only_refines_wrongly_is_passed_over(small_toge: Toge) -> None:
+    def make() -> Executable:
+        right = make_torch_executable(small_toge, SETTINGS)
+
+        def act(e: FloatArray, s: FloatArray, h: FloatArray, since_s: float | None) -> FloatArray:
+            chunk = right.act(e, s, h, since_s)
+            return chunk if since_s is None else -chunk
+
+        return replace(right, act=act)
+
+    executable, notes = first_faithful(small_toge, [Candidate(label="x", make=make)], SETTINGS)
+    assert executable.engine == "torch"
+    assert "passed over" in notes[0]
+
+
+def test_the_default_on_a_cpu_is_openvino(small_toge: Toge) -> None:
+    executable, notes = choose_executable(small_toge, "auto", SETTINGS)
+    assert executable.engine.startswith("openvino")
+    assert "agrees with torch" in notes[-1]
+    probe = make_probe(small_toge.contract)
+    reference, quiet = choose_executable(small_toge, "torch", SETTINGS)
+    assert (reference.engine, quiet) == ("torch", ())
+    assert disagreement(probe_chunks(reference, probe), probe_chunks(executable, probe)) is None
+
+
+@pytest.mark.parametrize("weights", ["small_toge", "trained_toge"])
+def test_the_fastest_precision_that_passes_is_taken_and_the_others_are_named(
+    weights: str, request: pytest.FixtureRequest
+) -> None:
+    policy: Toge = request.getfixturevalue(weights)
+    settings = Settings(name="toge", head_steps=2)
+    probe = make_probe(policy.contract)
+    expected = probe_chunks(make_torch_executable(policy, settings), probe)
+    failed = []
+    for vision, action in precisions():
+        first = make_openvino_executable(policy, settings, vision, action)
+        if disagreement(expected, probe_chunks(first, probe)) is None:
+            break
+        failed.append(f"openvino (images {vision}, actions {action}) is passed over: a stick is")
+    executable, notes = choose_executable(policy, "auto", settings)
+    assert executable.engine == first.engine
+    assert len(notes) == len(failed) + 1
+    assert all(reason in note for reason, note in zip(failed, notes[:-1], strict=True))
+
+
+def test_without_openvino_torch_flies(small_toge: Toge, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("policy.engines.choose.find_spec", lambda name: None)
+    executable, _ = choose_executable(small_toge, "auto", SETTINGS)
+    assert executable.engine == "torch"
+    with pytest.raises(PolicyError, match="pip install openvino"):
+        choose_executable(small_toge, "openvino", SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("engine", "device", "message"),
+    [
+        ("cuda-graph", "cpu", "runs on --device cuda, not on"),
+        ("openvino", "cuda:1", "runs on --device cpu, not on"),
+    ],
+)
+def test_an_engine_asked_for_on_the_wrong_device_is_refused(
+    small_toge: Toge, engine: EngineName, device: str, message: str
+) -> None:
+    settings = replace(SETTINGS, vision_device=device, action_device=device)
+    with pytest.raises(PolicyError, match=message):
+        choose_executable(small_toge, engine, settings)
+
+
+def test_engines_of_our_networks_do_not_take_others() -> None:
+    class Other:
+        def __init__(self, contract: Any) -> None:
+            self.contract = contract
+
+        def predict(self, image: Any, state: Any, history: Any, steps: int) -> torch.Tensor:
+            return torch.zeros(1, 16, 4)
+
+    policy = Other(Contract())
+    single = replace(SETTINGS, dual_rate=False)
+    assert choose_executable(policy, "auto", single)[0].engine == "torch"
+    with pytest.raises(PolicyError, match="knows toge and resnet-unet only"):
+        choose_executable(policy, "openvino", single)
+
+
+def test_the_probe_reaches_all_that_a_policy_looks_at(small_toge: Toge) -> None:
+    probe = make_probe(small_toge.contract)
+    again = make_probe(small_toge.contract)
+    np.testing.assert_array_equal(probe.rgb, again.rgb)
+    assert probe.rgb.min() < 30 < 220 < probe.rgb.max()
+    assert not np.array_equal(probe.rgb[0], probe.rgb[1])
+    np.testing.assert_allclose(np.linalg.norm(probe.state[:, 3:7], axis=1), 1, rtol=1e-6)
+    asked = make_probe(replace(small_toge.contract, since_exposure=True))
+    np.testing.assert_array_equal(asked.state[:, :13], probe.state)
+    assert asked.state.shape == (4, 20)
+    assert (asked.state[:, 13:] != 0).all()

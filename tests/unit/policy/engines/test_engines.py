@@ -1,0 +1,145 @@
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from policy.contract import Contract, Executable, SingleRatePolicy
+from policy.engines.direct import make_numpy_executable
+from policy.engines.executable import Settings
+from policy.engines.torch_eager import make_torch_executable
+from policy.errors import PolicyError
+from policy.nets.toge import Toge
+from policy.preprocess import image_to_input
+from policy.scripted import ScriptedPolicy
+
+RGB = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+STATE = np.eye(1, 13, 3, dtype=np.float32)
+HISTORY = np.zeros((1, 4, 4), np.float32)
+CHUNK = np.zeros((1, 4, 4), np.float32)
+
+
+def frozen(array: np.ndarray) -> np.ndarray:
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> None:
+    executable = make_torch_executable(small_toge, Settings(name="toge", num_diffusion_steps=3))
+    assert (executable.engine, executable.dual_rate) == ("torch", True)
+    feature = executable.encode(RGB)
+    chunk = executable.act(frozen(feature), frozen(STATE), frozen(HISTORY), None)
+    image = torch.tensor(image_to_input(RGB, small_toge.contract))
+    with torch.inference_mode():
+        expected = small_toge.predict(image, torch.tensor(STATE), torch.tensor(HISTORY), 3)
+    assert feature.dtype == chunk.dtype == np.float32
+    np.testing.assert_array_equal(chunk, expected.numpy())
+
+
+def test_single_rate_carries_the_image_to_act(small_toge: Toge) -> None:
+    dual, single = (
+        make_torch_executable(
+            small_toge, Settings(name="toge", num_diffusion_steps=2, dual_rate=dual_rate)
+        )
+        for dual_rate in (True, False)
+    )
+    image = single.encode(RGB)
+    assert image.shape == (1, 3, 32, 32)
+    np.testing.assert_array_equal(
+        single.act(image, STATE, HISTORY, None), dual.act(dual.encode(RGB), STATE, HISTORY, None)
+    )
+
+
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_numpy_policies_are_called_as_they_are(dual_rate: bool) -> None:
+    policy = ScriptedPolicy("hover", lambda: 0.0)
+    executable = make_numpy_executable(policy, Settings(name="scripted", dual_rate=dual_rate))
+    assert executable.engine == "numpy"
+    encoded = executable.encode(RGB)
+    assert encoded.shape == ((1, 8) if dual_rate else (1, 3, 224, 224))
+    chunk = executable.act(encoded, STATE, HISTORY, None)
+    np.testing.assert_array_equal(
+        chunk, policy.predict_fast(np.zeros((1, 8), np.float32), STATE, HISTORY, 10)
+    )
+
+
+@pytest.mark.parametrize("make", [make_numpy_executable, make_torch_executable])
+def test_a_persons_policy_that_asks_gets_the_motion_since_the_exposure(
+    make: Callable[..., Executable],
+) -> None:
+    seen: list[tuple[int, ...]] = []
+    policy = Fake(act=lambda feature, state: seen.append(tuple(state.shape)) or CHUNK)
+    policy.contract = replace(policy.contract, since_exposure=True)
+    if make is make_torch_executable:
+        policy = Fake(
+            encode=lambda _: torch.zeros(1, 2),
+            act=lambda feature, state: seen.append(tuple(state.shape)) or torch.tensor(CHUNK),
+        )
+        policy.contract = replace(policy.contract, since_exposure=True, arrays="torch")
+    make(policy, Settings(name="fake"))
+    assert set(seen) == {(1, 20)}
+
+
+class Fake:
+    """A dual-rate numpy policy whose parts can be replaced."""
+
+    def __init__(self, **parts: Callable[..., Any]) -> None:
+        self.contract = Contract(
+            image_height=16, image_width=16, feature_dim=2, horizon=4, arrays="numpy"
+        )
+        self._parts = parts
+
+    def encode_visual(self, image: np.ndarray) -> Any:
+        return self._parts.get("encode", lambda _: np.zeros((1, 2)))(image)
+
+    def predict_fast(self, feature: Any, state: Any, action_history: Any, steps: int) -> Any:
+        return self._parts.get("act", lambda *_: np.zeros((1, 4, 4)))(feature, state)
+
+    def predict(self, image: Any, state: Any, action_history: Any, steps: int) -> Any:
+        return self.predict_fast(image, state, action_history, steps)
+
+
+def raises(error: Exception) -> Callable[..., Any]:
+    def call(*_: Any) -> Any:
+        raise error
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"encode": lambda _: np.zeros((1, 3))}, r"encode_visual must be \[1, 2\]"),
+        ({"encode": lambda _: np.full((1, 2), np.nan)}, "encode_visual holds NaN"),
+        ({"encode": lambda _: [0.0, 0.0]}, "returned list"),
+        ({"act": lambda *_: np.zeros((4, 4))}, r"the chunk must be \[1, 4, 4\]"),
+        ({"act": lambda *_: np.full((1, 4, 4), np.inf)}, "the chunk holds NaN or infinity"),
+        ({"act": raises(RuntimeError("boom"))}, r"RuntimeError: boom \(.*test_engines.py:\d+\)"),
+        ({"act": raises(KeyError("x"))}, r"image \[1, 3, 16, 16\], state \[1, 13\]"),
+    ],
+)
+def test_a_policy_that_breaks_its_contract_never_flies(
+    parts: dict[str, Callable[..., Any]], message: str
+) -> None:
+    with pytest.raises(PolicyError, match=message):
+        make_numpy_executable(Fake(**parts), Settings(name="fake"))
+
+
+def test_torch_policies_must_return_tensors() -> None:
+    policy = Fake()
+    policy.contract = replace(policy.contract, arrays="torch")
+    with pytest.raises(PolicyError, match="returned ndarray; its contract says torch"):
+        make_torch_executable(policy, Settings(name="fake"))
+
+
+def test_dual_rate_needs_a_fast_path() -> None:
+    class Slow:
+        contract = Contract(arrays="numpy")
+        predict = Fake.predict
+
+    policy: SingleRatePolicy = Slow()
+    with pytest.raises(PolicyError, match="fly it single-rate"):
+        make_numpy_executable(policy, Settings(name="slow"))

@@ -1,0 +1,100 @@
+import pytest
+import torch
+
+from policy.errors import PolicyError
+from policy.nets.backbones import BACKBONE_NAMES, BackboneName, build_backbone, load_imagenet_state
+
+# Names and shapes of torchvision's published ImageNet state dicts.
+KNOWN_PARAMETERS: list[tuple[BackboneName, str, tuple[int, ...]]] = [
+    ("efficientnet_b3", "features.0.0.weight", (40, 3, 3, 3)),
+    ("efficientnet_b3", "features.0.1.running_var", (40,)),
+    ("efficientnet_b3", "features.1.0.block.0.0.weight", (40, 1, 3, 3)),
+    ("efficientnet_b3", "features.1.0.block.1.fc1.weight", (10, 40, 1, 1)),
+    ("efficientnet_b3", "features.1.0.block.2.1.num_batches_tracked", ()),
+    ("efficientnet_b3", "features.2.0.block.0.0.weight", (144, 24, 1, 1)),
+    ("efficientnet_b3", "features.2.0.block.2.fc2.bias", (144,)),
+    ("efficientnet_b3", "features.3.0.block.1.0.weight", (192, 1, 5, 5)),
+    ("efficientnet_b3", "features.7.1.block.3.0.weight", (384, 2304, 1, 1)),
+    ("efficientnet_b3", "features.8.0.weight", (1536, 384, 1, 1)),
+    ("convnext_tiny", "features.0.0.bias", (96,)),
+    ("convnext_tiny", "features.0.1.weight", (96,)),
+    ("convnext_tiny", "features.1.0.layer_scale", (96, 1, 1)),
+    ("convnext_tiny", "features.1.0.block.0.weight", (96, 1, 7, 7)),
+    ("convnext_tiny", "features.1.0.block.2.weight", (96,)),
+    ("convnext_tiny", "features.2.1.weight", (192, 96, 2, 2)),
+    ("convnext_tiny", "features.5.8.block.3.weight", (1536, 384)),
+    ("convnext_tiny", "features.7.2.block.5.weight", (768, 3072)),
+    ("convnext_tiny", "classifier.0.weight", (768,)),
+    ("resnet18", "conv1.weight", (64, 3, 7, 7)),
+    ("resnet18", "layer2.0.downsample.0.weight", (128, 64, 1, 1)),
+    ("resnet18", "layer4.1.bn2.running_mean", (512,)),
+    ("resnet50", "layer1.0.downsample.1.weight", (256,)),
+    ("resnet50", "layer3.5.conv3.weight", (1024, 256, 1, 1)),
+    ("resnet50", "layer4.2.bn3.bias", (2048,)),
+]
+
+# Parameters that torchvision's documentation gives, classifier of 1000 classes included.
+KNOWN_TOTALS: list[tuple[BackboneName, int, int]] = [
+    ("efficientnet_b3", 12_233_232, 1536),
+    ("convnext_tiny", 28_589_128, 768),
+    ("resnet18", 11_689_512, 512),
+    ("resnet50", 25_557_032, 2048),
+]
+
+
+@pytest.mark.parametrize(("name", "total", "out_dim"), KNOWN_TOTALS)
+def test_has_torchvisions_parameter_count(name: BackboneName, total: int, out_dim: int) -> None:
+    backbone = build_backbone(name)
+    classifier = out_dim * 1000 + 1000
+    assert sum(p.numel() for p in backbone.parameters()) + classifier == total
+    assert backbone.out_dim == 3 * out_dim
+
+
+@pytest.mark.parametrize("name", [name for name, _, _ in KNOWN_TOTALS])
+def test_has_torchvisions_names_and_shapes(name: BackboneName) -> None:
+    state = build_backbone(name).state_dict()
+    for backbone, key, shape in KNOWN_PARAMETERS:
+        if backbone == name:
+            assert tuple(state[key].shape) == shape
+
+
+@pytest.mark.parametrize("size", [32, 64, 97])
+@pytest.mark.parametrize("name", BACKBONE_NAMES)
+def test_pools_any_image_size(name: BackboneName, size: int) -> None:
+    backbone = build_backbone(name).eval()
+    with torch.inference_mode():
+        feature = backbone(torch.randn(2, 3, size, size))
+    assert feature.shape == (2, backbone.out_dim)
+    assert torch.isfinite(feature).all()
+
+
+@pytest.mark.parametrize("name", BACKBONE_NAMES)
+def test_untrained_feature_depends_on_the_image(name: BackboneName) -> None:
+    images = torch.randn(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        first, second = build_backbone(name).eval()(images)
+    assert (first - second).abs().max() > 1e-3 * first.abs().max()
+    assert first.abs().max() > 1e-6
+
+
+@pytest.mark.parametrize("name", BACKBONE_NAMES)
+def test_feature_says_where(name: BackboneName) -> None:
+    images = torch.zeros(2, 3, 96, 96)
+    images[0, :, 40:56, 16:32] = images[1, :, 40:56, 64:80] = 3.0  # whole strides apart
+    with torch.inference_mode():
+        left, right = build_backbone(name).eval()(images)
+    assert (left - right).abs().max() > 1e-2 * left.abs().max()
+
+
+def test_imagenet_weights_load_without_their_classifier() -> None:
+    source, target = build_backbone("resnet18"), build_backbone("resnet18")
+    state = source.state_dict()
+    state["fc.weight"], state["fc.bias"] = torch.zeros(1000, 512), torch.zeros(1000)
+    load_imagenet_state(target, state)
+    assert torch.equal(target.state_dict()["layer4.1.conv2.weight"], state["layer4.1.conv2.weight"])
+
+
+def test_weights_of_another_backbone_are_refused() -> None:
+    state = build_backbone("resnet18").state_dict()
+    with pytest.raises(PolicyError, match="not of this backbone"):
+        load_imagenet_state(build_backbone("resnet50"), state)

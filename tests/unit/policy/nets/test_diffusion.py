@@ -1,0 +1,191 @@
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from policy.errors import PolicyError
+from policy.nets.diffusion import BetaSchedule, NoiseSchedule, Prediction, ddim_solve
+
+STEP_COUNTS = [1, 2, 3, 7, 10, 33, 50, 99, 100]
+SCHEDULES: list[BetaSchedule] = ["squared_cosine", "linear"]
+
+
+def solve(schedule: NoiseSchedule, count: int, denoise: object, noise: Tensor) -> Tensor:
+    """``denoise(signal, noise_scale, x)`` with the coefficients of the step."""
+    steps = schedule.ddim_steps(count)
+    return ddim_solve(
+        schedule,
+        steps,
+        lambda index, x: denoise(steps[index].signal, steps[index].noise, x),  # type: ignore[operator]
+        noise,
+    )
+
+
+def standard_normal(*shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+def test_squared_cosine_schedule_by_hand() -> None:
+    power = NoiseSchedule().signal_power()
+    assert len(power) == 100
+    at_zero = math.cos(0.008 / 1.008 * math.pi / 2) ** 2
+    for t in (0, 9, 49, 98):  # the last beta is capped at 0.999
+        expected = math.cos(((t + 1) / 100 + 0.008) / 1.008 * math.pi / 2) ** 2 / at_zero
+        assert power[t] == pytest.approx(expected, rel=1e-9)
+    assert power[99] == pytest.approx(0.001 * power[98])
+
+
+def test_linear_schedule_by_hand() -> None:
+    power = NoiseSchedule(betas="linear").signal_power()
+    assert power[0] == pytest.approx(1 - 1e-3)
+    assert power[1] == pytest.approx((1 - 1e-3) * (1 - (1e-3 + 0.199 / 99)))
+    assert power[99] < 1e-4
+
+
+@pytest.mark.parametrize("betas", SCHEDULES)
+def test_signal_falls_at_every_timestep(betas: BetaSchedule) -> None:
+    power = NoiseSchedule(betas=betas).signal_power()
+    assert all(after < before for before, after in pairwise(power))
+    assert 0 < power[-1] < power[0] < 1
+
+
+@pytest.mark.parametrize("count", range(1, 101))
+def test_steps_start_at_pure_noise_and_end_clean(count: int) -> None:
+    steps = NoiseSchedule().ddim_steps(count)
+    timesteps = [step.timestep for step in steps]
+    assert len(timesteps) == count
+    assert timesteps[0] == 99
+    assert timesteps == sorted(set(timesteps), reverse=True)
+    assert timesteps[-1] >= 0
+    assert (steps[-1].next_signal, steps[-1].next_noise) == (1.0, 0.0)
+    for step, following in pairwise(steps):
+        assert (step.next_signal, step.next_noise) == (following.signal, following.noise)
+        assert step.signal**2 + step.noise**2 == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "sample"])
+@pytest.mark.parametrize("betas", SCHEDULES)
+@pytest.mark.parametrize("count", STEP_COUNTS)
+def test_a_perfect_net_recovers_the_clean_sample(
+    count: int, betas: BetaSchedule, prediction: Prediction
+) -> None:
+    schedule = NoiseSchedule(betas=betas, prediction=prediction)
+    clean = standard_normal(2, 16, 4).clamp(-1, 1)
+
+    def denoise(signal: float, noise_scale: float, x: Tensor) -> Tensor:
+        return clean if prediction == "sample" else (x - signal * clean) / noise_scale
+
+    result = solve(schedule, count, denoise, standard_normal(2, 16, 4))
+    torch.testing.assert_close(result, clean, atol=1e-9, rtol=0)
+
+
+def test_one_step_is_the_nets_estimate_of_the_clean_sample() -> None:
+    estimate = torch.tensor([[-0.5, 0.25, 3.0, -7.0]])
+    schedule = NoiseSchedule(prediction="sample")
+    result = solve(schedule, 1, lambda *_: estimate, torch.randn(1, 4))
+    assert result.tolist() == [[-0.5, 0.25, 1.0, -1.0]]
+
+
+DEVIATION = 0.1
+
+
+def gaussian_posterior_mean(signal: float, noise_scale: float, x: Tensor) -> Tensor:
+    """E[x_0 | x_t] for x_0 ~ N(0, DEVIATION^2): the best a net can do."""
+    variance = DEVIATION**2
+    return signal * variance / (signal**2 * variance + noise_scale**2) * x
+
+
+def gaussian_flow(schedule: NoiseSchedule, noise: Tensor) -> Tensor:
+    """Closed-form end of the probability flow: it keeps x_t over its marginal deviation."""
+    power = schedule.signal_power()[-1]
+    return noise * DEVIATION / math.sqrt(power * DEVIATION**2 + 1 - power)
+
+
+def gaussian_error(schedule: NoiseSchedule, count: int) -> float:
+    """Largest error of a solve with the analytic score, relative to the largest exact value."""
+    noise = torch.linspace(-3, 3, 13, dtype=torch.float64)
+    exact = gaussian_flow(schedule, noise)
+
+    def denoise(signal: float, noise_scale: float, x: Tensor) -> Tensor:
+        clean = gaussian_posterior_mean(signal, noise_scale, x)
+        return clean if schedule.prediction == "sample" else (x - signal * clean) / noise_scale
+
+    return float((solve(schedule, count, denoise, noise) - exact).abs().max() / exact.abs().max())
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "sample"])
+@pytest.mark.parametrize("betas", SCHEDULES)
+def test_gaussian_data_converges_to_the_probability_flow(
+    betas: BetaSchedule, prediction: Prediction
+) -> None:
+    schedule = NoiseSchedule(betas=betas, prediction=prediction)
+    errors = [gaussian_error(schedule, count) for count in (5, 10, 25, 50, 100)]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.15
+
+
+@pytest.mark.parametrize("betas", SCHEDULES)
+def test_solver_is_of_first_order(betas: BetaSchedule) -> None:
+    schedule = NoiseSchedule(betas=betas, num_train_timesteps=1000)
+    coarse, fine = (gaussian_error(schedule, count) for count in (250, 1000))
+    assert coarse / fine == pytest.approx(4.0, rel=0.3)
+    assert fine < 0.03
+
+
+def test_one_step_on_gaussian_data_collapses_to_the_mean() -> None:
+    noise = torch.linspace(-3, 3, 13, dtype=torch.float64)
+    result = solve(NoiseSchedule(), 1, gaussian_posterior_mean, noise)
+    assert float(result.abs().max()) < 1e-4
+
+
+def test_add_noise_has_the_schedules_mean_and_variance() -> None:
+    schedule = NoiseSchedule()
+    clean = torch.full((4000, 1, 4), 0.5)
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    for t in (0, 50, 99):
+        noisy = schedule.add_noise(clean, noise, torch.full((4000,), t))
+        power = schedule.signal_power()[t]
+        assert float(noisy.mean()) == pytest.approx(0.5 * math.sqrt(power), abs=0.03)
+        assert float(noisy.var()) == pytest.approx(1 - power, rel=0.05)
+
+
+def test_add_noise_takes_a_timestep_per_sample() -> None:
+    schedule = NoiseSchedule()
+    noisy = schedule.add_noise(torch.ones(2, 3), torch.zeros(2, 3), torch.tensor([0, 99]))
+    expected = [math.sqrt(schedule.signal_power()[t]) for t in (0, 99)]
+    torch.testing.assert_close(noisy, torch.tensor(expected)[:, None].expand(2, 3))
+
+
+@pytest.mark.parametrize("count", [0, -1, 101, 10.0, True, "10"])
+def test_refuses_step_counts_outside_the_schedule(count: object) -> None:
+    with pytest.raises(PolicyError, match=r"1\.\.100"):
+        NoiseSchedule().ddim_steps(count)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"num_train_timesteps": 0},
+        {"num_train_timesteps": 1001},
+        {"betas": "quadratic"},
+        {"prediction": "velocity"},
+    ],
+)
+def test_refuses_unknown_schedules(changes: dict[str, object]) -> None:
+    with pytest.raises(PolicyError):
+        NoiseSchedule(**changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("noise_shape", "timestep"),
+    [((2, 4), [0, 0]), ((2, 3), [0]), ((2, 3), [0, 100]), ((2, 3), [-1, 0])],
+)
+def test_add_noise_refuses_what_does_not_fit(
+    noise_shape: tuple[int, ...], timestep: list[int]
+) -> None:
+    with pytest.raises(PolicyError):
+        NoiseSchedule().add_noise(
+            torch.zeros(2, 3), torch.zeros(noise_shape), torch.tensor(timestep)
+        )

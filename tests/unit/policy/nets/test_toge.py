@@ -1,0 +1,238 @@
+import pytest
+import torch
+from torch import Tensor
+
+from policy.checkpoints.policy_file import BuiltinPolicy
+from policy.contract import Contract, DualRatePolicy, SingleRatePolicy, WarmStartPolicy
+from policy.errors import ContractError, PolicyError
+from policy.nets.action_head import DiffusionHead
+from policy.nets.diffusion import NoiseSchedule, Prediction
+from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
+from policy.nets.toge import Toge, TogeConfig
+
+
+def sample(batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    """Image, state, history for ``small_toge``."""
+    generator = torch.Generator().manual_seed(2)
+    image = torch.randn(batch, 3, 32, 32, generator=generator)
+    state = torch.randn(batch, 13, generator=generator)
+    return image, state, torch.rand(batch, 4, 4, generator=generator) * 2 - 1
+
+
+def test_keeps_the_dual_rate_protocol(small_toge: Toge) -> None:
+    assert isinstance(small_toge, DualRatePolicy)
+    assert small_toge.contract.feature_dim == 256
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("steps", [1, 4, 10])
+@pytest.mark.parametrize("with_history", [True, False])
+def test_both_paths_agree_bit_for_bit(small_toge: Toge, steps: int, with_history: bool) -> None:
+    image, state, history = sample()
+    past = history if with_history else None
+    direct = small_toge.predict(image, state, past, steps)
+    cached = small_toge.predict_fast(small_toge.encode_visual(image), state, past, steps)
+    assert torch.equal(direct, cached)
+    assert direct.shape == (1, 16, 4)
+    assert direct.abs().max() <= 1.0
+
+
+def test_keeps_the_protocol_of_a_warm_start(small_toge: Toge) -> None:
+    assert isinstance(small_toge, WarmStartPolicy)
+    assert small_toge.noise_shares(10, 9)[0] > 0.9 > small_toge.noise_shares(10, 5)[0]
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("counts", [[1] * 10, [2] * 5, [1, 3, 3, 3], [2, 4, 4], [10]])
+def test_a_solve_in_parts_is_the_whole_one_bit_for_bit(
+    trained_toge: Toge, counts: list[int]
+) -> None:
+    image, state, history = sample()
+    feature = trained_toge.encode_visual(image)
+    noisy, first = trained_toge.initial_noise, 0
+    for count in counts:
+        noisy = trained_toge.denoise_fast(feature, state, history, noisy, 10, first, count)
+        first += count
+    assert torch.equal(noisy, trained_toge.predict_fast(feature, state, history, 10))
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize(("first", "count"), [(-1, 2), (3, 0), (3, 2), (4, 1)])
+def test_refuses_steps_that_a_solve_does_not_have(small_toge: Toge, first: int, count: int) -> None:
+    image, state, history = sample()
+    feature, noise = small_toge.encode_visual(image), small_toge.initial_noise
+    with pytest.raises(PolicyError, match=f"a solve of 4 steps has no {count} from step {first}"):
+        small_toge.denoise_fast(feature, state, history, noise, 4, first, count)
+    with pytest.raises(PolicyError, match=r"noisy must be \[B, 16, 4\]"):
+        small_toge.denoise_fast(feature, state, history, noise[:, 1:], 4, 0, 1)
+
+
+@torch.inference_mode()
+def test_observation_is_encoded_in_the_same_two_halves(small_toge: Toge) -> None:
+    image, state, history = sample(batch=3)
+    feature = small_toge.encode_visual(image)
+    assert feature.shape == (3, 256)
+    fused = small_toge.encode_and_fuse(feature, state, history)
+    assert torch.equal(small_toge.encode_observation(image, state, history), fused)
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("changed", ["image", "state", "history"])
+def test_every_input_reaches_the_sticks(small_toge: Toge, changed: str) -> None:
+    inputs = dict(zip(("image", "state", "history"), sample(), strict=True))
+    base = small_toge.predict(*inputs.values(), 2)
+    inputs[changed] = inputs[changed] + 0.5
+    assert not torch.equal(small_toge.predict(*inputs.values(), 2), base)
+
+
+@torch.inference_mode()
+def test_order_of_the_history_matters(small_toge: Toge) -> None:
+    image, state, history = sample()
+    base = small_toge.predict(image, state, history, 2)
+    assert not torch.equal(small_toge.predict(image, state, history.flip(1), 2), base)
+
+
+@torch.inference_mode()
+def test_a_quaternion_and_its_negative_are_one_attitude(small_toge: Toge) -> None:
+    image, state, history = sample()
+    state[:, 3:7] = torch.tensor([0.5, -0.5, 0.5, 0.5])
+    negated = state.clone()
+    negated[:, 3:7] *= -1
+    first, second = (small_toge.predict(image, s, history, 2) for s in (state, negated))
+    torch.testing.assert_close(first, second)
+
+
+def test_state_is_scaled_by_the_documented_constants(small_toge: Toge) -> None:
+    # Heading east (yaw 90 degrees) and level: 5 m/s to the north is 5 m/s to the left.
+    r = 0.5**0.5
+    state = torch.tensor([[5.0, 0, -10, r, 0, 0, r, 3, 0, -1.5, 0, 0, -9.80665]])
+    expected = torch.tensor([[0.0, -1, -2, 0, 0, 1, 1, 0, -0.5, 0, 0, -1]])
+    torch.testing.assert_close(small_toge.state_encoder.normalise(state), expected)
+
+
+@torch.inference_mode()
+def test_a_seed_fixes_the_noise_of_a_flight() -> None:
+    torch.manual_seed(0)
+    config = TogeConfig(
+        backbone="resnet18",
+        contract=Contract(image_height=32, image_width=32),
+        schedule=NoiseSchedule(prediction="epsilon"),
+    )
+    policy = Toge(config).eval()
+    chunks = []
+    for seed in (7, 7, 8):
+        policy.reset(seed)
+        chunks.append(policy.predict(*sample(), 3))
+    assert torch.equal(chunks[0], chunks[1])
+    assert not torch.equal(chunks[0], chunks[2])
+    assert torch.equal(policy.predict(*sample(), 3), chunks[2])
+    assert not any("noise" in name for name in policy.state_dict())
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("steps", [0, 101])
+def test_refuses_impossible_step_counts(small_toge: Toge, steps: int) -> None:
+    with pytest.raises(PolicyError, match=r"1\.\.100"):
+        small_toge.predict(*sample(), steps)
+
+
+@torch.inference_mode()
+def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
+    image, state, history = sample()
+    with pytest.raises(PolicyError, match=r"image must be \[B, 3, 32, 32\]"):
+        small_toge.encode_visual(image[..., :31])
+    feature = small_toge.encode_visual(image)
+    with pytest.raises(PolicyError, match=r"feature must be \[B, 256\]"):
+        small_toge.predict_fast(feature[:, :-1], state, history)
+    with pytest.raises(PolicyError, match=r"state must be \[B, 13\]"):
+        small_toge.predict_fast(feature, state[0], history)
+    with pytest.raises(PolicyError, match=r"action_history must be \[B, 4, 4\]"):
+        small_toge.predict_fast(feature, state, history[:, :3])
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("kind", [TogeConfig, ResnetUnetConfig])
+def test_every_number_since_the_exposure_reaches_the_sticks(
+    kind: type[TogeConfig | ResnetUnetConfig],
+) -> None:
+    image, state, history = sample()
+    contract = Contract(image_height=32, image_width=32, since_exposure=True)
+    if kind is TogeConfig:
+        policy: BuiltinPolicy = Toge(TogeConfig(backbone="resnet18", contract=contract)).eval()
+    else:
+        policy = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
+    with pytest.raises(PolicyError, match=r"state must be \[B, 20\], got \[1, 13\]"):
+        policy.predict(image, state, history, 2)
+    wide = torch.cat([state, torch.zeros(1, 7)], dim=1)
+    chunk = policy.predict(image, wide, history, 2)
+    for index in range(13, 20):
+        moved = wide.clone()
+        moved[0, index] = 1.0
+        assert not torch.equal(policy.predict(image, moved, history, 2), chunk), index
+    # Over its scale: a tenth of a second of age counts as much as 2 m/s.
+    normal = policy.state_encoder.normalise(torch.ones(1, 20))[0, 12:]
+    assert normal.tolist() == pytest.approx([10, 2, 2, 2, 0.5, 0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: TogeConfig(size="huge"), "small"),  # type: ignore[arg-type]
+        (lambda: TogeConfig(backbone="vgg16"), "efficientnet_b3"),  # type: ignore[arg-type]
+        (lambda: TogeConfig(contract=Contract(feature_dim=99)), "feature_dim 99"),
+        (lambda: TogeConfig(contract=Contract(arrays="numpy")), "torch"),
+        (lambda: ResnetUnetConfig(contract=Contract(feature_dim=256)), "feature_dim 0"),
+        (lambda: ResnetUnetConfig(size="huge"), "small"),  # type: ignore[arg-type]
+    ],
+)
+def test_refuses_configs_of_another_network(build: object, message: str) -> None:
+    with pytest.raises((PolicyError, ContractError), match=message):
+        build()  # type: ignore[operator]
+
+
+@torch.inference_mode()
+def test_resnet_unet_flies_single_rate_only() -> None:
+    torch.manual_seed(0)
+    contract = Contract(image_height=32, image_width=32)
+    policy = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
+    assert isinstance(policy, SingleRatePolicy)
+    assert not isinstance(policy, DualRatePolicy)
+    image, state, history = sample(batch=2)
+    chunk = policy.predict(image, state, history, 3)
+    assert chunk.shape == (2, 16, 4)
+    assert chunk.abs().max() <= 1.0
+    assert not torch.equal(policy.predict(image, state + 0.5, history, 3), chunk)
+    assert not torch.equal(policy.predict(image, state, -history, 3), chunk)
+    with pytest.raises(PolicyError, match="action_history"):
+        policy.predict(image, state, history[:, :2], 3)
+
+
+@torch.inference_mode()
+def test_reference_network_at_its_real_size() -> None:
+    torch.manual_seed(0)
+    policy = Toge(TogeConfig()).eval()
+    feature = policy.encode_visual(torch.randn(1, 3, 224, 224))
+    chunk = policy.predict_fast(feature, torch.zeros(1, 13), torch.zeros(1, 4, 4), 2)
+    assert feature.shape == (1, 256)
+    assert chunk.shape == (1, 16, 4)
+    assert torch.isfinite(chunk).all()
+
+
+def test_no_history_is_one_of_centred_sticks(small_toge: Toge) -> None:
+    image, state, history = sample()
+    without = small_toge.predict(image, state, None, 2)
+    assert torch.equal(without, small_toge.predict(image, state, torch.zeros_like(history), 2))
+
+
+@pytest.mark.parametrize("prediction", ["sample", "epsilon"])
+def test_a_u_net_without_an_opinion_leaves_the_sticks_to_what_is_read_off_the_condition(
+    prediction: Prediction,
+) -> None:
+    torch.manual_seed(0)
+    head = DiffusionHead("small", Contract(), NoiseSchedule(prediction=prediction)).eval()
+    torch.nn.init.zeros_(head.unet.out.weight)
+    torch.nn.init.zeros_(head.unet.out.bias)
+    condition = torch.randn(2, 256)
+    read = head.read(condition).clamp(-1, 1)
+    is_read = [torch.allclose(head.sample(condition, steps), read) for steps in (1, 3)]
+    assert is_read == [prediction == "sample"] * 2

@@ -1,0 +1,101 @@
+import pytest
+import torch
+import torch.nn.functional as F
+
+from policy.contract import Contract
+from policy.errors import PolicyError
+from policy.nets.action_head import DiffusionHead, Size
+from policy.nets.diffusion import NoiseSchedule
+from policy.nets.unet1d import Conv, UNet1d, UNet1dConfig
+
+
+@pytest.fixture(scope="module")
+def unet() -> UNet1d:
+    torch.manual_seed(0)
+    config = UNet1dConfig(horizon=16, action_dim=4, condition_dim=32, widths=(16, 24, 32))
+    return UNet1d(config).eval()
+
+
+@pytest.mark.parametrize(("taps", "stride", "length"), [(1, 1, 4), (3, 1, 5), (3, 2, 8), (5, 1, 4)])
+def test_conv_is_a_convolution(taps: int, stride: int, length: int) -> None:
+    conv = Conv(6, 8, taps, stride=stride)
+    x = torch.randn(2, length, 6)
+    weight = conv.linear.weight.reshape(8, taps, 6).permute(0, 2, 1)
+    expected = F.conv1d(
+        x.transpose(1, 2), weight, conv.linear.bias, stride=stride, padding=taps // 2
+    )
+    torch.testing.assert_close(conv(x), expected.transpose(1, 2))
+
+
+@torch.inference_mode()
+def test_output_has_the_inputs_shape(unet: UNet1d) -> None:
+    film = unet.film_of_timestep(torch.tensor([3, 99, 0])) + unet.film_of_condition(
+        torch.randn(3, 32)
+    )
+    assert film.shape == (3, unet.film_dim)
+    assert unet(torch.randn(3, 16, 4), film).shape == (3, 16, 4)
+
+
+@torch.inference_mode()
+def test_batch_rows_do_not_touch_each_other(unet: UNet1d) -> None:
+    noisy, film = torch.randn(3, 16, 4), torch.randn(3, unet.film_dim)
+    together = unet(noisy, film)
+    for row in range(3):
+        alone = unet(noisy[row : row + 1], film[row : row + 1])
+        torch.testing.assert_close(together[row : row + 1], alone, atol=1e-5, rtol=1e-4)
+
+
+@torch.inference_mode()
+def test_every_level_listens_to_time_and_condition(unet: UNet1d) -> None:
+    noisy, condition = torch.randn(1, 16, 4), torch.randn(1, 32)
+    base_film = unet.film_of_condition(condition)
+    base = unet(noisy, base_film)
+    for start in range(0, unet.film_dim, 16):
+        film = base_film.clone()
+        film[:, start : start + 16] += 1.0
+        assert not torch.allclose(unet(noisy, film), base)
+    early, late = unet.film_of_timestep(torch.tensor([0, 99]))
+    assert not torch.allclose(early, late)
+
+
+@torch.inference_mode()
+def test_whole_chunk_is_seen_by_every_action(unet: UNet1d) -> None:
+    noisy, film = torch.randn(1, 16, 4), torch.randn(1, unet.film_dim)
+    changed = noisy.clone()
+    changed[:, 0] += 1.0
+    assert (unet(changed, film) - unet(noisy, film)).abs().amax(dim=2).min() > 1e-7
+
+
+def test_every_parameter_learns(unet: UNet1d) -> None:
+    film = unet.film_of_timestep(torch.tensor([5])) + unet.film_of_condition(torch.randn(1, 32))
+    unet(torch.randn(1, 16, 4), film).square().mean().backward()
+    silent = [n for n, p in unet.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    # A bias right before a norm of its own group can be cancelled, a weight cannot.
+    assert [name for name in silent if name.endswith("weight")] == []
+    unet.zero_grad()
+
+
+def test_refuses_a_horizon_that_cannot_be_halved() -> None:
+    with pytest.raises(PolicyError, match="multiple of 4"):
+        UNet1dConfig(horizon=10, action_dim=4, condition_dim=32, widths=(16, 24, 32))
+
+
+@pytest.mark.parametrize(
+    ("size", "low", "high"),
+    [("small", 2.5e6, 3.5e6), ("medium", 10e6, 15e6), ("large", 36e6, 44e6)],
+)
+def test_head_sizes(size: Size, low: float, high: float) -> None:
+    head = DiffusionHead(size, Contract(), NoiseSchedule())
+    assert low < sum(p.numel() for p in head.parameters()) < high
+
+
+@torch.inference_mode()
+def test_hoisted_film_gives_what_denoising_step_by_step_gives() -> None:
+    torch.manual_seed(0)
+    head = DiffusionHead("small", Contract(), NoiseSchedule(prediction="epsilon")).eval()
+    condition = torch.randn(2, 256)
+    noisy = head.initial_noise.expand(2, -1, -1)
+    for step in head.schedule.ddim_steps(4):
+        output = head.denoise(noisy, torch.full((2,), step.timestep), condition)
+        noisy = head.schedule.ddim_update(step, noisy, output)
+    torch.testing.assert_close(head.sample(condition, 4), noisy, atol=1e-4, rtol=1e-3)

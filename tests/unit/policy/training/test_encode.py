@@ -1,0 +1,61 @@
+"""Images are encoded once, in an order that makes the most of little time."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from policy.training.batches import PooledStore
+from policy.training.encode import ENCODE_BATCH, Job, both_ways, encode_rows, one_way_first
+
+FRAMES = 2 * ENCODE_BATCH + 10
+
+
+def encoded(path: Path, jobs: list[Job], *, jobs_done: int) -> PooledStore:
+    """Outputs that tell their image; negative where it was mirrored."""
+    asked = iter(range(1, len(jobs) + 1))
+
+    def encode(frames: np.ndarray, is_mirrored: bool) -> torch.Tensor:
+        sign = -1.0 if is_mirrored else 1.0
+        return sign * (1.0 + torch.from_numpy(frames).float())[:, None].expand(-1, 2)
+
+    return encode_rows(path, jobs, encode, dim=2, go_on=lambda _: next(asked) < jobs_done)
+
+
+def test_half_of_the_time_encodes_each_image_one_way(tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).permutation(FRAMES)
+    jobs = one_way_first(frames, mirror=True)
+    store = encoded(tmp_path / "half", jobs, jobs_done=len(jobs) // 2)
+    assert store.frames.tolist() == list(range(FRAMES))
+    assert not store.has_mirrored
+    for wanted in (False, True):
+        ways = store.ways(store.frames, np.full(FRAMES, wanted))
+        assert set(ways) == {False, True}
+        read = store.read(store.frames, ways)
+        assert np.array_equal(read[:, 0], np.where(ways, -1.0, 1.0) * (1 + store.frames))
+
+
+def test_with_time_for_all_both_ways_are_there(tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).permutation(FRAMES)
+    for name, jobs in (
+        ("one", one_way_first(frames, mirror=True)),
+        ("both", both_ways(frames, mirror=True)),
+    ):
+        store = encoded(tmp_path / name, jobs, jobs_done=len(jobs) + 1)
+        assert store.has_mirrored
+        for wanted in (False, True):
+            assert set(store.ways(store.frames, np.full(FRAMES, wanted))) == {wanted}
+
+
+def test_unmirrored_images_are_encoded_as_they_are(tmp_path: Path) -> None:
+    jobs = one_way_first(np.arange(FRAMES), mirror=False)
+    store = encoded(tmp_path / "plain", jobs, jobs_done=len(jobs) + 1)
+    assert not store.has_mirrored
+    assert not store.ways(store.frames, np.zeros(FRAMES, bool)).any()
+
+
+def test_both_ways_at_a_time_leaves_no_image_with_one(tmp_path: Path) -> None:
+    jobs = both_ways(np.arange(FRAMES), mirror=True)
+    store = encoded(tmp_path / "cut", jobs, jobs_done=1)
+    assert store.has_mirrored
+    assert store.frames.tolist() == list(range(ENCODE_BATCH))

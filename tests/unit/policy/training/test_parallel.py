@@ -1,0 +1,103 @@
+"""A step on two threads is the step on one."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.flight_folders import write_spot_flight
+from policy.contract import Contract
+from policy.data.flight_folders import read_flight
+from policy.data.frames import store_frames
+from policy.data.samples import Timeline
+from policy.nets.toge import Toge, TogeConfig
+from policy.training.batches import Batch, Batches
+from policy.training.parallel import Gradients, StepLoss
+from policy.training.trainee import Trainee
+
+CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(params=[1, 2], ids=["one thread", "two threads"])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    folder = tmp_path_factory.mktemp("flight")
+    flight = read_flight(write_spot_flight(folder / "flight", 0, seconds=0.6))
+    store = store_frames(
+        [flight], height=32, width=32, folder=folder / "frames", progress=lambda _: None
+    )
+    ages_ns = np.array([20_000_000], np.int64)
+    batches = Batches(
+        Timeline([flight], CONTRACT, ages_ns), store, timesteps=100, seed=0, mirrors=True
+    )
+    return batches.with_images(0, count=7, repeats=3, size=(32, 32))
+
+
+def trainee() -> Trainee:
+    torch.manual_seed(0)
+    return Trainee(Toge(TogeConfig(backbone="resnet18", contract=CONTRACT)))
+
+
+def losses(model: Trainee, batch: Batch) -> StepLoss:
+    made = model(batch, torch.ones(4))
+    return StepLoss(total=made.sticks + made.gate, told={"loss": made.sticks})
+
+
+def frozen(model: Trainee) -> None:
+    model.train()
+    model.policy.backbone.eval()  # batch norms would see other batches
+
+
+def gradients_of(batch: Batch, model: Trainee) -> dict[str, torch.Tensor]:
+    with Gradients(model, device=CPU, bf16=False) as gradients:
+        gradients.each(frozen)
+        told = gradients.compute(batch, losses)
+    assert told["loss"].isfinite()
+    return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
+
+
+def test_splits_between_images(batch: Batch) -> None:
+    first, second = batch.split(2)
+    assert (len(first.look), len(second.look)) == (3, 4)
+    assert (len(first.state), len(second.state)) == (9, 12)
+    torch.testing.assert_close(torch.cat([first.chunk, second.chunk]), batch.chunk)
+
+
+def test_gradients_are_those_of_the_mean_loss(batch: Batch, threads: int) -> None:
+    model = trainee()
+    made = gradients_of(batch, model)
+    model.zero_grad()
+    parts = batch.split(threads)
+    for part in parts:
+        (losses(model, part).total / len(parts)).backward()  # type: ignore[no-untyped-call]
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None
+        torch.testing.assert_close(parameter.grad, made[name], rtol=1e-3, atol=1e-6)
+
+
+def test_the_same_twice(batch: Batch, threads: int) -> None:
+    assert threads in (1, 2)
+    first, second = (gradients_of(batch, trainee()) for _ in range(2))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_statistics_of_norms_are_those_of_the_first_part(batch: Batch, threads: int) -> None:
+    model = trainee()
+    before = model.policy.backbone.bn1.running_mean.clone()  # type: ignore[union-attr, operator]
+    with Gradients(model, device=CPU, bf16=False) as gradients:
+        gradients.each(Trainee.train)
+        gradients.compute(batch, losses)
+    alone = trainee().train()
+    alone(batch.split(threads)[0], torch.ones(4))
+    after = model.policy.backbone.bn1.running_mean  # type: ignore[union-attr]
+    assert not torch.equal(before, after)  # type: ignore[arg-type]
+    torch.testing.assert_close(after, alone.policy.backbone.bn1.running_mean)  # type: ignore[union-attr]

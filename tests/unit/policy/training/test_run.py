@@ -1,0 +1,313 @@
+"""Training on flights in which the image alone says what to do."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from helpers.flight_folders import write_spot_flight
+from helpers.training_runs import check_resuming, check_stopping, weights_of
+from policy.checkpoints.policy_file import TRAINING_KEY, load_checkpoint
+from policy.contract import Contract
+from policy.data.episodes import DatasetError, Episode
+from policy.data.flight_folders import read_flight
+from policy.data.frames import store_frames
+from policy.data.samples import Timeline
+from policy.errors import PolicyError
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import Toge, TogeConfig
+from policy.training.batches import Batches
+from policy.training.plan import Budget, TrainSettings, learning_rate_factor, make_stages
+from policy.training.report import Progress, TrainResult
+from policy.training.run import train
+from policy.training.state import Position, RunFolder, TrainingError
+from policy.training.trainee import Trainee, gate_labels, gate_loss
+
+CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Sums of two threads differ in the last bit; and the other cores are somebody else's."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def episodes(tmp_path_factory: pytest.TempPathFactory) -> list[Episode]:
+    """Short ones, to run through."""
+    folder = tmp_path_factory.mktemp("flights")
+    return [read_flight(write_spot_flight(folder / str(n), n, seconds=0.6)) for n in range(3)]
+
+
+def settings(out: Path, **changes: object) -> TrainSettings:
+    made = TrainSettings(
+        policy=TogeConfig(backbone="resnet18", contract=CONTRACT),
+        out=out / "trained.safetensors",
+        budget=Budget(steps=4),
+        batch_size=8,
+        repeats=2,
+        head_batch_size=32,
+        ema_decay=0.95,
+        precision="f32",
+        validations=2,
+        gate_weight=0.2,  # of so few steps the sticks need most
+    )
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def run(
+    episodes: list[Episode],
+    settings: TrainSettings,
+    report: Callable[[Progress], None] = lambda progress: None,
+    check: Callable[[Path], float] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> TrainResult:
+    ticking = count()
+    return train(
+        episodes,
+        settings,
+        now_s=lambda: next(ticking) * 0.1,
+        report=report,
+        should_stop=should_stop,
+        check=check,
+    )
+
+
+def test_learns_where_the_image_says_to_go(tmp_path: Path) -> None:
+    episodes = [read_flight(write_spot_flight(tmp_path / str(n), n)) for n in range(4)]
+    result = run(episodes, settings(tmp_path, budget=Budget(steps=60), batch_size=16))
+    held_out = result.validation
+    assert held_out is not None
+    assert held_out.stick_error < 0.6 * held_out.mean_stick_error
+    assert held_out.stick_error < 0.6 * held_out.hold_error
+    policy = load_checkpoint(result.checkpoint, fallback=settings(tmp_path).policy)
+    assert policy.contract == replace(CONTRACT, feature_dim=256)
+    with safe_open(result.checkpoint, framework="pt") as file:
+        card = json.loads(file.metadata()[TRAINING_KEY])
+    assert card["flights"] == 3
+    ages = card["feature_age_ms"]
+    assert sum(ages["counts_from_0"][8:15]) == sum(ages["counts_from_0"]) > 1000  # 40..75 ms
+    log = [json.loads(line) for line in _log(settings(tmp_path)).splitlines()]
+    assert {"loss", "gate_loss", "learning_rate", "stage", "fraction"} <= set(log[0])
+    assert list(settings(tmp_path).work_folder.iterdir()) == [
+        settings(tmp_path).work_folder / "log.jsonl"
+    ]
+
+
+def _log(of: TrainSettings) -> str:
+    return (of.work_folder / "log.jsonl").read_text()
+
+
+def short_run(out: Path, **changes: object) -> TrainSettings:
+    """Two steps of encoder and head, state kept, two of the head, state kept, two more."""
+    out.mkdir(exist_ok=True)
+    return settings(out, budget=Budget(steps=6), validations=3, **changes)
+
+
+@pytest.fixture(scope="module")
+def whole(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
+    return run(episodes, short_run(tmp_path_factory.mktemp("whole")))
+
+
+@pytest.mark.parametrize("killed_at", [4, 6, None])  # in the encoder; in the head; stopped
+def test_a_run_that_was_ended_goes_on_as_if_it_had_not_been(
+    episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int | None
+) -> None:
+    def train_there(
+        episodes: list[Episode],
+        *,
+        resume: bool = False,
+        report: Callable[[Progress], None] = lambda _: None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> TrainResult:
+        return run(episodes, short_run(tmp_path, resume=resume), report, should_stop=should_stop)
+
+    if killed_at is None:
+        check_stopping(train_there, episodes, whole, validated_at=4)
+    else:
+        check_resuming(train_there, episodes, whole, killed_at=killed_at)
+
+
+def test_resnet_unet_trains_too_and_an_ablation_is_a_weight_of_zero(
+    episodes: list[Episode], tmp_path: Path
+) -> None:
+    network = ResnetUnetConfig(contract=CONTRACT)
+    made = settings(tmp_path, policy=network, gate_weight=0.0, mirror=False, validations=1)
+    result = run(episodes[:2], made)
+    assert load_checkpoint(result.checkpoint, fallback=network).contract == CONTRACT
+
+
+def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(
+    episodes: list[Episode], tmp_path: Path
+) -> None:
+    scores = iter([0.9, 0.3])
+    seen: list[Path] = []
+
+    def check(path: Path) -> float:
+        seen.append(path)
+        load_checkpoint(path, fallback=settings(tmp_path).policy)
+        return next(scores)
+
+    made = settings(tmp_path, check_every=1, validation_fraction=0.0)
+    result = run(episodes[:2], made, check=check)
+    assert result.score == 0.9
+    assert len(seen) == 2
+    assert result.validation is None
+    further = replace(
+        made, start_from=result.checkpoint, out=tmp_path / "next.safetensors", learning_rate=0.0
+    )
+    again = weights_of(run(episodes[:2], further).checkpoint)
+    before = weights_of(result.checkpoint)
+    same = [name for name in before if before[name] == again[name]]
+    assert "head.unet.out.weight" in same
+    other = replace(further, policy=TogeConfig(backbone="resnet50", contract=CONTRACT))
+    with pytest.raises(PolicyError, match=r"another policy: backbone 'resnet18'"):
+        run(episodes[:2], other)
+
+
+def test_a_frozen_encoder_stays_and_the_head_learns(
+    episodes: list[Episode], tmp_path: Path, whole: TrainResult
+) -> None:
+    made = settings(
+        tmp_path, start_from=whole.checkpoint, freeze_encoder=True, budget=Budget(steps=3)
+    )
+    stages: list[str] = []
+    result = run(episodes, made, lambda progress: stages.append(progress.stage))
+    before, after = weights_of(whole.checkpoint), weights_of(result.checkpoint)
+    encoder = [name for name in before if name.startswith("backbone.")]
+    assert [name for name in encoder if before[name] != after[name]] == []
+    assert before["head.unet.out.weight"] != after["head.unet.out.weight"]
+    assert not any(stage.startswith("encoder") for stage in stages)
+    with pytest.raises(PolicyError, match="--start-from"):
+        replace(made, start_from=None)
+
+
+def test_in_training_the_denoiser_sees_a_part_of_many_samples(tmp_path: Path) -> None:
+    episode = read_flight(write_spot_flight(tmp_path / "flight", 0, seconds=1.5))
+    store = store_frames(
+        [episode], height=32, width=32, folder=tmp_path / "frames", progress=lambda _: None
+    )
+    timeline = Timeline([episode], CONTRACT, np.array([40_000_000]))
+    batches = Batches(timeline, store, timesteps=100, seed=0, mirrors=True)
+    trainee = Trainee(Toge(TogeConfig(backbone="resnet18", contract=CONTRACT)))
+    rows: list[int] = []
+    trainee.policy.head.unet.register_forward_hook(lambda _, args, out: rows.append(len(out)))
+    for images in (4, 16, 64):
+        batch = batches.with_images(0, count=images, repeats=2, size=(32, 32))
+        for is_training in (True, False):
+            trainee.train(is_training)
+            trainee(batch, torch.ones(4))
+    assert rows == [8, 8, 16, 32, 32, 128]
+
+
+def test_a_packed_checkpoint_is_smaller_and_flies_alike(
+    episodes: list[Episode], tmp_path: Path, whole: TrainResult
+) -> None:
+    result = run(episodes, settings(tmp_path, pack=True))
+    assert result.checkpoint.stat().st_size < whole.checkpoint.stat().st_size / 2.5
+    load_checkpoint(result.checkpoint, fallback=settings(tmp_path).policy)
+
+
+def test_a_budget_of_time_ends_and_has_time_for_the_head(
+    episodes: list[Episode], tmp_path: Path
+) -> None:
+    stages: list[str] = []
+    result = run(
+        episodes[:2],
+        settings(tmp_path, budget=Budget(seconds=4.0), validations=1),
+        lambda progress: stages.append(progress.stage),
+    )
+    assert 0 < result.steps < 200
+    assert "head" in stages
+
+
+def test_weights_that_diverge_are_refused(episodes: list[Episode], tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="diverged"):
+        run(episodes[:2], settings(tmp_path, budget=Budget(steps=44), learning_rate=1e30))
+
+
+def test_flights_that_do_not_fit_are_refused(episodes: list[Episode], tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no flights"):
+        run([], settings(tmp_path))
+    enu = replace(episodes[0], state_frame="enu_flu")
+    with pytest.raises(DatasetError, match="one kind at a time"):
+        run([episodes[0], enu], settings(tmp_path))
+    with pytest.raises(DatasetError, match="enu_flu states"):
+        run([enu], settings(tmp_path))
+    blind = replace(episodes[0], age_ns=np.zeros(0, np.int64))
+    with pytest.raises(DatasetError, match="--ages"):
+        run([blind], settings(tmp_path))
+    with pytest.raises(TrainingError, match="no folder"):
+        run(episodes, settings(tmp_path / "missing"))
+    with pytest.raises(TrainingError, match="no run to resume"):
+        run(episodes[:2], settings(tmp_path, resume=True))
+
+
+def test_settings_that_no_run_could_use_are_refused(tmp_path: Path) -> None:
+    for changes in (
+        {"batch_size": 1},
+        {"validation_fraction": 1.0},
+        {"repeats": 0},
+        {"start_from": tmp_path, "backbone_weights": tmp_path},
+    ):
+        with pytest.raises(PolicyError):
+            settings(tmp_path, **changes)
+    with pytest.raises(PolicyError, match="safetensors"):
+        replace(settings(tmp_path), out=tmp_path / "a.pt")
+    for budget in ({}, {"steps": 1, "seconds": 1.0}, {"steps": 0}, {"seconds": float("nan")}):
+        with pytest.raises(PolicyError):
+            Budget(**budget)  # type: ignore[arg-type]
+
+
+def test_stages_grow_and_fill_the_budget(tmp_path: Path) -> None:
+    contract = Contract(image_height=224, image_width=160)
+    stages = make_stages(settings(tmp_path, policy=TogeConfig(contract=contract)))
+    assert [stage.image_size for stage in stages] == [(128, 96), (160, 128), (224, 160), (224, 160)]
+    assert [stage.trains_encoder for stage in stages] == [True, True, True, False]
+    assert stages[0].start == 0
+    assert stages[-1].end == 1
+    assert all(a.end == b.start for a, b in pairwise(stages))
+    assert [s.image_size for s in make_stages(settings(tmp_path))] == [(32, 32), (32, 32)]
+
+
+def test_learning_rate_warms_up_and_falls() -> None:
+    factors = [learning_rate_factor(progress) for progress in np.linspace(0, 1, 101)]
+    assert factors[5] == max(factors) == 1.0
+    assert factors[-1] == pytest.approx(0.01)
+    assert factors[0] == 0.01
+
+
+def test_gate_labels_leave_out_what_no_camera_sees() -> None:
+    ahead = [3.0, 0.0, 4.0, 0.5, 0.0, 5.0, 0.0]  # 5 m away; the gate after it is abeam
+    behind = [-3.0, 0.0, 4.0, 0.5, *[float("nan")] * 3]
+    labels = gate_labels(torch.tensor([ahead, behind]))
+    expected = [0.6, 0.0, 0.8, np.log(0.5), np.cos(0.5), np.sin(0.5)]
+    np.testing.assert_allclose(labels[0, :6].numpy(), expected, atol=1e-6)
+    assert labels[0, 6:].isnan().all()
+    assert labels[1].isnan().all()
+    made = torch.zeros(2, 10, requires_grad=True)
+    gate_loss(made, torch.tensor([ahead, behind])).backward()  # type: ignore[no-untyped-call]
+    assert made.grad is not None
+    assert made.grad.isfinite().all()
+    assert not made.grad[1].any()
+
+
+def test_a_state_that_cannot_be_written_is_one_message(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run", "identity")
+    folder.path.rmdir()
+    with pytest.raises(TrainingError, match="the training cannot be kept"):
+        folder.save(Position(), {})
+    assert not folder.has_state
+    folder.path.mkdir()
+    (folder.path / "state.pt").write_bytes(b"PK torn")
+    with pytest.raises(TrainingError, match="is damaged"):
+        folder.load()

@@ -1,0 +1,371 @@
+"""Training a world model on flights whose sticks steer what is seen."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from helpers.steered_flights import steered_flight
+from helpers.training_runs import check_resuming, check_stopping, weights_of
+from policy.checkpoints.policy_file import TRAINING_KEY
+from policy.checkpoints.world_model_file import load_world_model
+from policy.contract import QUATERNION, VELOCITY, Contract
+from policy.data.episodes import DatasetError, Episode
+from policy.data.frames import store_frames
+from policy.data.windows import find_windows
+from policy.errors import PolicyError
+from policy.training.batches import PooledStore
+from policy.training.encode import both_ways, encode_rows
+from policy.training.plan import Budget, WorldTrainSettings
+from policy.training.report import Progress, TrainResult, WorldValidation
+from policy.training.state import TrainingError
+from policy.training.world_model.batches import CONTEXT_NOISE, WindowBatches, frame_batch
+from policy.training.world_model.losses import autoencoder_loss, dynamics_loss, psnr_db, set_scales
+from policy.training.world_model.run import train_world_model
+from policy.world_model.config import WorldModelConfig
+from policy.world_model.model import WorldModel
+from policy.world_model.relative_state import context_features, motion_since
+
+MODEL = WorldModelConfig(
+    image_size=32,
+    latent_channels=4,
+    frames=4,
+    autoencoder_widths=(8, 8, 16),
+    dynamics_width=32,
+    dynamics_depth=2,
+    contract=Contract(image_height=32, image_width=32),
+)
+WIDER = replace(MODEL, autoencoder_widths=(16, 16, 16), dynamics_width=64)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Sums of two threads differ in the last bit; and the other cores are somebody else's."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list[Episode]:
+    """Short ones, to run through."""
+    return [steered_flight(seed, seconds=1.0) for seed in range(3)]
+
+
+def settings(out: Path, **changes: object) -> WorldTrainSettings:
+    made = WorldTrainSettings(
+        model=MODEL,
+        out=out / "world.safetensors",
+        budget=Budget(steps=6),
+        batch_size=8,
+        window_batch_size=8,
+        autoencoder_share=0.5,
+        ema_decay=0.95,
+        precision="f32",
+        mirror=False,
+        validations=3,
+    )
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def run(
+    episodes: list[Episode],
+    settings: WorldTrainSettings,
+    report: Callable[[Progress], None] = lambda progress: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> TrainResult:
+    ticking = count()
+    return train_world_model(
+        episodes,
+        settings,
+        now_s=lambda: next(ticking) * 0.1,
+        report=report,
+        should_stop=should_stop,
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainResult, WorldTrainSettings]:
+    """A few seconds of training on flights of three seconds."""
+    made = settings(
+        tmp_path_factory.mktemp("trained"),
+        model=WIDER,
+        budget=Budget(steps=400),
+        batch_size=16,
+        window_batch_size=32,
+        learning_rate=3e-3,
+        ema_decay=0.98,
+        validations=2,
+    )
+    return run([steered_flight(seed) for seed in range(6)], made), made
+
+
+def test_sticks_tell_how_the_vehicle_will_move(
+    trained: tuple[TrainResult, WorldTrainSettings],
+) -> None:
+    result, made = trained
+    held_out = result.validation
+    assert isinstance(held_out, WorldValidation)
+    assert held_out.velocity_error_mps is not None
+    assert held_out.held_velocity_error_mps is not None
+    assert held_out.velocity_error_mps < 0.5 * held_out.held_velocity_error_mps
+    log = [json.loads(line) for line in (made.work_folder / "log.jsonl").read_text().splitlines()]
+    for stage in ("autoencoder", "dynamics"):
+        losses = [line["loss"] for line in log if line["stage"] == stage and "loss" in line]
+        assert losses[-1] < 0.7 * losses[0]
+    assert {"latents", "motion", "sticks", "learning_rate", "spent_s"} <= set(log[-2])
+    foretold = [line["foreseen"] for line in log if "foreseen" in line]
+    assert foretold[-1] < 0.5 * foretold[0]
+    assert [path.name for path in made.work_folder.iterdir()] == ["log.jsonl"]
+
+
+def test_other_sticks_make_another_future(trained: tuple[TrainResult, WorldTrainSettings]) -> None:
+    model = load_world_model(trained[0].checkpoint)
+    states = torch.zeros(2, 2, 13)
+    states[..., QUATERNION.start] = 1.0
+    actions = torch.zeros(2, 4, 4)
+    actions[0, :, 2], actions[1, :, 2] = 0.8, -0.8
+    latents = model.encode(torch.full((1, 32, 32, 3), 90, dtype=torch.uint8))
+    made = model.sample(
+        latents[None].expand(2, 2, -1, -1, -1),
+        states,
+        actions,
+        ddim_steps=4,
+        noise_seed=0,
+        sim_mode=True,
+    )
+    forward, backward = made.states[:, -1, VELOCITY.start].tolist()
+    assert forward > 0.5 > -0.5 > backward  # 1.9 m/s each way
+
+
+def test_a_checkpoint_says_how_it_was_trained(
+    trained: tuple[TrainResult, WorldTrainSettings],
+) -> None:
+    with safe_open(trained[0].checkpoint, framework="pt") as file:
+        card = json.loads(file.metadata()[TRAINING_KEY])
+    assert card["flights"] == 5
+    assert card["images"] == 5 * 91
+    assert card["windows"] == 5 * 76
+    assert 200 < card["steps"] <= 400
+    assert card["validation"]["psnr_db"] > 10
+
+
+@pytest.fixture(scope="module")
+def whole(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
+    return run(episodes, settings(tmp_path_factory.mktemp("whole")))
+
+
+@pytest.mark.parametrize("killed_at", [4, 6, None])  # in the autoencoder; in the dynamics; stopped
+def test_a_run_that_was_ended_goes_on_as_if_it_had_not_been(
+    episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int | None
+) -> None:
+    def train_there(
+        episodes: list[Episode],
+        *,
+        resume: bool = False,
+        report: Callable[[Progress], None] = lambda _: None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> TrainResult:
+        return run(episodes, settings(tmp_path, resume=resume), report, should_stop=should_stop)
+
+    if killed_at is None:
+        check_stopping(train_there, episodes, whole, validated_at=4)
+    else:
+        check_resuming(train_there, episodes, whole, killed_at=killed_at)
+
+
+def test_an_autoencoder_that_is_kept_stays_as_it_is(
+    episodes: list[Episode], whole: TrainResult, tmp_path: Path
+) -> None:
+    stages: set[str] = set()
+    made = settings(tmp_path, autoencoder_of=whole.checkpoint)
+    result = run(episodes, made, lambda progress: stages.add(progress.stage))
+    assert result.steps == 6
+    assert "dynamics" in stages
+    assert "autoencoder" not in stages
+    before, after = (weights_of(path) for path in (whole.checkpoint, result.checkpoint))
+    kept = [name for name in before if name.startswith(("autoencoder.enc", "autoencoder.dec"))]
+    assert kept
+    assert all(before[name] == after[name] for name in kept)
+    assert any(before[name] != after[name] for name in before if name.startswith("dynamics"))
+    with pytest.raises(PolicyError, match="latent_channels 4, this model 8"):
+        run(episodes, replace(made, model=replace(MODEL, latent_channels=8)))
+
+
+def test_a_budget_of_time_ends_with_a_checkpoint(episodes: list[Episode], tmp_path: Path) -> None:
+    stages: list[str] = []
+    made = settings(tmp_path, budget=Budget(seconds=12.0), validation_fraction=0.0, mirror=True)
+    result = run(episodes[:2], made, lambda progress: stages.append(progress.note or ""))
+    assert result.validation is None
+    assert 2 < result.steps < 200
+    assert any("held out" in note for note in stages)
+    load_world_model(result.checkpoint)
+
+
+def latents_of(windows_frames: int, path: Path, *, mirror: bool) -> PooledStore:
+    """Latents that tell their frame, and whether it was mirrored."""
+
+    def encode(frames: np.ndarray, is_mirrored: bool) -> torch.Tensor:
+        sign = -1.0 if is_mirrored else 1.0
+        return sign * torch.from_numpy(frames)[:, None].float().expand(-1, 64)
+
+    frames = np.arange(windows_frames)
+    jobs = both_ways(frames, mirror=mirror)
+    return encode_rows(path, jobs, encode, dim=64, go_on=lambda done: True)
+
+
+def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(
+    tmp_path: Path,
+) -> None:
+    windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
+    latents = latents_of(91, tmp_path / "latents", mirror=True)
+    batches = WindowBatches(windows, latents, MODEL, seed=3, mirrors=True, decision_share=0.25)
+    batch = batches.batch(5, 64)
+    for name, value in vars(batches.batch(5, 64)).items():
+        assert torch.equal(value, getattr(batch, name)), name
+    assert not torch.equal(batches.batch(6, 64).latents, batch.latents)
+    is_mirrored = batch.latents[:, -1, 0, 0, 0] < 0
+    assert 0.3 < is_mirrored.float().mean() < 0.7
+    assert 0.1 < (~batch.knows_actions).float().mean() < 0.4
+    assert batch.context_noise.std() < CONTEXT_NOISE
+    first = batch.latents[:, 0, 0, 0, 0].abs().long()
+    plain = windows.samples(np.searchsorted(windows.frames[:, 0], first.numpy()))
+    signs = torch.where(is_mirrored, -1.0, 1.0)
+    yaw = torch.from_numpy(plain.actions[..., 1]) * signs[:, None]
+    torch.testing.assert_close(batch.actions[..., 1], yaw)
+    torch.testing.assert_close(
+        batch.states[..., 9], torch.from_numpy(plain.states[..., 9]) * signs[:, None]
+    )
+    # The mirrored state is one that could be flown: its turn fits its rates.
+    turned = _turn_about_z(batch.states)
+    flown = _turn_about_z(torch.from_numpy(plain.states))
+    torch.testing.assert_close(turned, flown * signs[:, None], atol=1e-4, rtol=0)
+    for part in batches.validation(16):
+        assert (part.context_noise == 0).all()
+        assert (part.latents >= 0).all()
+        assert abs(part.knows_actions.float().mean() - 0.5) < 0.05
+
+
+def _turn_about_z(states: torch.Tensor) -> torch.Tensor:
+    """Since the last state of the context, rad."""
+    motion = motion_since(states[:, 1:2], states[:, 2:])
+    return torch.atan2(motion[..., 4], 1 + motion[..., 3])
+
+
+def test_scales_make_what_is_denoised_of_unit_size(tmp_path: Path) -> None:
+    windows = find_windows(
+        [steered_flight(seed) for seed in range(3)], context_frames=2, frames=4, frame_dt_s=0.1
+    )
+    latents = latents_of(273, tmp_path / "latents", mirror=False)
+    model = WorldModel(MODEL)
+    set_scales(model, windows, latents, mirrors=False)
+    samples = windows.samples(np.arange(len(windows)))
+    states = torch.from_numpy(samples.states)
+    motion = model.normalise_motion(motion_since(states[:, 1:2], states[:, 2:]))
+    assert motion.mean(dim=0).abs().max() < 1e-3
+    moving = motion.std(dim=0)[:, [0, 3, 4, 11]]  # speed, both of yaw, and its rate
+    assert moving.min() > 0.05
+    assert moving.max() < 1.01
+    sticks = model.normalise_actions(torch.from_numpy(samples.actions))
+    torch.testing.assert_close(sticks[..., 1:3].std(dim=(0, 1)), torch.ones(2), atol=0.01, rtol=0)
+    assert sticks[..., 0].abs().max() == 0
+    raw = torch.from_numpy(latents.read(np.arange(273), np.zeros(273, bool)))
+    normal = model.autoencoder.normalise(raw.reshape(273, 4, 4, 4))
+    assert abs(float(normal.mean())) < 1e-3
+    assert float(normal.std()) == pytest.approx(1.0, abs=0.01)
+    assert context_features(states[:, :2], MODEL.contract).abs().max() < 5
+
+
+def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
+    windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
+    latents = latents_of(91, tmp_path / "latents", mirror=False)
+    model = WorldModel(MODEL)
+    for share, decides in ((0.0, False), (1.0, True)):
+        batches = WindowBatches(
+            windows, latents, MODEL, seed=0, mirrors=False, decision_share=share
+        )
+        with torch.inference_mode():
+            told = dynamics_loss(model, batches.batch(0, 8)).told
+        assert (float(told["sticks"]) > 0) == decides
+        assert float(told["motion"]) > 0
+        assert float(told["latents"]) > 0
+
+
+def test_the_change_of_latents_is_in_units_of_what_copying_the_last_frame_costs(
+    tmp_path: Path,
+) -> None:
+    windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
+    latents = latents_of(91, tmp_path / "latents", mirror=False)
+    model = WorldModel(MODEL)
+    set_scales(model, windows, latents, mirrors=False)
+    every = WindowBatches(windows, latents, MODEL, seed=0, mirrors=False, decision_share=0.0)
+    batch = every.validation(len(windows))[0]
+    normal = model.autoencoder.normalise(batch.latents.flatten(0, 1)).unflatten(0, (-1, 6))
+    cost = ((normal[:, 2:] - normal[:, 1:2]) / model.change_std).square().mean()
+    assert float(cost) == pytest.approx(1.0, abs=1e-3)
+    with torch.inference_mode():
+        assert float(dynamics_loss(model, batch).told["pixels"]) > 0
+
+
+def test_the_autoencoder_sees_neighbours_and_pays_for_what_changes(tmp_path: Path) -> None:
+    flight = steered_flight(0)
+    windows = find_windows([flight], context_frames=2, frames=4, frame_dt_s=0.1)
+    size = MODEL.image_size
+    store = store_frames(
+        [flight], height=size, width=size, folder=tmp_path, progress=lambda _: None
+    )
+    batch = frame_batch(store, windows, MODEL, 3, count=4, seed=0, mirrors=True)
+    assert batch.images.shape == (4, 2, size, size, 3)
+    assert (batch.images[:, 0] != batch.images[:, 1]).any()
+    still = replace(batch, images=batch.images[:, :1].expand_as(batch.images))
+    model = WorldModel(MODEL)
+    with torch.inference_mode():
+        unsteady, steady = (
+            float(autoencoder_loss(model, one).told["unsteady"]) for one in (batch, still)
+        )
+    assert unsteady > steady
+    assert steady == pytest.approx(0.0, abs=1e-6)
+
+
+def test_psnr_is_that_of_the_mean_squared_error() -> None:
+    black = torch.zeros(2, 4, 4, 3, dtype=torch.uint8)
+    grey = black.clone()
+    grey[0] += 51  # a fifth of full scale
+    assert psnr_db(grey, black).tolist() == pytest.approx([20 * np.log10(5), 99.0])
+
+
+def test_weights_that_diverge_are_refused(episodes: list[Episode], tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="diverged"):
+        run(episodes[:2], settings(tmp_path, budget=Budget(steps=60), learning_rate=1e30))
+
+
+def test_flights_that_do_not_fit_are_refused(episodes: list[Episode], tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no flights"):
+        run([], settings(tmp_path))
+    with pytest.raises(DatasetError, match="enu_flu states"):
+        run([replace(episodes[0], state_frame="enu_flu")], settings(tmp_path))
+    with pytest.raises(DatasetError, match="fly longer"):
+        run([steered_flight(0, seconds=0.3)], settings(tmp_path))
+    with pytest.raises(TrainingError, match="no run to resume"):
+        run(episodes, settings(tmp_path, resume=True))
+    hasty = settings(tmp_path, budget=Budget(seconds=0.01))
+    with pytest.raises(DatasetError, match="--minutes"):
+        run([steered_flight(seed, seconds=9.0) for seed in range(2)], hasty)
+
+
+def test_settings_that_no_run_could_use_are_refused(tmp_path: Path) -> None:
+    for changes in (
+        {"window_batch_size": 0},
+        {"autoencoder_share": 1.0},
+        {"decision_share": 1.5},
+        {"batch_size": 1},
+    ):
+        with pytest.raises(PolicyError):
+            settings(tmp_path, **changes)

@@ -1,0 +1,105 @@
+"""States as changes since now, and back."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from policy import rotation
+from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract, StateFrame
+from policy.world_model.relative_state import (
+    MOTION_DIM,
+    context_features,
+    motion_since,
+    state_after,
+)
+
+
+def random_states(count: int, seed: int = 0) -> Tensor:
+    """Any attitude, also upside down; w >= 0."""
+    random = np.random.default_rng(seed)
+    states = random.normal(size=(count, 13))
+    quaternion = states[:, QUATERNION] / np.linalg.norm(states[:, QUATERNION], axis=1)[:, None]
+    states[:, QUATERNION] = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+    return torch.from_numpy(states.astype(np.float32))
+
+
+def turned(states: Tensor, by: np.ndarray) -> Tensor:
+    """The same flight with the world turned by a quaternion; bodies stay as they are."""
+    out = states.numpy().astype(np.float64)
+    out[:, QUATERNION] = rotation.multiply(by, out[:, QUATERNION])
+    out[:, VELOCITY] = rotation.rotate(np.broadcast_to(by, (len(out), 4)), out[:, VELOCITY])
+    return torch.from_numpy(out.astype(np.float32))
+
+
+def test_a_motion_leads_back_to_the_state() -> None:
+    now, then = random_states(500), random_states(500, seed=1)
+    again = state_after(now, motion_since(now, then))
+    torch.testing.assert_close(again, then, atol=2e-5, rtol=0)
+
+
+def test_a_half_turn_about_each_axis_is_told_and_undone() -> None:
+    now = random_states(1).expand(3, -1)
+    half_turns = np.eye(4)[1:]
+    then = now.clone()
+    attitude = rotation.multiply(now[:, QUATERNION].numpy().astype(np.float64), half_turns)
+    then[:, QUATERNION] = torch.from_numpy(attitude.astype(np.float32))
+    again = state_after(now, motion_since(now, then))
+    assert (again[:, QUATERNION] * then[:, QUATERNION]).sum(1).abs().min() > 1 - 1e-5
+
+
+def test_a_motion_is_the_rotation_that_the_quaternions_tell() -> None:
+    now, then = random_states(20), random_states(20, seed=1)
+    motion = motion_since(now, then).numpy()
+    assert motion.shape == (20, MOTION_DIM)
+    q_now, q_then = (s[:, QUATERNION].numpy().astype(np.float64) for s in (now, then))
+    turn = rotation.multiply(rotation.conjugate(q_now), q_then)
+    for index, axis in enumerate(np.eye(3)[:2]):
+        column = rotation.rotate(turn, np.broadcast_to(axis, (20, 3)))
+        told = motion[:, 3 + 3 * index : 6 + 3 * index] + axis
+        np.testing.assert_allclose(told, column, atol=1e-5)
+    change = (then - now)[:, VELOCITY].numpy().astype(np.float64)
+    in_body = rotation.rotate(rotation.conjugate(q_now), change)
+    np.testing.assert_allclose(motion[:, :3], in_body, atol=1e-5)
+    np.testing.assert_allclose(motion[:, 9:12], (then - now)[:, RATE], atol=1e-6)
+    np.testing.assert_allclose(motion[:, 12:], (then - now)[:, SPECIFIC_FORCE], atol=1e-6)
+
+
+def test_what_a_net_makes_up_becomes_a_unit_quaternion_with_positive_w() -> None:
+    motion = 3 * torch.randn(300, MOTION_DIM, generator=torch.Generator().manual_seed(0))
+    quaternion = state_after(random_states(300), motion)[:, QUATERNION]
+    torch.testing.assert_close(quaternion.norm(dim=1), torch.ones(300))
+    assert (quaternion[:, 0] >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("frame", "up"), [("ned_frd", (0.0, 0.0, -1.0)), ("enu_flu", (0.0, 0.0, 1.0))]
+)
+def test_what_is_told_is_the_same_on_every_heading(
+    frame: StateFrame, up: tuple[float, float, float]
+) -> None:
+    by = rotation.about_z(np.array([1.1]))[0]
+    past, then = random_states(2), random_states(7, seed=1)
+    past_turned, then_turned = turned(past, by), turned(then, by)
+    contract = Contract(state_frame=frame)
+    torch.testing.assert_close(
+        context_features(past_turned[None], contract),
+        context_features(past[None], contract),
+        atol=1e-5,
+        rtol=0,
+    )
+    motion = motion_since(past[1], then)
+    torch.testing.assert_close(motion_since(past_turned[1], then_turned), motion, atol=1e-5, rtol=0)
+    # A second of climbing is a climb in both frames, whatever the heading.
+    level = torch.zeros(13)
+    level[QUATERNION] = torch.from_numpy(by.astype(np.float32))
+    climbing = level.clone()
+    climbing[VELOCITY] = torch.tensor(up)
+    np.testing.assert_allclose(motion_since(level, climbing)[:3], up, atol=1e-6)
+
+
+def test_a_wrong_sign_of_the_quaternion_changes_nothing() -> None:
+    now, then = random_states(10), random_states(10, seed=1)
+    flipped = now.clone()
+    flipped[:, QUATERNION] *= -1
+    torch.testing.assert_close(motion_since(flipped, then), motion_since(now, then))

@@ -1,0 +1,278 @@
+"""The world model without training: its two roles, its shapes, and what makes it repeatable."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from policy.contract import QUATERNION, Contract
+from policy.errors import PolicyError
+from policy.nets.diffusion import NoiseSchedule
+from policy.world_model.config import WorldModelConfig
+from policy.world_model.dynamics import Future
+from policy.world_model.model import Imagined, WorldModel
+from policy.world_model.relative_state import MOTION_DIM
+
+SMALL = WorldModelConfig(
+    image_size=32,
+    latent_channels=4,
+    frames=4,
+    autoencoder_widths=(8, 8, 8),
+    dynamics_width=32,
+    dynamics_depth=2,
+    contract=Contract(image_height=32, image_width=32),
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """The other cores are somebody else's."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def model() -> WorldModel:
+    """Not to be changed by a test."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return WorldModel(SMALL).eval()
+
+
+def images(count: int, seed: int = 0) -> Tensor:
+    drawn = torch.randint(0, 256, (count, 32, 32, 3), generator=torch.Generator().manual_seed(seed))
+    return drawn.to(torch.uint8)
+
+
+def context(batch: int) -> tuple[Tensor, Tensor]:
+    random = torch.Generator().manual_seed(1)
+    states = torch.randn(batch, 2, 13, generator=random)
+    states[..., QUATERNION] = torch.nn.functional.normalize(states[..., QUATERNION], dim=-1)
+    return torch.randn(batch, 2, 4, 4, 4, generator=random), states
+
+
+def actions(batch: int) -> Tensor:
+    return torch.rand(batch, 4, 4, generator=torch.Generator().manual_seed(2)) * 2 - 1
+
+
+def simulate(model: WorldModel, given: Tensor, *, seed: int | torch.Generator = 0) -> Imagined:
+    return model.sample(*context(len(given)), given, ddim_steps=3, noise_seed=seed, sim_mode=True)
+
+
+def test_simulation_gives_latents_and_states_for_the_actions_given(model: WorldModel) -> None:
+    given = actions(3)
+    made = simulate(model, given)
+    assert made.latents.shape == (3, 4, 4, 4, 4)
+    assert made.states.shape == (3, 4, 13)
+    assert torch.equal(made.actions, given)
+    assert made.video is None
+    torch.testing.assert_close(made.states[..., QUATERNION].norm(dim=-1), torch.ones(3, 4))
+    assert (made.states[..., QUATERNION.start] >= 0).all()
+
+
+def test_decision_makes_sticks(model: WorldModel) -> None:
+    made = model.sample(
+        *context(2), None, ddim_steps=2, noise_seed=0, sim_mode=False, decode_video=True
+    )
+    assert made.actions.shape == (2, 4, 4)
+    assert made.actions.abs().max() <= 1
+    assert made.actions.std() > 0
+    assert made.video is not None
+    assert made.video.shape == (2, 4, 32, 32, 3)
+    assert torch.equal(made.video.flatten(0, 1), model.decode(made.latents.flatten(0, 1)))
+
+
+def test_a_seed_repeats_itself_and_another_does_not(model: WorldModel) -> None:
+    given = actions(1)
+    torch.manual_seed(5)
+    first = simulate(model, given, seed=7)
+    torch.manual_seed(6)  # the process's own random stream plays no part
+    assert torch.equal(first.latents, simulate(model, given, seed=7).latents)
+    assert torch.equal(first.states, simulate(model, given, seed=7).states)
+    assert not torch.equal(first.latents, simulate(model, given, seed=8).latents)
+    generator = torch.Generator().manual_seed(7)
+    assert torch.equal(first.latents, simulate(model, given, seed=generator).latents)
+    assert not torch.equal(first.latents, simulate(model, given, seed=generator).latents)
+
+
+def test_a_stick_changes_what_comes_after_it_and_nothing_before(model: WorldModel) -> None:
+    given = actions(1)
+    other = given.clone()
+    other[:, 2] += 0.5
+    plain, changed = simulate(model, given), simulate(model, other)
+    assert torch.equal(plain.latents[:, :2], changed.latents[:, :2])
+    assert torch.equal(plain.states[:, :2], changed.states[:, :2])
+    for index in (2, 3):
+        assert not torch.equal(plain.latents[:, index], changed.latents[:, index])
+        assert not torch.equal(plain.states[:, index], changed.states[:, index])
+
+
+def test_frames_are_coded_as_if_they_were_alone(model: WorldModel) -> None:
+    frames = images(7)
+    latents = model.encode(frames)
+    assert latents.shape == (7, 4, 4, 4)
+    assert torch.equal(latents[2:4], model.encode(frames[2:4]))
+    shown = model.decode(latents)
+    assert shown.shape == frames.shape
+    assert shown.dtype == torch.uint8
+    assert torch.equal(shown[5:6], model.decode(latents[5:6]))
+    strided = torch.stack([latents, latents], dim=-1)[..., 0]  # other strides, same numbers
+    assert torch.equal(shown, model.decode(strided))
+    assert torch.equal(shown.flip(0), model.decode(latents.flip(0)))
+    assert model.decode(latents[:0]).shape == (0, 32, 32, 3)
+    assert model.encode(frames[:0]).shape == (0, 4, 4, 4)
+
+
+def test_gradient_reaches_every_weight() -> None:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = WorldModel(SMALL)
+    pixels = torch.randn(2, 3, 32, 32)
+    mean, log_variance = model.autoencoder.posterior(pixels)
+    loss = model.autoencoder.reconstruct(mean).square().mean() + log_variance.square().mean()
+    latents, states = context(2)
+    noisy = Future(
+        latents=torch.randn(2, 4, 4, 4, 4),
+        motion=torch.randn(2, 4, MOTION_DIM),
+        actions=torch.randn(2, 4, 4),
+    )
+    known = torch.tensor([True, False])
+    view = model.view(latents[:, -1], states[:, -1])
+    past = model.foresee(view, latents, states, noisy.actions, known)
+    made = model.denoise(noisy, torch.tensor([3, 99]), past)
+    assert torch.equal(made.actions[0], noisy.actions[0])
+    loss = loss + sum(part.square().mean() for part in vars(made).values())
+    poses = model.poses(states[:, -1], torch.ones(2, 4, MOTION_DIM))
+    loss = loss + model.moved(view, poses)[0].square().mean()
+    loss.backward()
+    for name, weight in model.named_parameters():
+        assert weight.grad is not None, name
+        assert weight.grad.abs().sum() > 0, name
+
+
+def test_what_is_not_known_of_the_sticks_is_not_looked_at(model: WorldModel) -> None:
+    latents, states = context(2)
+    view = model.view(latents[:, -1], states[:, -1])
+    known, unknown = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool)
+
+    def foreseen(knows: Tensor, given: Tensor) -> Tensor:
+        return model.foresee(view, latents, states, given, knows).carried
+
+    given, other = actions(2), -actions(2)
+    assert torch.equal(foreseen(unknown, given), foreseen(unknown, other))
+    assert not torch.equal(foreseen(known, given), foreseen(known, other))
+
+
+class CellCoder(nn.Module):
+    """In place of an autoencoder: each latent is the colour of its cell."""
+
+    def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        return functional.avg_pool2d(images, 8), images
+
+    def reconstruct(self, latents: Tensor) -> Tensor:
+        return functional.interpolate(latents, scale_factor=8)
+
+    def normalise(self, latents: Tensor) -> Tensor:
+        return latents
+
+    denormalise = normalise
+
+
+class Prophet(nn.Module):
+    """In place of a foresight: knows the yaw of each frame, of unit scale as it is given."""
+
+    def __init__(self, yaw_rad: Tensor) -> None:
+        super().__init__()
+        self._yaw_rad = yaw_rad
+
+    def forward(self, features: Tensor, actions: Tensor, knows_actions: Tensor) -> Tensor:
+        motion = torch.zeros(len(features), len(self._yaw_rad), MOTION_DIM)
+        motion[..., 3], motion[..., 4] = self._yaw_rad.cos() - 1, self._yaw_rad.sin()
+        motion[..., 6], motion[..., 7] = -self._yaw_rad.sin(), self._yaw_rad.cos() - 1
+        return motion
+
+
+def test_a_net_that_says_nothing_shows_the_last_frame_turned_as_was_foreseen() -> None:
+    config = replace(SMALL, image_size=64, latent_channels=3, camera_tilt_rad=0.0)
+    model = WorldModel(config).eval()
+    # By the first yaw, a column of cells comes to where its left neighbour was, in the middle.
+    yaw_rad = torch.tensor([0.0, 1.0, -1.0, 3.0]) * torch.tensor(8 / 32).atan()
+    model.autoencoder, model.foresight = CellCoder(), Prophet(yaw_rad)  # type: ignore[assignment]
+    model.motion_std.fill_(1.0)
+    for out in (model.dynamics.out_patch, model.dynamics.out_vehicle):
+        out.weight.data.zero_()
+    latents = torch.zeros(1, 2, 3, 8, 8)
+    latents[:, 1, 0, :, 4] = 1.0  # right of the middle
+    states = torch.zeros(1, 2, 13)
+    states[..., QUATERNION.start] = 1.0
+    made = model.sample(
+        latents, states, actions(1), ddim_steps=2, noise_seed=0, sim_mode=True
+    ).latents[0, :, 0]
+    torch.testing.assert_close(made[0], latents[0, 1, 0], atol=1e-4, rtol=0)
+    assert (made[1, 3:5].argmax(dim=-1) == 3).all()
+    assert (made[2, 3:5].argmax(dim=-1) == 5).all()
+    view = model.view(latents[:, -1], states[:, -1])
+    known = torch.ones(1, dtype=torch.bool)
+    in_view = model.foresee(view, latents, states, actions(1), known).in_view[0, :, 0]
+    assert (in_view[0] == 1).all()
+    assert (in_view[3, :, -1] == 0).all()  # has come in from the right
+    assert (in_view[3, 3:5, 0] == 1).all()
+
+
+def test_the_shipped_size_fits_in_four_megabytes() -> None:
+    weights = sum(weight.numel() for weight in WorldModel(WorldModelConfig()).parameters())
+    assert 2 * weights < 4_000_000
+
+
+def test_inputs_that_do_not_fit_are_refused(model: WorldModel) -> None:
+    latents, states = context(1)
+    given = actions(1)
+
+    def sample(
+        latents: Tensor = latents,
+        states: Tensor = states,
+        given: Tensor | None = given,
+        *,
+        steps: int = 2,
+        sim_mode: bool = True,
+    ) -> None:
+        model.sample(latents, states, given, ddim_steps=steps, noise_seed=0, sim_mode=sim_mode)
+
+    with pytest.raises(PolicyError, match="latents must be"):
+        sample(latents=latents[:, :1])
+    with pytest.raises(PolicyError, match="states must be"):
+        sample(states=states[..., :12])
+    with pytest.raises(PolicyError, match="actions must be"):
+        sample(given=given[:, :2])
+    with pytest.raises(PolicyError, match="missing"):
+        sample(given=None)
+    with pytest.raises(PolicyError, match="not to be given"):
+        sample(sim_mode=False)
+    with pytest.raises(PolicyError, match="num_diffusion_steps"):
+        sample(steps=0)
+    with pytest.raises(PolicyError, match="uint8"):
+        model.encode(images(1).float())
+    with pytest.raises(PolicyError, match="resize"):
+        model.encode(images(1)[:, :16])
+    with pytest.raises(PolicyError, match="latents must be"):
+        model.decode(torch.zeros(1, 4, 8, 8))
+
+
+def test_shapes_that_cannot_be_built_are_refused() -> None:
+    for changes, says in (
+        ({"image_size": 40}, "multiple of 16"),
+        ({"frames": 0}, "frames"),
+        ({"dynamics_width": 48}, "multiple of 32"),
+        ({"frame_dt_s": float("nan")}, "frame_dt_s"),
+        ({"autoencoder_widths": (8, 8)}, "autoencoder_widths"),
+        ({"horizontal_fov_rad": 90.0}, "rad, got 90"),
+        ({"camera_tilt_rad": float("nan")}, "camera_tilt_rad"),
+        ({"schedule": NoiseSchedule(prediction="epsilon")}, "predict the sample"),
+    ):
+        with pytest.raises(PolicyError, match=says):
+            replace(SMALL, **changes)

@@ -1,0 +1,56 @@
+import pytest
+
+from mavbridge.simulation.clock import START_NS, AheadClock, SteppedClock
+
+
+def test_events_run_at_their_time_in_order_of_scheduling() -> None:
+    clock = SteppedClock(0)
+    seen: list[tuple[str, int]] = []
+    clock.schedule(20, lambda: seen.append(("late", clock.now_ns())))
+    clock.schedule(10, lambda: seen.append(("first", clock.now_ns())))
+    clock.schedule(10, lambda: seen.append(("second", clock.now_ns())))
+    clock.sleep_until_ns(15)
+    assert seen == [("first", 10), ("second", 10)]
+    assert clock.now_ns() == 15
+    clock.sleep_until_ns(20)
+    assert seen[-1] == ("late", 20)
+
+
+def test_an_event_may_plan_the_next_one_within_the_same_wait() -> None:
+    clock = SteppedClock(0)
+    seen: list[int] = []
+
+    def tick() -> None:
+        seen.append(clock.now_ns())
+        clock.schedule(clock.now_ns() + 10, tick)
+
+    clock.schedule(10, tick)
+    clock.sleep_until_ns(35)
+    assert seen == [10, 20, 30]
+    assert clock.next_event_ns == 40
+
+
+def test_time_never_goes_back() -> None:
+    clock = SteppedClock()
+    clock.sleep_until_ns(START_NS + 5)
+    clock.sleep_until_ns(START_NS)
+    late: list[int] = []
+    clock.schedule(START_NS, lambda: late.append(clock.now_ns()))
+    clock.sleep_until_ns(START_NS + 5)
+    assert late == [START_NS + 5]
+
+
+def test_an_event_must_not_wait() -> None:
+    clock = SteppedClock(0)
+    clock.schedule(1, lambda: clock.sleep_until_ns(2))
+    with pytest.raises(RuntimeError, match="must not wait"):
+        clock.sleep_until_ns(1)
+
+
+def test_a_loop_that_works_as_an_event_is_ahead_of_the_world() -> None:
+    world = SteppedClock(100)
+    clock = AheadClock(world)
+    clock.ahead_ns += 30
+    assert (clock.now_ns(), world.now_ns()) == (130, 100)
+    clock.sleep_until_ns(150)
+    assert clock.ahead_ns == 50
