@@ -33,7 +33,7 @@ class Link(Protocol):
         """Take in all that has arrived; never blocks."""
         ...
 
-    def tend(self) -> None:
+    def service(self) -> None:
         """Heartbeat, handshake and requests that are due; called when the sticks have left."""
         ...
 
@@ -52,7 +52,7 @@ class Link(Protocol):
         """Finish giving the sticks back; takes up to half a second, at the end of a flight."""
         ...
 
-    def seize(self) -> None:
+    def force_release(self) -> None:
         """From any thread: give the sticks back now, and let nothing else leave any more."""
         ...
 

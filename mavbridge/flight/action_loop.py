@@ -1,4 +1,4 @@
-"""The fast path: pace, poll, state, feature, act, smooth, guard, send, emit, tend."""
+"""The fast path: newest state + cached feature -> chunk of actions -> one stick command a slot."""
 
 import threading
 from collections.abc import Callable
@@ -19,12 +19,13 @@ from mavbridge.core.records import (
     StickTrace,
     Tick,
     VehicleState,
+    VehicleStatus,
 )
 from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory, sample_chunk
 from mavbridge.flight.state import Freshness, StateFrame, build_state
-from mavbridge.gate.engagement import Ask, Engagement, Facts, Hold, check_chunk
+from mavbridge.gate.engagement import Engagement, Facts, Hold, Request, check_chunk
 from mavbridge.gate.smoothing import StickSmoother
 
 Act = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
@@ -40,7 +41,7 @@ RC_FRESH_NS = NS_PER_S // 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionSettings:
-    """What the loop needs to know of the contract and the limits."""
+    """Parts of the contract and the limits that the loop needs."""
 
     state_frame: StateFrame
     since_exposure: bool
@@ -54,19 +55,16 @@ class ActionSettings:
     """How far ahead of the send a chunk is sampled: the lag of our own low-pass."""
     mode: str | None
     duration_ns: int | None
-    """Time to fly once engaged; None = until stopped."""
+    """Flight time from the first engagement on; None = until stopped."""
 
 
-@dataclass(slots=True)
-class _Step:
-    """What one tick has gathered on its way."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Flown:
+    """The policy's part of one tick: a command and how it came about, or a refusal."""
 
-    now_ns: int
-    snapshot: LinkSnapshot
-    feature: FeatureFrame | None
-    state: VehicleState | None = None
-    trace: StickTrace | None = None
-    predict_ns: int | None = None
+    decision: Decision
+    trace: StickTrace | None
+    predict_ns: int
 
 
 class ActionLoop:
@@ -114,79 +112,93 @@ class ActionLoop:
             self._hand_back()
 
     def step(self, slot: Slot) -> None:
-        """One tick."""
+        """One tick: state, feature, engagement, act, smooth, guard, send, emit."""
         snapshot, feature = self._link.poll(), self._cache.latest()
-        step = _Step(now_ns=self._clock.now_ns(), snapshot=snapshot, feature=feature)
-        decision = self._decide(step)
+        now_ns = self._clock.now_ns()
+        state = build_state(
+            snapshot.telemetry,
+            now_ns,
+            frame=self._settings.state_frame,
+            freshness=self._settings.freshness,
+        )
+        if isinstance(state, VehicleState) and self._ego_motion is not None:
+            self._ego_motion.push(state)
+        problem = self._input_problem(state, feature, now_ns)
+        directive = self._engagement.step(_facts(snapshot, problem, now_ns))
+        self._request(directive.request)
+
+        flown: _Flown | None = None
+        if isinstance(directive.sticks, Release):
+            decision: Decision = directive.sticks
+        elif directive.sticks is Hold.IDLE:
+            decision = Command(sticks=IDLE)
+        else:
+            flown = self._fly(snapshot.status, state, feature, now_ns)
+            decision = flown.decision
+        self._is_flying = flown is not None and flown.trace is not None
+
         sent = self._link.send(decision)
         sent_ns = self._clock.now_ns()
         self._has_commanded = isinstance(decision, Command)
         self._history.append(sent, sent_ns)
-        self._sink.emit(_tick(self._ticks, slot, step, decision, sent, sent_ns))
+        self._sink.emit(
+            _tick(self._ticks, slot, snapshot, feature, state, flown, decision, sent, sent_ns)
+        )
         self._ticks += 1
-        self._link.tend()
+        self._link.service()
         self.alive_ns = sent_ns
 
-    def _decide(self, step: _Step) -> Decision:
-        state = build_state(
-            step.snapshot.telemetry,
-            step.now_ns,
-            frame=self._settings.state_frame,
-            freshness=self._settings.freshness,
-        )
-        step.state = state if isinstance(state, VehicleState) else None
-        if step.state is not None and self._ego_motion is not None:
-            self._ego_motion.push(step.state)
-        problem = state if isinstance(state, Release) else self._feature_problem(step)
-        directive = self._engagement.step(_facts(step, problem))
-        self._ask(directive.ask)
-        was_flying, self._is_flying = self._is_flying, directive.sticks is Hold.FLY
-        if directive.sticks is Hold.IDLE:
-            return Command(sticks=IDLE)
-        if isinstance(directive.sticks, Release):
-            return directive.sticks
-        if not was_flying:
-            self._smoother.reset(_current_sticks(step))
-            self._chunk_state_ns = None
-        return self._fly(step)
-
-    def _feature_problem(self, step: _Step) -> Release | None:
-        if step.feature is None:
-            return Release("no image feature yet")
-        if step.feature.age_ns(step.now_ns) > self._settings.max_feature_age_ns:
+    def _input_problem(
+        self, state: VehicleState | Release, feature: FeatureFrame | None, now_ns: int
+    ) -> str | None:
+        """Name what the policy lacks at this tick, or None."""
+        if isinstance(state, Release):
+            return state.reason
+        if feature is None:
+            return "no image feature yet"
+        if feature.age_ns(now_ns) > self._settings.max_feature_age_ns:
             limit_ms = self._settings.max_feature_age_ns // NS_PER_MS
-            return Release(f"the image feature is older than {limit_ms} ms")
+            return f"the image feature is older than {limit_ms} ms"
         return None
 
-    def _fly(self, step: _Step) -> Decision:
-        if step.feature is None or step.state is None:
+    def _fly(
+        self,
+        status: VehicleStatus | None,
+        state: VehicleState | Release,
+        feature: FeatureFrame | None,
+        now_ns: int,
+    ) -> _Flown:
+        """Sample the policy, check its chunk, and smooth the action that acts now."""
+        if isinstance(state, Release) or feature is None:
             raise RuntimeError("engaged without inputs: the engagement must not allow this")
+        if not self._is_flying:
+            self._smoother.reset(_current_sticks(status, now_ns))
+            self._chunk_state_ns = None
         started_ns = self._clock.now_ns()
-        history = self._history.resample(step.now_ns)
-        elapsed_s = self._elapsed_s(step.state)
-        state = step.state.values[None]
+        history = self._history.resample(now_ns)
+        elapsed_s = self._elapsed_s(state)
+        values = state.values[None]
         if self._ego_motion is not None:
-            state = self._ego_motion.append_to(step.state, step.feature.captured_ns)
-        chunk = self._act(step.feature.value, state, history, elapsed_s)
+            values = self._ego_motion.append_to(state, feature.captured_ns)
+        chunk = self._act(feature.value, values, history, elapsed_s)
         done_ns = self._clock.now_ns()
-        step.predict_ns = done_ns - started_ns
+        predict_ns = done_ns - started_ns
         if (refusal := check_chunk(chunk)) is not None:
-            self._is_flying = False
-            return refusal
-        at_s = (done_ns - step.state.attitude_ns) / NS_PER_S + self._settings.lead_s
+            return _Flown(decision=refusal, trace=None, predict_ns=predict_ns)
+        at_s = (done_ns - state.attitude_ns) / NS_PER_S + self._settings.lead_s
         raw = sample_chunk(chunk[0], chunk_dt_s=self._settings.chunk_dt_s, at_s=at_s)
-        step.trace = self._smoother.step(raw, done_ns)
-        return Command(sticks=step.trace.smoothed)
+        trace = self._smoother.step(raw, done_ns)
+        return _Flown(decision=Command(sticks=trace.smoothed), trace=trace, predict_ns=predict_ns)
 
     def _elapsed_s(self, state: VehicleState) -> float | None:
         """Time from the state of the last chunk to this one, which becomes the last."""
         last_ns, self._chunk_state_ns = self._chunk_state_ns, state.attitude_ns
         return None if last_ns is None else (state.attitude_ns - last_ns) / NS_PER_S
 
-    def _ask(self, ask: Ask | None) -> None:
-        if ask == "mode" and self._settings.mode is not None:
+    def _request(self, request: Request | None) -> None:
+        if request == "mode" and self._settings.mode is not None:
             self._link.set_mode(self._settings.mode)
-        elif ask == "arm":
+        elif request == "arm":
             self._link.arm()
 
     def _is_over(self) -> bool:
@@ -207,49 +219,56 @@ class ActionLoop:
         self._link.hand_back()
 
 
-def _facts(step: _Step, problem: Release | None) -> Facts:
-    status = step.snapshot.status
+def _facts(snapshot: LinkSnapshot, input_problem: str | None, now_ns: int) -> Facts:
+    status = snapshot.status
     return Facts(
-        now_ns=step.now_ns,
-        link_problem=step.snapshot.problem,
-        input_problem=None if problem is None else problem.reason,
+        now_ns=now_ns,
+        link_problem=snapshot.problem,
+        input_problem=input_problem,
         mode=status.mode if status else None,
         armed=status is not None and status.armed,
-        is_overruled=step.snapshot.is_overruled,
-        echo_confirmed=step.snapshot.echo_confirmed,
+        is_overruled=snapshot.is_overruled,
+        echo_confirmed=snapshot.echo_confirmed,
     )
 
 
-def _current_sticks(step: _Step) -> Sticks:
-    """Where the sticks are as the policy takes over, so that it starts without a jump."""
-    status = step.snapshot.status
+def _current_sticks(status: VehicleStatus | None, now_ns: int) -> Sticks:
+    """Stick positions to start from, as the vehicle reports them, so that nothing jumps."""
     if status is None or status.rc_sticks is None or status.rc_arrived_ns is None:
         return NEUTRAL
-    is_fresh = step.now_ns - status.rc_arrived_ns <= RC_FRESH_NS
+    is_fresh = now_ns - status.rc_arrived_ns <= RC_FRESH_NS
     return status.rc_sticks if is_fresh else NEUTRAL
 
 
 def _tick(
-    serial: int, slot: Slot, step: _Step, decision: Decision, sent: Sticks | None, sent_ns: int
+    serial: int,
+    slot: Slot,
+    snapshot: LinkSnapshot,
+    feature: FeatureFrame | None,
+    state: VehicleState | Release,
+    flown: _Flown | None,
+    decision: Decision,
+    sent: Sticks | None,
+    sent_ns: int,
 ) -> Tick:
-    status = step.snapshot.status
+    status = snapshot.status
     return Tick(
         serial=serial,
         index=slot.index,
         due_ns=slot.due_ns,
         woke_ns=slot.woke_ns,
         missed_slots=slot.missed,
-        predict_ns=step.predict_ns,
+        predict_ns=flown.predict_ns if flown else None,
         sent_ns=sent_ns,
-        feature_frame_id=step.feature.frame_id if step.feature else None,
-        feature_captured_ns=step.feature.captured_ns if step.feature else None,
-        state=step.state,
-        trace=step.trace,
+        feature_frame_id=feature.frame_id if feature else None,
+        feature_captured_ns=feature.captured_ns if feature else None,
+        state=state if isinstance(state, VehicleState) else None,
+        trace=flown.trace if flown else None,
         sent=sent,
         release_reason=decision.reason if isinstance(decision, Release) else None,
         mode=status.mode if status else None,
         armed=status is not None and status.armed,
         rc_channels_us=status.rc_channels_us if status else (),
         rc_sticks=status.rc_sticks if status else None,
-        texts=step.snapshot.texts,
+        texts=snapshot.texts,
     )

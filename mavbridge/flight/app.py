@@ -263,7 +263,7 @@ class _Flight:
         """End the flight when the action loop hangs: its last sticks must not stay."""
         idle_ns = self._clock.now_ns() - self._action.alive_ns
         if action.is_alive and idle_ns > HANG_NS:
-            self._link.seize()
+            self._link.force_release()
             self._has_hung = True
             raise PeerError(
                 f"the action loop has hung for {idle_ns / NS_PER_S:.1f} s: the policy is too slow "
@@ -274,7 +274,7 @@ class _Flight:
         try:
             action.join(JOIN_S)
         except HungError:
-            self._link.seize()
+            self._link.force_release()
             if not self._has_hung:  # else that is being told already
                 raise
 

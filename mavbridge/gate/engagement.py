@@ -58,7 +58,7 @@ class Hold(Enum):
     FLY = "fly"
 
 
-Ask: TypeAlias = Literal["mode", "arm"]
+Request: TypeAlias = Literal["mode", "arm"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +66,7 @@ class Directive:
     """What to do this tick."""
 
     sticks: Hold | Release
-    ask: Ask | None = None
+    request: Request | None = None
 
 
 class Engagement:
@@ -121,10 +121,10 @@ class Engagement:
             return self._wait(facts.link_problem)
         return self._fly(facts)
 
-    def _wait(self, reason: str, ask: Ask | None = None) -> Directive:
+    def _wait(self, reason: str, request: Request | None = None) -> Directive:
         if self.phase is Phase.PREPARING:
             self.phase = Phase.WAITING
-        return Directive(sticks=Release(reason), ask=ask)
+        return Directive(sticks=Release(reason), request=request)
 
     def _on_ground(self, facts: Facts) -> Directive:
         self.phase = Phase.WAITING
@@ -134,14 +134,14 @@ class Engagement:
             return self._wait("disarmed: the flight is over, or arm it yourself")
         if not self._may_arm:
             self._own_mode = None
-            ask: Ask | None = "mode" if wants_mode else None
-            return self._wait("disarmed: arm the vehicle, or start with --arm", ask)
+            request: Request | None = "mode" if wants_mode else None
+            return self._wait("disarmed: arm the vehicle, or start with --arm", request)
         if self._wanted_mode is None and facts.mode not in PILOTED_MODES:
             return self._wait(f"{facts.mode} is not flown with sticks: name one with --mode")
         self._prepare(facts)
         if facts.input_problem is not None or not facts.echo_confirmed:
             return Directive(sticks=Hold.IDLE)
-        return Directive(sticks=Hold.IDLE, ask="mode" if wants_mode else "arm")
+        return Directive(sticks=Hold.IDLE, request="mode" if wants_mode else "arm")
 
     def _has_wanted_mode(self, facts: Facts) -> bool:
         """The wanted mode is there; once it is, it is ours, and a change of it somebody else's."""
@@ -159,7 +159,7 @@ class Engagement:
         if facts.input_problem is not None:
             return self._wait(facts.input_problem)
         self._prepare(facts)
-        return Directive(sticks=Release(f"waiting for mode {self._wanted_mode}"), ask="mode")
+        return Directive(sticks=Release(f"waiting for mode {self._wanted_mode}"), request="mode")
 
     def _fly(self, facts: Facts) -> Directive:
         if facts.input_problem is not None:

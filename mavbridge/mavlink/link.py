@@ -76,7 +76,7 @@ class MavlinkLink:
             self._adopt(self._vehicle.peer)
         return self._snapshot(self._clock.now_ns())
 
-    def tend(self) -> None:
+    def service(self) -> None:
         """Find or follow the vehicle, and keep house; called when the sticks have left."""
         now_ns = self._clock.now_ns()
         if self._vehicle is None:
@@ -284,7 +284,7 @@ class MavlinkLink:
             self._clock.sleep_until_ns(self._release_due_ns)
             self._send_release()
 
-    def seize(self) -> None:
+    def force_release(self) -> None:
         """From any thread: nothing but releases leaves from now on, and they leave here.
 
         For when the thread that owns the link hangs; if it comes back, its sticks stay here.

@@ -47,7 +47,7 @@ def test_it_waits_for_the_pilot_to_arm_unless_asked() -> None:
     engagement = Engagement(wanted_mode=None, arm=False, readonly=False)
     directive = engagement.step(GROUND)
     assert "disarmed" in released(directive)
-    assert directive.ask is None
+    assert directive.request is None
     assert engagement.step(READY).sticks is Hold.FLY
 
 
@@ -58,9 +58,9 @@ def test_asked_to_arm_it_idles_changes_mode_arms_and_flies() -> None:
     no_echo = replace(start, input_problem=None)
     assert engagement.step(no_echo) == Directive(sticks=Hold.IDLE)
     echoed = replace(no_echo, echo_confirmed=True)
-    assert engagement.step(echoed) == Directive(sticks=Hold.IDLE, ask="mode")
+    assert engagement.step(echoed) == Directive(sticks=Hold.IDLE, request="mode")
     in_mode = replace(echoed, mode="ALT_HOLD")
-    assert engagement.step(in_mode) == Directive(sticks=Hold.IDLE, ask="arm")
+    assert engagement.step(in_mode) == Directive(sticks=Hold.IDLE, request="arm")
     assert engagement.step(replace(in_mode, armed=True)).sticks is Hold.FLY
 
 
@@ -69,7 +69,7 @@ def test_it_arms_once_and_never_again_by_itself() -> None:
     for _ in range(3):
         directive = engagement.step(GROUND)
         assert "disarmed" in released(directive)
-        assert directive.ask is None
+        assert directive.request is None
 
 
 def test_arming_in_a_mode_without_sticks_needs_a_mode_flag() -> None:
@@ -81,8 +81,8 @@ def test_a_mode_is_asked_for_without_arming_when_only_that_was_wanted() -> None:
     engagement = Engagement(wanted_mode="ACRO", arm=False, readonly=False)
     directive = engagement.step(GROUND)
     assert released(directive)
-    assert directive.ask == "mode"
-    assert engagement.step(replace(READY)).ask == "mode"
+    assert directive.request == "mode"
+    assert engagement.step(replace(READY)).request == "mode"
 
 
 def test_the_pilot_takes_over_by_changing_the_mode_until_disarmed() -> None:
@@ -137,21 +137,21 @@ def test_an_override_that_fails_on_the_ground_is_tried_again() -> None:
 
 def test_a_mode_that_was_reached_is_not_asked_for_again_over_the_pilot() -> None:
     engagement = Engagement(wanted_mode="ALT_HOLD", arm=True, readonly=False)
-    assert engagement.step(GROUND).ask == "arm"
+    assert engagement.step(GROUND).request == "arm"
     waiting = replace(READY, input_problem="no feature")
     released(engagement.step(waiting))
     directive = engagement.step(replace(waiting, mode="LAND"))
     assert "ALT_HOLD to LAND" in released(directive)
-    assert directive.ask is None
-    assert engagement.step(replace(READY, mode="LAND")).ask is None
+    assert directive.request is None
+    assert engagement.step(replace(READY, mode="LAND")).request is None
 
 
 def test_an_arming_that_never_flew_is_the_only_one() -> None:
     engagement = Engagement(wanted_mode=None, arm=True, readonly=False)
-    assert engagement.step(GROUND).ask == "arm"
+    assert engagement.step(GROUND).request == "arm"
     released(engagement.step(replace(READY, input_problem="no feature")))
     directive = engagement.step(GROUND)
-    assert directive.ask is None
+    assert directive.request is None
     assert "disarmed" in released(directive)
 
 
@@ -197,7 +197,7 @@ def test_every_pair_of_events_keeps_the_rules(arm: bool) -> None:
         if directive.sticks is Hold.IDLE:
             assert arm
             assert not third.armed
-        if directive.ask == "arm":
+        if directive.request == "arm":
             assert arm
             assert not first.armed
             assert not second.armed

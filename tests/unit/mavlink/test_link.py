@@ -138,7 +138,7 @@ class Bench:
             self.texts += snapshot.texts
             if decision is not None:
                 self.link.send(decision)
-            self.link.tend()
+            self.link.service()
             self.clock.advance_ns(10 * MS)
         return snapshot
 
@@ -292,7 +292,7 @@ def test_once_seized_only_releases_leave() -> None:
     bench = Bench()
     bench.run(8.0)
     bench.run(0.2, Command(sticks=IDLE))
-    bench.link.seize()
+    bench.link.force_release()
     assert bench.overrides()[20:] == [RELEASE_US] * 10
     count = len(bench.vehicle.received)
     bench.run(1.0, Command(sticks=IDLE))  # the owner has come back
