@@ -33,7 +33,7 @@ from mavbridge.commands.imagine.start import Start, read_start
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import FloatArray
-from mavbridge.flight.assembly import load_configured_policy
+from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from policy.contract import ACTION_DIM, VELOCITY, Contract
 from policy.data.flight_folders import find_flights, is_exemplary

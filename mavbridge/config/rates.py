@@ -51,6 +51,21 @@ def period_ns(rate_hz: float) -> int:
     return round(NS_PER_S / rate_hz)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopRates:
+    """Rates of the two loops of one flight, in Hz."""
+
+    action_hz: float
+    min_vision_hz: float
+    max_vision_hz: float
+    """Equal to the minimum where the visual rate is fixed."""
+
+    @property
+    def state_hz(self) -> float:
+        """Rate of telemetry to ask the vehicle for."""
+        return max(self.action_hz, STATE_HZ)
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class Rates:
@@ -96,3 +111,10 @@ class Rates:
                 f"--visual-rate {self.visual_rate} is neither a rate in Hz nor auto[:MIN:MAX]"
             )
         return low_hz, high_hz
+
+    def loops(self, *, is_dual: bool) -> LoopRates:
+        """Rates of both loops; without dual rate each action has an image of its own."""
+        if not is_dual:
+            return LoopRates(action_hz=self.rate, min_vision_hz=self.rate, max_vision_hz=self.rate)
+        min_hz, max_hz = self.visual_limits_hz
+        return LoopRates(action_hz=self.action_rate, min_vision_hz=min_hz, max_vision_hz=max_hz)

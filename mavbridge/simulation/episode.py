@@ -7,18 +7,11 @@ import cv2
 import numpy as np
 
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
-from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, STATE_HZ, Rates, period_ns
+from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, Rates, period_ns
 from mavbridge.core.errors import UserError
-from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import TickSink
 from mavbridge.flight.action_loop import ActionLoop
-from mavbridge.flight.assembly import (
-    action_rate_hz,
-    make_action_loop,
-    make_vision_loop,
-    vision_limits_hz,
-)
-from mavbridge.flight.vision_rate import AdaptiveRate
+from mavbridge.flight.bridge import build_bridge
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.delays import Delay, Delays, draws_ns
@@ -149,7 +142,7 @@ class Episode:
         return referee.result(course_seed=self._course_seed, seed=self._seed)
 
     def _compose(self, executable: Executable, sinks: tuple[TickSink, ...]) -> ActionLoop:
-        """All of one flight, as in ``app``; the vision loop goes on the clock's queue."""
+        """Build the bridge, with its vision loop on the clock's queue."""
         config = FlyConfig(
             link=LinkConfig(connect="lockstep"),
             rates=self._setup.rates,
@@ -157,25 +150,22 @@ class Episode:
             mode=MODE,
             arm=True,
         )
-        is_dual = executable.dual_rate
-        min_hz, max_hz = vision_limits_hz(config.rates, is_dual=is_dual)
-        look = AdaptiveRate(min_hz=min_hz, max_hz=max_hz)
-        sink = FanOut([look, *sinks] if look.is_adaptive else sinks)
-        cache, vision_clock = LateFeatureCache(self.clock), AheadClock(self.clock)
-        timed = self._take_time(executable, vision_clock)
-        camera = self._make_camera(executable, camera_hz=max(max_hz, SIM_CAMERA_HZ))
-        vision = make_vision_loop(
-            timed,
-            clock=vision_clock,
+        loops = config.rates.loops(is_dual=executable.dual_rate)
+        vision_clock = AheadClock(self.clock)
+        camera = self._make_camera(executable, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
+        bridge = build_bridge(
+            config,
+            self._take_time(executable, vision_clock),
+            clock=self.clock,
+            link=MavlinkLink(self._transport, self.clock, config.link, state_hz=loops.state_hz),
             camera=camera,
-            cache=cache,
-            sink=LateSink(self.clock, sink),
-            period_ns=look.period_ns,
+            sinks=sinks,
+            cache=LateFeatureCache(self.clock),
+            vision_clock=vision_clock,
+            delay_vision=lambda sink: LateSink(self.clock, sink),
         )
-        VisionProcess(self.clock, vision_clock, camera, vision)
-        state_hz = max(action_rate_hz(config.rates, is_dual=is_dual), STATE_HZ)
-        link = MavlinkLink(self._transport, self.clock, config.link, state_hz=state_hz)
-        return make_action_loop(config, timed, clock=self.clock, link=link, cache=cache, sink=sink)
+        VisionProcess(self.clock, vision_clock, camera, bridge.vision)
+        return bridge.action
 
     def _make_camera(self, executable: Executable, *, camera_hz: float) -> LockstepCamera:
         camera_period_ns = period_ns(camera_hz)

@@ -14,7 +14,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.records import Tick
-from mavbridge.flight.assembly import load_configured_policy
+from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.delays import Delays, Fixed
 from mavbridge.simulation.episode import Episode, Setup, run_episode
 from mavbridge.simulation.referee import EpisodeInterruptedError

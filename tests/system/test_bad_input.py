@@ -80,15 +80,25 @@ def test_a_bad_flag_is_one_clear_error(
     assert told in text
 
 
-def test_a_flight_that_did_not_begin_leaves_the_folder_free(
+def test_a_flight_that_did_not_begin_leaves_no_folder_and_no_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "flight"
-    flags = ("--connect", "bluetooth", "--policy", "scripted", "--record", str(folder))
+    folder, report = tmp_path / "flight", tmp_path / "report.json"
+    flags = ("--connect", "bluetooth", "--record", str(folder), "--report", str(report))
     status, text = run(capsys, *flags)
     assert status == 1
     assert "HOST:PORT" in text
-    assert list(folder.iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_flight_leaves_no_empty_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "report.json"
+    flags = ("--connect", "udp:127.0.0.1:1", "--policy", "scripted:loop", "--report", str(report))
+    status, _ = run(capsys, *flags)
+    assert status == 1
+    assert not report.exists()
 
 
 def test_an_unknown_config_key_is_an_error(

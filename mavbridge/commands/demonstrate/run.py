@@ -17,7 +17,7 @@ from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
-from mavbridge.flight.assembly import load_for_episodes
+from mavbridge.flight.policies import load_for_episodes
 from mavbridge.recording.folder import META, prepare_folder
 from mavbridge.recording.meta import FlightError, read_meta
 from policy.contract import Contract

@@ -9,7 +9,7 @@ from mavbridge.config.flight import Limits
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.flight.assembly import load_for_episodes
+from mavbridge.flight.policies import load_for_episodes
 from mavbridge.simulation.delays import Delays, Longer
 from mavbridge.simulation.episode import Episode, Setup
 from mavbridge.simulation.result import EpisodeResult

@@ -19,7 +19,7 @@ from mavbridge.config.rates import SIM_CAMERA_PX
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.flight.app import fly_executable
-from mavbridge.flight.assembly import load_configured_policy
+from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.episode import MODE
 from mavbridge.simulation.result import EpisodeResult, Outcome, StickMeter
 from policy.errors import PolicyError

@@ -18,7 +18,7 @@ from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
-from mavbridge.flight.assembly import load_for_episodes
+from mavbridge.flight.policies import load_for_episodes
 from mavbridge.simulation.referee import EpisodeInterruptedError
 from policy.errors import PolicyError
 

@@ -24,7 +24,7 @@ from mavbridge.config.imagine import ImagineConfig
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
-from mavbridge.flight.assembly import load_configured_policy
+from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from policy.checkpoints.world_model_file import load_world_model
 from policy.world_model.model import WorldModel

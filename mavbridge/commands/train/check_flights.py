@@ -5,7 +5,7 @@ from pathlib import Path
 from mavbridge.config.courses import CHECK_COURSE_SEED
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import MonotonicClock
-from mavbridge.flight.assembly import load_configured_policy
+from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.episode import run_episode
 
 

@@ -19,7 +19,7 @@ from mavbridge.config.evaluate import EvaluateConfig, Variety
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.flight.assembly import is_stateless
+from mavbridge.flight.policies import is_stateless
 from mavbridge.simulation.episode import Episode, Setup
 
 CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)

@@ -1,0 +1,58 @@
+"""From the flags of a command to a loaded policy."""
+
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
+from policy.loading import LoadedPolicy, load_policy
+
+BUILT_IN = ("toge", "resnet-unet")
+
+
+def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
+    """The policy that the flags ask for; scripted ones follow ``clock``.
+
+    Raises:
+        PolicyError: with what was wrong, what was available and what to do.
+    """
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)  # a person's own module:Class lies where they work
+    return load_policy(
+        wanted.policy,
+        checkpoint=wanted.checkpoint,
+        allow_untrained=wanted.allow_untrained,
+        engine=wanted.engine,
+        device=wanted.device,
+        vision_device=wanted.vision_device,
+        action_device=wanted.action_device,
+        dual_rate=wanted.dual_rate,
+        num_diffusion_steps=wanted.num_diffusion_steps,
+        head_steps=wanted.head_steps,
+        image_size=wanted.image_size,
+        seed=wanted.seed,
+        now_s=lambda: clock.now_ns() / NS_PER_S,
+    )
+
+
+def is_stateless(policy: PolicyConfig) -> bool:
+    """A built-in net, which starts afresh with each flight; anything else may remember the last."""
+    return policy.policy.partition(":")[0] in BUILT_IN
+
+
+@lru_cache(maxsize=1)
+def _loaded_once(policy: PolicyConfig) -> LoadedPolicy:
+    return load_configured_policy(policy, MonotonicClock())
+
+
+def load_for_episodes(policy: PolicyConfig, clock: Clock) -> LoadedPolicy:
+    """A policy that knows nothing of earlier flights; nets are loaded once in a process.
+
+    Raises:
+        PolicyError: it cannot be loaded.
+    """
+    if is_stateless(policy):
+        return _loaded_once(policy)
+    return load_configured_policy(policy, clock)
