@@ -14,14 +14,9 @@ from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.processes import free_port
+
 TIMEOUT_S = 90.0
-
-
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class Override(NamedTuple):
@@ -152,7 +147,7 @@ class Flight:
 @contextmanager
 def flight(folder: Path, *vehicle_flags: str) -> Iterator[Flight]:
     """A vehicle and a relay, ready for ``Flight.start``; both end with the block."""
-    bridge_port = free_udp_port()
+    bridge_port = free_port()
     shm = f"test-{bridge_port}-{os.getpid()}"
     with Relay(bridge_port) as relay:
         command = [sys.executable, "-m", "sitl", "--connect", f"udpout:127.0.0.1:{relay.port}"]

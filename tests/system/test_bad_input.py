@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from helpers.stand import free_udp_port
 from mavbridge.__main__ import main
+from mavbridge.core.processes import free_port
 
 pytestmark = pytest.mark.system
 
@@ -144,7 +144,7 @@ def test_a_port_in_use(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_no_heartbeat(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    connect = f"udp:127.0.0.1:{free_udp_port()}"
+    connect = f"udp:127.0.0.1:{free_port()}"
     flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
     status, text = run(capsys, *flags, "--connect-timeout", "0.2")
     assert status == 1
@@ -152,7 +152,7 @@ def test_no_heartbeat(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_camera_that_ends(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    connect = f"udp:127.0.0.1:{free_udp_port()}"
+    connect = f"udp:127.0.0.1:{free_port()}"
     flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
     status, text = run(capsys, *flags)
     assert status == 1

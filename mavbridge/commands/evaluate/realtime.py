@@ -12,12 +12,12 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from mavbridge.commands.bench.processes import END_TIMEOUT_S, end, free_udp_port, running, wait
 from mavbridge.commands.evaluate.jobs import Flown, Job
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.rates import SIM_CAMERA_PX
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
+from mavbridge.core.processes import END_TIMEOUT_S, end, free_port, running, wait
 from mavbridge.flight.app import fly_executable
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.episode import MODE
@@ -68,7 +68,7 @@ def fly_realtime(jobs: Sequence[Job], *, should_stop: Callable[[], bool]) -> Ite
 
 
 def _fly(job: Job, folder: Path, should_stop: Callable[[], bool]) -> Flown | None:
-    port = free_udp_port()
+    port = free_port()
     camera = f"shm:mavbridge-evaluate-{port}"
     report, log = folder / "vehicle.json", folder / "vehicle.log"
     command = (

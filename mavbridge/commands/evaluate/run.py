@@ -13,7 +13,7 @@ from mavbridge.commands.evaluate.jobs import Flown, Job, fly_job, make_jobs
 from mavbridge.commands.evaluate.realtime import fly_realtime
 from mavbridge.commands.evaluate.results import Evaluation, to_json
 from mavbridge.commands.evaluate.tables import print_evaluation
-from mavbridge.commands.plots import needs_matplotlib
+from mavbridge.commands.output import require_matplotlib
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -124,8 +124,9 @@ def _one_by_one(jobs: Iterable[Job], should_stop: Callable[[], bool]) -> Iterato
 
 def _drawing(path: Path) -> Callable[[Evaluation], None]:
     """What draws the figure to ``path``; looked for before the run."""
-    with needs_matplotlib():
-        from mavbridge.commands.evaluate.figure import draw
+    require_matplotlib()
+    from mavbridge.commands.evaluate.figure import draw
+
     return lambda evaluation: draw(evaluation, path)
 
 

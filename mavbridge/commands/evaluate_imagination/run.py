@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from mavbridge.commands.bench.run import require_folder, table_console
 from mavbridge.commands.evaluate_imagination.drift import ITERATIONS, DriftScorer
 from mavbridge.commands.evaluate_imagination.lens import Lens, Mounting, make_lens
 from mavbridge.commands.evaluate_imagination.results import Given, Quality, to_json
@@ -28,6 +27,7 @@ from mavbridge.commands.evaluate_imagination.tables import print_quality
 from mavbridge.commands.evaluate_imagination.windows import WindowScorer
 from mavbridge.commands.imagine.run import SHIPPED, load_model
 from mavbridge.commands.imagine.sampling import Sampler
+from mavbridge.commands.output import require_writable, table_console
 from mavbridge.config.imagine import ImagineEvaluateConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
@@ -50,8 +50,7 @@ def evaluate_imagination(flights: Sequence[Path], config: ImagineEvaluateConfig)
     Raises:
         MavbridgeError, PolicyError: for whatever a person can have caused.
     """
-    if config.json is not None:
-        require_folder(config.json)
+    require_writable(config.json, "--json")
     cv2.setNumThreads(1)  # images this small are not worth a pool
     model = load_model(config.world_model, ddim_steps=config.ddim_steps, device=config.device)
     sampler = Sampler(model, ddim_steps=config.ddim_steps, decode_all=False, clock=MonotonicClock())
@@ -59,7 +58,7 @@ def evaluate_imagination(flights: Sequence[Path], config: ImagineEvaluateConfig)
     with stop_on_signals() as stop, _Bar(errors) as bar:
         quality = _Evaluation(flights, config, sampler, bar, stop.is_set).quality()
         was_stopped = stop.is_set()
-    print_quality(quality, table_console(highlight=False))
+    print_quality(quality, table_console())
     if config.json is not None:
         config.json.write_text(to_json(quality))
     if was_stopped:

@@ -13,6 +13,7 @@ import pytest
 from helpers.fakes import FakeClock
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
+from mavbridge.core.processes import free_port
 from mavbridge.mavlink.transport.sockets import (
     TCP_SILENCE_NS,
     SerialTransport,
@@ -22,13 +23,6 @@ from mavbridge.mavlink.transport.sockets import (
     UdpTransport,
     make_transport,
 )
-
-
-def free_port(kind: int = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 @pytest.mark.parametrize(

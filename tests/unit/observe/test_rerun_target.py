@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
+from mavbridge.core.processes import free_port
 from mavbridge.observe import rerun_target
 from mavbridge.observe.rerun_target import RrdFile, Viewer, prepare_target, spawn_viewer
 
@@ -24,14 +25,6 @@ def bound_port() -> Iterator[int]:
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
         yield bound.getsockname()[1]
-
-
-@pytest.fixture
-def free_port() -> int:
-    with socket.socket() as bound:
-        bound.bind(("127.0.0.1", 0))
-        port: int = bound.getsockname()[1]
-        return port
 
 
 def test_a_file_is_created_at_once(tmp_path: Path) -> None:
@@ -85,10 +78,11 @@ def test_a_viewer_that_does_not_listen_is_named(bound_port: int) -> None:
         prepare_target(f"connect=rerun+http://127.0.0.1:{bound_port}/proxy")
 
 
-def test_a_spawned_viewer_is_waited_for(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_spawned_viewer_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port(socket.SOCK_STREAM)
     monkeypatch.setattr(rerun_target, "SETTLE_S", 0.05)
-    viewer = spawn_viewer([sys.executable, "-c", LISTENS_UNTIL_KILLED], port=free_port)
-    assert viewer.url == f"rerun+http://127.0.0.1:{free_port}/proxy"
+    viewer = spawn_viewer([sys.executable, "-c", LISTENS_UNTIL_KILLED], port=port)
+    assert viewer.url == f"rerun+http://127.0.0.1:{port}/proxy"
     assert viewer.process is not None
     viewer.process.kill()
     viewer.process.wait(10)

@@ -6,6 +6,7 @@ from contextlib import closing
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from mavbridge.core.processes import free_port
 from sitl.clock import NS_PER_S, MonotonicClock
 from sitl.errors import UsageError
 from sitl.link.transport import MAX_PEERS, open_transport, split_frames
@@ -13,12 +14,6 @@ from sitl.link.transport import MAX_PEERS, open_transport, split_frames
 DEADLINE_S = 5.0
 UNREAD_NS = 80_000_000
 """How long a datagram waits in the socket, so that its arrival and its reading differ."""
-
-
-def free_port(kind=socket.SOCK_DGRAM):
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def drain_until(transport, count):

@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.bench import processes
-from mavbridge.commands.bench.processes import end, require_source_tree, running, wait
+from mavbridge.core import processes
 from mavbridge.core.errors import UserError
+from mavbridge.core.processes import end, running, wait
 
 pytestmark = pytest.mark.system
 FOR_EVER = "import threading; print('here', flush=True); threading.Event().wait()"
@@ -43,9 +43,13 @@ def test_a_process_that_will_not_end_is_killed(
     end(process)  # once more is harmless
 
 
-def test_outside_the_source_tree_it_says_so(
+def test_a_child_imports_this_mavbridge_wherever_it_is_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "SOURCE_TREE", tmp_path)
-    with pytest.raises(UserError, match="source tree"):
-        require_source_tree()
+    (tmp_path / "mavbridge.py").write_text("raise RuntimeError('another mavbridge')")
+    monkeypatch.chdir(tmp_path)
+    log = tmp_path / "log"
+    program = "import mavbridge; print(mavbridge.__file__)"
+    with running(sys.executable, "-c", program, log=log) as process:
+        wait(process, "the child", log, 30)
+    assert log.read_text().strip() == processes.mavbridge.__file__

@@ -1,0 +1,111 @@
+"""What every command writes for a person: tables, progress, figures, and checks of output files."""
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from mavbridge.core.errors import UserError
+
+PIPED_WIDTH = 120
+"""Columns of the tables where there is no terminal."""
+INK, MUTED, GRID, BLUE, RED = "#1f2933", "#6b7885", "#dfe4ea", "#2b6cb0", "#d1495b"
+FIGURE_DPI = 150
+FIGURE_STYLE: dict[Any, Any] = {
+    "font.size": 10,
+    "text.color": INK,
+    "axes.labelcolor": MUTED,
+    "axes.edgecolor": GRID,
+    "axes.titlesize": 12,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": GRID,
+    "xtick.color": MUTED,
+    "ytick.color": INK,
+    "legend.frameon": False,
+}
+"""For ``matplotlib.rc_context``."""
+
+
+def require_writable(path: Path | None, flag: str) -> None:
+    """Refuse an output file that cannot be written, before a long run; creates its folder.
+
+    Args:
+        path: the file; None where the flag was not given.
+        flag: its name on the command line, such as ``--json``.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        was_there = path.exists()
+        path.open("ab").close()
+        if not was_there:
+            path.unlink()
+    except OSError as error:
+        raise UserError(
+            f"cannot write {flag} {path}: {error.strerror}; name a file in a folder that you may "
+            "write to"
+        ) from error
+
+
+def require_matplotlib(flag: str = "--plot") -> None:
+    """Refuse a figure that cannot be drawn, before a long run.
+
+    Raises:
+        UserError: matplotlib is not installed.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise UserError(f"{flag} needs matplotlib: pip install 'mavbridge[bench]'")
+
+
+def table_console() -> Console:
+    """A console for tables on standard output: as wide as the terminal, or ``PIPED_WIDTH``."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = PIPED_WIDTH
+    return console
+
+
+def print_status(line: str) -> None:
+    """Print what is being done to standard error, apart from the results."""
+    Console(stderr=True, highlight=False).print(Text(line, style="dim"))
+
+
+class _StatusColumn(ProgressColumn):
+    """The task's field ``status``, if it has one."""
+
+    def render(self, task: Task) -> Text:
+        """Show it."""
+        return Text(str(task.fields.get("status", "")))
+
+
+def progress_bar(console: Console, *, as_percentage: bool = False) -> Progress:
+    """A bar with description, count (or percentage), the field ``status``, and the time left."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn() if as_percentage else MofNCompleteColumn(),
+        _StatusColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )

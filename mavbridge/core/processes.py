@@ -1,0 +1,76 @@
+"""Child processes: started with a log, waited for with a deadline, ended in every case."""
+
+import os
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import mavbridge
+from mavbridge.core.errors import UserError
+
+IMPORT_ROOT = Path(mavbridge.__file__).parents[1]
+"""The folder that holds this mavbridge: the source tree, or site-packages."""
+END_TIMEOUT_S = 10.0
+LOG_LINES_QUOTED = 8
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
+    """A UDP (or, with ``SOCK_STREAM``, TCP) port of the loopback that nobody uses now."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextmanager
+def running(*command: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a process beside the block, its output in ``log``; the block's end ends it.
+
+    A Python child imports this mavbridge, whatever modules the working directory holds.
+    """
+    import_path = (str(IMPORT_ROOT), os.environ.get("PYTHONPATH", ""))
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, import_path)),
+        "PYTHONSAFEPATH": "1",
+    }
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            command, env=environment, stdout=output, stderr=subprocess.STDOUT
+        )
+        try:
+            yield process
+        finally:
+            end(process)
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Terminate a process, and kill it if it has not ended after ``END_TIMEOUT_S``."""
+    if process.poll() is None:
+        process.terminate()
+    try:
+        process.wait(END_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait(END_TIMEOUT_S)
+
+
+def wait(process: subprocess.Popen[bytes], name: str, log: Path, timeout_s: float) -> None:
+    """Wait for a process that ends by itself.
+
+    Raises:
+        UserError: it failed, or did not end in time; quotes the end of its log.
+    """
+    try:
+        status = process.wait(timeout_s)
+    except subprocess.TimeoutExpired as error:
+        raise UserError(f"{name} has not ended after {timeout_s:g} s: {log_tail(log)}") from error
+    if status != 0:
+        raise UserError(f"{name} failed with status {status}: {log_tail(log)}")
+
+
+def log_tail(log: Path) -> str:
+    """The last lines of a log, for an error message."""
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return "\n".join(lines[-LOG_LINES_QUOTED:]) or "it printed nothing"

@@ -1,0 +1,50 @@
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from mavbridge.commands import output
+from mavbridge.commands.output import progress_bar, require_matplotlib, require_writable
+from mavbridge.core.errors import UserError
+
+
+def test_a_folder_is_made_for_the_output_and_the_output_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.json"
+    require_writable(path, "--json")
+    assert path.parent.is_dir()
+    assert not path.exists()
+
+
+def test_an_output_that_is_there_keeps_its_content(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("old")
+    require_writable(path, "--json")
+    assert path.read_text() == "old"
+
+
+@pytest.mark.parametrize("name", ["", "file/a.json"])
+def test_what_cannot_be_written_is_refused_with_its_flag(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"cannot write --json .*: "):
+        require_writable(tmp_path / name, "--json")
+
+
+def test_a_flag_that_was_not_given_is_no_error() -> None:
+    require_writable(None, "--json")
+
+
+def test_a_figure_without_matplotlib_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(output.importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"--plot needs matplotlib: pip install"):
+        require_matplotlib()
+
+
+@pytest.mark.parametrize(("as_percentage", "count"), [(False, "2/8"), (True, "25%")])
+def test_progress_shows_count_and_status(as_percentage: bool, count: str) -> None:
+    text = StringIO()
+    console = Console(file=text, width=120)
+    with progress_bar(console, as_percentage=as_percentage) as progress:
+        progress.add_task("flying", total=8, completed=2, status="1 of 2 finished")
+    for part in ("flying", count, "1 of 2 finished"):
+        assert part in text.getvalue()
