@@ -1,7 +1,6 @@
-"""What every command writes for a person: tables, progress, figures, and checks of output files."""
+"""What every command writes for a person: tables, progress bars and figures."""
 
 import importlib.util
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -41,31 +40,6 @@ FIGURE_STYLE: dict[Any, Any] = {
     "legend.frameon": False,
 }
 """For ``matplotlib.rc_context``."""
-
-
-def require_writable(path: Path | None, flag: str) -> None:
-    """Refuse an output file that cannot be written, before a long run; creates its folder.
-
-    Args:
-        path: the file; None where the flag was not given.
-        flag: its name on the command line, such as ``--json``.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        was_there = path.exists()
-        path.open("ab").close()
-        if not was_there:
-            path.unlink()
-    except OSError as error:
-        raise UserError(
-            f"cannot write {flag} {path}: {error.strerror}; name a file in a folder that you may "
-            "write to"
-        ) from error
 
 
 def require_matplotlib(flag: str = "--plot") -> None:

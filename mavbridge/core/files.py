@@ -5,12 +5,18 @@ from pathlib import Path
 from mavbridge.core.errors import UserError
 
 
-def require_writable(path: Path, flag: str) -> None:
-    """Make sure that ``path`` can be written, making its folder; leaves no file behind.
+def require_writable(path: Path | None, flag: str) -> None:
+    """Refuse an output file that cannot be written, before a long run; creates its folder.
+
+    Args:
+        path: the file, which is not left behind; None where the flag was not given.
+        flag: its name on the command line, such as ``--json``.
 
     Raises:
-        UserError: it cannot; the message names ``flag``.
+        UserError: the file cannot be written.
     """
+    if path is None:
+        return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         existed = path.exists()
@@ -19,6 +25,6 @@ def require_writable(path: Path, flag: str) -> None:
             path.unlink()
     except OSError as error:
         raise UserError(
-            f"{flag} {path} cannot be written ({error.strerror}): name a file in a folder that "
-            "you may write to"
+            f"cannot write {flag} {path}: {error.strerror}; name a file in a folder that you may "
+            "write to"
         ) from error

@@ -50,8 +50,7 @@ def fly(config: FlyConfig) -> int:
 def _check_quickly(config: FlyConfig, clock: Clock) -> None:
     """Refuse what can be told at once, before seconds of loading weights."""
     make_transport(config.link.connect, clock)
-    if config.report is not None:
-        require_writable(config.report, "--report")
+    require_writable(config.report, "--report")
     if config.record is not None:
         prepare_folder(config.record)
 

@@ -27,10 +27,11 @@ from mavbridge.commands.evaluate_imagination.tables import print_quality
 from mavbridge.commands.evaluate_imagination.windows import WindowScorer
 from mavbridge.commands.imagine.run import SHIPPED, load_model
 from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.commands.output import require_writable, table_console
+from mavbridge.commands.output import table_console
 from mavbridge.config.imagine import ImagineEvaluateConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.recording.meta import FlightMeta, read_meta

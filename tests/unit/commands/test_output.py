@@ -5,8 +5,9 @@ import pytest
 from rich.console import Console
 
 from mavbridge.commands import output
-from mavbridge.commands.output import progress_bar, require_matplotlib, require_writable
+from mavbridge.commands.output import progress_bar, require_matplotlib
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import require_writable
 
 
 def test_a_folder_is_made_for_the_output_and_the_output_is_not(tmp_path: Path) -> None:
