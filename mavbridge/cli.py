@@ -1,5 +1,6 @@
 """The command line: every flag is a field of a config dataclass."""
 
+import difflib
 import os
 import tomllib
 from pathlib import Path
@@ -14,21 +15,36 @@ from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.export import ExportConfig
 from mavbridge.config.flight import FlyConfig
+from mavbridge.config.groups import RARE
 from mavbridge.config.imagine import ImagineConfig, ImagineEvaluateConfig
 from mavbridge.config.train import TrainConfig
 from mavbridge.core.errors import UserError
 
+HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
+
+mavbridge --connect udp:127.0.0.1:14550 --dual-rate --camera 0 --checkpoint my.safetensors
+
+mavbridge --connect /dev/ttyACM0,921600 --dual-rate --policy my_module:MyPolicy --readonly
+"""
+
+
+def _shown_default(value: object) -> str | None:
+    """Leave out of the help what says nothing: a flag that is off, an empty text."""
+    return None if value in (False, "", None) else str(value)
+
+
 cli = App(
     name="mavbridge",
-    help="Fly an ArduPilot or PX4 vehicle with a vision policy.",
+    help=HELP,
     version=mavbridge.__version__,
+    default_parameter=Parameter(show_default=_shown_default),
 )
 
 
 @cli.command(name="fly")
 @cli.default
 def fly(config: FlyConfig | None = None) -> int:
-    """Fly. Nothing is armed and no mode is changed unless asked."""
+    """Fly; the default command. Nothing is armed and no mode is changed unless asked."""
     if config is None or not config.link.connect:
         raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
     from mavbridge.flight.app import fly as run_flight
@@ -165,7 +181,7 @@ def export(*flights: Path, config: ExportConfig) -> int:
 @cli.meta.default
 def with_config(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-    config: Path | None = None,
+    config: Annotated[Path | None, Parameter(group=RARE)] = None,
 ) -> int:
     """Read the settings file, then the command line on top of it.
 
@@ -173,6 +189,7 @@ def with_config(
         tokens: the rest of the command line.
         config: TOML file with flags as keys; flags given on the command line win.
     """
+    _check_command(tokens)
     if config is not None:
         _check_toml(config)
     cli.config = [] if config is None else [Toml(config, use_commands_as_keys=False)]
@@ -186,6 +203,16 @@ def _command_first(tokens: tuple[str, ...]) -> tuple[str, ...]:
         return tokens
     rest = [token for token in tokens[1:] if token != EVALUATE]
     return IMAGINE, EVALUATE, *rest
+
+
+def _check_command(tokens: tuple[str, ...]) -> None:
+    """Refuse a first word that is no command; the flight, which needs none, takes flags alone."""
+    if not tokens or tokens[0].startswith("-") or tokens[0] in cli:
+        return
+    commands = sorted(name for name in cli if not name.startswith("-"))
+    close = difflib.get_close_matches(tokens[0], commands, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(commands)}"
+    raise UserError(f"unknown command {tokens[0]!r}: {hint}")
 
 
 def _check_toml(path: Path) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from mavbridge.config.checks import check_range
+from mavbridge.config.groups import CAMERA, LIMITS, OUTPUT, RARE, VEHICLE
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
@@ -14,10 +15,10 @@ from mavbridge.core.errors import UserError
 Output = Literal["rc-override", "manual-control"]
 
 
-@Parameter(name="*")
+@Parameter(name="*", group=LIMITS)
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How old an input may be, and how fast a stick may move. Beyond it: released to the pilot."""
+    """How old an input may be, and how fast a stick may move."""
 
     max_attitude_age: float = 0.1
     """Oldest attitude and body rates to act on, in seconds."""
@@ -38,18 +39,18 @@ class Limits:
         check_range("max-slew", self.max_slew, 0, 1000, "1/s")
 
 
-@Parameter(name="*")
+@Parameter(name="*", group=VEHICLE)
 @dataclass(frozen=True, kw_only=True)
 class LinkConfig:
     """The vehicle and how to reach it."""
 
-    connect: str = ""
+    connect: Annotated[str, Parameter(show_default=False)] = ""
     """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD."""
-    source_system: int = 255
+    source_system: Annotated[int, Parameter(group=RARE)] = 255
     """Our MAVLink system id; ArduPilot obeys overrides from its MAV_GCS_SYSID (255) only."""
-    target_system: int = 0
+    target_system: Annotated[int, Parameter(group=RARE)] = 0
     """System id of the vehicle to fly; 0 = the only one on the link."""
-    connect_timeout: float = 30.0
+    connect_timeout: Annotated[float, Parameter(group=RARE)] = 30.0
     """Seconds to wait for the vehicle's first heartbeat."""
     output: Output = "rc-override"
     """RC_CHANNELS_OVERRIDE (ArduPilot) or MANUAL_CONTROL (PX4)."""
@@ -63,7 +64,7 @@ class LinkConfig:
         check_range("connect-timeout", self.connect_timeout, 0.1, 3600, "s")
 
 
-@Parameter(name="*")
+@Parameter(name="*", group=CAMERA)
 @dataclass(frozen=True, kw_only=True)
 class CameraConfig:
     """Where the images come from."""
@@ -71,7 +72,7 @@ class CameraConfig:
     camera: str = "0"
     """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
     screen:WINDOW TITLE."""
-    window_name: str | None = None
+    window_name: Annotated[str | None, Parameter(group=RARE)] = None
     """Same as --camera "screen:WINDOW TITLE"."""
 
     @property
@@ -90,17 +91,18 @@ class FlyConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
-    mode: str | None = None
+    mode: Annotated[str | None, Parameter(group=VEHICLE)] = None
     """Flight mode to ask for before flying, e.g. ALT_HOLD; by default the mode is left alone."""
-    arm: bool = False
+    arm: Annotated[bool, Parameter(group=VEHICLE)] = False
     """Arm the vehicle when everything is ready; by default arming is left to the pilot."""
-    duration: float | None = None
+    duration: Annotated[float | None, Parameter(group=VEHICLE)] = None
     """Seconds to fly once engaged; by default until Ctrl-C."""
-    rerun: Annotated[str, Parameter(help="spawn, connect[=URL], FILE.rrd, or off.")] = "off"
-    record: Path | None = None
+    rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
+    """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
+    record: Annotated[Path | None, Parameter(group=OUTPUT)] = None
     """Record the flight into this folder, new or empty: camera, ticks, raw MAVLink; needs the extra
     "record"."""
-    report: Path | None = None
+    report: Annotated[Path | None, Parameter(group=OUTPUT)] = None
     """Write the timing report here as JSON."""
 
     def __post_init__(self) -> None:

@@ -2,19 +2,20 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from mavbridge.config.checks import check_range
+from mavbridge.config.groups import POLICY, RARE
 
 Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 
 
-@Parameter(name="*")
+@Parameter(name="*", group=POLICY)
 @dataclass(frozen=True, kw_only=True)
 class PolicyConfig:
-    """What flies."""
+    """The policy, its weights, and what runs it."""
 
     policy: str = "toge"
     """toge[:small|medium|large[:BACKBONE]], resnet-unet, scripted[:hover|square|circle|yaw],
@@ -26,23 +27,22 @@ class PolicyConfig:
     num_diffusion_steps: int = 10
     """DDIM steps of the action head."""
     head_steps: int | None = None
-    """DDIM steps from the last chunk, moved to now (dual rate, toge); by default every solve has
-    all steps, from noise."""
-    allow_untrained: bool = False
-    """Fly TOGE with seeded random weights: for timing and bring-up only."""
-    image_size: int | None = None
+    """Warm start (dual rate, toge): DDIM steps from the last chunk, shifted to now, in place of all
+    steps from noise."""
+    allow_untrained: Annotated[bool, Parameter(group=RARE)] = False
+    """Fly TOGE with random weights: for timing and bring-up only."""
+    image_size: Annotated[int | None, Parameter(group=RARE)] = None
     """Pixels a side into the encoder; by default what the policy's contract says (224)."""
-    engine: Engine = "auto"
-    """What runs the network; auto takes the fastest that computes what torch computes."""
+    engine: Annotated[Engine, Parameter(group=RARE)] = "auto"
+    """What runs the network; auto takes the fastest that agrees with torch."""
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:1, mps."""
-    vision_device: str | None = None
-    """Device of the image encoder, if it is another one."""
-    action_device: str | None = None
-    """Device of the action head, if it is another one."""
-    seed: int = 0
-    """Seed of random weights and of the flight's initial diffusion noise; evaluate: of courses and
-    delays, too."""
+    vision_device: Annotated[str | None, Parameter(group=RARE)] = None
+    """Device of the image encoder, where it differs from --device."""
+    action_device: Annotated[str | None, Parameter(group=RARE)] = None
+    """Device of the action head, where it differs from --device."""
+    seed: Annotated[int, Parameter(group=RARE)] = 0
+    """Seed of random weights, diffusion noise and, in simulation, of courses and delays."""
 
     def __post_init__(self) -> None:
         """Refuse what the scheduler and encoders cannot serve."""

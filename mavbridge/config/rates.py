@@ -2,43 +2,30 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from mavbridge.config.checks import check_range
+from mavbridge.config.groups import RARE, RATES
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 
 HEARTBEAT_HZ = 1.0
 """MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
-
-
 RC_CHANNELS_HZ = 20.0
 """RC_CHANNELS for the echo check and the pilot's sticks; the check needs 10 Hz or more."""
-
-
 TIMESYNC_HZ = 2.0
 """TIMESYNC requests; the minimum-delay filter wants a few a second."""
-
-
 AUTO_VISUAL_HZ = (10.0, 60.0)
 """Limits of --visual-rate auto where none are given."""
-
-
 STATE_HZ = 50.0
-"""Least rate of telemetry to ask for, however slow the actions are: ages are limits in seconds."""
-
-
+"""Lowest rate of telemetry to ask for, however slow the actions: age limits are in seconds."""
 SIM_CAMERA_HZ = 30.0
 """Frames a second of the simulated camera, unless the visual rate asks for more."""
-
-
 SIM_CAMERA_PX = 224
-"""Side of its frames, as ``python -m sitl`` sends them: what a policy wants smaller is made smaller
-by the bridge, as in a real flight, and not drawn smaller."""
-
-
+"""Side of its frames in pixels, as ``python -m sitl`` sends them. The bridge resizes them to what
+the policy takes, as it does with a real camera."""
 STATUS_HZ = 5.0
 """Terminal refresh."""
 
@@ -66,27 +53,27 @@ class LoopRates:
         return max(self.action_hz, STATE_HZ)
 
 
-@Parameter(name="*")
+@Parameter(name="*", group=RATES)
 @dataclass(frozen=True, kw_only=True)
 class Rates:
     """Loop rates in Hz."""
 
     visual_rate: float | str = 30.0
-    """Most frames a second through the image encoder (dual rate); auto[:MIN:MAX] looks more often
+    """Most frames a second through the image encoder (dual rate); auto[:MIN:MAX] encodes more often
     when the vehicle turns or the image changes."""
     action_rate: float = 100.0
     """Commands a second (dual rate)."""
     rate: float = 30.0
     """Commands a second in single-rate mode, each with the newest image."""
-    realtime: bool = True
-    """Real-time scheduling of the action loop (SCHED_FIFO), where the system permits it."""
-    action_cpu: int | None = None
+    realtime: Annotated[bool, Parameter(group=RARE)] = True
+    """Real-time scheduling (SCHED_FIFO) of the action loop, where the system permits it."""
+    action_cpu: Annotated[int | None, Parameter(group=RARE)] = None
     """Run the action loop on this CPU alone."""
-    vision_cpu: int | None = None
+    vision_cpu: Annotated[int | None, Parameter(group=RARE)] = None
     """Run the vision loop on this CPU alone."""
     pace: Pace = "clock"
-    """clock: ticks on a fixed grid. state: a tick on each fresh attitude message, by the clock when
-    none comes."""
+    """clock: commands on a fixed grid. state: one on each new attitude message, or by the clock
+    when none comes."""
 
     def __post_init__(self) -> None:
         """Refuse rates that no autopilot serves."""
