@@ -118,6 +118,11 @@ class Flight:
                 lambda: any(text in line for line in self._lines), timeout=TIMEOUT_S
             )
 
+    @property
+    def bridge_pid(self) -> int:
+        assert self._bridge is not None
+        return self._bridge.pid
+
     def kill(self, number: signal.Signals) -> None:
         assert self._bridge is not None
         self._bridge.send_signal(number)

@@ -35,6 +35,19 @@ class Climbing:
         return self.predict_fast(image, state, action_history, num_diffusion_steps)
 
 
+class SingleRate:
+    """Climbs; has no fast path."""
+
+    contract = Contract(arrays="numpy")
+
+    def predict(
+        self, image: Array, state: Array, action_history: Array, num_diffusion_steps: int
+    ) -> Array:
+        chunk = np.zeros((1, self.contract.horizon, 4), dtype=np.float32)
+        chunk[..., 0] = 0.5
+        return chunk
+
+
 class Exploding(Climbing):
     """Fails after a second of flight."""
 

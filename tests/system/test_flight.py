@@ -1,11 +1,19 @@
 """The whole product in real processes over UDP. What is asserted is what happened, not how fast."""
 
+import json
+import os
 import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pymavlink import mavutil
 
-from helpers.stand import Flight, Override, flight
+from helpers.stand import Override, flight
+from mavbridge.core.records import Sticks
+from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 
 pytestmark = pytest.mark.system
 
@@ -14,100 +22,213 @@ NEUTRAL = Override(1500, 1500, 1500, 1500)
 RELEASE = Override(0, 0, 0, 0)
 
 
-def assert_handed_back(flown: Flight) -> None:
+def assert_released(overrides: list[Override]) -> None:
     """Sticks, then neutral, then ten zeros, then nothing."""
-    overrides = flown.relay.overrides
     releases = [k for k, sticks in enumerate(overrides) if sticks == RELEASE]
     assert releases == list(range(len(overrides) - 10, len(overrides)))
     assert overrides[-11] == NEUTRAL
 
 
-def test_takes_off_holds_altitude_and_hands_back(tmp_path: Path) -> None:
-    with flight(tmp_path) as flown:
-        flown.start(*FLY, "--policy", "scripted:hover", "--duration", "12")
-        status, output = flown.end()
+def pwm_us(sticks: Sticks) -> Override:
+    """The simulated vehicle's calibration: 1000 to 2000 us, pitch forward is below trim."""
+    return Override(
+        roll=round(1500 + 500 * sticks.roll),
+        pitch=round(1500 - 500 * sticks.pitch),
+        throttle=round(1500 + 500 * sticks.throttle),
+        yaw=round(1500 + 500 * sticks.yaw),
+    )
+
+
+def logged_overrides(path: Path) -> Iterator[Override]:
+    log = mavutil.mavlogfile(str(path))
+    while (message := log.recv_match(type="RC_CHANNELS_OVERRIDE")) is not None:
+        yield Override(*(getattr(message, f"chan{k}_raw") for k in range(1, 5)))
+    log.f.close()
+
+
+@dataclass(frozen=True)
+class Flown:
+    """One flight that ended in order: what the bridge printed, reported and recorded."""
+
+    overrides: list[Override]
+    output: str
+    report: Any
+    vehicle: Any
+    recording: Path
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    """Takes off, holds its altitude, ends after its duration; recorded, with a viewer's file."""
+    folder = tmp_path_factory.mktemp("flight")
+    recording = folder / "recording"
+    with flight(folder) as flying:
+        flags = ("--record", str(recording), "--rerun", str(recording / "flight.rrd"))
+        flying.start(*FLY, "--policy", "scripted:hover", "--duration", "8", *flags)
+        status, output = flying.end()
     assert status == 0, output
-    assert_handed_back(flown)
-    vehicle, report = flown.vehicle_report(), flown.report()
+    overrides = flying.relay.overrides
+    return Flown(overrides, output, flying.report(), flying.vehicle_report(), recording)
+
+
+def test_takes_off_and_holds_its_altitude(flown: Flown) -> None:
+    vehicle = flown.vehicle
     assert 2.0 < vehicle["max_altitude_m"] < 4.5
     assert not vehicle["crashed"]
-    assert vehicle["releases"]["count"] == 10
     assert [entry["mode"] for entry in vehicle["modes"]][:2] == ["STABILIZE", "ALT_HOLD"]
+    assert "Arming motors" in flown.output
+
+
+def test_gives_the_sticks_back_at_the_end(flown: Flown) -> None:
+    assert_released(flown.overrides)
+    assert flown.vehicle["releases"]["count"] == 10
+
+
+def test_reports_what_it_did(flown: Flown) -> None:
+    report = flown.report
     assert report["mode"] == "dual"
     assert report["link"]["echo_confirmed"] is True
-    assert report["link"]["sent_overrides"] >= vehicle["overrides"]["count"] > 0
+    assert report["link"]["sent_overrides"] >= flown.vehicle["overrides"]["count"] > 0
     assert report["vision"]["frames"] > 0
-    assert "Arming motors" in output
+    assert report["observer_drops"]["recorder"] == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_hands_the_sticks_back(tmp_path: Path, number: signal.Signals) -> None:
-    with flight(tmp_path) as flown:
-        flown.start(*FLY, "--policy", "scripted:hover")
-        assert flown.relay.has_flown.wait(60)
-        flown.kill(number)
-        flown.kill(number)  # an impatient user
-        status, output = flown.end()
+def assert_rows_match_frames(back: RecordedFlight) -> None:
+    assert sum(1 for _ in back.images()) == back.frames.num_rows > 0
+
+
+def test_the_recording_is_what_happened(flown: Flown) -> None:
+    assert str(flown.recording) in flown.output.splitlines()[-1]
+    back = open_flight(flown.recording)
+    assert back.meta.finished
+    assert (back.meta.policy, back.meta.mode) == ("scripted:hover", "dual")
+    assert back.meta.autopilot == flown.report["autopilot"]
+    assert back.ticks.num_rows == back.meta.ticks
+    assert back.frames.num_rows == back.meta.frames == flown.report["vision"]["frames"]
+    assert_rows_match_frames(back)
+    rows = [row.tick for row in back.tick_rows() if row.tick.sent is not None]
+    sent = [pwm_us(tick.sent) for tick in rows if tick.sent is not None]
+    assert flown.overrides[: len(sent)] == sent
+    assert set(flown.overrides[len(sent) :]) == {NEUTRAL, RELEASE}
+    assert list(logged_overrides(flown.recording / "link.tlog")) == flown.overrides
+    frame_ids = set(back.frames["frame_id"].to_pylist())
+    assert {tick.feature_frame_id for tick in rows} - {None} <= frame_ids
+
+
+def test_a_signal_gives_the_sticks_back(tmp_path: Path) -> None:
+    with flight(tmp_path) as flying:
+        flying.start(*FLY, "--policy", "scripted:hover")
+        assert flying.relay.has_flown.wait(60)
+        flying.kill(signal.SIGTERM)
+        flying.kill(signal.SIGTERM)  # an impatient user
+        status, output = flying.end()
     assert status == 0, output
-    assert_handed_back(flown)
+    assert_released(flying.relay.overrides)
     assert "Traceback" not in output
 
 
-def test_an_exception_in_the_policy_hands_the_sticks_back(tmp_path: Path) -> None:
-    with flight(tmp_path) as flown:
-        flown.start(*FLY, "--policy", "helpers.user_policies:Exploding")
-        status, output = flown.end()
+def test_an_exception_in_the_policy_gives_the_sticks_back(tmp_path: Path) -> None:
+    with flight(tmp_path) as flying:
+        flying.start(*FLY, "--policy", "helpers.user_policies:Exploding")
+        status, output = flying.end()
     assert status == 1
-    assert_handed_back(flown)
+    assert_released(flying.relay.overrides)
     assert "RuntimeError: the user's policy is broken" in output
     assert "user_policies.py" in output  # where, for the person who wrote it
     assert "Traceback" not in output
 
 
 def test_a_policy_that_hangs_loses_the_sticks_for_good(tmp_path: Path) -> None:
-    with flight(tmp_path) as flown:
-        flown.start(*FLY, "--policy", "helpers.user_policies:Hanging")
-        status, output = flown.end()
+    with flight(tmp_path) as flying:
+        flying.start(*FLY, "--policy", "helpers.user_policies:Hanging")
+        status, output = flying.end()
     assert status == 1
     assert "the action loop has hung" in output
-    overrides = flown.relay.overrides
+    overrides = flying.relay.overrides
     assert overrides[-10:] == [RELEASE] * 10
-    assert RELEASE not in overrides[:-10]  # and the sticks of the thread that came back stayed here
+    assert RELEASE not in overrides[:-10]  # the sticks of the thread that came back stayed here
 
 
 def test_without_arm_and_mode_nothing_is_sent(tmp_path: Path) -> None:
-    with flight(tmp_path) as flown:
-        flown.start("--dual-rate", "--policy", "scripted:hover")
-        assert flown.wait_for("disarmed: arm the vehicle, or start with --arm")
-        flown.kill(signal.SIGINT)
-        status, output = flown.end()
+    with flight(tmp_path) as flying:
+        flying.start("--dual-rate", "--policy", "scripted:hover")
+        assert flying.wait_for("disarmed: arm the vehicle, or start with --arm")
+        flying.kill(signal.SIGINT)
+        status, output = flying.end()
     assert status == 0, output
-    assert flown.relay.overrides == []
-    assert [entry["mode"] for entry in flown.vehicle_report()["modes"]] == ["STABILIZE"]
+    assert flying.relay.overrides == []
+    assert [entry["mode"] for entry in flying.vehicle_report()["modes"]] == ["STABILIZE"]
 
 
-def test_toge_runs_both_loops_untrained(tmp_path: Path) -> None:
-    with flight(tmp_path) as flown:
-        flags = ("--policy", "toge:small", "--allow-untrained", "--readonly", "--dual-rate")
-        flown.start(*flags, "--duration", "4", "--max-feature-age", "2")
-        status, output = flown.end()
+def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:
+    with flight(tmp_path) as flying:
+        flying.start("--dual-rate", "--head-steps", "2", "--readonly", "--duration", "2")
+        status, output = flying.end()
     assert status == 0, output
-    report = flown.report()
+    report = flying.report()
     assert report["mode"] == "dual"
     assert report["engine"].startswith("openvino")
     assert report["action"]["predict_ms"]["p50"] > 0
     assert report["vision"]["encode_ms"]["p50"] > 0
-    assert flown.relay.overrides == []
-    assert "untrained" in output
+    assert flying.relay.overrides == []
 
 
 def test_a_policy_without_a_fast_path_flies_single_rate_after_a_warning(tmp_path: Path) -> None:
-    with flight(tmp_path) as flown:
-        flags = ("--policy", "resnet-unet", "--allow-untrained", "--readonly", "--dual-rate")
-        flown.start(*flags, "--duration", "3", "--max-feature-age", "2")
-        status, output = flown.end()
+    with flight(tmp_path) as flying:
+        flags = ("--policy", "helpers.user_policies:SingleRate", "--dual-rate", "--readonly")
+        flying.start(*flags, "--duration", "1")
+        status, output = flying.end()
     assert status == 0, output
-    report = flown.report()
+    report = flying.report()
     assert report["mode"] == "single"
     assert report["action"]["target_hz"] == 30
-    assert output.count("single-rate") >= 1
+    assert "single-rate" in output
+
+
+def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
+    folder = tmp_path / "recording"
+    with flight(tmp_path) as flying:
+        flying.start(*FLY, "--policy", "scripted:square", "--record", str(folder))
+        assert flying.relay.has_flown.wait(60)
+        flying.kill(signal.SIGKILL)
+        flying.end()  # the output ends with the writer, which has inherited it
+    back = open_flight(folder)
+    assert not back.meta.finished
+    assert back.ticks.num_rows > 0
+    assert_rows_match_frames(back)
+    assert (folder / "frames.parquet").exists()
+    logged = list(logged_overrides(folder / "link.tlog"))
+    assert len(logged) > 0
+    assert logged == flying.relay.overrides[: len(logged)]
+
+
+def test_a_killed_writer_does_not_touch_the_flight(tmp_path: Path) -> None:
+    folder = tmp_path / "recording"
+    with flight(tmp_path) as flying:
+        flags = ("--policy", "scripted:square", "--duration", "2", "--record", str(folder))
+        flying.start(*FLY, *flags)
+        assert flying.relay.has_flown.wait(60)
+        os.kill(writer_of(flying.bridge_pid), signal.SIGKILL)
+        status, output = flying.end()
+    assert status == 0, output
+    assert output.count("recording no more images: the writer process has died") == 1
+    assert flying.relay.overrides[-10:] == [RELEASE] * 10
+    assert flying.report()["observer_drops"]["recorder"] > 0
+    back = open_flight(folder)
+    assert_rows_match_frames(back)
+    document = json.loads((folder / "meta.json").read_text())
+    assert document["ticks"] == back.ticks.num_rows
+    assert document["finished"] is False
+
+
+def writer_of(bridge_pid: int) -> int:
+    """The bridge's child that spawn has started for the video."""
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            command = (entry / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if parent == bridge_pid and b"spawn_main" in command:
+            return int(entry.name)
+    raise AssertionError("no writer process")

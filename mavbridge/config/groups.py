@@ -1,0 +1,11 @@
+"""Headings of the help, in their order."""
+
+from cyclopts import Group
+
+VEHICLE = Group("Vehicle", sort_key=1)
+POLICY = Group("Policy", sort_key=2)
+CAMERA = Group("Camera", sort_key=3)
+OUTPUT = Group("Output", sort_key=4)
+RATES = Group("Rates", sort_key=5)
+LIMITS = Group("Limits: beyond them the sticks are released to the pilot", sort_key=6)
+RARE = Group("Rarely needed", sort_key=9)
