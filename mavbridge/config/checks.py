@@ -1,4 +1,4 @@
-"""The one range check of all settings."""
+"""The range check of numeric settings."""
 
 import math
 

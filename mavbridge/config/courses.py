@@ -1,4 +1,4 @@
-"""Seeds of gate courses: training, checking and evaluation never share one."""
+"""Seeds of gate courses: training, its checks and evaluation never share one."""
 
 CHECK_COURSE_SEED = 900_000
 """Course seeds from here on are flown during training, and neither learned from nor evaluated."""

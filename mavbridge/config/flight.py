@@ -77,7 +77,7 @@ class CameraConfig:
 
     @property
     def source(self) -> str:
-        """The one camera spec that both flags end in."""
+        """The camera specification that both flags lead to."""
         return self.camera if self.window_name is None else f"screen:{self.window_name}"
 
 
@@ -96,7 +96,7 @@ class FlyConfig:
     arm: Annotated[bool, Parameter(group=VEHICLE)] = False
     """Arm the vehicle when everything is ready; by default arming is left to the pilot."""
     duration: Annotated[float | None, Parameter(group=VEHICLE)] = None
-    """Seconds to fly once engaged; by default until Ctrl-C."""
+    """Seconds to fly, from the first action of the policy; by default until Ctrl-C."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
     """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
     record: Annotated[Path | None, Parameter(group=OUTPUT)] = None

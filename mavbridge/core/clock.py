@@ -1,4 +1,4 @@
-"""The one clock: monotonic integer nanoseconds, injected everywhere, and the pacer on top of it."""
+"""The one clock, monotonic integer nanoseconds and injected everywhere, and the pacers' slots."""
 
 import time
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ NS_PER_MS = 1_000_000
 
 
 def wall_offset_ns(clock: "Clock") -> int:
-    """Unix time minus the clock: to be taken once, since wall time steps. Names moments, only."""
+    """Return Unix time minus the clock, to label moments; take it once, because wall time steps."""
     return time.time_ns() - clock.now_ns()
 
 
@@ -40,13 +40,13 @@ class MonotonicClock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slot:
-    """One slot of a pacer's grid, as it was met."""
+    """One slot: a point of the pacer's grid at which one command is due, and when it was met."""
 
     index: int
     due_ns: int
     woke_ns: int
     missed: int
-    """Slots skipped between the previous one and this one."""
+    """Slots skipped since the previous one: their commands were never sent."""
 
 
 class Pacer(Protocol):

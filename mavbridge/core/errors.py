@@ -1,4 +1,4 @@
-"""Every error that a person can meet, in one tree.
+"""Every error that a user can cause or meet, in one tree.
 
     MavbridgeError
     +-- UserError      what was asked cannot be done: flag, file, port

@@ -14,8 +14,8 @@ _BINS = (43 - _SUB_BITS) * _SUB_BINS
 class Histogram:
     """Distribution of durations in constant memory: percentiles within 0.4 %, exact extremes.
 
-    Bins are linear within an octave and doubled from one to the next, which takes a shift instead
-    of a logarithm (G. Tene, HdrHistogram). One thread adds; another may read at any time.
+    Bins are linear within an octave and double in width from one to the next, which takes a shift
+    instead of a logarithm (G. Tene, HdrHistogram). One thread adds; another may read at any time.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class Histogram:
         self.max_ns: int | None = None
 
     def add(self, value_ns: int) -> None:
-        """Count one duration; what is below zero falls in the first bin."""
+        """Count one duration; negative ones fall in the first bin."""
         clamped = 0 if value_ns < 0 else min(value_ns, _LARGEST_NS)
         shift = clamped.bit_length() - (_SUB_BITS + 1)
         if shift < 0:

@@ -1,4 +1,4 @@
-"""Observers hang off the loops by bounded queues: they may drop events, never delay a loop."""
+"""Observers behind bounded queues: they may drop events and never delay a loop."""
 
 import logging
 import threading
@@ -11,23 +11,22 @@ from mavbridge.core.ports import TickSink
 from mavbridge.core.records import Event, Tick
 
 BATCH_PERIOD_S = 0.1
-"""Time between hand-overs. Polled, since waking a thread from ``emit`` would cost the loop a
-system call and a fight for the interpreter lock."""
+"""Time between batches. The queue is polled: waking a thread from ``emit`` would cost the loop a
+system call and contention for the interpreter lock."""
 BATCH_EVENTS = 256
-"""Most events of a kind in one hand-over, so that a backlog does not become one long stretch of
-work."""
+"""Most events of a kind in one batch, so that a backlog is not handled in one long stretch."""
 
 _log = logging.getLogger(__name__)
 
 
 class Consumer(Protocol):
-    """What an observer does with the events; called by its own thread alone."""
+    """The work of an observer; called by the observer's thread alone."""
 
     def consume(self, batch: Sequence[Event]) -> None:
-        """Take events: all ticks in order, then all vision ticks in order.
+        """Handle events: all ticks in order, then all vision ticks in order.
 
         Raises:
-            MavbridgeError, OSError: cannot go on; no further batch will come.
+            MavbridgeError, OSError: it cannot continue; no further batch will come.
         """
         ...
 
@@ -37,10 +36,7 @@ class Consumer(Protocol):
 
 
 class _Lane:
-    """A bounded queue with one producer and one consumer; needs no lock under either.
-
-    Each counter has one writer.
-    """
+    """A bounded queue with one producer and one consumer, which therefore needs no lock."""
 
     def __init__(self, capacity: int) -> None:
         if capacity < 1:
@@ -53,21 +49,21 @@ class _Lane:
         return len(self._events)
 
     def put(self, event: Event) -> None:
-        """Producer: take the event, or count it."""
+        """Add the event, or count it as refused."""
         if len(self._events) < self._capacity:
             self._events.append(event)
         else:
             self.refused += 1
 
     def take(self) -> list[Event]:
-        """Consumer: up to ``BATCH_EVENTS`` of the oldest."""
+        """Remove and return up to ``BATCH_EVENTS`` of the oldest."""
         return [self._events.popleft() for _ in range(min(len(self._events), BATCH_EVENTS))]
 
 
 class ObserverThread:
-    """A ``TickSink`` that hands events in batches to a consumer on a thread of its own.
+    """A ``TickSink`` that passes events in batches to a consumer on its own thread.
 
-    Ticks and vision ticks queue separately, so images, which are large and slow to treat, drop
+    Ticks and vision ticks queue separately, so images, which are large and slow to handle, drop
     first and never push a tick out. Each kind must be emitted by one thread. The observer's thread
     is a daemon: a consumer that hangs cannot keep the process alive.
     """
@@ -117,7 +113,7 @@ class ObserverThread:
         return self._failure
 
     def close(self, timeout_s: float) -> None:
-        """Let the consumer work off the queue and finish, for at most ``timeout_s``."""
+        """Let the consumer empty the queue and finish, for at most ``timeout_s``."""
         self._open = False
         self._closing.set()
         self._thread.join(timeout_s)
@@ -158,7 +154,7 @@ class ObserverThread:
 
 
 class FanOut:
-    """A ``TickSink`` in front of several."""
+    """A ``TickSink`` that passes every event to several others."""
 
     def __init__(self, sinks: Iterable[TickSink]) -> None:
         self._sinks = tuple(sinks)

@@ -1,4 +1,4 @@
-"""The few Protocols that the loops need."""
+"""Interfaces of what the loops are connected to."""
 
 from typing import Protocol
 
@@ -27,41 +27,41 @@ class Camera(Protocol):
 
 
 class Link(Protocol):
-    """The vehicle's end of the action loop; used by the action loop's thread alone."""
+    """The connection to one vehicle; used by the action loop's thread alone."""
 
     def poll(self) -> LinkSnapshot:
-        """Take in all that has arrived; never blocks."""
+        """Receive everything that has arrived; never blocks."""
         ...
 
     def service(self) -> None:
-        """Heartbeat, handshake and requests that are due; called when the sticks have left."""
+        """Send what is due besides sticks (heartbeat, handshake, requests); called after them."""
         ...
 
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
-        """Take in what arrives until an attitude newer than that has come, or until the time.
+        """Receive until an attitude newer than ``newer_than_ns`` arrives, or until ``until_ns``.
 
-        Returns the arrival of the newest attitude, 0 before the first.
+        Returns the arrival time of the newest attitude, 0 before the first.
         """
         ...
 
     def send(self, decision: Decision) -> Sticks | None:
-        """Put the decision on the wire; returns the sticks that really left, None on release."""
+        """Send the decision; returns the sticks as rounded and sent, None when released."""
         ...
 
     def hand_back(self) -> None:
-        """Finish giving the sticks back; takes up to half a second, at the end of a flight."""
+        """Repeat the release at the end of a flight, as packets may be lost; takes 0.5 s."""
         ...
 
     def force_release(self) -> None:
-        """From any thread: give the sticks back now, and let nothing else leave any more."""
+        """From any thread: release the sticks now, and send nothing after that."""
         ...
 
     def set_mode(self, mode: str) -> None:
-        """Ask for a flight mode (rate-limited; the next heartbeat tells)."""
+        """Ask for a flight mode (rate-limited; a later heartbeat shows the result)."""
         ...
 
     def arm(self) -> None:
-        """Ask to arm (rate-limited; the next heartbeat tells)."""
+        """Ask to arm (rate-limited; a later heartbeat shows the result)."""
         ...
 
     def close(self) -> None:
@@ -70,11 +70,11 @@ class Link(Protocol):
 
 
 class PacketSource(Protocol):
-    """What goes over the link, for a recorder; drained by one thread."""
+    """Packets that went over the link, for a recorder; drained by one thread."""
 
     @property
     def dropped(self) -> int:
-        """Pieces that nobody drained in time."""
+        """Packets that were dropped because they were not drained in time."""
         ...
 
     def drain(self) -> list[Packet]:
@@ -83,7 +83,7 @@ class PacketSource(Protocol):
 
 
 class TickSink(Protocol):
-    """Where ticks go; must never block and never raise."""
+    """A receiver of ticks; must never block and never raise."""
 
     def emit(self, event: Event) -> None:
         """Take the event, or drop and count it."""

@@ -1,4 +1,4 @@
-"""What travels between the parts: frozen values, units and frames in the names.
+"""Values that travel between the parts: frozen, with units and frames in their names.
 
 Stamps are nanoseconds of the injected clock, taken where the thing happened (exposure, datagram
 arrival). Arrays are read-only once they are published here.
@@ -41,7 +41,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """Do not touch the sticks: they belong to the pilot. ``reason`` is shown to a person."""
+    """Do not touch the sticks: they belong to the pilot. ``reason`` is shown to the user."""
 
     reason: str
 
@@ -62,7 +62,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeatureFrame:
-    """What the slow path hands to the fast one: a value and the times that give its age."""
+    """An encoded image on its way from the vision loop to the action loop."""
 
     frame_id: int
     captured_ns: int
@@ -94,7 +94,7 @@ class Telemetry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleStatus:
-    """What the vehicle says of itself."""
+    """The vehicle's state as its heartbeat and RC_CHANNELS report it."""
 
     system_id: int
     autopilot: str
@@ -110,7 +110,7 @@ class VehicleStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSnapshot:
-    """All that the link knows at one tick."""
+    """Everything that the link knows at one tick."""
 
     telemetry: Telemetry
     status: VehicleStatus | None
@@ -167,18 +167,18 @@ class Tick:
     state: VehicleState | None
     trace: StickTrace | None
     sent: Sticks | None
-    """What left, after rounding to PWM; None when released or read-only."""
+    """Sticks as sent, after rounding to PWM; None when released or read-only."""
     release_reason: str | None
     mode: str | None
     armed: bool
     rc_channels_us: tuple[int, ...]
     rc_sticks: Sticks | None
     texts: tuple[str, ...] = ()
-    """What the vehicle and the link had to say since the last tick."""
+    """Status texts of the vehicle and warnings of the link since the last tick."""
 
     @property
     def activity(self) -> str:
-        """Who has the sticks, for a person."""
+        """Who has the sticks, as a line for the user."""
         if self.release_reason is not None:
             return f"RELEASED: {self.release_reason}"
         if self.trace is None:
@@ -227,7 +227,7 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStats:
-    """What the link counted over one flight; None = not measured."""
+    """Counters of the link over one flight; None = not measured."""
 
     messages_per_s: tuple[tuple[str, float], ...]
     """Mean arrival rate by MAVLink message name."""
@@ -247,7 +247,7 @@ class LinkStats:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutFrame:
-    """What is known of an imagined frame besides its pixels."""
+    """One row of an imagined flight: everything about a frame except its pixels."""
 
     number: int
     """In the video."""
@@ -259,7 +259,7 @@ class RolloutFrame:
     step: int
     """Since the newest frame that was really seen, whose step is 0; iterations may overlap."""
     frame_dt_s: float
-    """Of a step."""
+    """Duration of a step."""
     state: FloatArray
     """[13]"""
     action: FloatArray

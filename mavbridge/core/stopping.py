@@ -1,4 +1,4 @@
-"""Signals that end a flight in order, however many of them come."""
+"""Signals that end a flight in order, however often they are sent."""
 
 import queue
 import signal
@@ -23,16 +23,16 @@ class StopRequest:
         self._is_set = False
 
     def set(self) -> None:
-        """Ask for the stop."""
+        """Request the stop."""
         self._is_set = True
         self._wake.put(None)
 
     def is_set(self) -> bool:
-        """Somebody asked."""
+        """Return whether the stop was requested."""
         return self._is_set
 
     def wait(self, timeout_s: float) -> bool:
-        """Until somebody asks or the time is over; whether somebody has asked."""
+        """Wait for the request, at most ``timeout_s``; returns whether it has come."""
         if not self._is_set:
             with suppress(queue.Empty):
                 self._wake.get(timeout=timeout_s)
@@ -41,7 +41,7 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """SIGINT, SIGTERM and SIGHUP ask for the stop; the old handlers come back afterwards."""
+    """Let SIGINT, SIGTERM and SIGHUP request the stop; restores the old handlers afterwards."""
     stop = StopRequest()
 
     def on_signal(_number: int, _frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""Named threads whose failure is not lost."""
+"""Named threads whose exceptions are not lost."""
 
 import threading
 from collections.abc import Callable
@@ -11,7 +11,7 @@ class HungError(MavbridgeError):
 
 
 class Worker:
-    """A thread that keeps what its target raised, for whoever joins it."""
+    """A thread that keeps an exception of its target and raises it again in ``join``."""
 
     def __init__(self, name: str, target: Callable[[threading.Event], None]) -> None:
         self._target = target
@@ -26,21 +26,21 @@ class Worker:
             self._failure = failure
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     @property
     def is_alive(self) -> bool:
-        """Still at work."""
+        """Return whether the thread is running."""
         return self._thread.is_alive()
 
     def ends_within(self, timeout_s: float) -> bool:
-        """Wait for it without telling it to stop; whether it has ended."""
+        """Wait without requesting a stop; returns whether the thread has ended."""
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     def join(self, timeout_s: float) -> None:
-        """Tell the thread to stop, wait for it, and raise what it raised.
+        """Request the stop, wait for the thread, and raise what it raised.
 
         Raises:
             HungError: it did not stop in time.

@@ -48,7 +48,7 @@ def fly(config: FlyConfig) -> int:
 
 
 def _check_quickly(config: FlyConfig, clock: Clock) -> None:
-    """Refuse what can be told at once, before seconds of loading weights."""
+    """Check address, report and folder at once, before weights take seconds to load."""
     make_transport(config.link.connect, clock)
     require_writable(config.report, "--report")
     if config.record is not None:

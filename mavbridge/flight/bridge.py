@@ -42,7 +42,7 @@ def build_bridge(
     """Join a policy, a camera and a link.
 
     Args:
-        config: rates, limits, mode and arming; where camera and vehicle are is not looked at.
+        config: rates, limits, mode and arming; its camera and address are not used.
         executable: the policy on its engine.
         clock: time of the action loop, and of the vision loop if it has none of its own.
         link: the vehicle; used by the action loop alone.

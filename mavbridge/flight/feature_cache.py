@@ -1,4 +1,4 @@
-"""The seam between the two rates: one slot, newest value wins, nobody ever waits."""
+"""The cache between the two rates: one entry, the newest wins, and neither side waits."""
 
 from mavbridge.core.records import FeatureFrame
 

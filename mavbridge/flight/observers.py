@@ -1,4 +1,4 @@
-"""Everybody who watches one flight: timing, terminal, Rerun viewer and recorder."""
+"""The observers of one flight: timing, terminal, Rerun viewer and recorder."""
 
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -56,7 +56,7 @@ class FlightObservers:
 
     @property
     def sinks(self) -> tuple[TickSink, ...]:
-        """All that are open now, for the bridge."""
+        """All observers that are open, for the bridge."""
         optional = (self._recorder, self._viewer)
         return (self._timing, self.screen, *(sink for sink in optional if sink is not None))
 
@@ -115,7 +115,7 @@ class FlightObservers:
             self._recorder.close(RECORDER_JOIN_S)
 
     def finish(self, link: MavlinkLink) -> None:
-        """Print the report and write it, unless nothing ever happened."""
+        """Print the report, and write it where --report names a file."""
         drops = ObserverDrops(
             rerun=self._viewer.dropped if self._viewer else None,
             recorder=self._recorder.dropped if self._recorder else None,

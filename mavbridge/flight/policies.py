@@ -12,14 +12,14 @@ BUILT_IN = ("toge", "resnet-unet")
 
 
 def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
-    """The policy that the flags ask for; scripted ones follow ``clock``.
+    """Load the policy that the flags ask for; scripted ones follow ``clock``.
 
     Raises:
         PolicyError: with what was wrong, what was available and what to do.
     """
     here = str(Path.cwd())
     if here not in sys.path:
-        sys.path.append(here)  # a person's own module:Class lies where they work
+        sys.path.append(here)  # a user's module:Class lies in the working directory
     return load_policy(
         wanted.policy,
         checkpoint=wanted.checkpoint,
@@ -38,7 +38,7 @@ def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
 
 
 def is_stateless(policy: PolicyConfig) -> bool:
-    """A built-in net, which starts afresh with each flight; anything else may remember the last."""
+    """Return whether the policy keeps nothing between flights: the built-in nets."""
     return policy.policy.partition(":")[0] in BUILT_IN
 
 
@@ -48,7 +48,7 @@ def _loaded_once(policy: PolicyConfig) -> LoadedPolicy:
 
 
 def load_for_episodes(policy: PolicyConfig, clock: Clock) -> LoadedPolicy:
-    """A policy that knows nothing of earlier flights; nets are loaded once in a process.
+    """Load a policy for one of many flights; nets, which keep nothing between them, only once.
 
     Raises:
         PolicyError: it cannot be loaded.

@@ -27,7 +27,14 @@ class Freshness:
 def build_state(
     telemetry: Telemetry, now_ns: int, *, frame: StateFrame, freshness: Freshness
 ) -> VehicleState | Release:
-    """Join the newest readings; a part that is missing or too old is a reason, never a zero."""
+    """Join the newest readings; a part that is missing or too old is a release, never a zero.
+
+    Args:
+        telemetry: newest reading of each quantity, NED world and FRD body.
+        now_ns: time of the tick.
+        frame: frame of the contract, in which the state is returned.
+        freshness: oldest acceptable readings.
+    """
     attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
     velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
     if attitude is None or now_ns - attitude.arrived_ns > freshness.attitude_ns:
@@ -55,7 +62,7 @@ def build_state(
 def _stale(reading: Reading | None, what: str, limit_ns: int) -> Release:
     if reading is None:
         return Release(f"no {what} from the vehicle yet")
-    # The limit, not the age: a reason that changes every tick could not be compared.
+    # The limit, not the age: reasons are compared from tick to tick.
     return Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
 
 
@@ -83,7 +90,7 @@ def _to_enu_flu(
 
 
 def _unit_positive(q: tuple[float, ...]) -> tuple[float, ...]:
-    """Unit length and w >= 0: q and -q are one attitude, and a net should see one of them."""
+    """Normalise with w >= 0: q and -q are the same attitude, and nets see only one of them."""
     w, x, y, z = q
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     scale = (-1.0 if w < 0 else 1.0) / norm

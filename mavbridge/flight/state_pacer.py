@@ -1,17 +1,17 @@
-"""Ticks that follow the vehicle's clock instead of ours: as fresh a state as can be had."""
+"""Slots that follow the vehicle's attitude messages, for the freshest state at each command."""
 
 from mavbridge.core.clock import Clock, Slot
 from mavbridge.core.ports import Link
 
 
 class StatePacer:
-    """A tick as soon as a fresh attitude arrives; by the clock when it does not come.
+    """A slot as soon as a new attitude arrives, or by the clock when none does.
 
     - Never sooner than 3/4 of a period after the last tick: a faster stream is thinned.
-    - Never later than 5/4 of a period (one period where no stream is alive at all): then the tick
-      fires with what there is, and the state's age is judged by the same rules as ever.
+    - Never later than 5/4 of a period, or one period while no attitudes arrive at all. The usual
+      age limits then decide whether the state is fresh enough.
 
-    A stall counts the slots that it has cost, as with the grid.
+    Slots lost to a stall are counted, as by ``GridPacer``.
     """
 
     def __init__(self, clock: Clock, link: Link, *, period_ns: int) -> None:
@@ -23,7 +23,7 @@ class StatePacer:
         self._is_live = False
 
     def wait(self) -> Slot:
-        """Sleep until a fresh attitude is in, within the limits."""
+        """Sleep until a new attitude has arrived, within the limits."""
         last_ns = self._last_ns
         if last_ns is not None:
             earliest_ns = last_ns + self._period_ns * 3 // 4

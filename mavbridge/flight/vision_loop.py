@@ -1,4 +1,4 @@
-"""The slow path: newest frame -> encoder -> cache, in a thread of its own."""
+"""The slow path: newest frame -> encoder -> feature cache, in its own thread."""
 
 import threading
 from collections.abc import Callable
@@ -9,14 +9,14 @@ from mavbridge.core.records import FeatureFrame, FloatArray, ImageArray, VisionT
 from mavbridge.flight.feature_cache import FeatureCache
 
 READ_TIMEOUT_NS = 100 * NS_PER_MS
-"""How often a starving loop looks at the stop flag."""
+"""Longest wait for a frame before the stop flag is checked."""
 
 
 class VisionLoop:
     """Encodes frames as they come, at most at the visual rate, and publishes the result.
 
     It is driven by the camera, not by a grid: a frame is used when it arrives. Frames that come
-    faster than the visual rate are passed over, with a quarter of a period of tolerance for the
+    faster than the visual rate are skipped, with a quarter of a period of tolerance for the
     camera's own jitter.
     """
 
@@ -50,7 +50,7 @@ class VisionLoop:
             self.step()
 
     def step(self) -> None:
-        """Wait a moment for one frame and take it through.
+        """Wait up to ``READ_TIMEOUT_NS`` for one frame, encode and publish it.
 
         Raises:
             CameraError: the camera has died.

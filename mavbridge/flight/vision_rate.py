@@ -1,4 +1,4 @@
-"""How often to look: as fast as the scene moves, within what the encoder can sustain."""
+"""The adaptive visual rate: as fast as the scene moves, within what the encoder can sustain."""
 
 import math
 
@@ -9,13 +9,13 @@ from mavbridge.core.records import Event, ImageArray, Tick, VisionTick
 from policy.contract import RATE
 
 FULL_TURN_RADPS = 1.5
-"""Turn rate that asks for the highest rate; at 10 Hz it is 9 degrees from frame to frame."""
+"""Body rate that asks for the highest rate; at 10 Hz it is 9 degrees from frame to frame."""
 FULL_CHANGE_PER_S = 1.0
-"""Mean change of the image, in full scales a second, that asks for the highest rate."""
+"""Mean change of the pixels, in full scales a second, that asks for the highest rate."""
 BUDGET = 0.8
 """Share of one core that the encoder may take."""
 CALM_TAU_S = 0.5
-"""Demand rises at once and falls with this time constant: motion that pauses is not over."""
+"""Demand rises at once and falls with this time constant, because motion may resume."""
 _GRID = 16
 """The image change is measured on about this many pixels a side."""
 
@@ -31,7 +31,7 @@ class AdaptiveRate:
         self._min_hz = min_hz
         self._max_hz = max_hz
         self._turn_radps = 0.0
-        self._demand = 1.0  # until something is known, look often
+        self._demand = 1.0  # before the first measurements, the highest rate
         self._encode_s = 0.0
         self._last: tuple[int, ImageArray] | None = None
 
@@ -41,7 +41,7 @@ class AdaptiveRate:
         return self._max_hz > self._min_hz
 
     def emit(self, event: Event) -> None:
-        """Take the motion out of the event."""
+        """Measure the motion that the event shows."""
         if isinstance(event, Tick):
             if event.state is not None:
                 self._turn_radps = math.hypot(*event.state.values[RATE].tolist())

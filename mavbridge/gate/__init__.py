@@ -1,1 +1,1 @@
-"""Who holds the sticks, and how they move: the last step before the link."""
+"""The last step before the link: who holds the sticks, and how fast they move."""

@@ -1,4 +1,4 @@
-"""Who holds the sticks: one pure state machine, and the last check of what a policy returns."""
+"""Who holds the sticks: a pure state machine, and the check of every chunk a policy returns."""
 
 import math
 from dataclasses import dataclass
@@ -18,15 +18,15 @@ PILOTED_MODES = frozenset(
 """Modes in which sticks fly the vehicle (ArduPilot, PX4)."""
 
 RETAKE_NS = NS_PER_S // 2
-"""How long inputs must be good again before the policy takes the sticks back: a pilot must not be
-handed them, and robbed of them, several times a second."""
+"""How long inputs must be good again before the policy takes the sticks back, so that control does
+not pass between pilot and policy several times a second."""
 
 PREPARE_TIMEOUT_NS = 90 * NS_PER_S
 """For mode change and arming; a cold autopilot needs some 40 s for its estimator."""
 
 
 class Phase(Enum):
-    """Where the flight is."""
+    """State of the engagement."""
 
     WAITING = "waiting"
     PREPARING = "preparing"
@@ -37,21 +37,21 @@ class Phase(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
-    """What the state machine looks at, once a tick."""
+    """Inputs of the state machine at one tick."""
 
     now_ns: int
     link_problem: str | None
     input_problem: str | None
-    """No fresh state or feature."""
+    """What state or feature lacks, or None."""
     mode: str | None
     armed: bool
     is_overruled: bool
-    """The vehicle was seen not to act on our sticks."""
+    """The vehicle does not act on our sticks."""
     echo_confirmed: bool
 
 
 class Hold(Enum):
-    """What to do with the sticks when they are not released."""
+    """Use of the sticks while they are not released."""
 
     IDLE = "idle"
     """Throttle at the bottom, the rest centred: for arming."""
@@ -63,7 +63,7 @@ Request: TypeAlias = Literal["mode", "arm"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Directive:
-    """What to do this tick."""
+    """Output of the state machine at one tick."""
 
     sticks: Hold | Release
     request: Request | None = None
@@ -72,10 +72,10 @@ class Directive:
 class Engagement:
     """Decides whether the policy flies. Every path that does not is a ``Release`` with its reason.
 
-    WAITING -> PREPARING (asked to arm or to change mode) -> FLYING. Somebody else's hand on the
-    vehicle ends it: a mode that changes after we had it, in the air, or sticks that the vehicle no
-    longer takes from us in flight, lead to LATCHED, which only disarming ends. A problem of link or
-    inputs releases while it lasts.
+    WAITING -> PREPARING (asked to arm or to change mode) -> FLYING. A takeover by
+    somebody else ends it: a mode change in the air, or a vehicle that no longer acts on our sticks,
+    leads to LATCHED, which only disarming ends. A problem of link or inputs releases the sticks for
+    as long as it lasts.
     """
 
     def __init__(self, *, wanted_mode: str | None, arm: bool, readonly: bool) -> None:
@@ -83,7 +83,7 @@ class Engagement:
         self._may_arm = arm
         self._readonly = readonly
         self._own_mode: str | None = None
-        """The mode that we fly in, or had asked for and got; a change is somebody else's doing."""
+        """The mode that we fly in, or asked for and got; any change of it is a takeover."""
         self._prepare_until_ns: int | None = None
         self._retake_ns: int | None = None
         """Not before this time, after an input failed in flight."""
@@ -92,15 +92,15 @@ class Engagement:
         """First tick of flight."""
 
     def step(self, facts: Facts) -> Directive:
-        """One tick.
+        """Advance by one tick.
 
         Raises:
             PeerError: the vehicle did not take the mode or arm in time.
         """
         if self._readonly:
-            return self._read_along(facts)
+            return self._observe(facts)
         if facts.armed:
-            self._may_arm = False  # one arming, whoever did it: never a second by itself
+            self._may_arm = False  # armed once, by anybody: never arm a second time
         if facts.is_overruled and self.phase is Phase.FLYING:
             self.phase = Phase.LATCHED
         if facts.link_problem is not None:
@@ -109,14 +109,14 @@ class Engagement:
             return self._on_ground(facts)
         if self.phase is Phase.LATCHED:
             return Directive(
-                sticks=Release(f"somebody else has taken over ({facts.mode}); disarm to reset")
+                sticks=Release(f"somebody else has taken over ({facts.mode}): disarm to reset")
             )
         if self._own_mode is not None and facts.mode != self._own_mode:
             self.phase = Phase.LATCHED
             return Directive(sticks=Release(f"mode changed from {self._own_mode} to {facts.mode}"))
         return self._in_air(facts)
 
-    def _read_along(self, facts: Facts) -> Directive:
+    def _observe(self, facts: Facts) -> Directive:
         if facts.link_problem is not None:
             return self._wait(facts.link_problem)
         return self._fly(facts)
@@ -144,7 +144,7 @@ class Engagement:
         return Directive(sticks=Hold.IDLE, request="mode" if wants_mode else "arm")
 
     def _has_wanted_mode(self, facts: Facts) -> bool:
-        """The wanted mode is there; once it is, it is ours, and a change of it somebody else's."""
+        """Return whether the wanted mode is active; from then on a change of it is a takeover."""
         if facts.mode == self._wanted_mode:
             self._own_mode = facts.mode
         return facts.mode == self._wanted_mode
@@ -167,7 +167,9 @@ class Engagement:
                 self._retake_ns = facts.now_ns + RETAKE_NS
             return Directive(sticks=Release(facts.input_problem))
         if self._retake_ns is not None and facts.now_ns < self._retake_ns:
-            return Directive(sticks=Release("inputs are back: making sure that they stay"))
+            return Directive(
+                sticks=Release("inputs are good again: waiting to see that they stay so")
+            )
         self.phase = Phase.FLYING
         self._own_mode = facts.mode
         self._prepare_until_ns = None
@@ -188,7 +190,7 @@ class Engagement:
 
 
 def check_chunk(chunk: FloatArray) -> Release | None:
-    """Refuse a chunk [1, horizon, 4] that is none, or holds a value that is not finite."""
+    """Refuse a chunk that is not [1, horizon, 4], or holds a value that is not finite."""
     if chunk.ndim != 3 or chunk.shape[0] != 1 or not chunk.shape[1] or chunk.shape[2] != 4:
         return Release(f"the policy returned {list(chunk.shape)} instead of [1, horizon, 4]")
     if not math.isfinite(chunk.sum()):  # one pass; NaN and infinity survive every sum

@@ -9,15 +9,15 @@ from mavbridge.core.records import NEUTRAL, Sticks, StickTrace
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Smoothing:
-    """What the filter does, in seconds."""
+    """Settings of the filter."""
 
     max_slew_per_s: float
     """Largest stick movement in 1/s (full scale is 2); 0 = no limit."""
     tau_s: float
     """Time constant of the first-order low-pass; 0 = off."""
     max_dt_s: float = 0.15
-    """Longest step to integrate over: after a stall the sticks do not jump. In seconds, like the
-    rest, and longer than the longest period."""
+    """Longest step to integrate over, s, so that the sticks do not jump after a stall; longer than
+    any period."""
 
 
 class StickSmoother:
@@ -38,7 +38,7 @@ class StickSmoother:
         self._smoothed = NEUTRAL
 
     def reset(self, start: Sticks) -> None:
-        """Begin again from where the sticks are now."""
+        """Restart from the present stick positions."""
         self._last_ns = None
         self._slewed = start
         self._smoothed = start
@@ -47,7 +47,7 @@ class StickSmoother:
         """Filter one action.
 
         Args:
-            raw: the policy's action; must be finite (the guard saw to that).
+            raw: the policy's action; must be finite (``check_chunk`` saw to that).
             now_ns: time at which it acts; the first step after a reset spans no time.
         """
         dt_s = 0.0

@@ -44,7 +44,7 @@ SETTINGS = ActionSettings(
     duration_ns=None,
 )
 
-BACK = "inputs are back: making sure that they stay"
+BACK = "inputs are good again: waiting to see that they stay so"
 NO_SMOOTHING = Smoothing(max_slew_per_s=0.0, tau_s=0.0, max_dt_s=0.03)
 
 

@@ -113,9 +113,9 @@ def test_inputs_must_stay_good_before_the_sticks_are_taken_back() -> None:
     engagement = flying()
     bad = replace(READY, input_problem="too old")
     assert released(engagement.step(replace(bad, now_ns=S))) == "too old"
-    assert "making sure" in released(engagement.step(replace(READY, now_ns=S + RETAKE_NS // 2)))
+    assert "waiting to see" in released(engagement.step(replace(READY, now_ns=S + RETAKE_NS // 2)))
     assert released(engagement.step(replace(bad, now_ns=S + RETAKE_NS // 2))) == "too old"
-    assert "making sure" in released(engagement.step(replace(READY, now_ns=S + RETAKE_NS)))
+    assert "waiting to see" in released(engagement.step(replace(READY, now_ns=S + RETAKE_NS)))
     assert engagement.step(replace(READY, now_ns=S + 2 * RETAKE_NS)).sticks is Hold.FLY
 
 
