@@ -7,10 +7,11 @@ PORT ?= 14550
 COURSE ?= 1000007
 DURATION ?= 60
 POLICY ?= toge
+PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Each chunk goes on from the last one in two steps: ten from noise are too slow for two cores.
 WARM := $(if $(filter toge%,$(POLICY)),--head-steps 2)
 
-.PHONY: fly test lint bench clean
+.PHONY: fly check test lint bench clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -42,8 +43,11 @@ lint: $(VENV)/installed  ## format, lint, types, import direction
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+check: lint  ## all of lint, then every test that needs no second process
+	$(BIN)/pytest $(PARALLEL) -m 'not system'
+
 test: lint .venv-peers/installed  ## all of lint, then every test
-	$(BIN)/pytest
+	$(BIN)/pytest $(PARALLEL)
 
 bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link on this machine, and the peers beside us
 	@mkdir -p out

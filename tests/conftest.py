@@ -5,6 +5,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# Workers side by side have a core each: threads of torch would wait for each other, spinning.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # The first example of a property pays for imports and first kernels: no verdict on wall time.
 settings.register_profile("no-deadline", deadline=None)
 settings.load_profile("no-deadline")
