@@ -30,38 +30,38 @@ class Link(Protocol):
     """The vehicle's end of the action loop; used by the action loop's thread alone."""
 
     def poll(self) -> LinkSnapshot:
-        """Take in all that has arrived; never blocks."""
+        """Receive everything that has arrived; never blocks."""
         ...
 
-    def tend(self) -> None:
-        """Heartbeat, handshake and requests that are due; called when the sticks have left."""
+    def service(self) -> None:
+        """Send the heartbeat, handshake and requests that are due; called after the sticks."""
         ...
 
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
-        """Take in what arrives until an attitude newer than that has come, or until the time.
+        """Receive until an attitude newer than ``newer_than_ns`` has come, or until the deadline.
 
         Returns the arrival of the newest attitude, 0 before the first.
         """
         ...
 
     def send(self, decision: Decision) -> Sticks | None:
-        """Put the decision on the wire; returns the sticks that really left, None on release."""
+        """Send the decision; returns the sticks that were really sent, None on release."""
         ...
 
     def hand_back(self) -> None:
-        """Finish giving the sticks back; takes up to half a second, at the end of a flight."""
+        """Send the remaining releases at the end of a flight; takes up to half a second."""
         ...
 
-    def seize(self) -> None:
-        """From any thread: give the sticks back now, and let nothing else leave any more."""
+    def force_release(self) -> None:
+        """From any thread: release the sticks now and block all other sends."""
         ...
 
     def set_mode(self, mode: str) -> None:
-        """Ask for a flight mode (rate-limited; the next heartbeat tells)."""
+        """Request a flight mode (rate-limited; the next heartbeat shows the result)."""
         ...
 
     def arm(self) -> None:
-        """Ask to arm (rate-limited; the next heartbeat tells)."""
+        """Request arming (rate-limited; the next heartbeat shows the result)."""
         ...
 
     def close(self) -> None:
@@ -70,11 +70,11 @@ class Link(Protocol):
 
 
 class PacketSource(Protocol):
-    """What goes over the link, for a recorder; drained by one thread."""
+    """Packets of the link for a recorder; drained by one thread."""
 
     @property
     def dropped(self) -> int:
-        """Pieces that nobody drained in time."""
+        """Packets that were not drained in time."""
         ...
 
     def drain(self) -> list[Packet]:

@@ -124,7 +124,7 @@ class ActionLoop:
         self._history.append(sent, sent_ns)
         self._sink.emit(_tick(self._ticks, slot, step, decision, sent, sent_ns))
         self._ticks += 1
-        self._link.tend()
+        self._link.service()
         self.alive_ns = sent_ns
 
     def _decide(self, step: _Step) -> Decision:

@@ -31,8 +31,8 @@ from mavbridge.flight.assembly import (
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.vision_rate import AdaptiveRate
 from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.transport.packet_log import PacketLog
 from mavbridge.mavlink.transport.sockets import make_transport
-from mavbridge.mavlink.transport.tap import PacketTap
 from mavbridge.observe.rerun_flight import RerunView
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, report_json
@@ -133,7 +133,7 @@ class _Flight:
         )
         self._recorder: Recorder | None = None
         stack.callback(self._close_recorder)  # after the link: it records the release as well
-        self._tap = None if config.record is None else PacketTap()
+        self._packet_log = None if config.record is None else PacketLog()
         self._link = self._open_link()
         self._viewer = self._open_viewer()
         camera = self._open_camera()
@@ -169,7 +169,7 @@ class _Flight:
         return viewer
 
     def _open_recorder(self) -> "Recorder | None":
-        if self._config.record is None or self._tap is None:
+        if self._config.record is None or self._packet_log is None:
             return None
         from mavbridge.recording.meta import FlightMeta
         from mavbridge.recording.recorder import Recorder
@@ -192,7 +192,7 @@ class _Flight:
             return Recorder(
                 self._config.record,
                 meta,
-                packets=self._tap,
+                packets=self._packet_log,
                 wall_offset_ns=offset_ns,
                 autopilot=lambda: self._link.autopilot,
                 tell=self._screen.tell,
@@ -221,7 +221,7 @@ class _Flight:
             self._clock,
             config,
             state_hz=max(self._action_hz, STATE_HZ),
-            tap=self._tap,
+            packet_log=self._packet_log,
         )
         self._stack.callback(link.close)
         return link
@@ -263,7 +263,7 @@ class _Flight:
         """End the flight when the action loop hangs: its last sticks must not stay."""
         idle_ns = self._clock.now_ns() - self._action.alive_ns
         if action.is_alive and idle_ns > HANG_NS:
-            self._link.seize()
+            self._link.force_release()
             self._has_hung = True
             raise PeerError(
                 f"the action loop has hung for {idle_ns / NS_PER_S:.1f} s: the policy is too slow "
@@ -274,7 +274,7 @@ class _Flight:
         try:
             action.join(JOIN_S)
         except HungError:
-            self._link.seize()
+            self._link.force_release()
             if not self._has_hung:  # else that is being told already
                 raise
 

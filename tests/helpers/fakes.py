@@ -137,7 +137,7 @@ class FakeLink:
             echo_confirmed=self.echo_confirmed,
         )
 
-    def tend(self) -> None:
+    def service(self) -> None:
         pass
 
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:

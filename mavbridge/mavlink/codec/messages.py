@@ -1,11 +1,11 @@
-"""What the bridge understands of MAVLink: one frozen record per message, SI units, validated."""
+"""The part of MAVLink that the bridge uses: one frozen record per message, in SI units, checked."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 
-class Source(NamedTuple):
-    """Who sent a message."""
+class Endpoint(NamedTuple):
+    """MAVLink address of a sender or a receiver."""
 
     system: int
     component: int
@@ -42,13 +42,13 @@ class LocalVelocity:
 class SpecificForce:
     """Accelerometer of HIGHRES_IMU (105), SCALED_IMU (26), SCALED_IMU2 (116) or RAW_IMU (27)."""
 
-    source: str
+    message_name: str
     specific_force_body_mps2: tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RcChannels:
-    """RC_CHANNELS (65): what the vehicle acts on, in microseconds; 0 = absent."""
+    """RC_CHANNELS (65): the channels that the vehicle acts on, in microseconds; 0 = absent."""
 
     channels_us: tuple[int, ...]
 
@@ -59,13 +59,13 @@ class CommandAck:
 
     command: int
     result: int
-    target: Source
-    """Whose command was answered; zeros where the vehicle does not say."""
+    target: Endpoint
+    """Sender of the command; zeros where the vehicle does not fill it in."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParamValue:
-    """PARAM_VALUE (22), as ArduPilot encodes it: the number itself."""
+    """PARAM_VALUE (22) as ArduPilot encodes it: the number itself, whatever its type."""
 
     name: str
     value: float
@@ -80,7 +80,7 @@ class StatusText:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timesync:
-    """TIMESYNC (111)."""
+    """TIMESYNC (111), in nanoseconds."""
 
     tc1: int
     ts1: int
@@ -107,11 +107,38 @@ Body: TypeAlias = (
 )
 
 
-class Incoming(NamedTuple):
-    """One message off the wire."""
+class ReceivedMessage(NamedTuple):
+    """One packet that passed its checksum."""
 
-    source: Source
+    source: Endpoint
     sequence: int
     name: str
     body: Body | None
-    """None: a message that is counted, but that nothing here needs."""
+    """None: a message that the bridge does not use, or one with unusable values."""
+    packet: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CommandRequest:
+    """COMMAND_LONG (76); parameters that are not given are zero."""
+
+    command: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ParamRequest:
+    """PARAM_REQUEST_READ (20) by name."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class StreamRequest:
+    """REQUEST_DATA_STREAM (66), for vehicles without SET_MESSAGE_INTERVAL."""
+
+    stream: int
+    rate_hz: int
+
+
+Request: TypeAlias = CommandRequest | ParamRequest | StreamRequest

@@ -1,4 +1,4 @@
-"""What the link counts over one flight."""
+"""Counters of the link over one flight."""
 
 from collections import Counter
 
@@ -29,11 +29,11 @@ class LinkCounters:
         self._last_ns = arrived_ns
 
     def new_sequence(self) -> None:
-        """The sender starts its sequence anew: what follows is no gap."""
+        """Expect any sequence number next: the sender has restarted."""
         self._last_sequence = None
 
     def round_trip(self, round_trip_ns: int | None) -> None:
-        """Count one TIMESYNC exchange, if it was ours."""
+        """Count one TIMESYNC exchange; None is ignored."""
         if round_trip_ns is not None:
             self._round_trips.add(round_trip_ns)
 

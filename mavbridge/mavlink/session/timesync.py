@@ -1,4 +1,4 @@
-"""The vehicle's clock against ours, by TIMESYNC."""
+"""Offset between the vehicle's clock and ours, by TIMESYNC."""
 
 from collections import deque
 
@@ -11,10 +11,10 @@ _OUTSTANDING = 8
 
 
 class TimesyncFilter:
-    """Keeps the offset of the fastest recent exchange (the one with the least queueing in it).
+    """Keeps the offset of the fastest recent exchange, which was queued for the shortest time.
 
-    Only answers to our own outstanding requests count: replies are broadcast, and another station's
-    would pass for absurd round trips.
+    Only answers to our own outstanding requests count: replies are broadcast, and those to another
+    station would look like absurd round trips.
     """
 
     def __init__(self) -> None:
@@ -31,7 +31,7 @@ class TimesyncFilter:
         return now_ns
 
     def receive(self, reply: Timesync, arrived_ns: int) -> int | None:
-        """Round trip of a reply to us in ns; None for anybody else's, and for requests."""
+        """Round trip of a reply to us in ns; None for a request or a reply to another station."""
         if reply.tc1 == 0 or reply.ts1 not in self._outstanding:
             return None
         self._outstanding.remove(reply.ts1)
