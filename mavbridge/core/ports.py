@@ -10,14 +10,14 @@ class Camera(Protocol):
 
     @property
     def dropped_frames(self) -> int:
-        """Frames that the source delivered and nobody read, since it was opened."""
+        """Frames that the source has delivered but that were never read, since it was opened."""
         ...
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """Newest frame that was not returned before; None if none comes within the timeout.
+        """Newest frame that was not returned before; None if there is none within the timeout.
 
         Raises:
-            CameraError: the source has died and will not come back by itself.
+            CameraError: the source has failed for good.
         """
         ...
 
