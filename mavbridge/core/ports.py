@@ -1,4 +1,4 @@
-"""The few Protocols that the loops need."""
+"""Interfaces of what the loops are connected to."""
 
 from typing import Protocol
 
@@ -10,14 +10,14 @@ class Camera(Protocol):
 
     @property
     def dropped_frames(self) -> int:
-        """Frames that the source has delivered but that were never read, since it was opened."""
+        """Frames that the source delivered and nobody read, since it was opened."""
         ...
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """Newest frame that was not returned before; None if there is none within the timeout.
+        """Newest frame that was not returned before; None if none comes within the timeout.
 
         Raises:
-            CameraError: the source has failed for good.
+            CameraError: the source has died and will not come back by itself.
         """
         ...
 
@@ -27,41 +27,41 @@ class Camera(Protocol):
 
 
 class Link(Protocol):
-    """The vehicle's end of the action loop; used by the action loop's thread alone."""
+    """The connection to one vehicle; used by the action loop's thread alone."""
 
     def poll(self) -> LinkSnapshot:
         """Receive everything that has arrived; never blocks."""
         ...
 
     def service(self) -> None:
-        """Send the heartbeat, handshake and requests that are due; called after the sticks."""
+        """Send what is due besides sticks (heartbeat, handshake, requests); called after them."""
         ...
 
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
-        """Receive until an attitude newer than ``newer_than_ns`` has come, or until the deadline.
+        """Receive until an attitude newer than ``newer_than_ns`` arrives, or until ``until_ns``.
 
-        Returns the arrival of the newest attitude, 0 before the first.
+        Returns the arrival time of the newest attitude, 0 before the first.
         """
         ...
 
     def send(self, decision: Decision) -> Sticks | None:
-        """Send the decision; returns the sticks that were really sent, None on release."""
+        """Send the decision; returns the sticks as rounded and sent, None when released."""
         ...
 
     def hand_back(self) -> None:
-        """Send the remaining releases at the end of a flight; takes up to half a second."""
+        """Repeat the release at the end of a flight, as packets may be lost; takes 0.5 s."""
         ...
 
     def force_release(self) -> None:
-        """From any thread: release the sticks now and block all other sends."""
+        """From any thread: release the sticks now, and send nothing after that."""
         ...
 
     def set_mode(self, mode: str) -> None:
-        """Request a flight mode (rate-limited; the next heartbeat shows the result)."""
+        """Ask for a flight mode (rate-limited; a later heartbeat shows the result)."""
         ...
 
     def arm(self) -> None:
-        """Request arming (rate-limited; the next heartbeat shows the result)."""
+        """Ask to arm (rate-limited; a later heartbeat shows the result)."""
         ...
 
     def close(self) -> None:
@@ -70,11 +70,11 @@ class Link(Protocol):
 
 
 class PacketSource(Protocol):
-    """Packets of the link for a recorder; drained by one thread."""
+    """Packets that went over the link, for a recorder; drained by one thread."""
 
     @property
     def dropped(self) -> int:
-        """Packets that were not drained in time."""
+        """Packets that were dropped because they were not drained in time."""
         ...
 
     def drain(self) -> list[Packet]:
@@ -83,7 +83,7 @@ class PacketSource(Protocol):
 
 
 class TickSink(Protocol):
-    """Where ticks go; must never block and never raise."""
+    """A receiver of ticks; must never block and never raise."""
 
     def emit(self, event: Event) -> None:
         """Take the event, or drop and count it."""

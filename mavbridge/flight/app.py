@@ -195,7 +195,7 @@ class _Flight:
                 packets=self._packet_log,
                 wall_offset_ns=offset_ns,
                 autopilot=lambda: self._link.autopilot,
-                tell=self._screen.tell,
+                tell=self._screen.show_message,
             )
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error
@@ -254,7 +254,7 @@ class _Flight:
         def run_settled(stop: threading.Event) -> None:
             refusal = settle_thread(realtime=realtime, cpu=cpu)
             if refusal is not None:
-                self._screen.tell(refusal)
+                self._screen.show_message(refusal)
             run(stop)
 
         return run_settled

@@ -151,14 +151,14 @@ def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
         screen.emit(make_tick(0))
         for _ in range(2 * round(PLAIN_PERIOD_S * STATUS_HZ)):
             screen.refresh()
-    news, *lines = out.getvalue().splitlines()
-    assert news == "FLYING: the policy has the sticks"
+    message, *lines = out.getvalue().splitlines()
+    assert message == "FLYING: the policy has the sticks"
     assert len(lines) == 2
     assert lines[0].startswith("FLYING  ALT_HOLD armed")
     assert lines[0].endswith("missed 0")  # not cut at 80 columns: it goes to a file
 
 
-def test_news_is_printed_once_in_order() -> None:
+def test_messages_are_printed_once_in_order() -> None:
     out = io.StringIO()
     screen = FlightScreen(Console(file=out, width=80), action_hz=100, vision_hz=30, readonly=False)
     screen.emit(make_released_tick(0, reason="no [bold] state", texts=("vehicle: Arming motors",)))
@@ -203,6 +203,7 @@ def test_the_table_holds_the_numbers_in_milliseconds() -> None:
     assert rows["attitude age at send"] == ["3.00"] * 4
     assert rows["vision encode"] == ["-"] * 4
     assert rows["link round trip"] == ["-"] * 4
+    assert "A slot is one period" in text
 
 
 def test_the_table_fits_eighty_columns() -> None:
@@ -210,7 +211,7 @@ def test_the_table_fits_eighty_columns() -> None:
     assert max(len(line) for line in rendered(timing_table(report_of(*slow))).splitlines()) <= 80
 
 
-def test_verdicts_say_what_was_asked_and_what_came() -> None:
+def test_verdicts_compare_targets_and_results() -> None:
     link = LinkStats(
         messages_per_s=(),
         lost_fraction=0.0,
@@ -220,8 +221,8 @@ def test_verdicts_say_what_was_asked_and_what_came() -> None:
     )
     report = report_of(*(make_tick(index) for index in range(11)), link=link, rerun_drops=0)
     assert verdict_lines(report) == [
-        "action  100.0 of 100 Hz asked, 0 missed slots in 11 ticks",
-        "vision  - of 30 Hz asked, 0 frames dropped by the camera",
+        "action  100.0 Hz of 100 Hz, 0 missed slots in 11 ticks",
+        "vision  - Hz of 30 Hz, 0 frames dropped by the camera",
         "link    11 stick messages sent, echo confirmed, 0.00% of the vehicle's messages lost",
         "sticks  never released",
     ]
@@ -274,4 +275,4 @@ def test_show_report_prints_table_and_verdicts() -> None:
     screen = FlightScreen(Console(file=out, width=100), action_hz=100, vision_hz=30, readonly=False)
     screen.show_report(report_of(*(make_tick(index) for index in range(11))))
     assert "toge-small on torch, ardupilot" in out.getvalue()
-    assert "100.0 of 100 Hz asked" in out.getvalue()
+    assert "100.0 Hz of 100 Hz" in out.getvalue()
