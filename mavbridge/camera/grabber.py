@@ -31,11 +31,9 @@ class ImageSource(Protocol):
         Raises:
             CameraError: there will be none.
         """
-        ...
 
     def close(self) -> None:
         """Free the device or connection."""
-        ...
 
 
 class Grabber:

@@ -235,7 +235,7 @@ def _release_verdict(report: TimingReport) -> str:
 
 
 def _line(name: str, text: str, style: str = "") -> Text:
-    return Text.assemble((f"{name:8}", "bold"), (text, style))
+    return Text.assemble((f"{name:9}", "bold"), (text, style))
 
 
 def _cells(measured: Percentiles | None) -> tuple[str, ...]:

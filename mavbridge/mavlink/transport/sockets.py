@@ -48,19 +48,15 @@ class Transport(Protocol):
             UserError: it cannot be opened as configured, and trying again will not help.
             TransportDownError: it cannot be opened now.
         """
-        ...
 
     def drain(self) -> Iterator[Chunk]:
         """Everything that has arrived. Raises TransportDownError when the connection is lost."""
-        ...
 
     def wait(self, until_ns: int) -> None:
         """Return when ``drain`` has something to yield, or at the given time."""
-        ...
 
     def answer_to(self, sender: Address | None) -> None:
         """From now on send to this peer; no effect on a stream."""
-        ...
 
     def send(self, data: bytes) -> bool:
         """Hand one whole packet to the kernel; False: dropped, because it cannot be sent now.
@@ -68,11 +64,9 @@ class Transport(Protocol):
         Raises:
             TransportDownError: the connection is lost.
         """
-        ...
 
     def close(self) -> None:
         """Free the socket or port; may be called twice."""
-        ...
 
 
 def _resolve(address: Address) -> Address:

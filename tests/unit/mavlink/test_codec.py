@@ -104,8 +104,7 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
 def flat(body: Any) -> list[Any]:
     """Fields of a record with tuples opened, so that floats can be compared approximately."""
     out: list[Any] = []
-    for name in body.__slots__:
-        value = getattr(body, name)
+    for value in body:
         out.extend(value if isinstance(value, tuple) else [value])
     return out
 

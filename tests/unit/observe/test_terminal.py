@@ -221,10 +221,10 @@ def test_verdicts_compare_targets_and_results() -> None:
     )
     report = report_of(*(make_tick(index) for index in range(11)), link=link, rerun_drops=0)
     assert verdict_lines(report) == [
-        "action  100.0 Hz of 100 Hz, 0 missed slots in 11 ticks",
-        "vision  - Hz of 30 Hz, 0 frames dropped by the camera",
-        "link    11 stick messages sent, echo confirmed, 0.00% of the vehicle's messages lost",
-        "sticks  never released",
+        "action   100.0 Hz of 100 Hz, 0 missed slots in 11 ticks",
+        "vision   - Hz of 30 Hz, 0 frames dropped by the camera",
+        "link     11 stick messages sent, echo confirmed, 0.00% of the vehicle's messages lost",
+        "sticks   never released",
     ]
 
 
@@ -234,8 +234,8 @@ def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
         *(make_released_tick(index, reason) for index, reason in enumerate(reasons)), rerun_drops=1
     )
     assert verdict_lines(report)[-2:] == [
-        "sticks  released 4 times, last for: b (0.0 s); c (0.0 s); d (0.0 s)",
-        "rerun   missed 1 event",
+        "sticks   released 4 times, last for: b (0.0 s); c (0.0 s); d (0.0 s)",
+        "rerun    missed 1 event",
     ]
 
 
@@ -257,7 +257,7 @@ def test_the_link_verdict_is_honest(
         echo_confirmed=confirmed,
     )
     assert verdict_lines(report_of(make_tick(), link=link))[2] == (
-        f"link    1 stick message sent, {expected}"
+        f"link     1 stick message sent, {expected}"
     )
 
 
