@@ -48,27 +48,43 @@ class _RateMeter:
         return (last - first) * NS_PER_S / (last_ns - first_ns) if last_ns > first_ns else None
 
 
-class StatusLine:
-    """A ``TickSink`` that keeps the newest tick and turns it into one line."""
+class FlightScreen:
+    """Status line and final table on one console; a ``TickSink``.
 
-    def __init__(self, *, action_hz: float, vision_hz: float, readonly: bool) -> None:
+    ``emit`` is for the loops' threads, ``show_message`` for any thread, the rest for the main one.
+    """
+
+    def __init__(
+        self, console: Console, *, action_hz: float, vision_hz: float, readonly: bool
+    ) -> None:
+        self._console = console
         self._target_hz = (action_hz, vision_hz)
         self._readonly = readonly
         self._action, self._vision = _RateMeter(), _RateMeter()
         self._tick: Tick | None = None
         self._missed_slots = 0
+        self._messages: deque[str] = deque(maxlen=MAX_MESSAGES)
+        self._live = Live(console=console, auto_refresh=False, transient=True)
+        self._refreshes = 0
 
     def emit(self, event: Event) -> None:
-        """Remember the event."""
-        if isinstance(event, Tick):
-            self._tick = event
-            self._missed_slots += event.missed_slots
-            self._action.count(event.woke_ns)
-        else:
+        """Remember the event and the messages in it."""
+        if not isinstance(event, Tick):
             self._vision.count(event.ready_ns)
+            return
+        self._action.count(event.woke_ns)
+        self._missed_slots += event.missed_slots
+        self._messages.extend(event.texts)
+        if self._tick is None or event.activity != self._tick.activity:
+            self._messages.append(event.activity)
+        self._tick = event
 
-    def render(self) -> Text:
-        """The line now; to be called at ``STATUS_HZ``, since rates are averages over calls."""
+    def show_message(self, text: str) -> None:
+        """Show a message with the next refresh."""
+        self._messages.append(text)
+
+    def status_line(self) -> Text:
+        """The status now; to be called at ``STATUS_HZ``, since rates are averages over calls."""
         rates_hz = (self._action.sample_hz(), self._vision.sample_hz())
         tick = self._tick
         if tick is None:
@@ -96,37 +112,6 @@ class StatusLine:
             return "READ-ONLY", "bold cyan"
         return "FLYING" if tick.trace else "PREPARING", "bold green"
 
-
-class FlightScreen:
-    """Status line and final table on one console; a ``TickSink``.
-
-    ``emit`` is for the loops' threads, ``show_message`` for any thread, the rest for the main one.
-    """
-
-    def __init__(
-        self, console: Console, *, action_hz: float, vision_hz: float, readonly: bool
-    ) -> None:
-        self._console = console
-        self._status = StatusLine(action_hz=action_hz, vision_hz=vision_hz, readonly=readonly)
-        self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._refreshes = 0
-        self._messages: deque[str] = deque(maxlen=MAX_MESSAGES)
-        self._activity: str | None = None
-
-    def emit(self, event: Event) -> None:
-        """Remember the event and the messages in it."""
-        self._status.emit(event)
-        if not isinstance(event, Tick):
-            return
-        self._messages.extend(event.texts)
-        if event.activity != self._activity:
-            self._activity = event.activity
-            self._messages.append(event.activity)
-
-    def show_message(self, text: str) -> None:
-        """Show a message with the next refresh."""
-        self._messages.append(text)
-
     @contextmanager
     def live(self) -> Iterator[None]:
         """Show the status line, if there is a terminal, until the end of the block."""
@@ -142,7 +127,7 @@ class FlightScreen:
         Without a terminal, the line is printed every ``PLAIN_PERIOD_S``.
         """
         self._print_messages()
-        line = self._status.render()
+        line = self.status_line()
         self._refreshes += 1
         if self._console.is_terminal:
             self._live.update(line, refresh=True)
