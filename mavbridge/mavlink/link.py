@@ -12,11 +12,9 @@ from mavbridge.mavlink.codec.messages import (
     CommandAck,
     CommandRequest,
     Heartbeat,
-    StatusText,
     Timesync,
 )
 from mavbridge.mavlink.codec.packets import Codec, manual_control_sticks, pwm_of
-from mavbridge.mavlink.session import params
 from mavbridge.mavlink.session.discovery import VehicleDiscovery, VehicleIdentity
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.timesync import TimesyncFilter
@@ -63,7 +61,6 @@ class MavlinkLink:
         self._calibration: RcCalibration | None = None
         """Calibration of the last override that was sent: a release needs it even if the vehicle
         has rebooted since."""
-        self._has_advised = False
         self._was_confirmed = False
         self._is_drained = False
         """``wait_for_attitude`` has just received everything."""
@@ -79,7 +76,7 @@ class MavlinkLink:
             self._receive_all()
         self._is_drained = False
         if self._vehicle is not None and self._vehicle.has_rebooted:
-            self._connection.texts.append("the vehicle has rebooted: starting over")
+            self._report("the vehicle has rebooted: starting over")
             self._adopt(self._vehicle.identity)
         return self._snapshot(self._clock.now_ns())
 
@@ -114,21 +111,14 @@ class MavlinkLink:
         ):
             return
         self._counters.receive(message.name, message.sequence, arrived_ns)
-        vehicle.handshake.streams.receive(message.name)
         match message.body:
-            case None:
-                return
             case Timesync() as reply:
-                self._counters.round_trip(self._timesync.receive(reply, arrived_ns))
-            case StatusText(text=text):
-                self._connection.texts.append(f"vehicle: {text}")
+                self._timesync.receive(reply, arrived_ns)
             case CommandAck() as ack if ack.target not in ((0, 0), self._codec.source):
                 return  # an answer to another station
             case CommandAck() as ack:
                 self._report_refusal(ack)
-                vehicle.receive(ack, arrived_ns)
-            case body:
-                vehicle.receive(body, arrived_ns)
+        vehicle.receive(message, arrived_ns)
 
     def _report_refusal(self, ack: CommandAck) -> None:
         if ack.command not in self._requested_ns or ack.result == dialect.MAV_RESULT_ACCEPTED:
@@ -136,7 +126,7 @@ class MavlinkLink:
         command = dialect.enums["MAV_CMD"][ack.command].name.removeprefix("MAV_CMD_")
         result = dialect.enums["MAV_RESULT"].get(ack.result)
         reason = result.name.removeprefix("MAV_RESULT_") if result else ack.result
-        self._connection.texts.append(f"the vehicle answered {command} with {reason}")
+        self._report(f"the vehicle answered {command} with {reason}")
 
     def _snapshot(self, now_ns: int) -> LinkSnapshot:
         texts = tuple(self._connection.texts)
@@ -165,9 +155,9 @@ class MavlinkLink:
         has_echo = self._config.output == "rc-override"
         is_confirmed = self._vehicle is not None and self._vehicle.echo.confirmed
         return self._counters.stats(
+            self._timesync,
             echo_confirmed=(self._was_confirmed or is_confirmed) if has_echo else None,
             unusable_packets=self._codec.bad_data_count,
-            clock_offset_ns=self._timesync.offset_ns,
         )
 
     @property
@@ -175,8 +165,7 @@ class MavlinkLink:
         """Autopilot and version, for the report."""
         if self._vehicle is None:
             return "none"
-        version = self._vehicle.handshake.version or ""
-        return f"{self._vehicle.identity.autopilot} {version}".strip()
+        return f"{self._vehicle.identity.autopilot} {self._vehicle.version or ''}".strip()
 
     # --- finding and keeping the vehicle
 
@@ -186,14 +175,20 @@ class MavlinkLink:
         if self._vehicle is None:
             self._find_vehicle(now_ns)
         elif (moved := self._discovery.moved(self._vehicle.identity, now_ns)) is not None:
-            text = f"the vehicle now sends from {moved.address}: starting over"
-            self._connection.texts.append(text)
+            self._report(f"the vehicle now sends from {moved.address}: starting over")
             self._adopt(moved)
-        self._send_requests(now_ns)
+        if now_ns >= self._heartbeat_due_ns:
+            self._heartbeat_due_ns = now_ns + period_ns(HEARTBEAT_HZ)
+            self._connection.send(self._codec.encode_heartbeat())
+        if (vehicle := self._vehicle) is None:
+            return
+        for request in vehicle.step(now_ns):
+            self._connection.send(self._codec.encode_request(vehicle.identity.source, request))
+        if (ts1 := self._timesync.request(now_ns)) is not None:
+            self._connection.send(self._codec.encode_timesync(ts1))
 
     def _find_vehicle(self, now_ns: int) -> None:
-        identity = self._discovery.choose(now_ns)
-        if identity is not None:
+        if (identity := self._discovery.choose(now_ns)) is not None:
             self._adopt(identity)
             return
         waited_ns = now_ns - self._started_ns
@@ -205,25 +200,14 @@ class MavlinkLink:
 
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""
-        self._vehicle = VehicleSession(identity, self._config, state_hz=self._state_hz)
+        self._vehicle = VehicleSession(
+            identity, self._config, state_hz=self._state_hz, report=self._report
+        )
         self._counters.new_sequence()
-        self._has_advised = False
         self._connection.answer_to(identity.address)
 
-    def _send_requests(self, now_ns: int) -> None:
-        if now_ns >= self._heartbeat_due_ns:
-            self._heartbeat_due_ns = now_ns + period_ns(HEARTBEAT_HZ)
-            self._connection.send(self._codec.encode_heartbeat())
-        vehicle = self._vehicle
-        if vehicle is None:
-            return
-        for request in vehicle.handshake.step(now_ns):
-            self._connection.send(self._codec.encode_request(vehicle.identity.source, request))
-        if (ts1 := self._timesync.request(now_ns)) is not None:
-            self._connection.send(self._codec.encode_timesync(ts1))
-        if not self._has_advised and vehicle.handshake.problem is None:
-            self._has_advised = True
-            self._connection.texts += params.override_advice(vehicle.handshake.values)
+    def _report(self, text: str) -> None:
+        self._connection.texts.append(text)
 
     def set_mode(self, mode: str) -> None:
         """Request a flight mode, at most once a second."""

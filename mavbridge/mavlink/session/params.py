@@ -29,6 +29,10 @@ class ParamReader:
         """Time of the last request and number of requests."""
         self.values: dict[str, float] = {}
 
+    def request(self, names: tuple[str, ...]) -> None:
+        """Read these parameters as well."""
+        self._waiting |= dict.fromkeys(names)
+
     @property
     def is_done(self) -> bool:
         """Every parameter has arrived or was given up."""

@@ -4,6 +4,7 @@ from collections import deque
 
 from mavbridge.config.rates import TIMESYNC_HZ, period_ns
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.histogram import Histogram
 from mavbridge.mavlink.codec.messages import Timesync
 
 _WINDOW = 20
@@ -21,6 +22,7 @@ class TimesyncFilter:
         self._outstanding: deque[int] = deque(maxlen=_OUTSTANDING)
         self._samples: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
         self._next_ns = 0
+        self.round_trips = Histogram()
 
     def request(self, now_ns: int) -> int | None:
         """ts1 of the request that is due, if any."""
@@ -30,16 +32,15 @@ class TimesyncFilter:
         self._outstanding.append(now_ns)
         return now_ns
 
-    def receive(self, reply: Timesync, arrived_ns: int) -> int | None:
-        """Round trip of a reply to us in ns; None for a request or a reply to another station."""
+    def receive(self, reply: Timesync, arrived_ns: int) -> None:
+        """Take a TIMESYNC; requests and replies to other stations are ignored."""
         if reply.tc1 == 0 or reply.ts1 not in self._outstanding:
-            return None
+            return
         self._outstanding.remove(reply.ts1)
         round_trip_ns = arrived_ns - reply.ts1
-        if not 0 <= round_trip_ns < NS_PER_S:
-            return None
-        self._samples.append((round_trip_ns, reply.tc1 - (reply.ts1 + arrived_ns) // 2))
-        return round_trip_ns
+        if 0 <= round_trip_ns < NS_PER_S:
+            self._samples.append((round_trip_ns, reply.tc1 - (reply.ts1 + arrived_ns) // 2))
+            self.round_trips.add(round_trip_ns)
 
     @property
     def offset_ns(self) -> int | None:

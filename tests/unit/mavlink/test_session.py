@@ -271,11 +271,13 @@ def test_only_answers_to_our_own_requests_count() -> None:
     ts1 = sync.request(1_000)
     assert ts1 == 1_000
     assert sync.request(2_000) is None  # not due yet
-    assert sync.receive(Timesync(tc1=0, ts1=ts1), 3_000) is None  # a request of somebody
-    assert sync.receive(Timesync(tc1=5, ts1=77), 3_000) is None  # somebody else's answer
-    assert sync.receive(Timesync(tc1=10_000, ts1=ts1), 5_000) == 4_000
-    assert sync.receive(Timesync(tc1=10_000, ts1=ts1), 5_000) is None  # said twice
+    sync.receive(Timesync(tc1=0, ts1=ts1), 3_000)  # a request of another station
+    sync.receive(Timesync(tc1=5, ts1=77), 3_000)  # an answer to another station
+    assert sync.offset_ns is None
+    sync.receive(Timesync(tc1=10_000, ts1=ts1), 5_000)
+    sync.receive(Timesync(tc1=20_000, ts1=ts1), 5_000)  # answered twice
     assert sync.offset_ns == 10_000 - 3_000
+    assert (sync.round_trips.count, sync.round_trips.max_ns) == (1, 4_000)
 
 
 def test_the_fastest_exchange_sets_the_offset() -> None:
@@ -381,21 +383,20 @@ def test_a_worse_message_never_overwrites_a_better_live_one() -> None:
 
 
 def test_losses_are_gaps_in_the_sequence() -> None:
-    counters = LinkCounters()
-    assert (
-        counters.stats(echo_confirmed=None, unusable_packets=0, clock_offset_ns=None).lost_fraction
-        is None
-    )
+    counters, sync = LinkCounters(), TimesyncFilter()
+    nothing = counters.stats(sync, echo_confirmed=None, unusable_packets=0)
+    assert (nothing.lost_fraction, nothing.rtt_ms, nothing.vehicle_clock_offset_ns) == (None,) * 3
     for k, sequence in enumerate((254, 255, 0, 2, 3)):  # one lost, and a wrap that is none
         counters.receive("ATTITUDE", sequence, k * S)
     counters.new_sequence()
     counters.receive("HEARTBEAT", 99, 10 * S)
-    counters.round_trip(None)
-    counters.round_trip(2 * NS_PER_MS)
-    stats = counters.stats(echo_confirmed=True, unusable_packets=3, clock_offset_ns=-5)
+    ts1 = sync.request(S)
+    assert ts1 is not None
+    sync.receive(Timesync(tc1=S, ts1=ts1), ts1 + 2 * NS_PER_MS)
+    stats = counters.stats(sync, echo_confirmed=True, unusable_packets=3)
     assert stats.lost_fraction == pytest.approx(1 / 7)
     assert stats.messages_per_s == (("ATTITUDE", 0.5), ("HEARTBEAT", 0.1))
     assert stats.rtt_ms is not None
     assert stats.rtt_ms.p50 == pytest.approx(2.0, rel=0.01)
-    assert (stats.unusable_packets, stats.vehicle_clock_offset_ns) == (3, -5)
+    assert (stats.unusable_packets, stats.vehicle_clock_offset_ns) == (3, -NS_PER_MS)
     assert stats.echo_confirmed is None  # nothing was sent: there was nothing to confirm
