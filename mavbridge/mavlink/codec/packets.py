@@ -47,34 +47,43 @@ class Codec:
         self._mav.buf_index = 0
 
     def decode_datagram(self, data: bytes) -> Iterator[ReceivedMessage]:
-        """Messages of one datagram, which nearly always starts with a packet.
+        """Messages of one datagram, which nearly always is one whole packet.
 
         What was left of an earlier datagram was then cut off, and must not swallow this one. A
         datagram that starts otherwise may be the next piece of a forwarded serial stream.
         """
         if data[:1] in _PACKET_STARTS:
             self.forget_partial()
-        elif not self._mav.buf_len():
+            try:
+                message = self._mav.decode(bytearray(data))  # in half the time of the parser
+            except dialect.MAVError:
+                yield from self.decode(data)
+            else:
+                yield self._read(message)
+        elif self._mav.buf_len():
+            yield from self.decode(data)
+        else:
             self.bad_data_count += 1
-            return
-        yield from self.decode(data)
 
     def decode(self, data: bytes) -> Iterator[ReceivedMessage]:
         """Messages completed by these bytes; corrupt bytes and unusable values are counted."""
         for message in self._mav.parse_buffer(data) or ():
-            name = message.get_type()
-            if name == "BAD_DATA":
+            if message.get_type() == "BAD_DATA":
                 self.bad_data_count += 1
-                continue
-            reader = READERS.get(name)
-            try:
-                body = None if reader is None else reader(message)
-            except UnusableError:
-                self.bad_data_count += 1
-                body = None
-            source = Endpoint(message.get_srcSystem(), message.get_srcComponent())
-            packet = bytes(message.get_msgbuf())
-            yield ReceivedMessage(source, message.get_seq(), name, body, packet)
+            else:
+                yield self._read(message)
+
+    def _read(self, message: dialect.MAVLink_message) -> ReceivedMessage:
+        name = message.get_type()
+        reader = READERS.get(name)
+        try:
+            body = None if reader is None else reader(message)
+        except UnusableError:
+            self.bad_data_count += 1
+            body = None
+        source = Endpoint(message.get_srcSystem(), message.get_srcComponent())
+        packet = bytes(message.get_msgbuf())
+        return ReceivedMessage(source, message.get_seq(), name, body, packet)
 
     def _pack(self, message: dialect.MAVLink_message) -> bytes:
         data: bytes = message.pack(self._mav)
