@@ -225,7 +225,7 @@ class RerunView:
         self._send(AGE, index, _ms([_ages_ns(tick) for tick in ticks]))
         self._send(ACTION_PERIOD, index, period_ms)
         self._send(ACTION_JITTER, index, jitter_ms)
-        self._send(PREDICT, index, _ms([_or_gap(tick.predict_ns) for tick in ticks]))
+        self._send(PREDICT, index, _ms([tick.predict_ns for tick in ticks]))
         self._send(MISSED, index, missed)
         stages = np.array([_stick_stages(tick) for tick in ticks])
         for axis, plot in enumerate(STICKS):
@@ -311,20 +311,16 @@ class _Periods:
         return period_ms, np.abs(period_ms - self._target_ms)
 
 
-def _ms(values_ns: Sequence[float] | Sequence[tuple[float, ...]]) -> FloatColumn:
+def _ms(values_ns: Sequence[float | None] | Sequence[tuple[float | None, ...]]) -> FloatColumn:
+    """Milliseconds; a missing value becomes NaN, which breaks its line."""
     return np.array(values_ns, dtype=np.float64) / NS_PER_MS
 
 
-def _or_gap(value: float | None) -> float:
-    """NaN, which breaks the line, for a missing value; a zero would be wrong."""
-    return math.nan if value is None else value
-
-
-def _ages_ns(tick: Tick) -> tuple[float, float]:
+def _ages_ns(tick: Tick) -> tuple[int | None, int | None]:
     feature_ns = tick.feature_captured_ns
     return (
-        math.nan if feature_ns is None else tick.sent_ns - feature_ns,
-        math.nan if tick.state is None else tick.sent_ns - tick.state.attitude_ns,
+        None if feature_ns is None else tick.sent_ns - feature_ns,
+        None if tick.state is None else tick.sent_ns - tick.state.attitude_ns,
     )
 
 

@@ -40,7 +40,7 @@ class _RateMeter:
         self._newest = (self._newest[0] + 1, stamp_ns)
 
     def sample_hz(self) -> float | None:
-        """To be called once a refresh; None while no events come."""
+        """Events per second, to be called once a refresh; None while no events come."""
         if self._newest[0] == 0:
             return None
         self._samples.append(self._newest)

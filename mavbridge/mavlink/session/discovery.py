@@ -1,4 +1,4 @@
-"""Finds the vehicle to fly among all that is heard on the link."""
+"""Finds the vehicle to fly among all senders on the link."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ AUTOPILOT_COMPONENT = 1
 SETTLE_NS = 3 * NS_PER_S // 2
 """Every vehicle sends a heartbeat at 1 Hz: after this long, a second vehicle has been heard."""
 MOVED_NS = 3 * NS_PER_S
-"""Silence after which a vehicle that speaks from a new address has moved there."""
+"""Silence after which a vehicle that sends from a new address has moved there."""
 
 _NOT_VEHICLES = frozenset(
     {
@@ -109,7 +109,7 @@ class VehicleDiscovery:
         return wanted[0]
 
     def moved(self, vehicle: VehicleIdentity, now_ns: int) -> VehicleIdentity | None:
-        """The same vehicle at the address that it now speaks from, if that has changed."""
+        """The same vehicle at the address that it now sends from, if that has changed."""
         if now_ns - self._heard_ns.get(vehicle, 0) < MOVED_NS:
             return None
         for other, heard_ns in self._heard_ns.items():
@@ -122,7 +122,7 @@ class VehicleDiscovery:
         if self._heard_ns:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
             return (
-                f"system {self._target_system} is silent, but heard system {heard}: "
+                f"system {self._target_system} is silent, but system {heard} was heard: "
                 "correct --target-system"
             )
         if self._others:

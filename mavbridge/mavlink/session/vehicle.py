@@ -105,7 +105,7 @@ class VehicleSession:
         return self._old_stamps >= _REBOOT_STAMPS
 
     def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
-        """Take one message from this vehicle, unless it is an answer to somebody else."""
+        """Take one message from this vehicle."""
         self._streams.receive(message.name)
         match message.body:
             case Attitude() | LocalVelocity() | SpecificForce() as body:
@@ -219,9 +219,7 @@ class VehicleSession:
         if switch is not None:
             channels_us = self._rc[1].channels_us if self._rc else ()
             if len(channels_us) < switch or channels_us[switch - 1] < _SWITCH_ON_US:
-                return (
-                    f"the override switch (RC{switch}) is off: switch it on to fly"
-                )
+                return f"the override switch (RC{switch}) is off: switch it on to fly"
         return None
 
     @cached_property
