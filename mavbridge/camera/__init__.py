@@ -1,5 +1,5 @@
 """Video sources behind the `Camera` port; `mavbridge.camera.open` picks one by its name.
 
-Every source gives its newest frame, counts those that nobody read, stamps each with the time of
-exposure (or failing that, of arrival), and says so when it has died.
+Every source returns its newest frame, counts the frames that were not read, stamps each with its
+exposure (or else its arrival), and raises CameraError when it has failed for good.
 """

@@ -1,9 +1,9 @@
-"""From the text after ``--camera`` to an open camera."""
+"""Opens the camera that ``--camera`` describes."""
 
 from functools import partial
 from pathlib import Path
 
-from mavbridge.camera.capture import DeviceSource, StreamSource
+from mavbridge.camera.capture import open_device, open_stream
 from mavbridge.camera.grabber import Grabber
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
@@ -22,10 +22,10 @@ def open_camera(spec: str, *, image_size: int, clock: Clock) -> Camera:
     """Open the source that ``spec`` names.
 
     ``image_size`` is the side of the policy's square image in pixels: a device is asked for a mode
-    that covers it. All other sources deliver the size that they have.
+    that covers it. All other sources deliver their own size.
 
     Raises:
-        UserError: ``spec`` is no known form, names no file, or needs a package that is absent.
+        UserError: ``spec`` has no known form, names no file, or needs a package that is missing.
         CameraError: the source cannot be opened.
     """
     kind, _, rest = spec.partition(":")
@@ -34,14 +34,14 @@ def open_camera(spec: str, *, image_size: int, clock: Clock) -> Camera:
     if kind == "screen":
         return _open_screen(rest, clock)
     if spec.startswith(STREAM_SCHEMES):
-        return Grabber(partial(StreamSource, spec, clock=clock), clock=clock)
+        return Grabber(partial(open_stream, spec, clock=clock), clock=clock)
     if spec.isdecimal() or spec.startswith("/dev/video"):
         device = int(spec) if spec.isdecimal() else Path(spec)
-        opener = partial(DeviceSource, device, image_size=image_size, clock=clock)
+        opener = partial(open_device, device, image_size=image_size, clock=clock)
         return Grabber(opener, clock=clock)
     path = Path(spec)
     if not path.is_file():
-        raise UserError(f"--camera {spec!r}: no such file, and no other source; want {FORMS}")
+        raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
     return VideoFileCamera(path, clock=clock)
 
 
@@ -49,9 +49,9 @@ def _open_screen(title: str, clock: Clock) -> Camera:
     try:
         from mavbridge.camera.screen import ScreenCamera
     except ModuleNotFoundError as error:
-        if error.name != "mss":
+        if error.name not in ("mss", "Xlib"):
             raise
         raise UserError(
-            "--camera screen: needs the package mss: pip install 'mavbridge[screen]'"
+            f"--camera screen: needs the package {error.name}: pip install 'mavbridge[screen]'"
         ) from error
     return ScreenCamera(title, clock=clock)

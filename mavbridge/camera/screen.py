@@ -1,4 +1,4 @@
-"""A window, or the whole screen, as a camera: for simulators that only show their view."""
+"""A window, or the whole screen, as a camera: for simulators that offer no other video."""
 
 from collections.abc import Sequence
 
@@ -7,21 +7,24 @@ import mss
 import numpy as np
 from mss.exception import ScreenShotError
 
+from mavbridge.camera.deadlines import wait_until_due
 from mavbridge.camera.x11 import Region, Window, X11Screen
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError, UserError
 from mavbridge.core.records import Frame
 
 INTERVAL_NS = NS_PER_S // 60
-"""Screens change no faster, and a capture costs milliseconds."""
+"""Screens change no faster, and a capture takes milliseconds."""
 
 
 class ScreenCamera:
-    """Captures what is on the screen where the window is, whatever may lie over it.
+    """Captures the area of the screen that a window covers, including whatever overlaps it.
 
-    Captures in ``read``, so that a frame is as old as the capture takes; a screen has no frames of
-    its own that could be dropped. A window may move and change its size.
+    Captures in ``read``, so a frame is as old as the capture takes, and none is ever dropped. The
+    window may be moved and resized.
     """
+
+    dropped_frames = 0
 
     def __init__(self, title: str, *, clock: Clock) -> None:
         """Find the window; an empty title stands for the whole screen.
@@ -36,7 +39,7 @@ class ScreenCamera:
         try:
             self._screen = mss.MSS()
         except ScreenShotError as error:
-            raise CameraError(f"there is no screen to capture: {error}") from error
+            raise CameraError(f"there is no screen to capture: {error}; is DISPLAY set?") from error
         if title:
             try:
                 self._windows = X11Screen()
@@ -45,18 +48,11 @@ class ScreenCamera:
                 self.close()
                 raise
         self._frame_count = 0
-        self._next_ns = clock.now_ns()
-
-    @property
-    def dropped_frames(self) -> int:
-        """None ever."""
-        return 0
+        self._due_ns = clock.now_ns()
 
     def read(self, timeout_ns: int) -> Frame | None:
         """See `mavbridge.core.ports.Camera`; at most 60 frames a second."""
-        deadline_ns = self._clock.now_ns() + timeout_ns
-        self._clock.sleep_until_ns(min(self._next_ns, deadline_ns))
-        if self._next_ns > deadline_ns:
+        if not wait_until_due(self._clock, self._due_ns, timeout_ns):
             return None
         captured_ns = self._clock.now_ns()
         region = self._region()
@@ -67,7 +63,7 @@ class ScreenCamera:
         rgb = np.asarray(cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGB), dtype=np.uint8)
         rgb.flags.writeable = False
         self._frame_count += 1
-        self._next_ns = captured_ns + INTERVAL_NS
+        self._due_ns = captured_ns + INTERVAL_NS
         return Frame(frame_id=self._frame_count, captured_ns=captured_ns, rgb=rgb)
 
     def close(self) -> None:
@@ -82,18 +78,20 @@ class ScreenCamera:
             return Region(**{side: everything[side] for side in Region._fields})
         region = self._windows.region(self._window.id)
         if region is None:
-            raise CameraError(f"the window {self._title!r} has been closed, hidden or moved away")
+            raise CameraError(
+                f"the window {self._title!r} has been closed, hidden or moved off the screen"
+            )
         return region
 
 
 def choose_window(windows: Sequence[Window], title: str) -> Window:
-    """The window of this title, or else the only one whose title contains it, in any case.
+    """The window with this title, or else the only one whose title contains it in any case.
 
     Window managers may give a frame the title of the window inside it, so of equal titles the last
-    is taken: the innermost, topmost one.
+    is chosen: the innermost, topmost one.
 
     Raises:
-        UserError: none or several; lists what there is.
+        UserError: there is none, or there are several; lists the windows.
     """
     exact = [window for window in windows if window.title == title]
     similar = [window for window in windows if title.casefold() in window.title.casefold()]

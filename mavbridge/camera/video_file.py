@@ -6,20 +6,22 @@ from pathlib import Path
 import cv2
 
 from mavbridge.camera.capture import retrieve_rgb
+from mavbridge.camera.deadlines import wait_until_due
+from mavbridge.camera.grabber import Image
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
-from mavbridge.core.records import Frame, ImageArray
+from mavbridge.core.records import Frame
 
 DEFAULT_FPS = 30.0
-"""For files without stamps and without a rate."""
+"""For files with neither stamps nor a rate."""
 
 
 class VideoFileCamera:
-    """Plays a file at its own pace on the injected clock, from the first ``read`` on.
+    """Plays a file in real time on the injected clock, from the first ``read`` on.
 
-    Frames become due at their own stamps; of several that are due, the newest is returned and the
-    others count as dropped. After the last frame ``read`` raises CameraError. Decodes in ``read``:
-    there is no thread.
+    Frames become due at their own stamps; if several are due, the newest is returned and the
+    others count as dropped. After the last frame ``read`` raises CameraError. Frames are decoded in
+    ``read``; there is no thread.
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
@@ -32,63 +34,52 @@ class VideoFileCamera:
         self._clock = clock
         self._capture = cv2.VideoCapture(str(path))
         fps = self._capture.get(cv2.CAP_PROP_FPS)
-        self._interval_ns = round(
-            NS_PER_S / (fps if math.isfinite(fps) and fps > 0 else DEFAULT_FPS)
-        )
+        has_rate = math.isfinite(fps) and fps > 0
+        self._interval_ns = round(NS_PER_S / (fps if has_rate else DEFAULT_FPS))
         self._start_ns: int | None = None
         self._frame_count = 0
-        self._dropped_frames = 0
+        self.dropped_frames = 0
         self._upcoming = self._decode(previous_ns=None)
         if self._upcoming is None:
             self._capture.release()
-            raise CameraError(f"{path} holds no video that can be decoded")
-
-    @property
-    def dropped_frames(self) -> int:
-        """Frames that became due and were followed by another before they were read."""
-        return self._dropped_frames
+            raise CameraError(f"{path} contains no video that can be decoded")
 
     def read(self, timeout_ns: int) -> Frame | None:
         """See `mavbridge.core.ports.Camera`."""
-        now_ns = self._clock.now_ns()
-        deadline_ns = now_ns + timeout_ns
         if self._start_ns is None:
-            self._start_ns = now_ns
+            self._start_ns = self._clock.now_ns()
         if self._upcoming is None:
             raise CameraError(f"{self._path}: video ended after {self._frame_count} frames")
-        due_ns = self._start_ns + self._upcoming[0]
-        self._clock.sleep_until_ns(min(due_ns, deadline_ns))
-        if due_ns > deadline_ns:
+        if not wait_until_due(self._clock, self._start_ns + self._upcoming.captured_ns, timeout_ns):
             return None
-        return self._newest_due(self._start_ns, self._clock.now_ns())
+        newest, played_ns = self._upcoming, self._clock.now_ns() - self._start_ns
+        self._frame_count += 1
+        self._upcoming = self._decode(previous_ns=newest.captured_ns)
+        while self._upcoming is not None and self._upcoming.captured_ns <= played_ns:
+            newest = self._upcoming
+            self.dropped_frames += 1
+            self._frame_count += 1
+            self._upcoming = self._decode(previous_ns=newest.captured_ns)
+        return Frame(
+            frame_id=self._frame_count,
+            captured_ns=self._start_ns + newest.captured_ns,
+            rgb=newest.rgb,
+        )
 
     def close(self) -> None:
         """Close the file."""
         self._capture.release()
 
-    def _newest_due(self, start_ns: int, now_ns: int) -> Frame | None:
-        newest = None
-        while self._upcoming is not None and start_ns + self._upcoming[0] <= now_ns:
-            self._dropped_frames += newest is not None
-            self._frame_count += 1
-            newest = self._upcoming
-            self._upcoming = self._decode(previous_ns=newest[0])
-        if newest is None:
-            return None
-        stamp_ns, rgb = newest
-        return Frame(frame_id=self._frame_count, captured_ns=start_ns + stamp_ns, rgb=rgb)
+    def _decode(self, *, previous_ns: int | None) -> Image | None:
+        """The next frame, stamped with its time in the file; None at the end.
 
-    def _decode(self, *, previous_ns: int | None) -> tuple[int, ImageArray] | None:
-        """The next frame and its time since the start of the file; None at the end.
-
-        A stamp that does not increase, as in files that carry none, is replaced by the nominal one.
+        A stamp that does not increase, as in files without stamps, is replaced by the nominal one.
         """
         if not self._capture.grab():
             return None
-        stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
         rgb = retrieve_rgb(self._capture, str(self._path))
         rgb.flags.writeable = False
-        stamp_ns = round(stamp_ms * NS_PER_MS)
         if previous_ns is not None and stamp_ns <= previous_ns:
             stamp_ns = previous_ns + self._interval_ns
-        return stamp_ns, rgb
+        return Image(stamp_ns, rgb)

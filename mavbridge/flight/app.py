@@ -107,7 +107,7 @@ class _Flight:
             clock,
             config.link,
             state_hz=loops.state_hz,
-            tap=self._observers.packets,
+            packet_log=self._observers.packets,
         )
         stack.callback(self._link.close)
         self._observers.open_viewer(stack)
@@ -155,7 +155,7 @@ class _Flight:
         def run_settled(stop: threading.Event) -> None:
             refusal = settle_thread(realtime=realtime, cpu=cpu)
             if refusal is not None:
-                self._observers.screen.tell(refusal)
+                self._observers.screen.show_message(refusal)
             run(stop)
 
         return run_settled

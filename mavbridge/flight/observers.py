@@ -14,7 +14,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.observers import ObserverThread
 from mavbridge.core.ports import TickSink
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.tap import PacketTap
+from mavbridge.mavlink.transport.packet_log import PacketLog
 from mavbridge.observe.rerun_flight import RerunView
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
@@ -52,7 +52,7 @@ class FlightObservers:
         self.screen = FlightScreen(
             console, action_hz=action_hz, vision_hz=vision_hz, readonly=config.link.readonly
         )
-        self.packets = None if config.record is None else PacketTap()
+        self.packets = None if config.record is None else PacketLog()
 
     @property
     def sinks(self) -> tuple[TickSink, ...]:
@@ -104,7 +104,7 @@ class FlightObservers:
                 packets=self.packets,
                 wall_offset_ns=offset_ns,
                 autopilot=lambda: link.autopilot,
-                tell=self.screen.tell,
+                tell=self.screen.show_message,
             )
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error

@@ -1,15 +1,14 @@
-"""A flight in the Rerun viewer; the only module that imports rerun.
+"""A flight in the Rerun viewer.
 
-Runs as the consumer of an ``ObserverThread``. The SDK blocks its caller while a viewer does not
-keep up, at the end of the flight too; here the caller is that thread, whose queue then drops and
-counts, and whose ``close`` has a deadline. Each batch becomes one ``send_columns`` a plot, which
-costs a tenth of one ``log`` a value.
+The view is the consumer of an ``ObserverThread``: the SDK blocks its caller while a viewer does not
+keep up, even at the end of the flight, so the caller is that thread, whose queue drops and counts
+events and whose ``close`` has a deadline. Each batch becomes one ``send_columns`` per plot, which
+costs a tenth of one ``log`` per value.
 """
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 from uuid import uuid4
 
 import cv2
@@ -25,9 +24,7 @@ from mavbridge.observe.rerun_target import RrdFile, prepare_target
 
 JPEG_QUALITY = 85
 MAX_IMAGE_WIDTH = 640
-"""Wider images are scaled down: the viewer shows them no larger."""
-RC_CHANNELS_SHOWN = 4
-"""The sticks' channels, unless RCMAP_* says otherwise; the stick plots show the mapped echo."""
+"""Wider images are scaled down, since the viewer does not show them any larger."""
 
 CAMERA = "camera"
 EVENTS = "events"
@@ -45,69 +42,55 @@ _WHITE: _Rgb = (235, 235, 235)
 _GREY: _Rgb = (135, 135, 135)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Series:
+class _Series(NamedTuple):
     name: str
     color: _Rgb
     width: float = 1.5
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Plot:
+class _Plot(NamedTuple):
     """One entity: series that share their stamps."""
 
     path: str
     series: tuple[_Series, ...]
 
 
-AGE = _Plot(
-    path="age",
-    series=(
-        _Series(name="feature age", color=_BLUE),
-        _Series(name="state age", color=_ORANGE),
-    ),
+AGE = _Plot("age", (_Series("feature age", _BLUE), _Series("state age", _ORANGE)))
+ACTION_PERIOD = _Plot("period/action", (_Series("action", _BLUE),))
+VISION_PERIOD = _Plot("period/vision", (_Series("vision", _ORANGE),))
+ACTION_JITTER = _Plot("jitter/action", (_Series("action", _BLUE),))
+VISION_JITTER = _Plot("jitter/vision", (_Series("vision", _ORANGE),))
+PREDICT = _Plot("compute/action", (_Series("predict", _BLUE),))
+ENCODE = _Plot("compute/vision", (_Series("encode", _ORANGE),))
+MISSED = _Plot("missed/action", (_Series("missed slots", _BLUE),))
+DROPPED = _Plot("missed/vision", (_Series("dropped frames", _ORANGE),))
+_STICK_SERIES = (
+    _Series("vehicle's echo", _GREEN, width=4),  # first: drawn under the sticks
+    _Series("raw", _GREY),
+    _Series("clipped", _PINK),
+    _Series("slewed", _YELLOW),
+    _Series("smoothed", _BLUE),
+    _Series("sent", _WHITE),
 )
-ACTION_PERIOD = _Plot(path="period/action", series=(_Series(name="action", color=_BLUE),))
-VISION_PERIOD = _Plot(path="period/vision", series=(_Series(name="vision", color=_ORANGE),))
-ACTION_JITTER = _Plot(path="jitter/action", series=(_Series(name="action", color=_BLUE),))
-VISION_JITTER = _Plot(path="jitter/vision", series=(_Series(name="vision", color=_ORANGE),))
-PREDICT = _Plot(path="compute/action", series=(_Series(name="predict", color=_BLUE),))
-ENCODE = _Plot(path="compute/vision", series=(_Series(name="encode", color=_ORANGE),))
-MISSED = _Plot(path="missed/action", series=(_Series(name="missed slots", color=_BLUE),))
-DROPPED = _Plot(path="missed/vision", series=(_Series(name="dropped frames", color=_ORANGE),))
-STICKS = tuple(  # the echo lies under what it should match
-    _Plot(
-        path=f"sticks/{axis}",
-        series=(
-            _Series(name="vehicle's echo", color=_GREEN, width=4),
-            _Series(name="raw", color=_GREY),
-            _Series(name="clipped", color=_PINK),
-            _Series(name="slewed", color=_YELLOW),
-            _Series(name="smoothed", color=_BLUE),
-            _Series(name="sent", color=_WHITE),
-        ),
-    )
-    for axis in Sticks._fields
-)
+STICKS = tuple(_Plot(f"sticks/{axis}", _STICK_SERIES) for axis in Sticks._fields)
 RC = _Plot(
-    path="rc",
-    series=tuple(
-        _Series(name=f"channel {number}", color=color)
-        for number, color in zip(
-            range(1, RC_CHANNELS_SHOWN + 1), (_BLUE, _ORANGE, _GREEN, _PINK), strict=True
-        )
+    "rc",
+    tuple(
+        _Series(f"channel {number + 1}", color)
+        for number, color in enumerate((_BLUE, _ORANGE, _GREEN, _PINK))
     ),
 )
-_EVENT_COLUMNS = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
-"""The viewer's own time column is too narrow to read: the text starts with the time."""
+"""Channels 1 to 4 hold the sticks, unless RCMAP_* says otherwise; the stick plots are mapped."""
 PLOTS = (
     *(AGE, ACTION_PERIOD, VISION_PERIOD, ACTION_JITTER, VISION_JITTER),
     *(PREDICT, ENCODE, MISSED, DROPPED, *STICKS, RC),
 )
+_EVENT_COLUMNS = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
+"""The viewer's own time column is too narrow to read, so the text starts with the time."""
 
 
 def flight_blueprint() -> rrb.Blueprint:
-    """What the viewer opens on: the scene, what it costs, the loops, the sticks."""
+    """Initial layout of the viewer: scene, ages and computing times, loops, sticks."""
     scene = rrb.Vertical(
         rrb.Spatial2DView(origin=CAMERA, name="Camera: what the policy sees"),
         rrb.TextLogView(origin=EVENTS, name="Events", columns=_EVENT_COLUMNS),
@@ -121,7 +104,7 @@ def flight_blueprint() -> rrb.Blueprint:
     loops = rrb.Vertical(
         _time_series("Period of the loops [ms]", ACTION_PERIOD, VISION_PERIOD),
         _time_series("Jitter: |period - target| [ms]", ACTION_JITTER, VISION_JITTER),
-        _time_series("Missed slots, dropped frames [since start]", MISSED, DROPPED),
+        _time_series("Missed slots, dropped frames [since the start]", MISSED, DROPPED),
     )
     sticks = rrb.Vertical(
         *(
@@ -130,7 +113,7 @@ def flight_blueprint() -> rrb.Blueprint:
             )
             for axis, plot in zip(Sticks._fields, STICKS, strict=True)
         ),
-        row_shares=[4, 3, 3, 3],  # the first has the legend of all
+        row_shares=[4, 3, 3, 3],  # the first contains the legend for all
     )
     return rrb.Blueprint(
         rrb.Horizontal(scene, freshness, loops, sticks),
@@ -155,7 +138,7 @@ def _time_series(
 
 
 def _style(plot: _Plot) -> rr.SeriesLines:
-    """Names and colours; zoomed out, a line shows its extremes: an average would hide a stall."""
+    """Names and colours; zoomed out, lines show their extremes, since averages hide stalls."""
     return rr.SeriesLines(
         names=[series.name for series in plot.series],
         colors=[series.color for series in plot.series],
@@ -165,26 +148,26 @@ def _style(plot: _Plot) -> rr.SeriesLines:
 
 
 class RerunView:
-    """Consumer that shows ticks and vision ticks, on the timelines ``time`` and ``tick``.
+    """Shows ticks and vision ticks on the timelines ``time`` and ``tick``.
 
-    A row of a tick is stamped with its wake-up, numbers of a frame with the end of its encoding,
-    the image with its exposure; ``time`` is zero at the first tick. What was not measured is a gap
-    in its line.
+    ``time`` starts at the first tick. Values of a tick are stamped with its wake-up, values of a
+    frame with the end of its encoding, images with their exposure. A value that was not measured
+    is a gap in its line.
     """
 
     def __init__(self, target: str, *, action_hz: float, vision_hz: float) -> None:
-        """Check the target; every call that can block is left to ``consume`` and ``close``.
+        """Check the target; calls that may block are left to ``consume`` and ``close``.
 
         Args:
             target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
-            action_hz: what the action loop is asked for; jitter is measured against it.
-            vision_hz: what the vision loop is asked for.
+            action_hz: target rate of the action loop; jitter is measured against it.
+            vision_hz: target rate of the vision loop.
 
         Raises:
-            MavbridgeError: as ``rerun_target.prepare_target``.
+            MavbridgeError: see ``rerun_target.prepare_target``.
         """
         self._target = prepare_target(target)
-        rr.unregister_shutdown()  # its atexit hook waits for ever for a viewer that stalls
+        rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
         self._recording = rr.RecordingStream("mavbridge", recording_id=uuid4())
         self._is_open = False
         self._action_periods = _Periods(action_hz)
@@ -192,6 +175,7 @@ class RerunView:
         self._origin_ns: int | None = None
         self._last_tick: Tick | None = None
         self._missed_slots = 0
+        self._first_dropped: int | None = None
 
     def consume(self, batch: Sequence[Event]) -> None:
         """Send one batch; blocks while the viewer does not keep up."""
@@ -208,7 +192,7 @@ class RerunView:
             self._last_tick = ticks[-1]
 
     def close(self) -> None:
-        """Deliver what is left and let go of the file or viewer; blocks until it has taken all.
+        """Deliver the rest and close the file or connection; blocks until all is taken.
 
         Raises:
             MavbridgeError: the viewer is gone.
@@ -241,7 +225,7 @@ class RerunView:
         self._send(AGE, index, _ms([_ages_ns(tick) for tick in ticks]))
         self._send(ACTION_PERIOD, index, period_ms)
         self._send(ACTION_JITTER, index, jitter_ms)
-        self._send(PREDICT, index, _ms([_or_gap(tick.predict_ns) for tick in ticks]))
+        self._send(PREDICT, index, _ms([tick.predict_ns for tick in ticks]))
         self._send(MISSED, index, missed)
         stages = np.array([_stick_stages(tick) for tick in ticks])
         for axis, plot in enumerate(STICKS):
@@ -255,7 +239,10 @@ class RerunView:
         self._send(VISION_PERIOD, index, period_ms)
         self._send(VISION_JITTER, index, jitter_ms)
         self._send(ENCODE, index, _ms([vision.ready_ns - vision.started_ns for vision in visions]))
-        self._send(DROPPED, index, np.array([vision.dropped_frames for vision in visions]))
+        dropped = np.array([vision.dropped_frames for vision in visions])
+        if self._first_dropped is None:
+            self._first_dropped = int(dropped[0])
+        self._send(DROPPED, index, dropped - self._first_dropped)
         captured_ns = [vision.captured_ns for vision in visions]
         self._recording.send_columns(
             CAMERA,
@@ -270,25 +257,27 @@ class RerunView:
     def _send_events(self, ticks: list[Tick]) -> None:
         before = [self._last_tick, *ticks[:-1]]
         changes = [
-            (tick, change)
+            (tick, *change)
             for last, tick in zip(before, ticks, strict=True)
             for change in _changes(last, tick)
         ]
         if not changes:
             return
+        changed, texts, levels, colors = zip(*changes, strict=True)
+        since_s = [(tick.woke_ns - (self._origin_ns or 0)) / NS_PER_S for tick in changed]
         self._recording.send_columns(
             EVENTS,
-            self._index([t.woke_ns for t, _ in changes], [t.index for t, _ in changes]),
+            self._index([tick.woke_ns for tick in changed], [tick.index for tick in changed]),
             rr.TextLog.columns(
-                text=[f"{self._since_s(tick):6.2f} s  {change.text}" for tick, change in changes],
-                level=[change.level for _, change in changes],
-                color=[change.color for _, change in changes],
+                text=[f"{t_s:6.2f} s  {text}" for t_s, text in zip(since_s, texts, strict=True)],
+                level=levels,
+                color=colors,
             ),
             strict=True,
         )
 
     def _tick_indexes_at(self, stamps_ns: list[int], ticks: list[Tick]) -> list[int]:
-        """Index of the last tick that had woken at each stamp, as far as this batch tells."""
+        """Index of the last tick before each stamp, as far as this batch shows."""
         known = [tick for tick in (self._last_tick, *ticks) if tick is not None]
         if not known:
             return [0] * len(stamps_ns)
@@ -301,9 +290,6 @@ class RerunView:
             rr.TimeColumn("time", duration=since_ns.astype("timedelta64[ns]")),
             rr.TimeColumn("tick", sequence=tick_indexes),
         ]
-
-    def _since_s(self, tick: Tick) -> float:
-        return (tick.woke_ns - (self._origin_ns or 0)) / NS_PER_S
 
     def _send(self, plot: _Plot, index: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         columns = rr.Scalars.columns(scalars=values.reshape(-1, len(plot.series)))
@@ -318,27 +304,23 @@ class _Periods:
         self._last_ns: int | None = None
 
     def extend(self, stamps_ns: list[int]) -> tuple[FloatColumn, FloatColumn]:
-        """(period, |period - target|) in ms; a gap for the very first stamp."""
+        """Period and |period - target| in ms; a gap for the very first stamp."""
         first_ns = math.nan if self._last_ns is None else stamps_ns[0] - self._last_ns
         period_ms = _ms([first_ns, *np.diff(stamps_ns)])
         self._last_ns = stamps_ns[-1]
         return period_ms, np.abs(period_ms - self._target_ms)
 
 
-def _ms(values_ns: Sequence[float] | Sequence[tuple[float, ...]]) -> FloatColumn:
+def _ms(values_ns: Sequence[float | None] | Sequence[tuple[float | None, ...]]) -> FloatColumn:
+    """Milliseconds; a missing value becomes NaN, which breaks its line."""
     return np.array(values_ns, dtype=np.float64) / NS_PER_MS
 
 
-def _or_gap(value: float | None) -> float:
-    """NaN breaks the line; a zero would lie."""
-    return math.nan if value is None else value
-
-
-def _ages_ns(tick: Tick) -> tuple[float, float]:
+def _ages_ns(tick: Tick) -> tuple[int | None, int | None]:
     feature_ns = tick.feature_captured_ns
     return (
-        math.nan if feature_ns is None else tick.sent_ns - feature_ns,
-        math.nan if tick.state is None else tick.sent_ns - tick.state.attitude_ns,
+        None if feature_ns is None else tick.sent_ns - feature_ns,
+        None if tick.state is None else tick.sent_ns - tick.state.attitude_ns,
     )
 
 
@@ -351,30 +333,23 @@ def _stick_stages(tick: Tick) -> tuple[Sticks, ...]:
 
 
 def _rc_channels(tick: Tick) -> tuple[float, ...]:
-    shown = tick.rc_channels_us[:RC_CHANNELS_SHOWN]
-    return shown + (math.nan,) * (RC_CHANNELS_SHOWN - len(shown))
+    shown = tick.rc_channels_us[: len(RC.series)]
+    return shown + (math.nan,) * (len(RC.series) - len(shown))
 
 
-@dataclass(frozen=True, slots=True)
-class _Change:
-    text: str
-    level: str = "INFO"
-    color: _Rgb = _WHITE
-
-
-def _changes(before: Tick | None, now: Tick) -> Iterator[_Change]:
-    """What a person should know of this tick and did not know before."""
+def _changes(before: Tick | None, now: Tick) -> Iterator[tuple[str, str, _Rgb]]:
+    """Text, level and colour of everything in this tick that is new to the user."""
     if before is None or before.activity != now.activity:
         if now.release_reason is None:
-            yield _Change(now.activity, color=_GREEN if now.trace else _WHITE)
+            yield now.activity, "INFO", _GREEN if now.trace else _WHITE
         else:
-            yield _Change(now.activity, "WARN", _ORANGE)
+            yield now.activity, "WARN", _ORANGE
     if now.mode is not None and (before is None or before.mode != now.mode):
-        yield _Change(f"mode {now.mode}")
+        yield f"mode {now.mode}", "INFO", _WHITE
     if before is None or before.armed != now.armed:
-        yield _Change("armed" if now.armed else "disarmed")
+        yield "armed" if now.armed else "disarmed", "INFO", _WHITE
     for text in now.texts:
-        yield _Change(text)
+        yield text, "INFO", _WHITE
 
 
 def _jpeg(rgb: ImageArray) -> bytes:

@@ -1,7 +1,4 @@
-"""Where a Rerun recording goes (``--rerun``): checked, and if need be started, before the flight.
-
-Knows files, ports and the viewer's process; not the SDK.
-"""
+"""Checks the target of a Rerun recording (``--rerun``) and starts the viewer before the flight."""
 
 import socket
 import subprocess
@@ -9,7 +6,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TypeAlias
+from typing import TypeAlias
 from urllib.parse import urlsplit
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
@@ -19,11 +16,11 @@ VIEWER_PORT = 9876
 """Rerun's own default."""
 VIEWER_URL = f"rerun+http://{VIEWER_HOST}:{VIEWER_PORT}/proxy"
 VIEWER_MEMORY = "2GB"
-"""Oldest data goes first beyond this: the viewer shares the machine with the flight."""
+"""Beyond this the viewer drops its oldest data: it shares the machine with the flight."""
 CONNECT_TIMEOUT_S = 2.0
 SPAWN_TIMEOUT_S = 15.0
 SETTLE_S = 1.0
-"""A viewer without a display opens its port first and dies right after."""
+"""A viewer without a display opens its port first and exits right after."""
 _POLL_S = 0.1
 _SCHEMES = ("rerun", "rerun+http", "rerun+https")
 
@@ -41,20 +38,20 @@ class Viewer:
 
     url: str
     process: "subprocess.Popen[bytes] | None" = None
-    """If we started it; it is left to the person who looks at it, and outlives us."""
+    """Set if we started it; it stays open after the flight."""
 
 
 Target: TypeAlias = RrdFile | Viewer
 
 
 def prepare_target(text: str) -> Target:
-    """Make sure that a recording can go where ``--rerun`` says.
+    """Make sure that a recording can be written to the target of ``--rerun``.
 
     Args:
         text: ``spawn``, ``connect``, ``connect=URL`` or a path that ends in ``.rrd``.
 
     Raises:
-        UserError: none of these, a malformed URL, or a path that cannot be written.
+        UserError: an unknown form, a malformed URL, or a path that cannot be written.
         PeerError: nothing listens at the URL.
         MavbridgeError: the viewer does not start.
     """
@@ -74,14 +71,14 @@ def _writable(path: Path) -> RrdFile:
         path.open("wb").close()
     except OSError as error:
         raise UserError(
-            f"--rerun: {path} cannot be written ({error.strerror}); name a file in a folder that "
-            f"exists and that you may write to"
+            f"--rerun: {path} cannot be written ({error.strerror}); name a file in an existing "
+            "folder that you may write to"
         ) from error
     return RrdFile(path)
 
 
 def _reachable(url: str) -> Viewer:
-    problem = f"--rerun: {url!r} is not a viewer's address; it looks like {VIEWER_URL}"
+    problem = f"--rerun: {url!r} is not a viewer's address; it should look like {VIEWER_URL}"
     try:
         parts = urlsplit(url)
         port = parts.port
@@ -91,8 +88,8 @@ def _reachable(url: str) -> Viewer:
         raise UserError(problem)
     if not _listens(parts.hostname, port, timeout_s=CONNECT_TIMEOUT_S):
         raise PeerError(
-            f"no Rerun viewer listens at {url}; start one with `rerun`, let the bridge start it "
-            f"(--rerun spawn), or record to a file (--rerun flight.rrd)"
+            f"no Rerun viewer listens at {url}: start one with `rerun`, let the bridge start one "
+            "(--rerun spawn), or record to a file (--rerun flight.rrd)"
         )
     return Viewer(url)
 
@@ -106,12 +103,12 @@ def _listens(host: str, port: int, *, timeout_s: float) -> bool:
 
 
 def spawn_viewer(command: list[str], *, port: int) -> Viewer:
-    """Start a viewer, and see it listen and stay.
+    """Start a viewer and wait until it listens and has not exited for SETTLE_S.
 
-    Its own session keeps Ctrl-C from it; its output would tear the status line.
+    It gets a session of its own, out of reach of Ctrl-C, and its output is not shown.
 
     Raises:
-        MavbridgeError: it ended, or did not listen in time.
+        MavbridgeError: it exited, or did not listen in time.
     """
     options = ["--port", str(port), "--bind", VIEWER_HOST, "--memory-limit", VIEWER_MEMORY]
     with tempfile.TemporaryFile() as errors:
@@ -123,29 +120,22 @@ def spawn_viewer(command: list[str], *, port: int) -> Viewer:
             start_new_session=True,
         )
         for _ in range(round(SPAWN_TIMEOUT_S / _POLL_S)):
-            listening = _listens(VIEWER_HOST, port, timeout_s=_POLL_S)
-            if _ends_within(process, SETTLE_S if listening else _POLL_S):
-                raise MavbridgeError(_no_viewer(f"ended at once: {_last_line(errors)}"))
-            if listening:
-                return Viewer(f"rerun+http://{VIEWER_HOST}:{port}/proxy", process)
+            is_listening = _listens(VIEWER_HOST, port, timeout_s=_POLL_S)
+            try:
+                process.wait(SETTLE_S if is_listening else _POLL_S)
+            except subprocess.TimeoutExpired:
+                if is_listening:
+                    return Viewer(f"rerun+http://{VIEWER_HOST}:{port}/proxy", process)
+                continue
+            errors.seek(0)
+            lines = errors.read().decode(errors="replace").strip().splitlines()
+            raise _not_started(f"exited at once: {lines[-1] if lines else 'it gave no reason'}")
         process.terminate()
         process.wait(SPAWN_TIMEOUT_S)
-        raise MavbridgeError(_no_viewer(f"did not listen within {SPAWN_TIMEOUT_S:g} s"))
+        raise _not_started(f"did not listen within {SPAWN_TIMEOUT_S:g} s")
 
 
-def _ends_within(process: subprocess.Popen[bytes], timeout_s: float) -> bool:
-    try:
-        process.wait(timeout_s)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
-
-
-def _no_viewer(what: str) -> str:
-    return f"the Rerun viewer {what}; record to a file instead: --rerun flight.rrd"
-
-
-def _last_line(errors: IO[bytes]) -> str:
-    errors.seek(0)
-    lines = errors.read().decode(errors="replace").strip().splitlines()
-    return lines[-1] if lines else "it gave no reason"
+def _not_started(reason: str) -> MavbridgeError:
+    return MavbridgeError(
+        f"the Rerun viewer {reason}; record to a file instead: --rerun flight.rrd"
+    )

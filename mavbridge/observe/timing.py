@@ -1,4 +1,4 @@
-"""Ticks in, percentiles out: what a flight's report says of its timing. Pure, constant memory."""
+"""Ticks in, percentiles out: the timing report of a flight. Pure, constant memory."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -9,20 +9,23 @@ from mavbridge.core.histogram import Histogram
 from mavbridge.core.records import Event, LinkStats, Percentiles, Tick, VisionTick
 
 MAX_RELEASES = 1000
-"""Release transitions kept in a report; the rest is counted."""
-
+"""Releases listed in a report; the rest are only counted."""
 
 Mode = Literal["dual", "single"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionReport:
-    """The action loop while the policy flew; None = not measured."""
+    """The action loop while the policy flew; None = not measured.
+
+    A slot is one period of the loop's fixed time grid. The loop runs once in each slot; a slot that
+    it was too late for is missed.
+    """
 
     target_hz: float
     rate_hz: float | None
     flying_s: float
-    """How long that was; the rest of the flight is waiting, preparing and releases."""
+    """Duration of this part; the rest of the flight is waiting, preparing and releases."""
     ticks: int
     missed_slots: int
     period_ms: Percentiles | None
@@ -40,22 +43,22 @@ class VisionReport:
     rate_hz: float | None
     frames: int
     dropped_frames: int
-    """By the source, since the first frame of the flight."""
+    """Dropped by the source since the first frame of the flight."""
     encode_ms: Percentiles | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseEvent:
-    """The sticks went back to the pilot, or the reason why they stay there changed."""
+    """The sticks were released, or the reason for their release changed."""
 
     t_s: float
-    """Since the first tick."""
+    """Time since the first tick."""
     reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObserverDrops:
-    """Events that observers missed; None = not running."""
+    """Events that observers missed; None = no such observer."""
 
     rerun: int | None
     recorder: int | None
@@ -63,7 +66,7 @@ class ObserverDrops:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimingReport:
-    """What a flight was like; None = not measured."""
+    """Timing of one flight; None = not measured."""
 
     duration_s: float
     mode: Mode
@@ -73,11 +76,12 @@ class TimingReport:
     action: ActionReport
     vision: VisionReport
     feature_age_ms: Percentiles | None
-    """Since exposure, at the send, of the feature behind each action."""
+    """Time from the exposure of an image to the sending of each action that is based on it."""
     state_age_ms: Percentiles | None
-    """Since arrival, at the send, of the attitude behind each action."""
+    """Time from the arrival of an attitude to the sending of each action that is based on it."""
     state_to_wire_ms: Percentiles | None
-    """Arrival of an attitude to the departure of the first sticks made from it."""
+    """State to wire: time from the arrival of a new attitude to the sending of the first sticks
+    that are based on it."""
     link: LinkStats | None
     releases: tuple[ReleaseEvent, ...]
     """The first ``MAX_RELEASES``."""
@@ -93,101 +97,40 @@ class FlightTiming:
     """
 
     def __init__(self, *, action_hz: float, vision_hz: float) -> None:
-        self._action = _ActionCounts(action_hz)
-        self._vision = _VisionCounts(vision_hz)
+        self._action_hz, self._vision_hz = action_hz, vision_hz
+        self._ticks, self._frames = _Span(), _Span()
+        self._flown_ticks = self._missed_slots = self._flying_ns = 0
+        self._last_flown_ns: int | None = None
+        self._last_attitude_ns: int | None = None
+        self._last_reason: str | None = None
+        self._releases: list[ReleaseEvent] = []
+        self._release_count = 0
+        self._period, self._jitter, self._predict = Histogram(), Histogram(), Histogram()
+        self._feature_age, self._state_age = Histogram(), Histogram()
+        self._state_to_wire, self._encode = Histogram(), Histogram()
+        self._first_dropped: int | None = None
+        self._dropped_frames = 0
 
     def emit(self, event: Event) -> None:
         """Count the event."""
         if isinstance(event, Tick):
-            self._action.add(event)
+            self._add_tick(event)
         else:
-            self._vision.add(event)
+            self._add_frame(event)
 
-    def report(
-        self,
-        *,
-        mode: Mode,
-        engine: str,
-        policy: str,
-        autopilot: str | None,
-        link: LinkStats | None,
-        observer_drops: ObserverDrops,
-    ) -> TimingReport:
-        """All that was counted so far; exact once the loops have stopped."""
-        action = self._action
-        return TimingReport(
-            duration_s=round(action.span.duration_s, 3),
-            mode=mode,
-            engine=engine,
-            policy=policy,
-            autopilot=autopilot,
-            action=action.report(),
-            vision=self._vision.report(),
-            feature_age_ms=action.feature_age.percentiles_ms(),
-            state_age_ms=action.state_age.percentiles_ms(),
-            state_to_wire_ms=action.state_to_wire.percentiles_ms(),
-            link=link,
-            releases=tuple(action.releases),
-            release_count=action.release_count,
-            observer_drops=observer_drops,
-        )
+    def _add_frame(self, vision: VisionTick) -> None:
+        self._frames.add(vision.started_ns)
+        self._encode.add(vision.ready_ns - vision.started_ns)
+        if self._first_dropped is None:
+            self._first_dropped = vision.dropped_frames
+        self._dropped_frames = vision.dropped_frames - self._first_dropped
 
-
-class _Span:
-    """First and last of a series of stamps, and how many."""
-
-    def __init__(self) -> None:
-        self.first_ns: int | None = None
-        self.last_ns: int | None = None
-        self.count = 0
-
-    def add(self, stamp_ns: int) -> int | None:
-        """Time since the previous stamp; None for the first."""
-        since_ns = None if self.last_ns is None else stamp_ns - self.last_ns
-        if self.first_ns is None:
-            self.first_ns = stamp_ns
-        self.last_ns = stamp_ns
-        self.count += 1
-        return since_ns
-
-    @property
-    def duration_s(self) -> float:
-        if self.first_ns is None or self.last_ns is None:
-            return 0.0
-        return (self.last_ns - self.first_ns) / NS_PER_S
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Intervals per second; None before there is one."""
-        duration_s = self.duration_s
-        return round((self.count - 1) / duration_s, 3) if duration_s > 0 else None
-
-
-class _ActionCounts:
-    """The action thread's half of ``FlightTiming``."""
-
-    def __init__(self, target_hz: float) -> None:
-        self._target_hz = target_hz
-        self._target_period_ns = round(NS_PER_S / target_hz)
-        self._missed_slots = 0
-        self._flown_ticks = 0
-        self._flown_ns: int | None = None
-        self._flying_ns = 0
-        self._period, self._jitter, self._predict = Histogram(), Histogram(), Histogram()
-        self._last_reason: str | None = None
-        self._last_attitude_ns: int | None = None
-        self.span = _Span()
-        self.feature_age, self.state_age = Histogram(), Histogram()
-        self.state_to_wire = Histogram()
-        self.releases: list[ReleaseEvent] = []
-        self.release_count = 0
-
-    def add(self, tick: Tick) -> None:
-        self.span.add(tick.woke_ns)
+    def _add_tick(self, tick: Tick) -> None:
+        self._ticks.add(tick.woke_ns)
         if tick.predict_ns is not None:
             self._predict.add(tick.predict_ns)
         if tick.trace is None:
-            self._flown_ns = None
+            self._last_flown_ns = None
         else:
             self._add_period(tick)
             self._add_ages(tick)
@@ -199,74 +142,98 @@ class _ActionCounts:
     def _add_period(self, tick: Tick) -> None:
         """Only between two ticks of flight: a released loop has nothing to compute."""
         self._flown_ticks += 1
-        last_ns, self._flown_ns = self._flown_ns, tick.woke_ns
+        last_ns, self._last_flown_ns = self._last_flown_ns, tick.woke_ns
         if last_ns is None:
             return
         period_ns = tick.woke_ns - last_ns
         self._period.add(period_ns)
-        self._jitter.add(abs(period_ns - self._target_period_ns))
+        self._jitter.add(abs(period_ns - round(NS_PER_S / self._action_hz)))
         self._missed_slots += tick.missed_slots
         self._flying_ns += period_ns
 
     def _add_ages(self, tick: Tick) -> None:
         if tick.feature_captured_ns is not None:
-            self.feature_age.add(tick.sent_ns - tick.feature_captured_ns)
+            self._feature_age.add(tick.sent_ns - tick.feature_captured_ns)
         if tick.state is None:
             return
         age_ns = tick.sent_ns - tick.state.attitude_ns
-        self.state_age.add(age_ns)
+        self._state_age.add(age_ns)
         if tick.sent is not None and tick.state.attitude_ns != self._last_attitude_ns:
             self._last_attitude_ns = tick.state.attitude_ns
-            self.state_to_wire.add(age_ns)
+            self._state_to_wire.add(age_ns)
 
     def _add_release(self, woke_ns: int, reason: str) -> None:
-        self.release_count += 1
-        if len(self.releases) < MAX_RELEASES and self.span.first_ns is not None:
-            t_s = (woke_ns - self.span.first_ns) / NS_PER_S
-            self.releases.append(ReleaseEvent(t_s=round(t_s, 3), reason=reason))
+        self._release_count += 1
+        if len(self._releases) < MAX_RELEASES:
+            t_s = (woke_ns - self._ticks.first_ns) / NS_PER_S
+            self._releases.append(ReleaseEvent(t_s=round(t_s, 3), reason=reason))
 
-    def report(self) -> ActionReport:
-        return ActionReport(
-            target_hz=self._target_hz,
-            rate_hz=(
-                round(self._period.count * NS_PER_S / self._flying_ns, 3)
-                if self._flying_ns
-                else None
+    def report(
+        self,
+        *,
+        mode: Mode,
+        engine: str,
+        policy: str,
+        autopilot: str | None,
+        link: LinkStats | None,
+        observer_drops: ObserverDrops,
+    ) -> TimingReport:
+        """The figures so far; exact once the loops have stopped."""
+        intervals = self._period.count
+        return TimingReport(
+            duration_s=round(self._ticks.duration_s, 3),
+            mode=mode,
+            engine=engine,
+            policy=policy,
+            autopilot=autopilot,
+            action=ActionReport(
+                target_hz=self._action_hz,
+                rate_hz=round(intervals * NS_PER_S / self._flying_ns, 3) if intervals else None,
+                flying_s=round(self._flying_ns / NS_PER_S, 3),
+                ticks=self._flown_ticks,
+                missed_slots=self._missed_slots,
+                period_ms=self._period.percentiles_ms(),
+                jitter_ms=self._jitter.percentiles_ms(),
+                predict_ms=self._predict.percentiles_ms(),
             ),
-            flying_s=round(self._flying_ns / NS_PER_S, 3),
-            ticks=self._flown_ticks,
-            missed_slots=self._missed_slots,
-            period_ms=self._period.percentiles_ms(),
-            jitter_ms=self._jitter.percentiles_ms(),
-            predict_ms=self._predict.percentiles_ms(),
+            vision=VisionReport(
+                target_hz=self._vision_hz,
+                rate_hz=self._frames.rate_hz,
+                frames=self._frames.count,
+                dropped_frames=self._dropped_frames,
+                encode_ms=self._encode.percentiles_ms(),
+            ),
+            feature_age_ms=self._feature_age.percentiles_ms(),
+            state_age_ms=self._state_age.percentiles_ms(),
+            state_to_wire_ms=self._state_to_wire.percentiles_ms(),
+            link=link,
+            releases=tuple(self._releases),
+            release_count=self._release_count,
+            observer_drops=observer_drops,
         )
 
 
-class _VisionCounts:
-    """The vision thread's half of ``FlightTiming``."""
+class _Span:
+    """First and last of a series of stamps, and their number."""
 
-    def __init__(self, target_hz: float) -> None:
-        self._target_hz = target_hz
-        self._span = _Span()
-        self._encode = Histogram()
-        self._dropped_before: int | None = None
-        self._dropped_frames = 0
+    def __init__(self) -> None:
+        self.first_ns = self.last_ns = self.count = 0
 
-    def add(self, vision: VisionTick) -> None:
-        self._span.add(vision.started_ns)
-        self._encode.add(vision.ready_ns - vision.started_ns)
-        if self._dropped_before is None:
-            self._dropped_before = vision.dropped_frames
-        self._dropped_frames = vision.dropped_frames - self._dropped_before
+    def add(self, stamp_ns: int) -> None:
+        if not self.count:
+            self.first_ns = stamp_ns
+        self.last_ns = stamp_ns
+        self.count += 1
 
-    def report(self) -> VisionReport:
-        return VisionReport(
-            target_hz=self._target_hz,
-            rate_hz=self._span.rate_hz,
-            frames=self._span.count,
-            dropped_frames=self._dropped_frames,
-            encode_ms=self._encode.percentiles_ms(),
-        )
+    @property
+    def duration_s(self) -> float:
+        return (self.last_ns - self.first_ns) / NS_PER_S
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Intervals per second; None before there is one."""
+        duration_s = self.duration_s
+        return round((self.count - 1) / duration_s, 3) if duration_s > 0 else None
 
 
 def report_json(report: TimingReport) -> str:

@@ -1,5 +1,6 @@
 """Sticks <-> PWM with the vehicle's own radio calibration: the one table of signs and channels."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -20,14 +21,14 @@ class RcChannel:
     """One channel as RCn_* and RCMAP_* describe it; PWM in microseconds."""
 
     number: int
-    """1-based."""
+    """1 to 8."""
     min_us: int
     trim_us: int
     max_us: int
     is_reversed: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse a calibration that no stick can be mapped with."""
+        """Refuse a calibration that sticks cannot be mapped with."""
         if not 1 <= self.number <= 8:
             raise ValueError(f"channel {self.number} is not one of 1..8")
         if not 500 <= self.min_us < self.max_us <= 2500:
@@ -74,32 +75,33 @@ class RcCalibration:
 
     @property
     def channels(self) -> tuple[RcChannel, RcChannel, RcChannel, RcChannel]:
-        """In the order of ``Sticks``."""
+        """Channels in the order of ``Sticks``."""
         return self.throttle, self.yaw, self.pitch, self.roll
 
-    def _centres_us(self) -> tuple[float, float, float, float]:
-        # Throttle is a range channel: its centre is the middle, whatever RCn_TRIM says.
-        throttle, yaw, pitch, roll = self.channels
-        middle_us = (throttle.min_us + throttle.max_us) / 2
-        return middle_us, yaw.trim_us, pitch.trim_us, roll.trim_us
+    def _mapping(self) -> Iterator[tuple[RcChannel, float, float]]:
+        """Channel, sign and centre in us of each stick, in the order of ``Sticks``.
+
+        Throttle is a range channel: its centre is the middle, not RCn_TRIM.
+        """
+        middle_us = (self.throttle.min_us + self.throttle.max_us) / 2
+        centres_us = (middle_us, *(channel.trim_us for channel in self.channels[1:]))
+        return zip(self.channels, PWM_SIGN, centres_us, strict=True)
 
     def to_pwm_us(self, sticks: Sticks) -> Pwm:
         """PWM of throttle, yaw, pitch, roll, inside the calibrated range."""
-        throttle, yaw, pitch, roll = [
+        throttle, yaw, pitch, roll = (
             channel.to_us(stick * sign, centre_us=centre_us)
-            for channel, stick, sign, centre_us in zip(
-                self.channels, sticks, PWM_SIGN, self._centres_us(), strict=True
-            )
-        ]
+            for stick, (channel, sign, centre_us) in zip(sticks, self._mapping(), strict=True)
+        )
         return max(throttle, self.throttle_floor_us), yaw, pitch, roll
 
     def to_sticks(self, pwm_us: Pwm) -> Sticks:
-        """Sticks that these PWM values stand for."""
+        """Sticks that correspond to these PWM values."""
         return Sticks(
             *(
-                channel.to_stick(value, centre_us=centre_us) * sign
-                for channel, value, sign, centre_us in zip(
-                    self.channels, pwm_us, PWM_SIGN, self._centres_us(), strict=True
+                channel.to_stick(value_us, centre_us=centre_us) * sign
+                for value_us, (channel, sign, centre_us) in zip(
+                    pwm_us, self._mapping(), strict=True
                 )
             )
         )

@@ -1,18 +1,16 @@
-"""What the bridge understands of MAVLink: one frozen record per message, SI units, validated."""
+"""The part of MAVLink that the bridge uses: one frozen record per message, in SI units, checked."""
 
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 
-class Source(NamedTuple):
-    """Who sent a message."""
+class Endpoint(NamedTuple):
+    """MAVLink address of a sender or a receiver."""
 
     system: int
     component: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Heartbeat:
+class Heartbeat(NamedTuple):
     """HEARTBEAT (0)."""
 
     vehicle_type: int
@@ -21,8 +19,7 @@ class Heartbeat:
     custom_mode: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Attitude:
+class Attitude(NamedTuple):
     """ATTITUDE_QUATERNION (31) or ATTITUDE (30)."""
 
     is_quaternion: bool
@@ -31,63 +28,55 @@ class Attitude:
     rate_body_radps: tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LocalVelocity:
+class LocalVelocity(NamedTuple):
     """Velocity of LOCAL_POSITION_NED (32)."""
 
     velocity_ned_mps: tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SpecificForce:
+class SpecificForce(NamedTuple):
     """Accelerometer of HIGHRES_IMU (105), SCALED_IMU (26), SCALED_IMU2 (116) or RAW_IMU (27)."""
 
-    source: str
+    message_name: str
     specific_force_body_mps2: tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RcChannels:
-    """RC_CHANNELS (65): what the vehicle acts on, in microseconds; 0 = absent."""
+class RcChannels(NamedTuple):
+    """RC_CHANNELS (65): the channels that the vehicle acts on, in microseconds; 0 = absent."""
 
     channels_us: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CommandAck:
+class CommandAck(NamedTuple):
     """COMMAND_ACK (77)."""
 
     command: int
     result: int
-    target: Source
-    """Whose command was answered; zeros where the vehicle does not say."""
+    target: Endpoint
+    """Sender of the command; zeros where the vehicle does not fill it in."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ParamValue:
-    """PARAM_VALUE (22), as ArduPilot encodes it: the number itself."""
+class ParamValue(NamedTuple):
+    """PARAM_VALUE (22) as ArduPilot encodes it: the number itself, whatever its type."""
 
     name: str
     value: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusText:
+class StatusText(NamedTuple):
     """STATUSTEXT (253)."""
 
     text: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Timesync:
-    """TIMESYNC (111)."""
+class Timesync(NamedTuple):
+    """TIMESYNC (111), in nanoseconds."""
 
     tc1: int
     ts1: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AutopilotVersion:
+class AutopilotVersion(NamedTuple):
     """AUTOPILOT_VERSION (148)."""
 
     version: str
@@ -107,11 +96,35 @@ Body: TypeAlias = (
 )
 
 
-class Incoming(NamedTuple):
-    """One message off the wire."""
+class ReceivedMessage(NamedTuple):
+    """One packet that passed its checksum."""
 
-    source: Source
+    source: Endpoint
     sequence: int
     name: str
     body: Body | None
-    """None: a message that is counted, but that nothing here needs."""
+    """None: a message that the bridge does not use, or one with unusable values."""
+    packet: bytes
+
+
+class CommandRequest(NamedTuple):
+    """COMMAND_LONG (76); parameters that are not given are zero."""
+
+    command: int
+    params: tuple[float, ...]
+
+
+class ParamRequest(NamedTuple):
+    """PARAM_REQUEST_READ (20) by name."""
+
+    name: str
+
+
+class StreamRequest(NamedTuple):
+    """REQUEST_DATA_STREAM (66), for vehicles without SET_MESSAGE_INTERVAL."""
+
+    stream: int
+    rate_hz: int
+
+
+Request: TypeAlias = CommandRequest | ParamRequest | StreamRequest

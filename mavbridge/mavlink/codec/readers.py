@@ -1,4 +1,4 @@
-"""Message by message: pymavlink's values -> our records, checked and in SI units."""
+"""Received MAVLink messages as our records, checked and in SI units."""
 
 import math
 from collections.abc import Callable
@@ -10,11 +10,11 @@ from mavbridge.mavlink.codec.messages import (
     AutopilotVersion,
     Body,
     CommandAck,
+    Endpoint,
     Heartbeat,
     LocalVelocity,
     ParamValue,
     RcChannels,
-    Source,
     SpecificForce,
     StatusText,
     Timesync,
@@ -28,10 +28,10 @@ _HIGHRES_ACCEL_FIELDS = 0b111
 
 
 class UnusableError(Exception):
-    """A well-formed message whose values mean nothing."""
+    """A well-formed message with values that cannot be used."""
 
 
-def _finite(*values: float) -> None:
+def _require_finite(*values: float) -> None:
     if not math.isfinite(sum(values)):  # NaN and infinity survive every sum
         raise UnusableError
 
@@ -45,32 +45,32 @@ def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
     )
 
 
-def attitude_quaternion(fields: tuple[float, ...]) -> Body:
-    """ATTITUDE_QUATERNION from its wire fields."""
-    boot_ms, qw, qx, qy, qz, p, q, r = fields[:8]
-    _finite(qw, qx, qy, qz, p, q, r)
-    if not 0.81 < qw * qw + qx * qx + qy * qy + qz * qz < 1.21:  # the norm, within a tenth of 1
+def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body:
+    quaternion = (m.q1, m.q2, m.q3, m.q4)
+    rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
+    _require_finite(*quaternion, *rate)
+    if not 0.9 < math.hypot(*quaternion) < 1.1:
         raise UnusableError
     return Attitude(
         is_quaternion=True,
-        boot_ms=int(boot_ms),
-        ned_from_body_wxyz=(qw, qx, qy, qz),
-        rate_body_radps=(p, q, r),
+        boot_ms=m.time_boot_ms,
+        ned_from_body_wxyz=quaternion,
+        rate_body_radps=rate,
     )
 
 
 def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
     rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
-    _finite(m.roll, m.pitch, m.yaw, *rate)
+    _require_finite(m.roll, m.pitch, m.yaw, *rate)
     return Attitude(
         is_quaternion=False,
         boot_ms=m.time_boot_ms,
-        ned_from_body_wxyz=quaternion_from_euler(m.roll, m.pitch, m.yaw),
+        ned_from_body_wxyz=_quaternion_from_euler(m.roll, m.pitch, m.yaw),
         rate_body_radps=rate,
     )
 
 
-def quaternion_from_euler(
+def _quaternion_from_euler(
     roll_rad: float, pitch_rad: float, yaw_rad: float
 ) -> tuple[float, float, float, float]:
     """ned_from_body quaternion (w, x, y, z) of MAVLink's intrinsic Z-Y-X Euler angles."""
@@ -85,25 +85,23 @@ def quaternion_from_euler(
     )
 
 
-def local_position(fields: tuple[float, ...]) -> Body:
-    """LOCAL_POSITION_NED from its wire fields."""
-    _, _, _, _, vx, vy, vz = fields
-    _finite(vx, vy, vz)
-    return LocalVelocity(velocity_ned_mps=(vx, vy, vz))
+def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:
+    _require_finite(m.vx, m.vy, m.vz)
+    return LocalVelocity(velocity_ned_mps=(m.vx, m.vy, m.vz))
 
 
-def highres_imu(fields: tuple[float, ...]) -> Body:
-    """HIGHRES_IMU from its wire fields."""
-    x, y, z = fields[1:4]
-    _finite(x, y, z)
-    if int(fields[14]) & _HIGHRES_ACCEL_FIELDS != _HIGHRES_ACCEL_FIELDS:
+def _highres_imu(m: dialect.MAVLink_highres_imu_message) -> Body:
+    _require_finite(m.xacc, m.yacc, m.zacc)
+    if m.fields_updated & _HIGHRES_ACCEL_FIELDS != _HIGHRES_ACCEL_FIELDS:
         raise UnusableError
-    return SpecificForce(source="HIGHRES_IMU", specific_force_body_mps2=(x, y, z))
+    return SpecificForce(
+        message_name="HIGHRES_IMU", specific_force_body_mps2=(m.xacc, m.yacc, m.zacc)
+    )
 
 
 def _milli_g_imu(m: dialect.MAVLink_scaled_imu_message) -> Body:
     x, y, z = (value * MG_TO_MPS2 for value in (m.xacc, m.yacc, m.zacc))
-    return SpecificForce(source=m.get_type(), specific_force_body_mps2=(x, y, z))
+    return SpecificForce(message_name=m.get_type(), specific_force_body_mps2=(x, y, z))
 
 
 def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
@@ -112,21 +110,13 @@ def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
 
 
 def _command_ack(m: dialect.MAVLink_command_ack_message) -> Body:
-    target = Source(m.target_system, m.target_component)
+    target = Endpoint(m.target_system, m.target_component)
     return CommandAck(command=m.command, result=m.result, target=target)
 
 
 def _param_value(m: dialect.MAVLink_param_value_message) -> Body:
-    _finite(m.param_value)
+    _require_finite(m.param_value)
     return ParamValue(name=m.param_id, value=m.param_value)
-
-
-def _statustext(m: dialect.MAVLink_statustext_message) -> Body:
-    return StatusText(text=m.text)
-
-
-def _timesync(m: dialect.MAVLink_timesync_message) -> Body:
-    return Timesync(tc1=m.tc1, ts1=m.ts1)
 
 
 def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
@@ -137,14 +127,17 @@ def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
 READERS: dict[str, Callable[[dialect.MAVLink_message], Body]] = {
     "HEARTBEAT": _heartbeat,
     "ATTITUDE": _attitude,
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "LOCAL_POSITION_NED": _local_position,
+    "HIGHRES_IMU": _highres_imu,
     "SCALED_IMU": _milli_g_imu,
     "SCALED_IMU2": _milli_g_imu,
     "RAW_IMU": _milli_g_imu,
     "RC_CHANNELS": _rc_channels,
     "COMMAND_ACK": _command_ack,
     "PARAM_VALUE": _param_value,
-    "STATUSTEXT": _statustext,
-    "TIMESYNC": _timesync,
+    "STATUSTEXT": lambda m: StatusText(text=m.text),
+    "TIMESYNC": lambda m: Timesync(tc1=m.tc1, ts1=m.ts1),
     "AUTOPILOT_VERSION": _autopilot_version,
 }
-"""All but those of ``fast_packets``."""
+"""Reader of each MAVLink message that the bridge uses; raises UnusableError."""

@@ -1,1 +1,1 @@
-"""The conversation with one vehicle, without I/O: handshake, parameters, streams, echo."""
+"""The session with one vehicle, without I/O: discovery, parameters, streams, echo check."""

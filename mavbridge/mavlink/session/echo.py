@@ -1,4 +1,4 @@
-"""The echo check: does the vehicle act on what we send?"""
+"""Echo check: compares the sticks that we send with those that the vehicle reports."""
 
 from collections import deque
 
@@ -6,17 +6,17 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.mavlink.codec.calibration import Pwm
 
 ECHO_DEADLINE_NS = NS_PER_S
-"""An override shows up in RC_CHANNELS within some 14 ms; a second leaves room for a slow link."""
+"""An override shows up in RC_CHANNELS within about 14 ms; a second allows for a slow link."""
 NUDGE_US = 4
-"""Off centre on the roll channel, inside every usual dead zone (20 us), until the echo is seen."""
+"""Added to the roll channel until the echo is seen; the usual dead zone is 20 us."""
 _RETRY_NS = 3 * NS_PER_S
 
 
 class EchoCheck:
-    """Compares RC_CHANNELS with the overrides of the last second, over the four stick channels.
+    """Compares the stick channels of RC_CHANNELS with the overrides of the last second.
 
-    Confirmed when the vehicle reports a set of values that we sent and that it did not report
-    before we sent any; failed when a second of sending brought none.
+    Confirmed when the vehicle reports values that we sent and that it did not report before we
+    sent any; failed when it reports none within a second of sending.
     """
 
     def __init__(self) -> None:
@@ -31,11 +31,11 @@ class EchoCheck:
         """The vehicle acts on our sticks."""
         return self.confirmed_ns is not None
 
-    def distinct(self, pwm_us: Pwm) -> Pwm:
-        """The same, or, until confirmed, nudged apart from what the vehicle showed before.
+    def with_nudge(self, pwm_us: Pwm) -> Pwm:
+        """The values to send: until confirmed, they differ from what the vehicle reported before.
 
-        Sticks at rest look the same whoever holds them; without this, a vehicle that ignores us
-        would pass the check.
+        A vehicle that ignores us while its receiver's sticks rest where ours do would otherwise
+        pass the check.
         """
         if self.confirmed or pwm_us != self._baseline:
             return pwm_us
@@ -43,7 +43,7 @@ class EchoCheck:
         return throttle, yaw, pitch, roll + NUDGE_US
 
     def sent(self, pwm_us: Pwm, now_ns: int) -> None:
-        """Note an override that left."""
+        """Note an override that was sent."""
         if self._since_ns is None:
             self._since_ns = now_ns
         self._sent.append((now_ns, pwm_us))
@@ -61,13 +61,13 @@ class EchoCheck:
         if self._since_ns is None:
             self._baseline = pwm_us
             return
-        is_telling = self.confirmed or pwm_us != self._baseline
-        if is_telling and any(pwm_us == past for _, past in self._sent):
+        is_conclusive = self.confirmed or pwm_us != self._baseline
+        if is_conclusive and any(pwm_us == past for _, past in self._sent):
             self.confirmed_ns = now_ns
             self._failed_ns = None
 
     def failed(self, now_ns: int) -> bool:
-        """No echo within the deadline. Stays so for a while after sending has stopped."""
+        """No echo within the deadline; stays true for 3 s after sending has stopped."""
         if self._since_ns is not None:
             newest_ns = max(self._since_ns, self.confirmed_ns or 0)
             if now_ns - newest_ns > ECHO_DEADLINE_NS:

@@ -1,18 +1,8 @@
-"""Flight modes by name, for the autopilots that the bridge knows."""
-
-from typing import NamedTuple
+"""Flight modes by name, for ArduPilot and PX4."""
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.errors import UserError
-
-
-class ModeNumbers(NamedTuple):
-    """Parameters 2 and 3 of MAV_CMD_DO_SET_MODE."""
-
-    main: int
-    sub: int
-
 
 _PX4_MAIN = {
     "MANUAL": 1,
@@ -42,7 +32,7 @@ def _ardupilot_modes(vehicle_type: int) -> dict[str, int]:
 
 
 class ModeTable:
-    """Mode names of one vehicle."""
+    """Names and numbers of one vehicle's flight modes."""
 
     def __init__(self, *, autopilot: str, vehicle_type: int) -> None:
         self._is_px4 = autopilot == "px4"
@@ -50,12 +40,12 @@ class ModeTable:
         self._names = {number: name for name, number in self._numbers.items()}
 
     def name(self, custom_mode: int) -> str:
-        """Name of HEARTBEAT.custom_mode; a number where it has none."""
+        """Name of HEARTBEAT.custom_mode, or its number if it has no name."""
         number = custom_mode >> 16 & 0xFF if self._is_px4 else custom_mode
         return self._names.get(number, str(number))
 
-    def numbers(self, name: str) -> ModeNumbers:
-        """What to ask for to get this mode.
+    def number(self, name: str) -> int:
+        """Parameter 2 of MAV_CMD_DO_SET_MODE for this mode.
 
         Raises:
             UserError: this vehicle has no such mode.
@@ -65,4 +55,4 @@ class ModeTable:
             raise UserError(
                 f"this vehicle has no mode {name!r}; it has {', '.join(sorted(self._numbers))}"
             )
-        return ModeNumbers(number, 0)
+        return number

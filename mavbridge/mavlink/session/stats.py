@@ -1,14 +1,14 @@
-"""What the link counts over one flight."""
+"""Counters of the link over one flight."""
 
 from collections import Counter
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.histogram import Histogram
 from mavbridge.core.records import LinkStats
+from mavbridge.mavlink.session.timesync import TimesyncFilter
 
 
 class LinkCounters:
-    """Messages, losses and round trips of the chosen vehicle."""
+    """Messages and losses of the chosen vehicle."""
 
     def __init__(self) -> None:
         self._by_name: Counter[str] = Counter()
@@ -16,7 +16,6 @@ class LinkCounters:
         self._lost = 0
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._round_trips = Histogram()
         self.sent = 0
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
@@ -29,16 +28,11 @@ class LinkCounters:
         self._last_ns = arrived_ns
 
     def new_sequence(self) -> None:
-        """The sender starts its sequence anew: what follows is no gap."""
+        """Expect any sequence number next: the sender has restarted."""
         self._last_sequence = None
 
-    def round_trip(self, round_trip_ns: int | None) -> None:
-        """Count one TIMESYNC exchange, if it was ours."""
-        if round_trip_ns is not None:
-            self._round_trips.add(round_trip_ns)
-
     def stats(
-        self, *, echo_confirmed: bool | None, unusable_packets: int, clock_offset_ns: int | None
+        self, timesync: TimesyncFilter, *, echo_confirmed: bool | None, unusable_packets: int
     ) -> LinkStats:
         """The totals so far."""
         received = self._by_name.total()
@@ -50,9 +44,9 @@ class LinkCounters:
                 if span_ns > 0
             ),
             lost_fraction=self._lost / (self._lost + received) if received else None,
-            rtt_ms=self._round_trips.percentiles_ms(),
+            rtt_ms=timesync.round_trips.percentiles_ms(),
             sent_overrides=self.sent,
             echo_confirmed=echo_confirmed if self.sent else None,
             unusable_packets=unusable_packets,
-            vehicle_clock_offset_ns=clock_offset_ns,
+            vehicle_clock_offset_ns=timesync.offset_ns,
         )

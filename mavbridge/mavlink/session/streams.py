@@ -1,84 +1,75 @@
-"""Asking for telemetry at the rate of the action loop, and asking again when it stops coming."""
+"""Requests telemetry at the rate of the action loop, and again whenever it slows down."""
 
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.messages import CommandAck
-from mavbridge.mavlink.codec.requests import AskCommand, AskStream, Request
+from mavbridge.mavlink.codec.messages import (
+    CommandAck,
+    CommandRequest,
+    Request,
+    StreamRequest,
+)
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
 _ATTEMPTS = 4
 _LOWEST_HZ = 25.0
 _WATCH_NS = 2 * NS_PER_S
 _ENOUGH = 0.7
-"""Share of the granted rate below which somebody else has changed it (or it never came)."""
+"""Share of the granted rate below which another station is assumed to have changed it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamGroup:
-    """One quantity, the messages that carry it, best first, and its legacy stream."""
+    """One quantity: the messages that carry it, best first, and its legacy stream."""
 
     messages: tuple[str, ...]
     stream: int
     rate_hz: float
 
 
-def groups(*, state_hz: float, rc_hz: float) -> tuple[StreamGroup, ...]:
-    """What the bridge needs."""
-    return (
-        StreamGroup(
-            messages=("ATTITUDE_QUATERNION", "ATTITUDE"),
-            stream=dialect.MAV_DATA_STREAM_EXTRA1,
-            rate_hz=state_hz,
-        ),
-        StreamGroup(
-            messages=("LOCAL_POSITION_NED",),
-            stream=dialect.MAV_DATA_STREAM_POSITION,
-            rate_hz=state_hz,
-        ),
-        StreamGroup(
-            messages=("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2"),
-            stream=dialect.MAV_DATA_STREAM_RAW_SENSORS,
-            rate_hz=state_hz,
-        ),
-        StreamGroup(
-            messages=("RC_CHANNELS",), stream=dialect.MAV_DATA_STREAM_RC_CHANNELS, rate_hz=rc_hz
-        ),
+def telemetry_streams(*, state_hz: float, rc_hz: float) -> tuple[StreamGroup, ...]:
+    """The telemetry that the bridge needs."""
+    return tuple(
+        StreamGroup(messages=messages, stream=stream, rate_hz=rate_hz)
+        for messages, stream, rate_hz in (
+            (("ATTITUDE_QUATERNION", "ATTITUDE"), dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
+            (("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
+            (
+                ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2"),
+                dialect.MAV_DATA_STREAM_RAW_SENSORS,
+                state_hz,
+            ),
+            (("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, rc_hz),
+        )
     )
 
 
 class _Stream:
-    """Negotiation of one group: which message, at which rate, by which request."""
+    """Negotiation of one group: the message, its rate, and the kind of request."""
 
     def __init__(self, group: StreamGroup) -> None:
         self.group = group
-        self._choice = 0
         self.rate_hz = group.rate_hz
         self.attempts = 0
         self.is_settled = False
         self.received = 0
-
-    @property
-    def is_legacy(self) -> bool:
-        """No message interval was accepted: REQUEST_DATA_STREAM it is."""
-        return self._choice >= len(self.group.messages)
+        self._choice = 0
 
     def request(self) -> Request:
-        """The next thing to ask."""
+        """The next request to send: REQUEST_DATA_STREAM once no message interval was accepted."""
         self.attempts += 1
-        if self.is_legacy:
-            return AskStream(self.group.stream, round(self.group.rate_hz))
-        name = self.group.messages[self._choice]
-        interval_us = 1e6 / self.rate_hz
-        return AskCommand(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (message_id(name), interval_us))
+        if self._choice >= len(self.group.messages):
+            return StreamRequest(self.group.stream, round(self.group.rate_hz))
+        number = message_id(self.group.messages[self._choice])
+        return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
-    def accepted(self) -> None:
+    def accept(self) -> None:
         self.is_settled = True
         self.attempts = 0
 
-    def refused(self) -> None:
+    def refuse(self) -> None:
         """Half the rate, then the next message: "denied" may mean too fast or unknown."""
         self.attempts = 0
         if self.rate_hz / 2 >= _LOWEST_HZ:
@@ -87,8 +78,8 @@ class _Stream:
         self.rate_hz = self.group.rate_hz
         self._choice += 1
 
-    def unanswered(self) -> None:
-        """The vehicle knows no such command."""
+    def give_up_intervals(self) -> None:
+        """The vehicle does not answer SET_MESSAGE_INTERVAL."""
         self.attempts = 0
         self._choice = len(self.group.messages)
 
@@ -99,8 +90,8 @@ def message_id(name: str) -> int:
     return number
 
 
-class StreamKeeper:
-    """Keeps all groups flowing; one request is under way at a time, since acks carry no id."""
+class StreamRequester:
+    """Keeps all groups coming; one request is open at a time, since acks carry no message id."""
 
     def __init__(self, wanted: tuple[StreamGroup, ...]) -> None:
         self._streams = [_Stream(group) for group in wanted]
@@ -108,67 +99,65 @@ class StreamKeeper:
             name: stream for stream in self._streams for name in stream.group.messages
         }
         self._pending: _Stream | None = None
-        self._asked_ns = 0
-        self._watched_ns: int | None = None
+        self._requested_ns = 0
+        self._window_ns: int | None = None
+        """Start of the window in which messages are counted; None while requests are open."""
         self.renewals = 0
-        """Times that a stream had to be asked for again."""
+        """Number of streams that had to be requested again."""
 
     @property
-    def settled(self) -> bool:
-        """Every group was granted at least once."""
+    def is_settled(self) -> bool:
+        """Every group is granted."""
         return all(stream.is_settled for stream in self._streams)
 
     def receive(self, name: str) -> None:
         """Count one message."""
-        stream = self._by_message.get(name)
-        if stream is not None:
+        if (stream := self._by_message.get(name)) is not None:
             stream.received += 1
 
     def receive_ack(self, ack: CommandAck) -> None:
-        """Take the vehicle's answer to the request under way."""
+        """Take the vehicle's answer to the open request."""
         if self._pending is None or ack.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             return
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
-            self._pending.accepted()
+            self._pending.accept()
         elif ack.result not in (
             dialect.MAV_RESULT_TEMPORARILY_REJECTED,
             dialect.MAV_RESULT_IN_PROGRESS,
         ):
-            self._pending.refused()
+            self._pending.refuse()
         self._pending = None
 
     def step(self, now_ns: int) -> Request | None:
         """The request that is due, if any."""
-        self._watch(now_ns)
+        self._check_rates(now_ns)
         if self._pending is not None:
-            if now_ns - self._asked_ns < _ACK_TIMEOUT_NS:
+            if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
             if self._pending.attempts >= _ATTEMPTS:
-                self._pending.unanswered()
+                self._pending.give_up_intervals()
         self._pending = next((s for s in self._streams if not s.is_settled), None)
         if self._pending is None:
             return None
-        self._asked_ns = now_ns
+        self._requested_ns = now_ns
         request = self._pending.request()
-        if isinstance(request, AskStream):  # never acknowledged
-            self._pending.accepted()
+        if isinstance(request, StreamRequest):  # never acknowledged
+            self._pending.accept()
             self._pending = None
         return request
 
-    def _watch(self, now_ns: int) -> None:
-        if not self.settled:
-            self._watched_ns = None
+    def _check_rates(self, now_ns: int) -> None:
+        if not self.is_settled:
+            self._window_ns = None
             return
-        if self._watched_ns is None:
-            self._watched_ns = now_ns
-        elif now_ns - self._watched_ns < _WATCH_NS:
-            return
-        else:
-            span_s = (now_ns - self._watched_ns) / NS_PER_S
+        if self._window_ns is not None:
+            if now_ns - self._window_ns < _WATCH_NS:
+                return
+            span_s = (now_ns - self._window_ns) / NS_PER_S
             for stream in self._streams:
                 if stream.received < _ENOUGH * stream.rate_hz * span_s:
                     stream.is_settled = False
                     self.renewals += 1
-            self._watched_ns = now_ns
+        self._window_ns = now_ns
         for stream in self._streams:
             stream.received = 0

@@ -5,52 +5,56 @@ from mavbridge.core.records import Reading, Telemetry
 from mavbridge.mavlink.codec.messages import Attitude, LocalVelocity, SpecificForce
 
 _YIELD_NS = 300 * NS_PER_MS
-"""How long a better message may be silent before a worse one takes its place."""
+"""Silence after which a better message gives way to a worse one."""
 
 _FORCE_RANK = {"HIGHRES_IMU": 0, "RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2}
 """Float m/s^2 first, then the first IMU in milli-g, then the second."""
 
 
-class TelemetryJoiner:
-    """Joins messages into one ``Telemetry``; a worse source never overwrites a better, live one."""
+class _BestReading:
+    """Readings of one quantity; a worse message never replaces a better one that still comes."""
 
     def __init__(self) -> None:
-        self._attitude: tuple[int, Reading, Reading] | None = None
-        self._force: tuple[int, Reading] | None = None
+        self._rank = 0
+        self.newest: Reading | None = None
+
+    def offer(self, rank: int, reading: Reading) -> None:
+        """Take a reading; a lower rank is better."""
+        held = self.newest
+        if held is None or rank <= self._rank or reading.arrived_ns - held.arrived_ns > _YIELD_NS:
+            self._rank, self.newest = rank, reading
+
+
+class TelemetryCollector:
+    """Joins messages into one ``Telemetry``."""
+
+    def __init__(self) -> None:
+        self._attitude, self._rate, self._force = _BestReading(), _BestReading(), _BestReading()
         self._velocity: Reading | None = None
 
-    def attitude(self, message: Attitude, arrived_ns: int) -> None:
-        """Take attitude and body rates."""
-        rank = 0 if message.is_quaternion else 1
-        held = self._attitude
-        if held is None or rank <= held[0] or arrived_ns - held[1].arrived_ns > _YIELD_NS:
-            self._attitude = (
-                rank,
-                Reading(arrived_ns, message.ned_from_body_wxyz),
-                Reading(arrived_ns, message.rate_body_radps),
-            )
+    def receive(self, body: Attitude | LocalVelocity | SpecificForce, arrived_ns: int) -> None:
+        """Take a message."""
+        match body:
+            case Attitude():
+                rank = 0 if body.is_quaternion else 1
+                self._attitude.offer(rank, Reading(arrived_ns, body.ned_from_body_wxyz))
+                self._rate.offer(rank, Reading(arrived_ns, body.rate_body_radps))
+            case LocalVelocity():
+                self._velocity = Reading(arrived_ns, body.velocity_ned_mps)
+            case SpecificForce():
+                reading = Reading(arrived_ns, body.specific_force_body_mps2)
+                self._force.offer(_FORCE_RANK[body.message_name], reading)
 
     @property
     def attitude_ns(self) -> int:
         """Arrival of the newest attitude; 0 before the first."""
-        return self._attitude[1].arrived_ns if self._attitude else 0
-
-    def velocity(self, message: LocalVelocity, arrived_ns: int) -> None:
-        """Take velocity."""
-        self._velocity = Reading(arrived_ns, message.velocity_ned_mps)
-
-    def force(self, message: SpecificForce, arrived_ns: int) -> None:
-        """Take specific force."""
-        rank = _FORCE_RANK[message.source]
-        held = self._force
-        if held is None or rank <= held[0] or arrived_ns - held[1].arrived_ns > _YIELD_NS:
-            self._force = (rank, Reading(arrived_ns, message.specific_force_body_mps2))
+        return self._attitude.newest.arrived_ns if self._attitude.newest else 0
 
     def snapshot(self) -> Telemetry:
-        """All that is known now."""
+        """The newest reading of each quantity."""
         return Telemetry(
-            ned_from_body_wxyz=self._attitude[1] if self._attitude else None,
-            rate_body_radps=self._attitude[2] if self._attitude else None,
+            ned_from_body_wxyz=self._attitude.newest,
+            rate_body_radps=self._rate.newest,
             velocity_ned_mps=self._velocity,
-            specific_force_body_mps2=self._force[1] if self._force else None,
+            specific_force_body_mps2=self._force.newest,
         )

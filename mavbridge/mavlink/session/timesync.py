@@ -1,9 +1,10 @@
-"""The vehicle's clock against ours, by TIMESYNC."""
+"""Offset between the vehicle's clock and ours, by TIMESYNC."""
 
 from collections import deque
 
 from mavbridge.config.rates import TIMESYNC_HZ, period_ns
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.histogram import Histogram
 from mavbridge.mavlink.codec.messages import Timesync
 
 _WINDOW = 20
@@ -11,16 +12,17 @@ _OUTSTANDING = 8
 
 
 class TimesyncFilter:
-    """Keeps the offset of the fastest recent exchange (the one with the least queueing in it).
+    """Keeps the offset of the fastest recent exchange, which was queued for the shortest time.
 
-    Only answers to our own outstanding requests count: replies are broadcast, and another station's
-    would pass for absurd round trips.
+    Only answers to our own outstanding requests count: replies are broadcast, and those to another
+    station would look like absurd round trips.
     """
 
     def __init__(self) -> None:
         self._outstanding: deque[int] = deque(maxlen=_OUTSTANDING)
         self._samples: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
         self._next_ns = 0
+        self.round_trips = Histogram()
 
     def request(self, now_ns: int) -> int | None:
         """ts1 of the request that is due, if any."""
@@ -30,16 +32,15 @@ class TimesyncFilter:
         self._outstanding.append(now_ns)
         return now_ns
 
-    def receive(self, reply: Timesync, arrived_ns: int) -> int | None:
-        """Round trip of a reply to us in ns; None for anybody else's, and for requests."""
+    def receive(self, reply: Timesync, arrived_ns: int) -> None:
+        """Take a TIMESYNC; requests and replies to other stations are ignored."""
         if reply.tc1 == 0 or reply.ts1 not in self._outstanding:
-            return None
+            return
         self._outstanding.remove(reply.ts1)
         round_trip_ns = arrived_ns - reply.ts1
-        if not 0 <= round_trip_ns < NS_PER_S:
-            return None
-        self._samples.append((round_trip_ns, reply.tc1 - (reply.ts1 + arrived_ns) // 2))
-        return round_trip_ns
+        if 0 <= round_trip_ns < NS_PER_S:
+            self._samples.append((round_trip_ns, reply.tc1 - (reply.ts1 + arrived_ns) // 2))
+            self.round_trips.add(round_trip_ns)
 
     @property
     def offset_ns(self) -> int | None:

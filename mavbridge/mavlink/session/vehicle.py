@@ -1,131 +1,135 @@
-"""What is known of the vehicle that was chosen, and whether it can be flown."""
+"""The session with one vehicle: its set-up, its state, and whether it can be flown.
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+A state machine without I/O. The link steps it at every tick, so connecting, reconnecting and a
+rebooted vehicle are all handled alike, and the action loop never waits for any of them.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import cached_property
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.config.flight import LinkConfig
 from mavbridge.config.rates import RC_CHANNELS_HZ
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.records import VehicleStatus
 from mavbridge.mavlink.codec.calibration import Pwm, RcCalibration
 from mavbridge.mavlink.codec.messages import (
     Attitude,
     AutopilotVersion,
-    Body,
     CommandAck,
+    CommandRequest,
     Heartbeat,
     LocalVelocity,
     ParamValue,
     RcChannels,
+    ReceivedMessage,
+    Request,
     SpecificForce,
+    StatusText,
 )
-from mavbridge.mavlink.session import params, streams
+from mavbridge.mavlink.session import params
+from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.echo import EchoCheck
-from mavbridge.mavlink.session.handshake import Handshake
 from mavbridge.mavlink.session.modes import ModeTable
-from mavbridge.mavlink.session.roster import Peer
-from mavbridge.mavlink.session.telemetry import TelemetryJoiner
+from mavbridge.mavlink.session.streams import StreamRequester, message_id, telemetry_streams
+from mavbridge.mavlink.session.telemetry import TelemetryCollector
 
 HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
-"""Beats come at 1 Hz: three lost in a row are a lost vehicle."""
+"""Heartbeats come at 1 Hz: a vehicle that loses three in a row is lost."""
+_VERSION_TIMEOUT_NS = 400 * NS_PER_MS
+_VERSION_ATTEMPTS = 4
 _REBOOT_STEP_MS = 1000
 _REBOOT_STAMPS = 2
-"""One old stamp may be a datagram that took a detour; two in a row are a clock that restarted."""
+"""One old stamp may be a delayed datagram; two in a row are a clock that has restarted."""
 _SWITCH_ON_US = 1800
 """ArduPilot's threshold of a high auxiliary switch."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Override:
-    """What the parameters say of overriding this vehicle."""
-
-    obstacles: str
-    """Why it would not obey us; empty where nothing speaks against it."""
-    switch_channel: int | None
-
-    @classmethod
-    def read(cls, values: Mapping[str, float], source_system: int) -> "_Override":
-        return cls(
-            obstacles="; ".join(params.override_obstacles(values, source_system)),
-            switch_channel=params.override_switch(values),
-        )
-
-
-class Vehicle:
+class VehicleSession:
     """One vehicle from its first heartbeat to its next reboot.
 
+    Reads its version, then its parameters (if the output needs them), then requests its streams and
+    keeps them coming.
+
+    Args:
+        identity: the vehicle.
+        config: output and source system.
+        state_hz: rate of the telemetry that the action loop needs.
+        report: shows a text to the user.
+
     Raises:
-        PeerError: it cannot be flown with the output that was asked for.
+        PeerError: the vehicle cannot be flown with the configured output.
     """
 
-    def __init__(self, peer: Peer, config: LinkConfig, *, state_hz: float) -> None:
-        self._config = config
+    def __init__(
+        self,
+        identity: VehicleIdentity,
+        config: LinkConfig,
+        *,
+        state_hz: float,
+        report: Callable[[str], None],
+    ) -> None:
+        self._source_system = config.source_system
         self._is_override = config.output == "rc-override"
-        if self._is_override and peer.autopilot == "px4":
+        if self._is_override and identity.autopilot == "px4":
             raise PeerError(
-                "PX4 takes RC_CHANNELS_OVERRIDE literally and has no release: "
-                "use --output manual-control"
+                "PX4 cannot release an RC_CHANNELS_OVERRIDE: use --output manual-control"
             )
-        if not self._is_override and peer.autopilot == "ardupilot":
-            raise PeerError(
-                "ArduPilot holds MANUAL_CONTROL like an override, and it cannot be released: "
-                "use --output rc-override"
-            )
-        self.peer = peer
-        self.modes = ModeTable(autopilot=peer.autopilot, vehicle_type=peer.vehicle_type)
-        self.telemetry = TelemetryJoiner()
+        if not self._is_override and identity.autopilot == "ardupilot":
+            raise PeerError("ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override")
+        self.identity = identity
+        self._report = report
+        self.modes = ModeTable(autopilot=identity.autopilot, vehicle_type=identity.vehicle_type)
+        self.telemetry = TelemetryCollector()
         self.echo = EchoCheck()
-        self.handshake = Handshake(
-            needs_calibration=self._is_override,
-            wanted=streams.groups(state_hz=state_hz, rc_hz=RC_CHANNELS_HZ),
-        )
+        self.calibration: RcCalibration | None = None
+        self.version: str | None = None
+        self._version_attempts = 0
+        self._version_due_ns = 0
+        self._params = params.ParamReader(params.FIRST_NAMES if self._is_override else ())
+        self._is_reading_channels = False
+        self._streams = StreamRequester(telemetry_streams(state_hz=state_hz, rc_hz=RC_CHANNELS_HZ))
+        self._has_advised = False
         self._status: VehicleStatus | None = None
-        """As last told; None after a message that may have changed it."""
-        self._beat: tuple[int, Heartbeat] | None = None
+        """None after a message that may have changed it."""
+        self._heartbeat: tuple[int, Heartbeat] | None = None
         self._rc: tuple[int, RcChannels] | None = None
-        self._override: _Override | None = None
         self._boot_ms = 0
         self._old_stamps = 0
-
-    @property
-    def calibration(self) -> RcCalibration | None:
-        """Its radio calibration, once read."""
-        return self.handshake.calibration
 
     @property
     def has_rebooted(self) -> bool:
         """Its clock has started again."""
         return self._old_stamps >= _REBOOT_STAMPS
 
-    def receive(self, body: Body, arrived_ns: int) -> None:
-        """Take one message of this vehicle."""
-        match body:
-            case Attitude():
-                self._watch_boot(body.boot_ms)
-                self.telemetry.attitude(body, arrived_ns)
-            case LocalVelocity():
-                self.telemetry.velocity(body, arrived_ns)
-            case SpecificForce():
-                self.telemetry.force(body, arrived_ns)
-            case RcChannels():
+    def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
+        """Take one message from this vehicle."""
+        self._streams.receive(message.name)
+        match message.body:
+            case Attitude() | LocalVelocity() | SpecificForce() as body:
+                if isinstance(body, Attitude):
+                    self._watch_boot(body.boot_ms)
+                self.telemetry.receive(body, arrived_ns)
+            case RcChannels() as body:
                 self._status = None
                 self._rc = (arrived_ns, body)
                 if (pwm_us := self._stick_channels_us(body)) is not None:
                     self.echo.received(pwm_us, arrived_ns)
-            case Heartbeat():
+            case Heartbeat() as body:
                 self._status = None
-                self._beat = (arrived_ns, body)
-            case CommandAck():
-                self.handshake.receive_ack(body)
-            case ParamValue():
-                self.handshake.receive_param(body)
-            case AutopilotVersion():
-                self.handshake.receive_version(body)
+                self._heartbeat = (arrived_ns, body)
+            case CommandAck() as body:
+                self._streams.receive_ack(body)
+            case ParamValue() as body:
+                self._params.receive(body)
+            case AutopilotVersion(version):
+                self.version = version
+            case StatusText(text):
+                self._report(f"vehicle: {text}")
             case _:
-                pass  # addressed to the link as a whole
+                pass  # handled by the link, or not used
 
     def _watch_boot(self, boot_ms: int) -> None:
         if boot_ms + _REBOOT_STEP_MS < self._boot_ms:
@@ -141,61 +145,99 @@ class Vehicle:
         t, y, p, r = (rc.channels_us[channel.number - 1] for channel in calibration.channels)
         return t, y, p, r
 
-    def status(self) -> VehicleStatus | None:
-        """What it says of itself; None before its first heartbeat."""
-        if self._status is None and self._beat is not None:
-            self._status = self._tell_status(*self._beat)
-        return self._status
+    def step(self, now_ns: int) -> Iterator[Request]:
+        """Requests that are due.
 
-    def _tell_status(self, beat_ns: int, beat: Heartbeat) -> VehicleStatus:
-        rc_sticks = None
-        if self._rc and self.calibration:
-            pwm_us = self._stick_channels_us(self._rc[1])
-            if pwm_us is not None and all(pwm_us):
-                rc_sticks = self.calibration.to_sticks(pwm_us)
-        return VehicleStatus(
-            system_id=self.peer.source.system,
-            autopilot=self.peer.autopilot,
-            mode=self.modes.name(beat.custom_mode),
-            armed=bool(beat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED),
-            heartbeat_ns=beat_ns,
-            rc_sticks=rc_sticks,
-            rc_channels_us=self._rc[1].channels_us if self._rc else (),
-            rc_arrived_ns=self._rc[0] if self._rc else None,
-        )
+        Raises:
+            PeerError: the vehicle cannot be flown with its present parameters.
+        """
+        is_version_open = self.version is None and self._version_attempts < _VERSION_ATTEMPTS
+        if is_version_open and now_ns >= self._version_due_ns:
+            self._version_due_ns = now_ns + _VERSION_TIMEOUT_NS
+            self._version_attempts += 1
+            number = float(message_id("AUTOPILOT_VERSION"))
+            yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
+        # Streams come after parameters: a vehicle slows its streams down while it sends those.
+        if self._is_override and self.calibration is None:
+            yield from self._params.step(now_ns)
+            self._advance_params()
+        elif (request := self._streams.step(now_ns)) is not None:
+            yield request
+        if not self._has_advised and self._unfinished() is None:
+            self._has_advised = True
+            for advice in params.override_advice(self._params.values):
+                self._report(advice)
 
-    def problem(self) -> str | None:
-        """Why it cannot be flown now, before any stick is sent; None if it can."""
-        if (problem := self.handshake.problem) is not None or not self._is_override:
-            return problem
-        if self._override is None:  # once: the parameters are all read by now
-            self._override = _Override.read(self.handshake.values, self._config.source_system)
-        if self._override.obstacles:
-            return f"the vehicle would not act on our sticks: {self._override.obstacles}"
-        if (channel := self._override.switch_channel) is not None:
-            values = self._rc[1].channels_us if self._rc else ()
-            if len(values) < channel or values[channel - 1] < _SWITCH_ON_US:
-                return f"the override switch (RC{channel}) is off"
+    def _advance_params(self) -> None:
+        if not self._params.is_done:
+            return
+        if self._is_reading_channels:
+            self.calibration = params.calibration(self._params.values)
+        else:
+            self._is_reading_channels = True
+            self._params.request(params.calibration_names(self._params.values))
+
+    def _unfinished(self) -> str | None:
+        """The step of the set-up that is not finished, or None."""
+        if self._is_override and self.calibration is None:
+            return "reading the vehicle's radio calibration"
+        if not self._streams.is_settled and self._streams.renewals == 0:
+            return "requesting telemetry from the vehicle"
         return None
 
-    @property
-    def has_beaten(self) -> bool:
-        """Its heartbeat was heard, since it was chosen."""
-        return self._beat is not None
+    def status(self) -> VehicleStatus | None:
+        """The vehicle's own report; None before its first heartbeat."""
+        if self._status is None and self._heartbeat is not None:
+            heartbeat_ns, heartbeat = self._heartbeat
+            rc_ns, rc = self._rc or (None, RcChannels(()))
+            pwm_us, rc_sticks = self._stick_channels_us(rc), None
+            if self.calibration is not None and pwm_us is not None and all(pwm_us):
+                rc_sticks = self.calibration.to_sticks(pwm_us)
+            self._status = VehicleStatus(
+                system_id=self.identity.source.system,
+                autopilot=self.identity.autopilot,
+                mode=self.modes.name(heartbeat.custom_mode),
+                armed=bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED),
+                heartbeat_ns=heartbeat_ns,
+                rc_sticks=rc_sticks,
+                rc_channels_us=rc.channels_us,
+                rc_arrived_ns=rc_ns,
+            )
+        return self._status
 
-    def is_lost(self, now_ns: int) -> bool:
-        """It has stopped beating."""
-        return self._beat is not None and now_ns - self._beat[0] > HEARTBEAT_TIMEOUT_NS
+    def problem(self, now_ns: int) -> str | None:
+        """The reason why it cannot be flown now, or None."""
+        if self._heartbeat is None:
+            return "waiting for the vehicle's heartbeat"
+        if now_ns - self._heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
+            return "the vehicle's heartbeat is lost"
+        if (unfinished := self._unfinished()) is not None or not self._is_override:
+            return unfinished
+        obstacles, switch = self._override_check
+        if obstacles:
+            return f"the vehicle would ignore our sticks: {obstacles}"
+        if switch is not None:
+            channels_us = self._rc[1].channels_us if self._rc else ()
+            if len(channels_us) < switch or channels_us[switch - 1] < _SWITCH_ON_US:
+                return f"the override switch (RC{switch}) is off: switch it on to fly"
+        return None
+
+    @cached_property
+    def _override_check(self) -> tuple[str, int | None]:
+        """Obstacles to overriding (empty = none), and the channel of the override switch."""
+        values = self._params.values
+        obstacles = params.override_obstacles(values, self._source_system)
+        return "; ".join(obstacles), params.override_switch(values)
 
     def overruled(self, now_ns: int) -> str | None:
-        """Why it does not act on the sticks that we send, or None."""
+        """The likely reason why it ignores the sticks that we send, or None."""
         if not self.echo.failed(now_ns):
             return None
         if self._rc is None or now_ns - self._rc[0] > NS_PER_S:
-            reason = "no RC_CHANNELS arrives to check against"
+            reason = "no RC_CHANNELS arrive to check against"
         else:
-            reason = "another station may be overriding, or the receiver has priority"
-        return f"the vehicle does not act on our sticks: {reason}"
+            reason = "another station may be overriding them, or the receiver has priority"
+        return f"the vehicle ignores our sticks: {reason}"
 
     @property
     def echo_confirmed(self) -> bool:

@@ -1,1 +1,1 @@
-"""Where MAVLink bytes come from and go to: UDP, TCP, serial."""
+"""Transports for MAVLink bytes (UDP, TCP, serial) and the connection over them."""

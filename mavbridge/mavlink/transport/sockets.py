@@ -8,7 +8,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import serial
 
@@ -18,7 +18,7 @@ from mavbridge.core.errors import UserError
 Address: TypeAlias = tuple[str, int]
 
 TCP_SILENCE_NS = 5 * NS_PER_S
-"""A vehicle beats at 1 Hz: a connection this quiet is dead, whatever the kernel believes."""
+"""Heartbeats come at 1 Hz: a connection this quiet is dead, even if the kernel has not noticed."""
 _CHUNK_BYTES = 65536
 _SO_TIMESTAMPNS = 35
 """asm-generic/socket.h; Python's socket module does not name it."""
@@ -31,64 +31,46 @@ class Chunk(NamedTuple):
     data: bytes
     arrived_ns: int
     sender: Address | None
-    """Of a datagram; None on a stream, which has one far end."""
+    """Source of a datagram; None on a stream, which has a single peer."""
 
 
 class TransportDownError(Exception):
-    """The far end or the port is gone; closing and opening again may help."""
+    """The peer or the port is gone; closing and opening again may help."""
 
 
 class Transport(Protocol):
-    """One way to reach a vehicle; used by one thread."""
+    """A non-blocking connection to a vehicle; used by one thread."""
 
     def open(self) -> None:
         """Acquire the socket or port.
 
         Raises:
-            UserError: it cannot be had as asked, and trying again will not help.
-            TransportDownError: it cannot be had now.
+            UserError: it cannot be opened as configured, and trying again will not help.
+            TransportDownError: it cannot be opened now.
         """
-        ...
 
     def drain(self) -> Iterator[Chunk]:
-        """Everything that has arrived. Raises TransportDownError when the link is lost."""
-        ...
+        """Everything that has arrived. Raises TransportDownError when the connection is lost."""
 
     def wait(self, until_ns: int) -> None:
-        """Return when something can be drained, or at the time."""
-        ...
+        """Return when ``drain`` has something to yield, or at the given time."""
 
     def answer_to(self, sender: Address | None) -> None:
-        """From now on send to this peer (no effect where there is only one)."""
-        ...
+        """From now on send to this peer; no effect on a stream."""
 
     def send(self, data: bytes) -> bool:
-        """Hand one packet to the kernel, whole; False: dropped, since it cannot go now.
+        """Hand one whole packet to the kernel; False: dropped, because it cannot be sent now.
 
         Raises:
-            TransportDownError: the link is lost.
+            TransportDownError: the connection is lost.
         """
-        ...
 
     def close(self) -> None:
-        """Give the socket or port back."""
-        ...
-
-
-def _wait_readable(
-    source: socket.socket | serial.Serial | None, clock: Clock, until_ns: int
-) -> None:
-    timeout_ns = until_ns - clock.now_ns()
-    if timeout_ns <= 0:
-        return
-    if source is None:
-        clock.sleep_until_ns(until_ns)
-        return
-    select.select([source], [], [], timeout_ns / NS_PER_S)
+        """Free the socket or port; may be called twice."""
 
 
 def _resolve(address: Address) -> Address:
-    """Once, at the start: a resolver may block, and must not do so in flight."""
+    """IP address of a host; once, at the start, because a resolver may block."""
     host, port = address
     try:
         return socket.gethostbyname(host), port
@@ -96,25 +78,49 @@ def _resolve(address: Address) -> Address:
         raise UserError(f"cannot find host {host!r}: {error.strerror}") from error
 
 
-class UdpTransport:
+_Handle = TypeVar("_Handle", socket.socket, serial.Serial)
+
+
+class _Base(Generic[_Handle]):
+    """The parts that all transports have in common."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._handle: _Handle | None = None
+
+    def wait(self, until_ns: int) -> None:
+        """See `Transport`."""
+        timeout_ns = until_ns - self._clock.now_ns()
+        if self._handle is None:
+            self._clock.sleep_until_ns(until_ns)
+        elif timeout_ns > 0:
+            select.select([self._handle], [], [], timeout_ns / NS_PER_S)
+
+    def close(self) -> None:
+        """See `Transport`."""
+        if self._handle is not None:
+            self._handle.close()
+            self._handle = None
+
+
+class UdpTransport(_Base[socket.socket]):
     """UDP, listening (``udp:``, ``udpin:``) or calling (``udpout:``)."""
 
     def __init__(self, address: Address, clock: Clock, *, listen: bool) -> None:
+        super().__init__(clock)
         self._address = _resolve(address)
-        self._clock = clock
         self._listen = listen
         self._peer: Address | None = None if listen else self._address
-        self._socket: socket.socket | None = None
 
     def open(self) -> None:
-        """Bind or prepare the socket."""
+        """See `Transport`."""
         udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         udp.setblocking(False)
         if sys.platform == "linux":
             udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         if self._listen:
             self._bind(udp)
-        self._socket = udp
+        self._handle = udp
 
     def _bind(self, udp: socket.socket) -> None:
         try:
@@ -130,14 +136,14 @@ class UdpTransport:
             raise UserError(f"cannot use udp {host}:{port}: {error.strerror}; {hint}") from error
 
     def drain(self) -> Iterator[Chunk]:
-        """Datagrams with the kernel's arrival stamp where it gives one."""
-        while self._socket is not None:
+        """Datagrams, with the kernel's arrival stamp where there is one."""
+        while self._handle is not None:
             try:
-                data, control, _, sender = self._socket.recvmsg(_CHUNK_BYTES, 64)
+                data, control, _, sender = self._handle.recvmsg(_CHUNK_BYTES, 64)
             except BlockingIOError:
                 return
             except OSError:
-                continue  # the network's answer to an earlier send: nobody is there yet
+                continue  # the network's answer to an earlier send: nobody listens there yet
             yield Chunk(data, self._arrival_ns(control), sender)
 
     def _arrival_ns(self, control: list[tuple[int, int, bytes]]) -> int:
@@ -151,10 +157,6 @@ class UdpTransport:
                 return now_ns - min(max(queued_ns, 0), NS_PER_S)
         return now_ns
 
-    def wait(self, until_ns: int) -> None:
-        """Return when something has arrived, or at the time."""
-        _wait_readable(self._socket, self._clock, until_ns)
-
     def answer_to(self, sender: Address | None) -> None:
         """Send to this peer from now on, if we listen."""
         if self._listen:
@@ -162,53 +164,47 @@ class UdpTransport:
 
     def send(self, data: bytes) -> bool:
         """Send one datagram to the peer, if there is one and it can be reached now."""
-        if self._socket is None or self._peer is None:
+        if self._handle is None or self._peer is None:
             return False
         try:
-            self._socket.sendto(data, self._peer)
+            self._handle.sendto(data, self._peer)
         except OSError:
-            return False  # full buffer, no route, nobody there: UDP loses a datagram and goes on
+            return False  # full buffer, no route, nobody listens: this datagram is lost, no more
         return True
 
-    def close(self) -> None:
-        """Close the socket."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
 
+class _StreamTransport(_Base[_Handle]):
+    """A stream that may take a part of a packet: the rest goes out before the next packet."""
 
-class _Outbox:
-    """Whole packets into a stream that may take a part: the rest of one goes before the next."""
+    _unsent = b""
 
-    def __init__(self) -> None:
-        self._rest = b""
+    def answer_to(self, sender: Address | None) -> None:
+        """See `Transport`."""
 
-    def put(self, data: bytes, write: Callable[[bytes], int]) -> bool:
-        """Write the packet, or drop it whole; raises what ``write`` raises."""
+    def _put(self, data: bytes, write: Callable[[bytes], int]) -> bool:
+        """Write the packet, or drop it whole; raises OSError as ``write`` does."""
         try:
-            if self._rest:
-                self._rest = self._rest[write(self._rest) :]
-                if self._rest:
+            if self._unsent:
+                self._unsent = self._unsent[write(self._unsent) :]
+                if self._unsent:
                     return False
-            self._rest = data[write(data) :]
+            self._unsent = data[write(data) :]
         except BlockingIOError:
             return False
         return True
 
 
-class TcpTransport:
-    """TCP client (``tcp:``); connects in the background of ``drain``."""
+class TcpTransport(_StreamTransport[socket.socket]):
+    """TCP client (``tcp:``)."""
 
     def __init__(self, address: Address, clock: Clock) -> None:
+        super().__init__(clock)
         self._address = _resolve(address)
-        self._clock = clock
-        self._socket: socket.socket | None = None
         self._is_connected = False
         self._heard_ns = 0
-        self._outbox = _Outbox()
 
     def open(self) -> None:
-        """Begin to connect; ``drain`` finds out how it went."""
+        """Begin to connect; ``drain`` finds out whether it succeeded."""
         tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         tcp.setblocking(False)
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -218,129 +214,101 @@ class TcpTransport:
             code = error.errno or errno.EIO
         if code not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
             tcp.close()
-            raise TransportDownError(self._explain(code))
-        self._socket, self._is_connected, self._outbox = tcp, False, _Outbox()
+            raise self._down(code)
+        self._handle, self._is_connected, self._unsent = tcp, False, b""
         self._heard_ns = self._clock.now_ns()
 
-    def _explain(self, code: int | None) -> str:
+    def _down(self, code: int | None) -> TransportDownError:
         host, port = self._address
-        return f"tcp {host}:{port}: {errno.errorcode.get(code or 0, code)}"
+        return TransportDownError(f"tcp {host}:{port}: {errno.errorcode.get(code or 0, code)}")
 
     def drain(self) -> Iterator[Chunk]:
-        """Bytes received so far; loss of the connection, or of the far end, is an error."""
-        while self._socket is not None:
+        """Bytes received so far."""
+        while self._handle is not None:
             try:
-                data = self._socket.recv(_CHUNK_BYTES)
+                data = self._handle.recv(_CHUNK_BYTES)
             except BlockingIOError:
                 break
             except OSError as error:
                 if not self._is_connected and error.errno == errno.ENOTCONN:
                     break
-                raise TransportDownError(self._explain(error.errno)) from error
+                raise self._down(error.errno) from error
             if not data:
                 raise TransportDownError("tcp: the vehicle closed the connection")
             self._is_connected = True
             self._heard_ns = self._clock.now_ns()
             yield Chunk(data, self._heard_ns, None)
-        if self._socket is not None and self._clock.now_ns() - self._heard_ns > TCP_SILENCE_NS:
+        if self._handle is not None and self._clock.now_ns() - self._heard_ns > TCP_SILENCE_NS:
             raise TransportDownError(f"tcp: silent for {TCP_SILENCE_NS // NS_PER_S} s")
 
-    def wait(self, until_ns: int) -> None:
-        """Return when something has arrived, or at the time."""
-        _wait_readable(self._socket, self._clock, until_ns)
-
-    def answer_to(self, sender: Address | None) -> None:
-        """One connection has one peer."""
-
     def send(self, data: bytes) -> bool:
-        """Send one packet whole."""
-        if self._socket is None:
+        """See `Transport`."""
+        if self._handle is None:
             return False
         try:
-            return self._outbox.put(data, self._socket.send)
+            return self._put(data, self._handle.send)
         except OSError as error:
             if error.errno in (errno.ENOTCONN, errno.EINPROGRESS):
                 return False
-            raise TransportDownError(self._explain(error.errno)) from error
-
-    def close(self) -> None:
-        """Close the connection."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+            raise self._down(error.errno) from error
 
 
-class SerialTransport:
+class SerialTransport(_StreamTransport[serial.Serial]):
     """A serial port (``/dev/ttyX,BAUD``)."""
 
     def __init__(self, device: str, baud: int, clock: Clock) -> None:
+        super().__init__(clock)
         self._device = device
         self._baud = baud
-        self._clock = clock
-        self._port: serial.Serial | None = None
         self._was_open = False
-        self._outbox = _Outbox()
 
     def open(self) -> None:
-        """Open the port for non-blocking use, and for nobody else."""
+        """Open the port, non-blocking and exclusive."""
         try:
-            self._port = serial.Serial(self._device, self._baud, timeout=0, exclusive=True)
+            self._handle = serial.Serial(self._device, self._baud, timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # SerialException is an OSError
             if self._was_open:
-                raise TransportDownError(f"serial {self._device}: {error}") from error
+                raise self._down(error) from error
             raise UserError(
                 f"cannot open {self._device} at {self._baud} baud: {error}; check the name, that "
-                "no other program uses it, and that you may (group dialout)"
+                "no other program uses it, and that you have permission (group dialout)"
             ) from error
         self._was_open = True
-        self._outbox = _Outbox()
+        self._unsent = b""
+
+    def _down(self, error: Exception) -> TransportDownError:
+        return TransportDownError(f"serial {self._device}: {error}")
 
     def drain(self) -> Iterator[Chunk]:
         """Bytes received so far."""
-        if self._port is None:
+        if self._handle is None:
             return
         try:
-            data = self._port.read(_CHUNK_BYTES)
+            data = self._handle.read(_CHUNK_BYTES)
         except OSError as error:
-            raise TransportDownError(f"serial {self._device}: {error}") from error
+            raise self._down(error) from error
         if data:
             yield Chunk(data, self._clock.now_ns(), None)
 
-    def wait(self, until_ns: int) -> None:
-        """Return when something has arrived, or at the time."""
-        _wait_readable(self._port, self._clock, until_ns)
-
-    def answer_to(self, sender: Address | None) -> None:
-        """One port has one peer."""
-
     def send(self, data: bytes) -> bool:
-        """Queue one packet whole.
-
-        Past pyserial, whose write spins without end on a full buffer.
-        """
-        if self._port is None:
+        """See `Transport`. Bypasses pyserial, whose write loops forever on a full buffer."""
+        if self._handle is None:
             return False
-        descriptor = self._port.fileno()
+        descriptor = self._handle.fileno()
         try:
-            return self._outbox.put(data, lambda part: os.write(descriptor, part))
+            return self._put(data, lambda part: os.write(descriptor, part))
         except OSError as error:
-            raise TransportDownError(f"serial {self._device}: {error}") from error
-
-    def close(self) -> None:
-        """Close the port."""
-        if self._port is not None:
-            self._port.close()
-            self._port = None
+            raise self._down(error) from error
 
 
 _FORMS = "udp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyX,BAUD"
 
 
 def make_transport(spec: str, clock: Clock) -> Transport:
-    """The transport that a connection string asks for (pymavlink's forms), not opened yet.
+    """The transport for a connection string in pymavlink's notation, not opened yet.
 
     Raises:
-        UserError: the string is none of them, or names a host that does not exist.
+        UserError: the string is malformed, or its host does not exist.
     """
     kind, _, rest = spec.partition(":")
     if kind in ("udp", "udpin", "udpout"):

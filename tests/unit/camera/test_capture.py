@@ -9,7 +9,7 @@ import pytest
 
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import capture
-from mavbridge.camera.capture import DeviceSource, StreamSource, device_mode, exposure_ns
+from mavbridge.camera.capture import device_mode, exposure_ns, open_device, open_stream
 from mavbridge.camera.grabber import Grabber
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError
@@ -72,10 +72,16 @@ class FakeDevice:
 
 
 def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch):
-    monkeypatch.setattr(cv2, "VideoCapture", FakeDevice)
-    source = DeviceSource(Path("/dev/video7"), image_size=300, clock=FakeClock())
-    assert source._capture.opened_with == ("/dev/video7", cv2.CAP_V4L2)
-    assert source._capture.settings == {
+    opened = []
+
+    def open_capture(*arguments):
+        opened.append(FakeDevice(*arguments))
+        return opened[0]
+
+    monkeypatch.setattr(cv2, "VideoCapture", open_capture)
+    source = open_device(Path("/dev/video7"), image_size=300, clock=FakeClock())
+    assert opened[0].opened_with == ("/dev/video7", cv2.CAP_V4L2)
+    assert opened[0].settings == {
         cv2.CAP_PROP_FRAME_WIDTH: 640,
         cv2.CAP_PROP_FRAME_HEIGHT: 480,
     }
@@ -89,8 +95,10 @@ def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch):
 
 @pytest.mark.parametrize("device", [999, Path("/dev/video999")])
 def test_a_device_that_is_not_there_says_what_is(device):
-    with pytest.raises(CameraError, match=r"999 cannot be opened; (no /dev/video|present: )"):
-        DeviceSource(device, image_size=224, clock=FakeClock())
+    with pytest.raises(
+        CameraError, match=r"999 cannot be opened; (there is no /dev/video|present: )"
+    ):
+        open_device(device, image_size=224, clock=FakeClock())
 
 
 class MjpegHandler(http.server.BaseHTTPRequestHandler):
@@ -133,7 +141,7 @@ def test_a_stream_over_http_flows_and_its_end_is_noticed(mjpeg_server, monkeypat
     monkeypatch.delenv(capture.FFMPEG_OPTIONS_VARIABLE, raising=False)
     clock = MonotonicClock()
     url = f"http://127.0.0.1:{mjpeg_server.server_address[1]}/video.mjpg"
-    sources = [lambda: StreamSource(url, clock=clock)]
+    sources = [lambda: open_stream(url, clock=clock)]
 
     def open_once():
         if not sources:
@@ -174,7 +182,7 @@ def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
         return FakeDevice(*arguments)
 
     monkeypatch.setattr(cv2, "VideoCapture", open_capture)
-    source = StreamSource("udp://0.0.0.0:5600", clock=FakeClock())
+    source = open_stream("udp://0.0.0.0:5600", clock=FakeClock())
     assert options == [seen]
     assert os.environ.get(capture.FFMPEG_OPTIONS_VARIABLE) == set_by_user
     assert source.next_image().captured_ns == START_NS
@@ -184,4 +192,4 @@ def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
 
 def test_a_stream_that_nobody_sends_is_refused():
     with pytest.raises(CameraError, match="cannot be opened within 5 s"):
-        StreamSource("tcp://127.0.0.1:9", clock=FakeClock())
+        open_stream("tcp://127.0.0.1:9", clock=FakeClock())

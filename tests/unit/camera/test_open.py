@@ -29,8 +29,8 @@ def openers(monkeypatch):
 
         return source
 
-    monkeypatch.setattr(camera_open, "DeviceSource", refuse("device"))
-    monkeypatch.setattr(camera_open, "StreamSource", refuse("stream"))
+    monkeypatch.setattr(camera_open, "open_device", refuse("device"))
+    monkeypatch.setattr(camera_open, "open_stream", refuse("stream"))
 
 
 @pytest.mark.parametrize(
@@ -85,8 +85,11 @@ def test_a_device_that_is_not_there_is_refused():
         open_camera("999", image_size=224, clock=FakeClock())
 
 
-def test_the_screen_without_its_package_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mss", None)
+@pytest.mark.parametrize("package", ["mss", "Xlib"])
+def test_the_screen_without_its_packages_names_the_extra(monkeypatch, package):
+    for name in ("mavbridge.camera.x11", package):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "mavbridge.camera.screen", raising=False)
     with pytest.raises(UserError, match=r"pip install 'mavbridge\[screen\]'"):
         open_camera("screen:", image_size=224, clock=FakeClock())

@@ -13,8 +13,8 @@ from helpers.fakes import START_NS, FakeClock
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import CameraError, UserError
 
-if importlib.util.find_spec("mss") is None:
-    pytest.skip("needs the package mss", allow_module_level=True)
+if importlib.util.find_spec("mss") is None or importlib.util.find_spec("Xlib") is None:
+    pytest.skip("needs the packages mss and python-xlib", allow_module_level=True)
 
 from mavbridge.camera.screen import INTERVAL_NS, ScreenCamera, choose_window
 from mavbridge.camera.x11 import Window
@@ -158,7 +158,7 @@ def test_a_window_is_followed_and_clipped_to_the_screen(window, clock):
 def test_a_window_that_goes_away_is_dead(window, clock, command):
     camera = ScreenCamera("red", clock=clock)
     window.do(command)
-    with pytest.raises(CameraError, match="closed, hidden or moved away"):
+    with pytest.raises(CameraError, match="closed, hidden or moved off"):
         camera.read(NS_PER_S)
     camera.close()
 
@@ -168,7 +168,7 @@ def test_a_window_that_goes_away_is_dead(window, clock, command):
 def test_a_window_that_is_closed_is_dead(window, clock):
     camera = ScreenCamera("red", clock=clock)
     window.do("window.destroy(); window = type('Gone', (), {'update': lambda self: None})()")
-    with pytest.raises(CameraError, match="closed, hidden or moved away"):
+    with pytest.raises(CameraError, match="closed, hidden or moved off"):
         camera.read(NS_PER_S)
     camera.close()
 

@@ -166,15 +166,13 @@ def test_a_lapped_copy_is_thrown_away_and_the_newer_frame_taken(writer, clock, m
     camera = SharedMemoryCamera(writer.path.name, clock=clock)
     writer.publish(1, START_NS, grey=1)
     laps = iter([lambda: writer.publish(5, START_NS + 5, grey=5)])
-    in_order = shared_memory._Segment._in_order
 
-    def interrupted(segment):
-        in_order(segment)
+    def interrupted():
         if barriers.pop(0) == "after copy":
             next(laps, lambda: None)()
 
     barriers = ["newest", "before copy", "after copy", *["later"] * 3]
-    monkeypatch.setattr(shared_memory._Segment, "_in_order", interrupted)
+    monkeypatch.setattr(shared_memory, "memory_barrier", interrupted)
     frame = camera.read(0)
     assert frame is not None
     assert (frame.frame_id, frame.captured_ns, frame.rgb[0, 0, 0]) == (5, START_NS + 5, 5)
@@ -285,7 +283,7 @@ def test_a_folder_is_refused(path, clock):
 
 @pytest.mark.parametrize("name", ["", "a/b", "..", ".x"])
 def test_impossible_names_are_refused(name, clock):
-    with pytest.raises(UserError, match="want a name such as"):
+    with pytest.raises(UserError, match="use a name such as"):
         SharedMemoryCamera(name, clock=clock)
 
 

@@ -88,6 +88,13 @@ def test_periods_and_jitter_go_on_across_batches(rrd: Path) -> None:
     assert seen.values("missed/action") == [0, 0, 2, 2]
 
 
+def test_dropped_frames_start_from_zero(rrd: Path) -> None:
+    first = make_vision_tick(1, dropped_frames=40)
+    second, third = (make_vision_tick(k, dropped_frames=40 + k) for k in (2, 3))
+    seen = show(rrd, [make_tick(0), first, second], [third])
+    assert seen.values("missed/vision") == [0, 2, 3]
+
+
 def test_every_stage_of_every_stick_has_its_series(rrd: Path) -> None:
     stages = [
         Sticks(throttle=k + 0.125, yaw=k + 0.25, pitch=k + 0.5, roll=k + 0.75) for k in range(6)

@@ -63,7 +63,7 @@ def test_an_unknown_target_is_refused_with_the_choices(text: str) -> None:
     ],
 )
 def test_a_malformed_url_is_refused_with_an_example(url: str) -> None:
-    with pytest.raises(UserError, match=r"looks like rerun\+http://127\.0\.0\.1:9876/proxy"):
+    with pytest.raises(UserError, match=r"look like rerun\+http://127\.0\.0\.1:9876/proxy"):
         prepare_target(f"connect={url}")
 
 
@@ -90,7 +90,7 @@ def test_a_spawned_viewer_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_spawned_viewer_that_ends_is_reported_with_its_last_words(bound_port: int) -> None:
     dies = "import sys; sys.exit('starting up\\nno display is set')"
-    with pytest.raises(MavbridgeError, match="ended at once: no display is set; record to a file"):
+    with pytest.raises(MavbridgeError, match="exited at once: no display is set; record to a file"):
         spawn_viewer([sys.executable, "-c", dies], port=bound_port)
 
 

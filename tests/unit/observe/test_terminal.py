@@ -17,7 +17,6 @@ from mavbridge.core.records import LinkStats, Percentiles, Tick
 from mavbridge.observe.terminal import (
     PLAIN_PERIOD_S,
     FlightScreen,
-    StatusLine,
     timing_table,
     verdicts,
 )
@@ -27,8 +26,9 @@ ONE_UP_AND_ERASE = "\x1b[1A\x1b[2K"
 REFRESH_TICKS = round(100 / STATUS_HZ)
 
 
-def status_line(*, readonly: bool = False) -> StatusLine:
-    return StatusLine(action_hz=100, vision_hz=30, readonly=readonly)
+def make_screen(console: Console | None = None, *, readonly: bool = False) -> FlightScreen:
+    console = console or Console(file=io.StringIO())
+    return FlightScreen(console, action_hz=100, vision_hz=30, readonly=readonly)
 
 
 def rendered(what: RenderableType, width: int = 100) -> str:
@@ -37,15 +37,15 @@ def rendered(what: RenderableType, width: int = 100) -> str:
     return console.export_text()
 
 
-def fly(status: StatusLine, *, ticks: int, first: int = 0) -> str:
+def fly(screen: FlightScreen, *, ticks: int, first: int = 0) -> str:
     """Emit ticks, and frames at 25 Hz, as they come between refreshes; the last line."""
     line = ""
     for index in range(first, first + ticks):
-        status.emit(make_tick(index))
+        screen.emit(make_tick(index))
         if index % 4 == 0:
-            status.emit(make_vision_tick(index, ready_ns=START_NS + index * TICK_NS))
+            screen.emit(make_vision_tick(index, ready_ns=START_NS + index * TICK_NS))
         if index % REFRESH_TICKS == 0:
-            line = status.render().plain
+            line = screen.status_line().plain
     return line
 
 
@@ -70,14 +70,14 @@ def verdict_lines(report: TimingReport) -> list[str]:
 
 
 def test_the_line_of_a_good_flight() -> None:
-    assert fly(status_line(), ticks=201) == (
+    assert fly(make_screen(), ticks=201) == (
         "FLYING  ALT_HOLD armed  action 100.0 Hz  vision 25.0 Hz"
         "  feature 40 ms  state 3 ms  missed 0"
     )
 
 
 def test_before_the_first_tick_the_line_says_so() -> None:
-    assert status_line().render().plain == "waiting for the first tick"
+    assert make_screen().status_line().plain == "waiting for the first tick"
 
 
 @pytest.mark.parametrize(
@@ -93,49 +93,49 @@ def test_before_the_first_tick_the_line_says_so() -> None:
     ],
 )
 def test_the_line_shows_what_the_newest_tick_says(tick: Tick, expected: str) -> None:
-    status = status_line()
-    status.emit(tick)
-    assert expected in status.render().plain
+    screen = make_screen()
+    screen.emit(tick)
+    assert expected in screen.status_line().plain
 
 
 def test_readonly_is_not_called_flying_and_a_release_stays_a_release() -> None:
-    status = status_line(readonly=True)
-    status.emit(make_tick(0, sent=None))
-    assert status.render().plain.startswith("READ-ONLY  ")
-    status.emit(make_released_tick(1, "no feature yet"))
-    line = status.render().plain
+    screen = make_screen(readonly=True)
+    screen.emit(make_tick(0, sent=None))
+    assert screen.status_line().plain.startswith("READ-ONLY  ")
+    screen.emit(make_released_tick(1, "no feature yet"))
+    line = screen.status_line().plain
     assert line.startswith("RELEASED  ")
     assert line.endswith("  no feature yet")  # last, since it may be long
 
 
 def test_one_refresh_is_no_rate_yet() -> None:
-    status = status_line()
-    status.emit(make_tick(0))
-    assert "action - Hz  vision - Hz" in status.render().plain
+    screen = make_screen()
+    screen.emit(make_tick(0))
+    assert "action - Hz  vision - Hz" in screen.status_line().plain
 
 
 def test_a_loop_that_has_stopped_has_no_rate() -> None:
-    status = status_line()
-    assert "action 100.0 Hz" in fly(status, ticks=201)
-    lines = [status.render().plain for _ in range(2 * round(STATUS_HZ))]
+    screen = make_screen()
+    assert "action 100.0 Hz" in fly(screen, ticks=201)
+    lines = [screen.status_line().plain for _ in range(2 * round(STATUS_HZ))]
     assert "action - Hz  vision - Hz" in lines[-1]
 
 
 def test_the_rate_follows_within_the_window() -> None:
-    status = status_line()
-    fly(status, ticks=201)
+    screen = make_screen()
+    fly(screen, ticks=201)
     line = ""
     for number in range(1, 101):  # half the rate from here on
-        status.emit(make_tick(200 + 2 * number))
+        screen.emit(make_tick(200 + 2 * number))
         if number % (REFRESH_TICKS // 2) == 0:
-            line = status.render().plain
+            line = screen.status_line().plain
     assert "action 50.0 Hz" in line
 
 
 def test_the_line_is_cut_not_wrapped_on_a_narrow_terminal() -> None:
     out = io.StringIO()
     console = Console(file=out, width=60, force_terminal=True, color_system=None)
-    screen = FlightScreen(console, action_hz=100, vision_hz=30, readonly=False)
+    screen = make_screen(console)
     with screen.live():
         screen.emit(make_released_tick(0, "a very long reason " * 10))
         screen.refresh()
@@ -146,21 +146,21 @@ def test_the_line_is_cut_not_wrapped_on_a_narrow_terminal() -> None:
 
 def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
     out = io.StringIO()
-    screen = FlightScreen(Console(file=out, width=80), action_hz=100, vision_hz=30, readonly=False)
+    screen = make_screen(Console(file=out, width=80))
     with screen.live():
         screen.emit(make_tick(0))
         for _ in range(2 * round(PLAIN_PERIOD_S * STATUS_HZ)):
             screen.refresh()
-    news, *lines = out.getvalue().splitlines()
-    assert news == "FLYING: the policy has the sticks"
+    message, *lines = out.getvalue().splitlines()
+    assert message == "FLYING: the policy has the sticks"
     assert len(lines) == 2
     assert lines[0].startswith("FLYING  ALT_HOLD armed")
     assert lines[0].endswith("missed 0")  # not cut at 80 columns: it goes to a file
 
 
-def test_news_is_printed_once_in_order() -> None:
+def test_messages_are_printed_once_in_order() -> None:
     out = io.StringIO()
-    screen = FlightScreen(Console(file=out, width=80), action_hz=100, vision_hz=30, readonly=False)
+    screen = make_screen(Console(file=out, width=80))
     screen.emit(make_released_tick(0, reason="no [bold] state", texts=("vehicle: Arming motors",)))
     screen.emit(make_released_tick(1, reason="no [bold] state"))
     screen.emit(make_tick(2, trace=None))
@@ -180,7 +180,7 @@ def test_news_is_printed_once_in_order() -> None:
 def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
     out = io.StringIO()
     console = Console(file=out, width=100, force_terminal=True, color_system=None)
-    screen = FlightScreen(console, action_hz=100, vision_hz=30, readonly=False)
+    screen = make_screen(console)
     with screen.live():
         screen.emit(make_tick(0))
         screen.refresh()
@@ -203,6 +203,7 @@ def test_the_table_holds_the_numbers_in_milliseconds() -> None:
     assert rows["attitude age at send"] == ["3.00"] * 4
     assert rows["vision encode"] == ["-"] * 4
     assert rows["link round trip"] == ["-"] * 4
+    assert "A slot is one period" in text
 
 
 def test_the_table_fits_eighty_columns() -> None:
@@ -210,7 +211,7 @@ def test_the_table_fits_eighty_columns() -> None:
     assert max(len(line) for line in rendered(timing_table(report_of(*slow))).splitlines()) <= 80
 
 
-def test_verdicts_say_what_was_asked_and_what_came() -> None:
+def test_verdicts_compare_targets_and_results() -> None:
     link = LinkStats(
         messages_per_s=(),
         lost_fraction=0.0,
@@ -220,10 +221,10 @@ def test_verdicts_say_what_was_asked_and_what_came() -> None:
     )
     report = report_of(*(make_tick(index) for index in range(11)), link=link, rerun_drops=0)
     assert verdict_lines(report) == [
-        "action  100.0 of 100 Hz asked, 0 missed slots in 11 ticks",
-        "vision  - of 30 Hz asked, 0 frames dropped by the camera",
-        "link    11 stick messages sent, echo confirmed, 0.00% of the vehicle's messages lost",
-        "sticks  never released",
+        "action   100.0 Hz of 100 Hz, 0 missed slots in 11 ticks",
+        "vision   - Hz of 30 Hz, 0 frames dropped by the camera",
+        "link     11 stick messages sent, echo confirmed, 0.00% of the vehicle's messages lost",
+        "sticks   never released",
     ]
 
 
@@ -233,8 +234,8 @@ def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
         *(make_released_tick(index, reason) for index, reason in enumerate(reasons)), rerun_drops=1
     )
     assert verdict_lines(report)[-2:] == [
-        "sticks  released 4 times, last for: b (0.0 s); c (0.0 s); d (0.0 s)",
-        "rerun   missed 1 event",
+        "sticks   released 4 times, last for: b (0.0 s); c (0.0 s); d (0.0 s)",
+        "rerun    missed 1 event",
     ]
 
 
@@ -256,7 +257,7 @@ def test_the_link_verdict_is_honest(
         echo_confirmed=confirmed,
     )
     assert verdict_lines(report_of(make_tick(), link=link))[2] == (
-        f"link    1 stick message sent, {expected}"
+        f"link     1 stick message sent, {expected}"
     )
 
 
@@ -271,7 +272,7 @@ def test_a_loop_that_misses_its_rate_is_not_green(period_ns: int, style: str) ->
 
 def test_show_report_prints_table_and_verdicts() -> None:
     out = io.StringIO()
-    screen = FlightScreen(Console(file=out, width=100), action_hz=100, vision_hz=30, readonly=False)
+    screen = make_screen(Console(file=out, width=100))
     screen.show_report(report_of(*(make_tick(index) for index in range(11))))
     assert "toge-small on torch, ardupilot" in out.getvalue()
-    assert "100.0 of 100 Hz asked" in out.getvalue()
+    assert "100.0 Hz of 100 Hz" in out.getvalue()

@@ -1,4 +1,4 @@
-"""The link's parts, each a state machine without I/O."""
+"""The parts of a session, each a state machine without I/O."""
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -9,19 +9,20 @@ from mavbridge.core.errors import PeerError, UserError
 from mavbridge.mavlink.codec.messages import (
     Attitude,
     CommandAck,
+    CommandRequest,
+    Endpoint,
     Heartbeat,
     ParamValue,
-    Source,
     SpecificForce,
+    StreamRequest,
     Timesync,
 )
-from mavbridge.mavlink.codec.requests import AskCommand, AskStream
 from mavbridge.mavlink.session import params, streams
+from mavbridge.mavlink.session.discovery import VehicleDiscovery
 from mavbridge.mavlink.session.echo import NUDGE_US, EchoCheck
 from mavbridge.mavlink.session.modes import ModeTable
-from mavbridge.mavlink.session.roster import Roster
 from mavbridge.mavlink.session.stats import LinkCounters
-from mavbridge.mavlink.session.telemetry import TelemetryJoiner
+from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 
 S = NS_PER_S
@@ -31,72 +32,74 @@ def beat(vehicle_type: int = 2, autopilot: int = 3) -> Heartbeat:
     return Heartbeat(vehicle_type=vehicle_type, autopilot=autopilot, base_mode=1, custom_mode=0)
 
 
-# --- roster
+# --- discovery
 
 
 def test_one_vehicle_is_chosen_once_a_second_one_would_have_been_heard() -> None:
-    roster = Roster(target_system=0)
-    roster.hear(Source(255, 190), beat(dialect.MAV_TYPE_GCS, 8), None, 0)
-    roster.hear(Source(1, 154), beat(dialect.MAV_TYPE_GIMBAL, 8), None, 0)
-    assert roster.choose(10 * S) is None
-    roster.hear(Source(1, 1), beat(), ("host", 5), 10 * S)
-    assert roster.choose(11 * S) is None
-    peer = roster.choose(12 * S)
+    discovery = VehicleDiscovery(target_system=0)
+    discovery.receive(Endpoint(255, 190), beat(dialect.MAV_TYPE_GCS, 8), None, 0)
+    discovery.receive(Endpoint(1, 154), beat(dialect.MAV_TYPE_GIMBAL, 8), None, 0)
+    assert discovery.choose(10 * S) is None
+    discovery.receive(Endpoint(1, 1), beat(), ("host", 5), 10 * S)
+    assert discovery.choose(11 * S) is None
+    peer = discovery.choose(12 * S)
     assert peer is not None
-    assert (peer.source, peer.address, peer.autopilot) == (Source(1, 1), ("host", 5), "ardupilot")
+    assert (peer.source, peer.address, peer.autopilot) == (Endpoint(1, 1), ("host", 5), "ardupilot")
 
 
 def test_two_vehicles_need_a_choice() -> None:
-    roster = Roster(target_system=0)
-    roster.hear(Source(1, 1), beat(), None, 0)
-    roster.hear(Source(7, 1), beat(), None, S)
+    discovery = VehicleDiscovery(target_system=0)
+    discovery.receive(Endpoint(1, 1), beat(), None, 0)
+    discovery.receive(Endpoint(7, 1), beat(), None, S)
     with pytest.raises(PeerError, match=r"\[1, 7\].*--target-system"):
-        roster.choose(2 * S)
-    chosen = Roster(target_system=7)
-    chosen.hear(Source(1, 1), beat(), None, 0)
+        discovery.choose(2 * S)
+    chosen = VehicleDiscovery(target_system=7)
+    chosen.receive(Endpoint(1, 1), beat(), None, 0)
     assert chosen.choose(9 * S) is None
     assert "--target-system" in chosen.describe()
-    chosen.hear(Source(7, 1), beat(autopilot=12), None, S)
+    chosen.receive(Endpoint(7, 1), beat(autopilot=12), None, S)
     peer = chosen.choose(3 * S)
     assert peer is not None
     assert peer.autopilot == "px4"
 
 
 def test_two_vehicles_of_one_id_cannot_be_told_apart() -> None:
-    roster = Roster(target_system=1)
-    roster.hear(Source(1, 1), beat(), ("host", 5), 0)
-    roster.hear(Source(1, 1), beat(), ("host", 6), S)
-    with pytest.raises(PeerError, match=r"system 1 .*5.*6.*another id"):
-        roster.choose(2 * S)
+    discovery = VehicleDiscovery(target_system=1)
+    discovery.receive(Endpoint(1, 1), beat(), ("host", 5), 0)
+    discovery.receive(Endpoint(1, 1), beat(), ("host", 6), S)
+    with pytest.raises(PeerError, match=r"id 1 .*5.*6.*another id"):
+        discovery.choose(2 * S)
 
 
 def test_a_vehicle_that_speaks_from_a_new_address_has_moved() -> None:
-    roster = Roster(target_system=0)
-    roster.hear(Source(1, 1), beat(), ("host", 5), 0)
-    old = roster.choose(2 * S)
+    discovery = VehicleDiscovery(target_system=0)
+    discovery.receive(Endpoint(1, 1), beat(), ("host", 5), 0)
+    old = discovery.choose(2 * S)
     assert old is not None
-    roster.hear(Source(1, 1), beat(), ("host", 6), 2 * S)
-    assert roster.moved(old, 5 * S // 2) is None  # it was heard at both just now
-    roster.hear(Source(1, 1), beat(), ("host", 6), 4 * S)
-    moved = roster.moved(old, 4 * S)
+    discovery.receive(Endpoint(1, 1), beat(), ("host", 6), 2 * S)
+    assert discovery.moved(old, 5 * S // 2) is None  # it was heard at both just now
+    discovery.receive(Endpoint(1, 1), beat(), ("host", 6), 4 * S)
+    moved = discovery.moved(old, 4 * S)
     assert moved is not None
     assert moved.address == ("host", 6)
 
 
 @pytest.mark.parametrize(
-    ("heard", "told"),
+    ("heard", "expected"),
     [
         ([], "heard nothing"),
-        ([(Source(255, 190), beat(6, 8))], "heard only GCS (system 255, component 190)"),
-        ([(Source(1, 1), beat(2, 8))], "no autopilot"),  # quadrotor type, but no autopilot
+        ([(Endpoint(255, 190), beat(6, 8))], "heard only GCS (system 255, component 190)"),
+        ([(Endpoint(1, 1), beat(2, 8))], "no autopilot"),  # quadrotor type, but no autopilot
     ],
 )
-def test_what_was_heard_instead_is_told(heard: list[tuple[Source, Heartbeat]], told: str) -> None:
-    roster = Roster(target_system=0)
+def test_other_senders_are_described(
+    heard: list[tuple[Endpoint, Heartbeat]], expected: str
+) -> None:
+    discovery = VehicleDiscovery(target_system=0)
     for source, heartbeat in heard:
-        roster.hear(source, heartbeat, None, 0)
-    assert roster.choose(10 * S) is None
-    assert told in roster.describe()
+        discovery.receive(source, heartbeat, None, 0)
+    assert discovery.choose(10 * S) is None
+    assert expected in discovery.describe()
 
 
 # --- modes
@@ -105,13 +108,13 @@ def test_what_was_heard_instead_is_told(heard: list[tuple[Source, Heartbeat]], t
 def test_mode_names_of_both_autopilots() -> None:
     copter = ModeTable(autopilot="ardupilot", vehicle_type=dialect.MAV_TYPE_QUADROTOR)
     assert copter.name(2) == "ALT_HOLD"
-    assert copter.numbers("alt_hold") == (2, 0)
+    assert copter.number("alt_hold") == 2
     assert copter.name(99) == "99"
     px4 = ModeTable(autopilot="px4", vehicle_type=dialect.MAV_TYPE_QUADROTOR)
     assert px4.name(3 << 16 | 2 << 24) == "POSCTL"
-    assert px4.numbers("ACRO") == (5, 0)
+    assert px4.number("ACRO") == 5
     with pytest.raises(UserError, match="no mode 'HOVER'; it has ACRO"):
-        copter.numbers("HOVER")
+        copter.number("HOVER")
 
 
 # --- parameters
@@ -137,7 +140,7 @@ def test_parameters_are_asked_a_few_at_a_time_and_again_when_lost() -> None:
     assert again == ["P0", *names[16:]]
     for name in again:
         reader.receive(ParamValue(name=name, value=2.0))
-    assert reader.done
+    assert reader.is_done
     assert reader.values["P0"] == 2.0
 
 
@@ -145,8 +148,8 @@ def test_a_parameter_that_does_not_exist_is_given_up() -> None:
     reader = params.ParamReader(("NONE",))
     asked = sum(len(list(reader.step(k * S))) for k in range(20))
     assert asked == 4
-    assert reader.done
-    assert reader.missing == {"NONE"}
+    assert reader.is_done
+    assert reader.values == {}
 
 
 def test_calibration_comes_from_the_vehicle() -> None:
@@ -174,7 +177,7 @@ def test_an_unusable_calibration_is_the_peers_error(
 
 
 @pytest.mark.parametrize(
-    ("values", "source_system", "told"),
+    ("values", "source_system", "expected"),
     [
         ({"MAV_GCS_SYSID": 255.0}, 255, None),
         ({"MAV_GCS_SYSID": 255.0}, 42, "--source-system 255"),
@@ -187,10 +190,10 @@ def test_an_unusable_calibration_is_the_peers_error(
     ],
 )
 def test_obstacles_are_read_from_parameters(
-    values: dict[str, float], source_system: int, told: str | None
+    values: dict[str, float], source_system: int, expected: str | None
 ) -> None:
     found = list(params.override_obstacles(values, source_system))
-    assert found == [] if told is None else told in found[0]
+    assert found == [] if expected is None else expected in found[0]
 
 
 def test_the_override_switch_is_found() -> None:
@@ -202,62 +205,62 @@ def test_the_override_switch_is_found() -> None:
 
 
 def ack(result: int, command: int = dialect.MAV_CMD_SET_MESSAGE_INTERVAL) -> CommandAck:
-    return CommandAck(command=command, result=result, target=Source(0, 0))
+    return CommandAck(command=command, result=result, target=Endpoint(0, 0))
 
 
 def ids(request: object) -> tuple[float, float]:
-    assert isinstance(request, AskCommand)
+    assert isinstance(request, CommandRequest)
     return request.params[0], round(request.params[1])
 
 
-def one_group() -> streams.StreamKeeper:
-    return streams.StreamKeeper(streams.groups(state_hz=100, rc_hz=20)[:1])
+def one_group() -> streams.StreamRequester:
+    return streams.StreamRequester(streams.telemetry_streams(state_hz=100, rc_hz=20)[:1])
 
 
 def test_streams_are_asked_one_after_the_other_at_the_action_rate() -> None:
-    keeper = streams.StreamKeeper(streams.groups(state_hz=100, rc_hz=20))
+    requester = streams.StreamRequester(streams.telemetry_streams(state_hz=100, rc_hz=20))
     asked = []
     for k in range(4):
-        asked.append(ids(keeper.step(k)))
-        assert keeper.step(k) is None  # acks carry no id: one at a time
-        keeper.receive_ack(ack(0, command=400))  # somebody else's ack
-        assert keeper.step(k) is None
-        keeper.receive_ack(ack(0))
+        asked.append(ids(requester.step(k)))
+        assert requester.step(k) is None  # acks carry no id: one at a time
+        requester.receive_ack(ack(0, command=400))  # somebody else's ack
+        assert requester.step(k) is None
+        requester.receive_ack(ack(0))
     assert asked == [(31, 10000), (32, 10000), (105, 10000), (65, 50000)]
-    assert keeper.settled
+    assert requester.is_settled
 
 
 def test_denied_means_slower_then_another_message_then_the_legacy_stream() -> None:
-    keeper, asked = one_group(), []
+    requester, asked = one_group(), []
     for k in range(6):
-        asked.append(ids(keeper.step(k)))
-        keeper.receive_ack(ack(dialect.MAV_RESULT_DENIED))
+        asked.append(ids(requester.step(k)))
+        requester.receive_ack(ack(dialect.MAV_RESULT_DENIED))
     assert asked == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
-    assert keeper.step(9) == AskStream(dialect.MAV_DATA_STREAM_EXTRA1, 100)
-    assert keeper.settled
+    assert requester.step(9) == StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
+    assert requester.is_settled
 
 
 def test_silence_is_asked_again_and_then_taken_for_an_old_vehicle() -> None:
-    keeper = one_group()
-    requests = [keeper.step(k * S) for k in range(5)]
-    assert [type(request) for request in requests] == [AskCommand] * 4 + [AskStream]
+    requester = one_group()
+    requests = [requester.step(k * S) for k in range(5)]
+    assert [type(request) for request in requests] == [CommandRequest] * 4 + [StreamRequest]
 
 
 def test_a_stream_that_slows_down_is_asked_for_again() -> None:
-    keeper = one_group()
-    keeper.step(0)
-    keeper.receive_ack(ack(0))
+    requester = one_group()
+    requester.step(0)
+    requester.receive_ack(ack(0))
     now_ns, renewed = 0, []
     for tick in range(1000):
         now_ns = tick * 10 * NS_PER_MS
         # a ground station sets 4 Hz after three seconds
         if tick < 300 or tick % 25 == 0:
-            keeper.receive("ATTITUDE_QUATERNION")
-        if keeper.step(now_ns) is not None:
+            requester.receive("ATTITUDE_QUATERNION")
+        if requester.step(now_ns) is not None:
             renewed.append(now_ns // S)
-            keeper.receive_ack(ack(0))
+            requester.receive_ack(ack(0))
     assert renewed == [4, 6, 8]
-    assert keeper.renewals == 3
+    assert requester.renewals == 3
 
 
 # --- timesync
@@ -268,11 +271,13 @@ def test_only_answers_to_our_own_requests_count() -> None:
     ts1 = sync.request(1_000)
     assert ts1 == 1_000
     assert sync.request(2_000) is None  # not due yet
-    assert sync.receive(Timesync(tc1=0, ts1=ts1), 3_000) is None  # a request of somebody
-    assert sync.receive(Timesync(tc1=5, ts1=77), 3_000) is None  # somebody else's answer
-    assert sync.receive(Timesync(tc1=10_000, ts1=ts1), 5_000) == 4_000
-    assert sync.receive(Timesync(tc1=10_000, ts1=ts1), 5_000) is None  # said twice
+    sync.receive(Timesync(tc1=0, ts1=ts1), 3_000)  # a request of another station
+    sync.receive(Timesync(tc1=5, ts1=77), 3_000)  # an answer to another station
+    assert sync.offset_ns is None
+    sync.receive(Timesync(tc1=10_000, ts1=ts1), 5_000)
+    sync.receive(Timesync(tc1=20_000, ts1=ts1), 5_000)  # answered twice
     assert sync.offset_ns == 10_000 - 3_000
+    assert (sync.round_trips.count, sync.round_trips.max_ns) == (1, 4_000)
 
 
 def test_the_fastest_exchange_sets_the_offset() -> None:
@@ -327,7 +332,7 @@ def test_sticks_at_rest_are_nudged_until_they_are_seen() -> None:
     echo = EchoCheck()
     echo.received(A, 0)  # the receiver rests where we will hold the sticks
     for k in range(50):
-        nudged = echo.distinct(A)
+        nudged = echo.with_nudge(A)
         assert nudged == (1100, 1500, 1500, 1500 + NUDGE_US)
         echo.sent(nudged, S + k * 10 * NS_PER_MS)
         echo.received(A, S + k * 10 * NS_PER_MS)  # a vehicle that ignores us shows no nudge
@@ -335,7 +340,7 @@ def test_sticks_at_rest_are_nudged_until_they_are_seen() -> None:
     assert echo.failed(S + S + 1)
     echo.received(nudged, 2 * S)
     assert echo.confirmed
-    assert echo.distinct(A) == A
+    assert echo.with_nudge(A) == A
     echo.sent(A, 2 * S)
     echo.received(A, 2 * S + 1)
     assert not echo.failed(3 * S)
@@ -345,22 +350,24 @@ def test_sticks_at_rest_are_nudged_until_they_are_seen() -> None:
 
 
 def test_a_worse_message_never_overwrites_a_better_live_one() -> None:
-    joiner = TelemetryJoiner()
+    telemetry = TelemetryCollector()
 
     def force(source: str, value: float, at_ns: int) -> None:
-        joiner.force(SpecificForce(source=source, specific_force_body_mps2=(value, 0, 0)), at_ns)
+        telemetry.receive(
+            SpecificForce(message_name=source, specific_force_body_mps2=(value, 0, 0)), at_ns
+        )
 
     force("RAW_IMU", 1.0, 0)
     force("HIGHRES_IMU", 2.0, 1)
     force("RAW_IMU", 3.0, 2)
-    reading = joiner.snapshot().specific_force_body_mps2
+    reading = telemetry.snapshot().specific_force_body_mps2
     assert reading is not None
     assert reading == (1, (2.0, 0, 0))
     force("SCALED_IMU2", 4.0, S)
-    assert joiner.snapshot().specific_force_body_mps2 == (S, (4.0, 0, 0))
+    assert telemetry.snapshot().specific_force_body_mps2 == (S, (4.0, 0, 0))
 
     def attitude(quaternion: bool, at_ns: int) -> None:
-        joiner.attitude(
+        telemetry.receive(
             Attitude(
                 is_quaternion=quaternion,
                 boot_ms=0,
@@ -372,25 +379,24 @@ def test_a_worse_message_never_overwrites_a_better_live_one() -> None:
 
     attitude(True, 0)
     attitude(False, 1)
-    assert joiner.snapshot().rate_body_radps == (0, (0, 0, 0))
+    assert telemetry.snapshot().rate_body_radps == (0, (0, 0, 0))
 
 
 def test_losses_are_gaps_in_the_sequence() -> None:
-    counters = LinkCounters()
-    assert (
-        counters.stats(echo_confirmed=None, unusable_packets=0, clock_offset_ns=None).lost_fraction
-        is None
-    )
+    counters, sync = LinkCounters(), TimesyncFilter()
+    nothing = counters.stats(sync, echo_confirmed=None, unusable_packets=0)
+    assert (nothing.lost_fraction, nothing.rtt_ms, nothing.vehicle_clock_offset_ns) == (None,) * 3
     for k, sequence in enumerate((254, 255, 0, 2, 3)):  # one lost, and a wrap that is none
         counters.receive("ATTITUDE", sequence, k * S)
     counters.new_sequence()
     counters.receive("HEARTBEAT", 99, 10 * S)
-    counters.round_trip(None)
-    counters.round_trip(2 * NS_PER_MS)
-    stats = counters.stats(echo_confirmed=True, unusable_packets=3, clock_offset_ns=-5)
+    ts1 = sync.request(S)
+    assert ts1 is not None
+    sync.receive(Timesync(tc1=S, ts1=ts1), ts1 + 2 * NS_PER_MS)
+    stats = counters.stats(sync, echo_confirmed=True, unusable_packets=3)
     assert stats.lost_fraction == pytest.approx(1 / 7)
     assert stats.messages_per_s == (("ATTITUDE", 0.5), ("HEARTBEAT", 0.1))
     assert stats.rtt_ms is not None
     assert stats.rtt_ms.p50 == pytest.approx(2.0, rel=0.01)
-    assert (stats.unusable_packets, stats.vehicle_clock_offset_ns) == (3, -5)
+    assert (stats.unusable_packets, stats.vehicle_clock_offset_ns) == (3, -NS_PER_MS)
     assert stats.echo_confirmed is None  # nothing was sent: there was nothing to confirm

@@ -1,0 +1,136 @@
+"""Finds the vehicle to fly among all senders on the link."""
+
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import PeerError
+from mavbridge.mavlink.codec.messages import Endpoint, Heartbeat
+from mavbridge.mavlink.transport.sockets import Address
+
+AUTOPILOT_COMPONENT = 1
+SETTLE_NS = 3 * NS_PER_S // 2
+"""Every vehicle sends a heartbeat at 1 Hz: after this long, a second vehicle has been heard."""
+MOVED_NS = 3 * NS_PER_S
+"""Silence after which a vehicle that sends from a new address has moved there."""
+
+_NOT_VEHICLES = frozenset(
+    {
+        dialect.MAV_TYPE_GCS,
+        dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+        dialect.MAV_TYPE_GIMBAL,
+        dialect.MAV_TYPE_ADSB,
+        dialect.MAV_TYPE_CAMERA,
+        dialect.MAV_TYPE_ANTENNA_TRACKER,
+    }
+)
+_AUTOPILOTS = {
+    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
+    dialect.MAV_AUTOPILOT_PX4: "px4",
+}
+_CAPACITY = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleIdentity:
+    """One system id at one address, and the kind of vehicle."""
+
+    source: Endpoint
+    address: Address | None
+    vehicle_type: int
+    autopilot: str
+
+
+class VehicleDiscovery:
+    """Chooses component 1 of one vehicle, and explains itself when it cannot."""
+
+    def __init__(self, *, target_system: int) -> None:
+        self._target_system = target_system
+        self._heard_ns: dict[VehicleIdentity, int] = {}
+        self._others: set[str] = set()
+        self._first_ns: int | None = None
+
+    def receive(
+        self, source: Endpoint, heartbeat: Heartbeat, address: Address | None, now_ns: int
+    ) -> None:
+        """Note a heartbeat from any sender."""
+        if (
+            source.component != AUTOPILOT_COMPONENT
+            or source.system == 0
+            or heartbeat.vehicle_type in _NOT_VEHICLES
+            or heartbeat.autopilot == dialect.MAV_AUTOPILOT_INVALID
+        ):
+            kind = dialect.enums["MAV_TYPE"].get(heartbeat.vehicle_type)
+            name = kind.name.removeprefix("MAV_TYPE_") if kind else str(heartbeat.vehicle_type)
+            if len(self._others) < _CAPACITY:
+                self._others.add(f"{name} (system {source.system}, component {source.component})")
+            return
+        vehicle = VehicleIdentity(
+            source=source,
+            address=address,
+            vehicle_type=heartbeat.vehicle_type,
+            autopilot=_AUTOPILOTS.get(heartbeat.autopilot, "generic"),
+        )
+        if vehicle in self._heard_ns or len(self._heard_ns) < _CAPACITY:
+            self._heard_ns[vehicle] = now_ns
+        if self._first_ns is None and self._is_wanted(vehicle):
+            self._first_ns = now_ns
+
+    def _is_wanted(self, vehicle: VehicleIdentity) -> bool:
+        return self._target_system in (0, vehicle.source.system)
+
+    @property
+    def is_settling(self) -> bool:
+        """A vehicle was heard, but a second one may still show up."""
+        return self._first_ns is not None
+
+    def choose(self, now_ns: int) -> VehicleIdentity | None:
+        """The vehicle to fly, or None while it is not certain.
+
+        Raises:
+            PeerError: several vehicles are possible, or two cannot be told apart.
+        """
+        if self._first_ns is None or now_ns - self._first_ns < SETTLE_NS:
+            return None
+        wanted = [vehicle for vehicle in self._heard_ns if self._is_wanted(vehicle)]
+        systems = sorted({vehicle.source.system for vehicle in wanted})
+        if len(systems) > 1:
+            raise PeerError(
+                f"several vehicles are on this link (systems {systems}): "
+                "choose one with --target-system"
+            )
+        if len(wanted) > 1:
+            raise PeerError(
+                f"two vehicles use system id {systems[0]} "
+                f"(from {' and '.join(str(vehicle.address) for vehicle in wanted)}): give one of "
+                "them another id (MAV_SYSID, SYSID_THISMAV) or another port"
+            )
+        return wanted[0]
+
+    def moved(self, vehicle: VehicleIdentity, now_ns: int) -> VehicleIdentity | None:
+        """The same vehicle at the address that it now sends from, if that has changed."""
+        if now_ns - self._heard_ns.get(vehicle, 0) < MOVED_NS:
+            return None
+        for other, heard_ns in self._heard_ns.items():
+            if other.source == vehicle.source and now_ns - heard_ns < SETTLE_NS:
+                return other
+        return None
+
+    def describe(self) -> str:
+        """Everything that was heard instead of the vehicle, with advice."""
+        if self._heard_ns:
+            heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
+            return (
+                f"system {self._target_system} is silent, but system {heard} was heard: "
+                "correct --target-system"
+            )
+        if self._others:
+            return (
+                f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "
+                "the vehicle's own port, or have the ground station forward it"
+            )
+        return (
+            "heard nothing: is the vehicle running, and does it send to this address? "
+            "(udp: listens, udpout: calls)"
+        )
