@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sitl.app import RunOptions, run_vehicle, tell
-from sitl.course.course import course_to_json, make_course
+from sitl.camera.follow import run_follow
+from sitl.course.layout import course_to_json, make_course
 from sitl.errors import UsageError
-from sitl.follow import run_follow
 from sitl.stopping import stop_on_signal
 from sitl.vehicle.autopilot import VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions

@@ -10,11 +10,11 @@ from pathlib import Path
 from sitl.camera.fpv import FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, MonotonicClock
-from sitl.course.course import Course, make_course
+from sitl.course.layout import Course, make_course
 from sitl.errors import UsageError
 from sitl.link.transport import Transport, open_transport
 from sitl.report import write_report
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.stopping import StopRequest, stop_on_signal
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
@@ -53,7 +53,7 @@ def run_vehicle(options: RunOptions) -> int:
         transports = [
             stack.enter_context(closing(open_transport(url, clock))) for url in options.connect
         ]
-        vehicle = Vehicle(
+        vehicle = SimulatedVehicle(
             links=len(transports), boot_ns=clock.now_ns(), config=options.vehicle, course=course
         )
         stop = stack.enter_context(stop_on_signal())
@@ -71,7 +71,7 @@ def run_vehicle(options: RunOptions) -> int:
 
 
 def fly(
-    vehicle: Vehicle,
+    vehicle: SimulatedVehicle,
     transports: Sequence[Transport],
     clock: Clock,
     stop: StopRequest,
@@ -110,7 +110,7 @@ def tell(line: str) -> None:
 class _Console:
     """Says what changes: who connects, modes, arming, the vehicle's own words."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
         self._heard: set[int] = set()
         self._mode = vehicle.ap.mode
@@ -144,7 +144,7 @@ class _Console:
 
 @contextmanager
 def filming(
-    options: RunOptions, shm_name: str, course: Course, vehicle: Vehicle, clock: Clock
+    options: RunOptions, shm_name: str, course: Course, vehicle: SimulatedVehicle, clock: Clock
 ) -> Iterator[None]:
     """The FPV camera in its own thread, for as long as the context lasts."""
     stop = threading.Event()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +88,7 @@ class VehicleFaults:
         self._freezes = [fault for fault in script if isinstance(fault, SensorFreeze)]
         self._reboots_s = sorted(fault.at_s for fault in script if isinstance(fault, Reboot))
 
-    def apply(self, vehicle: Vehicle, now_ns: int) -> None:
+    def apply(self, vehicle: SimulatedVehicle, now_ns: int) -> None:
         """Bring the vehicle into the state of this moment; call it before each step."""
         t_s = (now_ns - self._start_ns) / NS_PER_S
         while self._reboots_s and t_s >= self._reboots_s[0]:

@@ -37,8 +37,8 @@ from typing import Any, Literal
 import numpy as np
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course.collision import Crash, struck_gate
-from sitl.course.course import Course, GateCounter, GatePass
+from sitl.course.layout import Course
+from sitl.course.referee import Crash, GateCounter, GatePass, struck_gate
 from sitl.rotation import Vec3, cos_tilt, to_euler
 from sitl.vehicle.autopilot import Autopilot
 

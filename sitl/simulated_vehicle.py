@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from sitl.course.course import Course, Start
+from sitl.course.layout import AirborneStart, Course
 from sitl.link.server import MavlinkServer
 from sitl.report import FlightLog
 from sitl.vehicle.autopilot import STEP_NS, Autopilot, VehicleConfig
@@ -21,7 +21,7 @@ class Pose:
     body: BodyState
 
 
-class Vehicle:
+class SimulatedVehicle:
     """Autopilot, physics and MAVLink of one vehicle; stamps are the caller's monotonic clock."""
 
     def __init__(
@@ -66,7 +66,7 @@ class Vehicle:
         """What the link has to send: whole frames, in order."""
         return self.server.links[link_id].take_outgoing()
 
-    def launch(self, start: Start) -> None:
+    def launch(self, start: AirborneStart) -> None:
         """Be airborne in this state from now on: armed, in ALT_HOLD, gates counted from its own."""
         self.ap.launch(start.position_ned_m, start.velocity_ned_mps, start.ned_from_body_wxyz)
         self.log.start_over(start.next_gate)

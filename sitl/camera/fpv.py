@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sitl.camera import scenery
 from sitl.camera.imager import Imager
-from sitl.course.course import Course
+from sitl.course.layout import Course
 from sitl.errors import UsageError
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions

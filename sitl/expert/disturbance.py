@@ -10,8 +10,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sitl.course.course import Course, Start
-from sitl.expert.expert import CENTRED, Sticks4
+from sitl.course.layout import AirborneStart, Course
+from sitl.expert.demonstrator import CENTRED, StickPositions
 from sitl.rotation import from_euler
 from sitl.vehicle.control import clamp
 
@@ -20,8 +20,8 @@ NOISY_S = (0.5, 2.0)
 PULSE_S = (0.15, 0.5)
 NOISE_TIME_S = 0.25
 """Correlation time of the noise: about as fast as a thumb."""
-NOISE_RMS = Sticks4(throttle=0.25, yaw=0.12, pitch=0.25, roll=0.25)
-PULSE_MAX = Sticks4(throttle=0.6, yaw=0.4, pitch=0.6, roll=0.6)
+NOISE_RMS = StickPositions(throttle=0.25, yaw=0.12, pitch=0.25, roll=0.25)
+PULSE_MAX = StickPositions(throttle=0.6, yaw=0.4, pitch=0.6, roll=0.6)
 START_AWAY_M = (3.0, 5.5)
 """Before a gate: behind the one before it, whose leg is at least 7 m long."""
 LATE_CHANCE = 0.3
@@ -31,7 +31,7 @@ LATE_S = (0.2, 2.0)
 class _Stretch(NamedTuple):
     kind: Literal["quiet", "noise", "pulse", "late"]
     end_s: float
-    offset: Sticks4
+    offset: StickPositions
 
 
 class StickDisturbance:
@@ -56,7 +56,7 @@ class StickDisturbance:
         """What the last call returned is not what the demonstrator asked for."""
         return self._strength > 0.0 and self._stretch.kind != "quiet"
 
-    def flown(self, wanted: Sticks4, t_s: float) -> Sticks4:
+    def flown(self, wanted: StickPositions, t_s: float) -> StickPositions:
         """What to fly at ``t_s`` where the demonstrator wants ``wanted``; within [-1, 1]."""
         if self._start_s is None:
             self._start_s = t_s
@@ -74,7 +74,7 @@ class StickDisturbance:
             max(-1.0, min(1.0, stick + self._strength * float(off)))
             for stick, off in zip(wanted, offset, strict=True)
         ]
-        return Sticks4(*disturbed)
+        return StickPositions(*disturbed)
 
     def _next(self, ended: _Stretch) -> _Stretch:
         if ended.kind != "quiet":
@@ -86,7 +86,7 @@ class StickDisturbance:
         held = self._random.uniform(-1.0, 1.0, 4) * np.array(PULSE_MAX)
         held *= self._random.permutation([1.0, 1.0, 0.0, 0.0])
         length_s = float(self._random.uniform(*PULSE_S))
-        return _Stretch("pulse", ended.end_s + length_s, Sticks4(*held.tolist()))
+        return _Stretch("pulse", ended.end_s + length_s, StickPositions(*held.tolist()))
 
     def _wander(self, dt_s: float) -> None:
         """An Ornstein-Uhlenbeck process, exact for any step."""
@@ -95,7 +95,9 @@ class StickDisturbance:
         self._noise = kept * self._noise + fresh * np.array(NOISE_RMS)
 
 
-def random_start(course: Course, seed: int, *, speed_mps: float, strength: float = 1.0) -> Start:
+def random_start(
+    course: Course, seed: int, *, speed_mps: float, strength: float = 1.0
+) -> AirborneStart:
     """Somewhere before a random gate, off the line to it, moving and facing roughly along it."""
     random = np.random.Generator(np.random.PCG64(seed))
     gate = course.gates[int(random.integers(len(course.gates)))]
@@ -108,7 +110,7 @@ def random_start(course: Course, seed: int, *, speed_mps: float, strength: float
     lean_rad = random.normal(0.0, 0.12 * strength, 2).tolist()
     north_m, east_m, down_m = gate.center_ned_m
     cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
-    return Start(
+    return AirborneStart(
         position_ned_m=(
             north_m - away_m * cos_yaw - side_m * sin_yaw,
             east_m - away_m * sin_yaw + side_m * cos_yaw,

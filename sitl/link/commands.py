@@ -8,7 +8,7 @@ from typing import Protocol
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.vehicle.autopilot import Autopilot
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 
 FORCE = 21196.0
 """Param 2 of ARM_DISARM that overrules every check (MAVLink common.xml)."""

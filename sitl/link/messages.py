@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.rotation import Vec3, conjugate, rotate, to_euler
 from sitl.vehicle.autopilot import Autopilot
 from sitl.vehicle.dynamics import GRAVITY_MPS2
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 
 Message: TypeAlias = Any
 """A pymavlink message (the library has no types)."""

@@ -1,4 +1,4 @@
-"""An onlooker on a vehicle's MAVLink link: what it says of its pose, and how to make it say so.
+"""An listener on a vehicle's MAVLink link: what it says of its pose, and how to make it say so.
 
 Pure: bytes in, bytes out, times given. Nothing that could steer the vehicle is sent: a heartbeat,
 and requests for messages.
@@ -18,7 +18,7 @@ Pose: TypeAlias = tuple[Vec3, Quat]
 
 SYSTEM_ID = 246
 """Not 255: ArduPilot takes a heartbeat with its ground station's id for that station's presence,
-and an onlooker must not hide that the pilot's has gone."""
+and an listener must not hide that the pilot's has gone."""
 POSE_MAX_AGE_NS = NS_PER_S
 HOUSEKEEPING_NS = NS_PER_S
 ROUNDS_BEFORE_EULER = 3
@@ -78,7 +78,7 @@ class PoseTracker:
         return (north_m, east_m, down_m), attitude
 
 
-class Onlooker:
+class PoseListener:
     """Our end of the MAVLink conversation, without a socket: bytes in, bytes out.
 
     Follows the first autopilot that it hears and asks it, once a second, for each message that

@@ -9,7 +9,7 @@ import math
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.link.commands import Command, execute, mode_by_number
-from sitl.link.link import Link
+from sitl.link.endpoint import Link
 from sitl.link.messages import Message
 from sitl.report import FlightLog
 from sitl.vehicle.autopilot import Autopilot

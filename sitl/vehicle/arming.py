@@ -1,7 +1,7 @@
 """What is checked before the motors may turn, with ArduCopter's words for each refusal."""
 
 from sitl.vehicle import sticks as pilot
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 from sitl.vehicle.params import Params
 from sitl.vehicle.rc import RcEngine
 from sitl.vehicle.sticks import Sticks

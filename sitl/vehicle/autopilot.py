@@ -9,13 +9,12 @@ from typing import NamedTuple
 
 from sitl.clock import NS_PER_S
 from sitl.rotation import Quat, Vec3, cos_tilt
-from sitl.vehicle.air import Air, SensorNoise
 from sitl.vehicle.arming import prearm_refusal, stick_refusal
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.dynamics import PHYSICS_STEP_NS, BodyState, Quadrotor
+from sitl.vehicle.environment import SensorNoise, Wind
 from sitl.vehicle.failsafe import GcsFailsafe, RadioFailsafe
-from sitl.vehicle.flight import STOPPED, FlightControl
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import STOPPED, FlightControl, Mode
 from sitl.vehicle.params import Params
 from sitl.vehicle.rc import IDLE_RECEIVER_US, RcEngine
 from sitl.vehicle.sticks import read_sticks
@@ -78,7 +77,7 @@ class Autopilot:
         """Fault: telemetry and control keep the last state, the world goes on."""
         self._control = FlightControl(params)
         self._quad = Quadrotor(config.conditions)
-        self._air = Air(config.conditions, STEP_NS / NS_PER_S)
+        self._wind = Wind(config.conditions, STEP_NS / NS_PER_S)
         self._noise = SensorNoise(config.conditions)
         self._physics = self._quad.at_rest()
         self.sensed = self._physics.body
@@ -167,7 +166,7 @@ class Autopilot:
             self._on_gcs_change()
         self.motor_commands = self._motors()
         self._physics = self._quad.step(
-            self._physics, self.motor_commands, SUBSTEPS, self._air.step()
+            self._physics, self.motor_commands, SUBSTEPS, self._wind.step()
         )
         if not self.sensors_frozen:
             self.sensed = self._noise.sense(self._physics.body)

@@ -14,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import VehicleConfig
 
 GCS = 255
@@ -40,7 +40,7 @@ class MockPeer:
     def __init__(self, *, receiver: bool) -> None:
         self._now_ns = 0
         config = VehicleConfig(receiver=receiver)
-        self.vehicle = Vehicle(links=1, boot_ns=0, config=config)
+        self.vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config)
 
     def now_ns(self) -> int:
         return self._now_ns

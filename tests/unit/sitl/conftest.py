@@ -8,7 +8,7 @@ import pytest
 from sitl.clock import NS_PER_S
 from sitl.rotation import to_euler
 from sitl.vehicle.autopilot import STEP_NS, Autopilot, VehicleConfig
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 from sitl.vehicle.params import Params
 
 STEPS_PER_STICK_UPDATE = 8

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from helpers.course_flights import fly_course
 from sitl.camera.fpv import body_from_camera
-from sitl.course.course import Start, in_gate_axes, make_course
+from sitl.course.layout import AirborneStart, make_course
 from sitl.course.truth import gate_truth
 from sitl.errors import UsageError
+from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance, random_start
-from sitl.expert.expert import Expert
 from sitl.expert.guidance import Knot, least_acceleration
 from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import random_conditions
@@ -89,7 +89,7 @@ def test_a_missed_gate_is_flown_at_again(axial_m, right_m):
     gate = course.gates[6]
     cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
     north_m, east_m, down_m = gate.center_ned_m
-    start = Start(
+    start = AirborneStart(
         position_ned_m=(
             north_m + axial_m * cos_yaw - right_m * sin_yaw,
             east_m + axial_m * sin_yaw + right_m * cos_yaw,
@@ -99,7 +99,7 @@ def test_a_missed_gate_is_flown_at_again(axial_m, right_m):
         ned_from_body_wxyz=from_euler(0.0, 0.0, gate.yaw_rad),
         next_gate=6,
     )
-    assert in_gate_axes(gate, start.position_ned_m) == pytest.approx((axial_m, right_m, 0.0))
+    assert gate.offset_m(start.position_ned_m) == pytest.approx((axial_m, right_m, 0.0))
     assert fly_course(course, 5.0, start=start).succeeded
 
 

@@ -8,10 +8,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from sitl.camera.follow import open_wire, run_follow
 from sitl.camera.fpv import FpvRenderer
-from sitl.course.course import make_course
+from sitl.course.layout import make_course
 from sitl.errors import UsageError
-from sitl.follow import open_wire, run_follow
 from sitl.rotation import IDENTITY
 from sitl.stopping import StopRequest
 

@@ -15,14 +15,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.__main__ import main
 from sitl.app import RunOptions, filming, fly
 from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from sitl.course.collision import Crash
-from sitl.course.course import Course, make_course
+from sitl.course.layout import Course, make_course
+from sitl.course.referee import Crash
 from sitl.link.transport import Received
 from sitl.report import FlightLog, write_report
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.stopping import StopRequest, stop_on_signal
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 
 
 class FakeClock:
@@ -66,7 +66,7 @@ class FakeTransport:
 
 def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
     clock = FakeClock()
-    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
 
     fly(vehicle, [FakeTransport(clock)], clock, StopRequest(), end_ns=NS_PER_S)
 
@@ -77,7 +77,7 @@ def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
 @pytest.mark.parametrize(("wanted", "ends_ns"), [(True, 0), (False, NS_PER_S // 2)])
 def test_a_crash_ends_the_loop_if_the_course_is_to_end_it(wanted, ends_ns):
     clock = FakeClock()
-    vehicle = Vehicle(links=0, boot_ns=0, course=make_course(1))
+    vehicle = SimulatedVehicle(links=0, boot_ns=0, course=make_course(1))
     vehicle.log.crash = Crash(t_s=0.0, hit="ground", speed_mps=5.0)
 
     fly(vehicle, [], clock, StopRequest(), end_ns=NS_PER_S // 2, end_with_course=wanted)
@@ -87,7 +87,7 @@ def test_a_crash_ends_the_loop_if_the_course_is_to_end_it(wanted, ends_ns):
 
 def test_after_a_stall_it_catches_up_without_a_burst():
     clock = FakeClock(stall_at_ns=NS_PER_S, stall_ns=300 * NS_PER_MS + 1)
-    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
     vehicle.server.links[0].set_interval(mav.MAVLINK_MSG_ID_ATTITUDE, 10_000)
     transport = FakeTransport(clock)
 
@@ -103,7 +103,7 @@ def test_after_a_stall_it_catches_up_without_a_burst():
 
 def test_the_loop_takes_in_bytes_and_says_who_came(capsys):
     clock = FakeClock()
-    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
     frame = mav.MAVLink_command_long_message(1, 1, 176, 0, 1, int(Mode.ALT_HOLD), *[0] * 5)
     arrivals = [Received(frame.pack(mav.MAVLink(None, srcSystem=255)), 50 * NS_PER_MS)]
 
@@ -118,7 +118,7 @@ def test_a_signal_ends_the_loop_and_handlers_come_back(number):
     with stop_on_signal() as stop:
         os.kill(os.getpid(), number)
         assert stop.is_set()
-        fly(Vehicle(links=0, boot_ns=0), [], FakeClock(), stop, end_ns=None)
+        fly(SimulatedVehicle(links=0, boot_ns=0), [], FakeClock(), stop, end_ns=None)
 
     assert signal.getsignal(number) is before
 
@@ -129,7 +129,7 @@ def logged(arrivals_ms, releases_ms=()):
     events += [(ms, log.on_release) for ms in releases_ms]
     for ms, happens in sorted(events, key=lambda event: event[0]):
         happens(ms * NS_PER_MS)
-    return log.summary(Vehicle(links=1, boot_ns=0).ap, 0)
+    return log.summary(SimulatedVehicle(links=1, boot_ns=0).ap, 0)
 
 
 def test_override_rate_and_gaps():
@@ -161,7 +161,7 @@ def test_a_report_without_overrides_holds_nulls_not_zeros():
 
 
 def test_releases_and_foreign_overrides_on_the_wire_are_told_apart():
-    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
     sender = mav.MAVLink(None, srcSystem=255)
     for primary in ([1500] * 8, [1500, 0, *[65535] * 6], [0] * 8, [0, *[65535] * 7], [65535] * 8):
         frame = mav.MAVLink_rc_channels_override_message(1, 1, *primary).pack(sender)
@@ -297,7 +297,7 @@ def test_the_camera_publishes_while_its_context_lasts():
         vehicle=VehicleConfig(),
     )
     course = make_course(7)
-    vehicle = Vehicle(links=0, boot_ns=0, course=course)
+    vehicle = SimulatedVehicle(links=0, boot_ns=0, course=course)
     clock = MonotonicClock()
     deadline_ns = clock.now_ns() + 10 * NS_PER_S
     with filming(options, name, course, vehicle, clock):

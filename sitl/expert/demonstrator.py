@@ -11,7 +11,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from sitl.course.course import Course, Gate, GateCounter, crossing, in_gate_axes, turned_to_gate
+from sitl.course.layout import Course, Gate
+from sitl.course.referee import GateCounter, crossing
 from sitl.errors import UsageError
 from sitl.expert.guidance import Knot, Plan, least_acceleration
 from sitl.rotation import Quat, Vec3, rotate, to_euler, wrap_pi
@@ -58,7 +59,7 @@ DEAD_ZONE_SLOPE = 0.08
 """A dead zone is jumped over within about this share of full scale."""
 
 
-class Sticks4(NamedTuple):
+class StickPositions(NamedTuple):
     """Stick positions in [-1, 1], in the order of the action vector."""
 
     throttle: float
@@ -71,7 +72,7 @@ class Sticks4(NamedTuple):
     """+ right."""
 
 
-CENTRED = Sticks4(0.0, 0.0, 0.0, 0.0)
+CENTRED = StickPositions(0.0, 0.0, 0.0, 0.0)
 
 
 class Expert:
@@ -117,7 +118,7 @@ class Expert:
         ned_from_body_wxyz: Quat,
         rate_body_radps: Vec3,
         t_s: float,
-    ) -> Sticks4:
+    ) -> StickPositions:
         """What to hold now; the positions of all calls are the trajectory that passes gates."""
         self._referee.update(position_ned_m, t_s)
         state = _State.ahead(
@@ -248,7 +249,7 @@ def _knots(
     before, way_m = state.position_m, 0.0
     for gate in ahead:
         # Off the axis the way does not shrink to nothing in the plane of the gate; time must.
-        axial_m, right_m, _ = in_gate_axes(gate, before)
+        axial_m, right_m, _ = gate.offset_m(before)
         leg_m = math.hypot(min(0.0, axial_m), max(0.0, abs(right_m) - gate.size_m / 2))
         gained = 2 * PLANNED_ACCEL_MPS2 * (way_m + leg_m / 2)
         pace_mps = min(max(closing_mps, speed_mps), math.sqrt(closing_mps**2 + gained))
@@ -266,7 +267,7 @@ def _knots(
 def _look_point(state: _State, ahead: tuple[Gate, ...]) -> Vec3:
     """The next gate; from nearer than ``LOOK_M`` a point that slides along the leg after it."""
     gate = ahead[0]
-    axial_m, _, _ = in_gate_axes(gate, state.position_m)
+    axial_m, _, _ = gate.offset_m(state.position_m)
     beyond_m = max(0.0, LOOK_M + axial_m)
     if len(ahead) > 1:
         leg = _minus(ahead[1].center_ned_m, gate.center_ned_m)
@@ -284,12 +285,12 @@ def _must_back_off(state: _State, gate: Gate) -> float:
     """0 where the gate can be flown at from here, 1 where it cannot: beside it, behind it, or too
     fast and too far off to get into the opening.
     """
-    axial_m, right_m, down_m = in_gate_axes(gate, state.position_m)
+    axial_m, right_m, down_m = gate.offset_m(state.position_m)
     if axial_m >= 0.0:
         return 1.0
     reach_m = gate.size_m / 2 + 0.2 - 0.8 * axial_m
     beside = _smoothstep(abs(right_m) - reach_m, 0.0, 1.5)
-    forward_mps, rightward_mps, downward_mps = turned_to_gate(gate, state.velocity_mps)
+    forward_mps, rightward_mps, downward_mps = gate.to_axes(state.velocity_mps)
     left_s = -axial_m / max(forward_mps, MIN_SPEED_MPS)
     right_miss_m = abs(right_m + rightward_mps * left_s) - MAX_ACCEL_MPS2 * left_s**2 / 2
     down_miss_m = abs(down_m + downward_mps * left_s) - CLIMB_ACCEL_MPS2 * left_s**2 / 2
@@ -299,7 +300,7 @@ def _must_back_off(state: _State, gate: Gate) -> float:
 
 def _back_off(state: _State, gate: Gate) -> _Demand:
     """Backwards beside the gate, nose along its passage, until it is in front again."""
-    axial_m, right_m, down_m = in_gate_axes(gate, state.position_m)
+    axial_m, right_m, down_m = gate.offset_m(state.position_m)
     cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
     beside = axial_m > -1.0 and abs(right_m) < CLEAR_OF_FRAME_M
     side_m = math.copysign(CLEAR_OF_FRAME_M, right_m) if beside else right_m
@@ -333,7 +334,7 @@ def _brake(state: _State) -> _Demand:
 
 def _past(state: _State, last: Gate) -> float:
     """1 where the last gate is far enough behind to brake in full."""
-    beyond_m, _, _ = in_gate_axes(last, state.position_m)
+    beyond_m, _, _ = last.offset_m(state.position_m)
     return _smoothstep(beyond_m, 0.0, BRAKING_BEGINS_M)
 
 
@@ -374,7 +375,7 @@ class _Response:
         half = (1000.0 - params["RC3_DZ"]) / 2.0
         self._throttle_dead = 2.0 * params["THR_DZ"] * (half / 500.0) / 1000.0
 
-    def sticks(self, wanted: _Demand, state: _State) -> Sticks4:
+    def sticks(self, wanted: _Demand, state: _State) -> StickPositions:
         """Leans by the ratio to gravity in the heading's axes, rates by their full scale."""
         velocity_n, velocity_e, _ = state.velocity_mps
         accel_n = wanted.accel_north_mps2 + DRAG_PER_S * velocity_n
@@ -386,7 +387,7 @@ class _Response:
         right_rad = math.atan(right * math.cos(nose_down_rad))
         full_mps = self._climb_mps if wanted.climb_mps > 0.0 else self._descent_mps
         turn = wanted.yaw_rate_radps / self._yaw_radps
-        return Sticks4(
+        return StickPositions(
             throttle=_past_dead_zone(wanted.climb_mps / full_mps, self._throttle_dead),
             yaw=_past_dead_zone(_without_expo(turn, self._yaw_expo), self._yaw_dead),
             pitch=_past_dead_zone(nose_down_rad / self._lean_rad, self._pitch_dead),

@@ -14,9 +14,9 @@ from typing import Protocol, TypeAlias
 from sitl.camera.fpv import FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, MonotonicClock
-from sitl.course.course import make_course
+from sitl.course.layout import make_course
 from sitl.errors import UsageError
-from sitl.link.pose_listener import Onlooker
+from sitl.link.pose_listener import PoseListener
 from sitl.stopping import StopRequest
 
 Address: TypeAlias = tuple[str, int]
@@ -51,7 +51,7 @@ def run_follow(
         raise UsageError(f"the frame rate must be positive, got {fps}")
     clock = MonotonicClock()
     renderer = FpvRenderer(make_course(course_seed), width, height)
-    onlooker = Onlooker(rate_hz=min(MESSAGES_PER_FRAME * fps, MAX_MESSAGE_HZ))
+    listener = PoseListener(rate_hz=min(MESSAGES_PER_FRAME * fps, MAX_MESSAGE_HZ))
     period_ns = round(NS_PER_S / fps)
     due_ns = clock.now_ns()
     known: bool | None = None
@@ -63,10 +63,10 @@ def run_follow(
             clock.sleep_until_ns(due_ns)
             now_ns = clock.now_ns()
             for data in _waiting(wire):
-                onlooker.receive(data, now_ns)
-            for packet in onlooker.outgoing(now_ns):
+                listener.receive(data, now_ns)
+            for packet in listener.outgoing(now_ns):
                 wire.send(packet)
-            pose = onlooker.pose_at(now_ns)
+            pose = listener.pose_at(now_ns)
             if pose is not None:
                 publisher.publish(renderer.render(*pose), now_ns)
             if known != (pose is not None):

@@ -1,12 +1,12 @@
-"""What each mode makes of the sticks: one law a mode, from sticks and state to motor commands."""
+"""Flight modes: ArduCopter's numbers, and how each turns sticks and state into motor commands."""
 
 import math
+from enum import IntEnum
 
 from sitl.rotation import Vec3, cos_tilt, to_euler, wrap_pi
 from sitl.vehicle import sticks as pilot
 from sitl.vehicle.control import AttitudeController, HeightController, mix, thrust_for
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
-from sitl.vehicle.modes import Mode
 from sitl.vehicle.params import Params
 from sitl.vehicle.sticks import Sticks
 
@@ -24,8 +24,28 @@ VELOCITY_GAIN_PER_S = 2.0
 TRAINER_GAIN_PER_S = 5.0
 
 
+class Mode(IntEnum):
+    """Flight mode by its number in HEARTBEAT.custom_mode."""
+
+    STABILIZE = 0
+    ACRO = 1
+    ALT_HOLD = 2
+    RTL = 6
+    LAND = 9
+
+    @property
+    def manual_throttle(self) -> bool:
+        """The throttle stick is thrust; refused in RC failsafe, and for arming it must be down."""
+        return self in (Mode.STABILIZE, Mode.ACRO)
+
+    @property
+    def piloted(self) -> bool:
+        """The sticks fly it; also the modes in which it can be armed."""
+        return self in (Mode.STABILIZE, Mode.ACRO, Mode.ALT_HOLD)
+
+
 class FlightControl:
-    """The laws of all modes, and the controllers that they share."""
+    """Control laws of all modes, and the controllers that they share."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -33,7 +53,7 @@ class FlightControl:
         self._height = HeightController()
         self._home_reached = False
         self.collective = 0.0
-        """Mean thrust asked for, as a fraction of full."""
+        """Commanded mean thrust, as a fraction of full."""
 
     def reset(self, body: BodyState) -> None:
         """Forget the targets: before flight and at each mode change."""
