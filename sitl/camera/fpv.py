@@ -6,21 +6,19 @@ pixels, no distortion; integer pixel coordinates are pixel centres.
 """
 
 import math
-from typing import TypeAlias
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sitl.camera import scenery
-from sitl.camera.imager import Imager
+from sitl.camera.imager import Image, Imager
+from sitl.camera.scenery import FloatArray
 from sitl.course.layout import Course
 from sitl.errors import UsageError
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
-
-FloatArray: TypeAlias = NDArray[np.float64]
-Image: TypeAlias = NDArray[np.uint8]
 
 TILT_UP_RAD = NOMINAL.camera_tilt_rad
 NEAR_M = 0.05
@@ -33,6 +31,16 @@ GROUND_FADE_M = 14.0
 """Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
 SUBPIXEL_BITS = 4
 """Corners are rounded to 1/16 pixel."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraOptions:
+    """Where and how a camera publishes its frames."""
+
+    shm_name: str
+    image_size: int
+    """Side of the square image, in pixels."""
+    fps: float
 
 
 class FpvRenderer:

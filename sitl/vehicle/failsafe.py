@@ -52,8 +52,8 @@ class GcsFailsafe:
         self._due_ns = 0
         self.active = False
 
-    def seen(self, now_ns: int) -> None:
-        """A heartbeat, override or manual control of MAV_GCS_SYSID has come in."""
+    def on_contact(self, now_ns: int) -> None:
+        """Record a heartbeat, override or manual control of the ground station."""
         self._last_contact_ns = now_ns
 
     def update(self, now_ns: int) -> bool:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import VehicleConfig
 
@@ -62,7 +62,7 @@ class UdpPeer:
     """A flight controller that sends to a UDP port of ours."""
 
     def __init__(self, address: tuple[str, int]) -> None:
-        self._clock = MonotonicClock()
+        self._clock = Clock()
         self._peer: tuple[str, int] | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(address)

@@ -13,15 +13,16 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
-from sitl.app import RunOptions, filming, fly
-from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from sitl.app import filming, fly
+from sitl.camera.fpv import CameraOptions
+from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.course.layout import Course, make_course
 from sitl.course.referee import Crash
 from sitl.link.transport import Received
 from sitl.report import FlightLog, write_report
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.stopping import StopRequest, stop_on_signal
-from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
+from sitl.vehicle.autopilot import STEP_NS
 from sitl.vehicle.flight_modes import Mode
 
 
@@ -286,21 +287,12 @@ def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
 
 def test_the_camera_publishes_while_its_context_lasts():
     name = f"sitl-test-{os.getpid()}"
-    options = RunOptions(
-        connect=(),
-        shm_name=name,
-        course_seed=7,
-        image_size=32,
-        fps=200.0,
-        report=None,
-        duration_s=None,
-        vehicle=VehicleConfig(),
-    )
+    options = CameraOptions(shm_name=name, image_size=32, fps=200.0)
     course = make_course(7)
     vehicle = SimulatedVehicle(links=0, boot_ns=0, course=course)
-    clock = MonotonicClock()
+    clock = Clock()
     deadline_ns = clock.now_ns() + 10 * NS_PER_S
-    with filming(options, name, course, vehicle, clock):
+    with filming(vehicle, course, options, clock):
         path = Path("/dev/shm") / name
         frame_id = 0
         while frame_id < 3 and clock.now_ns() < deadline_ns:
