@@ -16,10 +16,8 @@ class LinkFaults:
 
     loss: float = 0.0
     duplicate: float = 0.0
-    corrupt: float = 0.0
-    """One byte is changed."""
-    reorder: float = 0.0
-    """The packet is held back by ``reorder_ms``, so later ones overtake it."""
+    corrupt: float = 0.0  # one byte is changed
+    reorder: float = 0.0  # the packet is held back by ``reorder_ms``, so later ones overtake it
     reorder_ms: float = 20.0
     delay_ms: float = 0.0
 

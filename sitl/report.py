@@ -43,8 +43,7 @@ from sitl.course.referee import Crash, GateCounter, GatePass, struck_gate
 from sitl.rotation import Vec3, cos_tilt, to_euler
 from sitl.vehicle.autopilot import Autopilot
 
-CRASH_SPEED_MPS = 3.5
-"""ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash."""
+CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
 MAX_RELEASE_TIMES = 100
 MAX_TEXTS = 200
@@ -53,8 +52,7 @@ END_AFTER_NS = NS_PER_S
 PATH_PERIOD_NS = NS_PER_S // 20
 """Path length is summed at 20 Hz: fine enough for turns, coarse enough not to add up vibration."""
 
-LogEntry: TypeAlias = dict[str, float | str]
-"""A time ``t_s`` and what happened then."""
+LogEntry: TypeAlias = dict[str, float | str]  # a time ``t_s`` and what happened then
 
 
 class FlightLog:

@@ -16,8 +16,7 @@ from sitl.link.transport import FOLLOWER_KINDS, open_transport
 from sitl.stopping import StopRequest
 
 MESSAGES_PER_FRAME = 2
-MAX_MESSAGE_HZ = 200.0
-"""Within what ArduPilot can send at its default loop rate."""
+MAX_MESSAGE_HZ = 200.0  # within what ArduPilot can send at its default loop rate
 NO_POSE = "no pose from the vehicle in the last second, so no frames"
 
 

@@ -21,16 +21,13 @@ from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
 TILT_UP_RAD = NOMINAL.camera_tilt_rad
-NEAR_M = 0.05
-"""What is nearer than this, or behind, is cut off before it is projected."""
+NEAR_M = 0.05  # what is nearer than this, or behind, is cut off before it is projected
 LOWEST_EYE_M = 0.12
 """The eye is drawn at least this high, so that a vehicle on the ground sees ground."""
-GATE_HAZE_M = 90.0
-"""Distance at which a gate has lost 63 % of its contrast."""
+GATE_HAZE_M = 90.0  # distance at which a gate has lost 63 % of its contrast
 GROUND_FADE_M = 14.0
 """Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
-SUBPIXEL_BITS = 4
-"""Corners are rounded to 1/16 pixel."""
+SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,8 +35,7 @@ class CameraOptions:
     """Where and how a camera publishes its frames."""
 
     shm_name: str
-    image_size: int
-    """Side of the square image, in pixels."""
+    image_size: int  # side of the square image, in pixels
     fps: float
 
 

@@ -10,8 +10,7 @@ from sitl.vehicle.conditions import Conditions
 
 Image: TypeAlias = NDArray[np.uint8]
 
-REFERENCE_WIDTH_PX = 224
-"""Image width for which the conditions give the blur."""
+REFERENCE_WIDTH_PX = 224  # image width for which the conditions give the blur
 NOISE_MARGIN_PX = 61
 """Noise is drawn once, this much larger than the image, and cropped anew for every frame."""
 

@@ -15,11 +15,9 @@ from sitl.vehicle.conditions import NOMINAL, Conditions, Rgb
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
-LEG_M = 0.09
-"""Width of the two posts that reach down to the ground."""
+LEG_M = 0.09  # width of the two posts that reach down to the ground
 PIP_M = 0.16
-PIP_PITCH_M = 0.32
-"""White squares on the front of the top bar: the gate's number, counted from one."""
+PIP_PITCH_M = 0.32  # white squares on the front of the top bar: the gate's number, counted from one
 INSIDE_BRIGHTNESS = 0.7
 BOTH_SIDES: Vec3 = (0.0, 0.0, 0.0)
 
@@ -37,10 +35,8 @@ GRASS_RGB = (62, 96, 62)
 GRID_RGB = (196, 200, 160)
 LEG_RGB = (58, 60, 68)
 PIP_RGB = (255, 248, 232)
-BACK_RGB = (96, 98, 112)
-"""A gate is grey from behind: it must not be passed from there."""
-FRONT_RGB = NOMINAL.gate_rgb
-"""Even gates, odd gates."""
+BACK_RGB = (96, 98, 112)  # a gate is grey from behind: it must not be passed from there
+FRONT_RGB = NOMINAL.gate_rgb  # even gates, odd gates
 BACKDROP_RGB = (
     (-1.0, (78, 98, 66)),
     (-0.30, (92, 108, 76)),
@@ -57,8 +53,7 @@ class _Face(NamedTuple):
     """One quadrilateral in gate axes: forward through the gate, right, down."""
 
     corners_m: tuple[Vec3, ...]
-    normal: Vec3
-    """Towards the side from which it is seen; zero = it is seen from both."""
+    normal: Vec3  # towards the side from which it is seen; zero = it is seen from both
     rgb: Rgb
 
 

@@ -14,12 +14,9 @@ from sitl.errors import UsageError
 from sitl.rotation import Quat, Vec3, wrap_pi
 
 GATE_COUNT = 8
-OPENING_M = 2.4
-"""Side of the opening: five times the width of a 0.5 m quadrotor."""
-BAR_M = 0.32
-"""Width of the bars around an opening."""
-DEPTH_M = 0.24
-"""Depth of the frame along the passage; the gate's centre is halfway in."""
+OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
+BAR_M = 0.32  # width of the bars around an opening
+DEPTH_M = 0.24  # depth of the frame along the passage; the gate's centre is halfway in
 
 # At 8 m/s the sharpest turn over the shortest leg, 35 degrees in 7 m, asks for v^2 * angle / leg =
 # 5.6 m/s^2 = g * tan(30 deg), ArduCopter's default lean limit. The climb limit asks for 1.1 m/s.
@@ -36,12 +33,9 @@ class Gate:
     """One gate of a course."""
 
     center_ned_m: Vec3
-    yaw_rad: float
-    """Heading of the passage, in [-pi, pi]."""
-    size_m: float
-    """Side of the square opening; the frame around it is not part of it."""
-    index: int
-    """Position on the course, from 0."""
+    yaw_rad: float  # heading of the passage, in [-pi, pi]
+    size_m: float  # side of the square opening; the frame around it is not part of it
+    index: int  # position on the course, from 0
 
     def to_axes(self, vector_ned: Vec3) -> Vec3:
         """Turn a direction, velocity or offset into gate axes: forward through it, right, down."""
@@ -71,8 +65,7 @@ class AirborneStart:
     position_ned_m: Vec3
     velocity_ned_mps: Vec3
     ned_from_body_wxyz: Quat
-    next_gate: int
-    """Index of the first gate to pass."""
+    next_gate: int  # index of the first gate to pass
 
 
 def make_course(seed: int) -> Course:

@@ -22,8 +22,7 @@ class Crash:
     """The first hard impact; it ends the flight."""
 
     t_s: float
-    hit: str
-    """"ground" or "gate N"."""
+    hit: str  # "ground" or "gate N"
     speed_mps: float
 
 

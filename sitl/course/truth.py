@@ -10,14 +10,10 @@ from sitl.rotation import Quat, Vec3, conjugate, rotate, to_euler, wrap_pi
 class GateTruth:
     """The next two gates relative to one pose; None where the course has no more gates."""
 
-    next_gate: int | None = None
-    """Index of the next gate."""
-    gate_body_m: Vec3 | None = None
-    """Centre of the next gate in FRD body axes."""
-    gate_yaw_rad: float | None = None
-    """Heading of its passage relative to the body's heading, in [-pi, pi]."""
-    gate_after_body_m: Vec3 | None = None
-    """Centre of the gate after it, in FRD body axes."""
+    next_gate: int | None = None  # index of the next gate
+    gate_body_m: Vec3 | None = None  # centre of the next gate in FRD body axes
+    gate_yaw_rad: float | None = None  # heading of its passage minus the body's, in [-pi, pi]
+    gate_after_body_m: Vec3 | None = None  # centre of the gate after it, in FRD body axes
 
 
 def gate_truth(

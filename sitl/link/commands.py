@@ -14,8 +14,7 @@ ACCEPTED: int = mav.MAV_RESULT_ACCEPTED
 DENIED: int = mav.MAV_RESULT_DENIED
 UNSUPPORTED: int = mav.MAV_RESULT_UNSUPPORTED
 FAILED: int = mav.MAV_RESULT_FAILED
-FORCE = 21196.0
-"""Param 2 of ARM_DISARM that overrules every check (MAVLink common.xml)."""
+FORCE = 21196.0  # param 2 of ARM_DISARM that overrules every check (MAVLink common.xml)
 UINT16_MAX = 65535
 
 

@@ -16,8 +16,7 @@ from sitl.vehicle.autopilot import Autopilot
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 from sitl.vehicle.flight_modes import Mode
 
-Message: TypeAlias = Any
-"""A pymavlink message (the library has no types)."""
+Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 
 HOME_LAT_DEG, HOME_LON_DEG, HOME_ALT_M = -35.3632621, 149.1652374, 584.0
 """ArduPilot SITL's default home."""

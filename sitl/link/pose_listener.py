@@ -14,8 +14,7 @@ from sitl.clock import NS_PER_S
 from sitl.link.messages import Message
 from sitl.rotation import Quat, Vec3, from_euler, integrate
 
-ReportedPose: TypeAlias = tuple[Vec3, Quat]
-"""position_ned_m, ned_from_body_wxyz"""
+ReportedPose: TypeAlias = tuple[Vec3, Quat]  # position_ned_m, ned_from_body_wxyz
 
 SYSTEM_ID = 246
 """Not 255: ArduPilot would count our heartbeats as its ground station's, and so not notice that

@@ -12,8 +12,7 @@ from sitl.vehicle.conditions import NOMINAL, Conditions
 HEARTBEAT_INTERVAL_MS = 1000
 MAX_INTERVAL_US = 60_000_000
 MAX_DISTINCT_INTERVALS = 10
-PARAM_SLOWDOWN = 4
-"""Factor on all intervals while a parameter list is being sent."""
+PARAM_SLOWDOWN = 4  # factor on all intervals while a parameter list is being sent
 
 STREAM_GROUPS: dict[int, tuple[int, ...]] = {
     mav.MAV_DATA_STREAM_RAW_SENSORS: (
@@ -45,10 +44,8 @@ STREAM_GROUPS: dict[int, tuple[int, ...]] = {
 @dataclass(slots=True, kw_only=True)
 class _Stream:
     interval_ms: int
-    due_ns: int
-    """Next slot on the stream's own grid."""
-    late_ns: int = 0
-    """Delay of the next message after its slot."""
+    due_ns: int  # next slot on the stream's own grid
+    late_ns: int = 0  # delay of the next message after its slot
 
 
 class Streams:

@@ -12,21 +12,16 @@ from sitl.errors import UsageError
 
 Address: TypeAlias = tuple[str, int]
 
-VEHICLE_KINDS = ("udpout", "udpin", "tcpin")
-"""Links of a vehicle."""
-FOLLOWER_KINDS = ("udp", "udpin", "udpout", "tcp")
-"""Links to another vehicle; ``udp`` is ``udpin``."""
+VEHICLE_KINDS = ("udpout", "udpin", "tcpin")  # links of a vehicle
+FOLLOWER_KINDS = ("udp", "udpin", "udpout", "tcp")  # links to another vehicle; ``udp`` is ``udpin``
 MAX_DATAGRAM = 65535
-MAX_PACKED = 1200
-"""Frames of one step share a datagram up to this size: below any usual MTU."""
-MAX_PEERS = 8
-"""Addresses that a listening link answers; the one that was silent longest makes room."""
+MAX_PACKED = 1200  # frames of one step share a datagram up to this size: below any usual MTU
+MAX_PEERS = 8  # addresses that a listening link answers; the one that was silent longest makes room
 MAX_READS = 1000
 """Per drain, so that a flood cannot stop the loop: the rest waits for the next step."""
 CONNECT_TIMEOUT_S = 1.0
 
-_SO_TIMESTAMPNS = 35
-"""Linux (asm-generic/socket.h); Python does not name it."""
+_SO_TIMESTAMPNS = 35  # Linux (asm-generic/socket.h); Python does not name it
 _TIMESPEC = struct.Struct("@qq")
 _ANCILLARY_BYTES = 64
 _UNREACHABLE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENOBUFS)

@@ -25,83 +25,53 @@ class Conditions:
     (`sitl.vehicle.params`).
     """
 
-    seed: int = 0
-    """Seed of gusts, sensor noise and image noise."""
+    seed: int = 0  # of gusts, sensor noise and image noise
 
-    mass_factor: float = 1.0
-    """Scales mass and inertia."""
-    thrust_factor: float = 1.0
-    """Scales full thrust: battery, propellers, air."""
-    drag_factor: float = 1.0
-    """Scales rotor and body drag."""
-    wind_ned_mps: Vec3 = (0.0, 0.0, 0.0)
-    """Mean velocity of the air."""
-    gust_rms_mps: float = 0.0
-    """Per horizontal axis; the vertical gust is half as strong."""
+    mass_factor: float = 1.0  # scales mass and inertia
+    thrust_factor: float = 1.0  # scales full thrust: battery, propellers, air
+    drag_factor: float = 1.0  # scales rotor and body drag
+    wind_ned_mps: Vec3 = (0.0, 0.0, 0.0)  # mean velocity of the air
+    gust_rms_mps: float = 0.0  # per horizontal axis; the vertical gust is half as strong
     gust_time_s: float = 1.5
 
     angle_max_cdeg: float = 3000.0
     pilot_yaw_rate_degps: float = 202.5
     pilot_yaw_expo: float = 0.0
     pilot_speed_up_cmps: float = 250.0
-    pilot_speed_down_cmps: float = 0.0
-    """0: as up."""
+    pilot_speed_down_cmps: float = 0.0  # 0: as up
     pilot_accel_z_cmps2: float = 250.0
-    throttle_dead_zone_permille: float = 100.0
-    """Share of the stick's travel, on each side of the middle."""
-    rc_dead_zones_us: tuple[float, ...] = (20.0, 20.0, 30.0, 20.0)
-    """Channels 1 to 4: roll, pitch, throttle, yaw."""
-    input_time_s: float = 0.15
-    """Time constant with which the target lean follows the stick."""
-    angle_gains_per_s: Vec3 = (6.0, 6.0, 3.0)
-    """Roll, pitch, yaw."""
-    lean_rate_max_degps: float = 220.0
-    """0: no limit."""
-    lean_accel_max_cdegps2: float = 110_000.0
-    """0: no limit."""
+    throttle_dead_zone_permille: float = 100.0  # of the stick, on each side of the middle
+    rc_dead_zones_us: tuple[float, ...] = (20.0, 20.0, 30.0, 20.0)  # roll, pitch, throttle, yaw
+    input_time_s: float = 0.15  # time constant of the target lean behind the stick
+    angle_gains_per_s: Vec3 = (6.0, 6.0, 3.0)  # roll, pitch, yaw
+    lean_rate_max_degps: float = 220.0  # 0: no limit
+    lean_accel_max_cdegps2: float = 110_000.0  # 0: no limit
 
-    stream_slowdown_ms: int = 0
-    """Added to every message interval, as ArduPilot does where its radio reports a full buffer."""
-    stream_jitter_ms: float = 0.0
-    """Largest random delay of a message."""
-    stream_phase_spread: float = 0.0
-    """Largest share of its interval, 0 to 1, by which a stream randomly begins earlier."""
+    stream_slowdown_ms: int = 0  # added to every interval, as for a full radio buffer
+    stream_jitter_ms: float = 0.0  # largest random delay of a message
+    stream_phase_spread: float = 0.0  # largest share of its interval that a stream begins early
 
-    velocity_noise_mps: float = 0.0
-    """Standard deviation per sample and axis, as for the other two sensors."""
+    velocity_noise_mps: float = 0.0  # standard deviation per sample and axis, as the next two
     rate_noise_radps: float = 0.0
     specific_force_noise_mps2: float = 0.0
 
-    camera_tilt_rad: float = math.radians(10.0)
-    """Upwards, as on racing quadrotors, which fly nose down."""
-    camera_roll_rad: float = 0.0
-    """About the optical axis, right side down."""
-    camera_yaw_rad: float = 0.0
-    """To the right."""
-    camera_offset_body_m: Vec3 = (0.0, 0.0, 0.0)
-    """Position of the camera in FRD body axes."""
+    camera_tilt_rad: float = math.radians(10.0)  # upwards; racing quadrotors fly nose down
+    camera_roll_rad: float = 0.0  # about the optical axis, right side down
+    camera_yaw_rad: float = 0.0  # to the right
+    camera_offset_body_m: Vec3 = (0.0, 0.0, 0.0)  # position of the camera in FRD body axes
     horizontal_fov_rad: float = math.radians(90.0)
 
-    gate_rgb: tuple[Rgb, Rgb] = ((255, 126, 22), (222, 34, 48))
-    """Front colours: orange for gates 0, 2, ..., red for gates 1, 3, ..."""
-    ground_tint: Vec3 = (1.0, 1.0, 1.0)
-    """Factors on red, green and blue, as for the sky."""
-    sky_tint: Vec3 = (1.0, 1.0, 1.0)
-    """Also tints haze and far ground."""
-    ground_seed: int = 0
-    """Seed of the pattern of grass and soil."""
-    sun_ned: Vec3 = (-0.45, 0.35, -0.82)
-    """Direction to the sun, unit length."""
-    ambient: float = 0.78
-    """Brightness of a surface turned away from the sun."""
+    gate_rgb: tuple[Rgb, Rgb] = ((255, 126, 22), (222, 34, 48))  # even gates, odd gates
+    ground_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green and blue, as the next
+    sky_tint: Vec3 = (1.0, 1.0, 1.0)  # also tints haze and far ground
+    ground_seed: int = 0  # seed of the pattern of grass and soil
+    sun_ned: Vec3 = (-0.45, 0.35, -0.82)  # direction to the sun, unit length
+    ambient: float = 0.78  # brightness of a surface turned away from the sun
 
-    exposure: float = 1.0
-    """Factor on all colours, before they saturate."""
+    exposure: float = 1.0  # factor on all colours, before they saturate
     white_balance: Vec3 = (1.0, 1.0, 1.0)
-    blur_px: float = 0.0
-    """Standard deviation, in pixels of a 224 pixel wide image."""
-    image_noise: float = 0.0
-    """Standard deviation per pixel and channel, in levels of 0..255."""
+    blur_px: float = 0.0  # standard deviation, in pixels of a 224 pixel wide image
+    image_noise: float = 0.0  # standard deviation per channel, in levels of 0..255
 
     def numbers(self) -> dict[str, float]:
         """Every number by name, for ``meta.json``; ``name_k`` is entry k of a vector."""

@@ -27,8 +27,7 @@ RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
 MIN_INPUT_TIME_S = 0.01
 MAX_TARGET_LEAD_RAD = math.radians(30.0)
 """In rate mode the target may run ahead of the vehicle by this much before it is pulled back."""
-SPIN_MIN = 0.05
-"""Lowest thrust of an armed, flying motor."""
+SPIN_MIN = 0.05  # lowest thrust of an armed, flying motor
 _ANGLE_GAINS = ("ATC_ANG_RLL_P", "ATC_ANG_PIT_P", "ATC_ANG_YAW_P")
 
 

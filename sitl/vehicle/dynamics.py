@@ -19,8 +19,7 @@ from sitl.vehicle.conditions import NOMINAL, Conditions
 GRAVITY_MPS2 = 9.80665
 MASS_KG = 1.2
 INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
-MOTOR_ARM_M = 0.12
-"""Motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase."""
+MOTOR_ARM_M = 0.12  # motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase
 MAX_MOTOR_THRUST_N = 7.54
 """Hover at 0.39 of full thrust, which is ArduCopter's learned-hover order of magnitude."""
 YAW_TORQUE_PER_THRUST_M = 0.016
@@ -33,8 +32,7 @@ REST_HEIGHT_M = 0.06
 
 PHYSICS_STEP_NS = 1_250_000
 
-_BODY = 1
-"""After the world."""
+_BODY = 1  # after the world
 _FULL_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -91,12 +89,9 @@ class BodyState(NamedTuple):
     ned_from_body_wxyz: Quat
     velocity_ned_mps: Vec3
     rate_body_radps: Vec3
-    specific_force_body_mps2: Vec3
-    """What an accelerometer reads: (0, 0, -9.8) at rest."""
-    motors: tuple[float, ...]
-    """Thrust of each motor as a fraction of full, in ArduCopter's quad X order."""
-    touching: bool
-    """Some part of the frame is on the ground."""
+    specific_force_body_mps2: Vec3  # what an accelerometer reads: (0, 0, -9.8) at rest
+    motors: tuple[float, ...]  # thrust over full thrust, in ArduCopter's quad X order
+    touching: bool  # some part of the frame is on the ground
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,8 +4,7 @@ from sitl.clock import NS_PER_S
 from sitl.vehicle.params import Params
 
 LOW_READS_TO_FAIL = 3
-GCS_CHECK_PERIOD_NS = NS_PER_S // 3
-"""ArduCopter looks at the ground station in its 3 Hz loop."""
+GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter looks at the ground station in its 3 Hz loop
 
 
 class RadioFailsafe:

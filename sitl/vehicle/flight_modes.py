@@ -11,11 +11,9 @@ from sitl.vehicle.params import Params
 from sitl.vehicle.sticks import Sticks
 
 STOPPED = (0.0, 0.0, 0.0, 0.0)
-IDLE = (0.03, 0.03, 0.03, 0.03)
-"""Armed on the ground, throttle down."""
+IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 
-FAST_DESCENT_MPS = 1.5
-"""LAND above SLOW_DESCENT_HEIGHT_M (WPNAV_SPEED_DN); LAND_SPEED below it."""
+FAST_DESCENT_MPS = 1.5  # LAND above SLOW_DESCENT_HEIGHT_M (WPNAV_SPEED_DN); LAND_SPEED below it
 SLOW_DESCENT_HEIGHT_M = 10.0
 RTL_SPEED_MPS = 5.0
 RTL_ARRIVED_M = 1.0

@@ -10,15 +10,11 @@ from sitl.clock import NS_PER_S
 from sitl.vehicle.params import RC_CHANNELS_WITH_PARAMS, Params
 
 CHANNELS = 16
-PRIMARY_CHANNELS = 8
-"""Channels 1-8 and 9-16 differ in what 0 and the highest values mean."""
+PRIMARY_CHANNELS = 8  # channels 1-8 and 9-16 differ in what 0 and the highest values mean
 IGNORE = 65535
-RELEASE_ON_AUX = 65534
-"""Releases channels 9-16; on 1-8 it is a value like any other."""
-RELEASE = 0
-"""Releases channels 1-8; on 9-16 it means "ignore"."""
-AXIS_ABSENT = 32767
-"""MANUAL_CONTROL axis that the sender does not drive."""
+RELEASE_ON_AUX = 65534  # releases channels 9-16; on 1-8 it is a value like any other
+RELEASE = 0  # releases channels 1-8; on 9-16 it means "ignore"
+AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
 IDLE_RECEIVER_US = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
 """A transmitter that lies on the table: throttle down, the rest centred."""
 

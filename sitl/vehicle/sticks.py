@@ -16,16 +16,11 @@ THROTTLE_FULL = 1000.0
 class Sticks(NamedTuple):
     """Stick positions after calibration and dead zone."""
 
-    roll: float
-    """[-1, 1], + right."""
-    pitch: float
-    """[-1, 1], + stick back, nose up: the sign of the raw channel, not of a joystick."""
-    yaw: float
-    """[-1, 1], + nose right."""
-    throttle: float
-    """[0, 1000] from stick down to stick up."""
-    throttle_mid: float
-    """Middle of the throttle's travel on that scale."""
+    roll: float  # [-1, 1], + right
+    pitch: float  # [-1, 1], + stick back, nose up: the sign of the raw channel, not of a joystick
+    yaw: float  # [-1, 1], + nose right
+    throttle: float  # [0, 1000] from stick down to stick up
+    throttle_mid: float  # middle of the throttle's travel on that scale
 
 
 def read_sticks(rc: RcEngine, params: Params) -> Sticks:

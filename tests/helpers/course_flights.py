@@ -8,8 +8,9 @@ import numpy as np
 
 from sitl.clock import NS_PER_S
 from sitl.course.layout import AirborneStart, Course
-from sitl.expert.demonstrator import Expert, StickPositions
+from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance
+from sitl.expert.stick_response import StickPositions
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, Conditions

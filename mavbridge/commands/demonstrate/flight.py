@@ -20,8 +20,9 @@ from mavbridge.simulation.episode import Episode, Setup
 from mavbridge.simulation.world import Exposure, varied_scene
 from policy.contract import Contract, Executable, FloatArray
 from sitl.course.truth import gate_truth
-from sitl.expert.demonstrator import Expert, StickPositions
+from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance, random_start
+from sitl.expert.stick_response import StickPositions
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
 
 NOMINAL_SHARE = 0.25

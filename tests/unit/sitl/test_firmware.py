@@ -10,7 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from helpers.course_flights import fly_course, pwm_us
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import AirborneStart, make_course
-from sitl.expert.demonstrator import Expert, StickPositions
+from sitl.expert.demonstrator import Expert
+from sitl.expert.stick_response import StickPositions
 from sitl.link.streams import Streams
 from sitl.rotation import IDENTITY, to_euler
 from sitl.simulated_vehicle import SimulatedVehicle
