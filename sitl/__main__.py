@@ -31,82 +31,44 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sitl",
-        description="Simulated ArduCopter that speaks MAVLink, with an FPV camera in shared memory "
-        "over a course of gates.",
+        description="A simulated ArduCopter that speaks MAVLink, with an FPV camera in shared "
+        "memory over a course of gates.",
         allow_abbrev=False,
     )
     parser.set_defaults(run=_fly)
-    parser.add_argument(
-        "--connect",
-        action="append",
-        metavar="LINK",
-        help="MAVLink link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeat the flag "
-        "for several links",
-    )
-    parser.add_argument(
-        "--report", type=Path, metavar="FILE", help="write a JSON report when the flight ends"
-    )
-    parser.add_argument("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
-    parser.add_argument(
-        "--end-with-course",
-        action="store_true",
-        help="stop one second after the last gate, or at a crash",
-    )
-    parser.add_argument(
-        "--receiver",
-        choices=("idle", "none"),
-        default="idle",
-        help="RC receiver: one with centred sticks (default), or none",
-    )
-    parser.add_argument(
-        "--conditions",
-        type=_SEED,
-        metavar="SEED",
-        help="randomise airframe, firmware settings, wind, light, colours and lens with this seed "
-        "(default: nominal)",
-    )
+    add = parser.add_argument
+    connect_help = "udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeat for several"
+    add("--connect", action="append", metavar="LINK", help=connect_help)
+    add("--report", type=Path, metavar="FILE", help="write a JSON report when the flight ends")
+    add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
+    end_help = "stop one second after the last gate, or at a crash"
+    add("--end-with-course", action="store_true", help=end_help)
+    receiver_help = "RC receiver: with idle sticks (default), or none"
+    add("--receiver", choices=("idle", "none"), default="idle", help=receiver_help)
+    conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
+    add("--conditions", type=_SEED, metavar="SEED", help=conditions_help)
     _add_camera_flags(parser)
-    commands = parser.add_subparsers(title="other commands", metavar="")
-    camera = commands.add_parser(
-        "camera", help="film the course from another vehicle's reported pose", allow_abbrev=False
-    )
+    commands = parser.add_subparsers(title="other commands", metavar="COMMAND")
+    camera_help = "film the course from another vehicle's reported pose"
+    camera = commands.add_parser("camera", help=camera_help, allow_abbrev=False)
     camera.set_defaults(run=_film)
-    camera.add_argument(
-        "--follow",
-        required=True,
-        metavar="LINK",
-        help="MAVLink link of that vehicle: udp:HOST:PORT or udpin: to listen, udpout: or tcp: to "
-        "connect to it",
-    )
+    follow_help = "its MAVLink link: udp:HOST:PORT or udpin: to listen, udpout: or tcp: to connect"
+    camera.add_argument("--follow", required=True, metavar="LINK", help=follow_help)
     _add_camera_flags(camera)
     course = commands.add_parser("course", help="print a course", allow_abbrev=False)
     course.set_defaults(run=_print_course)
-    course.add_argument("--course", type=_SEED, default=0, metavar="SEED")
+    course.add_argument("--course", type=_SEED, default=0, metavar="SEED", help="default: 0")
     course.add_argument("--json", action="store_true", help="print JSON instead of a table")
     return parser
 
 
 def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--camera", type=_shm_name, metavar="shm:NAME", help="publish camera frames under this name"
-    )
-    parser.add_argument(
-        "--course", type=_SEED, default=0, metavar="SEED", help="seed of the course (default: 0)"
-    )
-    parser.add_argument(
-        "--image-size",
-        type=_IMAGE_SIZE,
-        default=224,
-        metavar="PIXELS",
-        help="side of the square camera image (default: 224)",
-    )
-    parser.add_argument(
-        "--fps",
-        type=_POSITIVE,
-        default=30.0,
-        metavar="HZ",
-        help="frame rate of the camera (default: 30)",
-    )
+    add = parser.add_argument
+    add("--camera", type=_shm_name, metavar="shm:NAME", help="publish frames under this name")
+    add("--course", type=_SEED, default=0, metavar="SEED", help="its gates (default: 0)")
+    size_help = "side of the square image (default: 224)"
+    add("--image-size", type=_IMAGE_SIZE, default=224, metavar="PIXELS", help=size_help)
+    add("--fps", type=_POSITIVE, default=30.0, metavar="HZ", help="frame rate (default: 30)")
 
 
 def _fly(args: argparse.Namespace) -> None:

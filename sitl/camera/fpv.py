@@ -1,4 +1,4 @@
-"""What a camera on the vehicle sees of a gate course, drawn with OpenCV.
+"""Draws the view of a camera on the vehicle over a gate course, with OpenCV.
 
 Frames: NED world; FRD body; camera x right, y down, z along the optical axis. The camera sits at
 the body's origin and looks forward, tilted up, unless the conditions shift it. Pinhole, square
@@ -40,9 +40,9 @@ class CameraOptions:
 
 
 class FpvRenderer:
-    """Draws the view from any pose; holds what course, image size and conditions determine.
+    """Draws the view from any pose on a course.
 
-    Only image noise, where the conditions ask for it, depends on how many frames came before.
+    Only image noise, where the conditions have it, depends on how many frames came before.
     """
 
     def __init__(
@@ -52,16 +52,9 @@ class FpvRenderer:
             raise UsageError(f"the image must have at least 16x16 pixels, got {width}x{height}")
         self._focal_px = width / 2 / math.tan(conditions.horizontal_fov_rad / 2)
         self._center_px = np.array([(width - 1) / 2, (height - 1) / 2])
-        self._ray_from_pixel = (
-            np.array(
-                [
-                    [1.0, 0.0, -self._center_px[0]],
-                    [0.0, 1.0, -self._center_px[1]],
-                    [0.0, 0.0, self._focal_px],
-                ]
-            )
-            / self._focal_px
-        )
+        u_px, v_px = self._center_px
+        scaled = [[1.0, 0.0, -u_px], [0.0, 1.0, -v_px], [0.0, 0.0, self._focal_px]]
+        self._ray_from_pixel = np.array(scaled) / self._focal_px
         self._u_px = np.arange(width, dtype=np.float32)
         self._v_px = np.arange(height, dtype=np.float32)[:, None]
         self._body_from_camera = body_from_camera(conditions)
@@ -98,7 +91,9 @@ class FpvRenderer:
         has_ground = np.maximum(falls[:, 0], falls[:, -1]) > 0
         if has_ground.any():
             top = int(has_ground.argmax())
-            self._draw_ground(image[top:], falls[top:], eye_ned_m, ned_ray_from_pixel @ _rows(top))
+            pixel_from_cropped = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, top], [0.0, 0.0, 1.0]])
+            ned_ray_from_cropped = ned_ray_from_pixel @ pixel_from_cropped
+            self._draw_ground(image[top:], falls[top:], eye_ned_m, ned_ray_from_cropped)
         return image
 
     def _draw_ground(
@@ -108,7 +103,7 @@ class FpvRenderer:
         eye_ned_m: FloatArray,
         ned_ray_from_pixel: FloatArray,
     ) -> None:
-        """Blend the ground's texture in, the less the farther it is."""
+        """Blend the ground's texture in, less with distance."""
         height_m = -eye_ned_m[2]
         weight = np.maximum(falls, 0)
         weight /= weight + np.float32(height_m / GROUND_FADE_M)
@@ -157,18 +152,12 @@ class FpvRenderer:
         return np.rint(points_px * (1 << SUBPIXEL_BITS)).astype(np.int32)
 
     def _in_view(self, corners_m: FloatArray) -> NDArray[np.bool_]:
-        """Which of [N, 4, 3] are not wholly behind the near plane or outside one image border."""
+        """Whether each of [N, 4, 3] is not wholly behind the near plane or one image border."""
         x, y, z = np.moveaxis(corners_m, -1, 0)
         half_width, half_height = (self._center_px + 1) / self._focal_px
-        outside = np.stack(
-            [
-                z < NEAR_M,
-                x > half_width * z,
-                x < -half_width * z,
-                y > half_height * z,
-                y < -half_height * z,
-            ]
-        )
+        is_left, is_right = x < -half_width * z, x > half_width * z
+        is_above, is_below = y < -half_height * z, y > half_height * z
+        outside = np.stack([z < NEAR_M, is_left, is_right, is_above, is_below])
         return np.asarray(~outside.all(axis=2).any(axis=0))
 
 
@@ -182,11 +171,6 @@ def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
     about_axis = rotation_matrix(from_euler(0.0, 0.0, roll_rad))
     about_down = rotation_matrix(from_euler(0.0, 0.0, yaw_rad))
     return np.asarray(about_down @ tilted @ about_axis)
-
-
-def _rows(top: int) -> FloatArray:
-    """Pixel of the whole image from a pixel of its part that starts at row ``top``."""
-    return np.array([[1.0, 0.0, 0.0], [0.0, 1.0, top], [0.0, 0.0, 1.0]])
 
 
 def clip_near(corners_m: FloatArray) -> FloatArray:

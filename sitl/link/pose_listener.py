@@ -53,7 +53,9 @@ class PoseListener:
         for message in self._messages(data):
             if message.get_srcComponent() != mav.MAV_COMP_ID_AUTOPILOT1:
                 continue
-            if self._vehicle is None and _is_autopilot(message):
+            is_heartbeat = message.get_type() == "HEARTBEAT"
+            is_autopilot = is_heartbeat and message.autopilot != mav.MAV_AUTOPILOT_INVALID
+            if self._vehicle is None and is_autopilot:
                 self._vehicle = message.get_srcSystem()
             if message.get_srcSystem() == self._vehicle:
                 self._received[message.get_msgId()] += 1
@@ -71,11 +73,9 @@ class PoseListener:
         if now_ns - min(attitude_ns, position_ns) > POSE_MAX_AGE_NS:
             return None
         dt_s = (now_ns - position_ns) / NS_PER_S
-        north_m, east_m, down_m = (
-            p + v * dt_s for p, v in zip(position_m, velocity_mps, strict=True)
-        )
-        attitude = integrate(wxyz, rate_radps, (now_ns - attitude_ns) / NS_PER_S)
-        return (north_m, east_m, down_m), attitude
+        (north, east, down), (north_mps, east_mps, down_mps) = position_m, velocity_mps
+        now_m = (north + north_mps * dt_s, east + east_mps * dt_s, down + down_mps * dt_s)
+        return now_m, integrate(wxyz, rate_radps, (now_ns - attitude_ns) / NS_PER_S)
 
     def outgoing(self, now_ns: int) -> list[bytes]:
         """Packets to send now: a heartbeat and requests once a second, else nothing."""
@@ -146,8 +146,3 @@ class PoseListener:
         return mav.MAVLink_command_long_message(
             self._vehicle, autopilot, number, 0, kind, interval_us, *[0.0] * 5
         )
-
-
-def _is_autopilot(message: Message) -> bool:
-    is_heartbeat: bool = message.get_type() == "HEARTBEAT"
-    return is_heartbeat and message.autopilot != mav.MAV_AUTOPILOT_INVALID

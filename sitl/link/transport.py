@@ -92,7 +92,8 @@ class UdpLink:
             except ConnectionError:  # an earlier datagram found nobody there
                 continue
             if self._listen:
-                self._remember(sender)
+                others = [peer for peer in self._peers if peer != sender]
+                self._peers = [*others[-MAX_PEERS + 1 :], sender]
             yield Received(data, self._arrival_ns(ancillary))
 
     def send(self, data: bytes) -> None:
@@ -110,10 +111,6 @@ class UdpLink:
     def close(self) -> None:
         """Free the port."""
         self._socket.close()
-
-    def _remember(self, sender: Address) -> None:
-        others = [peer for peer in self._peers if peer != sender]
-        self._peers = [*others[-MAX_PEERS + 1 :], sender]
 
     def _arrival_ns(self, ancillary: list[tuple[int, int, bytes]]) -> int:
         for level, kind, payload in ancillary:

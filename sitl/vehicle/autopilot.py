@@ -20,7 +20,7 @@ from sitl.vehicle.sticks import climb_rate_mps, read_sticks
 
 SUBSTEPS = 2
 STEP_NS = SUBSTEPS * PHYSICS_STEP_NS
-LOOP_HZ = NS_PER_S // STEP_NS
+STEP_S = STEP_NS / NS_PER_S
 GPS_PERIOD_NS = NS_PER_S // 5
 
 LANDED_AFTER_NS = NS_PER_S
@@ -77,7 +77,7 @@ class Autopilot:
         """Fault: telemetry and control keep the last state, the physics goes on."""
         self._control = FlightControl(params)
         self._quad = Quadrotor(config.conditions)
-        self._wind = Wind(config.conditions, STEP_NS / NS_PER_S)
+        self._wind = Wind(config.conditions, STEP_S)
         self._noise = SensorNoise(config.conditions)
         self._physics = self._quad.at_rest()
         self.sensed = self._physics.body
@@ -185,9 +185,8 @@ class Autopilot:
         if self.gcs_failsafe.update(self.now_ns):
             self._on_gcs_change()
         self.motor_commands = self._motors()
-        self._physics = self._quad.step(
-            self._physics, self.motor_commands, SUBSTEPS, self._wind.step()
-        )
+        wind_mps = self._wind.step()
+        self._physics = self._quad.step(self._physics, self.motor_commands, SUBSTEPS, wind_mps)
         if not self.sensors_frozen:
             self.sensed = self._noise.sense(self._physics.body)
             if self.now_ns >= self._gps_due_ns:
@@ -218,25 +217,18 @@ class Autopilot:
         sticks = read_sticks(self.rc, self.params)
         if self.landed:
             if not self._control.wants_takeoff(self.mode, sticks):
-                self._disarm_when_idle()
+                # LAND and RTL stop the motors on touchdown, the pilot's modes after DISARM_DELAY.
+                delay_s = self.params["DISARM_DELAY"]
+                is_idle = delay_s > 0.0 and self._has_held(self._idle_since_ns, delay_s * NS_PER_S)
+                if is_idle or not self.mode.piloted:
+                    self.disarm(force=False)
                 return self._control.idle(self.sensed)
             self.landed = False
             self._still_since_ns = None
         self._idle_since_ns = self.now_ns
         return self._control.fly(
-            self.mode,
-            sticks,
-            self.sensed,
-            has_position=self.position_ready,
-            dt_s=STEP_NS / NS_PER_S,
+            self.mode, sticks, self.sensed, has_position=self.position_ready, dt_s=STEP_S
         )
-
-    def _disarm_when_idle(self) -> None:
-        """LAND and RTL stop the motors on touchdown, the pilot's modes after DISARM_DELAY."""
-        delay_s = self.params["DISARM_DELAY"]
-        waited = delay_s > 0.0 and self.now_ns - self._idle_since_ns >= delay_s * NS_PER_S
-        if waited or not self.mode.piloted:
-            self.disarm(force=False)
 
     def _detect_landing(self) -> None:
         body = self.sensed
@@ -262,7 +254,7 @@ class Autopilot:
             return None
         return self.now_ns if since_ns is None else since_ns
 
-    def _has_held(self, since_ns: int | None, duration_ns: int) -> bool:
+    def _has_held(self, since_ns: int | None, duration_ns: float) -> bool:
         return since_ns is not None and self.now_ns - since_ns >= duration_ns
 
     def _read_radio(self) -> None:

@@ -88,14 +88,11 @@ class FlightControl:
         if mode is Mode.STABILIZE:
             self.collective = pilot.manual_thrust(sticks, self._params)
         else:
-            self.collective = self._hold_climb(self._climb_mps(mode, sticks, body), body, dt_s)
+            limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
+            accel = self._height.update(body, self._climb_mps(mode, sticks, body), limit, dt_s)
+            tilt = cos_tilt(body.ned_from_body_wxyz)
+            self.collective = thrust_for(accel, tilt, self._params["MOT_THST_HOVER"])
         return mix(self.collective, turn)
-
-    def _hold_climb(self, climb_mps: float, body: BodyState, dt_s: float) -> float:
-        limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
-        accel = self._height.update(body, climb_mps, limit, dt_s)
-        tilt = cos_tilt(body.ned_from_body_wxyz)
-        return thrust_for(accel, tilt, self._params["MOT_THST_HOVER"])
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
         if mode is Mode.ALT_HOLD:
