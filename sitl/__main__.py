@@ -39,7 +39,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     connect_help = "udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeat for several"
     add("--connect", action="append", metavar="LINK", help=connect_help)
-    add("--report", type=Path, metavar="FILE", help="write a JSON report when the flight ends")
+    add("--report", type=Path, metavar="FILE", help="write a report (docs/flight_report.md)")
     add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
     end_help = "stop one second after the last gate, or at a crash"
     add("--end-with-course", action="store_true", help=end_help)

@@ -1,32 +1,4 @@
-"""Measures a flight on the vehicle's side of the wire, for ``--report fc.json``.
-
-All times are seconds since the vehicle's start (``t_s``). Keys:
-
-    start_ns             CLOCK_MONOTONIC of t_s = 0, shared by all processes of one machine
-    duration_s           simulated time
-    overrides            accepted RC_CHANNELS_OVERRIDE that drove at least one of channels 1-8:
-      count, first_t_s, last_t_s
-      rate_hz            (count - 1) / (last - first); null for fewer than two
-      gap_ms             {p50, p99, max} between consecutive overrides with no release in between;
-                         null for none. Arrival is the kernel's stamp where it gives one.
-    releases             {count, t_s: [...]}: messages that only release (zeros, the rest ignored);
-                         at most the first 100 times are listed
-    manual_control       {count}
-    refused_messages     accepted senders, but NaN or infinity where a number is needed
-    bad_frames           garbage, truncated or corrupt frames
-    armed_s              time armed
-    max_altitude_m       above the start
-    distance_m           flown over ground and through the air, along the path
-    crashed              hit the ground faster than 3.5 m/s or tilted by more than 45 degrees,
-                         or the frame of a gate; gates after that do not count
-    crash                {t_s, hit: "ground" or "gate N", speed_mps} of the first; null for none
-    impact_speed_mps     of the hardest touch; 0.0 if it never left the ground
-    gates                {total, passed: [{index, t_s}, ...]} or null without a course
-    conditions           every number of `sitl.vehicle.conditions.Conditions` that this flight had
-    modes                [{t_s, mode}, ...] from the first
-    statustexts          [{t_s, text}, ...]; at most the first 200
-    final                {mode, armed, landed, position_ned_m, velocity_ned_mps, roll_pitch_yaw_deg}
-"""
+"""Measures a flight on the vehicle's side of the wire: docs/flight_report.md is the format."""
 
 import json
 import math

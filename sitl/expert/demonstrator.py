@@ -65,12 +65,7 @@ class Expert:
     """
 
     def __init__(
-        self,
-        course: Course,
-        speed_mps: float,
-        *,
-        next_gate: int = 0,
-        params: Params | None = None,
+        self, course: Course, speed_mps: float, *, next_gate: int = 0, params: Params | None = None
     ) -> None:
         if not MIN_SPEED_MPS <= speed_mps <= MAX_SPEED_MPS:
             raise UsageError(

@@ -134,11 +134,7 @@ def _global_position_int(ap: Autopilot) -> Message | None:
 def _scaled_imu_fields(ap: Autopilot) -> tuple[int, ...]:
     """Acceleration in milli-g, gyro in mrad/s, field in mGauss."""
     accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
-    return (
-        *_int16(accel, 1.0),
-        *_int16(_raw_gyro(ap), 1000.0),
-        *_int16(_mag_gauss(ap), 1000.0),
-    )
+    return (*_int16(accel, 1.0), *_int16(_raw_gyro(ap), 1000.0), *_int16(_mag_gauss(ap), 1000.0))
 
 
 def _highres_imu(ap: Autopilot) -> Message:

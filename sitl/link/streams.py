@@ -15,10 +15,7 @@ MAX_DISTINCT_INTERVALS = 10
 PARAM_SLOWDOWN = 4  # factor on all intervals while a parameter list is being sent
 
 STREAM_GROUPS: dict[int, tuple[int, ...]] = {
-    mav.MAV_DATA_STREAM_RAW_SENSORS: (
-        mav.MAVLINK_MSG_ID_RAW_IMU,
-        mav.MAVLINK_MSG_ID_SCALED_IMU2,
-    ),
+    mav.MAV_DATA_STREAM_RAW_SENSORS: (mav.MAVLINK_MSG_ID_RAW_IMU, mav.MAVLINK_MSG_ID_SCALED_IMU2),
     mav.MAV_DATA_STREAM_EXTENDED_STATUS: (
         mav.MAVLINK_MSG_ID_SYS_STATUS,
         mav.MAVLINK_MSG_ID_GPS_RAW_INT,

@@ -262,8 +262,7 @@ class Autopilot:
         changed = self.radio_failsafe.update(
             new_input=new_input,
             throttle_us=self.rc.channels_us[self.rc.index_of("THROTTLE")],
-            has_receiver=self.config.receiver,
-            armed=self.armed,
+            can_fail=self.config.receiver or self.armed,
             now_ns=self.now_ns,
         )
         if not changed:

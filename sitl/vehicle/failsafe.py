@@ -16,17 +16,15 @@ class RadioFailsafe:
         self._low_reads = 0
         self.active = False
 
-    def update(
-        self, *, new_input: bool, throttle_us: int, has_receiver: bool, armed: bool, now_ns: int
-    ) -> bool:
+    def update(self, *, new_input: bool, throttle_us: int, can_fail: bool, now_ns: int) -> bool:
         """Check after one RC update; True if ``active`` has changed."""
         was_active = self.active
         if not self._params["FS_THR_ENABLE"]:
             self._last_input_ns, self._low_reads, self.active = now_ns, 0, False
         elif new_input:
             self._last_input_ns = now_ns
-            self._check_throttle(throttle_us, can_fail=has_receiver or armed)
-        elif has_receiver or armed:
+            self._check_throttle(throttle_us, can_fail=can_fail)
+        elif can_fail:
             timeout_ns = int(max(0.1, self._params["RC_FS_TIMEOUT"]) * NS_PER_S)
             self.active = self.active or now_ns - self._last_input_ns >= timeout_ns
         return self.active != was_active
