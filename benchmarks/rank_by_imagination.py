@@ -37,7 +37,8 @@ from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from policy.contract import ACTION_DIM, VELOCITY, Contract
 from policy.data.flight_folders import find_flights, is_exemplary
-from sitl.course.course import Course, GateCounter, make_course
+from sitl.course.layout import Course, make_course
+from sitl.course.referee import GateCounter
 
 ITERATIONS, EXE_STEPS = 8, 4
 """3.2 s, with a decision every 0.4 s: at 5 m/s that is two gates."""

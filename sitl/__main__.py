@@ -3,119 +3,107 @@
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
-from sitl.app import RunOptions, run_vehicle, tell
-from sitl.course.course import course_to_json, make_course
+from sitl.app import print_status, run_vehicle
+from sitl.camera.follow import film_vehicle
+from sitl.camera.fpv import CameraOptions
+from sitl.course.layout import course_to_json, make_course
 from sitl.errors import UsageError
-from sitl.follow import run_follow
 from sitl.stopping import stop_on_signal
 from sitl.vehicle.autopilot import VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; 2 for what the user got wrong."""
-    parser = _parser()
-    args = parser.parse_args(argv)
+    """Run the command; returns the exit code, 2 for a usage error."""
+    args = _parser().parse_args(argv)
     try:
-        if args.command == "course":
-            return _print_course(args)
-        if args.command == "camera":
-            return _follow(args)
-        return run_vehicle(_options(args))
+        args.run(args)
     except UsageError as error:
-        tell(f"error: {error}")
+        print_status(f"error: {error}")
         return 2
+    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sitl",
-        description="A simulated ArduCopter over MAVLink, with an FPV camera in shared memory.",
+        description="A simulated ArduCopter that speaks MAVLink, with an FPV camera in shared "
+        "memory over a course of gates.",
         allow_abbrev=False,
     )
-    parser.add_argument(
-        "--connect",
-        action="append",
-        metavar="LINK",
-        help="udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeat it for several links",
-    )
-    parser.add_argument(
-        "--report", type=Path, metavar="FILE", help="write a JSON report at the end"
-    )
-    parser.add_argument("--duration", type=_positive, metavar="S", help="stop after this time")
-    parser.add_argument(
-        "--end-with-course",
-        action="store_true",
-        help="stop a second after the last gate, or at a crash",
-    )
-    parser.add_argument(
-        "--receiver",
-        choices=("idle", "none"),
-        default="idle",
-        help="RC receiver: idle sticks (default), or none at all",
-    )
-    parser.add_argument(
-        "--conditions",
-        type=_natural,
-        metavar="SEED",
-        help="another vehicle, firmware, wind, light, colours and lens by seed (default: nominal)",
-    )
+    parser.set_defaults(run=_fly)
+    add = parser.add_argument
+    connect_help = "udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeat for several"
+    add("--connect", action="append", metavar="LINK", help=connect_help)
+    add("--report", type=Path, metavar="FILE", help="write a report (docs/flight_report.md)")
+    add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
+    end_help = "stop one second after the last gate, or at a crash"
+    add("--end-with-course", action="store_true", help=end_help)
+    receiver_help = "RC receiver: with idle sticks (default), or none"
+    add("--receiver", choices=("idle", "none"), default="idle", help=receiver_help)
+    conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
+    add("--conditions", type=_SEED, metavar="SEED", help=conditions_help)
     _add_camera_flags(parser)
-    commands = parser.add_subparsers(dest="command", metavar="")
-    camera = commands.add_parser(
-        "camera", help="film the course from another vehicle's reported pose", allow_abbrev=False
-    )
-    camera.add_argument("--follow", required=True, metavar="LINK", help="that vehicle's MAVLink")
+    commands = parser.add_subparsers(title="other commands", metavar="COMMAND")
+    camera_help = "film the course from another vehicle's reported pose"
+    camera = commands.add_parser("camera", help=camera_help, allow_abbrev=False)
+    camera.set_defaults(run=_film)
+    follow_help = "its MAVLink link: udp:HOST:PORT or udpin: to listen, udpout: or tcp: to connect"
+    camera.add_argument("--follow", required=True, metavar="LINK", help=follow_help)
     _add_camera_flags(camera)
     course = commands.add_parser("course", help="print a course", allow_abbrev=False)
-    course.add_argument("--course", type=_natural, default=0, metavar="SEED")
-    course.add_argument("--json", action="store_true", help="as JSON instead of a table")
+    course.set_defaults(run=_print_course)
+    course.add_argument("--course", type=_SEED, default=0, metavar="SEED", help="default: 0")
+    course.add_argument("--json", action="store_true", help="print JSON instead of a table")
     return parser
 
 
 def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--camera", type=_shm_name, metavar="shm:NAME", help="publish frames there")
-    parser.add_argument("--course", type=_natural, default=0, metavar="SEED", help="gate course")
-    parser.add_argument("--image-size", type=_image_size, default=224, metavar="PIXELS")
-    parser.add_argument("--fps", type=_positive, default=30.0, metavar="HZ")
+    add = parser.add_argument
+    add("--camera", type=_shm_name, metavar="shm:NAME", help="publish frames under this name")
+    add("--course", type=_SEED, default=0, metavar="SEED", help="its gates (default: 0)")
+    size_help = "side of the square image (default: 224)"
+    add("--image-size", type=_IMAGE_SIZE, default=224, metavar="PIXELS", help=size_help)
+    add("--fps", type=_POSITIVE, default=30.0, metavar="HZ", help="frame rate (default: 30)")
 
 
-def _options(args: argparse.Namespace) -> RunOptions:
+def _fly(args: argparse.Namespace) -> None:
     if not args.connect:
         raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
-    return RunOptions(
-        connect=tuple(args.connect),
-        shm_name=args.camera,
-        course_seed=args.course,
-        image_size=args.image_size,
-        fps=args.fps,
+    conditions = NOMINAL if args.conditions is None else random_conditions(args.conditions)
+    run_vehicle(
+        args.connect,
+        VehicleConfig(receiver=args.receiver == "idle", conditions=conditions),
+        make_course(args.course),
+        camera=None if args.camera is None else _camera(args),
         report=args.report,
         duration_s=args.duration,
-        vehicle=VehicleConfig(
-            receiver=args.receiver == "idle",
-            conditions=NOMINAL if args.conditions is None else random_conditions(args.conditions),
-        ),
         end_with_course=args.end_with_course,
     )
 
 
-def _follow(args: argparse.Namespace) -> int:
+def _film(args: argparse.Namespace) -> None:
     if args.camera is None:
-        raise UsageError("camera --follow needs --camera shm:NAME to publish to")
-    with stop_on_signal() as stop:
-        return run_follow(
-            args.follow, args.camera, args.course, args.image_size, args.image_size, args.fps, stop
+        raise UsageError(
+            "camera --follow needs --camera shm:NAME, the name to publish frames under"
         )
+    with stop_on_signal() as stop:
+        film_vehicle(args.follow, make_course(args.course), _camera(args), stop)
 
 
-def _print_course(args: argparse.Namespace) -> int:
+def _camera(args: argparse.Namespace) -> CameraOptions:
+    return CameraOptions(shm_name=args.camera, image_size=args.image_size, fps=args.fps)
+
+
+def _print_course(args: argparse.Namespace) -> None:
     course = make_course(args.course)
     if args.json:
         sys.stdout.write(course_to_json(course) + "\n")
-        return 0
+        return
     sys.stdout.write("gate  north_m  east_m  up_m  yaw_deg  size_m\n")
     for gate in course.gates:
         north, east, down = gate.center_ned_m
@@ -123,34 +111,31 @@ def _print_course(args: argparse.Namespace) -> int:
             f"{gate.index:4d}  {north:7.1f}  {east:6.1f}  {-down:4.1f}  "
             f"{math.degrees(gate.yaw_rad):7.1f}  {gate.size_m:6.1f}\n"
         )
-    return 0
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"must be a positive number, got {text}")
-    return value
+def _number(
+    parse: type[int] | type[float], low: float, high: float, wanted: str
+) -> Callable[[str], float]:
+    """A flag's type: a number within [low, high]."""
+
+    def convert(text: str) -> float:
+        with suppress(ValueError):
+            if low <= (value := parse(text)) <= high:
+                return value
+        raise argparse.ArgumentTypeError(f"must be {wanted}, got {text!r}")
+
+    return convert
 
 
-def _natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"must be 0 or more, got {text}")
-    return value
-
-
-def _image_size(text: str) -> int:
-    value = int(text)
-    if not 16 <= value <= 4096:
-        raise argparse.ArgumentTypeError(f"must be within 16..4096 pixels, got {text}")
-    return value
+_POSITIVE = _number(float, sys.float_info.min, sys.float_info.max, "a positive number")
+_SEED = _number(int, 0, math.inf, "a whole number, 0 or more")
+_IMAGE_SIZE = _number(int, 16, 4096, "16 to 4096 pixels")
 
 
 def _shm_name(text: str) -> str:
     prefix, _, name = text.partition(":")
     if prefix != "shm" or not name or "/" in name:
-        raise argparse.ArgumentTypeError(f"must be shm:NAME, got {text}")
+        raise argparse.ArgumentTypeError(f"must be shm:NAME, such as shm:fpv, got {text!r}")
     return name
 
 

@@ -1,4 +1,4 @@
-"""What a user can get wrong, as one exception."""
+"""The one exception for what a user got wrong."""
 
 
 class UsageError(Exception):

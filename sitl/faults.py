@@ -1,4 +1,4 @@
-"""Faults to order: a lossy link, frozen sensors, a reboot. Same seed, same faults."""
+"""Scripted faults: a lossy link, frozen sensors, a reboot; a seed always gives the same faults."""
 
 import heapq
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,51 +16,48 @@ class LinkFaults:
 
     loss: float = 0.0
     duplicate: float = 0.0
-    corrupt: float = 0.0
-    """One byte is changed."""
-    reorder: float = 0.0
-    """The packet is held back by ``reorder_ms``, so later ones overtake it."""
+    corrupt: float = 0.0  # one byte is changed
+    reorder: float = 0.0  # the packet is held back by ``reorder_ms``, so later ones overtake it
     reorder_ms: float = 20.0
     delay_ms: float = 0.0
 
 
 class FaultyLink:
-    """One direction of a link: packets in, what survives comes out when it is due."""
+    """One direction of a link: packets in, the surviving ones out when they are due."""
 
     def __init__(self, faults: LinkFaults, seed: int) -> None:
         self._faults = faults
         self._random = np.random.Generator(np.random.PCG64(seed))
         self._in_flight: list[tuple[int, int, bytes]] = []
-        self._order = 0
+        self._sent = 0
 
     def send(self, packet: bytes, now_ns: int) -> None:
         """Put a packet on the link."""
-        if self._chance(self._faults.loss):
+        if self._happens(self._faults.loss):
             return
-        copies = 2 if self._chance(self._faults.duplicate) else 1
-        for _ in range(copies):
-            late_ms = self._faults.delay_ms
-            if self._chance(self._faults.reorder):
-                late_ms += self._faults.reorder_ms
-            due_ns = now_ns + round(late_ms * NS_PER_MS)
-            heapq.heappush(self._in_flight, (due_ns, self._order, self._damaged(packet)))
-            self._order += 1
+        for _ in range(2 if self._happens(self._faults.duplicate) else 1):
+            delay_ms = self._faults.delay_ms
+            if self._happens(self._faults.reorder):
+                delay_ms += self._faults.reorder_ms
+            due_ns = now_ns + round(delay_ms * NS_PER_MS)
+            heapq.heappush(self._in_flight, (due_ns, self._sent, self._maybe_corrupt(packet)))
+            self._sent += 1
 
     def receive(self, now_ns: int) -> list[bytes]:
-        """The packets that have come through by now, in order of arrival."""
+        """Packets that have arrived by now, in order of arrival."""
         arrived = []
         while self._in_flight and self._in_flight[0][0] <= now_ns:
             arrived.append(heapq.heappop(self._in_flight)[2])
         return arrived
 
-    def _damaged(self, packet: bytes) -> bytes:
-        if not packet or not self._chance(self._faults.corrupt):
+    def _maybe_corrupt(self, packet: bytes) -> bytes:
+        if not packet or not self._happens(self._faults.corrupt):
             return packet
         at = int(self._random.integers(len(packet)))
         flipped = packet[at] ^ int(self._random.integers(1, 256))
         return packet[:at] + bytes([flipped]) + packet[at + 1 :]
 
-    def _chance(self, probability: float) -> bool:
+    def _happens(self, probability: float) -> bool:
         return probability > 0.0 and float(self._random.random()) < probability
 
 
@@ -88,8 +85,8 @@ class VehicleFaults:
         self._freezes = [fault for fault in script if isinstance(fault, SensorFreeze)]
         self._reboots_s = sorted(fault.at_s for fault in script if isinstance(fault, Reboot))
 
-    def apply(self, vehicle: Vehicle, now_ns: int) -> None:
-        """Bring the vehicle into the state of this moment; call it before each step."""
+    def apply(self, vehicle: SimulatedVehicle, now_ns: int) -> None:
+        """Apply the faults of this moment; call it before each step."""
         t_s = (now_ns - self._start_ns) / NS_PER_S
         while self._reboots_s and t_s >= self._reboots_s[0]:
             self._reboots_s.pop(0)

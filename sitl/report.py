@@ -1,49 +1,21 @@
-"""What happened, measured on the vehicle's side of the wire, for ``--report fc.json``.
-
-All times are seconds since the vehicle's start (``t_s``). Keys:
-
-    start_ns             CLOCK_MONOTONIC of t_s = 0, shared by all processes of one machine
-    duration_s           simulated time
-    overrides            RC_CHANNELS_OVERRIDE let in that drove at least one of channels 1-8:
-      count, first_t_s, last_t_s
-      rate_hz            (count - 1) / (last - first); null for fewer than two
-      gap_ms             {p50, p99, max} between consecutive overrides with no release in between;
-                         null for none. Arrival is the kernel's stamp where it gives one.
-    releases             {count, t_s: [...]}: messages that only release (zeros, the rest ignored);
-                         at most the first 100 times are listed
-    manual_control       {count}
-    refused_messages     let in but holding NaN or infinity where a number is needed
-    bad_frames           garbage, truncated or corrupt frames
-    armed_s              time armed
-    max_altitude_m       above the start
-    distance_m           flown over ground and through the air, along the path
-    crashed              hit the ground faster than 3.5 m/s or tilted by more than 45 degrees,
-                         or the frame of a gate; gates after that do not count
-    crash                {t_s, hit: "ground" or "gate N", speed_mps} of the first; null for none
-    impact_speed_mps     of the hardest touch; 0.0 if it never left the ground
-    gates                {total, passed: [{index, t_s}, ...]} or null without a course
-    conditions           every number of `sitl.vehicle.conditions.Conditions` that this flight had
-    modes                [{t_s, mode}, ...] from the first
-    statustexts          [{t_s, text}, ...]; at most the first 200
-    final                {mode, armed, landed, position_ned_m, velocity_ned_mps, roll_pitch_yaw_deg}
-"""
+"""Measures a flight on the vehicle's side of the wire: docs/flight_report.md is the format."""
 
 import json
 import math
+from array import array
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course.collision import Crash, struck_gate
-from sitl.course.course import Course, GateCounter, GatePass
+from sitl.course.layout import Course
+from sitl.course.referee import Crash, GateCounter, GatePass, struck_gate
 from sitl.rotation import Vec3, cos_tilt, to_euler
 from sitl.vehicle.autopilot import Autopilot
 
-CRASH_SPEED_MPS = 3.5
-"""ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash."""
+CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
 MAX_RELEASE_TIMES = 100
 MAX_TEXTS = 200
@@ -52,99 +24,97 @@ END_AFTER_NS = NS_PER_S
 PATH_PERIOD_NS = NS_PER_S // 20
 """Path length is summed at 20 Hz: fine enough for turns, coarse enough not to add up vibration."""
 
+LogEntry: TypeAlias = dict[str, float | str]  # a time ``t_s`` and what happened then
+
 
 class FlightLog:
-    """Collects one run; ``boot_ns`` of the first boot is its time zero."""
+    """Collects the measurements of one run; ``start_ns``, the first boot, is its time zero."""
 
     def __init__(self, start_ns: int, course: Course | None) -> None:
         self.refused_messages = 0
+        self.manual_controls = 0
+        """Accepted MANUAL_CONTROL messages."""
+        self.texts: list[LogEntry] = []
+        """The vehicle's STATUSTEXTs: ``t_s`` and ``text``."""
+        self.crash: Crash | None = None
+        """The first hard impact."""
+        self.distance_m = 0.0
+        """Length of the path so far."""
         self._start_ns = start_ns
-        self.gates_total = len(course.gates) if course else 0
-        self._course = course
-        self._gates = GateCounter(course) if course else None
-        self._position_ned_m: Vec3 | None = None
+        self._course = course or Course(seed=0, gates=())
+        self._has_course = course is not None
+        self._gates = GateCounter(self._course)
         self._overrides = _OverrideStats()
         self._release_times_s: list[float] = []
         self._releases = 0
-        self._manual_controls = 0
-        self.texts: list[dict[str, float | str]] = []
-        """What the vehicle has said: ``t_s`` and ``text``."""
-        self._modes: list[dict[str, float | str]] = []
+        self._modes: list[LogEntry] = []
         self._armed_ns = 0
-        self._last_ns = start_ns
-        self._max_altitude_m = 0.0
-        self.distance_m = 0.0
-        """Flown so far."""
-        self._path_due_ns = start_ns
-        self._path_point = (0.0, 0.0, 0.0)
+        self._last_ns = self._path_due_ns = start_ns
+        self._max_altitude_m = self._speed_mps = self._impact_mps = 0.0
+        self._path_point_ned_m: Vec3 = (0.0, 0.0, 0.0)
+        self._position_ned_m: Vec3 | None = None
         self._was_touching = True
-        self._speed_mps = 0.0
-        self._impact_mps = 0.0
-        self.crash: Crash | None = None
-        """What was hit first."""
 
     @property
     def crashed(self) -> bool:
-        """The frame of a gate, or the ground, was hit hard."""
+        """Whether the frame of a gate, or the ground, was hit hard."""
         return self.crash is not None
 
     @property
     def next_gate(self) -> int | None:
         """Index of the gate to be passed next; None after the last, or without a course."""
-        return self._gates.next_gate if self._gates else None
+        return self._gates.next_gate
+
+    @property
+    def gates_total(self) -> int:
+        """Number of gates on the course."""
+        return len(self._course.gates)
+
+    @property
+    def gates_passed(self) -> tuple[GatePass, ...]:
+        """Gates passed so far, in order."""
+        return tuple(self._gates.passed)
 
     def start_over(self, next_gate: int) -> None:
-        """The vehicle has been put somewhere else: count gates from this one."""
-        if self._course is not None:
-            self._gates = GateCounter(self._course, first=next_gate)
+        """Note that the vehicle was placed elsewhere in the air: count gates from this one."""
+        self._gates = GateCounter(self._course, first=next_gate)
         self._position_ned_m = None
         self._was_touching = False
         self.crash = None
 
     def on_reboot(self) -> None:
-        """The vehicle is back at the origin, without having flown there."""
-        if self._gates is not None:
-            self._gates.interrupt()
+        """Note that the vehicle is back at the origin, without having flown there."""
+        self._gates.interrupt()
         self._position_ned_m = None
         self._was_touching = True
 
-    @property
-    def gates_passed(self) -> tuple[GatePass, ...]:
-        """In order, so far."""
-        return tuple(self._gates.passed) if self._gates else ()
-
     def verdict(self, now_ns: int) -> Literal["crashed", "finished"] | None:
-        """How the course has ended: with a crash, or a second after its last gate; None if not."""
+        """End of the course: by a crash, or a second after its last gate; None while it goes on."""
         if self.crashed:
             return "crashed"
-        passed = self._gates.passed if self._gates else ()
-        if not passed or self.next_gate is not None:
+        if not self._gates.passed or self.next_gate is not None:
             return None
         over_ns = now_ns - self._start_ns - END_AFTER_NS
-        return "finished" if passed[-1].t_s * NS_PER_S <= over_ns else None
+        return "finished" if self._gates.passed[-1].t_s * NS_PER_S <= over_ns else None
 
     def on_override(self, arrived_ns: int) -> None:
-        """An RC_CHANNELS_OVERRIDE that drives at least one stick."""
+        """Count an RC_CHANNELS_OVERRIDE that drives at least one stick."""
         self._overrides.add(arrived_ns)
 
     def on_release(self, arrived_ns: int) -> None:
-        """An RC_CHANNELS_OVERRIDE that only gives sticks back."""
+        """Count an RC_CHANNELS_OVERRIDE that only releases sticks."""
         self._overrides.interrupt(arrived_ns)
         self._releases += 1
         if len(self._release_times_s) < MAX_RELEASE_TIMES:
             self._release_times_s.append(self._t_s(arrived_ns))
 
-    def on_manual_control(self) -> None:
-        """An accepted MANUAL_CONTROL."""
-        self._manual_controls += 1
-
     def on_text(self, now_ns: int, text: str) -> None:
-        """The vehicle said something."""
+        """Log a STATUSTEXT of the vehicle."""
         if len(self.texts) < MAX_TEXTS:
             self.texts.append({"t_s": self._t_s(now_ns), "text": text})
 
     def on_step(self, ap: Autopilot) -> None:
-        """One control step has passed."""
+        """Measure the vehicle after a control step."""
         if not self._modes or self._modes[-1]["mode"] != ap.mode.name:
             self._modes.append({"t_s": self._t_s(ap.now_ns), "mode": ap.mode.name})
         if ap.armed:
@@ -154,20 +124,20 @@ class FlightLog:
         self._max_altitude_m = max(self._max_altitude_m, -body.position_ned_m[2])
         if ap.now_ns >= self._path_due_ns:
             self._path_due_ns = ap.now_ns + PATH_PERIOD_NS
-            self.distance_m += math.dist(body.position_ned_m, self._path_point)
-            self._path_point = body.position_ned_m
-        self._watch_gates(body.position_ned_m, ap.now_ns)
+            self.distance_m += math.dist(body.position_ned_m, self._path_point_ned_m)
+            self._path_point_ned_m = body.position_ned_m
+        self._check_gates(body.position_ned_m, ap.now_ns)
         if body.touching and not self._was_touching:
             self._impact_mps = max(self._impact_mps, self._speed_mps)
-            tilted = cos_tilt(body.ned_from_body_wxyz) < CRASH_TILT_COS
-            if tilted or self._speed_mps > CRASH_SPEED_MPS:
+            is_tilted = cos_tilt(body.ned_from_body_wxyz) < CRASH_TILT_COS
+            if is_tilted or self._speed_mps > CRASH_SPEED_MPS:
                 self._on_crash("ground", ap.now_ns)
         self._was_touching = body.touching
         self._speed_mps = math.hypot(*body.velocity_ned_mps)
 
-    def _watch_gates(self, position_ned_m: Vec3, now_ns: int) -> None:
+    def _check_gates(self, position_ned_m: Vec3, now_ns: int) -> None:
         before_ned_m, self._position_ned_m = self._position_ned_m, position_ned_m
-        if self._course is None or self._gates is None or self.crashed:
+        if self.crashed:
             return
         self._gates.update(position_ned_m, self._t_s(now_ns))
         if before_ned_m is not None:
@@ -183,12 +153,13 @@ class FlightLog:
         """The report, ready for JSON."""
         body = ap.truth
         angles = to_euler(body.ned_from_body_wxyz)
+        passed = [asdict(gate) for gate in self._gates.passed]
         return {
             "start_ns": self._start_ns,
             "duration_s": self._t_s(ap.now_ns),
             "overrides": self._overrides.summary(self._start_ns),
             "releases": {"count": self._releases, "t_s": self._release_times_s},
-            "manual_control": {"count": self._manual_controls},
+            "manual_control": {"count": self.manual_controls},
             "refused_messages": self.refused_messages,
             "bad_frames": bad_frames,
             "armed_s": self._armed_ns / NS_PER_S,
@@ -197,7 +168,7 @@ class FlightLog:
             "crashed": self.crashed,
             "crash": asdict(self.crash) if self.crash else None,
             "impact_speed_mps": self._impact_mps,
-            "gates": self._gates_summary(),
+            "gates": {"total": self.gates_total, "passed": passed} if self._has_course else None,
             "conditions": ap.config.conditions.numbers(),
             "modes": self._modes,
             "statustexts": self.texts,
@@ -211,62 +182,47 @@ class FlightLog:
             },
         }
 
-    def _gates_summary(self) -> dict[str, Any] | None:
-        if self._course is None or self._gates is None:
-            return None
-        passed = [{"index": gate.index, "t_s": gate.t_s} for gate in self._gates.passed]
-        return {"total": self.gates_total, "passed": passed}
-
     def _t_s(self, now_ns: int) -> float:
         return (now_ns - self._start_ns) / NS_PER_S
 
 
 class _OverrideStats:
-    """Arrival times of overrides; gaps are kept as float32, 4 bytes each, so an hour is 1.4 MB."""
+    """Arrival times of overrides; gaps are kept as float32, so an hour at 100 Hz is 1.4 MB."""
 
     def __init__(self) -> None:
         self._count = 0
         self._first_ns = self._last_ns = 0
         self._engaged = False
-        self._gaps_ms = np.empty(1024, dtype=np.float32)
-        self._gap_count = 0
+        self._gaps_ms = array("f")
 
     def add(self, arrived_ns: int) -> None:
-        """One more."""
+        """Count an override."""
         if self._count == 0:
             self._first_ns = arrived_ns
-        elif self._engaged:
-            self._add_gap((arrived_ns - self._last_ns) / NS_PER_MS)
+        self.interrupt(arrived_ns)
         self._count += 1
         self._last_ns = arrived_ns
         self._engaged = True
 
     def interrupt(self, arrived_ns: int) -> None:
-        """A release: the time up to it is a gap, sticks were held; the time after it is none."""
+        """End the current gap at a release: sticks were held until then, and are free after it."""
         if self._engaged:
-            self._add_gap((arrived_ns - self._last_ns) / NS_PER_MS)
+            self._gaps_ms.append((arrived_ns - self._last_ns) / NS_PER_MS)
         self._engaged = False
 
-    def _add_gap(self, gap_ms: float) -> None:
-        if self._gap_count == len(self._gaps_ms):
-            self._gaps_ms = np.concatenate([self._gaps_ms, np.empty_like(self._gaps_ms)])
-        self._gaps_ms[self._gap_count] = gap_ms
-        self._gap_count += 1
-
     def summary(self, start_ns: int) -> dict[str, Any]:
-        """The ``overrides`` block."""
+        """The ``overrides`` block of the report."""
         span_s = (self._last_ns - self._first_ns) / NS_PER_S
-        gaps = self._gaps_ms[: self._gap_count]
-        percentiles = np.percentile(gaps, (50, 99, 100)).tolist() if len(gaps) else None
-        some = self._count > 0
+        gap_ms = None
+        if self._gaps_ms:
+            p50, p99, most = np.percentile(np.asarray(self._gaps_ms), (50, 99, 100)).tolist()
+            gap_ms = {"p50": p50, "p99": p99, "max": most}
         return {
             "count": self._count,
-            "first_t_s": (self._first_ns - start_ns) / NS_PER_S if some else None,
-            "last_t_s": (self._last_ns - start_ns) / NS_PER_S if some else None,
+            "first_t_s": (self._first_ns - start_ns) / NS_PER_S if self._count else None,
+            "last_t_s": (self._last_ns - start_ns) / NS_PER_S if self._count else None,
             "rate_hz": (self._count - 1) / span_s if span_s > 0.0 else None,
-            "gap_ms": dict(zip(("p50", "p99", "max"), percentiles, strict=True))
-            if percentiles
-            else None,
+            "gap_ms": gap_ms,
         }
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from sitl.course.course import Course, Start
+from sitl.course.layout import AirborneStart, Course
 from sitl.link.server import MavlinkServer
 from sitl.report import FlightLog
 from sitl.vehicle.autopilot import STEP_NS, Autopilot, VehicleConfig
@@ -10,18 +10,18 @@ from sitl.vehicle.dynamics import BodyState
 from sitl.vehicle.params import Params
 
 MAX_STEPS_AT_ONCE = 400
-"""A second of simulated time: after a longer stall of the host the rest follows in later calls."""
+"""One second of simulated time; after a longer stall the rest follows in later calls."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """Where the vehicle was, for the camera; swapped by reference, so any thread may read it."""
+    """State of the vehicle for the camera; replaced as a whole, so any thread may read it."""
 
     stamp_ns: int
     body: BodyState
 
 
-class Vehicle:
+class SimulatedVehicle:
     """Autopilot, physics and MAVLink of one vehicle; stamps are the caller's monotonic clock."""
 
     def __init__(
@@ -41,11 +41,11 @@ class Vehicle:
 
     @property
     def bad_frames(self) -> int:
-        """Frames on all links that could not be read."""
+        """Unreadable frames on all links."""
         return sum(link.bad_frames for link in self.server.links)
 
     def receive(self, link_id: int, data: bytes, now_ns: int) -> None:
-        """Take bytes that arrived on a link at ``now_ns``."""
+        """Act on bytes that arrived on a link at ``now_ns``."""
         self.server.receive(link_id, data, now_ns)
 
     def step(self, now_ns: int) -> None:
@@ -63,17 +63,17 @@ class Vehicle:
             self.reboot()
 
     def take_outgoing(self, link_id: int) -> bytes:
-        """What the link has to send: whole frames, in order."""
+        """Bytes to send on a link: whole frames, in order."""
         return self.server.links[link_id].take_outgoing()
 
-    def launch(self, start: Start) -> None:
-        """Be airborne in this state from now on: armed, in ALT_HOLD, gates counted from its own."""
+    def launch(self, start: AirborneStart) -> None:
+        """Put the vehicle in the air in this state, armed and in ALT_HOLD."""
         self.ap.launch(start.position_ned_m, start.velocity_ned_mps, start.ned_from_body_wxyz)
         self.log.start_over(start.next_gate)
         self.pose = Pose(stamp_ns=self.ap.now_ns, body=self.ap.truth)
 
     def reboot(self) -> None:
-        """Start again on the ground at the origin: time_boot_ms is 0, parameters stay."""
+        """Restart on the ground at the origin: time_boot_ms is 0, parameters stay."""
         self.ap = Autopilot(self.params, self._config, self.ap.now_ns)
         self.server.restart(self.ap)
         self.log.on_reboot()

@@ -6,24 +6,27 @@ from contextlib import contextmanager
 
 
 class StopRequest:
-    """Set from a signal handler. Not a ``threading.Event``: a second signal would wait for the lock
-    that the first one's handler holds."""
+    """A flag that a signal handler may set.
+
+    Not a ``threading.Event``: a second signal would wait for the lock that the first one's handler
+    holds.
+    """
 
     def __init__(self) -> None:
         self._is_set = False
 
     def set(self) -> None:
-        """Ask for the stop."""
+        """Request the stop."""
         self._is_set = True
 
     def is_set(self) -> bool:
-        """Somebody asked."""
+        """Whether a stop was requested."""
         return self._is_set
 
 
 @contextmanager
 def stop_on_signal() -> Iterator[StopRequest]:
-    """SIGINT and SIGTERM ask for the stop; the old handlers come back afterwards."""
+    """Let SIGINT and SIGTERM request the stop; the old handlers come back afterwards."""
     stop = StopRequest()
     signals = (signal.SIGINT, signal.SIGTERM)
     previous = [signal.signal(number, lambda *_: stop.set()) for number in signals]

@@ -7,7 +7,7 @@ from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.records import Event, Tick
 from mavbridge.simulation.result import EpisodeResult, Outcome, StickMeter
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 
 READY_NS = 30 * NS_PER_S
 """Most that an episode may take until the policy flies; a quick boot needs some 4 s."""
@@ -23,7 +23,7 @@ class Referee:
     def __init__(
         self,
         clock: Clock,
-        vehicle: Vehicle,
+        vehicle: SimulatedVehicle,
         *,
         max_time_s: float,
         should_stop: Callable[[], bool] | None,

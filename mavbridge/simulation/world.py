@@ -11,9 +11,9 @@ from mavbridge.core.records import Frame, ImageArray
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.wire import Path
 from sitl.camera.fpv import FpvRenderer
-from sitl.course.course import Course, make_course
+from sitl.course.layout import Course, make_course
 from sitl.rotation import Quat, Vec3
-from sitl.simulated_vehicle import Pose, Vehicle
+from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
 from sitl.vehicle.dynamics import BodyState
@@ -45,7 +45,7 @@ class Blindfold:
 class Scene:
     """The simulated half of an episode."""
 
-    vehicle: Vehicle
+    vehicle: SimulatedVehicle
     """With one link, and with ``course`` in its log."""
     course: Course
     make_renderer: Callable[[int, int], Renderer]
@@ -67,7 +67,7 @@ def varied_scene(conditions: Conditions) -> BuildScene:
         course = make_course(course_seed)
         config = replace(QUICK_BOOT, conditions=conditions)
         return Scene(
-            vehicle=Vehicle(links=1, boot_ns=boot_ns, config=config, course=course),
+            vehicle=SimulatedVehicle(links=1, boot_ns=boot_ns, config=config, course=course),
             course=course,
             make_renderer=lambda width, height: FpvRenderer(course, width, height, conditions),
         )
@@ -103,7 +103,7 @@ class VehicleProcess:
     def __init__(
         self,
         clock: SteppedClock,
-        vehicle: Vehicle,
+        vehicle: SimulatedVehicle,
         boot_ns: int,
         *,
         to_vehicle: Path,

@@ -1,4 +1,4 @@
-"""What a camera on the vehicle sees of a gate course, drawn with OpenCV.
+"""Draws the view of a camera on the vehicle over a gate course, with OpenCV.
 
 Frames: NED world; FRD body; camera x right, y down, z along the optical axis. The camera sits at
 the body's origin and looks forward, tilted up, unless the conditions shift it. Pinhole, square
@@ -6,39 +6,43 @@ pixels, no distortion; integer pixel coordinates are pixel centres.
 """
 
 import math
-from typing import TypeAlias
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sitl.camera import scenery
-from sitl.camera.imager import Imager
-from sitl.course.course import Course
+from sitl.camera.imager import Image, Imager
+from sitl.camera.scenery import FloatArray
+from sitl.course.layout import Course
 from sitl.errors import UsageError
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
-FloatArray: TypeAlias = NDArray[np.float64]
-Image: TypeAlias = NDArray[np.uint8]
-
 TILT_UP_RAD = NOMINAL.camera_tilt_rad
-NEAR_M = 0.05
-"""What is nearer than this, or behind, is cut off before it is projected."""
+NEAR_M = 0.05  # what is nearer than this, or behind, is cut off before it is projected
 LOWEST_EYE_M = 0.12
 """The eye is drawn at least this high, so that a vehicle on the ground sees ground."""
-GATE_HAZE_M = 90.0
-"""Distance at which a gate has lost 63 % of its contrast."""
+GATE_HAZE_M = 90.0  # distance at which a gate has lost 63 % of its contrast
 GROUND_FADE_M = 14.0
 """Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
-SUBPIXEL_BITS = 4
-"""Corners are rounded to 1/16 pixel."""
+SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraOptions:
+    """Where and how a camera publishes its frames."""
+
+    shm_name: str
+    image_size: int  # side of the square image, in pixels
+    fps: float
 
 
 class FpvRenderer:
-    """Draws the view from any pose; holds what course, image size and conditions determine.
+    """Draws the view from any pose on a course.
 
-    Only image noise, where the conditions ask for it, depends on how many frames came before.
+    Only image noise, where the conditions have it, depends on how many frames came before.
     """
 
     def __init__(
@@ -48,16 +52,9 @@ class FpvRenderer:
             raise UsageError(f"the image must have at least 16x16 pixels, got {width}x{height}")
         self._focal_px = width / 2 / math.tan(conditions.horizontal_fov_rad / 2)
         self._center_px = np.array([(width - 1) / 2, (height - 1) / 2])
-        self._ray_from_pixel = (
-            np.array(
-                [
-                    [1.0, 0.0, -self._center_px[0]],
-                    [0.0, 1.0, -self._center_px[1]],
-                    [0.0, 0.0, self._focal_px],
-                ]
-            )
-            / self._focal_px
-        )
+        u_px, v_px = self._center_px
+        scaled = [[1.0, 0.0, -u_px], [0.0, 1.0, -v_px], [0.0, 0.0, self._focal_px]]
+        self._ray_from_pixel = np.array(scaled) / self._focal_px
         self._u_px = np.arange(width, dtype=np.float32)
         self._v_px = np.arange(height, dtype=np.float32)[:, None]
         self._body_from_camera = body_from_camera(conditions)
@@ -94,7 +91,9 @@ class FpvRenderer:
         has_ground = np.maximum(falls[:, 0], falls[:, -1]) > 0
         if has_ground.any():
             top = int(has_ground.argmax())
-            self._draw_ground(image[top:], falls[top:], eye_ned_m, ned_ray_from_pixel @ _rows(top))
+            pixel_from_cropped = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, top], [0.0, 0.0, 1.0]])
+            ned_ray_from_cropped = ned_ray_from_pixel @ pixel_from_cropped
+            self._draw_ground(image[top:], falls[top:], eye_ned_m, ned_ray_from_cropped)
         return image
 
     def _draw_ground(
@@ -104,7 +103,7 @@ class FpvRenderer:
         eye_ned_m: FloatArray,
         ned_ray_from_pixel: FloatArray,
     ) -> None:
-        """Blend the ground's texture in, the less the farther it is."""
+        """Blend the ground's texture in, less with distance."""
         height_m = -eye_ned_m[2]
         weight = np.maximum(falls, 0)
         weight /= weight + np.float32(height_m / GROUND_FADE_M)
@@ -153,18 +152,12 @@ class FpvRenderer:
         return np.rint(points_px * (1 << SUBPIXEL_BITS)).astype(np.int32)
 
     def _in_view(self, corners_m: FloatArray) -> NDArray[np.bool_]:
-        """Which of [N, 4, 3] are not wholly behind the near plane or outside one image border."""
+        """Whether each of [N, 4, 3] is not wholly behind the near plane or one image border."""
         x, y, z = np.moveaxis(corners_m, -1, 0)
         half_width, half_height = (self._center_px + 1) / self._focal_px
-        outside = np.stack(
-            [
-                z < NEAR_M,
-                x > half_width * z,
-                x < -half_width * z,
-                y > half_height * z,
-                y < -half_height * z,
-            ]
-        )
+        is_left, is_right = x < -half_width * z, x > half_width * z
+        is_above, is_below = y < -half_height * z, y > half_height * z
+        outside = np.stack([z < NEAR_M, is_left, is_right, is_above, is_below])
         return np.asarray(~outside.all(axis=2).any(axis=0))
 
 
@@ -178,11 +171,6 @@ def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
     about_axis = rotation_matrix(from_euler(0.0, 0.0, roll_rad))
     about_down = rotation_matrix(from_euler(0.0, 0.0, yaw_rad))
     return np.asarray(about_down @ tilted @ about_axis)
-
-
-def _rows(top: int) -> FloatArray:
-    """Pixel of the whole image from a pixel of its part that starts at row ``top``."""
-    return np.array([[1.0, 0.0, 0.0], [0.0, 1.0, top], [0.0, 0.0, 1.0]])
 
 
 def clip_near(corners_m: FloatArray) -> FloatArray:

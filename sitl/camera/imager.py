@@ -1,4 +1,6 @@
-"""What a real sensor does to the picture: exposure, colour cast, blur and noise."""
+"""Imaging of a real sensor: exposure, colour cast, blur and noise."""
+
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -6,12 +8,11 @@ from numpy.typing import NDArray
 
 from sitl.vehicle.conditions import Conditions
 
-Image = NDArray[np.uint8]
+Image: TypeAlias = NDArray[np.uint8]
 
-REFERENCE_WIDTH_PX = 224
-"""Blur is given for a picture this wide."""
+REFERENCE_WIDTH_PX = 224  # image width for which the conditions give the blur
 NOISE_MARGIN_PX = 61
-"""Noise is drawn once, this much larger than the picture, and cut out anew for every frame."""
+"""Noise is drawn once, this much larger than the image, and cropped anew for every frame."""
 
 
 class Imager:
@@ -32,7 +33,7 @@ class Imager:
             self._noise = noise.round().astype(np.int16)
 
     def expose(self, image: Image) -> Image:
-        """The picture [H, W, 3] RGB as the sensor would give it; the argument may be reused."""
+        """Image [H, W, 3] RGB as the sensor would record it; may be the argument itself."""
         if self._lut is not None:
             image = np.asarray(cv2.LUT(image, self._lut), dtype=np.uint8)
         if self._blur_px > 0.0:

@@ -1,4 +1,4 @@
-"""Surfaces and colours of the FPV view: gates, ridge, ground and sky. All constant per course."""
+"""Surfaces and colours of the FPV view: gates, ridge, ground and sky; constant for a course."""
 
 import math
 from dataclasses import dataclass
@@ -8,16 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.course.course import BAR_M, DEPTH_M, Course, Gate
+from sitl.camera.imager import Image
+from sitl.course.layout import BAR_M, DEPTH_M, Course, Gate
 from sitl.rotation import Vec3
 from sitl.vehicle.conditions import NOMINAL, Conditions, Rgb
 
 FloatArray: TypeAlias = NDArray[np.float64]
-Image: TypeAlias = NDArray[np.uint8]
 
-LEG_M = 0.09
+LEG_M = 0.09  # width of the two posts that reach down to the ground
 PIP_M = 0.16
-PIP_PITCH_M = 0.32
+PIP_PITCH_M = 0.32  # white squares on the front of the top bar: the gate's number, counted from one
+INSIDE_BRIGHTNESS = 0.7
+BOTH_SIDES: Vec3 = (0.0, 0.0, 0.0)
 
 RIDGE_SEGMENTS = 120
 RIDGE_ELEVATION_RAD = (math.radians(0.8), math.radians(6.5))
@@ -33,10 +35,8 @@ GRASS_RGB = (62, 96, 62)
 GRID_RGB = (196, 200, 160)
 LEG_RGB = (58, 60, 68)
 PIP_RGB = (255, 248, 232)
-BACK_RGB = (96, 98, 112)
-"""A gate is grey from behind: it must not be flown from there."""
-FRONT_RGB = NOMINAL.gate_rgb
-"""Of even gates, of odd gates; the white squares on top count from one."""
+BACK_RGB = (96, 98, 112)  # a gate is grey from behind: it must not be passed from there
+FRONT_RGB = NOMINAL.gate_rgb  # even gates, odd gates
 BACKDROP_RGB = (
     (-1.0, (78, 98, 66)),
     (-0.30, (92, 108, 76)),
@@ -46,14 +46,14 @@ BACKDROP_RGB = (
     (0.40, (126, 172, 222)),
     (1.0, (52, 100, 182)),
 )
-"""How far a viewing ray of unit depth rises -> colour, interpolated between."""
+"""Rise of a viewing ray of unit depth, and its colour; interpolated between."""
 
 
 class _Face(NamedTuple):
-    """One quadrilateral in a gate's axes: ahead along the passage, right, down."""
+    """One quadrilateral in gate axes: forward through the gate, right, down."""
 
     corners_m: tuple[Vec3, ...]
-    normal: Vec3
+    normal: Vec3  # towards the side from which it is seen; zero = it is seen from both
     rgb: Rgb
 
 
@@ -73,12 +73,13 @@ class Faces:
 
 
 def gate_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
-    """All surfaces of all gates."""
+    """Build all surfaces of all gates."""
     sun_ned, ambient = np.array(conditions.sun_ned), conditions.ambient
     corners, normals, rgb, owners = [], [], [], []
     for gate in course.gates:
-        ned_from_gate = _ned_from_gate(gate)
-        for face in _gate_parts(gate, conditions.gate_rgb):
+        cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
+        ned_from_gate = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
+        for face in _faces_of(gate, conditions.gate_rgb):
             normal_ned = ned_from_gate @ np.array(face.normal)
             light = ambient + (1 - ambient) * max(0.0, float(normal_ned @ sun_ned))
             corners.append(np.array(face.corners_m) @ ned_from_gate.T + gate.center_ned_m)
@@ -93,102 +94,88 @@ def gate_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
     )
 
 
-def _ned_from_gate(gate: Gate) -> FloatArray:
-    cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
-    return np.array([[cos_yaw, -sin_yaw, 0.0], [sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _gate_parts(gate: Gate, front_rgb: tuple[Rgb, Rgb]) -> list[_Face]:
-    """Faces in drawing order.
+def _faces_of(gate: Gate, front_rgb: tuple[Rgb, Rgb]) -> list[_Face]:
+    """Faces in drawing order: posts, walls inside the opening, outer walls, back, front, number.
 
     Walls inside the opening are hidden by any other part of the frame that is in the way, so they
     come first; an outer wall and a ring that are both seen never hide each other.
     """
     inner_m = gate.size_m / 2
     outer_m = inner_m + BAR_M
+    middle_m = inner_m + BAR_M / 2
+    front_m, back_m = -DEPTH_M / 2, DEPTH_M / 2
     paint = front_rgb[gate.index % len(front_rgb)]
-    inside = _scaled(paint, 0.7)
+    red, green, blue = (round(value * INSIDE_BRIGHTNESS) for value in paint)
+    inside = (red, green, blue)
+    to_ground_m = (outer_m, -gate.center_ned_m[2])
+    number_m = (-middle_m - PIP_M / 2, -middle_m + PIP_M / 2)
+    pips = [(k - gate.index / 2) * PIP_PITCH_M for k in range(gate.index + 1)]
     return [
-        *_legs(gate, inner_m, outer_m),
-        *(_wall(inner_m, quarter, inside, inward=True) for quarter in range(4)),
-        *(_wall(outer_m, quarter, inside, inward=False) for quarter in range(4)),
-        *(_ring(outer_m, inner_m, quarter, 1.0, BACK_RGB) for quarter in range(4)),
-        *(_ring(outer_m, inner_m, quarter, -1.0, paint) for quarter in range(4)),
-        *_pips(gate.index + 1, inner_m + BAR_M / 2),
+        *(
+            _Face(_upright(0.0, m, LEG_M, to_ground_m), BOTH_SIDES, LEG_RGB)
+            for m in (-middle_m, middle_m)
+        ),
+        *_tube(inner_m, (0.0, 0.0, 1.0), inside),
+        *_tube(outer_m, (0.0, 0.0, -1.0), inside),
+        *_ring(outer_m, inner_m, back_m, (1.0, 0.0, 0.0), BACK_RGB),
+        *_ring(outer_m, inner_m, front_m, (-1.0, 0.0, 0.0), paint),
+        *(_Face(_upright(front_m, m, PIP_M, number_m), (-1.0, 0.0, 0.0), PIP_RGB) for m in pips),
     ]
 
 
-def _legs(gate: Gate, inner_m: float, outer_m: float) -> list[_Face]:
-    """Two flat posts down to the ground."""
-    ground_m = -gate.center_ned_m[2]
-    faces = []
-    for middle_m in (-inner_m - BAR_M / 2, inner_m + BAR_M / 2):
-        left_m, right_m = middle_m - LEG_M / 2, middle_m + LEG_M / 2
-        corners = (
-            (0.0, left_m, outer_m),
-            (0.0, right_m, outer_m),
-            (0.0, right_m, ground_m),
-            (0.0, left_m, ground_m),
-        )
-        faces.append(_Face(corners, (0.0, 0.0, 0.0), LEG_RGB))
-    return faces
+def _upright(
+    forward_m: float, middle_m: float, width_m: float, down_m: tuple[float, float]
+) -> tuple[Vec3, ...]:
+    """Corners of a rectangle across the passage."""
+    left_m, right_m = middle_m - width_m / 2, middle_m + width_m / 2
+    top_m, bottom_m = down_m
+    return (
+        (forward_m, left_m, top_m),
+        (forward_m, right_m, top_m),
+        (forward_m, right_m, bottom_m),
+        (forward_m, left_m, bottom_m),
+    )
 
 
-def _wall(half_m: float, quarter: int, rgb: Rgb, *, inward: bool) -> _Face:
-    """Top wall of a square tube along the passage, turned by quarters of a turn."""
+def _tube(half_m: float, top_normal: Vec3, rgb: Rgb) -> list[_Face]:
+    """Walls of a square tube along the passage; its top wall has this normal."""
     depth_m = DEPTH_M / 2
-    corners = (
+    top = (
         (-depth_m, -half_m, -half_m),
         (-depth_m, half_m, -half_m),
         (depth_m, half_m, -half_m),
         (depth_m, -half_m, -half_m),
     )
-    normal = (0.0, 0.0, 1.0 if inward else -1.0)
-    return _Face(tuple(_turned(c, quarter) for c in corners), _turned(normal, quarter), rgb)
+    return _quarter_turns(_Face(top, top_normal, rgb))
 
 
-def _ring(outer_m: float, inner_m: float, quarter: int, side: float, rgb: Rgb) -> _Face:
-    """Top quarter of the front (side -1) or back (+1) of the frame, turned by quarters."""
-    ahead_m = side * DEPTH_M / 2
-    corners = (
-        (ahead_m, -outer_m, -outer_m),
-        (ahead_m, outer_m, -outer_m),
-        (ahead_m, inner_m, -inner_m),
-        (ahead_m, -inner_m, -inner_m),
+def _ring(outer_m: float, inner_m: float, forward_m: float, normal: Vec3, rgb: Rgb) -> list[_Face]:
+    """Front or back of the frame around the opening, in four parts."""
+    top = (
+        (forward_m, -outer_m, -outer_m),
+        (forward_m, outer_m, -outer_m),
+        (forward_m, inner_m, -inner_m),
+        (forward_m, -inner_m, -inner_m),
     )
-    return _Face(tuple(_turned(c, quarter) for c in corners), (side, 0.0, 0.0), rgb)
+    return _quarter_turns(_Face(top, normal, rgb))
 
 
-def _pips(count: int, height_m: float) -> list[_Face]:
-    """White squares on the front of the top bar: the gate's number, counted from one."""
-    ahead_m = -DEPTH_M / 2
-    half_m = PIP_M / 2
-    faces = []
-    for k in range(count):
-        right_m = (k - (count - 1) / 2) * PIP_PITCH_M
-        corners = tuple(
-            (ahead_m, right_m + dr * half_m, -height_m + dd * half_m)
-            for dr, dd in ((-1, -1), (1, -1), (1, 1), (-1, 1))
-        )
-        faces.append(_Face(corners, (-1.0, 0.0, 0.0), PIP_RGB))
+def _quarter_turns(top: _Face) -> list[_Face]:
+    """The face, then turned about the passage by one, two and three quarters of a turn."""
+    faces = [top]
+    for _ in range(3):
+        corners_m, normal, rgb = faces[-1]
+        faces.append(_Face(tuple(map(_quarter_turn, corners_m)), _quarter_turn(normal), rgb))
     return faces
 
 
-def _turned(point: Vec3, quarter: int) -> Vec3:
-    """Turned about the passage by quarters of a turn."""
-    ahead, right, down = point
-    for _ in range(quarter):
-        right, down = -down, right
-    return (ahead, right, down)
-
-
-def _scaled(rgb: Rgb, factor: float) -> Rgb:
-    red, green, blue = (round(value * factor) for value in rgb)
-    return (red, green, blue)
+def _quarter_turn(vector: Vec3) -> Vec3:
+    forward, right, down = vector
+    return (forward, -down, right)
 
 
 def ridge_directions(seed: int) -> FloatArray:
-    """Hills on the horizon as quadrilaterals of directions, [N, 4, 3] NED: they show rotation."""
+    """Hills on the horizon, which show rotation: quadrilaterals of NED directions, [N, 4, 3]."""
     random = np.random.Generator(np.random.PCG64(seed))
     azimuth_rad = np.linspace(-math.pi, math.pi, RIDGE_SEGMENTS + 1)
     waves = np.arange(2, 16)
@@ -203,12 +190,12 @@ def ridge_directions(seed: int) -> FloatArray:
 
 
 def tinted(rgb: Rgb, tint: Vec3) -> FloatArray:
-    """[3] the colour in another light, of 255."""
+    """Colour [3] under a tint, within 0..255."""
     return np.asarray(np.clip(np.array(rgb) * np.array(tint), 0, 255))
 
 
 def backdrop_colours(conditions: Conditions = NOMINAL) -> Image:
-    """Sky above and far ground below, [256, 1, 3] uint8 RGB.
+    """Colour table of sky and far ground, [256, 1, 3] uint8 RGB.
 
     Entry k is for a ray of unit depth that rises by k / 127.5 - 1.
     """

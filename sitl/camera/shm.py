@@ -18,10 +18,8 @@ SLOT_HEADER_BYTES = 32
 CHANNELS = 3
 SLOTS = 4
 LIVE, CLOSED = 1, 2
-NEWEST, STATE = 3, 4
-"""Places of the header's fields, in units of 8 bytes."""
-SEQ, FRAME_ID, CAPTURED_NS = 0, 1, 2
-"""Places of a slot's fields, in units of 8 bytes."""
+NEWEST, STATE = 3, 4  # fields of the header, in units of 8 bytes
+SEQ, FRAME_ID, CAPTURED_NS = 0, 1, 2  # fields of a slot, in units of 8 bytes
 
 
 class FramePublisher:
@@ -32,14 +30,18 @@ class FramePublisher:
             raise UsageError(f"a frame needs at least one pixel, got {width}x{height}")
         self._path = _shm_path(name)
         self._shape = (height, width, CHANNELS)
-        stride = -(-(SLOT_HEADER_BYTES + width * height * CHANNELS) // 64) * 64
+        size = height * width * CHANNELS
+        stride = -(-(SLOT_HEADER_BYTES + size) // 64) * 64
         self._map, self._inode = _create(self._path, width, height, HEADER_BYTES + SLOTS * stride)
         self._header = np.frombuffer(self._map, np.int64, HEADER_BYTES // 8)
-        self._slots = [
-            _Slot(self._map, HEADER_BYTES + k * stride, self._shape) for k in range(SLOTS)
+        starts = range(HEADER_BYTES, HEADER_BYTES + SLOTS * stride, stride)
+        self._fields = [np.frombuffer(self._map, np.int64, 4, start) for start in starts]
+        self._pixels = [
+            np.frombuffer(self._map, np.uint8, size, start + SLOT_HEADER_BYTES).reshape(self._shape)
+            for start in starts
         ]
         self._frame_id = 0
-        self._barrier = threading.Lock()
+        self._lock = threading.Lock()
 
     def publish(self, rgb: NDArray[np.uint8], captured_ns: int) -> None:
         """Copy a frame [height, width, 3] uint8 and make it the newest.
@@ -49,49 +51,37 @@ class FramePublisher:
         """
         if rgb.shape != self._shape or rgb.dtype != np.uint8:
             raise ValueError(f"want uint8 {self._shape}, got {rgb.dtype} {rgb.shape}")
-        if not self._slots:
+        if not self._fields:
             raise ValueError("publish after close")
         self._frame_id += 1
-        slot = self._slots[self._frame_id % SLOTS]
-        slot.fields[SEQ] += 1
-        self._in_order()
-        slot.fields[FRAME_ID] = self._frame_id
-        slot.fields[CAPTURED_NS] = captured_ns
-        slot.pixels[:] = rgb
-        self._in_order()
-        slot.fields[SEQ] += 1
-        self._in_order()
+        fields = self._fields[self._frame_id % SLOTS]
+        fields[SEQ] += 1
+        self._memory_barrier()
+        fields[FRAME_ID] = self._frame_id
+        fields[CAPTURED_NS] = captured_ns
+        self._pixels[self._frame_id % SLOTS][:] = rgb
+        self._memory_barrier()
+        fields[SEQ] += 1
+        self._memory_barrier()
         self._header[NEWEST] = self._frame_id
 
     def close(self) -> None:
-        """Tell the readers, and remove the name unless another writer has taken it over."""
-        if not self._slots:
+        """Mark the stream closed, and remove the name unless another writer has taken it over."""
+        if not self._fields:
             return
         self._header[STATE] = CLOSED
         if self._path.exists() and self._path.stat().st_ino == self._inode:
             self._path.unlink()
-        self._slots = []
-        self._header = np.empty(0, np.int64)
+        self._fields, self._pixels, self._header = [], [], np.empty(0, np.int64)
         self._map.close()
 
-    def _in_order(self) -> None:
-        """Memory barrier: the stores before it are seen before those after it.
+    def _memory_barrier(self) -> None:
+        """Order the stores before it before those after it, for readers on other cores.
 
         Python has none by name; taking and freeing a lock is one on every platform (POSIX 4.12).
         """
-        with self._barrier:
+        with self._lock:
             pass
-
-
-class _Slot:
-    """Views of one slot."""
-
-    def __init__(self, buffer: mmap.mmap, offset: int, shape: tuple[int, int, int]) -> None:
-        size = shape[0] * shape[1] * shape[2]
-        self.fields = np.frombuffer(buffer, np.int64, SLOT_HEADER_BYTES // 8, offset)
-        self.pixels = np.frombuffer(buffer, np.uint8, size, offset + SLOT_HEADER_BYTES).reshape(
-            shape
-        )
 
 
 def _shm_path(name: str) -> Path:
@@ -102,7 +92,7 @@ def _shm_path(name: str) -> Path:
 
 
 def _create(path: Path, width: int, height: int, size: int) -> tuple[mmap.mmap, int]:
-    """Lay the file out under another name, then give it its own: no reader sees half a header."""
+    """Lay the file out under another name, then rename it: no reader sees half a header."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     with draft.open("w+b") as file:
         file.truncate(size)

@@ -1,1 +1,1 @@
-"""Gate courses, the referee that counts gates, and collisions."""
+"""Gate courses, ground truth about them, and the referee of a flight."""

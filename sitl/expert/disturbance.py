@@ -1,8 +1,8 @@
-"""Mistakes to learn from: starts off the course and sticks that are not the demonstrator's.
+"""Perturbs demonstrations, so that they hold mistakes to learn from: sticks and starts in the air.
 
-What is flown differs from what the demonstrator would hold; what it would hold stays the label, so
-that the way back from a mistake is in the data (Laskey et al., "DART: Noise Injection for Robust
-Imitation Learning", 2017). Everything follows from a seed.
+The disturbed sticks are flown while the expert's stay the label, so that the way back from a
+mistake is in the data (Laskey et al., "DART: Noise Injection for Robust Imitation Learning", 2017).
+Everything follows from a seed.
 """
 
 import math
@@ -10,20 +10,19 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sitl.course.course import Course, Start
-from sitl.expert.expert import CENTRED, Sticks4
+from sitl.course.layout import AirborneStart, Course
+from sitl.expert.stick_response import CENTRED, StickPositions
 from sitl.rotation import from_euler
 from sitl.vehicle.control import clamp
 
 QUIET_S = (1.0, 5.0)
 NOISY_S = (0.5, 2.0)
 PULSE_S = (0.15, 0.5)
-NOISE_TIME_S = 0.25
-"""Correlation time of the noise: about as fast as a thumb."""
-NOISE_RMS = Sticks4(throttle=0.25, yaw=0.12, pitch=0.25, roll=0.25)
-PULSE_MAX = Sticks4(throttle=0.6, yaw=0.4, pitch=0.6, roll=0.6)
+NOISE_TIME_S = 0.25  # correlation time of the noise: about as fast as a thumb
+NOISE_RMS = StickPositions(throttle=0.25, yaw=0.12, pitch=0.25, roll=0.25)
+PULSE_MAX = StickPositions(throttle=0.6, yaw=0.4, pitch=0.6, roll=0.6)
 START_AWAY_M = (3.0, 5.5)
-"""Before a gate: behind the one before it, whose leg is at least 7 m long."""
+"""Distance before a gate: past the previous one, whose leg is at least 7 m long."""
 LATE_CHANCE = 0.3
 LATE_S = (0.2, 2.0)
 
@@ -31,14 +30,14 @@ LATE_S = (0.2, 2.0)
 class _Stretch(NamedTuple):
     kind: Literal["quiet", "noise", "pulse", "late"]
     end_s: float
-    offset: Sticks4
+    offset: StickPositions
 
 
 class StickDisturbance:
     """Stretches of correlated noise and held pulses on the sticks, with quiet ones in between.
 
-    ``strength`` scales amplitudes; 0 never disturbs. One flight each; ask it at every tick, in
-    order of time. Time counts from the first call. From the ground some flights start late.
+    ``strength`` scales amplitudes; 0 never disturbs. Use one per flight and call `flown` at every
+    tick, in order of time. Some flights from the ground start late.
     """
 
     def __init__(self, seed: int, *, strength: float = 1.0, from_ground: bool = True) -> None:
@@ -53,28 +52,28 @@ class StickDisturbance:
 
     @property
     def active(self) -> bool:
-        """What the last call returned is not what the demonstrator asked for."""
+        """Whether the last call of `flown` disturbed the sticks."""
         return self._strength > 0.0 and self._stretch.kind != "quiet"
 
-    def flown(self, wanted: Sticks4, t_s: float) -> Sticks4:
-        """What to fly at ``t_s`` where the demonstrator wants ``wanted``; within [-1, 1]."""
+    def flown(self, wanted: StickPositions, t_s: float) -> StickPositions:
+        """Sticks to fly at ``t_s`` where the expert wants ``wanted``; within [-1, 1]."""
         if self._start_s is None:
             self._start_s = t_s
         t_s -= self._start_s
         dt_s, self._last_s = t_s - self._last_s, t_s
         while t_s >= self._stretch.end_s:
             self._stretch = self._next(self._stretch)
-        self._wander(dt_s)
+        self._update_noise(dt_s)
         if not self.active:
             return wanted
         if self._stretch.kind == "late":
             return CENTRED
         offset = self._noise if self._stretch.kind == "noise" else self._stretch.offset
         disturbed = [
-            max(-1.0, min(1.0, stick + self._strength * float(off)))
+            clamp(stick + self._strength * float(off), 1.0)
             for stick, off in zip(wanted, offset, strict=True)
         ]
-        return Sticks4(*disturbed)
+        return StickPositions(*disturbed)
 
     def _next(self, ended: _Stretch) -> _Stretch:
         if ended.kind != "quiet":
@@ -86,17 +85,19 @@ class StickDisturbance:
         held = self._random.uniform(-1.0, 1.0, 4) * np.array(PULSE_MAX)
         held *= self._random.permutation([1.0, 1.0, 0.0, 0.0])
         length_s = float(self._random.uniform(*PULSE_S))
-        return _Stretch("pulse", ended.end_s + length_s, Sticks4(*held.tolist()))
+        return _Stretch("pulse", ended.end_s + length_s, StickPositions(*held.tolist()))
 
-    def _wander(self, dt_s: float) -> None:
+    def _update_noise(self, dt_s: float) -> None:
         """An Ornstein-Uhlenbeck process, exact for any step."""
         kept = math.exp(-max(dt_s, 0.0) / NOISE_TIME_S)
         fresh = math.sqrt(1.0 - kept * kept) * self._random.standard_normal(4)
         self._noise = kept * self._noise + fresh * np.array(NOISE_RMS)
 
 
-def random_start(course: Course, seed: int, *, speed_mps: float, strength: float = 1.0) -> Start:
-    """Somewhere before a random gate, off the line to it, moving and facing roughly along it."""
+def random_start(
+    course: Course, seed: int, *, speed_mps: float, strength: float = 1.0
+) -> AirborneStart:
+    """Draw a start before a random gate, off its axis, moving and facing roughly along it."""
     random = np.random.Generator(np.random.PCG64(seed))
     gate = course.gates[int(random.integers(len(course.gates)))]
     away_m = float(random.uniform(*START_AWAY_M))
@@ -108,7 +109,7 @@ def random_start(course: Course, seed: int, *, speed_mps: float, strength: float
     lean_rad = random.normal(0.0, 0.12 * strength, 2).tolist()
     north_m, east_m, down_m = gate.center_ned_m
     cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
-    return Start(
+    return AirborneStart(
         position_ned_m=(
             north_m - away_m * cos_yaw - side_m * sin_yaw,
             east_m - away_m * sin_yaw + side_m * cos_yaw,

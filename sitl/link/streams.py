@@ -1,4 +1,4 @@
-"""Which message is due when on one link: ArduPilot's rounding, caps and buckets."""
+"""Schedules the messages of one link, with ArduPilot's rounding, caps and buckets."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -12,14 +12,10 @@ from sitl.vehicle.conditions import NOMINAL, Conditions
 HEARTBEAT_INTERVAL_MS = 1000
 MAX_INTERVAL_US = 60_000_000
 MAX_DISTINCT_INTERVALS = 10
-PARAM_SLOWDOWN = 4
-"""All streams are this much slower while a parameter list is being sent."""
+PARAM_SLOWDOWN = 4  # factor on all intervals while a parameter list is being sent
 
 STREAM_GROUPS: dict[int, tuple[int, ...]] = {
-    mav.MAV_DATA_STREAM_RAW_SENSORS: (
-        mav.MAVLINK_MSG_ID_RAW_IMU,
-        mav.MAVLINK_MSG_ID_SCALED_IMU2,
-    ),
+    mav.MAV_DATA_STREAM_RAW_SENSORS: (mav.MAVLINK_MSG_ID_RAW_IMU, mav.MAVLINK_MSG_ID_SCALED_IMU2),
     mav.MAV_DATA_STREAM_EXTENDED_STATUS: (
         mav.MAVLINK_MSG_ID_SYS_STATUS,
         mav.MAVLINK_MSG_ID_GPS_RAW_INT,
@@ -45,17 +41,15 @@ STREAM_GROUPS: dict[int, tuple[int, ...]] = {
 @dataclass(slots=True, kw_only=True)
 class _Stream:
     interval_ms: int
-    due_ns: int
-    """On the stream's own grid."""
-    late_ns: int = 0
-    """By how much the next one is sent later than that."""
+    due_ns: int  # next slot on the stream's own grid
+    late_ns: int = 0  # delay of the next message after its slot
 
 
 class Streams:
     """The message intervals of one link; stamps are the vehicle's clock, intervals whole ms.
 
-    What the conditions add to them (a slow link, jitter, phases) is not in what MESSAGE_INTERVAL
-    reports, as on the firmware.
+    MESSAGE_INTERVAL does not report what the conditions add to them (a slow link, jitter, phases),
+    as on the firmware.
     """
 
     def __init__(
@@ -75,7 +69,7 @@ class Streams:
         """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the default.
 
         Returns:
-            None if accepted, else the reason of the refusal; the old interval is kept then.
+            None if accepted; else the reason, and the old interval is kept.
         """
         if message_id not in self._known:
             return f"No ap_message for mavlink id ({message_id})"
@@ -93,14 +87,14 @@ class Streams:
                 self._start(message_id, interval_ms, now_ns)
 
     def interval_us(self, message_id: int) -> int:
-        """As MESSAGE_INTERVAL reports it: 0 = unknown message, -1 = not streamed."""
+        """The interval that MESSAGE_INTERVAL reports: 0 = unknown message, -1 = not streamed."""
         if message_id not in self._known:
             return 0
         stream = self._streams.get(message_id)
         return stream.interval_ms * 1000 if stream else -1
 
     def due(self, now_ns: int, slowdown: int) -> list[int]:
-        """Ids to send now. Slots that were missed are dropped: a late message is sent once."""
+        """Ids of the messages to send now; missed slots are dropped, so a late one is sent once."""
         ready = [
             key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
         ]
@@ -108,11 +102,10 @@ class Streams:
             stream = self._streams[message_id]
             period_ns = (stream.interval_ms + self._slowdown_ms) * NS_PER_MS * slowdown
             stream.due_ns += period_ns * ((now_ns - stream.due_ns) // period_ns + 1)
-            stream.late_ns = self._below(self._jitter_ns)
+            stream.late_ns = self._random_ns(self._jitter_ns)
         return ready
 
-    def _below(self, most_ns: float) -> int:
-        """From 0 to ``most_ns``, at random."""
+    def _random_ns(self, most_ns: float) -> int:
         return int(self._random.uniform(0.0, most_ns)) if most_ns else 0
 
     @staticmethod
@@ -128,11 +121,11 @@ class Streams:
         if interval_ms > 0:
             interval_ms = self._bucket(interval_ms)
             period_ns = (interval_ms + self._slowdown_ms) * NS_PER_MS
-            due_ns = now_ns + period_ns - self._below(self._phase_spread * period_ns)
+            due_ns = now_ns + period_ns - self._random_ns(self._phase_spread * period_ns)
             self._streams[message_id] = _Stream(interval_ms=interval_ms, due_ns=due_ns)
 
     def _bucket(self, interval_ms: int) -> int:
-        """The firmware keeps ten distinct intervals a link; an eleventh joins the nearest."""
+        """The firmware keeps ten distinct intervals per link; an eleventh joins the nearest."""
         taken = {stream.interval_ms for stream in self._streams.values()}
         if interval_ms in taken or len(taken) < MAX_DISTINCT_INTERVALS:
             return interval_ms
@@ -140,5 +133,5 @@ class Streams:
 
 
 def shortest_ms(loop_hz: float) -> int:
-    """The fastest stream is 0.8 of the main loop, in whole milliseconds: 3 ms at 400 Hz."""
+    """Shortest interval: 0.8 of the main loop's rate, in whole milliseconds; 3 ms at 400 Hz."""
     return int(1000.0 / (0.8 * max(50.0, loop_hz)))

@@ -1,7 +1,7 @@
-"""The flight controller without its wire: sticks in, physics out, one step of 2.5 ms at a time.
+"""The flight controller without its link: sticks in, physics out, one step of 2.5 ms at a time.
 
-It is ArduCopter as a pilot and a companion computer see it: modes, arming, failsafes, and the words
-that it says about them. Nothing here knows about MAVLink, sockets or the host's time.
+It behaves as a pilot and a companion computer see ArduCopter: modes, arming, failsafes, and their
+status texts, word for word. Nothing here knows about MAVLink, sockets or the host's time.
 """
 
 from dataclasses import dataclass
@@ -9,20 +9,18 @@ from typing import NamedTuple
 
 from sitl.clock import NS_PER_S
 from sitl.rotation import Quat, Vec3, cos_tilt
-from sitl.vehicle.air import Air, SensorNoise
-from sitl.vehicle.arming import prearm_refusal, stick_refusal
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.dynamics import PHYSICS_STEP_NS, BodyState, Quadrotor
+from sitl.vehicle.environment import SensorNoise, Wind
 from sitl.vehicle.failsafe import GcsFailsafe, RadioFailsafe
-from sitl.vehicle.flight import STOPPED, FlightControl
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import STOPPED, FlightControl, Mode
 from sitl.vehicle.params import Params
 from sitl.vehicle.rc import IDLE_RECEIVER_US, RcEngine
-from sitl.vehicle.sticks import read_sticks
+from sitl.vehicle.sticks import climb_rate_mps, read_sticks
 
 SUBSTEPS = 2
 STEP_NS = SUBSTEPS * PHYSICS_STEP_NS
-LOOP_HZ = NS_PER_S // STEP_NS
+STEP_S = STEP_NS / NS_PER_S
 GPS_PERIOD_NS = NS_PER_S // 5
 
 LANDED_AFTER_NS = NS_PER_S
@@ -32,8 +30,9 @@ CRASH_AFTER_NS = NS_PER_S
 SEVERITY_CRITICAL, SEVERITY_WARNING, SEVERITY_INFO = 2, 4, 6
 
 FAILSAFE_LAND = {"FS_THR_ENABLE": 3, "FS_GCS_ENABLE": 5}
-"""The value of each parameter that asks for LAND; any other value but 0 means RTL."""
+"""The value of each parameter that selects LAND; any other value but 0 means RTL."""
 FS_OPTION_PILOT_CONTINUES = 16
+RC_OPTION_SKIP_NEUTRAL_CHECK = 64
 
 
 class StatusText(NamedTuple):
@@ -45,7 +44,7 @@ class StatusText(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleConfig:
-    """What differs between one simulated vehicle and another."""
+    """Differences between one simulated vehicle and another."""
 
     receiver: bool = True
     """An RC receiver with an idle transmitter; without one the sticks latch and the radio fails."""
@@ -54,7 +53,7 @@ class VehicleConfig:
     position_ready_s: float = 5.0
     """From boot until the estimator has a position (about 40 s on the real firmware)."""
     conditions: Conditions = NOMINAL
-    """Airframe, air and sensors; what concerns the camera is for `sitl.camera.fpv.FpvRenderer`."""
+    """Airframe, air and sensors; `sitl.camera.fpv.FpvRenderer` takes those of the camera."""
 
 
 class Autopilot:
@@ -72,18 +71,18 @@ class Autopilot:
         self.radio_failsafe = RadioFailsafe(params, boot_ns)
         self.gcs_failsafe = GcsFailsafe(params)
         self.texts: list[StatusText] = []
-        """Said since the last time somebody emptied the list."""
+        """Status texts to send; the reader empties the list."""
         self.motor_commands: tuple[float, ...] = STOPPED
         self.sensors_frozen = False
-        """Fault: telemetry and control keep the last state, the world goes on."""
+        """Fault: telemetry and control keep the last state, the physics goes on."""
         self._control = FlightControl(params)
         self._quad = Quadrotor(config.conditions)
-        self._air = Air(config.conditions, STEP_NS / NS_PER_S)
+        self._wind = Wind(config.conditions, STEP_S)
         self._noise = SensorNoise(config.conditions)
         self._physics = self._quad.at_rest()
         self.sensed = self._physics.body
         self.gps = self._physics.body
-        """As of the last 5 Hz fix."""
+        """State at the last 5 Hz fix."""
         self._gps_due_ns = boot_ns
         self._still_since_ns: int | None = boot_ns
         self._tipped_since_ns: int | None = None
@@ -110,28 +109,48 @@ class Autopilot:
         return self.uptime_ns >= self.config.position_ready_s * NS_PER_S
 
     def prearm_refusal(self) -> str | None:
-        """Why the vehicle is not ready to be armed, whatever the mode and the sticks; or None."""
-        return prearm_refusal(
-            self.rc,
-            self.params,
-            estimator_ready=self.estimator_ready,
-            radio_failsafe=self.radio_failsafe.active,
-        )
+        """Why the vehicle is not ready to arm, whatever the mode and the sticks; or None.
+
+        SYS_STATUS reports it as PREARM_CHECK; the words are ArduCopter's.
+        """
+        if not self.estimator_ready:
+            return "AHRS: EKF3 not started"
+        if not self.rc.found:
+            return "RC not found"
+        if self.radio_failsafe.active:
+            return "Radio failsafe on"
+        throttle_us = self.rc.channels_us[self.rc.index_of("THROTTLE")]
+        if self.params["FS_THR_ENABLE"] and throttle_us < self.params["FS_THR_VALUE"]:
+            return "Throttle below failsafe"
+        return None
+
+    def _stick_refusal(self) -> str | None:
+        """Why mode and sticks keep a vehicle that is ready from arming, or None."""
+        if not self.mode.piloted:
+            return f"{self.mode.name} mode not armable"
+        sticks = read_sticks(self.rc, self.params)
+        is_thrust = self.mode.manual_throttle and sticks.throttle > 0
+        if is_thrust or climb_rate_mps(sticks, self.params) > 0.0:
+            return "Throttle too high"
+        if self.params.integer("RC_OPTIONS") & RC_OPTION_SKIP_NEUTRAL_CHECK:
+            return None
+        for axis, value in (("Roll", sticks.roll), ("Pitch", sticks.pitch), ("Yaw", sticks.yaw)):
+            if value != 0.0:
+                return f"{axis} (RC{self.rc.index_of(axis.upper()) + 1}) is not neutral"
+        return None
 
     def arm(self, *, force: bool) -> bool:
-        """Start the motors; a refusal is said as a text. True if armed afterwards."""
+        """Start the motors; a refusal becomes a status text. True if armed afterwards."""
         if self.armed:
             return True
-        refusal = self.prearm_refusal() or stick_refusal(
-            self.mode, read_sticks(self.rc, self.params), self.rc, self.params
-        )
+        refusal = self.prearm_refusal() or self._stick_refusal()
         if refusal is not None and not force:
-            self._say(SEVERITY_CRITICAL, f"Arm: {refusal}")
+            self._send_text(SEVERITY_CRITICAL, f"Arm: {refusal}")
             return False
         self.armed = True
         self._idle_since_ns = self.now_ns
         self._control.reset(self.sensed)
-        self._say(SEVERITY_INFO, "Arming motors")
+        self._send_text(SEVERITY_INFO, "Arming motors")
         return True
 
     def disarm(self, *, force: bool) -> bool:
@@ -140,11 +159,11 @@ class Autopilot:
             return False
         if self.armed:
             self.armed = False
-            self._say(SEVERITY_INFO, "Disarming motors")
+            self._send_text(SEVERITY_INFO, "Disarming motors")
         return True
 
     def set_mode(self, mode: Mode) -> bool:
-        """Change the flight mode; a refusal is said as a text. True if in that mode afterwards."""
+        """Change the flight mode; a refusal becomes a status text. True if in that mode then."""
         if mode is self.mode:
             return True
         refusal = None
@@ -153,7 +172,7 @@ class Autopilot:
         elif mode is Mode.RTL and not self.position_ready:
             refusal = "requires position"
         if refusal is not None:
-            self._say(SEVERITY_WARNING, f"Mode change to {mode.name} failed: {refusal}")
+            self._send_text(SEVERITY_WARNING, f"Mode change to {mode.name} failed: {refusal}")
             return False
         self.mode = mode
         self._control.reset(self.sensed)
@@ -166,9 +185,8 @@ class Autopilot:
         if self.gcs_failsafe.update(self.now_ns):
             self._on_gcs_change()
         self.motor_commands = self._motors()
-        self._physics = self._quad.step(
-            self._physics, self.motor_commands, SUBSTEPS, self._air.step()
-        )
+        wind_mps = self._wind.step()
+        self._physics = self._quad.step(self._physics, self.motor_commands, SUBSTEPS, wind_mps)
         if not self.sensors_frozen:
             self.sensed = self._noise.sense(self._physics.body)
             if self.now_ns >= self._gps_due_ns:
@@ -199,56 +217,52 @@ class Autopilot:
         sticks = read_sticks(self.rc, self.params)
         if self.landed:
             if not self._control.wants_takeoff(self.mode, sticks):
-                self._disarm_when_idle()
+                # LAND and RTL stop the motors on touchdown, the pilot's modes after DISARM_DELAY.
+                delay_s = self.params["DISARM_DELAY"]
+                is_idle = delay_s > 0.0 and self._has_held(self._idle_since_ns, delay_s * NS_PER_S)
+                if is_idle or not self.mode.piloted:
+                    self.disarm(force=False)
                 return self._control.idle(self.sensed)
             self.landed = False
             self._still_since_ns = None
         self._idle_since_ns = self.now_ns
         return self._control.fly(
-            self.mode,
-            sticks,
-            self.sensed,
-            has_position=self.position_ready,
-            dt_s=STEP_NS / NS_PER_S,
+            self.mode, sticks, self.sensed, has_position=self.position_ready, dt_s=STEP_S
         )
-
-    def _disarm_when_idle(self) -> None:
-        """LAND and RTL stop the motors on touchdown, the pilot's modes after DISARM_DELAY."""
-        delay_s = self.params["DISARM_DELAY"]
-        waited = delay_s > 0.0 and self.now_ns - self._idle_since_ns >= delay_s * NS_PER_S
-        if waited or not self.mode.piloted:
-            self.disarm(force=False)
 
     def _detect_landing(self) -> None:
         body = self.sensed
-        hover = self.params["MOT_THST_HOVER"]
-        slow = max(abs(v) for v in body.velocity_ned_mps) < LANDED_SPEED_MPS
-        pushing = self.armed and self._control.collective > 0.5 * hover
-        if not (body.touching and slow) or pushing:
-            self._still_since_ns = None
-        elif self._still_since_ns is None:
-            self._still_since_ns = self.now_ns
-        elif not self.landed and self.now_ns - self._still_since_ns >= LANDED_AFTER_NS:
+        is_slow = max(abs(v) for v in body.velocity_ned_mps) < LANDED_SPEED_MPS
+        is_pushing = self.armed and self._control.collective > 0.5 * self.params["MOT_THST_HOVER"]
+        is_still = body.touching and is_slow and not is_pushing
+        self._still_since_ns = self._since(self._still_since_ns, is_still)
+        if self._has_held(self._still_since_ns, LANDED_AFTER_NS):
             self.landed = True
 
     def _detect_crash(self) -> None:
-        """Lying on its side with motors running."""
-        tilt = cos_tilt(self.sensed.ned_from_body_wxyz)
-        if not (self.armed and self.sensed.touching and tilt < CRASH_TILT_COS):
-            self._tipped_since_ns = None
-        elif self._tipped_since_ns is None:
-            self._tipped_since_ns = self.now_ns
-        elif self.now_ns - self._tipped_since_ns >= CRASH_AFTER_NS:
-            self._say(SEVERITY_CRITICAL, "Crash: Disarming")
+        """Stop the motors of a vehicle that lies on its side."""
+        is_tilted = cos_tilt(self.sensed.ned_from_body_wxyz) < CRASH_TILT_COS
+        is_tipped = self.armed and self.sensed.touching and is_tilted
+        self._tipped_since_ns = self._since(self._tipped_since_ns, is_tipped)
+        if self._has_held(self._tipped_since_ns, CRASH_AFTER_NS):
+            self._send_text(SEVERITY_CRITICAL, "Crash: Disarming")
             self.disarm(force=True)
+
+    def _since(self, since_ns: int | None, condition: bool) -> int | None:
+        """When the condition began to hold; None if it does not."""
+        if not condition:
+            return None
+        return self.now_ns if since_ns is None else since_ns
+
+    def _has_held(self, since_ns: int | None, duration_ns: float) -> bool:
+        return since_ns is not None and self.now_ns - since_ns >= duration_ns
 
     def _read_radio(self) -> None:
         new_input = self.rc.update(self.now_ns)
         changed = self.radio_failsafe.update(
             new_input=new_input,
             throttle_us=self.rc.channels_us[self.rc.index_of("THROTTLE")],
-            has_receiver=self.config.receiver,
-            armed=self.armed,
+            can_fail=self.config.receiver or self.armed,
             now_ns=self.now_ns,
         )
         if not changed:
@@ -256,26 +270,26 @@ class Autopilot:
         if self.radio_failsafe.active:
             self._fail_over("Radio", "FS_THR_ENABLE")
         else:
-            self._say(SEVERITY_WARNING, "Radio Failsafe Cleared")
+            self._send_text(SEVERITY_WARNING, "Radio Failsafe Cleared")
 
     def _on_gcs_change(self) -> None:
         if not self.gcs_failsafe.active:
-            self._say(SEVERITY_WARNING, "GCS Failsafe Cleared")
+            self._send_text(SEVERITY_WARNING, "GCS Failsafe Cleared")
             return
         self.rc.clear_overrides()
         continues = self.params.integer("FS_OPTIONS") & FS_OPTION_PILOT_CONTINUES
         if self.armed and self.mode.piloted and continues:
-            self._say(SEVERITY_WARNING, "GCS Failsafe - Continuing Pilot Control")
+            self._send_text(SEVERITY_WARNING, "GCS Failsafe - Continuing Pilot Control")
         else:
             self._fail_over("GCS", "FS_GCS_ENABLE")
 
     def _fail_over(self, who: str, parameter: str) -> None:
-        """Bring the vehicle down or home; the mode stays when the cause goes away."""
+        """Bring the vehicle down or home; the mode stays when the cause has gone."""
         if self.armed and self.landed:
-            self._say(SEVERITY_WARNING, f"{who} Failsafe - Disarming")
+            self._send_text(SEVERITY_WARNING, f"{who} Failsafe - Disarming")
             self.disarm(force=True)
             return
-        self._say(SEVERITY_WARNING, f"{who} Failsafe")
+        self._send_text(SEVERITY_WARNING, f"{who} Failsafe")
         if not self.armed:
             return
         if self.params.integer(parameter) == FAILSAFE_LAND[parameter] or not self.position_ready:
@@ -283,5 +297,5 @@ class Autopilot:
         elif self.mode is not Mode.LAND:
             self.set_mode(Mode.RTL)
 
-    def _say(self, severity: int, text: str) -> None:
+    def _send_text(self, severity: int, text: str) -> None:
         self.texts.append(StatusText(severity, text))

@@ -1,4 +1,4 @@
-"""What differs from one flight to the next: vehicle, firmware settings, air, sensors, light, lens.
+"""Everything that differs between flights: airframe, firmware settings, wind, noise, light, lens.
 
 The defaults are the nominal vehicle and view, to the bit. `random_conditions` draws others, so that
 a policy learns to fly a vehicle rather than this one (Tobin et al., "Domain Randomization", 2017).
@@ -6,7 +6,6 @@ a policy learns to fly a vehicle rather than this one (Tobin et al., "Domain Ran
 
 import colorsys
 import math
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import TypeAlias
 
@@ -20,120 +19,95 @@ Rgb: TypeAlias = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Conditions:
-    """One world; factors are 1 and offsets 0 where nothing differs."""
+    """Conditions of one flight; factors of 1 and offsets of 0 change nothing.
 
-    seed: int = 0
-    """Of gusts, sensor noise and image noise."""
+    The fields from ``angle_max_cdeg`` to ``lean_accel_max_cdegps2`` become firmware parameters
+    (`sitl.vehicle.params`).
+    """
 
-    mass_factor: float = 1.0
-    """Of mass and inertia."""
-    thrust_factor: float = 1.0
-    """Of full thrust: battery, propellers, air."""
-    drag_factor: float = 1.0
-    """Of rotor and body drag."""
-    wind_ned_mps: Vec3 = (0.0, 0.0, 0.0)
-    """Where the air moves to, in the mean."""
-    gust_rms_mps: float = 0.0
-    """Per axis; half of it in the vertical."""
+    seed: int = 0  # of gusts, sensor noise and image noise
+
+    mass_factor: float = 1.0  # scales mass and inertia
+    thrust_factor: float = 1.0  # scales full thrust: battery, propellers, air
+    drag_factor: float = 1.0  # scales rotor and body drag
+    wind_ned_mps: Vec3 = (0.0, 0.0, 0.0)  # mean velocity of the air
+    gust_rms_mps: float = 0.0  # per horizontal axis; the vertical gust is half as strong
     gust_time_s: float = 1.5
 
     angle_max_cdeg: float = 3000.0
-    """ANGLE_MAX; from here to ``lean_accel_max_cdegps2`` parameters that the vehicle boots with."""
     pilot_yaw_rate_degps: float = 202.5
-    """PILOT_Y_RATE."""
     pilot_yaw_expo: float = 0.0
-    """PILOT_Y_EXPO."""
     pilot_speed_up_cmps: float = 250.0
-    """PILOT_SPEED_UP."""
-    pilot_speed_down_cmps: float = 0.0
-    """PILOT_SPEED_DN; 0: as up."""
+    pilot_speed_down_cmps: float = 0.0  # 0: as up
     pilot_accel_z_cmps2: float = 250.0
-    """PILOT_ACCEL_Z."""
-    throttle_dead_zone_permille: float = 100.0
-    """THR_DZ: of the stick's travel, each side of the middle."""
-    rc_dead_zones_us: tuple[float, float, float, float] = (20.0, 20.0, 30.0, 20.0)
-    """RCn_DZ of channels 1 to 4: roll, pitch, throttle, yaw."""
-    input_time_s: float = 0.15
-    """ATC_INPUT_TC: how fast the target lean follows the stick."""
-    angle_gains_per_s: Vec3 = (6.0, 6.0, 3.0)
-    """ATC_ANG_RLL_P, ATC_ANG_PIT_P, ATC_ANG_YAW_P."""
-    lean_rate_max_degps: float = 220.0
-    """ATC_RATE_R_MAX, ATC_RATE_P_MAX."""
-    lean_accel_max_cdegps2: float = 110_000.0
-    """ATC_ACCEL_R_MAX, ATC_ACCEL_P_MAX."""
+    throttle_dead_zone_permille: float = 100.0  # of the stick, on each side of the middle
+    rc_dead_zones_us: tuple[float, ...] = (20.0, 20.0, 30.0, 20.0)  # roll, pitch, throttle, yaw
+    input_time_s: float = 0.15  # time constant of the target lean behind the stick
+    angle_gains_per_s: Vec3 = (6.0, 6.0, 3.0)  # roll, pitch, yaw
+    lean_rate_max_degps: float = 220.0  # 0: no limit
+    lean_accel_max_cdegps2: float = 110_000.0  # 0: no limit
 
-    stream_slowdown_ms: int = 0
-    """Added to every message interval, as ArduPilot does where its radio reports a full buffer."""
-    stream_jitter_ms: float = 0.0
-    """Most by which a message is late, at random."""
-    stream_phase_spread: float = 0.0
-    """Most of its interval by which a stream begins earlier, at random; at most 1."""
+    stream_slowdown_ms: int = 0  # added to every interval, as for a full radio buffer
+    stream_jitter_ms: float = 0.0  # largest random delay of a message
+    stream_phase_spread: float = 0.0  # largest share of its interval that a stream begins early
 
-    velocity_noise_mps: float = 0.0
-    """Standard deviations per sample of the vehicle's sensors, per axis."""
+    velocity_noise_mps: float = 0.0  # standard deviation per sample and axis, as the next two
     rate_noise_radps: float = 0.0
     specific_force_noise_mps2: float = 0.0
 
-    camera_tilt_rad: float = math.radians(10.0)
-    """Upwards; as on racing quadrotors, which fly nose down."""
-    camera_roll_rad: float = 0.0
-    """About the optical axis, right side down."""
-    camera_yaw_rad: float = 0.0
-    """To the right."""
-    camera_offset_body_m: Vec3 = (0.0, 0.0, 0.0)
-    """FRD."""
+    camera_tilt_rad: float = math.radians(10.0)  # upwards; racing quadrotors fly nose down
+    camera_roll_rad: float = 0.0  # about the optical axis, right side down
+    camera_yaw_rad: float = 0.0  # to the right
+    camera_offset_body_m: Vec3 = (0.0, 0.0, 0.0)  # position of the camera in FRD body axes
     horizontal_fov_rad: float = math.radians(90.0)
 
-    gate_rgb: tuple[Rgb, Rgb] = ((255, 126, 22), (222, 34, 48))
-    """Fronts: orange for gates 0, 2, ..., red for gates 1, 3, ..."""
-    ground_tint: Vec3 = (1.0, 1.0, 1.0)
-    """Factors on red, green, blue."""
-    sky_tint: Vec3 = (1.0, 1.0, 1.0)
-    """Of sky, haze and far ground."""
-    ground_seed: int = 0
-    """Of the pattern of grass and soil."""
-    sun_ned: Vec3 = (-0.45, 0.35, -0.82)
-    """Direction to the sun, unit length."""
-    ambient: float = 0.78
-    """Brightness of a surface turned away from the sun."""
+    gate_rgb: tuple[Rgb, Rgb] = ((255, 126, 22), (222, 34, 48))  # even gates, odd gates
+    ground_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green and blue, as the next
+    sky_tint: Vec3 = (1.0, 1.0, 1.0)  # also tints haze and far ground
+    ground_seed: int = 0  # seed of the pattern of grass and soil
+    sun_ned: Vec3 = (-0.45, 0.35, -0.82)  # direction to the sun, unit length
+    ambient: float = 0.78  # brightness of a surface turned away from the sun
 
-    exposure: float = 1.0
-    """Factor on all colours, before they saturate."""
+    exposure: float = 1.0  # factor on all colours, before they saturate
     white_balance: Vec3 = (1.0, 1.0, 1.0)
-    blur_px: float = 0.0
-    """Standard deviation, in pixels of a 224 pixel wide image."""
-    image_noise: float = 0.0
-    """Standard deviation per pixel and channel, of 255."""
+    blur_px: float = 0.0  # standard deviation, in pixels of a 224 pixel wide image
+    image_noise: float = 0.0  # standard deviation per channel, in levels of 0..255
 
     def numbers(self) -> dict[str, float]:
-        """Every number by name, ``name_k`` for those of a vector: for a flight's ``meta.json``."""
-        return dict(_flat(asdict(self)))
+        """Every number by name, for ``meta.json``; ``name_k`` is entry k of a vector."""
+        flat: dict[str, float] = {}
+        for name, value in asdict(self).items():
+            for index, number in np.ndenumerate(value):
+                flat["_".join((name, *map(str, index)))] = float(number)
+        return flat
 
 
 NOMINAL = Conditions()
 
 
 def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
-    """The conditions of this seed: the same on every machine; ``strength`` 0 is nominal but for it.
+    """Draw the conditions of this seed: the same on every machine.
+
+    A ``strength`` of 0 gives the nominal conditions with this seed, 1 the usual spread.
 
     Raises:
         UsageError: a negative seed, or a strength outside [0, 2].
     """
     if seed < 0:
-        raise UsageError(f"a conditions seed is a non-negative integer, got {seed}")
+        raise UsageError(f"a conditions seed is 0 or more, got {seed}")
     if not 0.0 <= strength <= 2.0:
         raise UsageError(f"the strength of conditions lies within 0..2, got {strength}")
-    if strength == 0.0:
-        return replace(NOMINAL, seed=seed)
-    draw = _Draw(np.random.Generator(np.random.PCG64(seed)), strength)
     conditions = replace(NOMINAL, seed=seed)
-    for part in (_vehicle, _air_and_sensors, _lens, _scene, _image, _firmware, _streams):
-        conditions = part(conditions, draw)
+    if strength > 0.0:
+        draw = _Draw(np.random.Generator(np.random.PCG64(seed)), strength)
+        # The order is part of the seed's meaning.
+        for vary in (_vary_physics, _vary_lens, _vary_scene, _vary_firmware, _vary_streams):
+            conditions = vary(conditions, draw)
     return conditions
 
 
 class _Draw:
-    """Uniform draws around a nominal value, as wide as the strength makes them."""
+    """Uniform draws around a nominal value; the strength scales their width."""
 
     def __init__(self, random: np.random.Generator, strength: float) -> None:
         self.random = random
@@ -151,33 +125,41 @@ class _Draw:
         """Within 0 .. most."""
         return self.strength * float(self.random.uniform(0.0, most))
 
-    def dead_zone_us(self) -> float:
-        """Within 0 .. 30: RCn_DZ's nominal values spread over all that is usual."""
-        return float(round(self.amount(30.0)))
-
     def tint(self, most: float) -> Vec3:
-        """A factor for each colour."""
+        """A factor for each of red, green and blue."""
         return (self.factor(most), self.factor(most), self.factor(most))
 
+    def angle_rad(self) -> float:
+        """Any direction, whatever the strength."""
+        return float(self.random.uniform(-math.pi, math.pi))
 
-def _vehicle(nominal: Conditions, draw: _Draw) -> Conditions:
-    return replace(
+    def dead_zone_us(self) -> float:
+        """Within 0 .. 30, which covers what is usual for RCn_DZ."""
+        return float(round(self.amount(30.0)))
+
+    def shade(self, rgb: Rgb) -> Rgb:
+        """A similar colour: hue within 20 degrees, paler or darker."""
+        hue, saturation, value = colorsys.rgb_to_hsv(*(part / 255 for part in rgb))
+        red, green, blue = colorsys.hsv_to_rgb(
+            (hue + self.offset(20.0) / 360.0) % 1.0,
+            max(0.3, saturation - self.amount(0.35)),
+            max(0.3, value - self.amount(0.3)),
+        )
+        return (round(255 * red), round(255 * green), round(255 * blue))
+
+
+def _vary_physics(nominal: Conditions, draw: _Draw) -> Conditions:
+    body = replace(
         nominal,
         mass_factor=draw.factor(1.12),
         thrust_factor=draw.factor(1.1),
         drag_factor=draw.factor(1.5),
     )
-
-
-def _air_and_sensors(nominal: Conditions, draw: _Draw) -> Conditions:
-    wind_mps, towards_rad = draw.amount(4.0), float(draw.random.uniform(-math.pi, math.pi))
+    wind_mps, towards_rad = draw.amount(4.0), draw.angle_rad()
+    north_mps, east_mps = wind_mps * math.cos(towards_rad), wind_mps * math.sin(towards_rad)
     return replace(
-        nominal,
-        wind_ned_mps=(
-            wind_mps * math.cos(towards_rad),
-            wind_mps * math.sin(towards_rad),
-            draw.offset(0.3),
-        ),
+        body,
+        wind_ned_mps=(north_mps, east_mps, draw.offset(0.3)),
         gust_rms_mps=draw.amount(1.2),
         gust_time_s=1.5 * draw.factor(2.0),
         velocity_noise_mps=draw.amount(0.05),
@@ -186,7 +168,7 @@ def _air_and_sensors(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _lens(nominal: Conditions, draw: _Draw) -> Conditions:
+def _vary_lens(nominal: Conditions, draw: _Draw) -> Conditions:
     return replace(
         nominal,
         camera_tilt_rad=nominal.camera_tilt_rad + draw.offset(math.radians(4.0)),
@@ -197,15 +179,15 @@ def _lens(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _scene(nominal: Conditions, draw: _Draw) -> Conditions:
-    azimuth_rad = float(draw.random.uniform(-math.pi, math.pi))
+def _vary_scene(nominal: Conditions, draw: _Draw) -> Conditions:
+    azimuth_rad = draw.angle_rad()
     elevation_rad = math.radians(float(draw.random.uniform(15.0, 80.0)))
     first, second = nominal.gate_rgb
     return replace(
         nominal,
-        gate_rgb=(_repainted(first, draw), _repainted(second, draw)),
-        ground_tint=_lit(draw.tint(1.25), draw.factor(1.3)),
-        sky_tint=_lit(draw.tint(1.1), draw.factor(1.15)),
+        gate_rgb=(draw.shade(first), draw.shade(second)),
+        ground_tint=_scaled(draw.tint(1.25), draw.factor(1.3)),
+        sky_tint=_scaled(draw.tint(1.1), draw.factor(1.15)),
         ground_seed=int(draw.random.integers(1 << 16)),
         sun_ned=(
             math.cos(elevation_rad) * math.cos(azimuth_rad),
@@ -213,12 +195,6 @@ def _scene(nominal: Conditions, draw: _Draw) -> Conditions:
             -math.sin(elevation_rad),
         ),
         ambient=min(0.95, max(0.4, nominal.ambient + draw.offset(0.15))),
-    )
-
-
-def _image(nominal: Conditions, draw: _Draw) -> Conditions:
-    return replace(
-        nominal,
         exposure=draw.factor(1.3),
         white_balance=draw.tint(1.08),
         blur_px=draw.amount(0.9),
@@ -226,38 +202,33 @@ def _image(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _firmware(nominal: Conditions, draw: _Draw) -> Conditions:
+def _vary_firmware(nominal: Conditions, draw: _Draw) -> Conditions:
     """Whole numbers where the firmware stores integers, three decimals where it stores floats."""
-    gain = draw.factor(1.35)
+    lean_gain_factor = draw.factor(1.35)
+    roll_gain, pitch_gain, yaw_gain = nominal.angle_gains_per_s
     return replace(
         nominal,
         angle_max_cdeg=round(nominal.angle_max_cdeg + draw.amount(1500.0)),
         pilot_yaw_rate_degps=round(nominal.pilot_yaw_rate_degps * draw.factor(1.4), 3),
         pilot_yaw_expo=round(min(0.6, draw.amount(0.3)), 3),
         pilot_speed_up_cmps=round(nominal.pilot_speed_up_cmps * draw.factor(1.4)),
-        # Nominal is the same as up.
         pilot_speed_down_cmps=round(nominal.pilot_speed_up_cmps * draw.factor(1.4)),
         pilot_accel_z_cmps2=round(nominal.pilot_accel_z_cmps2 * draw.factor(1.4)),
         throttle_dead_zone_permille=round(nominal.throttle_dead_zone_permille * draw.factor(1.4)),
-        rc_dead_zones_us=(
-            draw.dead_zone_us(),
-            draw.dead_zone_us(),
-            draw.dead_zone_us(),
-            draw.dead_zone_us(),
-        ),
+        rc_dead_zones_us=tuple(draw.dead_zone_us() for _ in nominal.rc_dead_zones_us),
         input_time_s=round(nominal.input_time_s * draw.factor(1.6), 3),
         angle_gains_per_s=(
-            round(nominal.angle_gains_per_s[0] * gain, 3),
-            round(nominal.angle_gains_per_s[1] * gain, 3),
-            round(nominal.angle_gains_per_s[2] * draw.factor(1.35), 3),
+            round(roll_gain * lean_gain_factor, 3),
+            round(pitch_gain * lean_gain_factor, 3),
+            round(yaw_gain * draw.factor(1.35), 3),
         ),
         lean_rate_max_degps=round(nominal.lean_rate_max_degps * draw.factor(1.4)),
         lean_accel_max_cdegps2=round(nominal.lean_accel_max_cdegps2 * draw.factor(1.4)),
     )
 
 
-def _streams(nominal: Conditions, draw: _Draw) -> Conditions:
-    """Half of the links are fast enough for all that is asked of them."""
+def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
+    """Half of the links are fast enough to send every message at the requested rate."""
     is_slow = draw.random.random() < 0.5
     slowdown_ms = round(draw.amount(23.0))
     return replace(
@@ -268,25 +239,6 @@ def _streams(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _repainted(rgb: Rgb, draw: _Draw) -> Rgb:
-    """Another shade: hue within 20 degrees, paler or darker."""
-    hue, saturation, value = colorsys.rgb_to_hsv(*(part / 255 for part in rgb))
-    red, green, blue = colorsys.hsv_to_rgb(
-        (hue + draw.offset(20.0) / 360.0) % 1.0,
-        max(0.3, saturation - draw.amount(0.35)),
-        max(0.3, value - draw.amount(0.3)),
-    )
-    return (round(255 * red), round(255 * green), round(255 * blue))
-
-
-def _lit(tint: Vec3, light: float) -> Vec3:
+def _scaled(tint: Vec3, brightness: float) -> Vec3:
     red, green, blue = tint
-    return (light * red, light * green, light * blue)
-
-
-def _flat(values: dict[str, object], prefix: str = "") -> Iterator[tuple[str, float]]:
-    for name, value in values.items():
-        if isinstance(value, tuple):
-            yield from _flat({str(k): part for k, part in enumerate(value)}, f"{prefix}{name}_")
-        elif isinstance(value, (int, float)):
-            yield prefix + name, float(value)
+    return (brightness * red, brightness * green, brightness * blue)

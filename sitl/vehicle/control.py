@@ -1,4 +1,4 @@
-"""The inner loops: attitude to angular acceleration, height to thrust, both to motors."""
+"""Inner loops: attitude to angular acceleration, height to thrust, both to motors."""
 
 import math
 
@@ -27,8 +27,7 @@ RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
 MIN_INPUT_TIME_S = 0.01
 MAX_TARGET_LEAD_RAD = math.radians(30.0)
 """In rate mode the target may run ahead of the vehicle by this much before it is pulled back."""
-SPIN_MIN = 0.05
-"""Lowest thrust of an armed, flying motor."""
+SPIN_MIN = 0.05  # lowest thrust of an armed, flying motor
 _ANGLE_GAINS = ("ATC_ANG_RLL_P", "ATC_ANG_PIT_P", "ATC_ANG_YAW_P")
 
 
@@ -47,7 +46,7 @@ class AttitudeController:
         self._roll_rate = self._pitch_rate = 0.0
 
     def reset(self, body: BodyState) -> None:
-        """Take the present attitude as the target: on the ground, and at each mode change."""
+        """Make the present attitude the target: on the ground, and at each mode change."""
         self._target = body.ned_from_body_wxyz
         self._roll, self._pitch, self._yaw = to_euler(body.ned_from_body_wxyz)
         self._roll_rate = self._pitch_rate = 0.0
@@ -81,16 +80,11 @@ class AttitudeController:
 
     def _track(self, body: BodyState, feedforward_radps: Vec3) -> Vec3:
         error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), self._target))
+        gains = [self._params[name] for name in _ANGLE_GAINS]
         ax, ay, az = (
-            rate_gain * (feedforward + angle_gain * angle - rate)
-            for rate_gain, angle_gain, feedforward, angle, rate in zip(
-                RATE_GAIN_PER_S,
-                [self._params[name] for name in _ANGLE_GAINS],
-                feedforward_radps,
-                error,
-                body.rate_body_radps,
-                strict=True,
-            )
+            RATE_GAIN_PER_S[k]
+            * (feedforward_radps[k] + gains[k] * error[k] - body.rate_body_radps[k])
+            for k in range(3)
         )
         return (ax, ay, az)
 
@@ -103,7 +97,7 @@ class AttitudeController:
         return rate_radps + clamp(wanted - rate_radps, max_accel_radps2 * dt_s)
 
     def _limit(self, name: str) -> float:
-        """0 means that there is none."""
+        """The parameter; infinite where it is 0."""
         limit = self._params[name]
         return limit if limit > 0.0 else math.inf
 

@@ -1,8 +1,8 @@
 """A 1.2 kg quadrotor as a MuJoCo free body: motors with lag, rotor drag, air drag, a ground to hit.
 
 MuJoCo works in north-west-up with a forward-left-up body; everything outside this module is NED and
-FRD. The two differ by a half turn about x on both sides, so vectors flip y and z, and the vector
-part of the quaternion does the same: ``_flip`` is the only conversion there is.
+FRD. Both differ by a half turn about x, so vectors and the vector part of quaternions flip y and z:
+``_flip`` is the only conversion.
 """
 
 from collections.abc import Sequence
@@ -19,8 +19,7 @@ from sitl.vehicle.conditions import NOMINAL, Conditions
 GRAVITY_MPS2 = 9.80665
 MASS_KG = 1.2
 INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
-MOTOR_ARM_M = 0.12
-"""Motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase."""
+MOTOR_ARM_M = 0.12  # motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase
 MAX_MOTOR_THRUST_N = 7.54
 """Hover at 0.39 of full thrust, which is ArduCopter's learned-hover order of magnitude."""
 YAW_TORQUE_PER_THRUST_M = 0.016
@@ -33,13 +32,12 @@ REST_HEIGHT_M = 0.06
 
 PHYSICS_STEP_NS = 1_250_000
 
-_BODY = 1
-"""After the world."""
+_BODY = 1  # after the world
 _FULL_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 def _model_xml(conditions: Conditions) -> str:
-    """The model, compiled anew for other masses: MuJoCo derives more from them than it shows.
+    """MuJoCo model of these conditions, to compile: it derives hidden values from masses.
 
     Motor order and directions are ArduCopter's quad X: front right and rear left turn anticlockwise
     seen from above, so they push the nose to the right.
@@ -91,17 +89,14 @@ class BodyState(NamedTuple):
     ned_from_body_wxyz: Quat
     velocity_ned_mps: Vec3
     rate_body_radps: Vec3
-    specific_force_body_mps2: Vec3
-    """What an accelerometer reads: (0, 0, -9.8) at rest."""
-    motors: tuple[float, ...]
-    """Thrust of each motor as a fraction of full, in ArduCopter's quad X order."""
-    touching: bool
-    """Some part of the frame is on the ground."""
+    specific_force_body_mps2: Vec3  # what an accelerometer reads: (0, 0, -9.8) at rest
+    motors: tuple[float, ...]  # thrust over full thrust, in ArduCopter's quad X order
+    touching: bool  # some part of the frame is on the ground
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhysicsState:
-    """All that MuJoCo needs to continue, and the same instant in the terms of the rest of us."""
+    """Full state of MuJoCo, and the same instant in NED and FRD."""
 
     integration: NDArray[np.float64]
     body: BodyState
@@ -113,7 +108,7 @@ def _flip(v: Sequence[float]) -> Vec3:
 
 
 class Quadrotor:
-    """The model; its MuJoCo data is scratch space, all state is in the argument and the result."""
+    """The physical model, without state: MuJoCo's data is only scratch space."""
 
     def __init__(self, conditions: Conditions = NOMINAL) -> None:
         self._model = mujoco.MjModel.from_xml_string(_model_xml(conditions))
@@ -139,9 +134,8 @@ class Quadrotor:
         self._data.qpos[:] = (*_flip(position_ned_m), w, *_flip(vector))
         self._data.qvel[:3] = _flip(velocity_ned_mps)
         tilt = max(0.5, cos_tilt(ned_from_body_wxyz))
-        self._data.act[:] = min(
-            1.0, self._mass_kg * GRAVITY_MPS2 / (4.0 * self._max_motor_thrust_n * tilt)
-        )
+        hover = self._mass_kg * GRAVITY_MPS2 / (4.0 * self._max_motor_thrust_n * tilt)
+        self._data.act[:] = min(1.0, hover)
         mujoco.mj_forward(self._model, self._data)
         return self._capture()
 

@@ -1,11 +1,10 @@
-"""When the pilot's sticks or the ground station count as lost; what follows is not decided here."""
+"""Detects the loss of the pilot's sticks or of the ground station; the autopilot acts on it."""
 
 from sitl.clock import NS_PER_S
 from sitl.vehicle.params import Params
 
 LOW_READS_TO_FAIL = 3
-GCS_CHECK_PERIOD_NS = NS_PER_S // 3
-"""ArduCopter looks at the ground station in its 3 Hz loop."""
+GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter looks at the ground station in its 3 Hz loop
 
 
 class RadioFailsafe:
@@ -17,24 +16,20 @@ class RadioFailsafe:
         self._low_reads = 0
         self.active = False
 
-    def update(
-        self, *, new_input: bool, throttle_us: int, has_receiver: bool, armed: bool, now_ns: int
-    ) -> bool:
-        """Account for one RC update; True if ``active`` has changed."""
+    def update(self, *, new_input: bool, throttle_us: int, can_fail: bool, now_ns: int) -> bool:
+        """Check after one RC update; True if ``active`` has changed."""
         was_active = self.active
         if not self._params["FS_THR_ENABLE"]:
             self._last_input_ns, self._low_reads, self.active = now_ns, 0, False
         elif new_input:
             self._last_input_ns = now_ns
-            self._judge_throttle(throttle_us, can_fail=has_receiver or armed)
-        elif (has_receiver or armed) and now_ns - self._last_input_ns >= self._timeout_ns():
-            self.active = True
+            self._check_throttle(throttle_us, can_fail=can_fail)
+        elif can_fail:
+            timeout_ns = int(max(0.1, self._params["RC_FS_TIMEOUT"]) * NS_PER_S)
+            self.active = self.active or now_ns - self._last_input_ns >= timeout_ns
         return self.active != was_active
 
-    def _timeout_ns(self) -> int:
-        return int(max(0.1, self._params["RC_FS_TIMEOUT"]) * NS_PER_S)
-
-    def _judge_throttle(self, throttle_us: int, *, can_fail: bool) -> None:
+    def _check_throttle(self, throttle_us: int, *, can_fail: bool) -> None:
         if throttle_us < self._params["FS_THR_VALUE"]:
             self._low_reads = min(LOW_READS_TO_FAIL, self._low_reads + can_fail)
             self.active = self.active or self._low_reads == LOW_READS_TO_FAIL
@@ -52,8 +47,8 @@ class GcsFailsafe:
         self._due_ns = 0
         self.active = False
 
-    def seen(self, now_ns: int) -> None:
-        """A heartbeat, override or manual control of MAV_GCS_SYSID has come in."""
+    def on_contact(self, now_ns: int) -> None:
+        """Record a heartbeat, override or manual control of the ground station."""
         self._last_contact_ns = now_ns
 
     def update(self, now_ns: int) -> bool:

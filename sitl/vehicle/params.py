@@ -1,96 +1,82 @@
-"""The parameters that the vehicle really reads, with ArduCopter 4.7's names and SITL defaults.
+"""Parameters that the simulated firmware reads, with ArduCopter 4.7's names and SITL defaults.
 
 Values are float32, as on the wire (PARAM_VALUE carries REAL32). Those that differ from one vehicle
-to the next come from its conditions; there the attitude gains and rate limits are this vehicle's
-own tuning, not the firmware's defaults.
+to the next come from its conditions; their nominal attitude gains and rate limits are this
+vehicle's own tuning, not the firmware's defaults.
 """
 
 import math
 import struct
-from collections.abc import Iterator
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
 RC_CHANNELS_WITH_PARAMS = 8
 
-_VEHICLE: tuple[tuple[str, float], ...] = (
-    ("ACRO_BAL_PITCH", 1.0),
-    ("ACRO_BAL_ROLL", 1.0),
-    ("ACRO_RP_EXPO", 0.3),
-    ("ACRO_RP_RATE", 360.0),  # deg/s
-    ("ACRO_TRAINER", 2.0),  # 0 none, 1 levels itself, 2 also limits the lean
-    ("ACRO_Y_RATE", 202.5),  # deg/s
-    ("DISARM_DELAY", 10.0),  # s
-    ("FS_GCS_ENABLE", 0.0),
-    ("FS_GCS_TIMEOUT", 5.0),  # s
-    ("FS_OPTIONS", 16.0),  # bit 4: carry on under pilot control when the GCS is lost
-    ("FS_THR_ENABLE", 1.0),  # 0 off, 1 RTL, 3 LAND
-    ("FS_THR_VALUE", 975.0),  # us
-    ("LAND_SPEED", 50.0),  # cm/s
-    ("MAV_GCS_SYSID", 255.0),
-    ("MAV_GCS_SYSID_HI", 0.0),
-    ("MAV_OPTIONS", 0.0),  # bit 0: listen to the GCS alone
-    ("MAV_SYSID", 1.0),
-    ("MOT_THST_HOVER", 0.39),
-    ("RCMAP_PITCH", 2.0),
-    ("RCMAP_ROLL", 1.0),
-    ("RCMAP_THROTTLE", 3.0),
-    ("RCMAP_YAW", 4.0),
-    ("RC_FS_TIMEOUT", 1.0),  # s
-    ("RC_OPTIONS", 32.0),  # bit 0 ignore receiver, 1 ignore overrides, 6 no neutral-stick check
-    ("RC_OVERRIDE_TIME", 3.0),  # s; 0 refuses overrides, < 0 never expires
-    ("RTL_ALT", 1500.0),  # cm
-    ("SCHED_LOOP_RATE", 400.0),  # Hz; bounds the message rates
-)
-_RC_DEFAULTS: tuple[tuple[str, float], ...] = (
-    ("MAX", 2000.0),
-    ("MIN", 1000.0),
-    ("OPTION", 0.0),
-    ("REVERSED", 0.0),
-    ("TRIM", 1500.0),
-)
+_FIXED = {
+    "ACRO_BAL_PITCH": 1.0,
+    "ACRO_BAL_ROLL": 1.0,
+    "ACRO_RP_EXPO": 0.3,
+    "ACRO_RP_RATE": 360.0,  # deg/s
+    "ACRO_TRAINER": 2.0,  # 0 none, 1 levels itself, 2 also limits the lean
+    "ACRO_Y_RATE": 202.5,  # deg/s
+    "DISARM_DELAY": 10.0,  # s
+    "FS_GCS_ENABLE": 0.0,
+    "FS_GCS_TIMEOUT": 5.0,  # s
+    "FS_OPTIONS": 16.0,  # bit 4: carry on under pilot control when the GCS is lost
+    "FS_THR_ENABLE": 1.0,  # 0 off, 1 RTL, 3 LAND
+    "FS_THR_VALUE": 975.0,  # us
+    "LAND_SPEED": 50.0,  # cm/s
+    "MAV_GCS_SYSID": 255.0,
+    "MAV_GCS_SYSID_HI": 0.0,
+    "MAV_OPTIONS": 0.0,  # bit 0: listen to the GCS alone
+    "MAV_SYSID": 1.0,
+    "MOT_THST_HOVER": 0.39,
+    "RCMAP_PITCH": 2.0,
+    "RCMAP_ROLL": 1.0,
+    "RCMAP_THROTTLE": 3.0,
+    "RCMAP_YAW": 4.0,
+    "RC_FS_TIMEOUT": 1.0,  # s
+    "RC_OPTIONS": 32.0,  # bit 0 ignore receiver, 1 ignore overrides, 6 no neutral-stick check
+    "RC_OVERRIDE_TIME": 3.0,  # s; 0 refuses overrides, < 0 never expires
+    "RTL_ALT": 1500.0,  # cm
+    "SCHED_LOOP_RATE": 400.0,  # Hz; bounds the message rates
+}
+_RC_CHANNEL = {"MAX": 2000.0, "MIN": 1000.0, "OPTION": 0.0, "REVERSED": 0.0, "TRIM": 1500.0}
 
 
-def _float32(value: float) -> float:
-    """The value that survives the wire."""
-    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
-    return float(rounded)
-
-
-def _at_boot(conditions: Conditions) -> Iterator[tuple[str, float]]:
-    yield from _VEHICLE
-    yield from _varied(conditions)
-    for channel in range(1, RC_CHANNELS_WITH_PARAMS + 1):
-        for suffix, value in _RC_DEFAULTS:
-            yield f"RC{channel}_{suffix}", value
-        flown = channel <= len(conditions.rc_dead_zones_us)
-        yield f"RC{channel}_DZ", conditions.rc_dead_zones_us[channel - 1] if flown else 0.0  # us
-
-
-def _varied(conditions: Conditions) -> Iterator[tuple[str, float]]:
+def _varied(conditions: Conditions) -> dict[str, float]:
     roll_gain, pitch_gain, yaw_gain = conditions.angle_gains_per_s
-    yield "ANGLE_MAX", conditions.angle_max_cdeg
-    yield "ATC_ACCEL_P_MAX", conditions.lean_accel_max_cdegps2  # 0: no limit
-    yield "ATC_ACCEL_R_MAX", conditions.lean_accel_max_cdegps2
-    yield "ATC_ANG_PIT_P", pitch_gain  # 1/s
-    yield "ATC_ANG_RLL_P", roll_gain
-    yield "ATC_ANG_YAW_P", yaw_gain
-    yield "ATC_INPUT_TC", conditions.input_time_s  # s
-    yield "ATC_RATE_P_MAX", conditions.lean_rate_max_degps  # deg/s; 0: no limit
-    yield "ATC_RATE_R_MAX", conditions.lean_rate_max_degps
-    yield "PILOT_ACCEL_Z", conditions.pilot_accel_z_cmps2
-    yield "PILOT_SPEED_DN", conditions.pilot_speed_down_cmps  # 0: as up
-    yield "PILOT_SPEED_UP", conditions.pilot_speed_up_cmps
-    yield "PILOT_Y_EXPO", conditions.pilot_yaw_expo
-    yield "PILOT_Y_RATE", conditions.pilot_yaw_rate_degps
-    yield "THR_DZ", conditions.throttle_dead_zone_permille  # of the stick, each side of the middle
+    return {
+        "ANGLE_MAX": conditions.angle_max_cdeg,
+        "ATC_ACCEL_P_MAX": conditions.lean_accel_max_cdegps2,  # 0: no limit
+        "ATC_ACCEL_R_MAX": conditions.lean_accel_max_cdegps2,
+        "ATC_ANG_PIT_P": pitch_gain,  # 1/s
+        "ATC_ANG_RLL_P": roll_gain,
+        "ATC_ANG_YAW_P": yaw_gain,
+        "ATC_INPUT_TC": conditions.input_time_s,  # s
+        "ATC_RATE_P_MAX": conditions.lean_rate_max_degps,  # deg/s; 0: no limit
+        "ATC_RATE_R_MAX": conditions.lean_rate_max_degps,
+        "PILOT_ACCEL_Z": conditions.pilot_accel_z_cmps2,
+        "PILOT_SPEED_DN": conditions.pilot_speed_down_cmps,  # 0: as up
+        "PILOT_SPEED_UP": conditions.pilot_speed_up_cmps,
+        "PILOT_Y_EXPO": conditions.pilot_yaw_expo,
+        "PILOT_Y_RATE": conditions.pilot_yaw_rate_degps,
+        "THR_DZ": conditions.throttle_dead_zone_permille,  # of the stick, each side of the middle
+    }
 
 
 class Params:
     """Named numbers in a fixed, sorted order (the order is PARAM_VALUE's index)."""
 
     def __init__(self, conditions: Conditions = NOMINAL) -> None:
-        self._values = {name: _float32(value) for name, value in sorted(_at_boot(conditions))}
+        values = _FIXED | _varied(conditions)
+        for index in range(RC_CHANNELS_WITH_PARAMS):
+            values |= {f"RC{index + 1}_{name}": value for name, value in _RC_CHANNEL.items()}
+            dead_zones_us = conditions.rc_dead_zones_us
+            values[f"RC{index + 1}_DZ"] = (
+                dead_zones_us[index] if index < len(dead_zones_us) else 0.0
+            )
+        self._values = {name: _float32(values[name]) for name in sorted(values)}
         self.names: tuple[str, ...] = tuple(self._values)
 
     def __getitem__(self, name: str) -> float:
@@ -103,15 +89,15 @@ class Params:
         return len(self._values)
 
     def integer(self, name: str) -> int:
-        """An enumeration or bit mask."""
+        """The value of an enumeration or bit mask."""
         return int(self._values[name])
 
     def decimal(self, name: str) -> float:
-        """The short decimal that was meant: float32 carries seven digits."""
+        """The value rounded to the seven digits that float32 carries: 0.15, not 0.1500000059."""
         return float(f"{self._values[name]:.7g}")
 
     def set(self, name: str, value: float) -> bool:
-        """Store the value; False for an unknown name or a value that is not a number."""
+        """Store the value; False for an unknown name or a value that is not a float32 number."""
         if name not in self._values or not math.isfinite(value):
             return False
         try:
@@ -119,3 +105,9 @@ class Params:
         except OverflowError:
             return False
         return True
+
+
+def _float32(value: float) -> float:
+    """Round as the wire does; raises OverflowError beyond its range."""
+    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
+    return float(rounded)

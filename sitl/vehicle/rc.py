@@ -1,4 +1,4 @@
-"""Whose sticks the vehicle acts on: the receiver's, or overrides that came over MAVLink.
+"""Merges the sticks of the RC receiver with overrides that came over MAVLink.
 
 Channel rules, timers and their quirks are ArduCopter 4.7's as measured on the firmware: per-channel
 expiry after RC_OVERRIDE_TIME, no range check, sticks that stay latched where no receiver exists.
@@ -10,17 +10,13 @@ from sitl.clock import NS_PER_S
 from sitl.vehicle.params import RC_CHANNELS_WITH_PARAMS, Params
 
 CHANNELS = 16
-PRIMARY_CHANNELS = 8
-"""Channels 1-8 and 9-16 differ in what 0 and the highest values mean."""
+PRIMARY_CHANNELS = 8  # channels 1-8 and 9-16 differ in what 0 and the highest values mean
 IGNORE = 65535
-RELEASE_ON_AUX = 65534
-"""Releases channels 9-16; on 1-8 it is a value like any other."""
-RELEASE = 0
-"""Releases channels 1-8; on 9-16 it means "ignore"."""
-AXIS_ABSENT = 32767
-"""MANUAL_CONTROL axis that the sender does not drive."""
+RELEASE_ON_AUX = 65534  # releases channels 9-16; on 1-8 it is a value like any other
+RELEASE = 0  # releases channels 1-8; on 9-16 it means "ignore"
+AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
 IDLE_RECEIVER_US = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
-"""A transmitter that lies on the table: throttle down, the rest centred."""
+"""An untouched transmitter: throttle down, the rest centred."""
 
 _RECEIVER_PERIOD_NS = NS_PER_S // 50
 _OPTION_OVERRIDE_SWITCH = 46
@@ -40,12 +36,12 @@ class RcEngine:
         self._next_receiver_ns = 0
         self._switch = _OverrideSwitch()
         self.channels_us = [0] * CHANNELS
-        """What RC_CHANNELS shows and the modes act on; 0 = never had a value."""
+        """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
         self.found = receiver_us is not None
-        """There is a receiver, or an override has come."""
+        """Whether there is a receiver, or an override has come."""
 
     def override(self, raw_us: Sequence[int], now_ns: int) -> None:
-        """Take the 18 fields of one RC_CHANNELS_OVERRIDE."""
+        """Apply the 18 fields of one RC_CHANNELS_OVERRIDE."""
         for index, value in enumerate(raw_us[:CHANNELS]):
             if index < PRIMARY_CHANNELS:
                 if value != IGNORE:
@@ -56,18 +52,21 @@ class RcEngine:
                 self._set(index, value, now_ns)
 
     def manual_control(self, *, x: int, y: int, z: int, r: int, now_ns: int) -> None:
-        """Take a MANUAL_CONTROL: -1000..1000 (z 0..1000); +x is forward, hence a lower PWM."""
+        """Apply a MANUAL_CONTROL: -1000..1000 (z 0..1000); +x is forward, hence a lower PWM."""
         if z < 0:
             return
-        axes = (("ROLL", y, 1), ("PITCH", x, -1), ("YAW", r, 1))
-        for axis, value, sign in axes:
+        axes = (
+            ("ROLL", y, y + 1000, 2000),
+            ("PITCH", x, 1000 - x, 2000),
+            ("YAW", r, r + 1000, 2000),
+            ("THROTTLE", z, z, 1000),
+        )
+        for axis, value, travel, full in axes:
             index = self.index_of(axis)
-            released = value == AXIS_ABSENT
-            self._set(
-                index, RELEASE if released else self._pwm(index, sign * value + 1000, 2000), now_ns
-            )
-        index = self.index_of("THROTTLE")
-        self._set(index, RELEASE if z == AXIS_ABSENT else self._pwm(index, z, 1000), now_ns)
+            low = self._params.integer(f"RC{index + 1}_MIN")
+            high = self._params.integer(f"RC{index + 1}_MAX")
+            pwm = low + (high - low) * travel // full
+            self._set(index, RELEASE if value == AXIS_ABSENT else pwm, now_ns)
 
     def clear_overrides(self) -> None:
         """Drop every override at once."""
@@ -79,7 +78,7 @@ class RcEngine:
         return min(max(mapped, 1), RC_CHANNELS_WITH_PARAMS) - 1
 
     def update(self, now_ns: int) -> bool:
-        """Refresh ``channels_us``; True if anything supplied a value (the link is alive)."""
+        """Refresh ``channels_us``; True if receiver or overrides supplied a value."""
         frame = self._receiver_us is not None and now_ns >= self._next_receiver_ns
         if not (frame or self._fresh_override):
             self._watch_switch(now_ns)
@@ -87,28 +86,24 @@ class RcEngine:
         self._fresh_override = False
         if frame:
             self._next_receiver_ns = now_ns + _RECEIVER_PERIOD_NS
-        supplied = False
-        for index in range(CHANNELS):
-            value = self._source(index, now_ns)
+        values = [self._source(index, now_ns) for index in range(CHANNELS)]
+        for index, value in enumerate(values):
             if value is not None:
                 self.channels_us[index] = value
-                supplied = True
         self._watch_switch(now_ns)
-        return supplied
+        return any(value is not None for value in values)
 
     def _source(self, index: int, now_ns: int) -> int | None:
         options = self._params.integer("RC_OPTIONS")
-        if self._is_overridden(index, now_ns) and not options & _OPTIONS_IGNORE_OVERRIDES:
+        lifetime_s = self._params["RC_OVERRIDE_TIME"]
+        age_ns = now_ns - self._override_ns[index]
+        is_alive = lifetime_s < 0.0 or age_ns < lifetime_s * NS_PER_S
+        is_allowed = is_alive and not options & _OPTIONS_IGNORE_OVERRIDES
+        if self._override_us[index] != RELEASE and is_allowed:
             return self._override_us[index]
         if self._receiver_us is None or options & _OPTIONS_IGNORE_RECEIVER:
             return None
         return self._receiver_us[index] if index < len(self._receiver_us) else 0
-
-    def _is_overridden(self, index: int, now_ns: int) -> bool:
-        if self._override_us[index] == RELEASE:
-            return False
-        lifetime_s = self._params["RC_OVERRIDE_TIME"]
-        return lifetime_s < 0.0 or now_ns - self._override_ns[index] < lifetime_s * NS_PER_S
 
     def _set(self, index: int, value_us: int, now_ns: int) -> None:
         if not self._switch.enabled:
@@ -117,11 +112,6 @@ class RcEngine:
         self._override_ns[index] = now_ns
         self._fresh_override = True
         self.found = True
-
-    def _pwm(self, index: int, numerator: int, denominator: int) -> int:
-        low = self._params.integer(f"RC{index + 1}_MIN")
-        high = self._params.integer(f"RC{index + 1}_MAX")
-        return low + (high - low) * numerator // denominator
 
     def _watch_switch(self, now_ns: int) -> None:
         for channel in range(1, RC_CHANNELS_WITH_PARAMS + 1):

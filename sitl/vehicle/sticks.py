@@ -1,4 +1,4 @@
-"""From PWM to what the pilot asks for: dead zones, curves and rates of ArduCopter's manual modes.
+"""From PWM to what the pilot commands: dead zones, curves and rates of ArduCopter's manual modes.
 
 Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_throttle`` and
 ``get_pilot_desired_climb_rate``; pinned by leans and rates measured on the firmware.
@@ -16,20 +16,15 @@ THROTTLE_FULL = 1000.0
 class Sticks(NamedTuple):
     """Stick positions after calibration and dead zone."""
 
-    roll: float
-    """[-1, 1], + right."""
-    pitch: float
-    """[-1, 1], + stick back, nose up: the sign of the raw channel, not of a joystick."""
-    yaw: float
-    """[-1, 1], + nose right."""
-    throttle: float
-    """[0, 1000] from stick down to stick up."""
-    throttle_mid: float
-    """Where the middle of the throttle's travel falls on that scale."""
+    roll: float  # [-1, 1], + right
+    pitch: float  # [-1, 1], + stick back, nose up: the sign of the raw channel, not of a joystick
+    yaw: float  # [-1, 1], + nose right
+    throttle: float  # [0, 1000] from stick down to stick up
+    throttle_mid: float  # middle of the throttle's travel on that scale
 
 
 def read_sticks(rc: RcEngine, params: Params) -> Sticks:
-    """The four flight sticks by RCMAP_*; a channel that never had a value is centred."""
+    """Read the four flight sticks by RCMAP_*; a channel that never had a value is centred."""
     throttle, mid = _throttle(rc, params)
     return Sticks(
         roll=_centred(rc, params, "ROLL"),
@@ -43,10 +38,10 @@ def read_sticks(rc: RcEngine, params: Params) -> Sticks:
 def _centred(rc: RcEngine, params: Params, axis: str) -> float:
     index = rc.index_of(axis)
     pwm = rc.channels_us[index]
-    if pwm == 0:
-        return 0.0
     name = f"RC{index + 1}_"
     trim, dead_zone = params[name + "TRIM"], params[name + "DZ"]
+    if pwm == 0:
+        return 0.0
     if pwm > trim + dead_zone:
         offset, span = pwm - trim - dead_zone, params[name + "MAX"] - trim - dead_zone
     elif pwm < trim - dead_zone:
@@ -58,6 +53,7 @@ def _centred(rc: RcEngine, params: Params, axis: str) -> float:
 
 
 def _throttle(rc: RcEngine, params: Params) -> tuple[float, float]:
+    """Throttle and its middle, in 0..THROTTLE_FULL."""
     index = rc.index_of("THROTTLE")
     name = f"RC{index + 1}_"
     low, high = params[name + "MIN"], params[name + "MAX"]
@@ -77,8 +73,7 @@ def _throttle(rc: RcEngine, params: Params) -> tuple[float, float]:
 def lean_angles(sticks: Sticks, params: Params) -> tuple[float, float]:
     """Roll and pitch in radians (+ right, + nose up), their length limited to ANGLE_MAX."""
     limit = math.radians(params["ANGLE_MAX"] / 100.0)
-    length = math.hypot(sticks.roll, sticks.pitch)
-    scale = limit / max(1.0, length)
+    scale = limit / max(1.0, math.hypot(sticks.roll, sticks.pitch))
     return sticks.roll * scale, sticks.pitch * scale
 
 
@@ -111,11 +106,10 @@ def climb_rate_mps(sticks: Sticks, params: Params) -> float:
     top = sticks.throttle_mid + dead_zone
     bottom = sticks.throttle_mid - dead_zone
     up = params["PILOT_SPEED_UP"] / 100.0
-    down = params["PILOT_SPEED_DN"] / 100.0 or up
     if sticks.throttle > top:
         return up * (sticks.throttle - top) / (THROTTLE_FULL - top)
     if sticks.throttle < bottom:
-        return down * (sticks.throttle - bottom) / bottom
+        return (params["PILOT_SPEED_DN"] / 100.0 or up) * (sticks.throttle - bottom) / bottom
     return 0.0
 
 

@@ -13,8 +13,8 @@ from typing import Any, Protocol
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from sitl.simulated_vehicle import Vehicle
+from sitl.clock import NS_PER_MS, NS_PER_S, Clock
+from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import VehicleConfig
 
 GCS = 255
@@ -40,7 +40,7 @@ class MockPeer:
     def __init__(self, *, receiver: bool) -> None:
         self._now_ns = 0
         config = VehicleConfig(receiver=receiver)
-        self.vehicle = Vehicle(links=1, boot_ns=0, config=config)
+        self.vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config)
 
     def now_ns(self) -> int:
         return self._now_ns
@@ -62,7 +62,7 @@ class UdpPeer:
     """A flight controller that sends to a UDP port of ours."""
 
     def __init__(self, address: tuple[str, int]) -> None:
-        self._clock = MonotonicClock()
+        self._clock = Clock()
         self._peer: tuple[str, int] | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(address)

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from mavbridge.core.processes import free_port
-from sitl.clock import NS_PER_S, MonotonicClock
+from sitl.clock import NS_PER_S, Clock
 from sitl.vehicle.params import Params
 
 PEERS = Path(__file__).parents[2] / ".venv-peers" / "bin"
@@ -58,7 +58,7 @@ class Console:
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._process = process
-        self._clock = MonotonicClock()
+        self._clock = Clock()
         self.seen = ""
 
     def type(self, line: str) -> None:

@@ -7,13 +7,14 @@ from itertools import pairwise
 import numpy as np
 
 from sitl.clock import NS_PER_S
-from sitl.course.course import Course, Start, in_gate_axes
+from sitl.course.layout import AirborneStart, Course
+from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance
-from sitl.expert.expert import Expert, Sticks4
-from sitl.simulated_vehicle import Pose, Vehicle
+from sitl.expert.stick_response import StickPositions
+from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, Conditions
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 
 TICK_NS = NS_PER_S // 100
 REST_S = 3.0
@@ -24,14 +25,14 @@ REST_S = 3.0
 class Tick:
     pose: Pose
     next_gate: int | None
-    label: Sticks4
-    flown: Sticks4
+    label: StickPositions
+    flown: StickPositions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CourseFlight:
     course: Course
-    vehicle: Vehicle
+    vehicle: SimulatedVehicle
     ticks: list[Tick]
 
     @property
@@ -55,12 +56,12 @@ class CourseFlight:
         for before, after in pairwise(self.ticks):
             if after.next_gate != before.next_gate:
                 gate = self.course.gates[before.next_gate]
-                _, right_m, down_m = in_gate_axes(gate, after.pose.body.position_ned_m)
+                _, right_m, down_m = gate.offset_m(after.pose.body.position_ned_m)
                 misses.append(max(abs(right_m), abs(down_m)))
         return misses
 
 
-def pwm_us(sticks: Sticks4) -> list[int]:
+def pwm_us(sticks: StickPositions) -> list[int]:
     """RC_CHANNELS_OVERRIDE of the default calibration; pitch is reversed."""
     throttle, yaw, pitch, roll = sticks
     axes = (roll, -pitch, throttle, yaw)
@@ -72,12 +73,12 @@ def fly_course(
     speed_mps: float,
     *,
     conditions: Conditions = NOMINAL,
-    start: Start | None = None,
+    start: AirborneStart | None = None,
     disturbance: StickDisturbance | None = None,
     limit_s: float = 60.0,
 ) -> CourseFlight:
     config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0, conditions=conditions)
-    vehicle = Vehicle(links=1, boot_ns=0, config=config, course=course)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config, course=course)
     if start is None:
         vehicle.step(50 * STEP_NS)
         assert vehicle.ap.set_mode(Mode.ALT_HOLD)

@@ -23,7 +23,7 @@ from mavbridge.simulation.wire import MemoryTransport
 from mavbridge.simulation.world import Exposure, Scene, nominal_scene
 from policy.contract import Executable, FloatArray
 from policy.errors import PolicyError
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 MS = NS_PER_MS
@@ -288,7 +288,7 @@ def never_ready(*, course_seed: int, seed: int, boot_ns: int) -> Scene:
     scene = nominal_scene(course_seed=course_seed, seed=seed, boot_ns=boot_ns)
     slow = VehicleConfig(estimator_ready_s=1000.0)
     return Scene(
-        vehicle=Vehicle(links=1, boot_ns=boot_ns, config=slow, course=scene.course),
+        vehicle=SimulatedVehicle(links=1, boot_ns=boot_ns, config=slow, course=scene.course),
         course=scene.course,
         make_renderer=scene.make_renderer,
     )

@@ -20,8 +20,9 @@ from mavbridge.simulation.episode import Episode, Setup
 from mavbridge.simulation.world import Exposure, varied_scene
 from policy.contract import Contract, Executable, FloatArray
 from sitl.course.truth import gate_truth
+from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance, random_start
-from sitl.expert.expert import Expert, Sticks4
+from sitl.expert.stick_response import StickPositions
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
 
 NOMINAL_SHARE = 0.25
@@ -247,7 +248,7 @@ class _Pilot:
         if self.opinion is None:
             raise RuntimeError("the expert flies what it was asked for")
         now_s = self._episode.clock.now_ns() / NS_PER_S
-        flown = self._noise.flown(Sticks4(*self.opinion), now_s)
+        flown = self._noise.flown(StickPositions(*self.opinion), now_s)
         return np.tile(np.array(flown, np.float32), (1, self._contract.horizon, 1))
 
 

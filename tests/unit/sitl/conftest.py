@@ -1,4 +1,4 @@
-"""A pilot for the autopilot without its wire: sticks by override, time by steps."""
+"""A pilot for the autopilot without its link: sticks by override, time by steps."""
 
 import math
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import pytest
 from sitl.clock import NS_PER_S
 from sitl.rotation import to_euler
 from sitl.vehicle.autopilot import STEP_NS, Autopilot, VehicleConfig
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 from sitl.vehicle.params import Params
 
 STEPS_PER_STICK_UPDATE = 8
@@ -61,10 +61,10 @@ class Pilot:
         return [math.degrees(angle) for angle in to_euler(self.ap.truth.ned_from_body_wxyz)]
 
     def texts(self) -> list[str]:
-        """What was said since the last call."""
-        said = [text.text for text in self.ap.texts]
+        """Status texts since the last call."""
+        texts = [text.text for text in self.ap.texts]
         self.ap.texts.clear()
-        return said
+        return texts
 
 
 @pytest.fixture

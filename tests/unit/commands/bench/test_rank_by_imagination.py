@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.rank_by_imagination import gates_passed
-from sitl.course.course import make_course
+from sitl.course.layout import make_course
 
 COURSE = make_course(3)
 

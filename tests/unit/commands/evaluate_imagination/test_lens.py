@@ -12,7 +12,7 @@ from mavbridge.commands.evaluate_imagination.lens import attitudes, body_rates, 
 from mavbridge.commands.evaluate_imagination.metrics import psnr_db
 from mavbridge.core.records import ImageArray
 from sitl.camera.fpv import FpvRenderer
-from sitl.course.course import make_course
+from sitl.course.layout import make_course
 from sitl.rotation import from_euler
 from sitl.vehicle.conditions import Conditions
 

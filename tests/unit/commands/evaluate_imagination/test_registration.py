@@ -7,7 +7,7 @@ from helpers.panoramas import attitude, nominal_lens, panorama
 from mavbridge.commands.evaluate_imagination.registration import turn_between
 from mavbridge.core.records import ImageArray
 from sitl.camera.fpv import FpvRenderer
-from sitl.course.course import make_course
+from sitl.course.layout import make_course
 from sitl.rotation import from_euler
 
 

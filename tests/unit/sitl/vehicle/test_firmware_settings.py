@@ -9,29 +9,30 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.course_flights import fly_course, pwm_us
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course.course import Start, make_course
-from sitl.expert.expert import Expert, Sticks4
+from sitl.course.layout import AirborneStart, make_course
+from sitl.expert.demonstrator import Expert
+from sitl.expert.stick_response import StickPositions
 from sitl.link.streams import Streams
 from sitl.rotation import IDENTITY, to_euler
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.params import Params
 
-ALOFT = Start(
+ALOFT = AirborneStart(
     position_ned_m=(0.0, 0.0, -30.0),
     velocity_ned_mps=(0.0, 0.0, 0.0),
     ned_from_body_wxyz=IDENTITY,
     next_gate=0,
 )
-CENTRED = Sticks4(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
+CENTRED = StickPositions(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
 ATTITUDE = mav.MAVLINK_MSG_ID_ATTITUDE
 
 
 def hold(sticks, seconds=2.0, **conditions):
     """The vehicle after it has been flown with these sticks since it hung in the air."""
     config = VehicleConfig(conditions=replace(NOMINAL, **conditions))
-    vehicle = Vehicle(links=1, boot_ns=0, config=config)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config)
     vehicle.launch(ALOFT)
     for now_ns in range(STEP_NS, round(seconds * NS_PER_S), STEP_NS):
         vehicle.ap.rc.override(pwm_us(sticks), now_ns)
@@ -59,7 +60,7 @@ def told(vehicle, name):
 
 def test_the_vehicle_tells_what_its_conditions_are():
     drawn = random_conditions(8)
-    vehicle = Vehicle(links=1, boot_ns=0, config=VehicleConfig(conditions=drawn))
+    vehicle = SimulatedVehicle(links=1, boot_ns=0, config=VehicleConfig(conditions=drawn))
     wanted = {
         "ANGLE_MAX": drawn.angle_max_cdeg,
         "PILOT_Y_RATE": drawn.pilot_yaw_rate_degps,

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 
 
 def test_alt_hold_holds_the_height_within_30_cm(pilot):
@@ -236,7 +236,7 @@ def test_gcs_failsafe_drops_overrides_and_leaves_the_pilot_in_control(pilot):
     pilot.ap.params.set("FS_GCS_ENABLE", 1.0)
     pilot.ap.params.set("RC_OVERRIDE_TIME", -1.0)
     pilot.take_off()
-    pilot.ap.gcs_failsafe.seen(pilot.ap.now_ns)
+    pilot.ap.gcs_failsafe.on_contact(pilot.ap.now_ns)
     pilot.hold(0.1, roll=1600)
     pilot.silence(4.8)
     assert pilot.ap.rc.channels_us[0] == 1600
@@ -246,7 +246,7 @@ def test_gcs_failsafe_drops_overrides_and_leaves_the_pilot_in_control(pilot):
     assert pilot.texts() == ["GCS Failsafe - Continuing Pilot Control"]
     assert pilot.ap.mode is Mode.ALT_HOLD
     assert pilot.ap.rc.channels_us[0] == 1500
-    pilot.ap.gcs_failsafe.seen(pilot.ap.now_ns)
+    pilot.ap.gcs_failsafe.on_contact(pilot.ap.now_ns)
     pilot.silence(0.5)
     assert pilot.texts() == ["GCS Failsafe Cleared"]
 
@@ -256,7 +256,7 @@ def test_gcs_failsafe_can_end_the_flight(pilot, choice, mode):
     pilot.ap.params.set("FS_GCS_ENABLE", float(choice))
     pilot.ap.params.set("FS_OPTIONS", 0.0)
     pilot.take_off()
-    pilot.ap.gcs_failsafe.seen(pilot.ap.now_ns)
+    pilot.ap.gcs_failsafe.on_contact(pilot.ap.now_ns)
 
     pilot.silence(5.5)
 

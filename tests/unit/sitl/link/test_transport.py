@@ -1,15 +1,15 @@
 """Real sockets on loopback, without waiting: what was sent is there when the kernel says so."""
 
 import socket
-from contextlib import closing
+from contextlib import closing, suppress
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from mavbridge.core.processes import free_port
-from sitl.clock import NS_PER_S, MonotonicClock
+from sitl.clock import NS_PER_S, Clock
 from sitl.errors import UsageError
-from sitl.link.transport import MAX_PEERS, open_transport, split_frames
+from sitl.link.transport import FOLLOWER_KINDS, MAX_PEERS, open_transport, split_frames
 
 DEADLINE_S = 5.0
 UNREAD_NS = 80_000_000
@@ -18,7 +18,7 @@ UNREAD_NS = 80_000_000
 
 def drain_until(transport, count):
     """At least ``count`` reads, by a deadline."""
-    clock = MonotonicClock()
+    clock = Clock()
     end_ns = clock.now_ns() + round(DEADLINE_S * NS_PER_S)
     received = []
     while len(received) < count and clock.now_ns() < end_ns:
@@ -39,7 +39,7 @@ FRAME = mav.MAVLink_timesync_message(0, 1).pack(mav.MAVLink(None))
 def test_udpout_sends_first_and_hears_the_answer():
     with udp_client() as ground:
         url = f"udpout:127.0.0.1:{ground.getsockname()[1]}"
-        with closing(open_transport(url, MonotonicClock())) as link:
+        with closing(open_transport(url, Clock())) as link:
             link.send(FRAME)
             data, address = ground.recvfrom(2048)
             ground.sendto(b"answer", address)
@@ -50,7 +50,7 @@ def test_udpout_sends_first_and_hears_the_answer():
 
 
 def test_arrival_is_stamped_when_it_came_not_when_it_was_read():
-    clock = MonotonicClock()
+    clock = Clock()
     with udp_client() as ground:
         url = f"udpin:127.0.0.1:{free_port()}"
         with closing(open_transport(url, clock)) as link:
@@ -68,7 +68,7 @@ def test_arrival_is_stamped_when_it_came_not_when_it_was_read():
 def test_udpin_answers_everybody_it_has_heard_and_forgets_the_oldest():
     port = free_port()
     grounds = [udp_client() for _ in range(MAX_PEERS + 1)]
-    with closing(open_transport(f"udpin:127.0.0.1:{port}", MonotonicClock())) as link:
+    with closing(open_transport(f"udpin:127.0.0.1:{port}", Clock())) as link:
         link.send(FRAME)
         for ground in grounds:
             ground.sendto(b"hello", ("127.0.0.1", port))
@@ -85,7 +85,7 @@ def test_udpin_answers_everybody_it_has_heard_and_forgets_the_oldest():
 
 def test_udpout_survives_a_ground_station_that_is_not_there():
     url = f"udpout:127.0.0.1:{free_port()}"
-    with closing(open_transport(url, MonotonicClock())) as link:
+    with closing(open_transport(url, Clock())) as link:
         for _ in range(3):
             link.send(FRAME)
             assert list(link.drain()) == []
@@ -93,7 +93,7 @@ def test_udpout_survives_a_ground_station_that_is_not_there():
 
 def test_tcp_clients_come_and_go():
     port = free_port(socket.SOCK_STREAM)
-    with closing(open_transport(f"tcpin:127.0.0.1:{port}", MonotonicClock())) as link:
+    with closing(open_transport(f"tcpin:127.0.0.1:{port}", Clock())) as link:
         for greeting in (b"first", b"second"):
             with socket.create_connection(("127.0.0.1", port), DEADLINE_S) as client:
                 client.sendall(greeting)
@@ -106,7 +106,7 @@ def test_tcp_clients_come_and_go():
 def test_a_tcp_client_that_does_not_read_is_cut_off():
     port = free_port(socket.SOCK_STREAM)
     with (
-        closing(open_transport(f"tcpin:127.0.0.1:{port}", MonotonicClock())) as link,
+        closing(open_transport(f"tcpin:127.0.0.1:{port}", Clock())) as link,
         socket.create_connection(("127.0.0.1", port), DEADLINE_S) as client,
     ):
         client.sendall(b"x")
@@ -115,6 +115,38 @@ def test_a_tcp_client_that_does_not_read_is_cut_off():
             link.send(FRAME * 10_000)
 
         client.sendall(b"still here")
+        assert list(link.drain()) == []
+
+
+def test_a_tcp_client_connects_to_send_and_again_after_the_connection_is_lost():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.05)
+        url = f"tcp:127.0.0.1:{server.getsockname()[1]}"
+        with closing(open_transport(url, Clock(), FOLLOWER_KINDS)) as link:
+            assert list(link.drain()) == []
+            for greeting in (b"first", b"second"):
+                with accept_while_sending(server, link, greeting) as accepted:
+                    accepted.settimeout(DEADLINE_S)
+                    assert accepted.recv(100) == greeting
+                    accepted.sendall(b"answer to " + greeting)
+                    (received,) = drain_until(link, 1)
+                    assert received.data == b"answer to " + greeting
+
+
+def accept_while_sending(server, link, data):
+    """A send before the end of a lost connection was read is lost with it."""
+    for _ in range(round(DEADLINE_S / server.gettimeout())):
+        assert list(link.drain()) == []
+        link.send(data)
+        with suppress(TimeoutError):
+            return server.accept()[0]
+    raise AssertionError(f"no connection within {DEADLINE_S} s")
+
+
+def test_a_tcp_server_that_is_not_there_is_no_error():
+    port = free_port(socket.SOCK_STREAM)
+    with closing(open_transport(f"tcp:127.0.0.1:{port}", Clock(), FOLLOWER_KINDS)) as link:
+        link.send(FRAME)
         assert list(link.drain()) == []
 
 
@@ -129,16 +161,18 @@ def test_a_tcp_client_that_does_not_read_is_cut_off():
         "udpin::14550",
         "udpin:127.0.0.1:0",
         "udpin:127.0.0.1:65536",
+        "tcp:127.0.0.1:1",
+        "serial:a:1",
     ],
 )
 def test_bad_names_are_refused(url):
-    with pytest.raises(UsageError, match="--connect"):
-        open_transport(url, MonotonicClock())
+    with pytest.raises(UsageError, match=f"link '{url}': "):
+        open_transport(url, Clock())
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 def test_a_taken_port_is_refused(kind):
-    clock = MonotonicClock()
+    clock = Clock()
     port = free_port(socket.SOCK_DGRAM if kind == "udpin" else socket.SOCK_STREAM)
     with (
         closing(open_transport(f"{kind}:127.0.0.1:{port}", clock)),

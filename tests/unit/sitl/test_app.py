@@ -1,7 +1,6 @@
-"""The real-time loop on a fake clock, the report, and the command line's refusals."""
+"""The real-time loop on a fake clock, the camera thread, and the command line."""
 
 import json
-import math
 import os
 import signal
 import socket
@@ -13,16 +12,16 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
-from sitl.app import RunOptions, filming, fly
-from sitl.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from sitl.course.collision import Crash
-from sitl.course.course import Course, make_course
+from sitl.app import filming, fly
+from sitl.camera.fpv import CameraOptions
+from sitl.clock import NS_PER_MS, NS_PER_S, Clock
+from sitl.course.layout import make_course
+from sitl.course.referee import Crash
 from sitl.link.transport import Received
-from sitl.report import FlightLog, write_report
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.stopping import StopRequest, stop_on_signal
-from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.autopilot import STEP_NS
+from sitl.vehicle.flight_modes import Mode
 
 
 class FakeClock:
@@ -66,7 +65,7 @@ class FakeTransport:
 
 def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
     clock = FakeClock()
-    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
 
     fly(vehicle, [FakeTransport(clock)], clock, StopRequest(), end_ns=NS_PER_S)
 
@@ -77,7 +76,7 @@ def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
 @pytest.mark.parametrize(("wanted", "ends_ns"), [(True, 0), (False, NS_PER_S // 2)])
 def test_a_crash_ends_the_loop_if_the_course_is_to_end_it(wanted, ends_ns):
     clock = FakeClock()
-    vehicle = Vehicle(links=0, boot_ns=0, course=make_course(1))
+    vehicle = SimulatedVehicle(links=0, boot_ns=0, course=make_course(1))
     vehicle.log.crash = Crash(t_s=0.0, hit="ground", speed_mps=5.0)
 
     fly(vehicle, [], clock, StopRequest(), end_ns=NS_PER_S // 2, end_with_course=wanted)
@@ -87,7 +86,7 @@ def test_a_crash_ends_the_loop_if_the_course_is_to_end_it(wanted, ends_ns):
 
 def test_after_a_stall_it_catches_up_without_a_burst():
     clock = FakeClock(stall_at_ns=NS_PER_S, stall_ns=300 * NS_PER_MS + 1)
-    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
     vehicle.server.links[0].set_interval(mav.MAVLINK_MSG_ID_ATTITUDE, 10_000)
     transport = FakeTransport(clock)
 
@@ -103,7 +102,7 @@ def test_after_a_stall_it_catches_up_without_a_burst():
 
 def test_the_loop_takes_in_bytes_and_says_who_came(capsys):
     clock = FakeClock()
-    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
     frame = mav.MAVLink_command_long_message(1, 1, 176, 0, 1, int(Mode.ALT_HOLD), *[0] * 5)
     arrivals = [Received(frame.pack(mav.MAVLink(None, srcSystem=255)), 50 * NS_PER_MS)]
 
@@ -118,121 +117,9 @@ def test_a_signal_ends_the_loop_and_handlers_come_back(number):
     with stop_on_signal() as stop:
         os.kill(os.getpid(), number)
         assert stop.is_set()
-        fly(Vehicle(links=0, boot_ns=0), [], FakeClock(), stop, end_ns=None)
+        fly(SimulatedVehicle(links=0, boot_ns=0), [], FakeClock(), stop, end_ns=None)
 
     assert signal.getsignal(number) is before
-
-
-def logged(arrivals_ms, releases_ms=()):
-    log = FlightLog(0, None)
-    events = [(ms, log.on_override) for ms in arrivals_ms]
-    events += [(ms, log.on_release) for ms in releases_ms]
-    for ms, happens in sorted(events, key=lambda event: event[0]):
-        happens(ms * NS_PER_MS)
-    return log.summary(Vehicle(links=1, boot_ns=0).ap, 0)
-
-
-def test_override_rate_and_gaps():
-    overrides = logged([*range(1000, 2000, 10), 2020])["overrides"]
-
-    assert overrides["count"] == 101
-    assert (overrides["first_t_s"], overrides["last_t_s"]) == (1.0, 2.02)
-    assert overrides["rate_hz"] == pytest.approx(100 / 1.02)
-    assert overrides["gap_ms"] == {"p50": 10.0, "p99": pytest.approx(10.2), "max": 30.0}
-
-
-def test_a_release_is_no_gap():
-    summary = logged([0, 10, 20, 5000, 5010], releases_ms=[30, 40])
-
-    assert summary["overrides"]["gap_ms"]["max"] == 10.0
-    assert summary["releases"] == {"count": 2, "t_s": [0.03, 0.04]}
-
-
-def test_a_report_without_overrides_holds_nulls_not_zeros():
-    overrides = logged([])["overrides"]
-
-    assert overrides == {
-        "count": 0,
-        "first_t_s": None,
-        "last_t_s": None,
-        "rate_hz": None,
-        "gap_ms": None,
-    }
-
-
-def test_releases_and_foreign_overrides_on_the_wire_are_told_apart():
-    vehicle = Vehicle(links=1, boot_ns=0)
-    sender = mav.MAVLink(None, srcSystem=255)
-    for primary in ([1500] * 8, [1500, 0, *[65535] * 6], [0] * 8, [0, *[65535] * 7], [65535] * 8):
-        frame = mav.MAVLink_rc_channels_override_message(1, 1, *primary).pack(sender)
-        vehicle.receive(0, frame, 0)
-    sender.srcSystem = 42
-    vehicle.receive(0, mav.MAVLink_rc_channels_override_message(1, 1, *[0] * 8).pack(sender), 0)
-
-    summary = vehicle.log.summary(vehicle.ap, 0)
-    assert summary["overrides"]["count"] == 2
-    assert summary["releases"]["count"] == 2
-
-
-def flown(pilot, course=None):
-    log = FlightLog(0, course)
-    return log, lambda ap: log.on_step(ap)
-
-
-def test_a_soft_flight_is_no_crash_and_is_measured(pilot):
-    log, watch = flown(pilot)
-    pilot.take_off(height_m=3.0)
-    pilot.hold(1.0, pitch=1400, watch=watch)
-    pilot.hold(1.0, pitch=1600, watch=watch)
-    pilot.hold(6.0, thr=1000, watch=watch)
-
-    summary = log.summary(pilot.ap, 0)
-    north, east, _ = summary["final"]["position_ned_m"]
-    assert not summary["crashed"]
-    assert 1.5 < summary["impact_speed_mps"] < 3.5
-    assert summary["distance_m"] > math.hypot(north, east) > 0.5
-    assert summary["max_altitude_m"] > 3.0
-    assert not summary["final"]["armed"] or summary["armed_s"] > 8.0
-
-
-def test_falling_out_of_the_sky_is_a_crash(pilot):
-    log, watch = flown(pilot)
-    pilot.take_off(height_m=5.0)
-    pilot.ap.disarm(force=True)
-    pilot.hold(3.0, watch=watch)
-
-    summary = log.summary(pilot.ap, 0)
-    assert summary["crashed"]
-    assert summary["impact_speed_mps"] > 5.0
-
-
-def test_a_course_without_gates_is_never_finished():
-    assert FlightLog(0, None).verdict(10 * NS_PER_S) is None
-    assert FlightLog(0, Course(seed=0, gates=())).verdict(10 * NS_PER_S) is None
-
-
-def test_modes_and_gates_are_logged(pilot):
-    log, watch = flown(pilot, make_course(7))
-    pilot.hold(1.0, thr=1000, watch=watch)
-    pilot.ap.set_mode(Mode.ALT_HOLD)
-    pilot.hold(1.0, thr=1000, watch=watch)
-
-    summary = log.summary(pilot.ap, 0)
-    assert [entry["mode"] for entry in summary["modes"]] == ["STABILIZE", "ALT_HOLD"]
-    assert summary["modes"][1]["t_s"] == pytest.approx(1.0, abs=0.01)
-    assert summary["gates"] == {"total": len(make_course(7).gates), "passed": []}
-
-
-def test_the_report_is_json(tmp_path, pilot):
-    path = tmp_path / "fc.json"
-    log = FlightLog(0, make_course(1))
-    log.on_text(5, "hello")
-
-    write_report(path, log.summary(pilot.ap, 3))
-
-    written = json.loads(path.read_text())
-    assert written["bad_frames"] == 3
-    assert written["statustexts"] == [{"t_s": 5e-9, "text": "hello"}]
 
 
 def test_a_short_run_writes_its_report(tmp_path):
@@ -286,21 +173,12 @@ def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
 
 def test_the_camera_publishes_while_its_context_lasts():
     name = f"sitl-test-{os.getpid()}"
-    options = RunOptions(
-        connect=(),
-        shm_name=name,
-        course_seed=7,
-        image_size=32,
-        fps=200.0,
-        report=None,
-        duration_s=None,
-        vehicle=VehicleConfig(),
-    )
+    options = CameraOptions(shm_name=name, image_size=32, fps=200.0)
     course = make_course(7)
-    vehicle = Vehicle(links=0, boot_ns=0, course=course)
-    clock = MonotonicClock()
+    vehicle = SimulatedVehicle(links=0, boot_ns=0, course=course)
+    clock = Clock()
     deadline_ns = clock.now_ns() + 10 * NS_PER_S
-    with filming(options, name, course, vehicle, clock):
+    with filming(vehicle, course, options, clock):
         path = Path("/dev/shm") / name
         frame_id = 0
         while frame_id < 3 and clock.now_ns() < deadline_ns:

@@ -1,11 +1,11 @@
 import pytest
 
-from sitl.course.collision import VEHICLE_RADIUS_M, struck_gate
-from sitl.course.course import BAR_M, DEPTH_M, Course, Gate, Start
+from sitl.course.layout import BAR_M, DEPTH_M, AirborneStart, Course, Gate
+from sitl.course.referee import VEHICLE_RADIUS_M, struck_gate
 from sitl.rotation import IDENTITY
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
-from sitl.vehicle.modes import Mode
+from sitl.vehicle.flight_modes import Mode
 
 GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0)
 FAR_GATE = Gate(center_ned_m=(20.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=1)
@@ -39,10 +39,17 @@ def test_a_straight_way(start, end, struck):
     assert struck_gate(COURSE, start, end) == struck
 
 
-def launched(start, *, course=COURSE):
+def launched(position_ned_m, *, north_mps, next_gate):
     config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0)
-    vehicle = Vehicle(links=1, boot_ns=0, config=config, course=course)
-    vehicle.launch(start)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config, course=COURSE)
+    vehicle.launch(
+        AirborneStart(
+            position_ned_m=position_ned_m,
+            velocity_ned_mps=(north_mps, 0.0, 0.0),
+            ned_from_body_wxyz=IDENTITY,
+            next_gate=next_gate,
+        )
+    )
     return vehicle
 
 
@@ -53,13 +60,7 @@ def glide(vehicle, seconds):
 
 
 def test_hitting_a_frame_is_a_crash_and_the_gates_after_it_do_not_count():
-    start = Start(
-        position_ned_m=(7.0, 1.1, -2.0),
-        velocity_ned_mps=(6.0, 0.0, 0.0),
-        ned_from_body_wxyz=IDENTITY,
-        next_gate=0,
-    )
-    vehicle = launched(start)
+    vehicle = launched((7.0, 1.1, -2.0), north_mps=6.0, next_gate=0)
     glide(vehicle, 1.0)
     summary = vehicle.log.summary(vehicle.ap, 0)
     assert vehicle.ap.truth.position_ned_m[0] > 11.0
@@ -70,13 +71,7 @@ def test_hitting_a_frame_is_a_crash_and_the_gates_after_it_do_not_count():
 
 
 def test_a_launched_vehicle_flies_on_from_there():
-    start = Start(
-        position_ned_m=(12.0, 0.0, -2.0),
-        velocity_ned_mps=(5.0, 0.0, 0.0),
-        ned_from_body_wxyz=IDENTITY,
-        next_gate=1,
-    )
-    vehicle = launched(start)
+    vehicle = launched((12.0, 0.0, -2.0), north_mps=5.0, next_gate=1)
     assert vehicle.pose.body.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
     assert (vehicle.ap.armed, vehicle.ap.landed, vehicle.ap.mode) == (True, False, Mode.ALT_HOLD)
     glide(vehicle, 2.5)
@@ -88,13 +83,7 @@ def test_a_launched_vehicle_flies_on_from_there():
 
 
 def test_a_reboot_takes_the_vehicle_home_through_no_gate():
-    start = Start(
-        position_ned_m=(14.0, 2.0, -2.0),
-        velocity_ned_mps=(0.0, 0.0, 0.0),
-        ned_from_body_wxyz=IDENTITY,
-        next_gate=0,
-    )
-    vehicle = launched(start)
+    vehicle = launched((14.0, 2.0, -2.0), north_mps=0.0, next_gate=0)
     glide(vehicle, 0.2)
     vehicle.reboot()
     glide(vehicle, 0.2)

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from helpers.course_flights import fly_course
 from sitl.camera.fpv import body_from_camera
-from sitl.course.course import Start, in_gate_axes, make_course
+from sitl.course.layout import AirborneStart, make_course
 from sitl.course.truth import gate_truth
 from sitl.errors import UsageError
+from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance, random_start
-from sitl.expert.expert import Expert
-from sitl.expert.guidance import Knot, least_acceleration
+from sitl.expert.guidance import Waypoint, least_acceleration
 from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import random_conditions
 
@@ -89,7 +89,7 @@ def test_a_missed_gate_is_flown_at_again(axial_m, right_m):
     gate = course.gates[6]
     cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
     north_m, east_m, down_m = gate.center_ned_m
-    start = Start(
+    start = AirborneStart(
         position_ned_m=(
             north_m + axial_m * cos_yaw - right_m * sin_yaw,
             east_m + axial_m * sin_yaw + right_m * cos_yaw,
@@ -99,7 +99,7 @@ def test_a_missed_gate_is_flown_at_again(axial_m, right_m):
         ned_from_body_wxyz=from_euler(0.0, 0.0, gate.yaw_rad),
         next_gate=6,
     )
-    assert in_gate_axes(gate, start.position_ned_m) == pytest.approx((axial_m, right_m, 0.0))
+    assert gate.offset_m(start.position_ned_m) == pytest.approx((axial_m, right_m, 0.0))
     assert fly_course(course, 5.0, start=start).succeeded
 
 
@@ -115,21 +115,22 @@ def test_a_speed_it_cannot_fly_at_is_refused(speed_mps):
 
 
 def test_least_acceleration_is_none_where_none_is_needed():
-    knots = [
-        Knot(point_m=(6.0 * k, 0.0, -2.0), velocity_mps=(6.0, 0.0, 0.0), leg_s=1.0) for k in (1, 2)
+    waypoints = [
+        Waypoint(point_m=(6.0 * k, 0.0, -2.0), velocity_mps=(6.0, 0.0, 0.0), leg_s=1.0)
+        for k in (1, 2)
     ]
-    plan = least_acceleration((0.0, 0.0, -2.0), (6.0, 0.0, 0.0), knots)
+    plan = least_acceleration((0.0, 0.0, -2.0), (6.0, 0.0, 0.0), waypoints)
     np.testing.assert_allclose(plan.accel_mps2, 0.0, atol=1e-9)
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.tuples(*[st.floats(-3.0, 3.0)] * 6))
 def test_the_planned_path_is_the_best_of_its_neighbours(start):
-    """The gradient of the cost at the knot, by hand: what soft knots pull, the path holds."""
-    knot = Knot(point_m=(5.0, 0.0, 0.0), velocity_mps=(5.0, 0.0, 0.0), leg_s=1.0)
-    plan = least_acceleration(start[:3], start[3:], [knot])
+    """The gradient of the cost at the waypoint, by hand."""
+    waypoint = Waypoint(point_m=(5.0, 0.0, 0.0), velocity_mps=(5.0, 0.0, 0.0), leg_s=1.0)
+    plan = least_acceleration(start[:3], start[3:], [waypoint])
     # At a free end the acceleration is the pull of the velocity's weight (costate of v, halved).
-    wanted = -2.0 * (plan.velocity_mps[1] - knot.velocity_mps)
+    wanted = -2.0 * (plan.velocity_mps[1] - waypoint.velocity_mps)
     np.testing.assert_allclose(plan.accel_mps2[1], wanted, atol=1e-6)
 
 

@@ -12,7 +12,7 @@ from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.faults import FaultyLink, LinkFaults, Reboot, SensorFreeze, VehicleFaults
 from sitl.link.messages import BUILDERS
 from sitl.link.streams import Streams
-from sitl.simulated_vehicle import Vehicle
+from sitl.simulated_vehicle import SimulatedVehicle
 
 STEP_NS = 2_500_000
 
@@ -21,7 +21,7 @@ class Station:
     """The far ends of a vehicle's links."""
 
     def __init__(self, links=1):
-        self.vehicle = Vehicle(links=links, boot_ns=0)
+        self.vehicle = SimulatedVehicle(links=links, boot_ns=0)
         self.now_ns = 0
         self._parsers = [mav.MAVLink(None) for _ in range(links)]
         self._sender = mav.MAVLink(None, srcSystem=255, srcComponent=190)
@@ -278,7 +278,7 @@ def test_prearm_health_waits_for_the_estimator_but_not_for_the_sticks(station):
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=300), max_size=8))
 def test_garbage_never_raises_and_a_good_frame_still_gets_through(chunks):
-    vehicle = Vehicle(links=1, boot_ns=0)
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
     for chunk in chunks:
         vehicle.receive(0, chunk, 0)
     ping = mav.MAVLink_timesync_message(0, 77).pack(mav.MAVLink(None, srcSystem=255))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sitl.camera import scenery
 from sitl.camera.fpv import NEAR_M, TILT_UP_RAD, FpvRenderer, clip_near
-from sitl.course.course import Course, Gate, make_course
+from sitl.course.layout import Course, Gate, make_course
 from sitl.errors import UsageError
 from sitl.rotation import IDENTITY, from_euler
 

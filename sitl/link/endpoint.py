@@ -1,5 +1,6 @@
 """One MAVLink link of the vehicle, without I/O: bytes in, messages out, messages in, bytes out."""
 
+from collections import deque
 from collections.abc import Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -9,24 +10,23 @@ from sitl.link.messages import BUILDERS, Message
 from sitl.link.streams import PARAM_SLOWDOWN, Streams
 from sitl.vehicle.autopilot import Autopilot
 
-COMPONENT = mav.MAV_COMP_ID_AUTOPILOT1
 TIMESYNC_PERIOD_NS = 10 * NS_PER_S
 PARAM_PERIOD_NS = 4 * NS_PER_MS
 MAX_STATUSTEXT = 50
 
 
-class Link:
-    """Framing, message intervals and the parameter pump of one link.
+class MavlinkEndpoint:
+    """Framing, message intervals and the parameter list of one link.
 
-    Intervals belong to the link, not to whoever asked for them; two ground stations on one link
-    share them.
+    Intervals belong to the link, not to the sender that requested them; two ground stations on one
+    link share them.
     """
 
     def __init__(self, ap: Autopilot) -> None:
         self.bad_frames = 0
         """Garbage, truncated frames and wrong checksums."""
         self.reboot_requested = False
-        self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=COMPONENT)
+        self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=mav.MAV_COMP_ID_AUTOPILOT1)
         self._mav.robust_parsing = True
         self._outgoing = bytearray()
         self.restart(ap)
@@ -36,12 +36,12 @@ class Link:
         self.reboot_requested = False
         self._ap = ap
         self._streams = Streams(BUILDERS, ap.now_ns, ap.config.conditions)
-        self._param_queue: list[int] = []
+        self._queued_params: deque[int] = deque()
         self._param_due_ns = ap.now_ns
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
 
     def parse(self, data: bytes) -> Iterator[Message]:
-        """The messages that these bytes complete; what cannot be read is counted and skipped."""
+        """Complete messages in these bytes; unreadable frames are counted and skipped."""
         for message in self._mav.parse_buffer(data) or ():
             if message.get_type() == "BAD_DATA":
                 self.bad_frames += 1
@@ -63,8 +63,10 @@ class Link:
     def step(self) -> None:
         """Queue what is due by the vehicle's clock."""
         now_ns = self._ap.now_ns
-        self._pump_params(now_ns)
-        for message_id in self._streams.due(now_ns, PARAM_SLOWDOWN if self._param_queue else 1):
+        if self._queued_params and now_ns >= self._param_due_ns:
+            self._param_due_ns = now_ns + PARAM_PERIOD_NS
+            self.send_param(self._queued_params.popleft())
+        for message_id in self._streams.due(now_ns, PARAM_SLOWDOWN if self._queued_params else 1):
             self.send_now(message_id)
         if now_ns >= self._timesync_due_ns:
             self._timesync_due_ns += TIMESYNC_PERIOD_NS
@@ -72,14 +74,14 @@ class Link:
             self.send(mav.MAVLink_timesync_message(0, self._ap.uptime_ns + system_id))
 
     def set_interval(self, message_id: int, interval_us: int) -> str | None:
-        """Change a stream; the reason if refused."""
+        """Change a stream; returns the reason if refused."""
         loop_hz = self._ap.params["SCHED_LOOP_RATE"]
         return self._streams.set_interval(
             message_id, interval_us, loop_hz=loop_hz, now_ns=self._ap.now_ns
         )
 
     def set_group(self, group: int, rate_hz: int) -> None:
-        """REQUEST_DATA_STREAM; rate 0 stops."""
+        """Change the group of streams of a REQUEST_DATA_STREAM; rate 0 stops it."""
         loop_hz = self._ap.params["SCHED_LOOP_RATE"]
         self._streams.set_group(group, rate_hz, loop_hz=loop_hz, now_ns=self._ap.now_ns)
 
@@ -89,26 +91,22 @@ class Link:
         self.send(mav.MAVLink_message_interval_message(message_id, interval_us))
 
     def send_now(self, message_id: int) -> bool:
-        """Send one message, unless it has nothing to say yet; False if it is unknown."""
+        """Send one message, unless it has nothing to report yet; False if it is unknown."""
         build = BUILDERS.get(message_id)
         message = build(self._ap) if build else None
         if message is not None:
             self.send(message)
         return build is not None
 
-    def say(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT on this link."""
+    def send_text(self, severity: int, text: str) -> None:
+        """Send STATUSTEXT, in as many messages as the text needs."""
         for start in range(0, len(text), MAX_STATUSTEXT):
-            chunk = text[start : start + MAX_STATUSTEXT]
-            self.send(mav.MAVLink_statustext_message(severity, chunk.encode("ascii", "replace")))
+            chunk = text[start : start + MAX_STATUSTEXT].encode("ascii", "replace")
+            self.send(mav.MAVLink_statustext_message(severity, chunk))
 
-    def reboot(self) -> None:
-        """Ask for a reboot after this command."""
-        self.reboot_requested = True
-
-    def queue_params(self) -> None:
-        """Send every parameter, a few hundred a second, from the first."""
-        self._param_queue = list(reversed(range(len(self._ap.params))))
+    def send_all_params(self) -> None:
+        """Send every parameter from the first, a few hundred a second."""
+        self._queued_params = deque(range(len(self._ap.params)))
 
     def send_param(self, index: int) -> None:
         """Send PARAM_VALUE; ``index`` must exist."""
@@ -116,15 +114,6 @@ class Link:
         name = params.names[index]
         self.send(
             mav.MAVLink_param_value_message(
-                name.encode("ascii"),
-                params[name],
-                mav.MAV_PARAM_TYPE_REAL32,
-                len(params),
-                index,
+                name.encode(), params[name], mav.MAV_PARAM_TYPE_REAL32, len(params), index
             )
         )
-
-    def _pump_params(self, now_ns: int) -> None:
-        if self._param_queue and now_ns >= self._param_due_ns:
-            self._param_due_ns = now_ns + PARAM_PERIOD_NS
-            self.send_param(self._param_queue.pop())

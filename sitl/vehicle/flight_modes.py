@@ -1,21 +1,19 @@
-"""What each mode makes of the sticks: one law a mode, from sticks and state to motor commands."""
+"""Flight modes: ArduCopter's numbers, and how each turns sticks and state into motor commands."""
 
 import math
+from enum import IntEnum
 
 from sitl.rotation import Vec3, cos_tilt, to_euler, wrap_pi
 from sitl.vehicle import sticks as pilot
 from sitl.vehicle.control import AttitudeController, HeightController, mix, thrust_for
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
-from sitl.vehicle.modes import Mode
 from sitl.vehicle.params import Params
 from sitl.vehicle.sticks import Sticks
 
 STOPPED = (0.0, 0.0, 0.0, 0.0)
-IDLE = (0.03, 0.03, 0.03, 0.03)
-"""Armed on the ground, throttle down."""
+IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 
-FAST_DESCENT_MPS = 1.5
-"""LAND above SLOW_DESCENT_HEIGHT_M (WPNAV_SPEED_DN); LAND_SPEED below it."""
+FAST_DESCENT_MPS = 1.5  # LAND above SLOW_DESCENT_HEIGHT_M (WPNAV_SPEED_DN); LAND_SPEED below it
 SLOW_DESCENT_HEIGHT_M = 10.0
 RTL_SPEED_MPS = 5.0
 RTL_ARRIVED_M = 1.0
@@ -24,8 +22,28 @@ VELOCITY_GAIN_PER_S = 2.0
 TRAINER_GAIN_PER_S = 5.0
 
 
+class Mode(IntEnum):
+    """Flight mode by its number in HEARTBEAT.custom_mode."""
+
+    STABILIZE = 0
+    ACRO = 1
+    ALT_HOLD = 2
+    RTL = 6
+    LAND = 9
+
+    @property
+    def manual_throttle(self) -> bool:
+        """The throttle stick is thrust; refused in RC failsafe, and for arming it must be down."""
+        return self in (Mode.STABILIZE, Mode.ACRO)
+
+    @property
+    def piloted(self) -> bool:
+        """The sticks fly it; also the modes in which it can be armed."""
+        return self in (Mode.STABILIZE, Mode.ACRO, Mode.ALT_HOLD)
+
+
 class FlightControl:
-    """The laws of all modes, and the controllers that they share."""
+    """Control laws of all modes, and the controllers that they share."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -33,7 +51,7 @@ class FlightControl:
         self._height = HeightController()
         self._home_reached = False
         self.collective = 0.0
-        """Mean thrust asked for, as a fraction of full."""
+        """Commanded mean thrust, as a fraction of full."""
 
     def reset(self, body: BodyState) -> None:
         """Forget the targets: before flight and at each mode change."""
@@ -70,14 +88,11 @@ class FlightControl:
         if mode is Mode.STABILIZE:
             self.collective = pilot.manual_thrust(sticks, self._params)
         else:
-            self.collective = self._hold_climb(self._climb_mps(mode, sticks, body), body, dt_s)
+            limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
+            accel = self._height.update(body, self._climb_mps(mode, sticks, body), limit, dt_s)
+            tilt = cos_tilt(body.ned_from_body_wxyz)
+            self.collective = thrust_for(accel, tilt, self._params["MOT_THST_HOVER"])
         return mix(self.collective, turn)
-
-    def _hold_climb(self, climb_mps: float, body: BodyState, dt_s: float) -> float:
-        limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
-        accel = self._height.update(body, climb_mps, limit, dt_s)
-        tilt = cos_tilt(body.ned_from_body_wxyz)
-        return thrust_for(accel, tilt, self._params["MOT_THST_HOVER"])
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
         if mode is Mode.ALT_HOLD:

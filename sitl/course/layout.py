@@ -1,0 +1,119 @@
+"""Gate courses: where the gates stand, generated from a seed.
+
+Frame: local NED in metres, origin at the start, the vehicle heads north. A gate is a vertical
+square opening; ``yaw_rad`` is the heading in which it must be flown through (0 = north).
+"""
+
+import json
+import math
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from sitl.errors import UsageError
+from sitl.rotation import Quat, Vec3, wrap_pi
+
+GATE_COUNT = 8
+OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
+BAR_M = 0.32  # width of the bars around an opening
+DEPTH_M = 0.24  # depth of the frame along the passage; the gate's centre is halfway in
+
+# At 8 m/s the sharpest turn over the shortest leg, 35 degrees in 7 m, asks for v^2 * angle / leg =
+# 5.6 m/s^2 = g * tan(30 deg), ArduCopter's default lean limit. The climb limit asks for 1.1 m/s.
+FIRST_LEG_M = 8.0
+LEG_M = (7.0, 12.0)
+TURN_RAD = math.radians(35.0)
+CLIMB_M = 1.0
+FIRST_ALTITUDE_M = (2.0, 3.0)
+ALTITUDE_M = (2.0, 4.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gate:
+    """One gate of a course."""
+
+    center_ned_m: Vec3
+    yaw_rad: float  # heading of the passage, in [-pi, pi]
+    size_m: float  # side of the square opening; the frame around it is not part of it
+    index: int  # position on the course, from 0
+
+    def to_axes(self, vector_ned: Vec3) -> Vec3:
+        """Turn a direction, velocity or offset into gate axes: forward through it, right, down."""
+        north, east, down = vector_ned
+        cos_yaw, sin_yaw = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return (north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw, down)
+
+    def offset_m(self, position_ned_m: Vec3) -> Vec3:
+        """Position relative to the gate's centre in gate axes: forward through it, right, down."""
+        north_m, east_m, down_m = position_ned_m
+        center_n, center_e, center_d = self.center_ned_m
+        return self.to_axes((north_m - center_n, east_m - center_e, down_m - center_d))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Course:
+    """Gates in the order in which they must be passed."""
+
+    seed: int
+    gates: tuple[Gate, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AirborneStart:
+    """State of a flight that begins in the air."""
+
+    position_ned_m: Vec3
+    velocity_ned_mps: Vec3
+    ned_from_body_wxyz: Quat
+    next_gate: int  # index of the first gate to pass
+
+
+def make_course(seed: int) -> Course:
+    """Generate the course of this seed: the same on every machine.
+
+    Legs turn by up to 35 degrees and rise or fall by up to 1 m; a gate faces the mean of the legs
+    before and after it.
+
+    Raises:
+        UsageError: the seed is negative.
+    """
+    if seed < 0:
+        raise UsageError(f"a course seed is 0 or more, got {seed}")
+    random = np.random.Generator(np.random.PCG64(seed))
+    turns_rad = random.uniform(-TURN_RAD, TURN_RAD, GATE_COUNT)
+    legs_m = random.uniform(*LEG_M, GATE_COUNT)
+    climbs_m = random.uniform(-CLIMB_M, CLIMB_M, GATE_COUNT)
+
+    north_m = east_m = heading_rad = 0.0
+    altitude_m = float(random.uniform(*FIRST_ALTITUDE_M))
+    gates = []
+    for index in range(GATE_COUNT):
+        leg_m = FIRST_LEG_M if index == 0 else float(legs_m[index])
+        north_m += leg_m * math.cos(heading_rad)
+        east_m += leg_m * math.sin(heading_rad)
+        if index > 0:
+            altitude_m = float(np.clip(altitude_m + climbs_m[index], *ALTITUDE_M))
+        turn_rad = float(turns_rad[index])
+        gates.append(
+            Gate(
+                center_ned_m=(north_m, east_m, -altitude_m),
+                yaw_rad=wrap_pi(heading_rad + turn_rad / 2),
+                size_m=OPENING_M,
+                index=index,
+            )
+        )
+        heading_rad += turn_rad
+    return Course(seed=seed, gates=tuple(gates))
+
+
+def course_to_json(course: Course) -> str:
+    """The course as JSON: frame, seed and gates in order."""
+    return json.dumps(
+        {
+            "seed": course.seed,
+            "frame": "local NED, metres; origin = start, which heads north; "
+            "yaw_rad = heading of the passage; size_m = side of the square opening",
+            "gates": [asdict(gate) for gate in course.gates],
+        },
+        indent=2,
+    )

@@ -1,0 +1,200 @@
+"""The listener is fed with real MAVLink bytes of a made-up vehicle; time is given."""
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.clock import NS_PER_S
+from sitl.link.pose_listener import POSE_MAX_AGE_NS, ROUNDS_BEFORE_EULER, SYSTEM_ID, PoseListener
+from sitl.rotation import IDENTITY, from_euler
+
+T0_NS = 100 * NS_PER_S
+RATE_HZ = 60.0
+QUATERNION, EULER, POSITION = 31, 30, 32
+
+
+class Vehicle:
+    """Packs what a vehicle would send."""
+
+    def __init__(self, system=1, component=1):
+        self._mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+
+    def heartbeat(self, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA):
+        kind = mavlink.MAV_TYPE_QUADROTOR
+        return self._mav.heartbeat_encode(kind, autopilot, 0, 0, 4).pack(self._mav)
+
+    def quaternion(self, wxyz=IDENTITY, rate_radps=(0.0, 0.0, 0.0)):
+        return self._mav.attitude_quaternion_encode(0, *wxyz, *rate_radps).pack(self._mav)
+
+    def euler(self, roll=0.0, pitch=0.0, yaw=0.0):
+        return self._mav.attitude_encode(0, roll, pitch, yaw, 0, 0, 0).pack(self._mav)
+
+    def position(self, position_m=(1.0, 2.0, -3.0), velocity_mps=(0.0, 0.0, 0.0)):
+        return self._mav.local_position_ned_encode(0, *position_m, *velocity_mps).pack(self._mav)
+
+
+@pytest.fixture
+def vehicle():
+    return Vehicle()
+
+
+@pytest.fixture
+def listener(vehicle):
+    listener = PoseListener(rate_hz=RATE_HZ)
+    listener.receive(vehicle.heartbeat(), T0_NS)
+    return listener
+
+
+def decode(packets):
+    """Read with a parser that knows nothing of the sender."""
+    return mavlink.MAVLink(None).parse_buffer(b"".join(packets)) or []
+
+
+def requested(packets):
+    return [int(m.param1) for m in decode(packets) if m.get_type() == "COMMAND_LONG"]
+
+
+def test_pose_of_quaternion_and_position(listener, vehicle):
+    tilted = from_euler(0.1, -0.2, 2.0)
+    listener.receive(vehicle.quaternion(tilted) + vehicle.position(), T0_NS)
+    position_m, wxyz = listener.pose_at(T0_NS)
+    assert position_m == (1.0, 2.0, -3.0)
+    assert wxyz == pytest.approx(tilted, abs=1e-6)
+
+
+def test_pose_of_euler_angles(listener, vehicle):
+    listener.receive(vehicle.euler(0.1, -0.2, 2.0) + vehicle.position(), T0_NS)
+    _, wxyz = listener.pose_at(T0_NS)
+    assert wxyz == pytest.approx(from_euler(0.1, -0.2, 2.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("missing", ["quaternion", "position"])
+def test_half_a_pose_is_none(listener, vehicle, missing):
+    other = {"quaternion": vehicle.position, "position": vehicle.quaternion}[missing]
+    listener.receive(other(), T0_NS)
+    assert listener.pose_at(T0_NS) is None
+
+
+def test_the_pose_is_carried_on_at_constant_velocity_and_rate(listener, vehicle):
+    turning = vehicle.quaternion(from_euler(0.0, 0.0, 1.0), (0.0, 0.0, 2.0))
+    listener.receive(turning, T0_NS)
+    listener.receive(vehicle.position((1.0, 2.0, -3.0), (4.0, -8.0, 1.0)), T0_NS + NS_PER_S // 4)
+    position_m, wxyz = listener.pose_at(T0_NS + NS_PER_S // 2)
+    assert position_m == pytest.approx((2.0, 0.0, -2.75))
+    assert wxyz == pytest.approx(from_euler(0.0, 0.0, 2.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("stale", ["quaternion", "position"])
+def test_a_pose_with_a_part_older_than_a_second_is_none(listener, vehicle, stale):
+    parts = {"quaternion": vehicle.quaternion, "position": vehicle.position}
+    listener.receive(parts.pop(stale)(), T0_NS)
+    listener.receive(parts.popitem()[1](), T0_NS + NS_PER_S // 2)
+    assert listener.pose_at(T0_NS + POSE_MAX_AGE_NS) is not None
+    assert listener.pose_at(T0_NS + POSE_MAX_AGE_NS + 1) is None
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        pytest.param(lambda v: v.position((math.nan, 0.0, 0.0)), id="position NaN"),
+        pytest.param(lambda v: v.position(velocity_mps=(0, math.inf, 0)), id="velocity inf"),
+        pytest.param(lambda v: v.quaternion((0.0, 0.0, 0.0, 0.0)), id="zero quaternion"),
+        pytest.param(lambda v: v.quaternion((math.nan, 0.0, 0.0, 0.0)), id="quaternion NaN"),
+        pytest.param(lambda v: v.quaternion(rate_radps=(math.nan, 0, 0)), id="rate NaN"),
+        pytest.param(lambda v: v.euler(roll=math.inf), id="roll inf"),
+    ],
+)
+def test_values_that_cannot_be_are_ignored(listener, vehicle, bad):
+    listener.receive(vehicle.quaternion() + vehicle.position(), T0_NS)
+    before = listener.pose_at(T0_NS)
+    listener.receive(bad(vehicle), T0_NS)
+    assert listener.pose_at(T0_NS) == before
+
+
+@given(st.lists(st.binary(max_size=300), max_size=8))
+def test_garbage_is_ignored(chunks):
+    listener = PoseListener(rate_hz=RATE_HZ)
+    for chunk in chunks:
+        listener.receive(chunk, T0_NS)
+    assert listener.pose_at(T0_NS) is None
+
+
+@pytest.mark.parametrize("length", [0x00, 0x20, 0x80, 0xFF])
+def test_nothing_is_lost_after_what_looks_like_a_frame(listener, vehicle, length):
+    """The lie about the length swallows good frames; they come out when it is found out."""
+    listener.receive(bytes([0xFD, length]) + b"garbage", T0_NS)
+    listener.receive(vehicle.quaternion() + vehicle.position((5.0, 6.0, -7.0)), T0_NS)
+    for _ in range(20):
+        listener.receive(vehicle.heartbeat(), T0_NS)
+    position_m, _ = listener.pose_at(T0_NS)
+    assert position_m == (5.0, 6.0, -7.0)
+
+
+def test_a_truncated_datagram_costs_nothing_but_itself(listener, vehicle):
+    listener.receive(vehicle.position()[:20], T0_NS)
+    listener.receive(vehicle.quaternion() + vehicle.position((5.0, 6.0, -7.0)), T0_NS)
+    position_m, _ = listener.pose_at(T0_NS)
+    assert position_m == (5.0, 6.0, -7.0)
+
+
+def test_only_the_first_autopilot_is_followed():
+    listener, camera, other = PoseListener(rate_hz=RATE_HZ), Vehicle(1, 100), Vehicle(2)
+    listener.receive(Vehicle(255, 190).heartbeat(mavlink.MAV_AUTOPILOT_INVALID), T0_NS)
+    listener.receive(Vehicle(7, 1).heartbeat(mavlink.MAV_AUTOPILOT_INVALID), T0_NS)
+    listener.receive(Vehicle(1).heartbeat() + other.heartbeat(), T0_NS)
+    listener.receive(other.quaternion() + other.position(), T0_NS)
+    listener.receive(camera.quaternion() + camera.position(), T0_NS)
+    assert listener.pose_at(T0_NS) is None
+    assert {m.target_system for m in decode(listener.outgoing(T0_NS))[1:]} == {1}
+
+
+def test_a_heartbeat_a_second_and_no_request_before_a_vehicle_is_heard():
+    listener = PoseListener(rate_hz=RATE_HZ)
+    times = [T0_NS + k * NS_PER_S // 30 for k in range(91)]
+    beats = [now_ns for now_ns in times if listener.outgoing(now_ns)]
+    assert len(beats) == 4
+    assert all(b - a == pytest.approx(NS_PER_S, abs=2) for a, b in pairwise(beats))
+    (beat,) = decode(listener.outgoing(times[-1] + NS_PER_S))
+    assert beat.get_type() == "HEARTBEAT"
+    assert (beat.type, beat.autopilot) == (
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+        mavlink.MAV_AUTOPILOT_INVALID,
+    )
+    assert beat.get_srcSystem() == SYSTEM_ID != 255
+
+
+def test_requests_name_the_vehicle_and_the_interval(listener):
+    _, request, _ = decode(listener.outgoing(T0_NS))
+    assert request.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+    assert (request.target_system, request.target_component) == (1, 1)
+    assert request.param2 == pytest.approx(1e6 / RATE_HZ)
+    assert request.param3 == 0
+
+
+def run_second(listener, second, packets):
+    """A second of these packets; returns what is asked for at its end."""
+    for packet in packets:
+        listener.receive(packet, T0_NS + second * NS_PER_S - 1)
+    return requested(listener.outgoing(T0_NS + second * NS_PER_S))
+
+
+def test_a_message_is_asked_for_until_it_flows_and_again_when_its_rate_drops(listener, vehicle):
+    flows = [vehicle.quaternion(), vehicle.position()] * 60
+    assert requested(listener.outgoing(T0_NS)) == [QUATERNION, POSITION]
+    assert run_second(listener, 1, []) == [QUATERNION, POSITION]
+    assert run_second(listener, 2, flows) == []
+    assert run_second(listener, 3, [vehicle.quaternion()] * 60 + [vehicle.position()] * 4) == [
+        POSITION
+    ]
+    assert run_second(listener, 4, flows) == []
+
+
+def test_euler_angles_are_asked_for_when_there_is_no_quaternion(listener, vehicle):
+    for second in range(ROUNDS_BEFORE_EULER):
+        assert EULER not in run_second(listener, second, [vehicle.position()] * 60)
+    assert run_second(listener, ROUNDS_BEFORE_EULER, []) == [QUATERNION, POSITION, EULER]
+    assert EULER not in run_second(listener, ROUNDS_BEFORE_EULER + 1, [vehicle.quaternion()])
