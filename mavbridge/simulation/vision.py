@@ -1,4 +1,4 @@
-"""The vision loop as events: it runs when a frame is there, its results exist when it says so."""
+"""The vision loop as events: it runs when a frame arrives, and publishes at its stamps."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -10,42 +10,42 @@ from mavbridge.core.records import Event, FeatureFrame, FloatArray, ImageArray, 
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.simulation.clock import AheadClock, SteppedClock
-from mavbridge.simulation.world import LockstepCamera
+from mavbridge.simulation.world import SimulatedCamera
 
 _IMAGES_KEPT = 4
-"""One in the cache, one on its way there; twice that."""
+"""One in the cache and one on its way there, doubled for safety."""
 
 
-class LateFeatureCache(FeatureCache):
-    """A feature is published at its own ``ready_ns``."""
+class DelayedFeatureCache(FeatureCache):
+    """Publishes each feature at its ``ready_ns``."""
 
     def __init__(self, clock: SteppedClock) -> None:
         super().__init__()
         self._clock = clock
 
     def publish(self, frame: FeatureFrame) -> None:
-        """Plan to replace the held feature."""
+        """Schedule the replacement of the cached feature."""
         publish_now = super().publish
         self._clock.schedule(frame.ready_ns, lambda: publish_now(frame))
 
 
-class LateSink:
-    """Sees a vision tick when its feature is ready, so that all events come in order of time."""
+class DelayedSink:
+    """Passes vision ticks on when their features are ready, so that events come in time order."""
 
     def __init__(self, clock: SteppedClock, sink: TickSink) -> None:
         self._clock = clock
         self._sink = sink
 
     def emit(self, event: Event) -> None:
-        """Plan to pass the event on."""
+        """Schedule a vision tick."""
         if isinstance(event, VisionTick):
             self._clock.schedule(event.ready_ns, lambda: self._sink.emit(event))
 
 
-class LateEncoder:
-    """Encodes an image when a chunk is first asked for it: what nobody looks at costs nothing.
+class DelayedEncoder:
+    """Takes the time of an encoding at once, and encodes only the images that an action needs.
 
-    Until then an empty array stands for the feature; the loops never look into one.
+    The vision loop gets an empty array as a placeholder, which ``resolve`` turns into the feature.
     """
 
     def __init__(
@@ -61,27 +61,27 @@ class LateEncoder:
         self._encoded: tuple[FloatArray, FloatArray] | None = None
 
     def encode(self, rgb: ImageArray) -> FloatArray:
-        """Stand-in for the feature; the time is taken now."""
-        stand_in = np.empty((1, 0), np.float32)
-        self._images.append((stand_in, rgb))
+        """Placeholder of the feature of an [H, W, 3] image, [1, 0]."""
+        placeholder = np.empty((1, 0), np.float32)
+        self._images.append((placeholder, rgb))
         self._clock.ahead_ns += next(self._delays_ns)
-        return stand_in
+        return placeholder
 
-    def resolve(self, stand_in: FloatArray) -> FloatArray:
-        """The feature."""
-        if self._encoded is None or self._encoded[0] is not stand_in:
-            rgb = next(rgb for held, rgb in self._images if held is stand_in)
+    def resolve(self, placeholder: FloatArray) -> FloatArray:
+        """Feature behind a placeholder, [1, feature_dim] and read-only."""
+        if self._encoded is None or self._encoded[0] is not placeholder:
+            rgb = next(image for key, image in self._images if key is placeholder)
             feature = self._encode(rgb)
             feature.setflags(write=False)
-            self._encoded = (stand_in, feature)
+            self._encoded = (placeholder, feature)
         return self._encoded[1]
 
 
-class VisionProcess:
-    """Runs the vision loop whenever it is free and a frame is there."""
+class VisionStepper:
+    """Runs a step of the vision loop whenever the loop is idle and a frame has arrived."""
 
     def __init__(
-        self, world: SteppedClock, clock: AheadClock, camera: LockstepCamera, loop: VisionLoop
+        self, world: SteppedClock, clock: AheadClock, camera: SimulatedCamera, loop: VisionLoop
     ) -> None:
         self._world = world
         self._clock = clock

@@ -1,18 +1,23 @@
-"""What an evaluation found: frozen values, and their JSON."""
+"""The results of an evaluation: summary, table and JSON."""
 
 import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from mavbridge.commands.evaluate.statistics import Estimate, mean, rate
-from mavbridge.config.evaluate import Variety
+from mavbridge.config.evaluate import ConditionsKind
 from mavbridge.simulation.result import EpisodeResult, Outcome
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
-    """Over all episodes unless said otherwise; None = no episode that could tell."""
+    """Figures over all episodes unless said otherwise; None = no episode has the figure."""
 
     success_rate: Estimate
     """All gates in order, no crash."""
@@ -48,13 +53,13 @@ def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """One run of ``mavbridge evaluate``."""
+    """One run of ``mavbridge evaluate``; the fields are keys of its JSON."""
 
     policy: str
     engine: str
     mode: str
     """"lockstep" or "realtime"."""
-    conditions: Variety
+    conditions: ConditionsKind
     """random: those that ``python -m sitl --conditions`` draws from each episode's course seed."""
     vision_delay_ms: float
     """Added to the encoding of each image."""
@@ -63,10 +68,15 @@ class Evaluation:
     episodes: tuple[EpisodeResult, ...]
     """In the order of their seeds; fewer than asked for if the run was interrupted."""
 
+    @cached_property
+    def summary(self) -> Summary:
+        """The figures of the episodes, of which there must be one at least."""
+        return summarise(self.episodes)
+
     @property
-    def setting(self) -> str:
-        """How it was flown, in a few words."""
-        parts = [self.mode]
+    def title(self) -> str:
+        """Policy, engine, and how it was flown."""
+        parts = [f"{self.policy} ({self.engine})", self.mode]
         if self.conditions != "nominal":
             parts.append(f"{self.conditions} conditions")
         if self.vision_delay_ms:
@@ -78,12 +88,38 @@ def to_json(evaluation: Evaluation) -> str:
     """Everything as JSON, the summary first."""
     document = asdict(evaluation)
     episodes = document.pop("episodes")
-    summary = asdict(summarise(evaluation.episodes)) if evaluation.episodes else None
-    if summary is not None:
-        summary["outcomes"] = dict(summary["outcomes"])
-    return (
-        json.dumps(
-            {**document, "summary": summary, "episodes": episodes}, indent=2, allow_nan=False
-        )
-        + "\n"
-    )
+    document["summary"] = None
+    if evaluation.episodes:
+        summary = asdict(evaluation.summary)
+        document["summary"] = {**summary, "outcomes": dict(summary["outcomes"])}
+    return json.dumps({**document, "episodes": episodes}, indent=2, allow_nan=False) + "\n"
+
+
+def print_evaluation(evaluation: Evaluation, console: Console) -> None:
+    """Print each figure with its 95 % interval, then how the flights ended."""
+    summary = evaluation.summary
+    table = Table(title=evaluation.title)
+    for heading in ("", "mean", "95 % interval", "flights"):
+        table.add_column(heading, justify="left" if heading == "" else "right")
+    table.add_row("success rate", *_cells(summary.success_rate, "{:.1%}"))
+    for name, estimate in (
+        (f"gates passed, of {evaluation.episodes[0].gates_total}", summary.gates_passed),
+        ("mean speed, m/s", summary.mean_speed_mps),
+        ("stick movement, 1/s", summary.stick_rate_per_s),
+        ("flown, s", summary.flown_s),
+        ("course time, s (successful flights)", summary.course_s),
+    ):
+        table.add_row(name, *_cells(estimate, "{:.2f}"))
+    console.print(table)
+    ends = ", ".join(f"{count} {outcome}" for outcome, count in summary.outcomes)
+    console.print(Text(f"{len(evaluation.episodes)} flights: {ends}"))
+
+
+def _cells(estimate: Estimate | None, form: str) -> tuple[str, str, str]:
+    """Value, interval and count."""
+    if estimate is None:
+        return "-", "-", "0"
+    interval = "-"
+    if estimate.low is not None and estimate.high is not None:
+        interval = f"{form.format(estimate.low)} to {form.format(estimate.high)}"
+    return form.format(estimate.value), interval, str(estimate.count)
