@@ -11,6 +11,7 @@ from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, STATE_HZ, Rates
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import TickSink
+from mavbridge.core.records import ImageArray
 from mavbridge.flight.action_loop import ActionLoop
 from mavbridge.flight.assembly import (
     action_rate_hz,
@@ -25,12 +26,7 @@ from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.referee import Referee
 from mavbridge.simulation.result import EpisodeResult
-from mavbridge.simulation.vision import (
-    DelayedEncoder,
-    DelayedFeatureCache,
-    DelayedSink,
-    VisionStepper,
-)
+from mavbridge.simulation.vision import DelayedFeatureCache, DelayedSink, VisionStepper
 from mavbridge.simulation.world import (
     NOMINAL_VEHICLE,
     BlankRenderer,
@@ -203,19 +199,20 @@ class SimulatedFlight:
         vision_ns = self._random.samples_ns(4, self._settings.delays.vision)
         action_ns = self._random.samples_ns(5, self._settings.delays.action)
         is_dual = executable.dual_rate
-        encoder = DelayedEncoder(
-            executable.encode, vision_clock, vision_ns if is_dual else iter(lambda: 0, 1)
-        )
+
+        def encode(rgb: ImageArray) -> FloatArray:
+            vision_clock.ahead_ns += next(vision_ns) if is_dual else 0
+            return executable.encode(rgb)
 
         def act(
             encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
         ) -> FloatArray:
-            chunk = executable.act(encoder.resolve(encoded), state, history, elapsed_s)
+            chunk = executable.act(encoded, state, history, elapsed_s)
             took_ns = next(action_ns) + (0 if is_dual else next(vision_ns))
             self.clock.sleep_until_ns(self.clock.now_ns() + took_ns)
             return chunk
 
-        return replace(executable, encode=encoder.encode, act=act)
+        return replace(executable, encode=encode, act=act)
 
 
 class _RandomStreams:
