@@ -97,7 +97,7 @@ def _raise_failure(outcome: Result | _Failure) -> Result:
 
 
 class _WorkerProcess(Generic[Job, Result]):
-    """A process that flies the jobs it is sent; this object is its end of the pipe."""
+    """A process that flies the jobs it is sent."""
 
     def __init__(self, number: int, fly: FlyJob[Job, Result], stop: Event) -> None:
         spawn = multiprocessing.get_context("spawn")
@@ -116,11 +116,10 @@ class _WorkerProcess(Generic[Job, Result]):
 
     def receive(self) -> Result | _Failure | None:
         """Outcome of the job; None if the process has died."""
-        try:
+        with suppress(EOFError, ConnectionResetError):
             outcome: Result | _Failure = self.connection.recv()
-        except (EOFError, ConnectionResetError):
-            return None
-        return outcome
+            return outcome
+        return None
 
     def end(self) -> None:
         """Wait for the end of the process, which follows that of its pipe; at worst kill it."""
@@ -162,17 +161,17 @@ def _fly_on_processes(
                 waiting.append(index)
                 losses[index] += 1
                 if losses[index] > MAX_RETRIES:
-                    raise PeerError(_describe_loss(jobs[index]))
+                    raise _loss(jobs[index])
     finally:
         stop.set()
         for worker in (*idle, *busy):
             worker.end()
 
 
-def _describe_loss(job: object) -> str:
-    return (
+def _loss(job: object) -> PeerError:
+    return PeerError(
         f"{job} lost {MAX_RETRIES + 1} workers one after the other (out of memory?): use fewer "
-        "--workers, or with one to see the cause"
+        "--workers, or one to see the cause"
     )
 
 
@@ -215,7 +214,7 @@ def _fly_on_ray(
                 except ray.exceptions.RayTaskError:
                     raise  # a bug, and not the worker's end: its traceback helps
                 except ray.exceptions.RayError as error:
-                    raise PeerError(f"{_describe_loss(jobs[index])}: {error}") from error
+                    raise _loss(jobs[index]) from error
                 yield index, _raise_failure(outcome)
     finally:
         ray.shutdown()
@@ -227,20 +226,15 @@ def _never() -> bool:
 
 
 def _require_reachable(address: str) -> None:
-    """Refuse an address where nothing answers: Ray would keep trying for minutes.
-
-    Raises:
-        UserError: nothing answers, or the address is malformed.
-    """
+    """Refuse an address where nothing answers: Ray would keep trying for long."""
     if address in ("auto", "local"):
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not (host and port.isdigit() and 0 < int(port) < 65536):
-        raise UserError(f"--ray {address!r} is not HOST:PORT, ray://HOST:PORT, auto or local")
     try:
         socket.create_connection((host, int(port)), CONNECT_TIMEOUT_S).close()
-    except OSError as error:
+    except (OSError, OverflowError, ValueError) as error:
+        reason = error.strerror or error if isinstance(error, OSError) else "no port number"
         raise UserError(
-            f"--ray {address}: nothing answers there ({error.strerror or error}); start a cluster "
-            "with ray start --head, or use --workers alone to fly on processes of this machine"
+            f"--ray {address}: nothing answers there ({reason}); name the head of a cluster as "
+            "HOST:PORT or ray://HOST:PORT (ray start --head starts one), or use --workers alone"
         ) from error

@@ -20,6 +20,8 @@ class Job:
     folder: Path | None = None
     error: Exception | None = None
     waits_for_stop: bool = False
+    gets_ctrl_c: bool = False
+    """As every process of a terminal does."""
 
     def __str__(self) -> str:
         return f"job {self.number}"
@@ -29,6 +31,8 @@ def run(job: Job, should_stop: Callable[[], bool]) -> int:
     if job.folder is not None and len(list(job.folder.iterdir())) < job.deaths:
         (job.folder / str(os.getpid())).touch()
         os.kill(os.getpid(), signal.SIGKILL)
+    if job.gets_ctrl_c:
+        signal.raise_signal(signal.SIGINT)
     if job.error is not None:
         raise job.error
     clock = MonotonicClock()

@@ -21,7 +21,7 @@ def jobs(folder: Path, *, deaths: int) -> list[Job]:
     return [
         Job(number=10),
         Job(number=20, deaths=deaths, folder=folder),
-        Job(number=30),
+        Job(number=30, gets_ctrl_c=True),
     ]
 
 

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mavbridge.commands.evaluate.statistics import Estimate, mean, rate
-from mavbridge.config.evaluate import ConditionsKind
+from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.simulation.result import EpisodeResult, Outcome
 
 
@@ -53,46 +53,54 @@ def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """One run of ``mavbridge evaluate``; the fields are keys of its JSON."""
+    """The results of one run of ``mavbridge evaluate``."""
 
-    policy: str
+    config: EvaluateConfig
     engine: str
-    mode: str
-    """"lockstep" or "realtime"."""
-    conditions: ConditionsKind
-    """random: those that ``python -m sitl --conditions`` draws from each episode's course seed."""
-    vision_delay_ms: float
-    """Added to the encoding of each image."""
-    seed: int
-    asked_episodes: int
+    """Empty where no episode was flown."""
     episodes: tuple[EpisodeResult, ...]
-    """In the order of their seeds; fewer than asked for if the run was interrupted."""
+    """In the order of their seeds; fewer than configured if the run was interrupted."""
 
     @cached_property
     def summary(self) -> Summary:
-        """The figures of the episodes, of which there must be one at least."""
+        """Figures of the episodes, of which there must be at least one."""
         return summarise(self.episodes)
+
+    @property
+    def mode(self) -> str:
+        """Either lockstep or realtime."""
+        return "realtime" if self.config.is_wall_clock else "lockstep"
 
     @property
     def title(self) -> str:
         """Policy, engine, and how it was flown."""
-        parts = [f"{self.policy} ({self.engine})", self.mode]
-        if self.conditions != "nominal":
-            parts.append(f"{self.conditions} conditions")
-        if self.vision_delay_ms:
-            parts.append(f"images {self.vision_delay_ms:g} ms later")
+        config = self.config
+        parts = [f"{config.policy.policy} ({self.engine})", self.mode]
+        if config.conditions != "nominal":
+            parts.append(f"{config.conditions} conditions")
+        if config.vision_delay:
+            parts.append(f"images {config.vision_delay:g} ms later")
         return ", ".join(parts)
 
 
 def to_json(evaluation: Evaluation) -> str:
-    """Everything as JSON, the summary first."""
-    document = asdict(evaluation)
-    episodes = document.pop("episodes")
-    document["summary"] = None
+    """Everything as JSON, the summary before the episodes; without episodes it is null."""
+    config, summary = evaluation.config, None
     if evaluation.episodes:
         summary = asdict(evaluation.summary)
-        document["summary"] = {**summary, "outcomes": dict(summary["outcomes"])}
-    return json.dumps({**document, "episodes": episodes}, indent=2, allow_nan=False) + "\n"
+        summary["outcomes"] = dict(summary["outcomes"])
+    document = {
+        "policy": config.policy.policy,
+        "engine": evaluation.engine,
+        "mode": evaluation.mode,
+        "conditions": config.conditions,
+        "vision_delay_ms": config.vision_delay,
+        "seed": config.policy.seed,
+        "asked_episodes": config.episodes,
+        "summary": summary,
+        "episodes": [asdict(one) for one in evaluation.episodes],
+    }
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 def print_evaluation(evaluation: Evaluation, console: Console) -> None:

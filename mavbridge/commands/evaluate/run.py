@@ -40,8 +40,18 @@ def evaluate(config: EvaluateConfig) -> int:
         except MavbridgeError as error:
             failure = error  # the episodes flown before still count
         was_stopped = stop.is_set()
-    if flown or failure is None:
-        _report(_evaluation(config, flown), config, draw)
+    episodes = [flown[index] for index in sorted(flown)]
+    evaluation = Evaluation(
+        config=config,
+        engine=episodes[0].engine if episodes else "",
+        episodes=tuple(one.result for one in episodes),
+    )
+    if episodes:
+        print_evaluation(evaluation, Console())
+        if draw is not None:
+            draw(evaluation)
+    if config.json is not None and (episodes or failure is None):
+        config.json.write_text(to_json(evaluation))
     if failure is not None or was_stopped:
         ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
         console.print(Text(f"{ended}{config.episodes} episodes", style="yellow"))
@@ -75,32 +85,6 @@ def _fly(
             flown[index] = episode
             finished = sum(one.result.has_finished for one in flown.values())
             progress.update(bar, advance=1, score=f"{finished} of {len(flown)} finished")
-
-
-def _evaluation(config: EvaluateConfig, flown: dict[int, FlownEpisode]) -> Evaluation:
-    episodes = [flown[index] for index in sorted(flown)]
-    return Evaluation(
-        policy=config.policy.policy,
-        engine=episodes[0].engine if episodes else "",
-        mode="realtime" if config.is_wall_clock else "lockstep",
-        conditions=config.conditions,
-        vision_delay_ms=config.vision_delay,
-        seed=config.policy.seed,
-        asked_episodes=config.episodes,
-        episodes=tuple(one.result for one in episodes),
-    )
-
-
-def _report(
-    evaluation: Evaluation, config: EvaluateConfig, draw: Callable[[Evaluation], None] | None
-) -> None:
-    """Print, draw and write."""
-    if evaluation.episodes:
-        print_evaluation(evaluation, Console())
-        if draw is not None:
-            draw(evaluation)
-    if config.json is not None:
-        config.json.write_text(to_json(evaluation))
 
 
 def _drawing(path: Path) -> Callable[[Evaluation], None]:

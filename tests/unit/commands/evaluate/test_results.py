@@ -13,6 +13,7 @@ from mavbridge.commands.evaluate.results import (
     summarise,
     to_json,
 )
+from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import NEUTRAL, Sticks
 from mavbridge.simulation.result import EpisodeResult, StickMeter
@@ -20,13 +21,8 @@ from mavbridge.simulation.result import EpisodeResult, StickMeter
 
 def evaluation(*episodes: EpisodeResult) -> Evaluation:
     return Evaluation(
-        policy="toge",
+        config=EvaluateConfig(episodes=5, conditions="random", vision_delay=50.0),
         engine="openvino",
-        mode="lockstep",
-        conditions="random",
-        vision_delay_ms=50.0,
-        seed=0,
-        asked_episodes=5,
         episodes=episodes,
     )
 

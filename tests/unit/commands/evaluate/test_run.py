@@ -160,7 +160,7 @@ def test_the_old_names_of_the_clocks_work_with_a_notice(
         (["--policy", "scripted", "--json", "/proc/none/out.json"], "cannot write"),
         (["--policy", "scripted", "--json", "/"], "cannot write /"),
         (["--policy", "scripted", "--plot", "/proc/none/out.png"], "cannot write"),
-        (["--policy", "scripted", "--ray", "cluster"], "not HOST:PORT"),
+        (["--policy", "scripted", "--ray", "cluster"], "--ray cluster: nothing answers there"),
         (["--fast"], "Unknown option: --fast"),
     ],
 )
