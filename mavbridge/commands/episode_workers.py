@@ -34,6 +34,7 @@ MAX_RETRIES = 3
 CONNECT_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 10.0
 """Limit for a process to end by itself, and then on SIGTERM, before it is killed."""
+_SPAWN = multiprocessing.get_context("spawn")
 _POLL_S = 0.1
 """Interval at which the stop flag is checked."""
 
@@ -63,49 +64,38 @@ def fly_jobs(
                 yield index, fly(job, should_stop)
 
 
-def end_process(process: multiprocessing.process.BaseProcess) -> None:
-    """Terminate a process and wait for its end; kill it after END_TIMEOUT_S."""
-    process.terminate()
-    process.join(END_TIMEOUT_S)
-    if process.is_alive():
-        process.kill()
-        process.join(END_TIMEOUT_S)
-
-
 @dataclass(frozen=True, slots=True)
-class _Failure:
+class Failure:
     """An exception on its way from a worker."""
 
     error: Exception
 
 
-def _attempt(fly: FlyJob[Job, Result], job: Job, should_stop: ShouldStop) -> Result | _Failure:
+def _attempt(fly: FlyJob[Job, Result], job: Job, should_stop: ShouldStop) -> Result | Failure:
     """Fly in a worker; an unexpected error takes its traceback along."""
     try:
         return fly(job, should_stop)
     except MavbridgeError as error:
-        return _Failure(error)
+        return Failure(error)
     except Exception as error:  # noqa: BLE001 - raised again where the results are awaited
         error.add_note(traceback.format_exc())
-        return _Failure(error)
+        return Failure(error)
 
 
-def _raise_failure(outcome: Result | _Failure) -> Result:
-    if isinstance(outcome, _Failure):
+def raise_failure(outcome: Result | Failure) -> Result:
+    """Return the result, or raise what the worker's job raised."""
+    if isinstance(outcome, Failure):
         raise outcome.error
     return outcome
 
 
-class _WorkerProcess(Generic[Job, Result]):
+class WorkerProcess(Generic[Job, Result]):
     """A process that flies the jobs it is sent."""
 
-    def __init__(self, number: int, fly: FlyJob[Job, Result], stop: Event) -> None:
-        spawn = multiprocessing.get_context("spawn")
-        self.connection, theirs = spawn.Pipe()
+    def __init__(self, name: str, fly: FlyJob[Job, Result], stop: Event) -> None:
+        self.connection, theirs = _SPAWN.Pipe()
         """Readable when an outcome has arrived, or when the process has died."""
-        self._process = spawn.Process(
-            target=_serve, args=(theirs, fly, stop), name=f"mavbridge-worker-{number}"
-        )
+        self._process = _SPAWN.Process(target=_serve, args=(theirs, fly, stop), name=name)
         self._process.start()
         theirs.close()
 
@@ -114,18 +104,27 @@ class _WorkerProcess(Generic[Job, Result]):
         with suppress(BrokenPipeError):  # it has died, which ``receive`` reports
             self.connection.send(job)
 
-    def receive(self) -> Result | _Failure | None:
-        """Outcome of the job; None if the process has died."""
+    def receive(self) -> Result | Failure | None:
+        """Outcome of the job; None if the process has died, or hangs."""
         with suppress(EOFError, ConnectionResetError):
-            outcome: Result | _Failure = self.connection.recv()
-            return outcome
+            if self.connection.poll(END_TIMEOUT_S):
+                outcome: Result | Failure = self.connection.recv()
+                return outcome
         return None
+
+    def terminate(self) -> None:
+        """Send SIGTERM, which ends a flight in order."""
+        self._process.terminate()
 
     def end(self) -> None:
         """Wait for the end of the process, which follows that of its pipe; at worst kill it."""
         self.connection.close()
+        for insist in (self._process.terminate, self._process.kill):
+            self._process.join(END_TIMEOUT_S)
+            if not self._process.is_alive():
+                return
+            insist()
         self._process.join(END_TIMEOUT_S)
-        end_process(self._process)
 
 
 def _serve(connection: Connection, fly: FlyJob[Job, Result], stop: Event) -> None:
@@ -141,13 +140,13 @@ def _fly_on_processes(
 ) -> Iterator[tuple[int, Result]]:
     waiting = list(reversed(range(len(jobs))))
     losses: Counter[int] = Counter()
-    stop, numbers = multiprocessing.get_context("spawn").Event(), itertools.count()
-    idle: list[_WorkerProcess[Job, Result]] = []
-    busy: dict[_WorkerProcess[Job, Result], int] = {}
+    stop, names = _SPAWN.Event(), map("mavbridge-worker-{}".format, itertools.count())
+    idle: list[WorkerProcess[Job, Result]] = []
+    busy: dict[WorkerProcess[Job, Result], int] = {}
     try:
         while (waiting or busy) and not should_stop():
             while waiting and len(busy) < count:
-                worker = idle.pop() if idle else _WorkerProcess(next(numbers), fly, stop)
+                worker = idle.pop() if idle else WorkerProcess(next(names), fly, stop)
                 busy[worker] = index = waiting.pop()
                 worker.send(jobs[index])
             ready = wait([worker.connection for worker in busy], _POLL_S)
@@ -155,7 +154,7 @@ def _fly_on_processes(
                 index, outcome = busy.pop(worker), worker.receive()
                 if outcome is not None:
                     idle.append(worker)
-                    yield index, _raise_failure(outcome)
+                    yield index, raise_failure(outcome)
                     continue
                 worker.end()
                 waiting.append(index)
@@ -210,12 +209,12 @@ def _fly_on_ray(
             for reference in ray.wait(list(busy), num_returns=1, timeout=_POLL_S)[0]:
                 index = busy.pop(reference)
                 try:
-                    outcome: Result | _Failure = ray.get(reference)
+                    outcome: Result | Failure = ray.get(reference)
                 except ray.exceptions.RayTaskError:
                     raise  # a bug, and not the worker's end: its traceback helps
                 except ray.exceptions.RayError as error:
                     raise _loss(jobs[index]) from error
-                yield index, _raise_failure(outcome)
+                yield index, raise_failure(outcome)
     finally:
         ray.shutdown()
 

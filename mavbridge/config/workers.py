@@ -11,7 +11,7 @@ from mavbridge.config.checks import check_range
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class WorkersConfig:
-    """Where episodes are flown, and how many at a time."""
+    """Number of episodes flown at a time, and the machines that fly them."""
 
     workers: int = 1
     """Episodes at a time, each in a process of its own."""

@@ -49,12 +49,12 @@ class Delays:
     """The delays of one flight; by default those of TOGE small on two shared cores."""
 
     camera: Delay = Delay(p50_ns=3 * NS_PER_MS)
-    """From exposure to the arrival of the frame."""
+    """Exposure to arrival of the frame."""
     vision: Delay = Delay(p50_ns=11 * NS_PER_MS, p99_ns=25 * NS_PER_MS)
-    """From image to feature."""
+    """Image to feature."""
     action: Delay = Delay(p50_ns=3 * NS_PER_MS, p99_ns=6 * NS_PER_MS)
-    """From state to chunk; in single-rate mode the time for the image comes on top."""
+    """State to chunk; in single-rate mode the time for the image comes on top."""
     uplink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
-    """From bridge to vehicle."""
+    """Bridge to vehicle."""
     downlink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
-    """From vehicle to bridge."""
+    """Vehicle to bridge."""

@@ -22,7 +22,7 @@ class EpisodeResult:
     gate_times_s: tuple[float, ...]
     """When each gate was passed, in order."""
     flown_s: float
-    """To the end of the episode: one second after the last gate, the crash, or the time limit."""
+    """Until the end of the episode: one second after the last gate, the crash, or the limit."""
     distance_m: float
     """Along the path, to the end of the episode."""
     stick_rate_per_s: float | None

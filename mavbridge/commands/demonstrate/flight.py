@@ -32,7 +32,7 @@ class DemonstrationSpec:
     """A demonstration to fly."""
 
     folder: Path
-    """What it holds is replaced."""
+    """Its contents are replaced."""
     seed: int
     """Decides the course and everything random."""
     config: DemonstrateConfig

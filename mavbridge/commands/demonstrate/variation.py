@@ -43,7 +43,7 @@ def draw_variation(seed: int) -> Variation:
 
 
 def _random_delays(random: np.random.Generator) -> Delays:
-    """From a fast computer to a busy one, each part with a log-uniform median."""
+    """Delays between those of a fast computer and a busy one, with log-uniform medians."""
 
     def median_ns(low_ms: float, high_ms: float) -> int:
         return round(NS_PER_MS * float(np.exp(random.uniform(np.log(low_ms), np.log(high_ms)))))

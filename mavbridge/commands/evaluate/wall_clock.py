@@ -4,7 +4,6 @@ import json
 import multiprocessing
 import sys
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from pathlib import Path
 from subprocess import Popen
 from tempfile import TemporaryDirectory
@@ -13,7 +12,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from mavbridge.commands.bench.processes import END_TIMEOUT_S, end, free_udp_port, running, wait
-from mavbridge.commands.episode_workers import end_process
+from mavbridge.commands.episode_workers import WorkerProcess, raise_failure
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.rates import SIM_CAMERA_PX
@@ -28,6 +27,12 @@ from mavbridge.simulation.result import EpisodeResult, Outcome, StickMeter
 STARTUP_S = 90.0
 """Limit on a flight's time beyond its own: imports, compiling an engine, arming."""
 _POLL_S = 0.1
+
+
+class _BridgeJob(NamedTuple):
+    spec: EpisodeSpec
+    port: int
+    camera: str
 
 
 class _BridgeReport(NamedTuple):
@@ -56,7 +61,7 @@ def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> Flo
         )
         with running(*command, log=log) as vehicle:
             try:
-                bridge = _run_bridge(spec, port, camera, vehicle, should_stop)
+                bridge = _run_bridge(_BridgeJob(spec, port, camera), vehicle, should_stop)
             except MavbridgeError:
                 if vehicle.poll():  # then the vehicle's failure is the reason
                     wait(vehicle, "python -m sitl", log, END_TIMEOUT_S)
@@ -67,65 +72,47 @@ def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> Flo
 
 
 def _run_bridge(
-    spec: EpisodeSpec,
-    port: int,
-    camera: str,
-    vehicle: "Popen[bytes]",
-    should_stop: Callable[[], bool],
+    job: _BridgeJob, vehicle: "Popen[bytes]", should_stop: Callable[[], bool]
 ) -> _BridgeReport:
-    """Run the bridge until it or the vehicle has ended."""
-    spawn = multiprocessing.get_context("spawn")
-    receiver, sender = spawn.Pipe(duplex=False)
-    process = spawn.Process(
-        target=_bridge_main, args=(spec, port, camera, sender), name="mavbridge-evaluate-bridge"
-    )
-    clock = MonotonicClock()
+    """Run the bridge in a process of its own until it or the vehicle has ended."""
+    clock, spec = MonotonicClock(), job.spec
     deadline_ns = clock.now_ns() + round((spec.config.max_time + STARTUP_S) * NS_PER_S)
-    process.start()
-    sender.close()
+    never = multiprocessing.get_context("spawn").Event()
+    worker = WorkerProcess("mavbridge-evaluate-bridge", _fly_bridge, never)
+    worker.send(job)
     try:
-        while process.is_alive() and vehicle.poll() is None and not should_stop():
-            process.join(_POLL_S)
+        while not worker.connection.poll(_POLL_S) and vehicle.poll() is None:
+            if should_stop():
+                raise EpisodeInterruptedError(f"{spec}: interrupted")
             if clock.now_ns() > deadline_ns:
                 raise PeerError(f"{spec}: the bridge has not ended in time")
     finally:
-        end_process(process)  # gives the sticks back
-    if should_stop():
-        raise EpisodeInterruptedError(f"{spec}: interrupted")
-    with receiver:
-        try:
-            outcome: _BridgeReport | MavbridgeError = receiver.recv()
-        except EOFError as error:
-            raise PeerError(f"{spec}: the bridge ended with status {process.exitcode}") from error
-    if isinstance(outcome, MavbridgeError):
-        raise outcome
-    return outcome
+        worker.terminate()  # gives the sticks back
+        outcome = worker.receive()
+        worker.end()
+    if outcome is None:
+        raise PeerError(f"{spec}: the bridge's process has died, or hung at its end")
+    return raise_failure(outcome)
 
 
-def _bridge_main(spec: EpisodeSpec, port: int, camera: str, sender: Connection) -> None:
-    """Main function of the bridge's process: one flight as of ``mavbridge fly``."""
+def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> _BridgeReport:
+    """Fly once, as ``mavbridge fly`` does; ended by signals, like that."""
+    settings, clock, meter = job.spec.config, MonotonicClock(), StickMeter()
     config = FlyConfig(
-        link=LinkConfig(connect=f"udp:127.0.0.1:{port}"),
-        policy=spec.config.policy,
-        camera=CameraConfig(camera=camera),
-        rates=spec.config.rates,
-        limits=spec.config.limits,
+        link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}"),
+        policy=settings.policy,
+        camera=CameraConfig(camera=job.camera),
+        rates=settings.rates,
+        limits=settings.limits,
         mode=MODE,
         arm=True,
-        duration=spec.config.max_time,
+        duration=settings.max_time,
     )
-    clock, meter = MonotonicClock(), StickMeter()
+    executable = load_configured_policy(config.policy, clock).executable
     with Path("/dev/null").open("w") as nowhere:
         console = Console(file=nowhere)
-        try:
-            executable = load_configured_policy(config.policy, clock).executable
-            fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))
-        except KeyboardInterrupt:
-            return  # before the flight; the parent was interrupted as well
-        except MavbridgeError as error:
-            sender.send(error)
-            return
-    sender.send(_BridgeReport(executable.engine, meter))
+        fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))
+    return _BridgeReport(executable.engine, meter)
 
 
 def _read_result(spec: EpisodeSpec, meter: StickMeter, path: Path) -> EpisodeResult:
