@@ -3,6 +3,8 @@
 import difflib
 import os
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -109,17 +111,24 @@ def imagine_evaluate(*flights: Path, config: ImagineEvaluateConfig | None = None
     return evaluate_imagination(flights, config or ImagineEvaluateConfig())
 
 
-@cli.command
-def evaluate(config: EvaluateConfig | None = None) -> int:
-    """Fly a policy over many simulated gate courses, and say how well it does."""
+@contextmanager
+def _needs_simulator(command: str) -> Iterator[None]:
+    """Say what to install where the simulator cannot be imported."""
     try:
-        from mavbridge.commands.evaluate.run import evaluate as run_evaluation
+        yield
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
             raise
         raise UserError(
-            "evaluate needs the simulator's dynamics: pip install 'mavbridge[sitl]'"
+            f"{command} needs the simulator's dynamics: pip install 'mavbridge[sitl]'"
         ) from error
+
+
+@cli.command
+def evaluate(config: EvaluateConfig | None = None) -> int:
+    """Fly a policy over many simulated gate courses, and say how well it does."""
+    with _needs_simulator("evaluate"):
+        from mavbridge.commands.evaluate.run import evaluate as run_evaluation
     return run_evaluation(EvaluateConfig() if config is None else config)
 
 
@@ -129,14 +138,8 @@ def demonstrate(config: DemonstrateConfig) -> int:
     from mavbridge.recording.folder import require_extra
 
     require_extra("demonstrate")
-    try:
+    with _needs_simulator("demonstrate"):
         from mavbridge.commands.demonstrate.run import demonstrate as run_demonstrations
-    except ModuleNotFoundError as error:
-        if error.name != "mujoco":
-            raise
-        raise UserError(
-            "demonstrate needs the simulator's dynamics: pip install 'mavbridge[sitl]'"
-        ) from error
     return run_demonstrations(config)
 
 

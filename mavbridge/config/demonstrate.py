@@ -8,6 +8,7 @@ from cyclopts import Parameter
 from mavbridge.config.checks import check_range
 from mavbridge.config.courses import CHECK_COURSE_SEED, MAX_EPISODES
 from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.workers import WorkersConfig
 
 
 @Parameter(name="*")
@@ -16,28 +17,26 @@ class DemonstrateConfig:
     """Flights to learn from."""
 
     out: Path
-    """Folder for the flights, each in a folder of its own; what is there already is kept."""
+    """Folder for the flights, each in a folder of its own; finished ones are kept."""
     episodes: int = 100
     """Flights in all."""
     speed: float = 5.0
-    """Of the expert along the course, in m/s."""
+    """Speed of the expert along the course, in m/s."""
     max_time: float = 40.0
     """Seconds after which a flight ends, on the course or not; a short one can start a rollout."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
-    """With --checkpoint the policy flies most of the time, and the expert says what it would do
-    (DAgger)."""
-    workers: int = 1
-    """Flights at a time."""
+    """With --checkpoint the policy flies most of the time, and the expert's sticks are recorded as
+    labels (DAgger)."""
+    workers: WorkersConfig = field(default_factory=WorkersConfig)
 
     def __post_init__(self) -> None:
         """Refuse what cannot be flown."""
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("speed", self.speed, 1.5, 10, "m/s")
         check_range("max-time", self.max_time, 1, 3600, "s")
-        check_range("workers", self.workers, 1, 64, "")
         check_range("seed", self.policy.seed, 0, CHECK_COURSE_SEED // MAX_EPISODES - 1, "")
 
     @property
     def first_course_seed(self) -> int:
-        """Never one of those that train or evaluate flies."""
+        """Course of the first flight; neither training nor evaluation flies any of these."""
         return self.policy.seed * MAX_EPISODES

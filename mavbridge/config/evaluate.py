@@ -11,9 +11,11 @@ from mavbridge.config.courses import MAX_EPISODES
 from mavbridge.config.flight import Limits
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
+from mavbridge.config.workers import WorkersConfig
 from mavbridge.core.errors import UserError
 
-Variety = Literal["nominal", "random"]
+ConditionsKind = Literal["nominal", "random"]
+ClockKind = Literal["simulated", "wall"]
 
 
 @Parameter(name="*")
@@ -33,18 +35,17 @@ class EvaluateConfig:
     """Courses to fly."""
     max_time: float = 60.0
     """Seconds that a flight may take, from the policy's first action."""
-    conditions: Variety = "nominal"
+    conditions: ConditionsKind = "nominal"
     """random: each flight has another vehicle, firmware settings, wind, light, colours and lens."""
+    clock: ClockKind = "simulated"
+    """simulated: bridge and simulator in lockstep, faster than real time, the same for the same
+    seed. wall: real processes over UDP in real time, one flight at a time."""
+    realtime: Annotated[bool | None, Parameter(negative="--lockstep", show=False)] = None
+    """The old names of --clock wall and --clock simulated."""
     vision_delay: float = 0.0
-    """Milliseconds by which each image takes longer to encode, with --lockstep; images older than
-    --max-feature-age are not flown by, whatever made them so."""
-    realtime: Annotated[bool, Parameter(negative="--lockstep")] = False
-    """--realtime: real processes over UDP against the wall clock, one flight at a time. --lockstep
-    (default): bridge and simulator on one simulated clock, as fast as the processor allows."""
-    workers: int = 1
-    """Episodes at a time; more than 1 takes ray (the extra "cluster")."""
-    ray: str | None = None
-    """Ray cluster to use, as HOST:PORT or auto; by default one on this machine, if needed."""
+    """Milliseconds added to the encoding of each image (simulated clock); an image older than
+    --max-feature-age is not flown by."""
+    workers: WorkersConfig = field(default_factory=WorkersConfig)
     json: Path | None = None
     """Write all results here as JSON."""
     plot: Path | None = None
@@ -54,20 +55,22 @@ class EvaluateConfig:
         """Refuse contradictions."""
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("max-time", self.max_time, 1, 3600, "s")
-        check_range("workers", self.workers, 1, 10_000, "")
         check_range("vision-delay", self.vision_delay, 0, 5000, "ms")
-        if self.realtime and self.vision_delay:
+        if self.is_wall_clock and self.vision_delay:
+            raise UserError("--vision-delay needs --clock simulated: real encoders take their time")
+        if self.is_wall_clock and self.workers.is_parallel:
             raise UserError(
-                "--realtime takes the time that it takes: --vision-delay is for --lockstep"
-            )
-        if self.realtime and (self.workers > 1 or self.ray is not None):
-            raise UserError(
-                "--realtime flies one episode at a time, since the processors must be its own: "
+                "--clock wall flies one episode at a time, which needs the processors for itself: "
                 "leave out --workers and --ray"
             )
         _ = self.rates
 
     @property
+    def is_wall_clock(self) -> bool:
+        """Flights take real time."""
+        return self.clock == "wall" if self.realtime is None else self.realtime
+
+    @property
     def rates(self) -> Rates:
-        """As ``fly`` takes them."""
+        """Rates of ``mavbridge fly``."""
         return Rates(visual_rate=self.visual_rate, action_rate=self.action_rate, rate=self.rate)

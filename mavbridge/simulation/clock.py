@@ -1,4 +1,4 @@
-"""Simulated time: it passes when somebody waits, and then what is due in the world happens."""
+"""Simulated time: it passes when a loop waits, and events run as it passes them."""
 
 import heapq
 from collections.abc import Callable
@@ -11,10 +11,10 @@ START_NS = 1_000 * NS_PER_S
 
 
 class SteppedClock:
-    """A ``Clock`` with a queue of events; one thread, always the same order.
+    """A ``Clock`` with a queue of events, for one thread.
 
-    Only the action loop waits. Everything else in the world is an event: it runs at its time, in
-    the order of scheduling where times are equal, and takes no time itself.
+    Only the action loop waits. Everything else in the simulated world is an event: it runs at its
+    time, takes no time itself, and events of equal time run in the order of scheduling.
     """
 
     def __init__(self, start_ns: int = START_NS) -> None:
@@ -24,22 +24,26 @@ class SteppedClock:
         self._is_in_event = False
 
     def now_ns(self) -> int:
-        """Simulated time; within an event, its time."""
+        """Simulated time."""
         return self._now_ns
 
     @property
     def next_event_ns(self) -> int | None:
-        """When the next event is due; None = nothing is planned."""
+        """When the next event is due; None = no event is scheduled."""
         return self._events[0][0] if self._events else None
 
     def schedule(self, at_ns: int, event: Callable[[], None]) -> None:
-        """Run ``event`` at ``at_ns``, or as soon as time passes if that is over."""
+        """Run ``event`` at ``at_ns``, or as soon as time passes if that is already over."""
         heapq.heappush(self._events, (at_ns, next(self._order), event))
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Let time pass to ``deadline_ns``, events at that very time included."""
+        """Let time pass to ``deadline_ns``, and run the events due by then.
+
+        Raises:
+            RuntimeError: called from within an event.
+        """
         if self._is_in_event:
-            raise RuntimeError("an event must not wait: it would reorder the world")
+            raise RuntimeError("an event must not wait: later events would run before its end")
         self._is_in_event = True
         try:
             while self._events and self._events[0][0] <= deadline_ns:
@@ -52,20 +56,21 @@ class SteppedClock:
 
 
 class AheadClock:
-    """The clock of a loop that runs as an event: ahead of the world by the time that it has worked.
+    """The ``Clock`` of a loop that runs as an event: simulated time plus the time it has worked.
 
-    The vision loop encodes an image in one go, and yet the result must exist only later; its stamps
-    come from here, and what it publishes is scheduled for them.
+    The vision loop encodes an image within one event, yet the result must exist only later: its
+    stamps come from this clock, and what it publishes is scheduled for them.
     """
 
     def __init__(self, world: SteppedClock) -> None:
         self._world = world
         self.ahead_ns = 0
+        """Time worked since the event began."""
 
     def now_ns(self) -> int:
-        """The world's time and the work since."""
+        """Simulated time plus the time worked."""
         return self._world.now_ns() + self.ahead_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Be ahead until then."""
+        """Count the time until ``deadline_ns`` as worked."""
         self.ahead_ns = max(self.ahead_ns, deadline_ns - self._world.now_ns())

@@ -1,4 +1,4 @@
-"""Decides when an episode is over, and how it went."""
+"""The end of a simulated flight, and its result."""
 
 import threading
 from collections.abc import Callable
@@ -10,15 +10,15 @@ from mavbridge.simulation.result import EpisodeResult, Outcome, StickMeter
 from sitl.simulated_vehicle import SimulatedVehicle
 
 READY_NS = 30 * NS_PER_S
-"""Most that an episode may take until the policy flies; a quick boot needs some 4 s."""
+"""Limit from the start to the policy's first action, which comes after some 4 s."""
 
 
 class EpisodeInterruptedError(MavbridgeError):
-    """Somebody asked for the end of an episode that was not over."""
+    """An episode was stopped before its end, so it has no result."""
 
 
 class Referee:
-    """A ``TickSink`` that also looks at the true vehicle after each of its steps."""
+    """A ``TickSink`` that also watches the true vehicle, and sets ``stop`` at the end."""
 
     def __init__(
         self,
@@ -34,35 +34,35 @@ class Referee:
         self._should_stop = should_stop
         self._start_ns = clock.now_ns()
         self._meter = StickMeter()
-        self._reason: str | None = None
+        self._release_reason: str | None = None
         self._outcome: Outcome | None = None
         self._end_ns = 0
         self._distance_m = 0.0
         self.stop = threading.Event()
-        """Set when the episode is over."""
 
     def emit(self, event: Event) -> None:
-        """Follow what the bridge does."""
+        """Follow the bridge's ticks."""
         if isinstance(event, Tick) and not self.stop.is_set():
-            self._reason = event.release_reason
+            self._release_reason = event.release_reason
             self._meter.emit(event)
 
     def watch(self) -> None:
-        """Look at the vehicle."""
+        """Check the vehicle; called after each of its steps."""
         if self.stop.is_set():
             return
-        self._outcome = self._judge()
-        is_stuck = self._meter.engaged_ns is None and self._waited_ns > READY_NS
-        if self._outcome is not None or is_stuck or (self._should_stop and self._should_stop()):
+        self._outcome = self._find_outcome()
+        is_interrupted = self._should_stop is not None and self._should_stop()
+        if self._outcome is not None or self._has_failed_to_engage or is_interrupted:
             self._end_ns = self._clock.now_ns()
             self._distance_m = self._vehicle.log.distance_m
             self.stop.set()
 
     @property
-    def _waited_ns(self) -> int:
-        return self._clock.now_ns() - self._start_ns
+    def _has_failed_to_engage(self) -> bool:
+        is_late = self._clock.now_ns() - self._start_ns > READY_NS
+        return self._meter.engaged_ns is None and is_late
 
-    def _judge(self) -> Outcome | None:
+    def _find_outcome(self) -> Outcome | None:
         if (engaged_ns := self._meter.engaged_ns) is None:
             return None
         ap = self._vehicle.ap
@@ -74,21 +74,20 @@ class Referee:
         return "timed out" if is_late else None
 
     def result(self, *, course_seed: int, seed: int) -> EpisodeResult:
-        """How it went.
+        """The result of a flight that has ended.
 
         Raises:
-            EpisodeInterruptedError: it was not over when it was stopped.
+            EpisodeInterruptedError: the flight was stopped before its end.
             PeerError: the policy never got the sticks.
         """
-        engaged_ns = self._meter.engaged_ns
+        if self._has_failed_to_engage:
+            reason = self._release_reason or "images or states are older than their limits"
+            raise PeerError(
+                f"the policy did not get the sticks within {READY_NS // NS_PER_S} s: {reason}"
+            )
+        engaged_ns, log = self._meter.engaged_ns, self._vehicle.log
         if self._outcome is None or engaged_ns is None:
-            if self._waited_ns > READY_NS and engaged_ns is None:
-                raise PeerError(
-                    f"the policy did not get the sticks within {READY_NS // NS_PER_S} s: "
-                    f"{self._reason}"
-                )
             raise EpisodeInterruptedError(f"course {course_seed}: interrupted")
-        log = self._vehicle.log
         offset_s = (engaged_ns - self._start_ns) / NS_PER_S
         return EpisodeResult(
             course_seed=course_seed,

@@ -1,4 +1,4 @@
-"""What an episode came to: frozen values that go into JSON and between processes."""
+"""The result of an episode: one flight of one course, simulated or on the wall clock."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Event, Sticks, Tick
 
 Outcome = Literal["finished", "crashed", "disarmed", "timed out"]
-"""All gates passed; hit the ground; motors stopped by themselves; none of these in time."""
+"""All gates passed; hit the ground or a gate; motors stopped in flight; none of these in time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,21 +22,21 @@ class EpisodeResult:
     gate_times_s: tuple[float, ...]
     """When each gate was passed, in order."""
     flown_s: float
-    """To the end of the episode: one second after the last gate, the crash, or the time limit."""
+    """Until the end of the episode: one second after the last gate, the crash, or the limit."""
     distance_m: float
-    """Along the path, over that time."""
+    """Along the path, to the end of the episode."""
     stick_rate_per_s: float | None
     """Mean over the four sticks of |change| per second, as sent; full deflection is 1. None = the
     policy never had the sticks for two actions in a row."""
 
     @property
     def has_finished(self) -> bool:
-        """All gates in order, and no crash."""
+        """All gates were passed in order, without a crash."""
         return self.outcome == "finished"
 
     @property
     def gates_passed(self) -> int:
-        """In order."""
+        """Number of gates passed in order."""
         return len(self.gate_times_s)
 
     @property
@@ -51,17 +51,17 @@ class EpisodeResult:
 
 
 class StickMeter:
-    """A ``TickSink``: how much the policy moves the sticks, and since when it has them."""
+    """A ``TickSink`` that measures how much the policy moves the sticks."""
 
     def __init__(self) -> None:
         self.engaged_ns: int | None = None
-        """First tick of the policy."""
+        """When the policy's first tick began."""
         self._last: tuple[int, Sticks] | None = None
         self._travel = 0.0
         self._moved_ns = 0
 
     def emit(self, event: Event) -> None:
-        """Take the sticks out of a tick."""
+        """Add the change since the tick before."""
         if not isinstance(event, Tick):
             return
         if event.trace is None or event.sent is None:

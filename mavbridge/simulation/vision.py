@@ -1,87 +1,44 @@
-"""The vision loop as events: it runs when a frame is there, its results exist when it says so."""
-
-from collections import deque
-from collections.abc import Callable, Iterator
-
-import numpy as np
+"""The vision loop as events: it runs when a frame arrives, and publishes at its stamps."""
 
 from mavbridge.core.ports import TickSink
-from mavbridge.core.records import Event, FeatureFrame, FloatArray, ImageArray, VisionTick
+from mavbridge.core.records import Event, FeatureFrame, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.simulation.clock import AheadClock, SteppedClock
-from mavbridge.simulation.world import LockstepCamera
-
-_IMAGES_KEPT = 4
-"""One in the cache, one on its way there; twice that."""
+from mavbridge.simulation.world import SimulatedCamera
 
 
-class LateFeatureCache(FeatureCache):
-    """A feature is published at its own ``ready_ns``."""
+class DelayedFeatureCache(FeatureCache):
+    """Publishes each feature at its ``ready_ns``."""
 
     def __init__(self, clock: SteppedClock) -> None:
         super().__init__()
         self._clock = clock
 
     def publish(self, frame: FeatureFrame) -> None:
-        """Plan to replace the held feature."""
+        """Schedule the replacement of the cached feature."""
         publish_now = super().publish
         self._clock.schedule(frame.ready_ns, lambda: publish_now(frame))
 
 
-class LateSink:
-    """Sees a vision tick when its feature is ready, so that all events come in order of time."""
+class DelayedSink:
+    """Passes vision ticks on when their features are ready, so that events come in time order."""
 
     def __init__(self, clock: SteppedClock, sink: TickSink) -> None:
         self._clock = clock
         self._sink = sink
 
     def emit(self, event: Event) -> None:
-        """Plan to pass the event on."""
+        """Schedule a vision tick."""
         if isinstance(event, VisionTick):
             self._clock.schedule(event.ready_ns, lambda: self._sink.emit(event))
 
 
-class LateEncoder:
-    """Encodes an image when a chunk is first asked for it: what nobody looks at costs nothing.
-
-    Until then an empty array stands for the feature; the loops never look into one.
-    """
+class VisionStepper:
+    """Runs a step of the vision loop whenever the loop is idle and a frame has arrived."""
 
     def __init__(
-        self,
-        encode: Callable[[ImageArray], FloatArray],
-        clock: AheadClock,
-        delays_ns: Iterator[int],
-    ) -> None:
-        self._encode = encode
-        self._clock = clock
-        self._delays_ns = delays_ns
-        self._images: deque[tuple[FloatArray, ImageArray]] = deque(maxlen=_IMAGES_KEPT)
-        self._encoded: tuple[FloatArray, FloatArray] | None = None
-
-    def encode(self, rgb: ImageArray) -> FloatArray:
-        """Stand-in for the feature; the time is taken now."""
-        stand_in = np.empty((1, 0), np.float32)
-        self._images.append((stand_in, rgb))
-        self._clock.ahead_ns += next(self._delays_ns)
-        return stand_in
-
-    def resolve(self, stand_in: FloatArray) -> FloatArray:
-        """The feature."""
-        if self._encoded is None or self._encoded[0] is not stand_in:
-            rgb = next(rgb for held, rgb in self._images if held is stand_in)
-            feature = self._encode(rgb)
-            feature.setflags(write=False)
-            self._encoded = (stand_in, feature)
-        return self._encoded[1]
-
-
-class VisionProcess:
-    """Runs the vision loop whenever it is free and a frame is there."""
-
-    def __init__(
-        self, world: SteppedClock, clock: AheadClock, camera: LockstepCamera, loop: VisionLoop
+        self, world: SteppedClock, clock: AheadClock, camera: SimulatedCamera, loop: VisionLoop
     ) -> None:
         self._world = world
         self._clock = clock

@@ -1,4 +1,4 @@
-"""Executables for episodes: a pilot who sees the truth, and some that do one thing."""
+"""Executables for simulated flights: constant sticks, and a pilot that knows the true state."""
 
 import math
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mavbridge.simulation.episode import Episode
+from mavbridge.simulation.flight import SimulatedFlight
 from policy.contract import Contract, Executable, FloatArray
 from policy.scripted import LEAN_PER_MPS, LEAN_PER_WANTED_MPS, THROTTLE_DEADZONE
 
@@ -15,7 +15,7 @@ CONTRACT = Contract(feature_dim=1, arrays="numpy", image_height=32, image_width=
 
 
 def steady(sticks: Callable[[], tuple[float, float, float, float]]) -> Executable:
-    """Asks for sticks at every action, and holds them for the chunk."""
+    """Calls ``sticks`` at every action and holds the result for the chunk."""
 
     def act(
         encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
@@ -38,14 +38,14 @@ def single_rate(executable: Executable) -> Executable:
     return replace(executable, dual_rate=False)
 
 
-def pursuit(episode: Episode) -> Executable:
-    """Flies through the gates by the true state: what a demonstrator does, in short."""
+def pursuit(flight: SimulatedFlight) -> Executable:
+    """Flies through the gates by the true state."""
 
     def sticks() -> tuple[float, float, float, float]:
-        body = episode.vehicle.ap.truth
+        body = flight.vehicle.ap.truth
         north, east, down = body.position_ned_m
-        gates = episode.course.gates
-        gate = gates[min(len(episode.vehicle.log.gates_passed), len(gates) - 1)]
+        gates = flight.course.gates
+        gate = gates[min(len(flight.vehicle.log.gates_passed), len(gates) - 1)]
         cos, sin = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
         gate_n, gate_e, gate_d = gate.center_ned_m
         ahead_m = (north - gate_n) * cos + (east - gate_e) * sin

@@ -1,51 +1,40 @@
-"""Evaluation in real processes: workers of a local cluster, and flights on the wall clock."""
+"""Evaluation in real processes: workers, and a flight on the wall clock."""
 
-import os
-import signal
 from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.evaluate.cluster import fly_on_ray
-from mavbridge.commands.evaluate.jobs import Flown, Job, fly_job, make_jobs
-from mavbridge.commands.evaluate.realtime import fly_realtime
+from mavbridge.commands.evaluate.episodes import EpisodeSpec
+from mavbridge.commands.evaluate.run import evaluate
+from mavbridge.commands.evaluate.wall_clock import fly_on_wall_clock
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.workers import WorkersConfig
 
 pytestmark = pytest.mark.system
 
-CONFIG = EvaluateConfig(
-    policy=PolicyConfig(policy="scripted:circle", dual_rate=True), episodes=3, max_time=1.0
-)
+CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)
 
 
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_a_killed_worker_costs_a_retry_and_changes_no_result(tmp_path: Path) -> None:
-    pytest.importorskip("ray", reason="needs the extra cluster")
-    has_died = tmp_path / "died"
-
-    def fly_and_die_once(job: Job) -> Flown:
-        if job.index == 1 and not has_died.exists():
-            has_died.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return fly_job(job)
-
-    jobs = make_jobs(CONFIG)
-    flown = fly_on_ray(
-        jobs, workers=2, address=None, should_stop=lambda: False, fly=fly_and_die_once
-    )
-    by_index = sorted(flown, key=lambda one: one.index)
-    assert has_died.exists()
-    assert by_index == [fly_job(job) for job in jobs]
-
-
-def test_an_episode_flies_in_real_time() -> None:
-    (job,) = make_jobs(
-        EvaluateConfig(
-            policy=CONFIG.policy, episodes=1, max_time=2.0, realtime=True, conditions="random"
+def test_two_workers_write_what_one_writes(tmp_path: Path) -> None:
+    for workers in (1, 2):
+        config = EvaluateConfig(
+            policy=CIRCLE,
+            episodes=3,
+            max_time=1.0,
+            conditions="random",
+            workers=WorkersConfig(workers=workers),
+            json=tmp_path / f"{workers}.json",
         )
+        assert evaluate(config) == 0
+    assert (tmp_path / "1.json").read_bytes() == (tmp_path / "2.json").read_bytes()
+
+
+def test_an_episode_flies_on_the_wall_clock() -> None:
+    config = EvaluateConfig(
+        policy=CIRCLE, episodes=1, max_time=2.0, clock="wall", conditions="random"
     )
-    (flown,) = fly_realtime([job], should_stop=lambda: False)
+    flown = fly_on_wall_clock(EpisodeSpec(config=config, index=0), lambda: False)
     assert flown.engine == "numpy"
     assert flown.result.outcome == "timed out"
     assert flown.result.flown_s >= 2.0

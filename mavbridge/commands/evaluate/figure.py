@@ -1,4 +1,4 @@
-"""An evaluation as one picture: how far the flights came, how fast, how smoothly."""
+"""The picture of an evaluation: gates passed, outcomes, speed against smoothness."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mavbridge.commands.evaluate.results import Evaluation, summarise
+from mavbridge.commands.evaluate.results import Evaluation
 from mavbridge.commands.evaluate.statistics import rate
 
 INK, MUTED, GRID, BLUE, RED = "#1f2933", "#6b7885", "#dfe4ea", "#2b6cb0", "#d1495b"
@@ -34,25 +34,29 @@ STYLE: dict[Any, Any] = {
 
 def draw(evaluation: Evaluation, path: Path) -> None:
     """Write the PNG; the evaluation holds at least one episode."""
+    make_figure(evaluation).savefig(path)
+
+
+def make_figure(evaluation: Evaluation) -> Figure:
+    """Plots, left to right: share of flights by gate, outcomes, speed against smoothness."""
     with rc_context(STYLE):
         figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor="white")
         axes = figure.subplots(1, 3)
-        _draw_reach(axes[0], evaluation)
+        _draw_gates(axes[0], evaluation)
         _draw_outcomes(axes[1], evaluation)
-        _draw_style(axes[2], evaluation)
+        _draw_smoothness(axes[2], evaluation)
         figure.suptitle(
-            f"{evaluation.policy} ({evaluation.engine}), {evaluation.setting}, "
-            f"{len(evaluation.episodes)} held-out courses",
+            f"{evaluation.title}, {len(evaluation.episodes)} held-out courses",
             x=0.012,
             ha="left",
             color=MUTED,
             fontsize=10,
         )
         figure.tight_layout(rect=(0, 0, 1, 0.97), w_pad=3)
-        figure.savefig(path)
+    return figure
 
 
-def _draw_reach(axes: Axes, evaluation: Evaluation) -> None:
+def _draw_gates(axes: Axes, evaluation: Evaluation) -> None:
     """Share of the flights that passed each gate, with the interval of the share."""
     episodes = evaluation.episodes
     gates = range(1, episodes[0].gates_total + 1)
@@ -74,7 +78,7 @@ def _draw_reach(axes: Axes, evaluation: Evaluation) -> None:
 
 
 def _draw_outcomes(axes: Axes, evaluation: Evaluation) -> None:
-    outcomes = summarise(evaluation.episodes).outcomes
+    outcomes = evaluation.summary.outcomes
     names, counts = [name for name, _ in outcomes], [count for _, count in outcomes]
     colours = [BLUE if name == "finished" else RED for name in names]
     axes.bar_label(axes.barh(names, counts, 0.6, color=colours), padding=4)
@@ -84,7 +88,7 @@ def _draw_outcomes(axes: Axes, evaluation: Evaluation) -> None:
     axes.set_title("How they ended")
 
 
-def _draw_style(axes: Axes, evaluation: Evaluation) -> None:
+def _draw_smoothness(axes: Axes, evaluation: Evaluation) -> None:
     """Speed against smoothness, a dot for each flight."""
     for has_finished, colour, label in ((True, BLUE, "finished"), (False, RED, "not finished")):
         dots = [

@@ -1,18 +1,23 @@
-"""What an evaluation found: frozen values, and their JSON."""
+"""The results of an evaluation: summary, table and JSON."""
 
 import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from mavbridge.commands.evaluate.statistics import Estimate, mean, rate
-from mavbridge.config.evaluate import Variety
+from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.simulation.result import EpisodeResult, Outcome
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
-    """Over all episodes unless said otherwise; None = no episode that could tell."""
+    """Figures over all episodes unless said otherwise; None = no episode has the figure."""
 
     success_rate: Estimate
     """All gates in order, no crash."""
@@ -48,42 +53,81 @@ def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """One run of ``mavbridge evaluate``."""
+    """The results of one run of ``mavbridge evaluate``."""
 
-    policy: str
+    config: EvaluateConfig
     engine: str
-    mode: str
-    """"lockstep" or "realtime"."""
-    conditions: Variety
-    """random: those that ``python -m sitl --conditions`` draws from each episode's course seed."""
-    vision_delay_ms: float
-    """Added to the encoding of each image."""
-    seed: int
-    asked_episodes: int
+    """Empty where no episode was flown."""
     episodes: tuple[EpisodeResult, ...]
-    """In the order of their seeds; fewer than asked for if the run was interrupted."""
+    """In the order of their seeds; fewer than configured if the run was interrupted."""
+
+    @cached_property
+    def summary(self) -> Summary:
+        """Figures of the episodes, of which there must be at least one."""
+        return summarise(self.episodes)
 
     @property
-    def setting(self) -> str:
-        """How it was flown, in a few words."""
-        parts = [self.mode]
-        if self.conditions != "nominal":
-            parts.append(f"{self.conditions} conditions")
-        if self.vision_delay_ms:
-            parts.append(f"images {self.vision_delay_ms:g} ms later")
+    def mode(self) -> str:
+        """Either lockstep or realtime."""
+        return "realtime" if self.config.is_wall_clock else "lockstep"
+
+    @property
+    def title(self) -> str:
+        """Policy, engine, and how it was flown."""
+        config = self.config
+        parts = [f"{config.policy.policy} ({self.engine})", self.mode]
+        if config.conditions != "nominal":
+            parts.append(f"{config.conditions} conditions")
+        if config.vision_delay:
+            parts.append(f"images {config.vision_delay:g} ms later")
         return ", ".join(parts)
 
 
 def to_json(evaluation: Evaluation) -> str:
-    """Everything as JSON, the summary first."""
-    document = asdict(evaluation)
-    episodes = document.pop("episodes")
-    summary = asdict(summarise(evaluation.episodes)) if evaluation.episodes else None
-    if summary is not None:
+    """Everything as JSON, the summary before the episodes; without episodes it is null."""
+    config, summary = evaluation.config, None
+    if evaluation.episodes:
+        summary = asdict(evaluation.summary)
         summary["outcomes"] = dict(summary["outcomes"])
-    return (
-        json.dumps(
-            {**document, "summary": summary, "episodes": episodes}, indent=2, allow_nan=False
-        )
-        + "\n"
-    )
+    document = {
+        "policy": config.policy.policy,
+        "engine": evaluation.engine,
+        "mode": evaluation.mode,
+        "conditions": config.conditions,
+        "vision_delay_ms": config.vision_delay,
+        "seed": config.policy.seed,
+        "asked_episodes": config.episodes,
+        "summary": summary,
+        "episodes": [asdict(one) for one in evaluation.episodes],
+    }
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def print_evaluation(evaluation: Evaluation, console: Console) -> None:
+    """Print each figure with its 95 % interval, then how the flights ended."""
+    summary = evaluation.summary
+    table = Table(title=evaluation.title)
+    for heading in ("", "mean", "95 % interval", "flights"):
+        table.add_column(heading, justify="left" if heading == "" else "right")
+    table.add_row("success rate", *_cells(summary.success_rate, "{:.1%}"))
+    for name, estimate in (
+        (f"gates passed, of {evaluation.episodes[0].gates_total}", summary.gates_passed),
+        ("mean speed, m/s", summary.mean_speed_mps),
+        ("stick movement, 1/s", summary.stick_rate_per_s),
+        ("flown, s", summary.flown_s),
+        ("course time, s (successful flights)", summary.course_s),
+    ):
+        table.add_row(name, *_cells(estimate, "{:.2f}"))
+    console.print(table)
+    ends = ", ".join(f"{count} {outcome}" for outcome, count in summary.outcomes)
+    console.print(Text(f"{len(evaluation.episodes)} flights: {ends}"))
+
+
+def _cells(estimate: Estimate | None, form: str) -> tuple[str, str, str]:
+    """Value, interval and count."""
+    if estimate is None:
+        return "-", "-", "0"
+    interval = "-"
+    if estimate.low is not None and estimate.high is not None:
+        interval = f"{form.format(estimate.low)} to {form.format(estimate.high)}"
+    return form.format(estimate.value), interval, str(estimate.count)

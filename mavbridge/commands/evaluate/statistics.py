@@ -1,4 +1,4 @@
-"""What a handful of flights says of all others: estimates with 95 % confidence intervals."""
+"""Means and rates of a sample of flights, with 95 % confidence intervals."""
 
 import math
 from collections.abc import Sequence
@@ -8,14 +8,15 @@ import numpy as np
 
 Z95 = 1.959963984540054
 """95 % of a normal distribution lie within this many standard deviations."""
-RESAMPLES = 10_000
+_BLOCKS, _BLOCK = 100, 100
+"""10,000 resamples, a block at a time."""
 _SEED = 0
-"""Of the resampling: the same flights have the same interval."""
+"""Seed of the resampling: the same flights have the same interval."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """A mean or a rate; the interval is None where one flight cannot tell."""
+    """A mean or a rate; the interval is None where a single flight has none."""
 
     value: float
     low: float | None
@@ -25,10 +26,10 @@ class Estimate:
 
 
 def rate(successes: int, count: int) -> Estimate:
-    """Share of successes with Wilson's score interval (E. B. Wilson 1927, JASA 22).
+    """Share of successes with Wilson's score interval (E. B. Wilson 1927, JASA 22, 209-212).
 
     Raises:
-        ValueError: there is nothing to count, or more successes than trials.
+        ValueError: no trials, or more successes than trials.
     """
     if not 0 <= successes <= count or count == 0:
         raise ValueError(f"{successes} successes of {count} are no rate")
@@ -49,8 +50,9 @@ def mean(values: Sequence[float]) -> Estimate | None:
     low = high = None
     if len(sample) > 1:
         random = np.random.Generator(np.random.PCG64(_SEED))
+        size = (_BLOCK, len(sample))
         means = [
-            sample[random.integers(len(sample), size=len(sample))].mean() for _ in range(RESAMPLES)
+            sample[random.integers(len(sample), size=size)].mean(axis=1) for _ in range(_BLOCKS)
         ]
         low, high = (float(bound) for bound in np.percentile(means, (2.5, 97.5)))
     return Estimate(value=float(sample.mean()), low=low, high=high, count=len(sample))

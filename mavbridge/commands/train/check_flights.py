@@ -6,7 +6,7 @@ from mavbridge.config.courses import CHECK_COURSE_SEED
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.simulation.episode import run_episode
+from mavbridge.simulation.flight import SimulatedFlight
 
 
 def share_of_gates(checkpoint: Path, policy: str, flights: int) -> float:
@@ -19,6 +19,7 @@ def share_of_gates(checkpoint: Path, policy: str, flights: int) -> float:
     executable = load_configured_policy(wanted, MonotonicClock()).executable
     passed = total = 0
     for index in range(flights):
-        result = run_episode(executable, course_seed=CHECK_COURSE_SEED + index, seed=index)
+        flight = SimulatedFlight(course_seed=CHECK_COURSE_SEED + index, seed=index)
+        result = flight.fly(executable)
         passed, total = passed + result.gates_passed, total + result.gates_total
     return passed / total

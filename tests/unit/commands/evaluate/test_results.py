@@ -1,13 +1,19 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from helpers.evaluated_flights import crashed, finished
 from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
-from mavbridge.commands.evaluate.results import Evaluation, summarise, to_json
-from mavbridge.commands.evaluate.tables import print_evaluation
+from mavbridge.commands.evaluate.results import (
+    Evaluation,
+    print_evaluation,
+    summarise,
+    to_json,
+)
+from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import NEUTRAL, Sticks
 from mavbridge.simulation.result import EpisodeResult, StickMeter
@@ -15,13 +21,8 @@ from mavbridge.simulation.result import EpisodeResult, StickMeter
 
 def evaluation(*episodes: EpisodeResult) -> Evaluation:
     return Evaluation(
-        policy="toge",
+        config=EvaluateConfig(episodes=5, conditions="random", vision_delay=50.0),
         engine="openvino",
-        mode="lockstep",
-        conditions="random",
-        vision_delay_ms=50.0,
-        seed=0,
-        asked_episodes=5,
         episodes=episodes,
     )
 
@@ -74,12 +75,17 @@ def test_the_table_shows_rate_interval_and_ends() -> None:
     assert "lockstep, random conditions, images 50 ms later" in text
 
 
-def test_the_picture_is_drawn(tmp_path: Path) -> None:
+def test_the_picture_plots_gates_outcomes_and_smoothness() -> None:
     pytest.importorskip("matplotlib", reason="needs the extra bench")
-    from mavbridge.commands.evaluate.figure import draw
+    from mavbridge.commands.evaluate.figure import make_figure
 
-    draw(evaluation(finished(), crashed(stick_rate_per_s=1.0)), tmp_path / "flights.png")
-    assert (tmp_path / "flights.png").read_bytes().startswith(b"\x89PNG")
+    figure = make_figure(evaluation(finished(), crashed(stick_rate_per_s=1.0), crashed()))
+    gates, outcomes, smoothness = figure.axes
+    assert gates.lines[0].get_xydata() == pytest.approx(np.array([[1, 1.0], [2, 1 / 3]]))
+    assert [bar.get_width() for bar in outcomes.patches] == [2, 1]
+    assert [label.get_text() for label in outcomes.get_yticklabels()] == ["crashed", "finished"]
+    dots = {line.get_label(): line.get_xydata().tolist() for line in smoothness.lines}
+    assert dots == {"finished": [[3.0, 0.5]], "not finished": [[6.0, 1.0]]}
 
 
 def test_stick_movement_counts_only_what_the_policy_sent_in_a_row() -> None:

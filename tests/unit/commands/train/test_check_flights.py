@@ -1,6 +1,9 @@
 """The check of a training run flies, on courses of its own."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +37,10 @@ def result(course_seed: int, seed: int, gates: int) -> EpisodeResult:
     )
 
 
+def flights_by(fly: Callable[..., EpisodeResult]) -> Callable[..., SimpleNamespace]:
+    return lambda **seeds: SimpleNamespace(fly=partial(fly, **seeds))
+
+
 def test_counts_the_gates_of_courses_that_nothing_else_flies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -44,7 +51,7 @@ def test_counts_the_gates_of_courses_that_nothing_else_flies(
         flown.append(course_seed)
         return result(course_seed, seed, gates=2 * seed)
 
-    monkeypatch.setattr(train_check, "run_episode", fly)
+    monkeypatch.setattr(train_check, "SimulatedFlight", flights_by(fly))
     checkpoint = save(tmp_path / "toge.safetensors", 0)
     assert train_check.share_of_gates(checkpoint, "toge", 3) == pytest.approx((0 + 2 + 4) / 24)
     assert flown == [CHECK_COURSE_SEED, CHECK_COURSE_SEED + 1, CHECK_COURSE_SEED + 2]
@@ -60,7 +67,7 @@ def test_flies_the_weights_that_are_in_the_file_now(
         features.append(executable.encode(np.full((32, 32, 3), 128, np.uint8)))
         return result(course_seed, seed, gates=0)
 
-    monkeypatch.setattr(train_check, "run_episode", fly)
+    monkeypatch.setattr(train_check, "SimulatedFlight", flights_by(fly))
     for seed in (0, 1):
         train_check.share_of_gates(save(tmp_path / "toge.safetensors", seed), "toge", 1)
     assert not np.allclose(features[0], features[1])

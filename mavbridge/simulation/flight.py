@@ -1,4 +1,4 @@
-"""One flight of one course: composed like a real one, with the world on its clock."""
+"""One simulated flight of one course: the real bridge, its world on a stepped clock."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -10,25 +10,28 @@ from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, Rates, period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.ports import TickSink
+from mavbridge.core.records import ImageArray
 from mavbridge.flight.action_loop import ActionLoop
 from mavbridge.flight.bridge import build_bridge
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
-from mavbridge.simulation.delays import Delay, Delays, draws_ns
+from mavbridge.simulation.delays import Delay, Delays
+from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.referee import Referee
 from mavbridge.simulation.result import EpisodeResult
-from mavbridge.simulation.vision import LateEncoder, LateFeatureCache, LateSink, VisionProcess
-from mavbridge.simulation.wire import MemoryTransport, Path
+from mavbridge.simulation.vision import DelayedFeatureCache, DelayedSink, VisionStepper
 from mavbridge.simulation.world import (
-    Blindfold,
-    BuildScene,
+    NOMINAL_VEHICLE,
+    BlankRenderer,
     Exposure,
-    LockstepCamera,
-    VehicleProcess,
-    nominal_scene,
+    SimulatedCamera,
+    VehicleStepper,
 )
 from policy.contract import Executable, FloatArray
-from sitl.vehicle.autopilot import STEP_NS
+from sitl.camera.fpv import FpvRenderer
+from sitl.course.layout import make_course
+from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 MAX_TIME_S = 60.0
 """For a course of some 80 m: a policy slower than 1.5 m/s does not race."""
@@ -36,43 +39,24 @@ MODE = "ALT_HOLD"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setup:
-    """How the bridge is set up, and how fast the world around it is."""
+class SimulationSettings:
+    """Settings of the bridge, and the delays of the world around it."""
 
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
     delays: Delays = field(default_factory=Delays)
     draw_images: bool = True
-    """False: nobody looks at the images, neither the policy nor a sink; they stay black."""
+    """False: images stay black, where neither the policy nor a sink looks at them."""
     least_camera_px: int = SIM_CAMERA_PX
     """Least side of the frames that are drawn, however small the policy wants them."""
 
 
-def run_episode(
-    executable: Executable,
-    *,
-    course_seed: int,
-    seed: int,
-    setup: Setup | None = None,
-    max_time_s: float = MAX_TIME_S,
-    sinks: tuple[TickSink, ...] = (),
-    build_scene: BuildScene = nominal_scene,
-) -> EpisodeResult:
-    """Fly one course; the same arguments give the same stick bytes.
+class SimulatedFlight:
+    """A vehicle on a course, and the bridge that flies it, once.
 
-    Raises:
-        as ``Episode.fly``.
-    """
-    episode = Episode(course_seed=course_seed, seed=seed, setup=setup, build_scene=build_scene)
-    return episode.fly(executable, max_time_s=max_time_s, sinks=sinks)
-
-
-class Episode:
-    """A vehicle on a course, and a bridge that will fly it, once.
-
-    Before ``fly`` anything can be hung on. ``vehicle.ap.truth`` is the true state at any moment,
-    also from within an executable's ``act``; ``clock`` is what a scripted policy has to follow;
-    ``watch_exposures`` tells the truth behind each frame.
+    The same arguments give the same stick bytes. Watchers are added before ``fly``. A scripted
+    policy follows ``clock``; ``vehicle.ap.truth`` is the true state at any moment, also from within
+    an executable's ``act``.
     """
 
     def __init__(
@@ -80,36 +64,49 @@ class Episode:
         *,
         course_seed: int,
         seed: int,
-        setup: Setup | None = None,
-        build_scene: BuildScene = nominal_scene,
+        settings: SimulationSettings | None = None,
+        vehicle: VehicleConfig = NOMINAL_VEHICLE,
     ) -> None:
-        self._setup = setup or Setup()
+        """Put the vehicle on the course.
+
+        Args:
+            course_seed: which course.
+            seed: decides the delays and the phases of vehicle and camera.
+            settings: of the bridge and the delays.
+            vehicle: also decides how the course looks.
+
+        Raises:
+            UserError: ``seed`` is negative.
+        """
+        self._settings = settings or SimulationSettings()
         self._course_seed = course_seed
         self._seed = seed
         self._random = _RandomStreams(seed)
         self.clock = SteppedClock()
-        # Two computers never tick in phase; and the phase, once there, stays for a whole flight.
+        # Two computers never tick in phase, and keep the phase that they have for a whole flight.
         boot_ns = self.clock.now_ns() + self._random.below(6, STEP_NS)
-        self._scene = build_scene(course_seed=course_seed, seed=seed, boot_ns=boot_ns)
-        self.vehicle = self._scene.vehicle
-        self.course = self._scene.course
-        delays = self._setup.delays
-        uplink = Path(self.clock, self._random.draws_ns(0, delays.uplink))
-        downlink = Path(self.clock, self._random.draws_ns(1, delays.downlink))
+        self.course = make_course(course_seed)
+        self._vehicle_config = vehicle
+        self.vehicle = SimulatedVehicle(
+            links=1, boot_ns=boot_ns, config=vehicle, course=self.course
+        )
+        delays = self._settings.delays
+        uplink = DelayedChannel(self.clock, self._random.samples_ns(0, delays.uplink))
+        downlink = DelayedChannel(self.clock, self._random.samples_ns(1, delays.downlink))
         self._transport = MemoryTransport(self.clock, to_vehicle=uplink, from_vehicle=downlink)
-        self._process = VehicleProcess(
+        self._stepper = VehicleStepper(
             self.clock, self.vehicle, boot_ns, to_vehicle=uplink, from_vehicle=downlink
         )
         self._exposure_watchers: list[Callable[[Exposure], None]] = []
         self._has_flown = False
 
     def watch_exposures(self, watch: Callable[[Exposure], None]) -> None:
-        """Call ``watch`` at each exposure, also of frames that nobody will read."""
+        """Call ``watch`` at each exposure, also of frames that are never read."""
         self._exposure_watchers.append(watch)
 
     def watch_steps(self, watch: Callable[[], None]) -> None:
         """Call ``watch`` after each step of the vehicle, every 2.5 ms."""
-        self._process.watchers.append(watch)
+        self._stepper.watchers.append(watch)
 
     def fly(
         self,
@@ -119,23 +116,24 @@ class Episode:
         sinks: tuple[TickSink, ...] = (),
         should_stop: Callable[[], bool] | None = None,
     ) -> EpisodeResult:
-        """Arm, fly, give the sticks back; ends with the last gate, a crash, or the time.
+        """Arm, fly, and give the sticks back; ends with the last gate, a crash, or the time.
 
         Args:
-            executable: what flies. It must not remember earlier episodes.
+            executable: the policy; it must not remember earlier flights.
             max_time_s: counted from the policy's first action.
             sinks: see every tick and vision tick, in order of time.
-            should_stop: asked often; True ends the episode without a result.
+            should_stop: called after each step of the vehicle; True ends the flight.
 
         Raises:
-            EpisodeInterruptedError: ``should_stop`` said so.
+            EpisodeInterruptedError: ``should_stop`` ended the flight.
             PeerError: the vehicle could not be engaged.
             PolicyError: the policy failed.
+            UserError: this flight was flown before.
         """
         if self._has_flown:
-            raise UserError("an episode is flown once: make another one")
+            raise UserError("a simulated flight is flown once: make another one")
         self._has_flown = True
-        cv2.setNumThreads(1)  # for the same images on any machine, and no pool to wake for them
+        cv2.setNumThreads(1)  # the same images on any machine, and no pool to wake for them
         referee = Referee(self.clock, self.vehicle, max_time_s=max_time_s, should_stop=should_stop)
         self.watch_steps(referee.watch)
         self._compose(executable, (referee, *sinks)).run(referee.stop)
@@ -145,8 +143,8 @@ class Episode:
         """Build the bridge, with its vision loop on the clock's queue."""
         config = FlyConfig(
             link=LinkConfig(connect="lockstep"),
-            rates=self._setup.rates,
-            limits=self._setup.limits,
+            rates=self._settings.rates,
+            limits=self._settings.limits,
             mode=MODE,
             arm=True,
         )
@@ -160,25 +158,27 @@ class Episode:
             link=MavlinkLink(self._transport, self.clock, config.link, state_hz=loops.state_hz),
             camera=camera,
             sinks=sinks,
-            cache=LateFeatureCache(self.clock),
+            cache=DelayedFeatureCache(self.clock),
             vision_clock=vision_clock,
-            delay_vision=lambda sink: LateSink(self.clock, sink),
+            delay_vision=lambda sink: DelayedSink(self.clock, sink),
         )
-        VisionProcess(self.clock, vision_clock, camera, bridge.vision)
+        VisionStepper(self.clock, vision_clock, camera, bridge.vision)
         return bridge.action
 
-    def _make_camera(self, executable: Executable, *, camera_hz: float) -> LockstepCamera:
+    def _make_camera(self, executable: Executable, *, camera_hz: float) -> SimulatedCamera:
         camera_period_ns = period_ns(camera_hz)
-        contract, least_px = executable.contract, self._setup.least_camera_px
+        contract, least_px = executable.contract, self._settings.least_camera_px
         width, height = max(contract.image_width, least_px), max(contract.image_height, least_px)
-        draw = self._setup.draw_images
-        camera = LockstepCamera(
+        conditions = self._vehicle_config.conditions
+        camera = SimulatedCamera(
             self.clock,
             lambda: self.vehicle.pose,
-            self._scene.make_renderer(width, height) if draw else Blindfold(width, height),
+            FpvRenderer(self.course, width, height, conditions)
+            if self._settings.draw_images
+            else BlankRenderer(width, height),
             period_ns=camera_period_ns,
             phase_ns=self._random.below(2, camera_period_ns),
-            delays_ns=self._random.draws_ns(3, self._setup.delays.camera),
+            delays_ns=self._random.samples_ns(3, self._settings.delays.camera),
         )
         camera.exposure_watchers += self._exposure_watchers
         return camera
@@ -188,26 +188,27 @@ class Episode:
 
         Without a fast path the whole network runs for every action, which then takes both times.
         """
-        vision_ns = self._random.draws_ns(4, self._setup.delays.vision)
-        action_ns = self._random.draws_ns(5, self._setup.delays.action)
+        vision_ns = self._random.samples_ns(4, self._settings.delays.vision)
+        action_ns = self._random.samples_ns(5, self._settings.delays.action)
         is_dual = executable.dual_rate
-        encoder = LateEncoder(
-            executable.encode, vision_clock, vision_ns if is_dual else iter(lambda: 0, 1)
-        )
+
+        def encode(rgb: ImageArray) -> FloatArray:
+            vision_clock.ahead_ns += next(vision_ns) if is_dual else 0
+            return executable.encode(rgb)
 
         def act(
             encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
         ) -> FloatArray:
-            chunk = executable.act(encoder.resolve(encoded), state, history, elapsed_s)
+            chunk = executable.act(encoded, state, history, elapsed_s)
             took_ns = next(action_ns) + (0 if is_dual else next(vision_ns))
             self.clock.sleep_until_ns(self.clock.now_ns() + took_ns)
             return chunk
 
-        return replace(executable, encode=encoder.encode, act=act)
+        return replace(executable, encode=encode, act=act)
 
 
 class _RandomStreams:
-    """Independent random numbers by purpose: changing one delay leaves the others' draws alone."""
+    """Independent random numbers for each purpose: changing one delay leaves the others alone."""
 
     def __init__(self, seed: int) -> None:
         if seed < 0:
@@ -217,10 +218,10 @@ class _RandomStreams:
     def _generator(self, purpose: int) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64((self._seed, purpose)))
 
-    def draws_ns(self, purpose: int, delay: Delay) -> Iterator[int]:
-        """Durations of one kind."""
-        return draws_ns(delay, self._generator(purpose))
+    def samples_ns(self, purpose: int, delay: Delay) -> Iterator[int]:
+        """Samples of a delay without end."""
+        return delay.samples_ns(self._generator(purpose))
 
     def below(self, purpose: int, limit: int) -> int:
-        """One integer from 0 on."""
+        """One integer in [0, limit)."""
         return int(self._generator(purpose).integers(limit))

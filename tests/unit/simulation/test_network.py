@@ -4,21 +4,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavbridge.simulation.clock import SteppedClock
-from mavbridge.simulation.wire import VEHICLE, MemoryTransport, Path
+from mavbridge.simulation.network import VEHICLE, DelayedChannel, MemoryTransport
 
 
-def wire(clock: SteppedClock, *delays_ns: int) -> tuple[MemoryTransport, Path, Path]:
+def network(
+    clock: SteppedClock, *delays_ns: int
+) -> tuple[MemoryTransport, DelayedChannel, DelayedChannel]:
     def draws() -> Iterator[int]:
         while True:
             yield from delays_ns
 
-    up, down = Path(clock, draws()), Path(clock, draws())
+    up, down = DelayedChannel(clock, draws()), DelayedChannel(clock, draws())
     return MemoryTransport(clock, to_vehicle=up, from_vehicle=down), up, down
 
 
 def test_a_datagram_arrives_whole_after_its_delay_with_its_own_stamp() -> None:
     clock = SteppedClock(0)
-    transport, _, down = wire(clock, 300)
+    transport, _, down = network(clock, 300)
     down.send(b"hello")
     clock.sleep_until_ns(299)
     assert list(transport.drain()) == []
@@ -29,21 +31,21 @@ def test_a_datagram_arrives_whole_after_its_delay_with_its_own_stamp() -> None:
 
 def test_what_is_sent_reaches_the_other_end() -> None:
     clock = SteppedClock(0)
-    transport, up, _ = wire(clock, 7)
+    transport, up, _ = network(clock, 7)
     assert transport.send(b"sticks")
     clock.sleep_until_ns(7)
-    assert list(up.arrived()) == [(7, b"sticks")]
+    assert list(up.receive()) == [(7, b"sticks")]
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=20))
 def test_no_datagram_overtakes_another(delays_ns: list[int]) -> None:
     clock = SteppedClock(0)
-    _, up, _ = wire(clock, *delays_ns)
+    _, up, _ = network(clock, *delays_ns)
     for number in range(len(delays_ns)):
         up.send(bytes([number]))
         clock.sleep_until_ns(clock.now_ns() + 1)
     clock.sleep_until_ns(10_000)
-    arrived = list(up.arrived())
+    arrived = list(up.receive())
     assert [data[0] for _, data in arrived] == list(range(len(delays_ns)))
     assert [stamp for stamp, _ in arrived] == sorted(stamp for stamp, _ in arrived)
     assert all(
@@ -54,7 +56,7 @@ def test_no_datagram_overtakes_another(delays_ns: list[int]) -> None:
 
 def test_waiting_ends_with_the_arrival_of_what_is_sent_meanwhile() -> None:
     clock = SteppedClock(0)
-    transport, _, down = wire(clock, 30)
+    transport, _, down = network(clock, 30)
     clock.schedule(100, lambda: down.send(b"attitude"))
     transport.wait(500)
     assert clock.now_ns() == 130

@@ -1,0 +1,120 @@
+"""The pilot of a demonstration: an expert, or a student whose every action the expert labels."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mavbridge.commands.demonstrate.variation import Variation
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.records import Sticks
+from mavbridge.simulation.flight import SimulatedFlight
+from policy.contract import Contract, Executable, FloatArray
+from sitl.expert.demonstrator import Expert
+from sitl.expert.disturbance import StickDisturbance, random_start
+from sitl.expert.stick_response import StickPositions
+
+SETTLE_NS = 300 * NS_PER_MS
+"""After a start in the air: until the last frame and state from the ground are gone."""
+STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
+"""Least and most length of a turn. Where a student flies, the expert takes over now and then: a
+student that crashes at the first gate would otherwise learn nothing about the later ones (DAgger,
+Ross et al. 2011, mixes the two at random)."""
+
+
+class Pilot:
+    """The expert's sticks at every action, and an executable that flies."""
+
+    def __init__(
+        self,
+        flight: SimulatedFlight,
+        variation: Variation,
+        *,
+        speed_mps: float,
+        contract: Contract,
+        student: Executable | None,
+    ) -> None:
+        self._flight = flight
+        self._variation = variation
+        self._speed_mps = speed_mps
+        self._student = student
+        self._disturbance = StickDisturbance(
+            variation.seed,
+            strength=variation.disturbance,
+            from_ground=not variation.starts_airborne,
+        )
+        self._turns = TurnSchedule(variation.seed)
+        self._expert: Expert | None = None
+        self.expert_sticks: Sticks | None = None
+        """Sticks that the expert would hold now; None before the first action."""
+        self.begin_ns: int | None = None
+        """When the demonstration begins; None before the first action."""
+        expert = Executable(
+            contract=contract,
+            name=f"expert at {speed_mps:g} m/s",
+            engine="numpy",
+            dual_rate=True,
+            encode=lambda _: np.zeros((1, 1), np.float32),
+            act=self._act,
+        )
+        self.executable = replace(student or expert, act=self._act)
+
+    def _act(
+        self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        now_ns = self._flight.clock.now_ns()
+        if self._expert is None:
+            self._expert = self._begin(now_ns)
+        now_s, body = now_ns / NS_PER_S, self._flight.vehicle.ap.truth
+        sticks = self._expert.sticks(
+            body.position_ned_m,
+            body.velocity_ned_mps,
+            body.ned_from_body_wxyz,
+            body.rate_body_radps,
+            now_s,
+        )
+        self.expert_sticks = Sticks(*sticks)
+        disturbed = self._disturbance.flown(StickPositions(*sticks), now_s)
+        horizon = self.executable.contract.horizon
+        chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
+        if self._student is None:
+            return chunk
+        # Called at every tick, also in the expert's turns: the student may hold state of its own.
+        students = self._student.act(encoded, state, history, elapsed_s)
+        return students if self._turns.is_students(now_s) else chunk
+
+    def _begin(self, now_ns: int) -> Expert:
+        """Start at the first action, so that a vehicle put in the air is under control at once.
+
+        The expert does not know the vehicle's parameters, which no learner could see: it flies as
+        many courses without them (37 of 40, and 37 of 40 with).
+        """
+        if not self._variation.starts_airborne:
+            self.begin_ns = now_ns
+            return Expert(self._flight.course, self._speed_mps)
+        seed = self._variation.seed
+        start = random_start(self._flight.course, seed, speed_mps=self._speed_mps)
+        self._flight.vehicle.launch(start)
+        self.begin_ns = now_ns + SETTLE_NS
+        return Expert(self._flight.course, self._speed_mps, next_gate=start.next_gate)
+
+
+class TurnSchedule:
+    """Student and expert fly in turns of random length, which follow from ``seed``."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = np.random.Generator(np.random.PCG64((seed, 5)))
+        self._is_students = bool(self._random.random() < 0.5)
+        self._end_s: float | None = None
+
+    def is_students(self, t_s: float) -> bool:
+        """The student flies at ``t_s``; call in order of time."""
+        if self._end_s is None:
+            self._end_s = t_s + self._length_s()
+        while t_s >= self._end_s:
+            self._is_students = not self._is_students
+            self._end_s += self._length_s()
+        return self._is_students
+
+    def _length_s(self) -> float:
+        turn_s = STUDENT_TURN_S if self._is_students else EXPERT_TURN_S
+        return float(self._random.uniform(*turn_s))

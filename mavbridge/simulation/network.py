@@ -1,0 +1,79 @@
+"""A network in memory between two ends: datagrams arrive whole and in order, after their delay."""
+
+from collections import deque
+from collections.abc import Iterator
+
+from mavbridge.mavlink.transport.sockets import Address, Chunk
+from mavbridge.simulation.clock import SteppedClock
+
+VEHICLE: Address = ("sitl", 1)
+"""Sender of the vehicle's datagrams."""
+
+
+class DelayedChannel:
+    """One direction of the network."""
+
+    def __init__(self, clock: SteppedClock, delays_ns: Iterator[int]) -> None:
+        self._clock = clock
+        self._delays_ns = delays_ns
+        self._in_flight: deque[tuple[int, bytes]] = deque()
+        self._last_arrival_ns = 0
+
+    def send(self, data: bytes) -> None:
+        """Send a datagram; it arrives after its delay, and never before an earlier one."""
+        arrival_ns = self._clock.now_ns() + next(self._delays_ns)
+        self._last_arrival_ns = max(self._last_arrival_ns, arrival_ns)
+        self._in_flight.append((self._last_arrival_ns, data))
+
+    def receive(self) -> Iterator[tuple[int, bytes]]:
+        """Arrival stamp in ns and bytes of every datagram that has arrived."""
+        now_ns = self._clock.now_ns()
+        while self._in_flight and self._in_flight[0][0] <= now_ns:
+            yield self._in_flight.popleft()
+
+    @property
+    def next_arrival_ns(self) -> int | None:
+        """Arrival of the oldest datagram that was not received; None = there is none."""
+        return self._in_flight[0][0] if self._in_flight else None
+
+
+class MemoryTransport:
+    """The bridge's end: a ``mavlink.transport.Transport`` whose arrival stamps are exact."""
+
+    def __init__(
+        self, clock: SteppedClock, *, to_vehicle: DelayedChannel, from_vehicle: DelayedChannel
+    ) -> None:
+        self._clock = clock
+        self._to_vehicle = to_vehicle
+        self._from_vehicle = from_vehicle
+
+    def open(self) -> None:
+        """Nothing to acquire."""
+
+    def drain(self) -> Iterator[Chunk]:
+        """Every datagram that has arrived."""
+        for arrived_ns, data in self._from_vehicle.receive():
+            yield Chunk(data, arrived_ns, VEHICLE)
+
+    def wait(self, until_ns: int) -> None:
+        """Let time pass until a datagram has arrived, or until ``until_ns``.
+
+        Time passes from event to event, since an event may send a datagram that arrives in time.
+        """
+        while (now_ns := self._clock.now_ns()) < until_ns:
+            arrival_ns, event_ns = self._from_vehicle.next_arrival_ns, self._clock.next_event_ns
+            if arrival_ns is not None and arrival_ns <= now_ns:
+                return
+            stops = [stop for stop in (arrival_ns, event_ns) if stop is not None]
+            self._clock.sleep_until_ns(min([until_ns, *stops]))
+
+    def answer_to(self, sender: Address | None) -> None:
+        """Nothing to choose: there is one vehicle."""
+
+    def send(self, data: bytes) -> bool:
+        """Send one packet; always succeeds."""
+        self._to_vehicle.send(data)
+        return True
+
+    def close(self) -> None:
+        """Nothing to free."""
