@@ -45,9 +45,8 @@ lint: $(VENV)/installed  ## format, lint, types, import direction
 test: lint .venv-peers/installed  ## all of lint, then every test
 	$(BIN)/pytest
 
-bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link on this machine, and the peers beside us
-	@mkdir -p out
-	$(BIN)/mavbridge bench --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
+bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
+	$(BIN)/python -m benchmarks.compare --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
 
 clean:  ## forget the environments and outputs
 	rm -rf $(VENV) .venv-peers out
