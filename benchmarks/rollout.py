@@ -5,27 +5,24 @@ python -m benchmarks.rollout --json rollout.json --plot docs/rollout.png
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
 from cyclopts import App
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from benchmarks.rollout_process import COMMAND, FRAMES, RolloutJob, Trial
+from benchmarks.rollout_process import COMMAND, RolloutJob, Trial
 from mavbridge.commands.bench.results import from_json, this_machine
 from mavbridge.commands.bench.tables import make_table, number
-from mavbridge.commands.imagine.run import SHIPPED
+from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.output import (
     BLUE,
     FIGURE_DPI,
     FIGURE_STYLE,
-    MUTED,
+    GREY,
     RED,
     print_status,
     require_matplotlib,
@@ -33,37 +30,14 @@ from mavbridge.commands.output import (
     table_console,
 )
 from mavbridge.core.processes import running, wait
-from policy.checkpoints.world_model_file import load_world_model
 
 TIMEOUT_S = 3600.0
-THEIRS = "#a9b4bf"
+STEPS, ITERATIONS = 4, 8
+"""DDIM steps where iterations vary, and iterations where steps vary."""
+FULL = ((8, 64, 256), (1, 2, 4, 8, 16, 32, 50), 3)
+QUICK = ((2, 8), (1, 4), 1)
+"""Iterations, DDIM steps, and repeats, of which the median by wall time counts."""
 app = App(help=__doc__)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Effort:
-    """The rollouts to measure."""
-
-    iterations: tuple[int, ...]
-    ddim_steps_long: int
-    """With each number of iterations."""
-    ddim_steps: tuple[int, ...]
-    iterations_short: int
-    """With each number of steps."""
-    repeats: int
-    """The latter; the median by wall time counts."""
-
-
-FULL = Effort(
-    iterations=(8, 64, 256),
-    ddim_steps_long=4,
-    ddim_steps=(1, 2, 4, 8, 16, 32, 50),
-    iterations_short=8,
-    repeats=3,
-)
-QUICK = Effort(
-    iterations=(2, 8), ddim_steps_long=2, ddim_steps=(1, 4), iterations_short=2, repeats=1
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,16 +57,6 @@ class Pair:
         """Amdahl's: the speed-up if all but the sampling took no time."""
         return self.serial.wall_s / self.serial.sample_s
 
-    @property
-    def is_exact(self) -> bool:
-        """The same frames, bit for bit."""
-        return self.serial.sha256 == self.streamed.sha256
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, with the figures that follow from the trials."""
-        derived = {"speed_up": self.speed_up, "bound": self.bound, "is_exact": self.is_exact}
-        return asdict(self) | derived
-
 
 @app.default
 def main(
@@ -101,6 +65,7 @@ def main(
     json: Path | None = None,
     plot: Path | None = None,
     world_model: Path | None = None,
+    device: str = "cpu",
 ) -> int:
     """Measure; 1 if the two ways do not give the same frames.
 
@@ -109,45 +74,38 @@ def main(
         json: where to write all figures.
         plot: where to draw them as PNG.
         world_model: weights; by default those that come with mavbridge.
+        device: torch device of the world model.
     """
     require_writable(json, "--json")
     require_writable(plot, "--plot")
     if plot is not None:
         require_matplotlib()
-    weights = world_model or SHIPPED
-    load_world_model(weights)  # refuses what is no world model before the first process starts
-    by_iterations, by_steps = measure(QUICK if quick else FULL, weights)
-    print_pairs(by_iterations, by_steps, table_console())
+    load_model(world_model, ddim_steps=STEPS, device=device)  # refused before the first process
+    iterations, steps, repeats = QUICK if quick else FULL
+    job = RolloutJob(
+        way="serial",
+        iterations=ITERATIONS,
+        ddim_steps=STEPS,
+        device=device,
+        world_model=world_model,
+    )
+    by_iterations = [measure(replace(job, iterations=count), repeats) for count in iterations]
+    by_steps = [measure(replace(job, ddim_steps=count), repeats) for count in steps]
+    print_pairs([*by_iterations, *by_steps], table_console())
     if json is not None:
-        write_json(json, by_iterations, by_steps)
+        write_json([*by_iterations, *by_steps], json)
     if plot is not None:
         draw(by_iterations, by_steps, plot)
-    return 0 if all(pair.is_exact for pair in (*by_iterations, *by_steps)) else 1
+    pairs = [*by_iterations, *by_steps]
+    return 0 if all(pair.serial.sha256 == pair.streamed.sha256 for pair in pairs) else 1
 
 
-def measure(effort: Effort, weights: Path) -> tuple[list[Pair], list[Pair]]:
-    """Pairs by iterations and pairs by steps, one after the other, on every device."""
-    by_iterations, by_steps = [], []
-    for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
-        for iterations in effort.iterations:
-            steps = effort.ddim_steps_long
-            by_iterations.append(compare(device, iterations, steps, 1, weights))
-        for steps in effort.ddim_steps:
-            iterations = effort.iterations_short
-            by_steps.append(compare(device, iterations, steps, effort.repeats, weights))
-    return by_iterations, by_steps
-
-
-def compare(device: str, iterations: int, steps: int, repeats: int, weights: Path) -> Pair:
-    """Both ways in turn, so that a machine that changes meanwhile does to both."""
-    print_status(f"{iterations} iterations of {steps} steps on {device}, both ways")
-    serial = RolloutJob(
-        way="serial", iterations=iterations, ddim_steps=steps, device=device, world_model=weights
-    )
-    streamed = replace(serial, way="streamed")
-    pairs = [(run_trial(serial), run_trial(streamed)) for _ in range(repeats)]
-    plain, ours = zip(*pairs, strict=True)
-    return Pair(serial=median_trial(plain), streamed=median_trial(ours))
+def measure(job: RolloutJob, repeats: int) -> Pair:
+    """Run both ways in turn, so that a machine that changes meanwhile does to both."""
+    print_status(f"{job.iterations} iterations of {job.ddim_steps} steps, both ways")
+    pairs = [(run_trial(job), run_trial(replace(job, way="streamed"))) for _ in range(repeats)]
+    serial, streamed = zip(*pairs, strict=True)
+    return Pair(serial=median_trial(serial), streamed=median_trial(streamed))
 
 
 def run_trial(job: RolloutJob) -> Trial:
@@ -158,9 +116,9 @@ def run_trial(job: RolloutJob) -> Trial:
     """
     with TemporaryDirectory(prefix="mavbridge-bench-") as name:
         out, log = Path(name) / "trial.json", Path(name) / "trial.log"
-        flags = [f"--{key.replace('_', '-')}={value}" for key, value in asdict(job).items()]
-        command = (sys.executable, "-c", COMMAND, f"--out={out}", *flags)
-        with running(*command, log=log) as process:
+        given = {key: value for key, value in asdict(job).items() if value is not None}
+        flags = [f"--{key.replace('_', '-')}={value}" for key, value in given.items()]
+        with running(sys.executable, "-c", COMMAND, f"--out={out}", *flags, log=log) as process:
             wait(process, f"the {job.way} rollout", log, TIMEOUT_S)
         return from_json(Trial, out.read_text())
 
@@ -170,58 +128,33 @@ def median_trial(trials: Sequence[Trial]) -> Trial:
     return sorted(trials, key=lambda trial: trial.wall_s)[(len(trials) - 1) // 2]
 
 
-def print_pairs(by_iterations: Sequence[Pair], by_steps: Sequence[Pair], console: Console) -> None:
-    """Print both tables, and whether the frames were the same."""
-    pairs = (*by_iterations, *by_steps)
-    console.print(trial_table(by_iterations))
+def print_pairs(pairs: Sequence[Pair], console: Console) -> None:
+    """Print two rows for each pair."""
+    header = (
+        *("way", "iterations", "steps", "threads", "decoded", "wall", "sampling"),
+        *("pixels", "files", "nets", "writer", "speed-up", "bound"),
+    )
     rows = [
         (
-            *(pair.serial.device, str(pair.serial.ddim_steps)),
-            *(number(pair.serial.wall_s, 2), number(pair.streamed.wall_s, 2)),
+            *(one.way, str(one.iterations), str(one.ddim_steps), str(one.torch_threads)),
+            *(str(one.frames_decoded), number(one.wall_s, 2), number(one.sample_s, 2)),
+            *(number(one.decode_s, 2), number(one.write_s, 2)),
+            *(number(one.peak_rss_mb, 0), number(one.writer_rss_mb, 0)),
             *(number(pair.speed_up, 2), number(pair.bound, 2)),
         )
-        for pair in by_steps
-    ]
-    title = "Speed-up by DDIM steps; bound: if all but the sampling took no time"
-    header = ("device", "steps", "serial, s", "streamed, s", "speed-up", "bound")
-    console.print(make_table(title, header, rows))
-    if all(pair.is_exact for pair in pairs):
-        console.print(f"all {len(pairs)} pairs have the same frames, bit for bit")
-    else:
-        console.print(Text("the two ways did not give the same frames", style="bold red"))
-
-
-def trial_table(pairs: Iterable[Pair]) -> Table:
-    """A row for each way and number of iterations."""
-    seconds = ("start_s", "wall_s", "sample_s", "decode_s", "write_s")
-    megabytes = ("peak_rss_mb", "writer_rss_mb", "peak_gpu_mb")
-    counts = ("iterations", "torch_threads", "frames_decoded")
-    rows = [
-        (
-            f"{trial.way}, {trial.device}",
-            *(str(getattr(trial, name)) for name in counts),
-            *(number(getattr(trial, name), 2) for name in seconds),
-            *(number(getattr(trial, name), 0) for name in megabytes),
-        )
         for pair in pairs
-        for trial in (pair.serial, pair.streamed)
+        for one in (pair.serial, pair.streamed)
     ]
-    header = ["way", "iterations", "threads", "decoded", "start", "wall", "sampling"]
-    header += ["pixels", "files", "nets", "writer", "GPU"]
-    return make_table(
-        "Time, s, with waits for pixels and files; peak memory of processes and GPU, MB",
-        header,
-        rows,
-    )
+    title = "Rollouts: time with waits for pixels and files, s; peak memory of processes, MB"
+    console.print(make_table(title, header, rows))
+    different = [pair for pair in pairs if pair.serial.sha256 != pair.streamed.sha256]
+    console.print(f"{len(different)} of {len(pairs)} pairs differ in their frames")
 
 
-def write_json(path: Path, by_iterations: Sequence[Pair], by_steps: Sequence[Pair]) -> None:
+def write_json(pairs: Sequence[Pair], path: Path) -> None:
     """Write all figures; null = not measured."""
-    document = {
-        "machine": asdict(this_machine()),
-        "by_iterations": [pair.to_dict() for pair in by_iterations],
-        "by_steps": [pair.to_dict() for pair in by_steps],
-    }
+    rows = [asdict(pair) | {"speed_up": pair.speed_up, "bound": pair.bound} for pair in pairs]
+    document = {"machine": asdict(this_machine()), "pairs": rows}
     path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
 
 
@@ -229,50 +162,43 @@ def draw(by_iterations: Sequence[Pair], by_steps: Sequence[Pair], path: Path) ->
     """Write a PNG: speed-up by steps, memory by iterations."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter
 
     with rc_context(FIGURE_STYLE | {"axes.grid.axis": "y"}):
         figure = Figure(figsize=(11.0, 4.4), dpi=FIGURE_DPI, facecolor="white")
         left, right = figure.subplots(1, 2)
         draw_speed_up(left, by_steps)
         draw_memory(right, by_iterations)
-        for axes in (left, right):
+        for axes, values in (
+            (left, [pair.serial.ddim_steps for pair in by_steps]),
+            (right, [pair.serial.iterations for pair in by_iterations]),
+        ):
             axes.set_xscale("log", base=2)
-            axes.set_xticks(sorted({float(x) for line in axes.lines for x in line.get_xdata()}))
-            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.set_xticks(values, [str(value) for value in values])
             axes.minorticks_off()
             axes.set_ylim(0, 1.2 * axes.get_ylim()[1])
             axes.legend(loc="best")
-        here = this_machine()
-        caption = f"{here.cpu}, cores: {here.cores}; {FRAMES} frames an iteration"
-        figure.text(0.012, 0.015, caption, color=MUTED, fontsize=8.5)
-        figure.tight_layout(rect=(0, 0.05, 1, 1), w_pad=3)
+        figure.tight_layout(w_pad=3)
         figure.savefig(path)
 
 
 def draw_speed_up(axes: Any, pairs: Sequence[Pair]) -> None:
-    """Measured speed-up and its bound by steps, a pair of lines for each device."""
-    for device, style in (("cpu", "-"), ("cuda", "--")):
-        there = [pair for pair in pairs if pair.serial.device == device]
-        if there:
-            steps = [pair.serial.ddim_steps for pair in there]
-            measured, bound = [one.speed_up for one in there], [one.bound for one in there]
-            axes.plot(steps, measured, style, marker="o", color=BLUE, label=f"measured, {device}")
-            axes.plot(steps, bound, style, color=RED, label=f"Amdahl's bound, {device}")
+    """Measured speed-up and its bound by steps."""
+    steps = [pair.serial.ddim_steps for pair in pairs]
+    axes.plot(steps, [one.speed_up for one in pairs], "o-", color=BLUE, label="measured")
+    axes.plot(steps, [one.bound for one in pairs], color=RED, label="Amdahl's bound")
     axes.set_xlabel("DDIM steps of a sample")
     axes.set_title("Speed-up over the serial path")
 
 
 def draw_memory(axes: Any, pairs: Sequence[Pair]) -> None:
-    """Peak memory on the CPU by iterations, a line for each way."""
-    there = [pair for pair in pairs if pair.serial.device == "cpu"]
-    iterations = [pair.serial.iterations for pair in there]
-    for way, color in (("serial", THEIRS), ("streamed", BLUE)):
-        memory_mb = [getattr(pair, way).peak_rss_mb for pair in there]
-        axes.plot(iterations, memory_mb, marker="o", color=color, label=way)
+    """Peak memory by iterations, a line for each way."""
+    iterations = [pair.serial.iterations for pair in pairs]
+    for way, color in (("serial", GREY), ("streamed", BLUE)):
+        memory_mb = [getattr(pair, way).peak_rss_mb for pair in pairs]
+        axes.plot(iterations, memory_mb, "o-", color=color, label=way)
     axes.set_xlabel("iterations")
     axes.set_ylabel("peak RSS, MB")
-    axes.set_title("Memory of the process with the nets")
+    axes.set_title("Memory of the process with the networks")
 
 
 if __name__ == "__main__":

@@ -29,7 +29,6 @@ from policy.world_model.config import WorldModelConfig
 COMMAND = "from benchmarks.rollout_process import app; app()"
 FRAMES, EXE_STEPS = 16, 1
 """Of an iteration, as ``mavbridge imagine`` has them by default."""
-MB = 1 << 20
 app = App(help=__doc__)
 
 
@@ -75,8 +74,6 @@ class Trial:
     """Process with the networks."""
     writer_rss_mb: float | None
     """Writer process, if there is one."""
-    peak_gpu_mb: float | None
-    """Torch's allocator on a GPU."""
     sha256: str
     """All frames."""
 
@@ -136,7 +133,6 @@ def measure(job: RolloutJob, video: Path) -> Trial:
         write_s=sampler.meter.write.seconds,
         peak_rss_mb=peak_rss_mb("self"),
         writer_rss_mb=writer_rss_mb,
-        peak_gpu_mb=torch.cuda.max_memory_allocated() / MB if job.device != "cpu" else None,
         sha256=output.sha256,
     )
 

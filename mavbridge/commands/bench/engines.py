@@ -66,14 +66,9 @@ def _cases(policy: PolicyConfig) -> tuple[list[_Case], list[str]]:
     notes = []
     for engine in engines:
         try:
-            found = _cases_on(replace(policy, engine=engine))
+            cases += _cases_on(replace(policy, engine=engine))
         except PolicyError as error:
-            notes.append(f"{policy.policy} on {engine}: not measured: {error}")
-            continue
-        if found[0].engine.startswith(engine):
-            cases += found
-        else:  # the engine was passed over
-            notes.append(f"{policy.policy} on {engine}: not measured: it disagrees with torch")
+            notes.append(f"{name_of(policy)} on {engine}: not measured: {error}")
     if cases:
         return cases, notes
     return _cases_on(policy), []  # a policy in numpy runs on "auto" alone; others are refused
@@ -83,7 +78,7 @@ def _cases_on(policy: PolicyConfig) -> list[_Case]:
     full = _load(replace(policy, head_steps=None))
     rgb, state, history = _sample(full)
     feature = full.encode(rgb)
-    engine = full.engine.partition("-")[0] if full.engine.startswith("openvino") else full.engine
+    engine = full.engine if policy.engine == "auto" else policy.engine
 
     def case(work: str, call: Callable[[], object]) -> _Case:
         return _Case(policy=name_of(policy), work=work, engine=engine, call=call)
@@ -103,7 +98,10 @@ def _cases_on(policy: PolicyConfig) -> list[_Case]:
 
 
 def _load(policy: PolicyConfig) -> Executable:
-    return load_configured_policy(policy, MonotonicClock()).executable
+    loaded = load_configured_policy(policy, MonotonicClock())
+    if policy.engine != "auto" and not loaded.executable.engine.startswith(policy.engine):
+        raise PolicyError("; ".join(loaded.notes))  # says why the engine was passed over
+    return loaded.executable
 
 
 def _sample(executable: Executable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,9 +12,17 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from mavbridge.commands.bench.engines import EAGER
 from mavbridge.commands.bench.results import OURS, BenchResult, EngineTiming, Flight, LinkLatency
-from mavbridge.commands.output import BLUE, FIGURE_DPI, FIGURE_STYLE, INK, MUTED, RED
+from mavbridge.commands.output import (
+    BLUE,
+    FIGURE_DPI,
+    FIGURE_STYLE,
+    GREY,
+    INK,
+    MUTED,
+    PALE_BLUE,
+    RED,
+)
 
-THEIRS, PALE_BLUE = "#a9b4bf", "#9cc5e8"
 STYLE = FIGURE_STYLE | {"axes.grid.axis": "x", "axes.spines.left": False, "ytick.left": False}
 
 
@@ -66,7 +74,7 @@ def draw_engines(axes: Axes, timings: Sequence[EngineTiming]) -> None:
         color = PALE_BLUE if name == EAGER else BLUE
         bars = axes.barh(centres, times, 0.9 * thickness, color=color, label=name)
         axes.bar_label(bars, [_digits(time) for time in times], padding=4, fontsize=9, color=INK)
-    labels = [f"{policy}\n{work}".replace(", ", "\n") for policy, work in works]
+    labels = [_in_two_lines(f"{policy}, {work}") for policy, work in works]
     axes.set_yticks(range(len(works)), labels)
     axes.set_ylim(len(works) - 0.5, -0.5)
     axes.set_xlabel("ms, median")
@@ -85,7 +93,7 @@ def draw_rates(axes: Axes, flights: Sequence[Flight]) -> None:
             bars = axes.barh(row + shift, reached or 0.0, 0.34, color=_color(flight))
             axes.bar_label(bars, [f"{reached or 0:.0f} {kind}"], padding=4, fontsize=9)
             axes.vlines(asked, row + shift - 0.17, row + shift + 0.17, color=RED)
-    axes.set_yticks(range(len(flights)), [_in_lines(flight.label) for flight in flights])
+    axes.set_yticks(range(len(flights)), [_in_two_lines(flight.label) for flight in flights])
     axes.set_ylim(len(flights) - 0.5, -0.5)
     axes.set_xlim(0, 1.25 * max((flight.asked_action_hz for flight in flights), default=1))
     axes.set_xlabel("Hz; red: what was asked for")
@@ -111,7 +119,7 @@ def draw_spans(axes: Axes, title: str, spans: Sequence[Span]) -> None:
         10 ** floor(log10(low)), 2 * high * (high / low) ** 0.35
     )  # room for the words at the right
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.set_yticks(range(len(spans)), [_in_lines(span.label) for span in spans])
+    axes.set_yticks(range(len(spans)), [_in_two_lines(span.label) for span in spans])
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(len(spans) - 0.5, -0.6)
     axes.set_xlabel("ms")
@@ -139,8 +147,11 @@ def link_spans(links: Sequence[LinkLatency]) -> list[Span]:
     ]
 
 
-def _in_lines(label: str) -> str:
-    return label.replace(", ", "\n")
+def _in_two_lines(label: str) -> str:
+    """Break a label at its middle comma."""
+    parts = label.split(", ")
+    half = len(parts) // 2
+    return "\n".join((", ".join(parts[:half]), ", ".join(parts[half:]))).strip()
 
 
 def _digits(value_ms: float) -> str:
@@ -149,5 +160,5 @@ def _digits(value_ms: float) -> str:
 
 def _color(flight: Flight) -> str:
     if flight.runner != OURS:
-        return THEIRS
+        return GREY
     return PALE_BLUE if flight.engine == EAGER else BLUE

@@ -34,7 +34,7 @@ def test_rates_are_drawn_beside_what_was_asked(axes) -> None:
     asked = [lines.get_segments()[0][0][0] for lines in axes.collections]
     assert asked == [100.0, 30.0, 100.0, 30.0]
     labels = [label.get_text().split("\n")[0] for label in axes.get_yticklabels()]
-    assert labels == ["mavbridge", "baseline"]
+    assert labels == ["mavbridge, toge:small", "baseline, toge:small"]
 
 
 def test_latencies_run_from_the_median_to_the_99th_percentile(axes) -> None:
