@@ -49,9 +49,8 @@ check: lint  ## all of lint, then every test that needs no second process
 test: lint .venv-peers/installed  ## all of lint, then every test
 	$(BIN)/pytest $(PARALLEL)
 
-bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link on this machine, and the peers beside us
-	@mkdir -p out
-	$(BIN)/mavbridge bench --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
+bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
+	$(BIN)/python -m benchmarks.compare --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
 
 clean:  ## forget the environments and outputs
 	rm -rf $(VENV) .venv-peers out

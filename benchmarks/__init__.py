@@ -1,1 +1,7 @@
-"""Measurements of the whole product; run one with ``python -m benchmarks.NAME``."""
+"""Comparisons and studies for developers; run one with ``python -m benchmarks.NAME``.
+
+compare     our engines, flights and link beside a roofline, a baseline runner and other clients
+rollout     imagined flights, serial and streamed
+study       what makes a checkpoint fly well, one setting at a time
+rank_by_imagination, imagined_strip     what a world model is worth
+"""

@@ -1,57 +1,77 @@
 """A picture of what the world model imagines, under what was really seen.
 
-    python -m benchmarks.imagined_strip FLIGHT --at 0.5 --out docs/imagined.png
+python -m benchmarks.imagined_strip FLIGHT --at 0.5 --out docs/imagined.png
 
 The sticks are those that were flown, and in the last row the same with the yaw stick full right.
 """
 
-import argparse
+from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
+from cyclopts import App
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 from mavbridge.commands.evaluate_imagination.runs import Run, read_runs, survey, with_images
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.imagine.sampling import Sampler
+from mavbridge.commands.output import FIGURE_STYLE
 from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from policy.contract import ACTION_NAMES
 
 STEPS = (1, 4, 8, 16)
-SCALE = 2
-MARGIN_PX, HEADER_PX, LABEL_PX = 4, 22, 128
+DPI = 64
+"""A frame is two inches wide."""
+app = App(help=__doc__)
 
 
-def strip(sampler: Sampler, run: Run, images: dict[int, ImageArray]) -> ImageArray:
-    """Rows of frames [H, W, 3]: real, imagined, copied, and imagined with another stick."""
-    now, dt_s = sampler.config.context_frames - 1, sampler.config.frame_dt_s
+@app.default
+def main(flight: Path, *, out: Path, at: float = 0.5, world_model: Path | None = None) -> None:
+    """Draw one window of one flight.
+
+    Args:
+        flight: a flight that the model was not trained on.
+        out: where to write the PNG.
+        at: where in the flight, from 0 to 1.
+        world_model: weights; by default those that come with mavbridge.
+
+    Raises:
+        UserError: the flight is too short.
+    """
+    model = load_model(world_model, ddim_steps=4, device="cpu")
+    sampler = Sampler(model, ddim_steps=4, decode_all=False, clock=MonotonicClock())
+    config = sampler.config
+    found = survey(flight, config, exe_steps=1, iterations=1)
+    if found is None:
+        least_s = config.frames * config.frame_dt_s
+        raise UserError(f"{flight} is too short: name one that is longer than {least_s:g} s")
+    rows = np.array([round(at * (found.windows - 1))])
+    steps = range(config.context_frames + config.frames)
+    runs = read_runs(flight, config, config.frames, rows)
+    run, images = next(with_images(runs, steps, config.image_size))
+    draw(strip(sampler, run, images), config.frame_dt_s, out)
+
+
+def strip(
+    sampler: Sampler, run: Run, images: Mapping[int, ImageArray]
+) -> dict[str, list[ImageArray]]:
+    """Rows of frames at ``STEPS`` by name."""
+    now = sampler.config.context_frames - 1
     turned: FloatArray = run.actions.copy()
     turned[:, ACTION_NAMES.index("yaw")] = 1.0
-    rows = {
+    return {
         "real": [images[now + step] for step in STEPS],
         "imagined": imagine(sampler, run, images, run.actions),
         "copy last": [images[now]] * len(STEPS),
         "yaw full right": imagine(sampler, run, images, turned),
     }
-    side = sampler.config.image_size * SCALE
-    pitch = side + MARGIN_PX
-    height, width = HEADER_PX + len(rows) * pitch, LABEL_PX + len(STEPS) * pitch
-    canvas = np.full((height, width, 3), 255, np.uint8)
-    for column, step in enumerate(STEPS):
-        _write(canvas, f"{step * dt_s:.1f} s", LABEL_PX + column * pitch, HEADER_PX - 7)
-    for row, (name, frames) in enumerate(rows.items()):
-        top = HEADER_PX + row * pitch
-        _write(canvas, name, 4, top + side // 2)
-        for column, frame in enumerate(frames):
-            left = LABEL_PX + column * pitch
-            large = cv2.resize(frame, (side, side), interpolation=cv2.INTER_NEAREST)
-            canvas[top : top + side, left : left + side] = large
-    return canvas
 
 
 def imagine(
-    sampler: Sampler, run: Run, images: dict[int, ImageArray], actions: FloatArray
+    sampler: Sampler, run: Run, images: Mapping[int, ImageArray], actions: FloatArray
 ) -> list[ImageArray]:
     """The frames at ``STEPS`` that follow from sticks [frames, 4]."""
     context = sampler.config.context_frames
@@ -60,37 +80,22 @@ def imagine(
     return list(sampler.decode(imagined.latents[[step - 1 for step in STEPS]]))
 
 
-def _write(canvas: ImageArray, text: str, left_px: int, baseline_px: int) -> None:
-    at = (left_px, baseline_px)
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60, 60, 60), 1, cv2.LINE_AA)
-
-
-def main() -> None:
-    """Draw one window of one flight."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("flight", type=Path, help="a flight that the model was not trained on")
-    parser.add_argument("--at", type=float, default=0.5, help="where in it, 0 to 1")
-    parser.add_argument("--world-model", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
-    args = parser.parse_args()
-    model = load_model(args.world_model, ddim_steps=4, device="cpu")
-    sampler = Sampler(model, ddim_steps=4, decode_all=False, clock=MonotonicClock())
-    config = sampler.config
-    found = survey(args.flight, config, exe_steps=1, iterations=1)
-    if found is None:
-        parser.error(
-            f"{args.flight} is too short: {config.frames * config.frame_dt_s:g} s and more"
-        )
-    rows = np.array([round(args.at * (found.windows - 1))])
-    runs = read_runs(args.flight, config, config.frames, rows)
-    steps = range(config.context_frames + config.frames)
-    run, images = next(with_images(runs, steps, config.image_size))
-    cv2.imwrite(
-        str(args.out), strip(sampler, run, images)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9]
-    )
+def draw(rows: Mapping[str, list[ImageArray]], step_s: float, path: Path) -> None:
+    """Write the PNG."""
+    with rc_context(FIGURE_STYLE | {"axes.grid": False}):
+        figure = Figure(figsize=(2.2 + 2 * len(STEPS), 0.5 + 2 * len(rows)), dpi=DPI)
+        panels = figure.subplots(len(rows), len(STEPS))
+        for line, (name, frames) in zip(panels, rows.items(), strict=True):
+            for axes, step, frame in zip(line, STEPS, frames, strict=True):
+                axes.imshow(frame, interpolation="nearest")
+                axes.set_xticks([])
+                axes.set_yticks([])
+                if axes in panels[0]:
+                    axes.set_title(f"{step * step_s:.1f} s")
+            line[0].set_ylabel(name, rotation=0, ha="right", va="center")
+        figure.tight_layout(pad=0.4)
+        figure.savefig(path)
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -1,4 +1,4 @@
-"""Link test, client: MAVSDK-Python 4, run by the interpreter that has it.
+"""Client of the link test: MAVSDK-Python 4, run by the interpreter that has it.
 
 A subscription's callback answers with manual control, which is MAVSDK's way to move sticks.
 """
@@ -27,4 +27,4 @@ def main(port: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[sys.argv.index("--port") + 1])

@@ -1,17 +1,14 @@
-"""Link test, client: the shortest loop that pymavlink allows, blocking receive and send."""
+"""Client of the link test: the shortest loop that pymavlink allows, blocking receive and send."""
 
-import argparse
-
+from cyclopts import run
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 
-def main() -> None:
+def main(*, port: int) -> None:
     """Answer until ended."""
-    parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
-    parser.add_argument("--port", type=int, required=True)
     connection = mavutil.mavlink_connection(
-        f"udpin:127.0.0.1:{parser.parse_args().port}",
+        f"udpin:127.0.0.1:{port}",
         source_system=255,
         source_component=mav.MAV_COMP_ID_ONBOARD_COMPUTER,
     )
@@ -27,4 +24,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

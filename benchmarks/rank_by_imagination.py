@@ -1,27 +1,26 @@
 """Does a policy that flies better in imagination fly better? Checkpoints ranked both ways.
 
-    python -m benchmarks.rank_by_imagination HELD_OUT_FLIGHTS \\
-        --candidate a.safetensors 1 5.2 --candidate b.safetensors 10 1.3
+python -m benchmarks.rank_by_imagination HELD_OUT_FLIGHTS
+--candidate a.safetensors 1 5.2 --candidate b.safetensors 10 1.3
 
 The numbers beside a checkpoint are its diffusion steps and its real score with them, the gates that
-``mavbridge evaluate --dual-rate --num-diffusion-steps N`` counts. The imagined one is the share of
-gates that it passes in the world model, from moments of demonstrations a little before a gate, of
-those that the expert passed there in the same time. The course is the demonstration's own, the path
-is the sum of the imagined velocities, and gates are counted as in a real flight. Two rows say what
-the figures are worth: the expert's own sticks, and sticks that stay centred.
+``mavbridge evaluate --dual-rate --num-diffusion-steps N`` counts. The imagined score is the number
+of gates that it passes in the world model from moments of demonstrations a little before a gate,
+out of those that the expert passed there in the same time. The course is the demonstration's own,
+the path is the sum of the imagined velocities, and gates are counted as in a real flight. Two
+controls calibrate the figures: the expert's own sticks, and sticks that stay centred.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
+from mavbridge.commands.bench.tables import make_table
 from mavbridge.commands.evaluate_imagination.metrics import spearman
 from mavbridge.commands.imagine.deciders import Decider, PolicyDecider
 from mavbridge.commands.imagine.loop import rollout
@@ -30,6 +29,7 @@ from mavbridge.commands.imagine.plan import RolloutPlan
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.commands.imagine.start import Start, read_start
+from mavbridge.commands.output import print_status, table_console
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import FloatArray
@@ -45,26 +45,27 @@ ITERATIONS, EXE_STEPS = 8, 4
 BEFORE_GATE_S = 1.2
 
 Points = NDArray[np.float64]
+app = App(help=__doc__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A moment of a demonstration, and what lay ahead."""
+    """A moment of a demonstration, and the expert's flight from there on."""
 
     start: Start
     position_ned_m: Points
     course: Course
     next_gate: int
     expert_gates: int
-    """That the expert passed in the time of a rollout."""
+    """Gates that the expert passed in the time of a rollout."""
     expert_end_ned_m: Points
     expert_sticks: FloatArray
-    """[steps, 4] that the expert's flight was sent, the mean of each step."""
+    """[steps, 4], the mean of what was sent in each step."""
 
 
 @dataclass(kw_only=True)
 class Replay:
-    """Gives sticks [steps, 4] that are known beforehand; a ``Decider`` for one case."""
+    """A ``Decider`` for one case that gives recorded sticks [steps, 4], and centred ones after."""
 
     sticks: FloatArray
     frames: int
@@ -73,7 +74,7 @@ class Replay:
     steps_given: int = 0
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
-        """Those of the next steps [frames, 4]; centred after the last."""
+        """Sticks of the next steps [frames, 4]."""
         chosen = np.zeros((self.frames, ACTION_DIM), np.float32)
         ahead = self.sticks[self.steps_given :][: self.frames]
         chosen[: len(ahead)] = ahead
@@ -83,15 +84,15 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Of one candidate."""
+    """Imagined flights of one candidate."""
 
-    passed: int
+    gates: int
     end_error_m: float
-    """From where the expert was at the end, mean."""
+    """Mean distance of the ends from where the expert was."""
 
 
 def cases_of(flight: RecordedFlight, sampler: Sampler) -> list[Case]:
-    """One a gate, where the flight goes on for long enough; none if its course is not known."""
+    """A case for each gate with enough flight around it; none if the course is not known."""
     if flight.meta.course_seed is None:
         return []
     rows = flight.frames.to_pylist()
@@ -129,7 +130,7 @@ def cases_of(flight: RecordedFlight, sampler: Sampler) -> list[Case]:
 
 
 def sticks_of(flight: RecordedFlight, from_ns: int, dt_s: float) -> FloatArray:
-    """What was sent [steps, 4] in each step of a rollout from a moment on."""
+    """Mean sticks [steps, 4] that were sent in each step of a rollout that starts at a moment."""
     known = [row.tick for row in flight.tick_rows() if row.tick.sent is not None]
     step = np.array([(tick.sent_ns - from_ns) / (dt_s * NS_PER_S) for tick in known])
     sent = np.array([tick.sent for tick in known], np.float32)
@@ -138,7 +139,7 @@ def sticks_of(flight: RecordedFlight, from_ns: int, dt_s: float) -> FloatArray:
 
 
 def path_of(sampler: Sampler, decider: Decider, case: Case, seed: int) -> Points:
-    """The imagined way [steps + 1, 3], m in NED, from where the vehicle really was."""
+    """The imagined path [steps + 1, 3], m in NED, from where the vehicle really was."""
     plan = RolloutPlan(
         iterations=ITERATIONS, frames=EXE_STEPS, exe_steps=EXE_STEPS, ddim_steps=4, seed=seed
     )
@@ -151,79 +152,75 @@ def path_of(sampler: Sampler, decider: Decider, case: Case, seed: int) -> Points
 
 
 def gates_passed(path_m: Points, course: Course, first: int) -> int:
-    """From gate ``first`` on, along straight steps between points [steps + 1, 3]."""
+    """Count gates from ``first`` on, along straight lines between points [steps + 1, 3], NED."""
     counter = GateCounter(course, first=first)
     for step, (north_m, east_m, down_m) in enumerate(path_m.tolist()):
         counter.update((north_m, east_m, down_m), float(step))
     return len(counter.passed)
 
 
-def policy_decider(sampler: Sampler, checkpoint: Path, steps: int) -> PolicyDecider:
-    """A candidate."""
-    wanted = PolicyConfig(checkpoint=checkpoint, dual_rate=True, num_diffusion_steps=steps)
-    return PolicyDecider(load_configured_policy(wanted, MonotonicClock()).executable, sampler)
+def score(sampler: Sampler, decider_for: Callable[[Case], Decider], cases: Sequence[Case]) -> Score:
+    """Fly every case in imagination."""
+    gates, errors_m = 0, []
+    for seed, case in enumerate(cases):
+        path_m = path_of(sampler, decider_for(case), case, seed)
+        gates += min(gates_passed(path_m, case.course, case.next_gate), case.expert_gates)
+        errors_m.append(float(np.linalg.norm(path_m[-1] - case.expert_end_ned_m)))
+    return Score(gates=gates, end_error_m=float(np.mean(errors_m)))
 
 
 def always(decider: Decider) -> Callable[[Case], Decider]:
-    """The same for every case."""
+    """The same decider for every case."""
     return lambda _: decider
 
 
-def score(sampler: Sampler, decider_for: Callable[[Case], Decider], cases: Sequence[Case]) -> Score:
-    """Fly every case in imagination."""
-    passed, errors_m = 0, []
-    for seed, case in enumerate(cases):
-        path_m = path_of(sampler, decider_for(case), case, seed)
-        passed += min(gates_passed(path_m, case.course, case.next_gate), case.expert_gates)
-        errors_m.append(float(np.linalg.norm(path_m[-1] - case.expert_end_ned_m)))
-    return Score(passed=passed, end_error_m=float(np.mean(errors_m)))
+@app.default
+def main(
+    *flights: Path,
+    candidate: list[tuple[Path, int, float]],
+    world_model: Path | None = None,
+    starts: int = 24,
+) -> None:
+    """Score all candidates, print them and how their two rankings correlate.
 
-
-def main() -> None:
-    """Score all candidates, print them and how the two rankings hang together."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("flights", type=Path, nargs="+", help="demonstrations, held out")
-    names = ("CHECKPOINT", "STEPS", "REAL")
-    parser.add_argument("--candidate", nargs=3, action="append", default=[], metavar=names)
-    parser.add_argument("--world-model", type=Path)
-    parser.add_argument("--starts", type=int, default=24)
-    args = parser.parse_args()
-    model = load_model(args.world_model, ddim_steps=4, device="cpu")
+    Args:
+        flights: held-out demonstrations.
+        candidate: checkpoint, diffusion steps and real score; may be repeated.
+        world_model: weights; by default those that come with mavbridge.
+        starts: cases, spread over all flights.
+    """
+    model = load_model(world_model, ddim_steps=4, device="cpu")
     sampler = Sampler(model, ddim_steps=4, decode_all=False, clock=MonotonicClock())
-    folders = [folder for folder in find_flights(args.flights) if is_exemplary(folder)]
+    folders = [folder for folder in find_flights(flights) if is_exemplary(folder)]
     every = [case for folder in folders for case in cases_of(open_flight(folder), sampler)]
-    chosen = np.linspace(0, len(every) - 1, min(args.starts, len(every))).astype(int)
+    chosen = np.linspace(0, len(every) - 1, min(starts, len(every))).astype(int)
     cases = [every[row] for row in chosen]
-    total = sum(case.expert_gates for case in cases)
     frames = sampler.config.frames
     controls: dict[str, Callable[[Case], Decider]] = {
         "the expert's sticks": lambda case: Replay(sticks=case.expert_sticks, frames=frames),
         "centred sticks": lambda case: Replay(sticks=0 * case.expert_sticks, frames=frames),
     }
-    table = Table(
-        "checkpoint", "steps", "real score", f"gates imagined, of {total}", "off the expert, m"
-    )
+    rows = []
     for name, control in controls.items():
         one = score(sampler, control, cases)
-        table.add_row(name, "-", "-", str(one.passed), f"{one.end_error_m:.1f}")
-    scores, real = [], [float(given) for _, _, given in args.candidate]
-    for name, steps, given in args.candidate:
-        decider = policy_decider(sampler, Path(name), int(steps))
+        rows.append((name, "-", "-", str(one.gates), f"{one.end_error_m:.1f}"))
+    scores = []
+    for path, steps, real in candidate:
+        wanted = PolicyConfig(checkpoint=path, dual_rate=True, num_diffusion_steps=steps)
+        loaded = load_configured_policy(wanted, MonotonicClock())
+        decider = PolicyDecider(loaded.executable, sampler)
         scores.append(one := score(sampler, always(decider), cases))
-        table.add_row(Path(name).stem, steps, given, str(one.passed), f"{one.end_error_m:.1f}")
-    console = Console(highlight=False)
-    console.print(table)
-    by_gates = spearman(real, [float(one.passed) for one in scores])
-    by_error = spearman(real, [-one.end_error_m for one in scores])
-    told = [f"{value:+.2f}" if value is not None else "none" for value in (by_gates, by_error)]
-    console.print(
-        f"{len(scores)} candidates, {len(cases)} starts in {len(folders)} flights; Spearman with "
-        f"gates imagined {told[0]}, with nearness to the expert {told[1]}",
-        soft_wrap=True,
-    )
+        rows.append((path.stem, str(steps), f"{real:g}", str(one.gates), f"{one.end_error_m:.1f}"))
+    total = sum(case.expert_gates for case in cases)
+    header = ("flown by", "steps", "real score", f"gates imagined, of {total}", "off the expert, m")
+    table_console().print(make_table(f"{len(cases)} starts, {len(folders)} flights", header, rows))
+    real_scores = [real for _, _, real in candidate]
+    for name, figures in (
+        ("gates imagined", [float(one.gates) for one in scores]),
+        ("small distance from the expert", [-one.end_error_m for one in scores]),
+    ):
+        print_status(f"Spearman of real score and {name}: {spearman(real_scores, figures)}")
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -12,7 +12,7 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
-from mavbridge.config.bench import BenchConfig, RolloutBenchConfig
+from mavbridge.config.bench import BenchConfig
 from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.export import ExportConfig
@@ -54,27 +54,12 @@ def fly(config: FlyConfig | None = None) -> int:
     return run_flight(config)
 
 
-bench_cli = App(name="bench")
-cli.command(bench_cli)
-
-
-@bench_cli.default
+@cli.command
 def bench(config: BenchConfig | None = None) -> int:
-    """Measure this machine: engines, loops against a simulated vehicle, the link, the peers."""
+    """Measure this machine with one policy: engines, both loops in simulated flight, the link."""
     from mavbridge.commands.bench.run import bench as run_bench
 
     return run_bench(BenchConfig() if config is None else config)
-
-
-@bench_cli.command(name="rollout")
-def bench_rollout(config: RolloutBenchConfig | None = None) -> int:
-    """Measure imagined flights: the plain serial way against ours."""
-    from mavbridge.recording.folder import require_extra
-
-    require_extra("bench rollout")
-    from mavbridge.commands.bench.rollout import bench_rollout as run_bench
-
-    return run_bench(RolloutBenchConfig() if config is None else config)
 
 
 IMAGINE, EVALUATE = "imagine", "--evaluate"

@@ -20,7 +20,8 @@ from mavbridge.core.errors import UserError
 
 PIPED_WIDTH = 120
 """Columns of the tables where there is no terminal."""
-INK, MUTED, GRID, BLUE, RED = "#1f2933", "#6b7885", "#dfe4ea", "#2b6cb0", "#d1495b"
+INK, MUTED, GRID, GREY = "#1f2933", "#6b7885", "#dfe4ea", "#a9b4bf"
+BLUE, PALE_BLUE, RED = "#2b6cb0", "#9cc5e8", "#d1495b"
 FIGURE_DPI = 150
 FIGURE_STYLE: dict[Any, Any] = {
     "font.size": 10,

@@ -1,37 +1,34 @@
 """Settings of ``mavbridge bench``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from cyclopts import Parameter
 
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.rates import Rates
+
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class BenchConfig:
-    """One benchmark run."""
+class BenchOutputs:
+    """How thoroughly to measure, and where the results go."""
 
     quick: bool = False
-    """A minute or two instead of nearly ten: figures to look at, not to quote."""
+    """Measure for seconds instead of minutes: figures to look at, not to quote."""
     json: Path | None = None
     """Write all figures here as JSON."""
     plot: Path | None = None
     """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
     check: Path | None = None
-    """Compare with this budget of ratios, and exit with 1 if something got worse."""
+    """Compare with this budget of ratios, and exit with 1 if one is exceeded."""
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class RolloutBenchConfig:
-    """One benchmark of rollouts."""
+class BenchConfig:
+    """One benchmark of one policy."""
 
-    quick: bool = False
-    """Short runs: figures to look at, not to quote."""
-    json: Path | None = None
-    """Write all figures here as JSON."""
-    plot: Path | None = None
-    """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
-    world_model: Path | None = None
-    """Weights of the world model; by default those that come with mavbridge, or else random
-    ones, which take as long."""
+    outputs: BenchOutputs = field(default_factory=BenchOutputs)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    rates: Rates = field(default_factory=Rates)

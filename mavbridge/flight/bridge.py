@@ -64,14 +64,28 @@ def build_bridge(
         clock=vision_clock or clock,
         period_ns=rate.period_ns,
     )
-    action_period_ns = period_ns(loops.action_hz)
+    action = build_action_loop(config, executable, clock=clock, link=link, cache=cache, sink=sink)
+    return Bridge(vision=vision, action=action)
+
+
+def build_action_loop(
+    config: FlyConfig,
+    executable: Executable,
+    *,
+    clock: Clock,
+    link: Link,
+    cache: FeatureCache,
+    sink: TickSink,
+) -> ActionLoop:
+    """Build the fast path alone; arguments as for ``build_bridge``."""
+    action_period_ns = period_ns(config.rates.loops(is_dual=executable.dual_rate).action_hz)
     pacer: Pacer
     if config.rates.pace == "state":
         pacer = StatePacer(clock, link, period_ns=action_period_ns)
     else:
         pacer = GridPacer(clock, period_ns=action_period_ns)
     limits = config.limits
-    action = ActionLoop(
+    return ActionLoop(
         clock=clock,
         pacer=pacer,
         link=link,
@@ -84,7 +98,6 @@ def build_bridge(
         sink=sink,
         settings=_action_settings(config, executable),
     )
-    return Bridge(vision=vision, action=action)
 
 
 def _action_settings(config: FlyConfig, executable: Executable) -> ActionSettings:

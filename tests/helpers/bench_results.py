@@ -1,96 +1,74 @@
+from typing import Any
+
 from mavbridge.commands.bench.results import (
     BenchResult,
+    ClientTiming,
+    EngineTiming,
     Flight,
-    Kernel,
-    Link,
+    LinkLatency,
     Machine,
-    RateTrial,
-    Roofline,
-    TopRate,
-    Vehicle,
 )
 from mavbridge.core.records import Percentiles
-
-ENCODE, SAMPLE = "encode", "sample"
 
 
 def all_equal(value: float) -> Percentiles:
     return Percentiles(p50=value, p99=value, p999=value, max=value)
 
 
-def make_flight(
-    runner: str, engine: str, *, action_hz: float | None, cores: float, wire_ms: float
-) -> Flight:
-    return Flight(
-        runner=runner,
-        policy="toge:small",
-        engine=engine,
-        asked_action_hz=100.0,
-        asked_vision_hz=30.0,
-        duration_s=60.0,
-        action_hz=action_hz,
-        vision_hz=15.0,
-        missed_slots=12,
-        period_ms=all_equal(10.0),
-        predict_ms=None,
-        encode_ms=all_equal(20.0),
-        feature_age_ms=all_equal(50.0),
-        state_to_wire_ms=all_equal(wire_ms),
-        cpu_cores=cores,
-        stolen_ms=None,
-        missed_by_cause={"inference": 9, "host": 3} if runner == "mavbridge" else None,
-        vehicle=Vehicle(override_hz=99.0, gap_p50_ms=10.0, gap_p99_ms=11.0, gap_max_ms=12.0),
-    )
+def make_flight(runner: str, **changes: Any) -> Flight:
+    """60 s with eager torch, asked for 100 and 30 Hz."""
+    fields: dict[str, Any] = {
+        "runner": runner,
+        "policy": "toge:small",
+        "solves": "full solves",
+        "engine": "torch",
+        "asked_action_hz": 100.0,
+        "asked_vision_hz": 30.0,
+        "duration_s": 60.0,
+        "action_hz": 50.0,
+        "vision_hz": 15.0,
+        "missed_slots": 12,
+        "period_ms": all_equal(10.0),
+        "predict_ms": None,
+        "encode_ms": all_equal(20.0),
+        "feature_age_ms": all_equal(50.0),
+        "state_to_wire_ms": all_equal(20.0),
+        "cpu_cores": 1.0,
+        "stolen_ms": None,
+        "missed_by_cause": {"inference": 9, "host": 3} if runner == "mavbridge" else None,
+        "vehicle_gap_ms": {"p50": 10.0, "p99": 11.0, "max": 12.0},
+    }
+    return Flight(**(fields | changes))
 
 
-def make_link(client: str, *, round_trip_ms: float, work_ms: float | None) -> Link:
-    return Link(
+def make_timing(work: str, engine: str, p50_ms: float) -> EngineTiming:
+    return EngineTiming(policy="toge", work=work, engine=engine, p50_ms=p50_ms, p99_ms=p50_ms + 1)
+
+
+def make_link(client: str, *, round_trip_ms: float, work_ms: float | None) -> LinkLatency:
+    return LinkLatency(
         client=client,
-        output="rc channels override",
         sent=600,
         answered=599,
         round_trip_ms=all_equal(round_trip_ms),
-        state_to_wire_ms=None,
-        work_ms=None if work_ms is None else all_equal(work_ms),
-    )
-
-
-def make_roofline(work: str, precision: str, floor_ms: float) -> Roofline:
-    return Roofline(
-        work=work,
-        precision=precision,
-        gflop=2.0,
-        weights_mb=40.0,
-        gflop_per_s=100.0,
-        gb_per_s=10.0,
-        floor_ms=floor_ms,
+        timing=ClientTiming(work_ms=None if work_ms is None else all_equal(work_ms)),
     )
 
 
 RESULT = BenchResult(
     machine=Machine(cpu="some cpu", cores=2, python="3.11.0", torch="2.13.0"),
     quick=True,
-    kernels=(
-        Kernel(work=ENCODE, engine="torch", p50_ms=60.0, p99_ms=70.0),
-        Kernel(work=SAMPLE, engine="torch", p50_ms=18.0, p99_ms=20.0),
-        Kernel(work=ENCODE, engine="quick", p50_ms=15.0, p99_ms=16.0),
-    ),
-    rooflines=(
-        make_roofline(ENCODE, "f32", 20.0),
-        make_roofline(ENCODE, "bf16", 5.0),
-        make_roofline(SAMPLE, "f32", 3.0),
+    engines=(
+        make_timing("encode", "torch", 60.0),
+        make_timing("sample", "torch", 18.0),
+        make_timing("encode", "quick", 15.0),
+        make_timing("encode", "roofline f32", 20.0),
+        make_timing("encode", "roofline bf16", 5.0),
+        make_timing("sample", "roofline f32", 3.0),
     ),
     flights=(
-        make_flight("mavbridge", "torch", action_hz=50.0, cores=1.0, wire_ms=20.0),
-        make_flight("usual runner", "torch", action_hz=25.0, cores=1.0, wire_ms=400.0),
-    ),
-    top_rates=(
-        TopRate(
-            label="torch",
-            action_hz=None,
-            trials=(RateTrial(action_hz=25.0, missed_fraction=0.5, vision_hz=9.0),),
-        ),
-        TopRate(label="quick", action_hz=250.0, trials=()),
+        make_flight("mavbridge"),
+        make_flight("baseline", action_hz=25.0, state_to_wire_ms=all_equal(400.0)),
     ),
     links=(
         make_link("mavbridge, 100 Hz clock", round_trip_ms=5.0, work_ms=0.6),

@@ -1,20 +1,50 @@
+"""``mavbridge bench`` and its peers with their real processes."""
+
+import json
+from pathlib import Path
+
 import pytest
 
-from mavbridge.commands.bench.link import clients, trial
+from benchmarks.compare import peer_clients
+from mavbridge.__main__ import main
+from mavbridge.commands.bench import run
+from mavbridge.commands.bench.link import time_link
+from mavbridge.commands.bench.run import Effort
 
 pytestmark = pytest.mark.system
 
+TINY = Effort(engine_rounds=1, engine_block_s=0.05, flight_s=1.0, attitudes=50)
 
-@pytest.mark.parametrize("name", ["mavbridge, 100 Hz clock", "bare pymavlink loop"])
-def test_the_link_is_measured_in_real_processes(name: str) -> None:
-    found, _ = clients()
-    (client,) = (client for client in found if client.name == name)
-    link = trial(client, attitudes=50)
-    assert link.client == name
-    assert link.output == "rc channels override"
-    assert link.sent == 50
-    # An attitude may be overtaken by the next one, and a shared host may stall.
+
+def test_a_benchmark_measures_engines_flight_and_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run, "QUICK", TINY)
+    monkeypatch.chdir(tmp_path)
+    flags = ("--quick", "--policy", "scripted:hover", "--rate", "50", "--json", "out/bench.json")
+    with pytest.raises(SystemExit) as stopped:
+        main(["bench", *flags])
+    captured = capsys.readouterr()
+    assert stopped.value.code == 0, captured.err
+    assert "scripted:hover" in captured.out
+    result = json.loads((tmp_path / "out" / "bench.json").read_text())
+    (flight,) = result["flights"]
+    assert (flight["asked_action_hz"], flight["solves"]) == (50.0, "single rate")
+    assert 0 < flight["action_hz"] < 51
+    assert flight["vision_hz"] > 0
+    assert flight["vehicle_gap_ms"]["p50"] > 0
+    assert [one["p50_ms"] > 0 for one in result["engines"]] == [True]
+    for link in result["links"]:
+        assert link["sent"] == 50
+        # An attitude may be overtaken by the next one, and a shared host may stall.
+        assert link["answered"] >= 25
+        times = link["round_trip_ms"]
+        assert 0 < times["p50"] <= times["p99"] <= times["max"]
+        assert link["timing"]["state_to_wire_ms"]["p50"] >= 0
+        assert link["timing"]["work_ms"]["p50"] > 0
+
+
+def test_a_bare_pymavlink_loop_is_a_client_of_the_link_test() -> None:
+    link = time_link(peer_clients()[0][0], attitudes=50)
     assert link.answered >= 25
-    assert 0 < link.round_trip_ms.p50 <= link.round_trip_ms.p99 <= link.round_trip_ms.max
-    assert (link.state_to_wire_ms is not None) == client.tells
-    assert (link.work_ms is not None) == client.tells
+    assert link.timing.work_ms is None

@@ -1,9 +1,9 @@
-"""``mavbridge bench``: what this machine reaches, beside what it could and what others do.
+"""``mavbridge bench``: what this machine reaches with one policy.
 
-    kernels   one encode, one chunk, every engine, against the roofline of one thread
-    flights   both loops against the simulated vehicle, and the usual runner beside them
-    link      attitude out of the vehicle to sticks back in, and the peers beside us
+    engines   encoding one image and sampling one chunk, on every engine that runs here
+    flight    both loops, flown against the simulated vehicle
+    link      an attitude out of a vehicle until the sticks made from it arrive
 
-Each measured thing runs in a process of its own; the parent only waits. The runner, the echoing
-vehicle and the peers' programs are in the source tree's ``benchmarks/``, outside the package.
+Flight and link run in child processes; this process only waits. Comparisons with other software
+are in ``benchmarks/`` of the source tree.
 """

@@ -1,4 +1,4 @@
-"""A stored budget, compared by ratio: two things of one run, so that no machine is too slow for it.
+"""A budget of ratios: each compares two figures of one run, so that no machine is too slow for it.
 
 The file is JSON, ``{"ratios": {name: most}}``; the names are those of ``ratios``. Every ratio is
 the smaller the better.
@@ -10,69 +10,68 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from mavbridge.commands.bench.engines import EAGER
-from mavbridge.commands.bench.flights import NAIVE_NAME, OURS_NAME
-from mavbridge.commands.bench.link import BARE
-from mavbridge.commands.bench.results import BenchResult, Flight, flight_label
+from mavbridge.commands.bench.results import BASELINE, OURS, BenchResult, Flight
 from mavbridge.core.errors import UserError
+
+ROOFLINE = "roofline f32"
+BARE_CLIENT = "bare pymavlink loop"
 
 
 def ratios(result: BenchResult) -> dict[str, float]:
     """Every ratio that the run allows, by name.
 
-    kernels: an engine over the roofline in f32, and over the eager engine. flights: our period over
-    the asked one, and period, state-to-wire and processor time an action over the usual runner's.
-    link: what our loop adds once it is awake, over the bare pymavlink loop's round trip.
+    Engines: median time over that of eager torch and over the roofline. Flights: period over the
+    asked one; and period, processor time an action and latency over the baseline's with the same
+    policy. Link: what a client does once it is awake, over the bare loop's round trip.
     """
-    return dict((*_kernel_ratios(result), *_flight_ratios(result), *_link_ratios(result)))
+    return dict((*_engine_ratios(result), *_flight_ratios(result), *_link_ratios(result)))
 
 
-def _kernel_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
-    floors = {roof.work: roof.floor_ms for roof in result.rooflines if roof.precision == "f32"}
-    eager = {kernel.work: kernel.p50_ms for kernel in result.kernels if kernel.engine == EAGER}
-    for kernel in result.kernels:
-        name = f"{kernel.work}: {kernel.engine}"
-        if kernel.work in floors:
-            yield f"{name} / roofline f32", kernel.p50_ms / floors[kernel.work]
-        if kernel.engine != EAGER and kernel.work in eager:
-            yield f"{name} / {EAGER}", kernel.p50_ms / eager[kernel.work]
+def _engine_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
+    times = {(one.policy, one.work, one.engine): one.p50_ms for one in result.engines}
+    for (policy, work, engine), time_ms in times.items():
+        for reference in (EAGER, ROOFLINE):
+            least_ms = times.get((policy, work, reference))
+            if least_ms and engine != reference and not engine.startswith("roofline"):
+                yield f"{policy}, {work}: {engine} / {reference}", time_ms / least_ms
 
 
 def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
-    usual = {flight.policy: flight for flight in result.flights if flight.runner == NAIVE_NAME}
+    baselines = {one.policy: one for one in result.flights if one.runner == BASELINE}
     for flight in result.flights:
-        if flight.runner != OURS_NAME or not flight.action_hz:
+        if flight.runner != OURS or not flight.action_hz:
             continue
-        naive = usual.get(flight.policy)
-        # Without the precision, which is the processor's: one budget serves them all.
+        # Without the precision, which depends on the processor: one budget serves them all.
         engine = flight.engine.partition("-")[0]
-        name = f"flight: {flight_label(flight.policy, engine, flight.head_steps)}"
-        yield f"{name} period / asked period", flight.asked_action_hz / flight.action_hz
-        if naive is None or not naive.action_hz:
+        name = f"flight: {flight.policy}, {flight.solves}, {engine}"
+        yield f"{name}: period / asked period", flight.asked_action_hz / flight.action_hz
+        baseline = baselines.get(flight.policy)
+        if baseline is None or not baseline.action_hz:
             continue
-        yield f"{name} period / {NAIVE_NAME}", naive.action_hz / flight.action_hz
-        yield f"{name} cpu an action / {NAIVE_NAME}", _cpu_ratio(flight, naive)
-        ours, theirs = flight.state_to_wire_ms, naive.state_to_wire_ms
+        yield f"{name}: period / {BASELINE}", baseline.action_hz / flight.action_hz
+        yield f"{name}: cpu an action / {BASELINE}", _cpu_ratio(flight, baseline)
+        ours, theirs = flight.state_to_wire_ms, baseline.state_to_wire_ms
         if ours is not None and theirs is not None and theirs.p50 > 0:
-            yield f"{name} state to wire / {NAIVE_NAME}", ours.p50 / theirs.p50
+            yield f"{name}: state to wire / {BASELINE}", ours.p50 / theirs.p50
 
 
-def _cpu_ratio(flight: Flight, naive: Flight) -> float:
-    if not (flight.action_hz and naive.action_hz and naive.cpu_cores):
+def _cpu_ratio(flight: Flight, baseline: Flight) -> float:
+    if not (flight.action_hz and baseline.action_hz and baseline.cpu_cores):
         return math.inf
-    return (flight.cpu_cores / flight.action_hz) / (naive.cpu_cores / naive.action_hz)
+    return (flight.cpu_cores / flight.action_hz) / (baseline.cpu_cores / baseline.action_hz)
 
 
 def _link_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
-    bare = next((link for link in result.links if link.client == BARE), None)
+    bare = next((link for link in result.links if link.client == BARE_CLIENT), None)
     if bare is None or bare.round_trip_ms.p50 <= 0:
         return
     for link in result.links:
-        if link.work_ms is not None:
-            yield f"link: {link.client} work / {BARE}", link.work_ms.p50 / bare.round_trip_ms.p50
+        if (work_ms := link.timing.work_ms) is not None:
+            yield f"link: {link.client}: work / {BARE_CLIENT}", work_ms.p50 / bare.round_trip_ms.p50
 
 
 def read_budget(path: Path) -> dict[str, float]:
-    """Name -> most.
+    """The largest allowed ratios, by name.
 
     Raises:
         UserError: no such file, or not a budget.
@@ -98,7 +97,7 @@ def _is_limit(value: object) -> bool:
 
 
 def violations(measured: Mapping[str, float], budget: Mapping[str, float]) -> tuple[str, ...]:
-    """What regressed, and what the budget names but the run did not measure; one line each."""
+    """A line for each ratio that is over the budget or was not measured."""
     lines = []
     for name, most in budget.items():
         if name not in measured:

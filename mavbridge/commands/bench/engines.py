@@ -1,67 +1,139 @@
-"""The engines that are compared: the one list, how a policy is loaded on each, what is asked."""
+"""Encoding one image and sampling one chunk on each engine, one thread, with nothing beside it."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 import torch
 
+from mavbridge.commands.bench.results import EngineTiming, name_of
+from mavbridge.commands.output import print_status
+from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from policy.checkpoints.policy_file import BuiltinPolicy, build_policy, load_checkpoint
-from policy.contract import Executable
-from policy.engines.executable import EngineName
-from policy.loading import SHIPPED, load_policy
-from policy.nets.toge import Toge, TogeConfig
+from mavbridge.core.histogram import Histogram
+from mavbridge.flight.policies import load_configured_policy
+from policy.contract import ACTION_DIM, QUATERNION, Executable
+from policy.errors import PolicyError
 
-EAGER: EngineName = "torch"
-ENGINES: tuple[EngineName, ...] = (EAGER, "openvino")
-"""The eager form first."""
-WARM_STEPS = 2
-"""Of a chunk that starts from the last one."""
-SEED = 0
-"""Of the untrained weights and the initial noise: every process makes the same policy of it."""
-STEPS = 10
-"""DDIM steps of a chunk."""
-FLIGHT_POLICY = "toge:small"
-SHIPPED_POLICY = "toge"
-"""The trained weights that ``--policy toge`` is."""
+EAGER: Engine = "torch"
+ENCODE, CHUNK, BOTH = "encode one image", "sample one chunk", "one image to one chunk"
+WARM_ELAPSED_S = 0.01
+"""Between two chunks at 100 Hz."""
 
 
-def load(policy: str, engine: EngineName, *, head_steps: int | None = None) -> Executable:
-    """A policy in dual rate on one engine; all but the shipped one have seeded random weights.
+@dataclass(frozen=True, kw_only=True)
+class _Case:
+    policy: str
+    work: str
+    engine: str
+    call: Callable[[], object]
+    durations: Histogram = field(default_factory=Histogram)
+
+
+def time_engines(
+    policies: Sequence[PolicyConfig], *, rounds: int, block_s: float
+) -> tuple[tuple[EngineTiming, ...], tuple[str, ...]]:
+    """Time every policy on every engine that runs it; and notes on the engines that do not.
+
+    Each round goes through all cases, so that a slow minute of the host is shared by all engines.
+
+    Args:
+        policies: their ``engine`` picks one engine, or with ``auto`` all of this device.
+        rounds: how often each case is measured.
+        block_s: how long each time.
 
     Raises:
-        PolicyError: the engine cannot run here.
+        PolicyError: a policy cannot be loaded on any engine.
     """
+    torch.set_num_threads(1)
+    cases, notes = [], []
+    for policy in policies:
+        found, remarks = _cases(policy)
+        cases += found
+        notes += remarks
+    for number in range(rounds):
+        print_status(f"engines, round {number + 1} of {rounds}")
+        for case in cases:
+            _time(case, block_s)
+    return tuple(map(_timing, cases)), tuple(notes)
+
+
+def _cases(policy: PolicyConfig) -> tuple[list[_Case], list[str]]:
+    devices = (policy.device, policy.vision_device or "", policy.action_device or "")
+    fast: Engine = "cuda-graph" if any(name.startswith("cuda") for name in devices) else "openvino"
+    engines: tuple[Engine, ...] = (EAGER, fast) if policy.engine == "auto" else (policy.engine,)
+    cases: list[_Case] = []
+    notes = []
+    for engine in engines:
+        try:
+            cases += _cases_on(replace(policy, engine=engine))
+        except PolicyError as error:
+            notes.append(f"{name_of(policy)} on {engine}: not measured: {error}")
+    if cases:
+        return cases, notes
+    return _cases_on(policy), []  # a policy in numpy runs on "auto" alone; others are refused
+
+
+def _cases_on(policy: PolicyConfig) -> list[_Case]:
+    full = _load(replace(policy, head_steps=None))
+    rgb, state, history = _sample(full)
+    feature = full.encode(rgb)
+    engine = full.engine if policy.engine == "auto" else policy.engine
+
+    def case(work: str, call: Callable[[], object]) -> _Case:
+        return _Case(policy=name_of(policy), work=work, engine=engine, call=call)
+
+    if not full.dual_rate:
+        return [case(BOTH, lambda: full.act(full.encode(rgb), state, history, None))]
+    cases = [
+        case(ENCODE, lambda: full.encode(rgb)),
+        case(CHUNK, lambda: full.act(feature, state, history, None)),
+    ]
+    if policy.head_steps is not None:
+        warm = _load(policy)
+        warm.act(feature, state, history, None)  # the chunk that the next one starts from
+        name = f"{CHUNK}, warm start of {policy.head_steps}"
+        cases.append(case(name, lambda: warm.act(feature, state, history, WARM_ELAPSED_S)))
+    return cases
+
+
+def _load(policy: PolicyConfig) -> Executable:
+    loaded = load_configured_policy(policy, MonotonicClock())
+    if policy.engine != "auto" and not loaded.executable.engine.startswith(policy.engine):
+        raise PolicyError("; ".join(loaded.notes))  # says why the engine was passed over
+    return loaded.executable
+
+
+def _sample(executable: Executable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A random image, a level state and an empty history in the shapes of the contract."""
+    contract = executable.contract
+    shape = (contract.image_height, contract.image_width, 3)
+    state = np.zeros((1, contract.state_dim), np.float32)
+    state[0, QUATERNION.start] = 1.0
+    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+    return np.random.default_rng(0).integers(0, 256, shape, np.uint8), state, history
+
+
+def _time(case: _Case, block_s: float) -> None:
     clock = MonotonicClock()
-    executable = load_policy(
-        policy,
-        checkpoint=None,
-        allow_untrained=policy != SHIPPED_POLICY,
-        engine=engine,
-        device="cpu",
-        dual_rate=True,
-        num_diffusion_steps=STEPS,
-        head_steps=head_steps,
-        image_size=None,
-        seed=SEED,
-        now_s=lambda: clock.now_ns() / NS_PER_S,
-    ).executable
-    if not executable.engine.startswith(engine):  # it may name its precisions, too
-        raise ValueError(f"asked for the engine {engine}, got {executable.engine}")
-    return executable
+    case.call()  # warms the caches that the other cases have emptied
+    end_ns = clock.now_ns() + round(block_s * NS_PER_S)
+    while True:
+        start_ns = clock.now_ns()
+        case.call()
+        case.durations.add(clock.now_ns() - start_ns)
+        if clock.now_ns() >= end_ns:
+            return
 
 
-def eager_toge(config: TogeConfig) -> Toge:
-    """The network alone, with seeded random weights."""
-    torch.manual_seed(SEED)
-    return _toge(build_policy(config))
-
-
-def shipped_toge() -> Toge:
-    """The network of ``SHIPPED_POLICY`` alone."""
-    return _toge(load_checkpoint(SHIPPED, fallback=TogeConfig()))
-
-
-def _toge(policy: BuiltinPolicy) -> Toge:
-    if not isinstance(policy, Toge):
-        raise TypeError(f"not a Toge: {type(policy).__name__}")
-    policy.eval()
-    policy.reset(SEED)
-    return policy
+def _timing(case: _Case) -> EngineTiming:
+    percentiles = case.durations.percentiles_ms()
+    if percentiles is None:
+        raise ValueError(f"{case.work} was never timed")
+    return EngineTiming(
+        policy=case.policy,
+        work=case.work,
+        engine=case.engine,
+        p50_ms=percentiles.p50,
+        p99_ms=percentiles.p99,
+    )

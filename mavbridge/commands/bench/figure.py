@@ -1,51 +1,32 @@
-"""A benchmark run as one picture: inference, rates, latency of the loop, latency of the link."""
+"""A benchmark's results as one picture: inference, rates, and latencies of flight and link."""
 
 from collections.abc import Sequence
+from math import floor, log10
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from mavbridge.commands.bench.engines import EAGER
-from mavbridge.commands.bench.flights import NAIVE_NAME, OURS_NAME
-from mavbridge.commands.bench.results import BenchResult, Flight
+from mavbridge.commands.bench.results import OURS, BenchResult, EngineTiming, Flight, LinkLatency
+from mavbridge.commands.output import (
+    BLUE,
+    FIGURE_DPI,
+    FIGURE_STYLE,
+    GREY,
+    INK,
+    MUTED,
+    PALE_BLUE,
+    RED,
+)
 
-INK, MUTED, GRID = "#1f2933", "#6b7885", "#dfe4ea"
-THEIRS = "#a9b4bf"
-ACCENT = "#d1495b"
-OURS = ("#9cc5e8", "#2b6cb0", "#1a365d")
-"""An engine each, the eager one the palest."""
-SIZE_INCHES = (12.0, 10.4)
-DOTS_PER_INCH = 150
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 10,
-    "text.color": INK,
-    "axes.labelcolor": MUTED,
-    "axes.edgecolor": GRID,
-    "axes.titlesize": 12,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlepad": 14,
-    "axes.grid": True,
-    "axes.grid.axis": "x",
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.spines.left": False,
-    "grid.color": GRID,
-    "xtick.color": MUTED,
-    "ytick.color": INK,
-    "ytick.left": False,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-}
+STYLE = FIGURE_STYLE | {"axes.grid.axis": "x", "axes.spines.left": False, "ytick.left": False}
 
 
-class _Span(NamedTuple):
+class Span(NamedTuple):
     """A row of a latency panel, in ms."""
 
     label: str
@@ -55,84 +36,72 @@ class _Span(NamedTuple):
 
 
 def draw(result: BenchResult, path: Path) -> None:
-    """Write the PNG."""
+    """Write the PNG, as high as its rows need."""
     with rc_context(STYLE):
-        figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor="white")
+        height = 5.0 + 0.65 * max(len(result.flights), len(result.links))
+        figure = Figure(figsize=(12.0, height), dpi=FIGURE_DPI, facecolor="white")
         panels = figure.subplots(2, 2)
-        _draw_kernels(panels[0][0], result)
-        _draw_rates(panels[0][1], result)
-        flights = [_flight_span(flight) for flight in result.flights if flight.state_to_wire_ms]
-        _draw_spans(panels[1][0], "Flying: attitude in to sticks out", flights)
-        _draw_spans(panels[1][1], "Link alone: vehicle to vehicle", _links(result))
-        machine = result.machine
-        figure.text(
-            *(0.012, 0.012),
-            f"{machine.cpu}, {machine.cores} cores; EfficientNet-B3 at 224 pixels, and ResNet-8 at "
-            "96 in the policy that ships; the simulated vehicle flies on the same cores.\n"
-            "Latency: dot = median, line to the 99th percentile, logarithmic.",
-            color=MUTED,
-            fontsize=8.5,
+        draw_engines(panels[0][0], result.engines)
+        draw_rates(panels[0][1], result.flights)
+        flights = flight_spans(result.flights)
+        draw_spans(panels[1][0], "Flying: attitude in to sticks out", flights)
+        draw_spans(panels[1][1], "Link alone: vehicle to vehicle", link_spans(result.links))
+        caption = (
+            f"{result.machine.cpu}, {result.machine.cores} cores, which the simulated vehicle "
+            "shares.\nLatency: dot = median, line to the 99th percentile, logarithmic."
         )
-        figure.tight_layout(rect=(0, 0.035, 1, 1), w_pad=3, h_pad=2.5)
+        figure.text(0.012, 0.012, caption, color=MUTED, fontsize=8.5)
+        figure.tight_layout(rect=(0, 0.35 / height, 1, 1), w_pad=3, h_pad=2.5)
         figure.savefig(path)
 
 
-def _draw_kernels(axes: Axes, result: BenchResult) -> None:
-    """Bars by work and engine; a tick where the roofline of the fastest precision is."""
-    engines = tuple(dict.fromkeys(kernel.engine for kernel in result.kernels))
-    works = tuple(dict.fromkeys(kernel.work for kernel in result.kernels))
+def draw_engines(axes: Axes, timings: Sequence[EngineTiming]) -> None:
+    """Bars for each piece of work, one for each engine; a line for a roofline."""
+    works = tuple(dict.fromkeys((one.policy, one.work) for one in timings))
+    names = tuple(dict.fromkeys(one.engine for one in timings))
+    engines = [name for name in names if not name.startswith("roofline")]
     thickness = 0.8 / max(len(engines), 1)
-    for index, engine in enumerate(engines):
-        found = [kernel for kernel in result.kernels if kernel.engine == engine]
-        rows = [works.index(kernel.work) + (index + 0.5) * thickness - 0.4 for kernel in found]
-        times = [kernel.p50_ms for kernel in found]
-        bars = axes.barh(rows, times, 0.9 * thickness, color=_color(index), label=engine)
+    for name in names:
+        found = [one for one in timings if one.engine == name]
+        rows = [works.index((one.policy, one.work)) for one in found]
+        times = [one.p50_ms for one in found]
+        if name not in engines:
+            tops, bottoms = [row - 0.4 for row in rows], [row + 0.4 for row in rows]
+            style = "-" if name.endswith("f32") else ":"
+            axes.vlines(times, tops, bottoms, color=RED, linestyle=style, label=name)
+            continue
+        centres = [row + (engines.index(name) + 0.5) * thickness - 0.4 for row in rows]
+        color = PALE_BLUE if name == EAGER else BLUE
+        bars = axes.barh(centres, times, 0.9 * thickness, color=color, label=name)
         axes.bar_label(bars, [_digits(time) for time in times], padding=4, fontsize=9, color=INK)
-    for precision, style in (("f32", "-"), ("bf16", ":")):
-        for number, roof in enumerate(
-            roof for roof in result.rooflines if roof.precision == precision
-        ):
-            row = works.index(roof.work)
-            label = f"roofline {precision}" if number == 0 else None
-            axes.plot([roof.floor_ms] * 2, [row - 0.4, row + 0.4], style, color=ACCENT, label=label)
-    axes.set_yticks(range(len(works)), [_in_two_lines(work) for work in works])
+    labels = [_in_two_lines(f"{policy}, {work}") for policy, work in works]
+    axes.set_yticks(range(len(works)), labels)
     axes.set_ylim(len(works) - 0.5, -0.5)
     axes.set_xlabel("ms, median")
-    axes.margins(x=0.1)
+    axes.margins(x=0.12)
     axes.set_title("Inference, one thread")
     axes.legend(loc="best")
 
 
-def _in_two_lines(work: str) -> str:
-    return work.replace(" (", "\n(")
-
-
-def _draw_rates(axes: Axes, result: BenchResult) -> None:
-    """What was reached of what was asked; and the highest rate that is kept."""
-    flights = result.flights
+def draw_rates(axes: Axes, flights: Sequence[Flight]) -> None:
+    """Two bars for each flight: actions and images a second, and lines for what was asked."""
     for row, flight in enumerate(flights):
-        for shift, reached, asked in (
-            (-0.19, flight.action_hz, flight.asked_action_hz),
-            (0.19, flight.vision_hz, flight.asked_vision_hz),
+        for shift, kind, reached, asked in (
+            (-0.19, "actions", flight.action_hz, flight.asked_action_hz),
+            (0.19, "images", flight.vision_hz, flight.asked_vision_hz),
         ):
-            kind = "actions" if shift < 0 else "images"
-            bars = axes.barh(row + shift, reached or 0.0, 0.34, color=_flight_color(flight))
+            bars = axes.barh(row + shift, reached or 0.0, 0.34, color=_color(flight))
             axes.bar_label(bars, [f"{reached or 0:.0f} {kind}"], padding=4, fontsize=9)
-            axes.plot([asked] * 2, [row + shift - 0.17, row + shift + 0.17], color=ACCENT)
-    labels = [_flight_label(flight) for flight in flights]
-    axes.set_yticks(range(len(flights)), labels)
+            axes.vlines(asked, row + shift - 0.17, row + shift + 0.17, color=RED)
+    axes.set_yticks(range(len(flights)), [_in_two_lines(flight.label) for flight in flights])
     axes.set_ylim(len(flights) - 0.5, -0.5)
     axes.set_xlim(0, 1.25 * max((flight.asked_action_hz for flight in flights), default=1))
     axes.set_xlabel("Hz; red: what was asked for")
-    best = max((top.action_hz for top in result.top_rates if top.action_hz), default=None)
-    axes.set_title("Rates" + (f" ({best:g} Hz with < 0.1 % missed)" if best else ""))
+    axes.set_title("Rates")
 
 
-def _flight_label(flight: Flight) -> str:
-    return f"{flight.runner}\n{flight.label}".replace(", ", "\n")
-
-
-def _draw_spans(axes: Axes, title: str, spans: Sequence[_Span]) -> None:
+def draw_spans(axes: Axes, title: str, spans: Sequence[Span]) -> None:
+    """A dot at each median and a line to the 99th percentile."""
     axes.set_title(title)
     if not spans:
         axes.set_axis_off()
@@ -146,41 +115,50 @@ def _draw_spans(axes: Axes, title: str, spans: Sequence[_Span]) -> None:
         )
     axes.set_xscale("log")
     low, high = min(span.p50 for span in spans), max(span.p99 for span in spans)
-    axes.set_xlim(low / 1.6, 2 * high * (high / low) ** 0.35)  # room for the words at the right
+    axes.set_xlim(
+        10 ** floor(log10(low)), 2 * high * (high / low) ** 0.35
+    )  # room for the words at the right
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.set_yticks(range(len(spans)), [span.label for span in spans])
+    axes.set_yticks(range(len(spans)), [_in_two_lines(span.label) for span in spans])
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(len(spans) - 0.5, -0.6)
     axes.set_xlabel("ms")
+
+
+def flight_spans(flights: Sequence[Flight]) -> list[Span]:
+    """Latencies of the flights that sent sticks."""
+    return [
+        Span(flight.label, latency.p50, latency.p99, _color(flight))
+        for flight in flights
+        if (latency := flight.state_to_wire_ms) is not None
+    ]
+
+
+def link_spans(links: Sequence[LinkLatency]) -> list[Span]:
+    """Round trips of all clients."""
+    return [
+        Span(
+            link.client,
+            link.round_trip_ms.p50,
+            link.round_trip_ms.p99,
+            BLUE if link.client.startswith(OURS) else MUTED,
+        )
+        for link in links
+    ]
+
+
+def _in_two_lines(label: str) -> str:
+    """Break a label at its middle comma."""
+    parts = label.split(", ")
+    half = len(parts) // 2
+    return "\n".join((", ".join(parts[:half]), ", ".join(parts[half:]))).strip()
 
 
 def _digits(value_ms: float) -> str:
     return f"{value_ms:.0f}" if value_ms >= 100 else f"{value_ms:.3g}"
 
 
-def _flight_span(flight: Flight) -> _Span:
-    latency = flight.state_to_wire_ms
-    if latency is None:
-        raise ValueError("a flight without latency cannot be drawn")
-    return _Span(_flight_label(flight), latency.p50, latency.p99, _flight_color(flight))
-
-
-def _links(result: BenchResult) -> list[_Span]:
-    return [
-        _Span(
-            link.client.replace(", ", "\n"),
-            link.round_trip_ms.p50,
-            link.round_trip_ms.p99,
-            OURS[1] if link.client.startswith(OURS_NAME) else MUTED,
-        )
-        for link in result.links
-    ]
-
-
-def _flight_color(flight: Flight) -> str:
-    if flight.runner == NAIVE_NAME:
-        return THEIRS
-    return OURS[0] if flight.engine == EAGER else OURS[1]
-
-
-def _color(index: int) -> str:
-    return OURS[min(index, len(OURS) - 1)]
+def _color(flight: Flight) -> str:
+    if flight.runner != OURS:
+        return GREY
+    return PALE_BLUE if flight.engine == EAGER else BLUE

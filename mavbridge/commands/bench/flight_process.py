@@ -1,75 +1,68 @@
-"""One flight of mavbridge, measured: ``python -m mavbridge.commands.bench.flight_process ...``.
+"""One measured flight: ``python -m mavbridge.commands.bench.flight_process --port P ...``.
 
-The composition is that of ``mavbridge fly``, sending included. Untrained weights would fly the
-vehicle into the ground, and a vehicle that has crashed takes no sticks: so every chunk is computed
-in full, and then its values are replaced by a slow level climb. Only for a simulated vehicle.
+It is composed and sends as ``mavbridge fly``. A policy without training would fly the vehicle into
+the ground, and a vehicle that has crashed takes no sticks: so each chunk is computed in full, and
+then its values are replaced by a slow level climb. Only for a simulated vehicle.
 """
 
-import argparse
+import time
 from dataclasses import replace
-from pathlib import Path
 
+from cyclopts import App
 from rich.console import Console
 
-from mavbridge.commands.bench import engines
-from mavbridge.commands.bench.flights import OURS_NAME
-from mavbridge.commands.bench.meter import FlightMeter
-from mavbridge.commands.bench.results import Flight, to_json
-from mavbridge.commands.bench.witness import GcWatch, Witness, read_counters
+from mavbridge.commands.bench.flight import FlightJob
+from mavbridge.commands.bench.missed_slots import (
+    GcTimer,
+    MissedSlotProbe,
+    stolen_ms_since,
+    stolen_ns,
+)
+from mavbridge.commands.bench.results import OURS, Flight, name_of, solves_of, to_json
 from mavbridge.config.flight import CameraConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.rates import Rates, period_ns
+from mavbridge.config.rates import period_ns
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_executable
-from mavbridge.observe.timing import TimingReport
+from mavbridge.flight.policies import load_configured_policy
+from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
 from policy.contract import Executable, FloatArray
 
 CLIMB_STICK = 0.3
 """0.3 m/s up in ALT_HOLD: beyond its dead zone, some 20 m in a minute."""
 MAX_FEATURE_AGE_S = 5.0
-"""A slow engine is to be measured, not released: the limit is far from what any of them needs."""
+"""A slow engine is to be measured, not released: far from what any of them needs."""
+app = App(help=__doc__)
 
 
-def main() -> None:
+@app.default
+def main(job: FlightJob) -> None:
     """Fly once and write the figures."""
-    args = arguments(__doc__)
     clock = MonotonicClock()
-    executable = level_climb(engines.load(args.policy, args.engine, head_steps=args.head_steps))
-    meter = FlightMeter(action_hz=args.action_hz, vision_hz=args.vision_hz)
-    with GcWatch(clock) as collector:
-        witness = Witness(
-            period_ns=period_ns(args.action_hz), read=lambda: read_counters(collector.total_ns)
-        )
-        fly_executable(
-            _config(args),
-            executable,
-            clock=clock,
-            console=Console(stderr=True),
-            sinks=(meter, witness),
-        )
-    meter.end()
-    report = meter.report(engine=executable.engine, policy=executable.name, link=None)
-    args.out.write_text(to_json(_flight(args, report, meter, witness)))
-
-
-def arguments(description: str | None) -> argparse.Namespace:
-    """The command line that all runners of the flight test share."""
-    parser = argparse.ArgumentParser(description=description, allow_abbrev=False)
-    parser.add_argument("--port", type=int, required=True, help="UDP, where the vehicle sends")
-    parser.add_argument("--camera", required=True, help="shm:NAME")
-    policies = (engines.FLIGHT_POLICY, engines.SHIPPED_POLICY)
-    parser.add_argument("--policy", default=engines.FLIGHT_POLICY, choices=policies)
-    parser.add_argument("--engine", default=engines.EAGER, choices=engines.ENGINES)
-    parser.add_argument("--head-steps", type=int, help="of a warm start")
-    parser.add_argument("--action-hz", type=float, required=True)
-    parser.add_argument("--vision-hz", type=float, required=True)
-    parser.add_argument("--duration", type=float, required=True, help="seconds, once engaged")
-    parser.add_argument("--out", type=Path, required=True, help="JSON with the figures")
-    return parser.parse_args()
+    executable = load_configured_policy(job.policy, clock).executable
+    loops = job.rates.loops(is_dual=executable.dual_rate)
+    meter = FlightMeter(action_hz=loops.action_hz, vision_hz=loops.max_vision_hz)
+    config = FlyConfig(
+        link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}"),
+        policy=job.policy,
+        camera=CameraConfig(camera=job.camera),
+        rates=job.rates,
+        limits=Limits(max_feature_age=MAX_FEATURE_AGE_S),
+        mode="ALT_HOLD",
+        arm=True,
+        duration=job.duration,
+    )
+    with GcTimer(clock) as gc_timer:
+        probe = MissedSlotProbe(period_ns=period_ns(loops.action_hz), gc_timer=gc_timer)
+        console = Console(stderr=True)
+        climb = level_climb(executable)
+        fly_executable(config, climb, clock=clock, console=console, sinks=(meter, probe))
+    job.out.write_text(to_json(_flight(job.policy, executable.engine, meter, probe)))
 
 
 def level_climb(executable: Executable) -> Executable:
-    """The same work, other sticks."""
+    """An executable that does the same work and returns other sticks."""
 
     def act(
         encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
@@ -81,29 +74,53 @@ def level_climb(executable: Executable) -> Executable:
     return replace(executable, act=act)
 
 
-def _config(args: argparse.Namespace) -> FlyConfig:
-    return FlyConfig(
-        link=LinkConfig(connect=f"udp:127.0.0.1:{args.port}"),
-        policy=PolicyConfig(policy=args.policy, dual_rate=True),
-        camera=CameraConfig(camera=args.camera),
-        rates=Rates(visual_rate=args.vision_hz, action_rate=args.action_hz),
-        limits=Limits(max_feature_age=MAX_FEATURE_AGE_S),
-        mode="ALT_HOLD",
-        arm=True,
-        duration=args.duration,
-    )
+class FlightMeter:
+    """A ``TickSink`` that measures from the policy's first action on.
+
+    Waiting, handshake and arming are cheap ticks on time: they would flatter a slow engine.
+    """
+
+    def __init__(self, *, action_hz: float, vision_hz: float) -> None:
+        self._timing = FlightTiming(action_hz=action_hz, vision_hz=vision_hz)
+        self._cpu_start_ns: int | None = None
+        self._stolen_start_ns: int | None = None
+        self.cpu_ns = 0
+        """Processor time of this process while the policy flew."""
+
+    def emit(self, event: Event) -> None:
+        """Count the event."""
+        if isinstance(event, Tick) and event.trace is not None:
+            if self._cpu_start_ns is None:
+                self._cpu_start_ns, self._stolen_start_ns = time.process_time_ns(), stolen_ns()
+            self.cpu_ns = time.process_time_ns() - self._cpu_start_ns
+        if self._cpu_start_ns is not None:
+            self._timing.emit(event)
+
+    @property
+    def stolen_ms(self) -> float | None:
+        """Processor time taken by the hypervisor since the first action; None = not known."""
+        return stolen_ms_since(self._stolen_start_ns)
+
+    def report(self) -> TimingReport:
+        """Figures of the flight so far; names and link are left empty."""
+        drops = ObserverDrops(rerun=None, recorder=None)
+        return self._timing.report(
+            mode="dual", engine="", policy="", autopilot=None, link=None, observer_drops=drops
+        )
 
 
 def _flight(
-    args: argparse.Namespace, report: TimingReport, meter: FlightMeter, witness: Witness
+    policy: PolicyConfig, engine: str, meter: FlightMeter, probe: MissedSlotProbe
 ) -> Flight:
+    report = meter.report()
     action, vision = report.action, report.vision
     return Flight(
-        runner=OURS_NAME,
-        policy=args.policy,
-        engine=report.engine,
-        asked_action_hz=args.action_hz,
-        asked_vision_hz=args.vision_hz,
+        runner=OURS,
+        policy=name_of(policy),
+        solves=solves_of(policy),
+        engine=engine,
+        asked_action_hz=action.target_hz,
+        asked_vision_hz=vision.target_hz,
         duration_s=report.duration_s,
         action_hz=action.rate_hz,
         vision_hz=vision.rate_hz,
@@ -115,10 +132,9 @@ def _flight(
         state_to_wire_ms=report.state_to_wire_ms,
         cpu_cores=round(meter.cpu_ns / (report.duration_s * NS_PER_S), 3),
         stolen_ms=meter.stolen_ms,
-        missed_by_cause=witness.missed_by_cause,
-        head_steps=args.head_steps,
+        missed_by_cause=probe.missed_by_cause,
     )
 
 
 if __name__ == "__main__":
-    main()
+    app()

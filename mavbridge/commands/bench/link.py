@@ -1,142 +1,77 @@
-"""Attitude out of the vehicle -> sticks back in: our loop and the peers, one echoing vehicle."""
+"""The latency of the link: clients in turn against one vehicle that times their answers."""
 
-import json
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 
-from mavbridge.commands.bench.processes import PEERS_PYTHON, end, free_udp_port, running, wait
-from mavbridge.commands.bench.results import (
-    Link,
-    LinkClient,
-    link_client_from_json,
-    median_percentiles,
-)
+from mavbridge.commands.bench.link_vehicle import ATTITUDE_HZ, CONNECT_S, Answers
+from mavbridge.commands.bench.results import OURS, ClientTiming, LinkLatency, from_json
+from mavbridge.commands.output import print_status
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import Percentiles
+from mavbridge.core.processes import end, free_port, log_tail, running, wait
 
-OURS = "mavbridge.commands.bench.link_process"
-BARE = "bare pymavlink loop"
-MAVSDK = "MAVSDK-Python 4"
-PEER_S_PER_ATTITUDE = 1 / 90
-"""A little slower than the peer really is."""
-CONNECTING_S = 45.0
+LINK_PROCESS = "mavbridge.commands.bench.link_process"
+LINK_VEHICLE = "mavbridge.commands.bench.link_vehicle"
+STARTING_S = 15.0
+"""For imports, beside what the vehicle gives a client to connect."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Client:
-    """One contender."""
+class LinkClient:
+    """A program that answers each attitude with sticks."""
 
     name: str
     command: tuple[str, ...]
-    """Without the port and the place for its figures."""
-    tells: bool
-    """Takes ``--port`` and ``--out`` and writes a ``LinkClient``; others take what they take."""
+    """``--port P`` is appended."""
+    writes_timing: bool = False
+    """Takes ``--out FILE``, too, and writes a ``ClientTiming`` there."""
 
 
-def clients() -> tuple[tuple[Client, ...], tuple[str, ...]]:
-    """Who can run here, and why the others cannot."""
-    ours = (
-        Client(name="mavbridge, 100 Hz clock", command=(sys.executable, "-m", OURS), tells=True),
-        Client(
-            name="mavbridge, --pace state",
-            command=(sys.executable, "-m", OURS, "--pace", "state"),
-            tells=True,
-        ),
+OUR_CLIENTS = tuple(
+    LinkClient(
+        name=f"{OURS}, {name}",
+        command=(sys.executable, "-m", LINK_PROCESS, "--pace", pace),
+        writes_timing=True,
     )
-    bare = Client(
-        name=BARE,
-        command=(sys.executable, "-m", "benchmarks.link_pymavlink", "--port"),
-        tells=False,
-    )
-    if not PEERS_PYTHON.is_file():
-        return (*ours, bare), (f"{MAVSDK}: not measured, there is no {PEERS_PYTHON} (make test)",)
-    mavsdk = Client(
-        name=MAVSDK,
-        command=(str(PEERS_PYTHON), "-m", "benchmarks.link_mavsdk"),
-        tells=False,
-    )
-    return (*ours, bare, mavsdk), ()
+    for pace, name in (("clock", "100 Hz clock"), ("state", "--pace state"))
+)
 
 
-def measure(
-    contenders: tuple[Client, ...], *, repeats: int, attitudes: int, say: Callable[[str], None]
-) -> tuple[Link, ...]:
-    """Every client ``repeats`` times, in turn; medians of the percentiles.
+def time_link(client: LinkClient, attitudes: int) -> LinkLatency:
+    """Time one client.
 
     Raises:
-        UserError: a client or the vehicle failed; with its last words.
+        UserError: the client or the vehicle failed; quotes the end of both logs.
     """
-    found: list[list[Link]] = [[] for _ in contenders]
-    for repeat in range(repeats):
-        for client, links in zip(contenders, found, strict=True):
-            say(f"link, repeat {repeat + 1} of {repeats}: {client.name}")
-            links.append(trial(client, attitudes))
-    return tuple(_merge(links) for links in found)
-
-
-def trial(client: Client, attitudes: int) -> Link:
-    """One client, once.
-
-    Raises:
-        UserError: the client or the vehicle failed; with its last words.
-    """
-    port = free_udp_port()
+    print_status(f"link: {client.name}")
+    port = str(free_port())
+    timeout_s = STARTING_S + CONNECT_S + 1.1 * attitudes / ATTITUDE_HZ
     with TemporaryDirectory(prefix="mavbridge-bench-") as name:
         folder = Path(name)
-        figures, peer_log, client_log = (
-            folder / part for part in ("figures.json", "peer.log", "client.log")
-        )
-        own = ("--port", str(port), "--out", str(figures)) if client.tells else (str(port),)
-        peer_command = (
-            *(sys.executable, "-m", "benchmarks.link_peer"),
-            *("--port", str(port), "--attitudes", str(attitudes)),
+        log, vehicle_log = folder / "client.log", folder / "vehicle.log"
+        timing, answers = folder / "timing.json", folder / "answers.json"
+        own = ("--out", str(timing)) if client.writes_timing else ()
+        vehicle_command = (
+            *(sys.executable, "-m", LINK_VEHICLE, "--port", port),
+            *("--attitudes", str(attitudes), "--out", str(answers)),
         )
         with (
-            running(*client.command, *own, log=client_log) as process,
-            running(*peer_command, log=peer_log) as peer,
+            running(*client.command, "--port", port, *own, log=log) as process,
+            running(*vehicle_command, log=vehicle_log) as vehicle,
         ):
-            seconds = CONNECTING_S + attitudes * PEER_S_PER_ATTITUDE
             try:
-                wait(peer, "python -m benchmarks.link_peer", peer_log, seconds)
+                wait(vehicle, f"python -m {LINK_VEHICLE}", vehicle_log, timeout_s)
             except UserError as error:
-                said = client_log.read_text(errors="replace").strip()
-                raise UserError(f"{client.name}: {error}\nthe client said: {said}") from error
+                raise UserError(f"{client.name}: {error}\nits log: {log_tail(log)}") from error
             end(process)
-        told = LinkClient(state_to_wire_ms=None, work_ms=None)
-        if client.tells:
-            told = link_client_from_json(figures.read_text())
-        return _link(client.name, json.loads(peer_log.read_text()), told)
-
-
-def _link(name: str, counted: dict[str, object], told: LinkClient) -> Link:
-    round_trip, sent, answered = (counted[key] for key in ("round_trip_ms", "sent", "answered"))
-    if not isinstance(round_trip, dict) or not isinstance(sent, int):
-        raise UserError(f"{name} has answered no attitude at all")
-    return Link(
-        client=name,
-        output=str(counted["output"]).replace("_", " ").lower(),
-        sent=sent,
-        answered=answered if isinstance(answered, int) else 0,
-        round_trip_ms=Percentiles(**round_trip),
-        state_to_wire_ms=told.state_to_wire_ms,
-        work_ms=told.work_ms,
-    )
-
-
-def _merge(links: list[Link]) -> Link:
-    round_trip = median_percentiles(link.round_trip_ms for link in links)
-    if round_trip is None:
-        raise ValueError("no repeats to merge")
-    return Link(
-        client=links[0].client,
-        output=links[0].output,
-        sent=round(median(link.sent for link in links)),
-        answered=round(median(link.answered for link in links)),
-        round_trip_ms=round_trip,
-        state_to_wire_ms=median_percentiles(link.state_to_wire_ms for link in links),
-        work_ms=median_percentiles(link.work_ms for link in links),
-    )
+        counted = from_json(Answers, answers.read_text())
+        if counted.round_trip_ms is None:
+            raise UserError(f"{client.name} answered no attitude; its log: {log_tail(log)}")
+        return LinkLatency(
+            client=client.name,
+            sent=counted.sent,
+            answered=counted.answered,
+            round_trip_ms=counted.round_trip_ms,
+            timing=from_json(ClientTiming, timing.read_text()) if own else ClientTiming(),
+        )

@@ -1,136 +1,106 @@
-"""Link test, client: our link and action loop, with a policy that only repeats the roll rate.
+"""Client of the link test: our link and action loop, with a policy that repeats the roll rate.
 
-``python -m mavbridge.commands.bench.link_process``. No torch is loaded and no camera runs, but
-every tick does all that a flight's does: drain, state, engagement, chunk, smoothing, send.
+``python -m mavbridge.commands.bench.link_process --port P --out FILE``. No torch is loaded and no
+camera runs, but every tick does all that a flight's does, from draining the socket to the send.
 """
 
-import argparse
 import signal
 import threading
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 
-from mavbridge.commands.bench.results import LinkClient, to_json
-from mavbridge.config.flight import LinkConfig
-from mavbridge.config.rates import Pace, period_ns
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, GridPacer, MonotonicClock
+from mavbridge.commands.bench.results import ClientTiming, to_json
+from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
+from mavbridge.config.rates import Pace, Rates
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.observers import FanOut
 from mavbridge.core.realtime import settle_process, settle_thread
-from mavbridge.core.records import Event, FeatureFrame, FloatArray, LinkStats, Tick
-from mavbridge.flight.action_loop import ActionLoop, ActionSettings
+from mavbridge.core.records import Event, FeatureFrame, FloatArray, Tick
+from mavbridge.flight.bridge import build_action_loop
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.state import Freshness
-from mavbridge.flight.state_pacer import StatePacer
-from mavbridge.gate.engagement import Engagement
-from mavbridge.gate.smoothing import Smoothing, StickSmoother
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import make_transport
-from mavbridge.observe.timing import FlightTiming, ObserverDrops
-from policy.contract import ACTION_DIM, RATE, Contract
+from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract, Executable
 
-ACTION_HZ = 100.0
-FOR_EVER_NS = 1 << 62
-ROLL = 3
-"""Index in an action."""
+ROLL = ACTION_NAMES.index("roll")
+DAY_NS = 24 * 3600 * NS_PER_S
+app = App(help=__doc__)
+
+
+@app.default
+def main(*, port: int, out: Path, pace: Pace = "clock") -> None:
+    """Answer until SIGTERM, then write the figures to ``out``."""
+    settle_process()
+    settle_thread(realtime=True, cpu=None)  # as a flight does
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    clock, meter, cache = MonotonicClock(), ClientMeter(), FeatureCache()
+    cache.publish(
+        FeatureFrame(
+            frame_id=0,
+            captured_ns=clock.now_ns() + DAY_NS,  # never too old
+            ready_ns=clock.now_ns(),
+            value=np.zeros((1, 1), np.float32),
+        )
+    )
+    config = FlyConfig(
+        link=LinkConfig(connect=f"udp:127.0.0.1:{port}"),
+        rates=Rates(pace=pace),
+        # No smoothing: the vehicle must find its number unchanged.
+        limits=Limits(tau=0.0, max_slew=0.0, max_attitude_age=0.25, max_velocity_age=1.0),
+    )
+    executable = Executable(
+        contract=Contract(),
+        name="roll rate",
+        engine="none",
+        dual_rate=True,
+        encode=lambda _: np.zeros((1, 1), np.float32),
+        act=repeat_roll_rate,
+    )
+    transport = make_transport(config.link.connect, clock)
+    link = MavlinkLink(transport, clock, config.link, state_hz=config.rates.action_rate)
+    loop = build_action_loop(config, executable, clock=clock, link=link, cache=cache, sink=meter)
+    try:
+        loop.run(stop)
+    finally:
+        link.close()
+    out.write_text(to_json(meter.timing()))
 
 
 def repeat_roll_rate(
     _feature: FloatArray, state: FloatArray, _history: FloatArray, _elapsed_s: float | None
 ) -> FloatArray:
-    """State [1, 13] -> chunk [1, 16, 4]: the roll stick is the roll rate, in rad/s."""
+    """State [1, 13] -> chunk [1, 16, 4] whose roll stick is the roll rate, in rad/s."""
     chunk = np.zeros((1, Contract.horizon, ACTION_DIM), np.float32)
     chunk[0, :, ROLL] = state[0, RATE][0]
     return chunk
 
 
-class WorkTiming:
-    """A ``TickSink``: how long ticks with new sticks took, from waking to the send."""
+class ClientMeter:
+    """A ``TickSink`` that times ticks which sent sticks."""
 
     def __init__(self) -> None:
-        self.work = Histogram()
+        self._work, self._state_to_wire = Histogram(), Histogram()
+        self._last_attitude_ns = 0
 
     def emit(self, event: Event) -> None:
-        """Count a tick that sent."""
-        if isinstance(event, Tick) and event.sent is not None:
-            self.work.add(event.sent_ns - event.woke_ns)
+        """Count a tick."""
+        if not isinstance(event, Tick) or event.sent is None or event.state is None:
+            return
+        self._work.add(event.sent_ns - event.woke_ns)
+        if event.state.attitude_ns != self._last_attitude_ns:
+            self._last_attitude_ns = event.state.attitude_ns
+            self._state_to_wire.add(event.sent_ns - event.state.attitude_ns)
 
-
-def main() -> None:
-    """Answer until ended, then write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
-    parser.add_argument("--port", type=int, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--pace", choices=("clock", "state"), default="clock")
-    args = parser.parse_args()
-    settle_process()
-    settle_thread(realtime=True, cpu=None)  # as a flight does
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    clock = MonotonicClock()
-    config = LinkConfig(connect=f"udp:127.0.0.1:{args.port}")
-    link = MavlinkLink(make_transport(config.connect, clock), clock, config, state_hz=ACTION_HZ)
-    timing, work = FlightTiming(action_hz=ACTION_HZ, vision_hz=1.0), WorkTiming()
-    try:
-        _loop(clock, link, FanOut([timing, work]), args.pace).run(stop)
-    finally:
-        link.close()
-    args.out.write_text(to_json(_figures(timing, work, link.stats())))
-
-
-def _loop(clock: MonotonicClock, link: MavlinkLink, sink: FanOut, pace: Pace) -> ActionLoop:
-    cache = FeatureCache()
-    cache.publish(
-        FeatureFrame(
-            frame_id=0,
-            captured_ns=clock.now_ns(),
-            ready_ns=clock.now_ns(),
-            value=np.zeros((1, 1), np.float32),
+    def timing(self) -> ClientTiming:
+        """Percentiles so far."""
+        return ClientTiming(
+            state_to_wire_ms=self._state_to_wire.percentiles_ms(),
+            work_ms=self._work.percentiles_ms(),
         )
-    )
-    contract = Contract()
-    tick_ns = period_ns(ACTION_HZ)
-    return ActionLoop(
-        clock=clock,
-        pacer=(
-            StatePacer(clock, link, period_ns=tick_ns)
-            if pace == "state"
-            else GridPacer(clock, period_ns=tick_ns)
-        ),
-        link=link,
-        cache=cache,
-        act=repeat_roll_rate,
-        # No lag and no limit: the vehicle must find its number unchanged.
-        smoother=StickSmoother(Smoothing(max_slew_per_s=0.0, tau_s=0.0, max_dt_s=1.0)),
-        engagement=Engagement(wanted_mode=None, arm=False, readonly=False),
-        sink=sink,
-        settings=ActionSettings(
-            state_frame=contract.state_frame,
-            since_exposure=False,
-            chunk_dt_s=contract.chunk_dt_s,
-            history_len=contract.history_len,
-            history_dt_s=contract.history_dt_s,
-            freshness=Freshness(attitude_ns=250 * NS_PER_MS, velocity_ns=NS_PER_S),
-            max_feature_age_ns=FOR_EVER_NS,
-            lead_s=0.0,
-            mode=None,
-            duration_ns=None,
-        ),
-    )
-
-
-def _figures(timing: FlightTiming, work: WorkTiming, stats: LinkStats) -> LinkClient:
-    report = timing.report(
-        mode="dual",
-        engine="none",
-        policy="repeat roll rate",
-        autopilot=None,
-        link=stats,
-        observer_drops=ObserverDrops(rerun=None, recorder=None),
-    )
-    return LinkClient(state_to_wire_ms=report.state_to_wire_ms, work_ms=work.work.percentiles_ms())
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -1,71 +1,57 @@
-"""What a benchmark run found: frozen values, and their JSON."""
+"""Results of a benchmark as frozen values, and their JSON."""
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
-from statistics import median
-from typing import Any
+import os
+import platform
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
 
-from mavbridge.commands.bench.engines import SHIPPED_POLICY
+from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.records import Percentiles
+
+OURS, BASELINE = "mavbridge", "baseline"
+"""Runners of a flight."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """Where the run took place."""
+    """The computer of a run."""
 
     cpu: str
     cores: int
-    """That this process may use."""
+    """Usable by this process."""
     python: str
     torch: str
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kernel:
-    """One piece of inference on one engine, one thread; medians over the repeats."""
+class EngineTiming:
+    """One piece of inference on one engine and one thread."""
 
+    policy: str
     work: str
     engine: str
+    """Or a bound, such as a roofline."""
     p50_ms: float
     p99_ms: float
 
 
 @dataclass(frozen=True, kw_only=True)
-class Roofline:
-    """The least time that one piece of inference can take on one thread of this machine."""
-
-    work: str
-    precision: str
-    gflop: float
-    """Counted by torch: convolutions and matrix products."""
-    weights_mb: float
-    """Bytes of the weights, once for every time that they are used."""
-    gflop_per_s: float
-    """Of a large matrix product, measured in this run."""
-    gb_per_s: float
-    """Of reading a buffer as large as the weights over and over, measured in this run."""
-    floor_ms: float
-    """The larger of compute and weight traffic."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Vehicle:
-    """What the simulated vehicle saw of a flight, on its side of the wire."""
-
-    override_hz: float | None
-    """From the first override to the last: with mavbridge, the seconds before arming too."""
-    gap_p50_ms: float | None
-    gap_p99_ms: float | None
-    gap_max_ms: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class Flight:
-    """Both loops against the vehicle, from the first action of the policy to the last."""
+    """Both loops against the simulated vehicle, from the policy's first action to its last.
+
+    None = not measured.
+    """
 
     runner: str
     policy: str
+    solves: str
+    """How chunks are sampled, as ``solves_of`` names it."""
     engine: str
     asked_action_hz: float
     asked_vision_hz: float
@@ -73,28 +59,27 @@ class Flight:
     action_hz: float | None
     vision_hz: float | None
     missed_slots: int
-    """Of the asked grid; for a runner without a grid, actions that did not happen."""
+    """Ticks of the asked grid that did not happen."""
     period_ms: Percentiles | None
     predict_ms: Percentiles | None
     encode_ms: Percentiles | None
     feature_age_ms: Percentiles | None
-    """Exposure to send."""
+    """From exposure to send."""
     state_to_wire_ms: Percentiles | None
-    """Arrival of an attitude at the host to the send of the first sticks made from it."""
+    """From an attitude's arrival at this computer to the send of the first sticks made from it."""
     cpu_cores: float
     """Processor time of the bridge's process over elapsed time."""
     stolen_ms: float | None
-    """Processor time that the host took from this machine meanwhile; None = not known."""
+    """Processor time that the hypervisor gave to others meanwhile."""
     missed_by_cause: Mapping[str, int] | None
-    """Missed slots by ``attribution.Cause``; None = this runner is not watched."""
-    head_steps: int | None = None
-    """Steps of a warm start; None = every chunk is solved in full."""
-    vehicle: Vehicle | None = None
+    """Missed slots by ``missed_slots.Cause``."""
+    vehicle_gap_ms: Mapping[str, float] | None = None
+    """p50, p99 and max between stick messages, as the vehicle saw them arrive."""
 
     @property
     def label(self) -> str:
-        """Engine and kind of solve, and the policy if it is the one that ships."""
-        return flight_label(self.policy, self.engine, self.head_steps)
+        """What flew."""
+        return f"{self.runner}, {self.policy}, {self.solves}, {self.engine}"
 
     @property
     def missed_fraction(self) -> float:
@@ -103,57 +88,26 @@ class Flight:
         return self.missed_slots / asked if asked > 0 else 1.0
 
 
-def flight_label(policy: str, engine: str, head_steps: int | None) -> str:
-    """What flies, for a person."""
-    warm = "" if head_steps is None else f", warm start of {head_steps}"
-    shipped = "policy that ships, " if policy == SHIPPED_POLICY else ""
-    return f"{shipped}{engine}{warm}"
+@dataclass(frozen=True, kw_only=True)
+class ClientTiming:
+    """What a client of the link test measured of itself; None = not measured."""
+
+    state_to_wire_ms: Percentiles | None = None
+    """From the kernel's arrival stamp of an attitude to the send."""
+    work_ms: Percentiles | None = None
+    """From waking for the tick to the send."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RateTrial:
-    """One flight of the search for the highest action rate."""
-
-    action_hz: float
-    missed_fraction: float
-    vision_hz: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class TopRate:
-    """The highest action rate with few enough missed slots."""
-
-    label: str
-    """Engine and kind of solve."""
-    action_hz: float | None
-    """None: not even the lowest rate tried."""
-    trials: tuple[RateTrial, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinkClient:
-    """What a client of the link test can say of itself."""
-
-    state_to_wire_ms: Percentiles | None
-    work_ms: Percentiles | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Link:
-    """Attitude out of the vehicle -> sticks back in, by one client; medians over the repeats."""
+class LinkLatency:
+    """The time from an attitude's send by the vehicle to the arrival of its sticks."""
 
     client: str
-    output: str
-    """The MAVLink message that carries the sticks, in words."""
     sent: int
     answered: int
     round_trip_ms: Percentiles
-    """On the vehicle's clock: its send to the arrival that the kernel stamped."""
-    state_to_wire_ms: Percentiles | None
-    """Inside the client: kernel's arrival stamp to the send; None = it cannot tell."""
-    work_ms: Percentiles | None
-    """Inside the client: waking for the tick to the send. The rest of the round trip is waiting
-    for the slot of its clock, and the kernel."""
+    """On the vehicle's clock: its send to the arrival that its kernel stamped."""
+    timing: ClientTiming
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,44 +116,58 @@ class BenchResult:
 
     machine: Machine
     quick: bool
-    kernels: tuple[Kernel, ...]
-    rooflines: tuple[Roofline, ...]
+    engines: tuple[EngineTiming, ...]
     flights: tuple[Flight, ...]
-    top_rates: tuple[TopRate, ...]
-    links: tuple[Link, ...]
+    links: tuple[LinkLatency, ...]
     notes: tuple[str, ...]
     """What was left out, and why."""
 
 
-def to_json(result: BenchResult | Flight | LinkClient) -> str:
-    """Keys in the order of the dataclasses; null = not measured."""
+def name_of(policy: PolicyConfig) -> str:
+    """The checkpoint's name, or that of the policy."""
+    return policy.policy if policy.checkpoint is None else policy.checkpoint.stem
+
+
+def solves_of(policy: PolicyConfig) -> str:
+    """How chunks are sampled, for tables."""
+    if not policy.dual_rate:
+        return "single rate"
+    return "full solves" if policy.head_steps is None else f"warm start of {policy.head_steps}"
+
+
+def this_machine() -> Machine:
+    """Describe the computer that runs this."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return Machine(
+        cpu=next(names, platform.processor() or "unknown processor"),
+        cores=len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1,
+        python=platform.python_version(),
+        torch=version("torch"),
+    )
+
+
+def to_json(result: object) -> str:
+    """A dataclass as JSON, keys in the order of its fields; null = not measured."""
+    if not is_dataclass(result) or isinstance(result, type):
+        raise TypeError(f"not a dataclass instance: {result!r}")
     return json.dumps(asdict(result), indent=2, allow_nan=False) + "\n"
 
 
-def flight_from_json(text: str, vehicle: Vehicle | None) -> Flight:
-    """What a runner's process wrote, joined with what the vehicle saw."""
-    document = _with_percentiles(json.loads(text))
-    return Flight(**(document | {"vehicle": vehicle}))
+def from_json(kind: type[T], text: str) -> T:
+    """Inverse of ``to_json`` for a dataclass whose nested fields are dataclasses or None."""
+    return _build(kind, json.loads(text))
 
 
-def link_client_from_json(text: str) -> LinkClient:
-    """What a client of the link test wrote."""
-    return LinkClient(**_with_percentiles(json.loads(text)))
+def _build(kind: type[T], document: Mapping[str, Any]) -> T:
+    hints = get_type_hints(kind)
 
+    def value_of(name: str, value: Any) -> Any:
+        kinds = get_args(hints[name]) or (hints[name],)
+        nested: Any = next((one for one in kinds if is_dataclass(one)), None)
+        return _build(nested, value) if nested and isinstance(value, dict) else value
 
-def _with_percentiles(document: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        key: Percentiles(**value) if key.endswith("_ms") and isinstance(value, dict) else value
-        for key, value in document.items()
-    }
-
-
-def median_percentiles(found: Iterable[Percentiles | None]) -> Percentiles | None:
-    """Each percentile's median over the repeats that have it; None if none has."""
-    present = [one for one in found if one is not None]
-    if not present:
-        return None
-    names = [field.name for field in fields(Percentiles)]
-    return Percentiles(
-        **{name: round(median(getattr(one, name) for one in present), 3) for name in names}
-    )
+    return kind(**{name: value_of(name, value) for name, value in document.items()})

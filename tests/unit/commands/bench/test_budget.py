@@ -12,15 +12,15 @@ from mavbridge.core.errors import UserError
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("encode: torch / roofline f32", 3.0),
-        ("sample: torch / roofline f32", 6.0),
-        ("encode: quick / roofline f32", 0.75),
-        ("encode: quick / torch", 0.25),
-        ("flight: torch period / asked period", 2.0),
-        ("flight: torch period / usual runner", 0.5),
-        ("flight: torch cpu an action / usual runner", 0.5),
-        ("flight: torch state to wire / usual runner", 0.05),
-        ("link: mavbridge, 100 Hz clock work / bare pymavlink loop", 2.0),
+        ("toge, encode: torch / roofline f32", 3.0),
+        ("toge, sample: torch / roofline f32", 6.0),
+        ("toge, encode: quick / roofline f32", 0.75),
+        ("toge, encode: quick / torch", 0.25),
+        ("flight: toge:small, full solves, torch: period / asked period", 2.0),
+        ("flight: toge:small, full solves, torch: period / baseline", 0.5),
+        ("flight: toge:small, full solves, torch: cpu an action / baseline", 0.5),
+        ("flight: toge:small, full solves, torch: state to wire / baseline", 0.05),
+        ("link: mavbridge, 100 Hz clock: work / bare pymavlink loop", 2.0),
     ],
 )
 def test_ratios_compare_two_figures_of_one_run(name: str, value: float) -> None:
@@ -32,17 +32,18 @@ def test_there_are_no_other_ratios() -> None:
 
 
 def test_a_run_without_the_other_side_has_no_ratio_with_it() -> None:
-    alone = replace(RESULT, kernels=(), flights=RESULT.flights[:1], links=RESULT.links[:1])
-    assert ratios(alone) == {"flight: torch period / asked period": pytest.approx(2.0)}
+    alone = replace(RESULT, engines=(), flights=RESULT.flights[:1], links=RESULT.links[:1])
+    name = "flight: toge:small, full solves, torch: period / asked period"
+    assert ratios(alone) == {name: pytest.approx(2.0)}
 
 
 def test_a_flight_that_never_acted_has_no_ratio() -> None:
-    idle = make_flight("mavbridge", "torch", action_hz=None, cores=0.0, wire_ms=1.0)
-    grounded = replace(RESULT, kernels=(), links=(), flights=(idle, RESULT.flights[1]))
+    idle = make_flight("mavbridge", action_hz=None, cpu_cores=0.0)
+    grounded = replace(RESULT, engines=(), links=(), flights=(idle, RESULT.flights[1]))
     assert ratios(grounded) == {}
 
 
-def test_within_the_budget_nothing_is_said() -> None:
+def test_within_the_budget_there_are_no_lines() -> None:
     assert violations({"a": 1.0, "b": 2.0}, {"a": 1.0, "b": 2.5}) == ()
 
 

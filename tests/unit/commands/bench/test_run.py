@@ -7,7 +7,7 @@ import pytest
 from helpers.bench_results import RESULT
 from mavbridge.commands.bench import run
 from mavbridge.commands.bench.results import BenchResult
-from mavbridge.config.bench import BenchConfig
+from mavbridge.config.bench import BenchConfig, BenchOutputs
 from mavbridge.core.errors import UserError
 
 
@@ -31,7 +31,7 @@ def forbidden(monkeypatch: pytest.MonkeyPatch) -> None:
 def budget(tmp_path: Path) -> Callable[[float], Path]:
     def write(most: float) -> Path:
         path = tmp_path / "budget.json"
-        path.write_text(json.dumps({"ratios": {"encode: torch / roofline f32": most}}))
+        path.write_text(json.dumps({"ratios": {"toge, encode: torch / roofline f32": most}}))
         return path
 
     return write
@@ -45,23 +45,23 @@ def test_exit_status_tells_whether_the_budget_holds(
     most: float,
     status: int,
 ) -> None:
-    assert run.bench(BenchConfig(check=budget(most))) == status
+    assert run.bench(BenchConfig(outputs=BenchOutputs(check=budget(most)))) == status
     out = capsys.readouterr().out
-    assert ("over budget: encode: torch / roofline f32: 3," in out) == bool(status)
+    assert ("over budget: toge, encode: torch / roofline f32: 3," in out) == bool(status)
 
 
 @pytest.mark.usefixtures("canned")
 def test_writes_json_into_a_folder_that_is_made(tmp_path: Path) -> None:
     path = tmp_path / "new" / "bench.json"
-    assert run.bench(BenchConfig(json=path)) == 0
+    assert run.bench(BenchConfig(outputs=BenchOutputs(json=path))) == 0
     assert json.loads(path.read_text())["machine"]["cpu"] == "some cpu"
 
 
 @pytest.mark.usefixtures("forbidden")
-@pytest.mark.parametrize("flag", ["json", "check"])
+@pytest.mark.parametrize("flag", ["json", "plot", "check"])
 def test_what_cannot_be_used_is_refused_before_the_run(tmp_path: Path, flag: str) -> None:
     with pytest.raises(UserError):
-        run.bench(BenchConfig(**{flag: tmp_path}))  # a folder
+        run.bench(BenchConfig(outputs=BenchOutputs(**{flag: tmp_path})))  # a folder
 
 
 def test_ctrl_c_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

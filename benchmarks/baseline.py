@@ -1,4 +1,4 @@
-"""The usual runner of a learned policy, written honestly: what mavbridge is measured against.
+"""The baseline: how a learned policy is commonly run, written honestly; mavbridge is beside it.
 
 Eager torch as it comes, the whole sampler at every step, one thread for images and one for actions
 with a lock around what they share, ``time.sleep(period - elapsed)``, and pymavlink's own connection
@@ -10,24 +10,27 @@ leaves the rest in the socket, and the next step acts on what is oldest there.
 It arms nothing, so the vehicle stays on the ground; its sticks are sent and counted all the same.
 """
 
-import argparse
 import threading
 import time
 
 import numpy as np
 import torch
+from cyclopts import App
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from mavbridge.camera.open import open_camera
-from mavbridge.commands.bench import engines
-from mavbridge.commands.bench.flight_process import arguments
-from mavbridge.commands.bench.flights import NAIVE_NAME
-from mavbridge.commands.bench.meter import since_ms, stolen_ns
-from mavbridge.commands.bench.results import Flight, to_json
+from mavbridge.commands.bench.engines import EAGER
+from mavbridge.commands.bench.flight import FlightJob
+from mavbridge.commands.bench.missed_slots import stolen_ms_since, stolen_ns
+from mavbridge.commands.bench.results import BASELINE, Flight, to_json
+from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
-from policy.nets.toge import TogeConfig
+from policy.checkpoints.policy_file import build_policy, load_checkpoint
+from policy.contract import ACTION_DIM
+from policy.loading import SHIPPED
+from policy.nets.toge import Toge, TogeConfig
 from policy.preprocess import image_to_input
 
 STREAMS = (
@@ -36,21 +39,40 @@ STREAMS = (
     mav.MAVLINK_MSG_ID_RAW_IMU,
 )
 READ_TIMEOUT_NS = 100 * NS_PER_MS
+app = App(help=__doc__)
 
 
-class NaiveRunner:
+@app.default
+def main(job: FlightJob) -> None:
+    """Fly once and write the figures."""
+    job.out.write_text(to_json(Baseline(job).run()))
+
+
+def eager_toge(policy: PolicyConfig) -> Toge:
+    """The network alone: the shipped TOGE, or with ``--allow-untrained`` seeded random weights."""
+    torch.manual_seed(policy.seed)
+    if policy.allow_untrained:
+        net = build_policy(TogeConfig(size="small"))
+    else:
+        net = load_checkpoint(SHIPPED, fallback=TogeConfig())
+    if not isinstance(net, Toge):
+        raise TypeError(f"not a Toge: {type(net).__name__}")
+    net.eval()
+    net.reset(policy.seed)
+    return net
+
+
+class Baseline:
     """Two threads and a lock; counts what mavbridge counts."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
-        self._args = args
-        shipped = args.policy == engines.SHIPPED_POLICY
-        policy = engines.shipped_toge() if shipped else engines.eager_toge(TogeConfig(size="small"))
-        self._policy = policy
+    def __init__(self, job: FlightJob) -> None:
+        self._job = job
+        self._net = eager_toge(job.policy)
         self._clock = MonotonicClock()
-        size = policy.contract.image_height
-        self._camera = open_camera(args.camera, image_size=size, clock=self._clock)
+        contract = self._net.contract
+        self._camera = open_camera(job.camera, image_size=contract.image_height, clock=self._clock)
         self._connection = mavutil.mavlink_connection(
-            f"udpin:127.0.0.1:{args.port}",
+            f"udpin:127.0.0.1:{job.port}",
             source_system=255,
             source_component=mav.MAV_COMP_ID_ONBOARD_COMPUTER,
         )
@@ -58,11 +80,8 @@ class NaiveRunner:
         self._feature: torch.Tensor | None = None
         self._captured_ns = 0
         self._stop = threading.Event()
-        self._history = np.zeros((1, policy.contract.history_len, 4), np.float32)
-        self._boot_offset_ns: int | None = None
-        self._last_attitude: mav.MAVLink_attitude_quaternion_message | None = None
-        self._cpu_ns = 0
-        self._stolen_ns: int | None = None
+        self._history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+        self._least_offset_ns: int | None = None
         self._stamps_ns: list[int] = []
         self._frames_ns: list[int] = []
         self._period, self._predict, self._encode = Histogram(), Histogram(), Histogram()
@@ -70,32 +89,26 @@ class NaiveRunner:
 
     def run(self) -> Flight:
         """Fly for the duration, from the first chunk on."""
-        self._warm_up()
+        contract = self._net.contract
+        # The first inference of a process allocates, which belongs to the start.
+        self._encode_image(np.zeros((contract.image_height, contract.image_width, 3), np.uint8))
+        self._sample(
+            torch.zeros(1, contract.feature_dim), np.zeros((1, contract.state_dim), np.float32)
+        )
         self._connect()
-        vision = threading.Thread(target=self._see, name="naive-vision")
+        vision = threading.Thread(target=self._vision_loop, name="baseline-vision")
         vision.start()
         try:
-            self._act()
+            return self._action_loop()
         finally:
             self._stop.set()
             vision.join()
             self._camera.close()
             self._connection.close()
-        return self._flight()
-
-    def _warm_up(self) -> None:
-        """The first inference of a process allocates, which belongs to the start."""
-        contract = self._policy.contract
-        image = torch.zeros(1, 3, contract.image_height, contract.image_width)
-        with torch.no_grad():
-            feature = self._policy.encode_visual(image)
-            history = torch.from_numpy(self._history)
-            state = torch.zeros(1, contract.state_dim)
-            self._policy.predict_fast(feature, state, history, engines.STEPS)
 
     def _connect(self) -> None:
         self._connection.wait_heartbeat()
-        interval_us = 1e6 / self._args.action_hz
+        interval_us = 1e6 / self._job.rates.action_rate
         for message in STREAMS:
             self._connection.mav.command_long_send(
                 self._connection.target_system,
@@ -104,44 +117,54 @@ class NaiveRunner:
                 *(0, message, interval_us, 0, 0, 0, 0, 0),
             )
 
-    # --- images
+    @torch.no_grad()
+    def _encode_image(self, rgb: np.ndarray) -> torch.Tensor:
+        image = torch.from_numpy(image_to_input(rgb, self._net.contract))
+        return self._net.encode_visual(image)
 
-    def _see(self) -> None:
-        period_s = 1 / self._args.vision_hz
+    @torch.no_grad()
+    def _sample(self, feature: torch.Tensor, state: np.ndarray) -> list[float]:
+        """The first action of a new chunk."""
+        history, steps = torch.from_numpy(self._history), self._job.policy.num_diffusion_steps
+        chunk = self._net.predict_fast(feature, torch.from_numpy(state), history, steps)
+        action: list[float] = chunk[0, 0].tolist()
+        return action
+
+    def _vision_loop(self) -> None:
         while not self._stop.is_set():
             started_ns = self._clock.now_ns()
             frame = self._camera.read(READ_TIMEOUT_NS)
             if frame is None:
                 continue
             encoding_ns = self._clock.now_ns()
-            image = torch.from_numpy(image_to_input(frame.rgb, self._policy.contract))
-            with torch.no_grad():
-                feature = self._policy.encode_visual(image)
+            feature = self._encode_image(frame.rgb)
             with self._lock:
                 self._feature, self._captured_ns = feature, frame.captured_ns
             if self._stamps_ns:
                 self._frames_ns.append(started_ns)
                 self._encode.add(self._clock.now_ns() - encoding_ns)
-            self._sleep(period_s, started_ns)
+            self._sleep(1 / self._vision_hz, started_ns)
 
-    # --- actions
+    @property
+    def _vision_hz(self) -> float:
+        return self._job.rates.visual_limits_hz[1]
 
-    def _act(self) -> None:
-        period_s = 1 / self._args.action_hz
+    def _action_loop(self) -> Flight:
         end_ns: int | None = None
-        beat_ns = 0
+        heartbeat_ns = cpu_ns = 0
+        start_stolen_ns: int | None = None
         while end_ns is None or self._clock.now_ns() < end_ns:
             started_ns = self._clock.now_ns()
-            if started_ns - beat_ns >= NS_PER_S:
-                beat_ns = started_ns
+            if started_ns - heartbeat_ns >= NS_PER_S:
+                heartbeat_ns = started_ns
                 self._connection.mav.heartbeat_send(
                     mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID, 0, 0, 0
                 )
             if self._step(started_ns) and end_ns is None:
-                end_ns = started_ns + round(self._args.duration * NS_PER_S)
-                self._cpu_ns, self._stolen_ns = time.process_time_ns(), stolen_ns()
-            self._sleep(period_s, started_ns)
-        self._cpu_ns = time.process_time_ns() - self._cpu_ns
+                end_ns = started_ns + round(self._job.duration * NS_PER_S)
+                cpu_ns, start_stolen_ns = time.process_time_ns(), stolen_ns()
+            self._sleep(1 / self._job.rates.action_rate, started_ns)
+        return self._flight(time.process_time_ns() - cpu_ns, stolen_ms_since(start_stolen_ns))
 
     def _step(self, started_ns: int) -> bool:
         attitude = self._connection.recv_match(type="ATTITUDE_QUATERNION", blocking=False)
@@ -150,24 +173,33 @@ class NaiveRunner:
             feature, captured_ns = self._feature, self._captured_ns
         if feature is None or state is None:
             return False
-        predicting_ns = self._clock.now_ns()
-        with torch.no_grad():
-            chunk = self._policy.predict_fast(
-                feature, torch.from_numpy(state), torch.from_numpy(self._history), engines.STEPS
-            )
-        self._predict.add(self._clock.now_ns() - predicting_ns)
-        self._send(chunk[0, 0].tolist())
-        self._count(started_ns, captured_ns, attitude)
+        sampling_ns = self._clock.now_ns()
+        action = self._sample(feature, state)
+        self._predict.add(self._clock.now_ns() - sampling_ns)
+        self._send(action)
+        now_ns = self._clock.now_ns()
+        if self._stamps_ns:
+            self._period.add(started_ns - self._stamps_ns[-1])
+        self._stamps_ns.append(started_ns)
+        self._feature_age.add(now_ns - captured_ns)
+        if attitude is not None:
+            # mavutil stamps a message when it is parsed, however long it has waited in the socket.
+            # The vehicle's own stamp does not wait: the least difference stands for no delay.
+            offset_ns = now_ns - attitude.time_boot_ms * NS_PER_MS
+            self._least_offset_ns = min(offset_ns, self._least_offset_ns or offset_ns)
+            self._state_to_wire.add(offset_ns - self._least_offset_ns)
         return True
 
     def _state(self) -> np.ndarray | None:
-        """[1, 13] of the newest message of each kind that the connection has parsed.
+        """[1, state_dim] of the newest message of each kind that the connection has parsed.
 
-        A policy that asks how old its image is gets zeros for that: this runner does not know.
+        A policy that takes the age of its image is given zeros: this runner does not know it.
         """
-        found = self._connection.messages
+        messages = self._connection.messages
         try:
-            q, p, i = found["ATTITUDE_QUATERNION"], found["LOCAL_POSITION_NED"], found["RAW_IMU"]
+            q, p, i = (
+                messages[name] for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "RAW_IMU")
+            )
         except KeyError:
             return None
         g = 9.80665e-3  # m/s^2 for each mg
@@ -175,7 +207,7 @@ class NaiveRunner:
             *(p.vx, p.vy, p.vz, q.q1, q.q2, q.q3, q.q4),
             *(q.rollspeed, q.pitchspeed, q.yawspeed, i.xacc * g, i.yacc * g, i.zacc * g),
         )
-        state = np.zeros((1, self._policy.contract.state_dim), np.float32)
+        state = np.zeros((1, self._net.contract.state_dim), np.float32)
         state[0, : len(values)] = values
         return state
 
@@ -192,53 +224,31 @@ class NaiveRunner:
         self._history = np.roll(self._history, -1, axis=1)
         self._history[0, -1] = action
 
-    # --- counting
-
-    def _count(
-        self,
-        started_ns: int,
-        captured_ns: int,
-        attitude: mav.MAVLink_attitude_quaternion_message | None,
-    ) -> None:
-        now_ns = self._clock.now_ns()
-        if self._stamps_ns:
-            self._period.add(started_ns - self._stamps_ns[-1])
-        self._stamps_ns.append(started_ns)
-        self._feature_age.add(now_ns - captured_ns)
-        if attitude is None:
-            return
-        # mavutil stamps a message when it is parsed, however long it has waited in the socket. The
-        # vehicle's own stamp does not wait: the smallest distance seen stands for no delay at all.
-        offset_ns = now_ns - attitude.time_boot_ms * NS_PER_MS
-        if self._boot_offset_ns is None or offset_ns < self._boot_offset_ns:
-            self._boot_offset_ns = offset_ns
-        self._state_to_wire.add(offset_ns - self._boot_offset_ns)
-
     def _sleep(self, period_s: float, started_ns: int) -> None:
         elapsed_s = (self._clock.now_ns() - started_ns) / NS_PER_S
         time.sleep(max(0.0, period_s - elapsed_s))  # noqa: TID251 - the habit under test
 
-    def _flight(self) -> Flight:
-        args = self._args
+    def _flight(self, cpu_ns: int, stolen_ms: float | None) -> Flight:
+        action_hz = self._job.rates.action_rate
         duration_s = (self._stamps_ns[-1] - self._stamps_ns[0]) / NS_PER_S
-        ticks = len(self._stamps_ns)
         return Flight(
-            runner=NAIVE_NAME,
-            policy=args.policy,
-            engine=engines.EAGER,
-            asked_action_hz=args.action_hz,
-            asked_vision_hz=args.vision_hz,
+            runner=BASELINE,
+            policy=self._job.policy.policy,
+            solves="full solves",
+            engine=EAGER,
+            asked_action_hz=action_hz,
+            asked_vision_hz=self._vision_hz,
             duration_s=round(duration_s, 3),
             action_hz=_rate_hz(self._stamps_ns),
             vision_hz=_rate_hz(self._frames_ns),
-            missed_slots=max(0, round(args.action_hz * duration_s) + 1 - ticks),
+            missed_slots=max(0, round(action_hz * duration_s) + 1 - len(self._stamps_ns)),
             period_ms=self._period.percentiles_ms(),
             predict_ms=self._predict.percentiles_ms(),
             encode_ms=self._encode.percentiles_ms(),
             feature_age_ms=self._feature_age.percentiles_ms(),
             state_to_wire_ms=self._state_to_wire.percentiles_ms(),
-            cpu_cores=round(self._cpu_ns / NS_PER_S / duration_s, 3),
-            stolen_ms=since_ms(self._stolen_ns, stolen_ns()),
+            cpu_cores=round(cpu_ns / NS_PER_S / duration_s, 3),
+            stolen_ms=stolen_ms,
             missed_by_cause=None,
         )
 
@@ -249,11 +259,5 @@ def _rate_hz(stamps_ns: list[int]) -> float | None:
     return round((len(stamps_ns) - 1) * NS_PER_S / (stamps_ns[-1] - stamps_ns[0]), 3)
 
 
-def main() -> None:
-    """Fly once and write the figures."""
-    args = arguments(__doc__)
-    args.out.write_text(to_json(NaiveRunner(args).run()))
-
-
 if __name__ == "__main__":
-    main()
+    app()

@@ -1,8 +1,6 @@
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from mavbridge.commands.bench.flights import RATES_HZ, highest_rate
+from benchmarks.compare import RATES_HZ, highest_rate
 
 KEPT, NEARLY, FAR = 0.0, 0.01, 0.5
 
@@ -13,25 +11,6 @@ def test_finds_the_highest_rate_that_is_kept(limit_hz: float | None) -> None:
         return KEPT if limit_hz is not None and rate_hz <= limit_hz else FAR
 
     assert highest_rate(RATES_HZ, missed) == limit_hz
-
-
-@given(st.lists(st.sampled_from([KEPT, NEARLY, FAR]), min_size=1, max_size=40))
-def test_ends_and_names_a_rate_that_was_kept(fractions: list[float]) -> None:
-    answers = iter(fractions)
-    kept: set[float] = set()
-    asked = 0
-
-    def missed(rate_hz: float) -> float:
-        nonlocal asked
-        asked += 1
-        fraction = next(answers, FAR)
-        if fraction == KEPT:
-            kept.add(rate_hz)
-        return fraction
-
-    best = highest_rate(RATES_HZ, missed)
-    assert best == (max(kept) if kept else None)
-    assert asked <= 2 * 4  # bisection of nine, each at most twice
 
 
 def test_a_single_stall_gets_a_second_chance() -> None:

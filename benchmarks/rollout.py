@@ -1,0 +1,205 @@
+"""Imagined flights: the plain serial way beside the streamed one.
+
+python -m benchmarks.rollout --json rollout.json --plot docs/rollout.png
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from cyclopts import App
+from rich.console import Console
+
+from benchmarks.rollout_process import COMMAND, RolloutJob, Trial
+from mavbridge.commands.bench.results import from_json, this_machine
+from mavbridge.commands.bench.tables import make_table, number
+from mavbridge.commands.imagine.run import load_model
+from mavbridge.commands.output import (
+    BLUE,
+    FIGURE_DPI,
+    FIGURE_STYLE,
+    GREY,
+    RED,
+    print_status,
+    require_matplotlib,
+    table_console,
+)
+from mavbridge.core.files import require_writable
+from mavbridge.core.processes import running, wait
+
+TIMEOUT_S = 3600.0
+STEPS, ITERATIONS = 4, 8
+"""DDIM steps where iterations vary, and iterations where steps vary."""
+FULL = ((8, 64, 256), (1, 2, 4, 8, 16, 32, 50), 3)
+QUICK = ((2, 8), (1, 4), 1)
+"""Iterations, DDIM steps, and repeats, of which the median by wall time counts."""
+app = App(help=__doc__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pair:
+    """The same rollout both ways."""
+
+    serial: Trial
+    streamed: Trial
+
+    @property
+    def speed_up(self) -> float:
+        """Serial over streamed time."""
+        return self.serial.wall_s / self.streamed.wall_s
+
+    @property
+    def bound(self) -> float:
+        """Amdahl's: the speed-up if all but the sampling took no time."""
+        return self.serial.wall_s / self.serial.sample_s
+
+
+@app.default
+def main(
+    *,
+    quick: bool = False,
+    json: Path | None = None,
+    plot: Path | None = None,
+    world_model: Path | None = None,
+    device: str = "cpu",
+) -> int:
+    """Measure; 1 if the two ways do not give the same frames.
+
+    Args:
+        quick: short rollouts, to look at and not to quote.
+        json: where to write all figures.
+        plot: where to draw them as PNG.
+        world_model: weights; by default those that come with mavbridge.
+        device: torch device of the world model.
+    """
+    require_writable(json, "--json")
+    require_writable(plot, "--plot")
+    if plot is not None:
+        require_matplotlib()
+    load_model(world_model, ddim_steps=STEPS, device=device)  # refused before the first process
+    iterations, steps, repeats = QUICK if quick else FULL
+    job = RolloutJob(
+        way="serial",
+        iterations=ITERATIONS,
+        ddim_steps=STEPS,
+        device=device,
+        world_model=world_model,
+    )
+    by_iterations = [measure(replace(job, iterations=count), repeats) for count in iterations]
+    by_steps = [measure(replace(job, ddim_steps=count), repeats) for count in steps]
+    print_pairs([*by_iterations, *by_steps], table_console())
+    if json is not None:
+        write_json([*by_iterations, *by_steps], json)
+    if plot is not None:
+        draw(by_iterations, by_steps, plot)
+    pairs = [*by_iterations, *by_steps]
+    return 0 if all(pair.serial.sha256 == pair.streamed.sha256 for pair in pairs) else 1
+
+
+def measure(job: RolloutJob, repeats: int) -> Pair:
+    """Run both ways in turn, so that a machine that changes meanwhile does to both."""
+    print_status(f"{job.iterations} iterations of {job.ddim_steps} steps, both ways")
+    pairs = [(run_trial(job), run_trial(replace(job, way="streamed"))) for _ in range(repeats)]
+    serial, streamed = zip(*pairs, strict=True)
+    return Pair(serial=median_trial(serial), streamed=median_trial(streamed))
+
+
+def run_trial(job: RolloutJob) -> Trial:
+    """One rollout in a process of its own.
+
+    Raises:
+        UserError: it failed; quotes the end of its log.
+    """
+    with TemporaryDirectory(prefix="mavbridge-bench-") as name:
+        out, log = Path(name) / "trial.json", Path(name) / "trial.log"
+        given = {key: value for key, value in asdict(job).items() if value is not None}
+        flags = [f"--{key.replace('_', '-')}={value}" for key, value in given.items()]
+        with running(sys.executable, "-c", COMMAND, f"--out={out}", *flags, log=log) as process:
+            wait(process, f"the {job.way} rollout", log, TIMEOUT_S)
+        return from_json(Trial, out.read_text())
+
+
+def median_trial(trials: Sequence[Trial]) -> Trial:
+    """The trial whose wall time is the median (the lower one of two)."""
+    return sorted(trials, key=lambda trial: trial.wall_s)[(len(trials) - 1) // 2]
+
+
+def print_pairs(pairs: Sequence[Pair], console: Console) -> None:
+    """Print two rows for each pair."""
+    header = (
+        *("way", "iterations", "steps", "threads", "decoded", "wall", "sampling"),
+        *("pixels", "files", "nets", "writer", "speed-up", "bound"),
+    )
+    rows = [
+        (
+            *(one.way, str(one.iterations), str(one.ddim_steps), str(one.torch_threads)),
+            *(str(one.frames_decoded), number(one.wall_s, 2), number(one.sample_s, 2)),
+            *(number(one.decode_s, 2), number(one.write_s, 2)),
+            *(number(one.peak_rss_mb, 0), number(one.writer_rss_mb, 0)),
+            *(number(pair.speed_up, 2), number(pair.bound, 2)),
+        )
+        for pair in pairs
+        for one in (pair.serial, pair.streamed)
+    ]
+    title = "Rollouts: time with waits for pixels and files, s; peak memory of processes, MB"
+    console.print(make_table(title, header, rows))
+    different = [pair for pair in pairs if pair.serial.sha256 != pair.streamed.sha256]
+    console.print(f"{len(different)} of {len(pairs)} pairs differ in their frames")
+
+
+def write_json(pairs: Sequence[Pair], path: Path) -> None:
+    """Write all figures; null = not measured."""
+    rows = [asdict(pair) | {"speed_up": pair.speed_up, "bound": pair.bound} for pair in pairs]
+    document = {"machine": asdict(this_machine()), "pairs": rows}
+    path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def draw(by_iterations: Sequence[Pair], by_steps: Sequence[Pair], path: Path) -> None:
+    """Write a PNG: speed-up by steps, memory by iterations."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(FIGURE_STYLE | {"axes.grid.axis": "y"}):
+        figure = Figure(figsize=(11.0, 4.4), dpi=FIGURE_DPI, facecolor="white")
+        left, right = figure.subplots(1, 2)
+        draw_speed_up(left, by_steps)
+        draw_memory(right, by_iterations)
+        for axes, values in (
+            (left, [pair.serial.ddim_steps for pair in by_steps]),
+            (right, [pair.serial.iterations for pair in by_iterations]),
+        ):
+            axes.set_xscale("log", base=2)
+            axes.set_xticks(values, [str(value) for value in values])
+            axes.minorticks_off()
+            axes.set_ylim(0, 1.2 * axes.get_ylim()[1])
+            axes.legend(loc="best")
+        figure.tight_layout(w_pad=3)
+        figure.savefig(path)
+
+
+def draw_speed_up(axes: Any, pairs: Sequence[Pair]) -> None:
+    """Measured speed-up and its bound by steps."""
+    steps = [pair.serial.ddim_steps for pair in pairs]
+    axes.plot(steps, [one.speed_up for one in pairs], "o-", color=BLUE, label="measured")
+    axes.plot(steps, [one.bound for one in pairs], color=RED, label="Amdahl's bound")
+    axes.set_xlabel("DDIM steps of a sample")
+    axes.set_title("Speed-up over the serial path")
+
+
+def draw_memory(axes: Any, pairs: Sequence[Pair]) -> None:
+    """Peak memory by iterations, a line for each way."""
+    iterations = [pair.serial.iterations for pair in pairs]
+    for way, color in (("serial", GREY), ("streamed", BLUE)):
+        memory_mb = [getattr(pair, way).peak_rss_mb for pair in pairs]
+        axes.plot(iterations, memory_mb, "o-", color=color, label=way)
+    axes.set_xlabel("iterations")
+    axes.set_ylabel("peak RSS, MB")
+    axes.set_title("Memory of the process with the networks")
+
+
+if __name__ == "__main__":
+    sys.exit(app())

@@ -1,0 +1,60 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cyclopts import App
+
+from helpers.factories import make_state
+from mavbridge.commands.bench.flight import FlightJob, to_flags
+from mavbridge.commands.bench.flight_process import CLIMB_STICK, level_climb
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.rates import Rates
+from policy.contract import Contract, Executable
+
+
+@pytest.mark.parametrize(
+    ("policy", "rates"),
+    [
+        (PolicyConfig(), Rates()),
+        (
+            PolicyConfig(
+                policy="toge:small",
+                checkpoint=Path("a b.safetensors"),
+                dual_rate=True,
+                head_steps=2,
+                allow_untrained=True,
+            ),
+            Rates(visual_rate="auto:10:60", action_rate=250.0, realtime=False, pace="state"),
+        ),
+    ],
+)
+def test_a_job_survives_the_way_over_the_command_line(policy: PolicyConfig, rates: Rates) -> None:
+    job = FlightJob(
+        port=1, camera="shm:a", duration=2.5, out=Path("a.json"), policy=policy, rates=rates
+    )
+    app = App(result_action="return_value")
+    app.default(lambda job: job)
+    received: list[FlightJob] = []
+
+    @app.command
+    def fly(job: FlightJob) -> None:
+        received.append(job)
+
+    app(("fly", *to_flags(job)))
+    assert received == [job]
+
+
+def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
+    called: list[float | None] = []
+
+    def act(*arguments: object) -> np.ndarray:
+        called.append(0.01)
+        return np.ones((1, 16, 4), np.float32)
+
+    executable = Executable(
+        contract=Contract(), name="a", engine="b", dual_rate=True, encode=lambda rgb: rgb, act=act
+    )
+    history = np.zeros((1, 4, 4), np.float32)
+    chunk = level_climb(executable).act(history, make_state().values[None], history, 0.01)
+    assert called
+    assert (chunk == np.float32([CLIMB_STICK, 0, 0, 0])).all()
