@@ -195,7 +195,7 @@ class _Flight:
                 packets=self._tap,
                 wall_offset_ns=offset_ns,
                 autopilot=lambda: self._link.autopilot,
-                tell=self._screen.tell,
+                report=self._screen.tell,
             )
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error

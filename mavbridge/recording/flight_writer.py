@@ -8,9 +8,15 @@ from pathlib import Path
 from mavbridge.core.records import Packet, Tick, VisionTick
 from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
 from mavbridge.recording.meta import FlightMeta, write_meta
-from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow
-from mavbridge.recording.schema import DEMONSTRATION_TICKS, ticks_batch
-from mavbridge.recording.schema import TICKS as TICKS_SCHEMA
+from mavbridge.recording.rows import (
+    DEMONSTRATION_TICKS,
+    FrameRow,
+    FrameTruth,
+    TickLabels,
+    TickRow,
+    ticks_batch,
+)
+from mavbridge.recording.rows import TICKS as TICKS_SCHEMA
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.tlog import TlogWriter
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError
@@ -51,12 +57,15 @@ class FlightWriter:
         """
         self._folder = folder
         self.meta = meta
+        self.video_failure: WriterDiedError | None = None
+        """Why there are no more frames, though the rest goes on."""
         self._schema = DEMONSTRATION_TICKS if with_labels else TICKS_SCHEMA
         self._rows: list[TickRow] = []
         self._flushed_ns = meta.start_ns
         self._tick_serial = self._frame_serial = -1
         self._ticks_dropped = 0
         self._source_size: tuple[int, int] | None = None
+        self._tlog: TlogWriter | None = None
         self._video = VideoWriter(
             folder / VIDEO,
             pressure=pressure,
@@ -67,18 +76,13 @@ class FlightWriter:
         try:
             write_meta(folder, meta)
             self._table = TableWriter(folder / TICKS, self._schema)
-            # Now and not in flight: whatever the first conversion has to import.
+            # Whatever the first conversion has to import is imported now and not in flight.
             self._table.append(ticks_batch([], self._schema))
-            self._tlog = (
-                None
-                if wall_offset_ns is None
-                else TlogWriter(folder / TLOG, wall_offset_ns=wall_offset_ns)
-            )
+            if wall_offset_ns is not None:
+                self._tlog = TlogWriter(folder / TLOG, wall_offset_ns=wall_offset_ns)
         except OSError:
             self._video.close()
             raise
-        self.video_failure: WriterDiedError | None = None
-        """Why there are no more frames, though the rest goes on."""
 
     def tick(self, tick: Tick, labels: TickLabels | None = None) -> None:
         """Record a tick; serial numbers that were left out count as dropped.
@@ -137,7 +141,7 @@ class FlightWriter:
 
     def _flush(self) -> None:
         if self._rows:
-            # First: rows that could not be written are not tried again.
+            # Cleared first: rows that could not be written are not tried again.
             rows, self._rows = self._rows, []
             self._table.append(ticks_batch(rows, self._schema))
 
@@ -162,7 +166,11 @@ class FlightWriter:
         try:
             self._flush()
             self._table.finish()
-            self._finish_video()
+            if self.video_failure is None:
+                try:
+                    self._video.finish()
+                except WriterDiedError as error:
+                    self.video_failure = error
         except BaseException:
             self.close()
             raise
@@ -170,13 +178,6 @@ class FlightWriter:
             self._tlog.close()
         self.meta = self._completed(meta)
         write_meta(self._folder, self.meta)
-
-    def _finish_video(self) -> None:
-        if self.video_failure is None:
-            try:
-                self._video.finish()
-            except WriterDiedError as error:
-                self.video_failure = error
 
     def _completed(self, meta: FlightMeta) -> FlightMeta:
         is_whole = self.video_failure is None

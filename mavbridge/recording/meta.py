@@ -27,7 +27,7 @@ class FlightMeta:
     started_at: str
     """ISO 8601, UTC."""
     start_ns: int
-    """The same moment on the clock of all stamps."""
+    """The same moment, on the clock of all stamps."""
     mavbridge_version: str
     source: Source
     policy: str | None
@@ -37,28 +37,27 @@ class FlightMeta:
     action_hz: float
     visual_hz: float
     image_height: int | None = None
-    """Of the recorded frames; these three are known with the first frame, and written at the
-    end."""
+    """Height of the recorded frames; the four sizes are written at the end."""
     image_width: int | None = None
     source_height: int | None = None
-    """Of the frames as they came: H.264 cannot have an odd last row or column, which is cut off."""
+    """Height of the frames as they came: H.264 cannot have an odd last row, which is cut off."""
     source_width: int | None = None
     contract: Contract | None
     course_seed: int | None = None
     seed: int | None = None
     finished: bool = False
-    """Closed in order."""
+    """Whether the recording was closed in order."""
     ticks: int | None = None
     frames: int | None = None
-    """Rows; known at the end."""
+    """Number of rows, of ticks and of frames; known at the end."""
     ticks_dropped: int | None = None
     frames_dropped: int | None = None
     packets_dropped: int | None = None
-    """Lost on the way to the recording, up to its last row."""
+    """Each of the three counts what was lost before the last row of its file."""
     success: bool | None = None
     gates_passed: int | None = None
     conditions: dict[str, float] = field(default_factory=dict)
-    """What was randomised."""
+    """Physical quantities that were randomised, by name."""
 
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:

@@ -10,6 +10,8 @@ import pyarrow.parquet as pq
 from mavbridge.core.errors import MavbridgeError
 
 READ_ERRORS = (pa.ArrowException, OSError)
+_GROUP_ROWS = 2_048
+"""Rows of a Parquet row group: twenty seconds of ticks. Encoding 16,384 at once took 27 MB."""
 
 
 class TableError(MavbridgeError):
@@ -58,10 +60,6 @@ class TableWriter:
     def abandon(self) -> None:
         """Leave the stream as it is, after an error."""
         self._sink.close()
-
-
-_GROUP_ROWS = 2_048
-"""Rows of a Parquet row group: twenty seconds of ticks. Encoding 16,384 at once took 27 MB."""
 
 
 def to_parquet(stream: Path, parquet: Path) -> None:

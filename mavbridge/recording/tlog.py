@@ -1,7 +1,7 @@
 """Telemetry logs as MAVProxy and the ground stations read them.
 
-Every packet with eight bytes in front: Unix time in microseconds, big-endian, whose lowest two
-bits number the link (pymavlink's mavlogfile takes them so); ours is link 0.
+Eight bytes precede every packet: Unix time in microseconds, big-endian. Its lowest two bits are the
+number of the link (pymavlink's mavlogfile reads them so), here always 0.
 """
 
 import struct

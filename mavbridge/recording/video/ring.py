@@ -1,8 +1,7 @@
 """Frames from one process to another through shared memory: a fixed number of slots.
 
-Who may use which slot is not kept here but told over the pipe of the two processes, whose messages
-also order the accesses. A slot belongs to the producer until ``Submit`` names it, and again from
-``Written`` on.
+The two processes say over their pipe who may use which slot, and its messages order the accesses: a
+slot belongs to the producer until ``Submit`` names it, and again from ``Written`` on.
 """
 
 import os
@@ -33,7 +32,7 @@ class FrameRing:
     """Slots of [H, W, 3] uint8, mapped."""
 
     def __init__(self, memory: SharedMemory, shape: RingShape) -> None:
-        """See ``create`` and ``attach``."""
+        """Use ``create`` in the producer, and ``attach`` in the consumer."""
         self.shape = shape
         self._memory = memory
         self._is_linked = False
@@ -43,7 +42,7 @@ class FrameRing:
 
     @classmethod
     def create(cls, height: int, width: int) -> "FrameRing":
-        """Producer: acquire the memory.
+        """Acquire the memory, in the producer.
 
         Raises:
             OSError: there is not enough.
@@ -63,7 +62,7 @@ class FrameRing:
 
     @classmethod
     def attach(cls, shape: RingShape) -> "FrameRing":
-        """Consumer: map the memory.
+        """Map the memory, in the consumer.
 
         Raises:
             OSError: it is gone.
@@ -78,13 +77,13 @@ class FrameRing:
         return frame
 
     def unlink(self) -> None:
-        """Producer: take the name away, so that nothing stays whoever is killed."""
+        """Take the memory's name away, in the producer: nothing stays, whoever is killed."""
         if self._is_linked:
             self._is_linked = False
             self._memory.unlink()
 
     def close(self) -> None:
-        """Unmap; the producer's end also takes the name away. May be called twice."""
+        """Unmap, and in the producer take the name away. May be called twice."""
         self._frames = None
         self._memory.close()
         self.unlink()

@@ -41,9 +41,9 @@ class Stand:
             packets=self.packets,
             wall_offset_ns=10**18,
             autopilot=lambda: "ardupilot 4.6.0",
-            tell=self.told.append,
+            report=self.told.append,
         )
-        self.writer = self.recorder._consumer._writer
+        self.writer = self.recorder._consumer.writer
 
     @property
     def pid(self) -> int:

@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.recordings import make_row, number_of, picture, send_signal
-from mavbridge.recording.schema import DEMONSTRATION_FRAMES, FRAMES, read_frames
+from mavbridge.recording.rows import DEMONSTRATION_FRAMES, FRAMES, read_frames
 from mavbridge.recording.tables import read_table
 from mavbridge.recording.video import ring
 from mavbridge.recording.video.file import count_frames, read_video
-from mavbridge.recording.video.messages import Finish, VideoJob
+from mavbridge.recording.video.frame_files import VideoJob
 from mavbridge.recording.video.ring import MIN_SLOTS
 from mavbridge.recording.video.writer import (
     FrameSender,
@@ -29,7 +29,7 @@ from mavbridge.recording.video.writer import (
     WriterDiedError,
     WriterError,
 )
-from mavbridge.recording.video.writer_process import WriterService
+from mavbridge.recording.video.writer_process import Notice, WriterService
 
 DEADLINE_S = 30.0
 
@@ -94,7 +94,7 @@ def test_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
 def test_a_name_stays_in_no_case(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "a.mp4", pressure="offline", hz=10) as video:
         submit(video, 40)  # more than a ring: it has been mapped by now
-        ring = video._sender._ring
+        ring = video._ring
         assert ring is not None
         assert not (Path("/dev/shm") / ring.shape.name).exists()
 
@@ -273,12 +273,10 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
         job = VideoJob(
             video=folder / "camera.mp4",
             rows=folder / "frames",
-            with_truth=False,
             hz=30,
-            yield_cpu=False,
         )
         service = WriterService(its, job)
-        sender = FrameSender(ours, Alive(), pressure="online")
+        sender = FrameSender(ours, Alive(), "online")
         offered = lost_upstream = 0
         taken: list[int] = []
         for step in steps:
@@ -291,7 +289,7 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
                 taken.append(offered)
                 lost_upstream_taken = lost_upstream
             offered += 1
-        ours.send(Finish())
+        ours.send(Notice.FINISH)
         while service.is_open:
             service.serve(0)
         sender.receive()
