@@ -23,13 +23,11 @@ from rich.console import Console
 from rich.table import Table
 
 from mavbridge.commands.evaluate_imagination.metrics import spearman
-from mavbridge.commands.imagine.deciders import Decider, PolicyDecider
-from mavbridge.commands.imagine.loop import rollout
-from mavbridge.commands.imagine.observation import ObservationQueue
-from mavbridge.commands.imagine.plan import RolloutPlan
+from mavbridge.commands.imagine.deciders import Decider, ObservationQueue, PolicyDecider
+from mavbridge.commands.imagine.loop import RolloutPlan, rollout
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.commands.imagine.start import Start, read_start
+from mavbridge.commands.imagine.start import RolloutStart, read_start
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import FloatArray
@@ -50,7 +48,7 @@ Points = NDArray[np.float64]
 class Case:
     """A moment of a demonstration, and what lay ahead."""
 
-    start: Start
+    start: RolloutStart
     position_ned_m: Points
     course: Course
     next_gate: int

@@ -11,13 +11,12 @@ from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
 from helpers.recordings import make_meta
-from mavbridge.commands.imagine.collected import CollectedOutput
 from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
-from mavbridge.commands.imagine.loop import Segment, rollout
-from mavbridge.commands.imagine.output import OnFrame, ignore
-from mavbridge.commands.imagine.plan import RolloutPlan
+from mavbridge.commands.imagine.loop import RolloutPlan, Segment, rollout
+from mavbridge.commands.imagine.output import OnFrame, SerialOutput
+from mavbridge.commands.imagine.run import ignore_frame
 from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.commands.imagine.start import Start, read_start
+from mavbridge.commands.imagine.start import RolloutStart, read_start
 from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import FloatArray, ImageArray, Sticks
@@ -105,10 +104,10 @@ def noise_executable(contract: Contract | None = None) -> Executable:
     )
 
 
-def make_start(config: WorldModelConfig = TINY) -> Start:
+def make_start(config: WorldModelConfig = TINY) -> RolloutStart:
     random = np.random.default_rng(0)
     shape = (config.context_frames, config.image_size, config.image_size, 3)
-    return Start(
+    return RolloutStart(
         images=random.integers(0, 255, shape).astype(np.uint8),
         states=np.stack([make_state().values] * config.context_frames),
         newest_ns=START_NS,
@@ -145,7 +144,7 @@ class Finished:
     sha256: str
     model: TinyWorld
     sampler: Sampler
-    output: StreamedOutput | CollectedOutput
+    output: StreamedOutput | SerialOutput
 
 
 def run(
@@ -156,11 +155,11 @@ def run(
     serial: bool = False,
     decode_video: bool = True,
     model: TinyWorld | None = None,
-    on_frame: OnFrame = ignore,
+    on_frame: OnFrame = ignore_frame,
 ) -> Finished:
     model = model or TinyWorld()
     sampler = make_sampler(model, serial=serial, steps=plan.ddim_steps)
-    kind = CollectedOutput if serial else StreamedOutput
+    kind = SerialOutput if serial else StreamedOutput
     output = kind(
         out,
         sampler,
@@ -214,6 +213,6 @@ def grey(frame: int) -> int:
     return 20 + 7 * (frame % 30)
 
 
-def start_of(folder: Path, start_s: float = 0.0, config: WorldModelConfig = TINY) -> Start:
+def start_of(folder: Path, start_s: float = 0.0, config: WorldModelConfig = TINY) -> RolloutStart:
     flight: RecordedFlight = open_flight(folder)
     return read_start(flight, config, start_s)

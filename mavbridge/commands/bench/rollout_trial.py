@@ -14,11 +14,10 @@ from rich.console import Console
 
 from mavbridge.commands.bench.rollout_results import Trial
 from mavbridge.commands.imagine.deciders import WorldModelDecider
-from mavbridge.commands.imagine.loop import rollout
-from mavbridge.commands.imagine.plan import RolloutPlan
+from mavbridge.commands.imagine.loop import RolloutPlan, rollout
 from mavbridge.commands.imagine.run import make_output, run_rollout
 from mavbridge.commands.imagine.sampling import Sampler, cores_left_free
-from mavbridge.commands.imagine.start import Start
+from mavbridge.commands.imagine.start import RolloutStart
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import NEUTRAL, ImageArray, RolloutFrame
 from policy.checkpoints.world_model_file import load_world_model
@@ -99,7 +98,7 @@ def _measure(model: WorldModel, args: argparse.Namespace, out: Path) -> Trial:
     )
 
 
-def _warm_up(model: WorldModel, plan: RolloutPlan, start: Start) -> None:
+def _warm_up(model: WorldModel, plan: RolloutPlan, start: RolloutStart) -> None:
     """First calls choose and build kernels."""
     once = RolloutPlan(
         iterations=1, frames=plan.frames, exe_steps=1, ddim_steps=plan.ddim_steps, seed=0
@@ -109,14 +108,14 @@ def _warm_up(model: WorldModel, plan: RolloutPlan, start: Start) -> None:
         pass
 
 
-def _start(config: WorldModelConfig) -> Start:
+def _start(config: WorldModelConfig) -> RolloutStart:
     """A picture of nothing, level and still: what is measured does not depend on it."""
     size, count = config.image_size, config.context_frames
     ramp = np.linspace(0, 255, size, dtype=np.float32).astype(np.uint8)
     image = np.broadcast_to(ramp[:, None, None], (size, size, 3))
     state = np.zeros(STATE_DIM, np.float32)
     state[QUATERNION.start] = 1.0
-    return Start(
+    return RolloutStart(
         images=np.stack([image] * count),
         states=np.stack([state] * count),
         newest_ns=0,

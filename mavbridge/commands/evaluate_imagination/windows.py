@@ -23,7 +23,7 @@ from mavbridge.commands.evaluate_imagination.results import (
     Teller,
 )
 from mavbridge.commands.evaluate_imagination.runs import Run
-from mavbridge.commands.imagine.plan import MAX_SEED
+from mavbridge.commands.imagine.loop import MAX_SEED
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.core.records import FloatArray, ImageArray
 from policy.contract import ACTION_NAMES

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from helpers.rollouts import DECIDERS, SIZE, make_plan, run
-from mavbridge.commands.imagine.files import read_rows
-from mavbridge.commands.imagine.plan import Stage
+from mavbridge.commands.imagine.loop import NoiseStage
+from mavbridge.commands.imagine.output import read_rows
 from mavbridge.recording.video.file import count_frames, read_video
 
 
@@ -51,7 +51,9 @@ def test_more_iterations_only_add_to_a_rollout(tmp_path: Path) -> None:
 
 def test_stages_and_iterations_share_no_noise() -> None:
     plans = [make_plan(seed=seed) for seed in (0, 1, 2**63 - 1)]
-    seeds = [plan.stage_seed(k, stage) for plan in plans for k in range(300) for stage in Stage]
+    seeds = [
+        plan.stage_seed(k, stage) for plan in plans for k in range(300) for stage in NoiseStage
+    ]
     assert len(set(seeds)) == len(seeds)
     assert all(0 <= seed < 2**63 for seed in seeds)
 
