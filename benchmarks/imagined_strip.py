@@ -11,7 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mavbridge.commands.evaluate_imagination.runs import Run, read_runs, survey, with_images
+from mavbridge.commands.evaluate_imagination.flights import (
+    FlightWindow,
+    choose_windows,
+    read_episode,
+    with_images,
+)
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.core.clock import MonotonicClock
@@ -23,16 +28,16 @@ SCALE = 2
 MARGIN_PX, HEADER_PX, LABEL_PX = 4, 22, 128
 
 
-def strip(sampler: Sampler, run: Run, images: dict[int, ImageArray]) -> ImageArray:
+def strip(sampler: Sampler, window: FlightWindow, images: dict[int, ImageArray]) -> ImageArray:
     """Rows of frames [H, W, 3]: real, imagined, copied, and imagined with another stick."""
     now, dt_s = sampler.config.context_frames - 1, sampler.config.frame_dt_s
-    turned: FloatArray = run.actions.copy()
+    turned: FloatArray = window.actions.copy()
     turned[:, ACTION_NAMES.index("yaw")] = 1.0
     rows = {
         "real": [images[now + step] for step in STEPS],
-        "imagined": imagine(sampler, run, images, run.actions),
+        "imagined": imagine(sampler, window, images, window.actions),
         "copy last": [images[now]] * len(STEPS),
-        "yaw full right": imagine(sampler, run, images, turned),
+        "yaw full right": imagine(sampler, window, images, turned),
     }
     side = sampler.config.image_size * SCALE
     pitch = side + MARGIN_PX
@@ -51,12 +56,12 @@ def strip(sampler: Sampler, run: Run, images: dict[int, ImageArray]) -> ImageArr
 
 
 def imagine(
-    sampler: Sampler, run: Run, images: dict[int, ImageArray], actions: FloatArray
+    sampler: Sampler, window: FlightWindow, images: dict[int, ImageArray], actions: FloatArray
 ) -> list[ImageArray]:
     """The frames at ``STEPS`` that follow from sticks [frames, 4]."""
     context = sampler.config.context_frames
     past = sampler.encode(np.stack([images[step] for step in range(context)]))[None]
-    imagined = sampler.sample(past, run.states[None, :context], actions, seed=0)
+    imagined = sampler.sample(past, window.states[None, :context], actions, seed=0)
     return list(sampler.decode(imagined.latents[[step - 1 for step in STEPS]]))
 
 
@@ -78,17 +83,18 @@ def main() -> None:
     model = load_model(args.world_model, ddim_steps=4, device="cpu")
     sampler = Sampler(model, ddim_steps=4, decode_all=False, clock=MonotonicClock())
     config = sampler.config
-    found = survey(args.flight, config, exe_steps=1, iterations=1)
-    if found is None:
+    every, _ = choose_windows(
+        [read_episode(args.flight, config)], config, steps=config.frames, count=1_000_000
+    )
+    if not every:
         parser.error(
             f"{args.flight} is too short: {config.frames * config.frame_dt_s:g} s and more"
         )
-    rows = np.array([round(args.at * (found.windows - 1))])
-    runs = read_runs(args.flight, config, config.frames, rows)
+    chosen = every[round(args.at * (len(every) - 1))]
     steps = range(config.context_frames + config.frames)
-    run, images = next(with_images(runs, steps, config.image_size))
+    window, images = next(with_images([chosen], steps, config.image_size))
     cv2.imwrite(
-        str(args.out), strip(sampler, run, images)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9]
+        str(args.out), strip(sampler, window, images)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9]
     )
 
 

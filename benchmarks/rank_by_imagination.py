@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from mavbridge.commands.evaluate_imagination.metrics import spearman
+from mavbridge.commands.evaluate_imagination.scores import spearman
 from mavbridge.commands.imagine.deciders import Decider, ObservationQueue, PolicyDecider
 from mavbridge.commands.imagine.loop import RolloutPlan, rollout
 from mavbridge.commands.imagine.run import load_model
@@ -212,8 +212,8 @@ def main() -> None:
         table.add_row(Path(name).stem, steps, given, str(one.passed), f"{one.end_error_m:.1f}")
     console = Console(highlight=False)
     console.print(table)
-    by_gates = spearman(real, [float(one.passed) for one in scores])
-    by_error = spearman(real, [-one.end_error_m for one in scores])
+    by_gates = spearman(np.array(real), np.array([float(one.passed) for one in scores]))
+    by_error = spearman(np.array(real), np.array([-one.end_error_m for one in scores]))
     told = [f"{value:+.2f}" if value is not None else "none" for value in (by_gates, by_error)]
     console.print(
         f"{len(scores)} candidates, {len(cases)} starts in {len(folders)} flights; Spearman with "
