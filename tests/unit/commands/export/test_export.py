@@ -15,7 +15,7 @@ import pytest
 from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
 from helpers.lerobot_rules import broken_rules
 from mavbridge.__main__ import main
-from mavbridge.commands.export.run import Exported, export, write_dataset
+from mavbridge.commands.export.run import ExportSummary, export, write_dataset
 from mavbridge.config.export import ExportConfig
 from mavbridge.core.errors import MavbridgeError, UserError
 from policy.data.episodes import Episode
@@ -64,7 +64,7 @@ def fly(
 
 def write(
     flights: list[Path], out: Path, video_file_bytes: int = 10**9, data_file_bytes: int = 10**9
-) -> Exported:
+) -> ExportSummary:
     out.mkdir()
     return write_dataset(
         [read_flight(flight) for flight in flights],

@@ -1,17 +1,21 @@
-"""Videos that hold many episodes one after the other, in files of a limited size.
+"""Videos and tables that hold many episodes one after the other, in files of a limited size.
 
 LeRobot's reader wants frame k of an episode at ``from_timestamp + k / fps``, within 0.1 ms
 (lerobot 0.6.1, ``datasets/lerobot_dataset.py`` ``tolerance_s``, ``datasets/video_utils.py``), so a
-file has one frame every 1/fps exactly, from 0 on.
+video has one frame every 1/fps exactly, from 0 on.
 """
 
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
 import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from av.container import OutputContainer
 from av.video.stream import VideoStream
+from numpy.typing import NDArray
 
 from mavbridge.core.records import ImageArray
 from policy.data import lerobot_format as names
@@ -20,17 +24,16 @@ FILES_A_CHUNK = 1000
 """LeRobot's ``DEFAULT_CHUNK_SIZE``."""
 MAX_FILE_S = 1000.0
 """The reader compares times as float32, whose step is above 0.1 ms from 1024 s on."""
-_OPTIONS = {
+_OPTIONS: dict[str, object] = {
     "preset": "veryfast",
     "crf": "20",  # as the recorder's
-    "g": "2",  # LeRobot's own: any frame is to be had for two decoded
+    "g": "2",  # LeRobot's own: any frame is had by decoding two
     "tune": "zerolatency",  # a frame in, a packet out; none is before time 0
     "threads": "1",
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class VideoSpan:
+class VideoSpan(NamedTuple):
     """Where the frames of an episode are."""
 
     chunk_index: int
@@ -45,14 +48,14 @@ class VideoFiles:
     def __init__(
         self, folder: Path, *, fps: int, height: int, width: int, limit_bytes: int
     ) -> None:
-        """Nothing is written yet.
+        """Prepare; nothing is written yet.
 
         Args:
             folder: the dataset.
             fps: frames a second of all files.
             height: of the frames, even.
             width: of the frames, even.
-            limit_bytes: of a file; one episode alone may be larger.
+            limit_bytes: size of a file; one episode alone may be larger.
         """
         self._folder = folder
         self._fps = fps
@@ -61,12 +64,11 @@ class VideoFiles:
         self._container: OutputContainer | None = None
         self._stream: VideoStream | None = None
         self._file = -1
-        self._frames = 0
-        """In the file."""
+        self._frames = self._bytes = 0
+        """Contents of the file."""
         self._first = 0
-        """Of them, the first of the episode."""
-        self._bytes = 0
-        self._all_frames, self._all_bytes = 0, 0
+        """Where in the file the episode begins."""
+        self._all_frames = self._all_bytes = 0
 
     def begin(self, frames: int) -> None:
         """Begin an episode of so many frames, in a new file where this one would grow too large.
@@ -86,8 +88,6 @@ class VideoFiles:
         Raises:
             OSError, FFmpegError: it cannot be written.
         """
-        if self._stream is None:
-            raise ValueError("begin an episode first")
         frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
         frame.pts, frame.time_base = self._frames, Fraction(1, self._fps)
         if self._frames == self._first:
@@ -97,13 +97,9 @@ class VideoFiles:
         self._all_frames += 1
 
     def end(self) -> VideoSpan:
-        """Where the episode went."""
-        return VideoSpan(
-            chunk_index=self._file // FILES_A_CHUNK,
-            file_index=self._file % FILES_A_CHUNK,
-            from_s=self._first / self._fps,
-            to_s=self._frames / self._fps,
-        )
+        """End the episode; where it is."""
+        chunk, file = divmod(self._file, FILES_A_CHUNK)
+        return VideoSpan(chunk, file, self._first / self._fps, self._frames / self._fps)
 
     def close(self) -> None:
         """Finish the file.
@@ -122,11 +118,7 @@ class VideoFiles:
         self.close()
         self._file += 1
         self._frames = self._bytes = 0
-        chunk, file = divmod(self._file, FILES_A_CHUNK)
-        path = self._folder / names.VIDEO.format(
-            video_key=names.CAMERA_KEY, chunk_index=chunk, file_index=file
-        )
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path = _path(self._folder, names.VIDEO, self._file)
         self._container = av.open(str(path), "w", options={"movflags": "faststart"})
         stream = self._container.add_stream("libx264", self._fps)
         stream.height, stream.width = self._size
@@ -136,9 +128,55 @@ class VideoFiles:
 
     def _mux(self, frame: av.VideoFrame | None) -> None:
         if self._container is None or self._stream is None:
-            raise ValueError("no file is open")
+            raise ValueError("begin an episode first")
         packets = self._stream.encode(frame)
         size = sum(packet.size for packet in packets)
         self._bytes += size
         self._all_bytes += size
         self._container.mux(packets)
+
+
+class TableFiles:
+    """Tables of the rows, one row group an episode."""
+
+    def __init__(self, folder: Path, limit_bytes: int) -> None:
+        self._folder, self._limit_bytes = folder, limit_bytes
+        self._writer: pq.ParquetWriter | None = None
+        self._paths: list[Path] = []
+        self._bytes = 0
+
+    def append(self, table: pa.Table) -> tuple[int, int]:
+        """Write an episode; its chunk and file.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        if self._writer is None or self._bytes + table.nbytes >= self._limit_bytes:
+            self.close()
+            self._paths.append(_path(self._folder, names.DATA, len(self._paths)))
+            self._writer = pq.ParquetWriter(self._paths[-1], table.schema, compression="snappy")
+            self._bytes = 0
+        self._writer.write_table(table)
+        self._bytes += table.nbytes
+        return divmod(len(self._paths) - 1, FILES_A_CHUNK)
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def column(self, name: str) -> NDArray[np.generic]:
+        """[rows, D] of all files."""
+        parts = [pq.read_table(path, columns=[name], partitioning=None) for path in self._paths]
+        column = pa.concat_tables(parts)[name].combine_chunks()
+        values = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
+        return np.asarray(values.to_numpy()).reshape(len(column), -1)
+
+
+def _path(folder: Path, pattern: str, number: int) -> Path:
+    """Path of a data or video file by its number; makes its folder."""
+    chunk, file = divmod(number, FILES_A_CHUNK)
+    path = folder / pattern.format(video_key=names.CAMERA_KEY, chunk_index=chunk, file_index=file)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
