@@ -29,8 +29,8 @@ FLUSH_ROWS = 256
 class FlightWriter:
     """Writes as the flight goes on; ``finish`` closes it in order.
 
-    After an error of ``tick``, ``frame`` or ``packets``, only ``finish`` and ``close`` may follow.
-    What was written before stays readable.
+    Methods raise OSError or WriterError where it cannot be written. After that only ``finish`` and
+    ``close`` may follow; what was written before stays readable.
     """
 
     def __init__(
@@ -50,10 +50,6 @@ class FlightWriter:
             pressure: "offline" drops nothing, and waits; see ``VideoWriter``.
             with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
             wall_offset_ns: wall time minus the clock of the stamps, for a tlog; None = no tlog.
-
-        Raises:
-            OSError: the folder cannot be written.
-            WriterError: the writer process does not start.
         """
         self._folder = folder
         self.meta = meta
@@ -85,11 +81,7 @@ class FlightWriter:
             raise
 
     def tick(self, tick: Tick, labels: TickLabels | None = None) -> None:
-        """Record a tick; serial numbers that were left out count as dropped.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Record a tick; serial numbers that were left out count as dropped."""
         dropped = tick.serial - self._tick_serial - 1
         self._tick_serial = tick.serial
         self._ticks_dropped += dropped
@@ -102,9 +94,6 @@ class FlightWriter:
         """Record a frame; serial numbers that were left out count as dropped.
 
         A writer process that died costs the frames alone: see ``video_failure``.
-
-        Raises:
-            WriterError: it cannot be written.
         """
         self._flush_if_due(vision.ready_ns)
         dropped = vision.serial - self._frame_serial - 1
@@ -126,11 +115,7 @@ class FlightWriter:
             self.video_failure = error
 
     def packets(self, packets: Iterable[Packet]) -> None:
-        """Append to the tlog.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Append to the tlog, if there is one."""
         if self._tlog is not None:
             self._tlog.append(packets)
 
@@ -159,9 +144,6 @@ class FlightWriter:
         """Close everything in order; ``meta`` is completed with what was counted here.
 
         A writer that died leaves its table as it was, and ``finished`` false.
-
-        Raises:
-            OSError, WriterError: it could not all be written.
         """
         try:
             self._flush()

@@ -79,7 +79,7 @@ class Recorder:
 
 
 class _FlightConsumer:
-    """Runs on the recorder's thread."""
+    """Runs on the recorder's thread; may raise OSError and WriterError."""
 
     def __init__(
         self,
@@ -101,11 +101,7 @@ class _FlightConsumer:
         return max(0, self._seen_frames - self.writer.frames_written)
 
     def consume(self, batch: Sequence[Event]) -> None:
-        """Write one batch, and the packets that came meanwhile.
-
-        Raises:
-            OSError, WriterError: they cannot be written.
-        """
+        """Write one batch, and the packets that came meanwhile."""
         seen_frames = self._seen_frames
         try:
             self.writer.packets(self._packets.drain())
@@ -128,11 +124,7 @@ class _FlightConsumer:
             self._report(f"recording no more images: {failure}; the rest is still recorded")
 
     def close(self) -> None:
-        """Finish in order, or after an error leave things as they are.
-
-        Raises:
-            OSError, WriterError: it could not all be written.
-        """
+        """Finish in order, or after an error leave things as they are."""
         if self._has_failed:
             self.writer.close()
             return

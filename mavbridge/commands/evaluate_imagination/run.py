@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import cv2
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 from rich.text import Text
 
 from mavbridge.commands.bench.run import require_folder, table_console
@@ -53,11 +53,7 @@ def evaluate_imagination(flights: Sequence[Path], config: EvaluateImaginationCon
     model = load_model(config.world_model, ddim_steps=config.ddim_steps, device=config.device)
     sampler = Sampler(model, ddim_steps=config.ddim_steps, decode_all=False, clock=MonotonicClock())
     errors = Console(stderr=True, highlight=False, emoji=False)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with (
-        stop_on_signals() as stop,
-        Progress(*columns, TimeRemainingColumn(), console=errors) as progress,
-    ):
+    with stop_on_signals() as stop, Progress(console=errors) as progress:
         quality = _Evaluation(config, sampler, progress, stop).run(flights)
         was_stopped = stop.is_set()
     print_quality(quality, table_console(highlight=False))

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from typing import TypeAlias
@@ -12,57 +11,33 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from mavbridge.commands.export.files import FILES_A_CHUNK, TableFiles, VideoFiles
+from mavbridge.commands.export.files import (
+    DATA_FILE_MB,
+    FILES_A_CHUNK,
+    VIDEO_FILE_MB,
+    DatasetSpec,
+    TableFiles,
+    VideoFiles,
+)
 from mavbridge.commands.export.rows import MIN_ROWS, Stretch
 from mavbridge.commands.export.stats import ImageStats, vector_stats
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
-from policy.contract import ACTION_NAMES, STATE_NAMES, StateFrame
+from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.data import lerobot_format as names
-
-MB = 1024**2
-DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
-"""LeRobot's defaults (``datasets/utils.py``)."""
 
 Json: TypeAlias = "str | int | float | bool | list[Json] | dict[str, Json] | None"
 
 _ROW_NUMBERS = ("frame_index", "episode_index", "index", "task_index")
 
 
-@dataclass(frozen=True, kw_only=True)
-class DatasetSpec:
-    """What is the same for all episodes."""
-
-    fps: int
-    height: int
-    width: int
-    state_frame: StateFrame
-    task: str
-    """In words, for policies that read them."""
-    data_file_bytes: int = DATA_FILE_MB * MB
-    video_file_bytes: int = VIDEO_FILE_MB * MB
-    """Size of a file; one episode alone may be larger."""
-
-
 class DatasetWriter:
     """A dataset that grows by an episode at a time; whole only after ``finish``."""
 
     def __init__(self, folder: Path, spec: DatasetSpec) -> None:
-        """Prepare; nothing is written yet.
-
-        Args:
-            folder: there, and empty.
-            spec: what is the same for all episodes.
-        """
+        """Prepare; nothing is written yet into the folder, which is there and empty."""
         self._folder, self._spec = folder, spec
-        self._video = VideoFiles(
-            folder,
-            fps=spec.fps,
-            height=spec.height,
-            width=spec.width,
-            limit_bytes=spec.video_file_bytes,
-        )
-        self._data = TableFiles(folder, spec.data_file_bytes)
+        self._video, self._data = VideoFiles(folder, spec), TableFiles(folder, spec)
         self._episodes: list[dict[str, Json]] = []
         self._colours = ImageStats()
         self.rows = 0

@@ -5,6 +5,7 @@ LeRobot's reader wants frame k of an episode at ``from_timestamp + k / fps``, wi
 video has one frame every 1/fps exactly, from 0 on.
 """
 
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
@@ -18,8 +19,12 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from mavbridge.core.records import ImageArray
+from policy.contract import StateFrame
 from policy.data import lerobot_format as names
 
+MB = 1024**2
+DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
+"""LeRobot's defaults (``datasets/utils.py``)."""
 FILES_A_CHUNK = 1000
 """LeRobot's ``DEFAULT_CHUNK_SIZE``."""
 MAX_FILE_S = 1000.0
@@ -42,25 +47,32 @@ class VideoSpan(NamedTuple):
     to_s: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class DatasetSpec:
+    """What is the same for all episodes."""
+
+    fps: int
+    height: int
+    """Size of the images, even, as ``width``."""
+    width: int
+    state_frame: StateFrame
+    task: str
+    """In words, for policies that read them."""
+    data_file_bytes: int = DATA_FILE_MB * MB
+    video_file_bytes: int = VIDEO_FILE_MB * MB
+    """Size of a file; one episode alone may be larger."""
+
+
 class VideoFiles:
-    """Encodes episodes one after the other, H.264, yuv420p."""
+    """Encodes episodes one after the other, H.264, yuv420p.
 
-    def __init__(
-        self, folder: Path, *, fps: int, height: int, width: int, limit_bytes: int
-    ) -> None:
-        """Prepare; nothing is written yet.
+    Methods raise OSError or FFmpegError where a file cannot be written.
+    """
 
-        Args:
-            folder: the dataset.
-            fps: frames a second of all files.
-            height: of the frames, even.
-            width: of the frames, even.
-            limit_bytes: size of a file; one episode alone may be larger.
-        """
+    def __init__(self, folder: Path, spec: DatasetSpec) -> None:
+        """Prepare; nothing is written yet."""
         self._folder = folder
-        self._fps = fps
-        self._size = (height, width)
-        self._limit_bytes = limit_bytes
+        self._spec = spec
         self._container: OutputContainer | None = None
         self._stream: VideoStream | None = None
         self._file = -1
@@ -71,25 +83,18 @@ class VideoFiles:
         self._all_frames = self._all_bytes = 0
 
     def begin(self, frames: int) -> None:
-        """Begin an episode of so many frames, in a new file where this one would grow too large.
-
-        Raises:
-            OSError, FFmpegError: it cannot be written.
-        """
+        """Begin an episode of so many frames, in a new file where this one would grow too large."""
         expected = self._bytes + frames * self._all_bytes / max(self._all_frames, 1)
-        is_full = expected >= self._limit_bytes or self._frames + frames > MAX_FILE_S * self._fps
-        if self._container is None or (is_full and self._frames > 0):
+        is_large = expected >= self._spec.video_file_bytes
+        is_long = self._frames + frames > MAX_FILE_S * self._spec.fps
+        if self._container is None or ((is_large or is_long) and self._frames > 0):
             self._next_file()
         self._first = self._frames
 
     def append(self, rgb: ImageArray) -> None:
-        """Encode a frame [H, W, 3] uint8.
-
-        Raises:
-            OSError, FFmpegError: it cannot be written.
-        """
+        """Encode a frame [H, W, 3] uint8."""
         frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
-        frame.pts, frame.time_base = self._frames, Fraction(1, self._fps)
+        frame.pts, frame.time_base = self._frames, Fraction(1, self._spec.fps)
         if self._frames == self._first:
             frame.pict_type = av.video.frame.PictureType.I  # an episode is decoded by itself
         self._mux(frame)
@@ -99,14 +104,11 @@ class VideoFiles:
     def end(self) -> VideoSpan:
         """End the episode; where it is."""
         chunk, file = divmod(self._file, FILES_A_CHUNK)
-        return VideoSpan(chunk, file, self._first / self._fps, self._frames / self._fps)
+        fps = self._spec.fps
+        return VideoSpan(chunk, file, self._first / fps, self._frames / fps)
 
     def close(self) -> None:
-        """Finish the file.
-
-        Raises:
-            OSError, FFmpegError: it cannot be written.
-        """
+        """Finish the file."""
         if self._container is not None:
             try:
                 self._mux(None)
@@ -120,10 +122,10 @@ class VideoFiles:
         self._frames = self._bytes = 0
         path = _path(self._folder, names.VIDEO, self._file)
         self._container = av.open(str(path), "w", options={"movflags": "faststart"})
-        stream = self._container.add_stream("libx264", self._fps)
-        stream.height, stream.width = self._size
+        stream = self._container.add_stream("libx264", self._spec.fps)
+        stream.height, stream.width = self._spec.height, self._spec.width
         stream.pix_fmt, stream.options = "yuv420p", dict(_OPTIONS)
-        stream.codec_context.time_base = Fraction(1, self._fps)
+        stream.codec_context.time_base = Fraction(1, self._spec.fps)
         self._stream = stream
 
     def _mux(self, frame: av.VideoFrame | None) -> None:
@@ -139,18 +141,14 @@ class VideoFiles:
 class TableFiles:
     """Tables of the rows, one row group an episode."""
 
-    def __init__(self, folder: Path, limit_bytes: int) -> None:
-        self._folder, self._limit_bytes = folder, limit_bytes
+    def __init__(self, folder: Path, spec: DatasetSpec) -> None:
+        self._folder, self._limit_bytes = folder, spec.data_file_bytes
         self._writer: pq.ParquetWriter | None = None
         self._paths: list[Path] = []
         self._bytes = 0
 
     def append(self, table: pa.Table) -> tuple[int, int]:
-        """Write an episode; its chunk and file.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write an episode; its chunk and file."""
         if self._writer is None or self._bytes + table.nbytes >= self._limit_bytes:
             self.close()
             self._paths.append(_path(self._folder, names.DATA, len(self._paths)))

@@ -9,23 +9,10 @@ from shutil import rmtree
 
 from av.error import FFmpegError
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress, TaskID
 
-from mavbridge.commands.export.dataset import (
-    DATA_FILE_MB,
-    MB,
-    VIDEO_FILE_MB,
-    DatasetSpec,
-    DatasetWriter,
-    even_size,
-)
+from mavbridge.commands.export.dataset import DatasetWriter, even_size
+from mavbridge.commands.export.files import DATA_FILE_MB, MB, VIDEO_FILE_MB, DatasetSpec
 from mavbridge.commands.export.rows import Stretch, common_fps, stretches, worst_shift_ns
 from mavbridge.config.export import ExportConfig
 from mavbridge.core.clock import NS_PER_MS
@@ -62,9 +49,11 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         raise UserError("nothing to export: these demonstrations all failed")
     if failed := len(folders) - len(exemplary):
         console.print(f"left out: {failed} of {len(folders)} flights, demonstrations that failed")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    progress = Progress(*columns, TimeRemainingColumn(), console=console)
-    with stop_on_signals() as stop, progress, _whole_or_nothing(config.out) as folder:
+    with (
+        stop_on_signals() as stop,
+        Progress(console=console) as progress,
+        _whole_or_nothing(config.out) as folder,
+    ):
 
         def advance(task: TaskID) -> None:
             if stop.is_set():

@@ -100,7 +100,10 @@ def captured_ns(frame: RolloutFrame) -> int:
 
 
 class RolloutOutput(ABC):
-    """Takes segments; used by the loop's thread."""
+    """Takes segments; used by the loop's thread.
+
+    Methods raise ``MavbridgeError`` if something, now or before, could not be written.
+    """
 
     def __init__(
         self,
@@ -121,9 +124,6 @@ class RolloutOutput(ABC):
             decode_video: whether there is to be a video; the rows are written in any case.
             clock: for deadlines and stamps.
             on_frame: observes every frame.
-
-        Raises:
-            MavbridgeError: the files cannot be made, or the writer process does not start.
         """
         self._out = out
         self._plan = plan
@@ -165,22 +165,11 @@ class RolloutOutput(ABC):
 
     @abstractmethod
     def put(self, segment: Segment) -> None:
-        """Take the next segment; may block.
-
-        Raises:
-            MavbridgeError: what came before could not be written.
-        """
+        """Take the next segment; may block."""
 
     @abstractmethod
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Write everything and close the files.
-
-        Args:
-            on_wait: called now and then meanwhile.
-
-        Raises:
-            MavbridgeError: it could not all be written.
-        """
+        """Write everything and close the files; ``on_wait`` is called now and then meanwhile."""
 
     @abstractmethod
     def close(self) -> None:
@@ -234,11 +223,7 @@ class SerialOutput(RolloutOutput):
             self._show(frame, rgb if self._decode_video else None)
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Write everything.
-
-        Raises:
-            RolloutError: it could not all be written.
-        """
+        """Write everything."""
         with self._sampler.meter.write, writing(self._out):
             table = TableWriter(self._out, SCHEMA)
             try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 from rich.text import Text
 
 import policy
@@ -119,15 +119,15 @@ def run_rollout(
     """
     done = 0
     try:
-        with stop_on_signals() as stop, _progress_bar(console) as bar:
-            task = bar.add_task("", total=plan.iterations * plan.frames, status="")
+        with stop_on_signals() as stop, Progress(console=console) as bar:
+            task = bar.add_task("imagining", total=plan.iterations * plan.frames)
 
             def refresh() -> None:
                 status = (
-                    f"iteration {done}/{plan.iterations}  decode queue {output.decode_queue}  "
-                    f"writer queue {output.writer_queue}"
+                    f"iteration {done}/{plan.iterations}, to decode {output.decode_queue}, "
+                    f"to write {output.writer_queue}"
                 )
-                bar.update(task, completed=output.frames, status=status)
+                bar.update(task, completed=output.frames, description=status)
 
             for segment in rollout(sampler, decider, start, plan):
                 output.put(segment)
@@ -147,17 +147,6 @@ def run_rollout(
     except BaseException:
         output.close()
         raise
-
-
-def _progress_bar(console: Console) -> Progress:
-    return Progress(
-        TextColumn("imagining"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total} frames"),
-        TextColumn("{task.fields[status]}"),
-        TimeRemainingColumn(),
-        console=console,
-    )
 
 
 def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> WorldModel:

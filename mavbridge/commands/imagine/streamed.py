@@ -150,11 +150,7 @@ class StreamedOutput(RolloutOutput):
         return None if self._video is None else self._video.pid
 
     def put(self, segment: Segment) -> None:
-        """Queue a segment; waits while the queue is full.
-
-        Raises:
-            MavbridgeError: the thread has failed, or is stuck.
-        """
+        """Queue a segment; waits while the queue is full."""
         frames = self._rows(segment)
         missing = None
         if self._video is not None:
@@ -187,11 +183,7 @@ class StreamedOutput(RolloutOutput):
                 raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Work off the queue, close the files, and compare their lengths.
-
-        Raises:
-            MavbridgeError: it could not all be written.
-        """
+        """Work off the queue, close the files, and compare their lengths."""
         with self._sampler.meter.decode:
             self._enqueue(None, on_wait)
             self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)

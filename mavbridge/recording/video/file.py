@@ -34,6 +34,7 @@ _OPTIONS: dict[str, object] = {
     "g": str(GOP_FRAMES),
 }
 _FRAGMENTED = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
+WRITE_ERRORS = (OSError, FFmpegError)
 _BOX_HEADER_BYTES = 8
 _BUFFER_BYTES = 1 << 20
 """More than a fragment: it is written in one call, which a kill cannot tear."""
@@ -44,7 +45,7 @@ class VideoError(MavbridgeError):
 
 
 class FragmentedMp4:
-    """A video file that grows by a frame at a time."""
+    """A video file that grows by a frame at a time; methods may raise ``WRITE_ERRORS``."""
 
     def __init__(self, path: Path, *, height: int, width: int, hz: float) -> None:
         """Create the file.
@@ -54,9 +55,6 @@ class FragmentedMp4:
             height: of every frame; even.
             width: of every frame; even.
             hz: nominal frame rate; the frames' own stamps decide.
-
-        Raises:
-            OSError: it exists, or cannot be written.
         """
         self._file: BinaryIO = path.open("xb", buffering=_BUFFER_BYTES)
         self._container: OutputContainer = av.open(
@@ -76,9 +74,6 @@ class FragmentedMp4:
         Args:
             rgb: [H, W, 3] uint8.
             captured_ns: its time; one that is not after the last frame's is moved behind it.
-
-        Raises:
-            OSError, FFmpegError: it cannot be written.
         """
         if self._first_ns is None:
             self._first_ns = captured_ns
@@ -90,20 +85,12 @@ class FragmentedMp4:
         self._last_pts = pts
 
     def close(self) -> None:
-        """Write what is left and close the file, also after an error.
-
-        Raises:
-            OSError, FFmpegError: it cannot be written.
-        """
+        """Write what is left and close the file, also after an error."""
         try:
             self._container.mux(self._stream.encode(None))
             self._container.close()
         finally:
             self._file.close()
-
-
-WRITE_ERRORS = (OSError, FFmpegError)
-"""What ``FragmentedMp4`` raises."""
 
 
 def count_frames(path: Path) -> int:

@@ -42,11 +42,7 @@ class FrameRing:
 
     @classmethod
     def create(cls, height: int, width: int) -> "FrameRing":
-        """Acquire the memory, in the producer.
-
-        Raises:
-            OSError: there is not enough.
-        """
+        """Acquire the memory, in the producer; OSError if there is not enough."""
         frame_bytes = height * width * 3
         slots = max(MIN_SLOTS, min(MAX_SLOTS, MAX_BYTES // frame_bytes))
         memory = SharedMemory(create=True, size=slots * frame_bytes)
@@ -62,11 +58,7 @@ class FrameRing:
 
     @classmethod
     def attach(cls, shape: RingShape) -> "FrameRing":
-        """Map the memory, in the consumer.
-
-        Raises:
-            OSError: it is gone.
-        """
+        """Map the memory, in the consumer; OSError if it is gone."""
         return cls(SharedMemory(name=shape.name), shape)
 
     def slot(self, index: int) -> ImageArray:

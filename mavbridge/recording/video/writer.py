@@ -45,7 +45,10 @@ class WriterDiedError(WriterError):
 
 
 class FrameSender:
-    """Frames into the ring, and the writer's messages out of the pipe; used by one thread."""
+    """Frames into the ring, and the writer's messages out of the pipe; used by one thread.
+
+    Methods raise ``WriterError`` if the writer failed or died, now or before.
+    """
 
     def __init__(
         self, pipe: "Connection[ToWriter, FromWriter]", process: BaseProcess, pressure: Pressure
@@ -85,9 +88,6 @@ class FrameSender:
 
         Returns:
             Whether it was taken.
-
-        Raises:
-            WriterError: the writer failed or died, now or before.
         """
         self._offered += 1
         self.receive()
@@ -124,11 +124,7 @@ class FrameSender:
         return ring
 
     def finish(self) -> None:
-        """Wait until every frame is on disk and the files are closed.
-
-        Raises:
-            WriterError: they are not all there.
-        """
+        """Wait until every frame is on disk and the files are closed."""
         self._send(Notice.FINISH)
         self._wait_until(lambda: Notice.DONE in self._notices)
 
@@ -141,11 +137,7 @@ class FrameSender:
             raise self._died() from None
 
     def _wait_until(self, condition: Callable[[], bool], timeout_s: float = STALL_S) -> None:
-        """Receive until the condition holds.
-
-        Raises:
-            WriterError: the writer failed, died, or was silent for that long.
-        """
+        """Receive until the condition holds; a writer that is silent for that long has hung."""
         while not condition():
             if not wait([self._pipe, self._process.sentinel], timeout_s):
                 self._failure = WriterDiedError(f"the writer process has hung for {timeout_s:g} s")
@@ -156,11 +148,7 @@ class FrameSender:
                     raise self._died()
 
     def receive(self) -> None:
-        """Take in the messages that have come.
-
-        Raises:
-            WriterError: the writer failed, or died.
-        """
+        """Take in the messages that have come."""
         try:
             while not self._failure and Notice.DONE not in self._notices and self._pipe.poll():
                 self._handle(self._pipe.recv())
@@ -216,9 +204,6 @@ class VideoWriter(FrameSender):
             hz: nominal frame rate.
             rows: path and stem of a frames table to make, or None.
             with_truth: the table has the columns of ``FrameTruth``.
-
-        Raises:
-            WriterError: it does not start.
         """
         job = VideoJob(video=video, hz=hz, rows=rows, with_truth=with_truth)
         # Not fork: threads and an engine run here.
@@ -253,11 +238,7 @@ class VideoWriter(FrameSender):
             self.close()
 
     def finish(self) -> None:
-        """Wait until every frame is on disk and the files are closed, and end the process.
-
-        Raises:
-            WriterError: they are not all there.
-        """
+        """Wait until every frame is on disk and the files are closed, and end the process."""
         try:
             super().finish()
         finally:

@@ -7,13 +7,21 @@ import numpy as np
 import pytest
 
 from mavbridge.commands.export import files
-from mavbridge.commands.export.files import VideoFiles, VideoSpan
+from mavbridge.commands.export.files import DatasetSpec, VideoFiles, VideoSpan
 
 FPS = 10
 
 
 def write(folder: Path, lengths: list[int], limit_bytes: int = 10**9) -> list[VideoSpan]:
-    video = VideoFiles(folder, fps=FPS, height=32, width=32, limit_bytes=limit_bytes)
+    spec = DatasetSpec(
+        fps=FPS,
+        height=32,
+        width=32,
+        state_frame="ned_frd",
+        task="fly",
+        video_file_bytes=limit_bytes,
+    )
+    video = VideoFiles(folder, spec)
     spans = []
     random = np.random.default_rng(0)
     for length in lengths:
