@@ -16,9 +16,9 @@ class ExportConfig:
     out: Path
     """Folder for the dataset, new or empty."""
     task: str = "fly"
-    """What the flights do, in words, for policies that read them."""
+    """What the flights do, in words, for policies that are given a task."""
 
     def __post_init__(self) -> None:
-        """Refuse a task that says nothing."""
+        """Refuse an empty task."""
         if not self.task.strip():
             raise UserError("--task must say something")

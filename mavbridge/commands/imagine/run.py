@@ -94,11 +94,7 @@ def make_output(
     clock: Clock,
     on_frame: OnFrame = ignore_frame,
 ) -> RolloutOutput:
-    """The serial form or the streamed one; the arguments are those of ``RolloutOutput``.
-
-    Raises:
-        MavbridgeError: the files cannot be made.
-    """
+    """Make the serial form or the streamed one; the arguments are those of ``RolloutOutput``."""
     kind = SerialOutput if serial else StreamedOutput
     return kind(out, sampler, plan, decode_video=decode_video, clock=clock, on_frame=on_frame)
 
@@ -150,12 +146,7 @@ def run_rollout(
 
 
 def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> WorldModel:
-    """Load a world model onto its device.
-
-    Args:
-        world_model: weights; None = those that come with mavbridge.
-        ddim_steps: number of DDIM steps it will be asked for.
-        device: name of a torch device.
+    """Load a world model, by default the one that comes with mavbridge, onto a torch device.
 
     Raises:
         UserError: none comes with mavbridge, or there is no such device.

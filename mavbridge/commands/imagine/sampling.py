@@ -99,13 +99,9 @@ class Sampler:
     def __init__(
         self, model: WorldModel, *, ddim_steps: int, decode_all: bool, clock: Clock
     ) -> None:
-        """Adapt a model.
+        """Adapt a model, which is on its device already.
 
-        Args:
-            model: on its device.
-            ddim_steps: DDIM steps of every sample.
-            decode_all: decode every sample's frames at once, as the serial way does.
-            clock: measures the meter's times.
+        ``decode_all`` decodes every sample's frames at once, as the serial way does.
         """
         self.model = model
         self.config: WorldModelConfig = model.config

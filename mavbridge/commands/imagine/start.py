@@ -120,7 +120,7 @@ def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
 class RealFrames:
     """What the flight's camera really saw after the start, at the world model's times and size.
 
-    Decodes forward only, and keeps no more than a window, so that it serves segments that overlap.
+    Decodes forward only; keeps as many frames as one segment has, since segments overlap.
     """
 
     def __init__(self, flight: RecordedFlight, config: WorldModelConfig, newest_ns: int) -> None:
@@ -129,8 +129,9 @@ class RealFrames:
         self._config = config
         self._newest_ns = newest_ns
         self._decoded = 0
-        self._window: deque[tuple[int, ImageArray]] = deque(maxlen=config.frames)
-        """(step, image), the newest last."""
+        self._newest_step = 0
+        self._window: deque[ImageArray] = deque(maxlen=config.frames)
+        """Images of consecutive steps, up to the newest."""
 
     def at(self, step: int) -> ImageArray | None:
         """The frame ``step`` times ``frame_dt_s`` after the start; None once the flight is over.
@@ -139,16 +140,15 @@ class RealFrames:
             ValueError: it has left the window: steps may go back by one segment at most.
             VideoError: the video is damaged.
         """
-        next_step = self._window[-1][0] + 1 if self._window else 1
-        for missing in range(next_step, step + 1):
-            rgb = self._decode(missing)
+        while self._newest_step < step:
+            rgb = self._decode(self._newest_step + 1)
             if rgb is None:
                 return None
-            self._window.append((missing, rgb))
-        for known, rgb in self._window:
-            if known == step:
-                return rgb
-        raise ValueError(f"step {step} has left the window")
+            self._newest_step += 1
+            self._window.append(rgb)
+        if self._newest_step - step >= len(self._window):
+            raise ValueError(f"step {step} has left the window")
+        return self._window[step - self._newest_step - 1]
 
     def _decode(self, step: int) -> ImageArray | None:
         at_ns = self._newest_ns + round(step * self._config.frame_dt_s * NS_PER_S)
@@ -161,4 +161,4 @@ class RealFrames:
             self._decoded += 1
         # Two steps share a frame only where the camera is slower than the world model.
         size = self._config.image_size
-        return self._window[-1][1] if rgb is None else resize(rgb, size, size)
+        return self._window[-1] if rgb is None else resize(rgb, size, size)

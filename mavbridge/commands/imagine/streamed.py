@@ -41,18 +41,6 @@ PINNED_FRAMES = 4
 _POLL_S = 0.1
 
 
-class PendingLatents:
-    """Latents of frames to decode later, and what on their device must have happened before."""
-
-    def __init__(self, values: Tensor) -> None:
-        """Must be made in the thread, and on the stream, that made the values [N, C, h, w]."""
-        self.values = values
-        self.ready: torch.cuda.Event | None = None
-        if values.is_cuda:
-            self.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self.ready.record(torch.cuda.current_stream(values.device))
-
-
 class FrameDecoder:
     """Latents to images, one frame at a time, since the loop wants the processor, too.
 
@@ -70,20 +58,23 @@ class FrameDecoder:
             self._ring = torch.empty(shape, dtype=torch.uint8, pin_memory=True)
             self._views: NDArray[np.uint8] = self._ring.numpy()
 
-    def frames(self, latents: PendingLatents) -> Iterator[ImageArray]:
-        """Images [H, W, 3] in order, each to be used before the next is asked for."""
+    def frames(self, latents: Tensor, ready: torch.cuda.Event | None) -> Iterator[ImageArray]:
+        """Images [H, W, 3] of latents [N, C, h, w], each to be used before the next is taken.
+
+        ``ready`` is what must have happened on a GPU before the latents may be read.
+        """
         if self._stream is None:
-            for latent in latents.values:
+            for latent in latents:
                 with torch.inference_mode():
                     pixels = self._model.decode(latent[None])
                 yield pixels[0].cpu().numpy()
             return
         under_way: deque[tuple[int, torch.cuda.Event]] = deque()
-        if latents.ready is not None:
-            self._stream.wait_event(latents.ready)
+        if ready is not None:
+            self._stream.wait_event(ready)
         # Freed by the loop's stream, the memory must not be given away before this one is done.
-        latents.values.record_stream(self._stream)
-        for row, latent in enumerate(latents.values):
+        latents.record_stream(self._stream)
+        for row, latent in enumerate(latents):
             if len(under_way) == PINNED_FRAMES:  # a slot is free once its frame was used
                 yield self._arrived(*under_way.popleft())
             slot = row % PINNED_FRAMES
@@ -94,8 +85,7 @@ class FrameDecoder:
     def _launch(self, latent: Tensor, slot: int, stream: torch.cuda.Stream) -> torch.cuda.Event:
         with torch.inference_mode(), torch.cuda.stream(stream):
             self._ring[slot].copy_(self._model.decode(latent[None])[0], non_blocking=True)
-            event = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            event.record(stream)
+            event: torch.cuda.Event = stream.record_event()
         return event
 
     def _arrived(self, slot: int, event: torch.cuda.Event) -> ImageArray:
@@ -110,8 +100,10 @@ class _Job:
 
     frames: list[RolloutFrame]
     decoded: dict[int, ImageArray]
-    missing: PendingLatents | None
+    missing: Tensor | None
     """Latents of the frames that are not decoded yet, in order; None: no video is wanted."""
+    ready: torch.cuda.Event | None
+    """What must have happened on a GPU before they may be read."""
 
 
 class StreamedOutput(RolloutOutput):
@@ -152,12 +144,14 @@ class StreamedOutput(RolloutOutput):
     def put(self, segment: Segment) -> None:
         """Queue a segment; waits while the queue is full."""
         frames = self._rows(segment)
-        missing = None
+        missing = ready = None
         if self._video is not None:
-            rows = [row for row in range(len(frames)) if row not in segment.decoded]
-            missing = PendingLatents(segment.latents[rows])
+            missing = segment.latents[[k for k in range(len(frames)) if k not in segment.decoded]]
+            if missing.is_cuda:
+                ready = torch.cuda.current_stream(missing.device).record_event()
+        job = _Job(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
         with self._sampler.meter.decode:
-            self._enqueue(_Job(frames=frames, decoded=segment.decoded, missing=missing))
+            self._enqueue(job)
 
     def _enqueue(self, job: _Job | None, on_wait: Callable[[], None] = lambda: None) -> None:
         def was_put() -> bool:
@@ -222,7 +216,9 @@ class StreamedOutput(RolloutOutput):
         # Rows first: after a crash there may be rows without a frame, but no frame without a row.
         with writing(self._table_path):
             self._table.append(rows_batch(job.frames))
-        images = iter(()) if job.missing is None else self._decoder.frames(job.missing)
+        images: Iterator[ImageArray] = iter(())
+        if job.missing is not None:
+            images = self._decoder.frames(job.missing, job.ready)
         for frame in job.frames:
             if stop.is_set():
                 return
