@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
-from helpers.recordings import make_meta
+from helpers.recordings import make_meta, without_writer_process
 from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
 from mavbridge.commands.imagine.loop import RolloutPlan, Segment, rollout
 from mavbridge.commands.imagine.output import OnFrame, SerialOutput
@@ -23,8 +23,6 @@ from mavbridge.core.records import FloatArray, ImageArray, Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
-from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.video.file import FragmentedMp4
 from policy.contract import Contract, Executable
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
@@ -37,30 +35,6 @@ TINY = WorldModelConfig(
     dynamics_width=32,
     dynamics_depth=1,
 )
-
-
-class InProcessWriter:
-    """Stands in for ``VideoWriter`` where its process is not what is tested: it takes seconds."""
-
-    def __init__(self, video: Path, *, pressure: str, hz: float) -> None:
-        assert pressure == "offline"
-        self._file = FragmentedMp4(video, height=SIZE, width=SIZE, hz=hz)
-        self._is_closed = False
-        self.written = self.lost = 0
-
-    def submit(self, rgb: ImageArray, row: FrameRow) -> bool:
-        assert row.frame_id == self.written
-        self._file.append(rgb, row.captured_ns)
-        self.written += 1
-        return True
-
-    def finish(self) -> None:
-        self.close()
-
-    def close(self) -> None:
-        if not self._is_closed:
-            self._is_closed = True
-            self._file.close()
 
 
 class TinyWorld(WorldModel):
@@ -192,7 +166,8 @@ def write_flight(
 ) -> Path:
     """A recorded flight: frame k is of ``grey(k)``, tick j has velocity x = j / 100."""
     folder.mkdir(parents=True, exist_ok=True)
-    writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
+    with without_writer_process():
+        writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
     writer_ticks = round(100 * seconds) if ticks else 0
     for index in range(writer_ticks):
         at_ns = START_NS + index * TICK_NS
