@@ -22,7 +22,7 @@ class ImagineConfig:
     out: Path
     """Video to write (.mp4), new; its rows go beside it (.parquet)."""
     decider: DeciderName = "world-model"
-    """Who chooses the sticks: the world model itself, or toge, the policy of --checkpoint."""
+    """Source of the sticks: the world model itself, or toge, the policy of --checkpoint."""
     world_model: Path | None = None
     """Weights of the world model; by default those that come with mavbridge."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)

@@ -8,5 +8,5 @@
 
 ``FlightWriter`` alone, in the offline mode, records what need not fly in real time
 (demonstrations); ``VideoWriter`` alone makes one video of frames from anywhere (rollouts).
-``open_flight`` reads it all back, after a crash as well. The loops import nothing of this.
+``open_flight`` reads it all back, after a crash as well. The loops do not import this package.
 """

@@ -31,7 +31,7 @@ class RecordedFlight:
         return read_ticks(self.ticks)
 
     def frame_rows(self) -> Iterator[FrameRow]:
-        """What is known of each image besides its pixels."""
+        """The row of each image."""
         return read_frames(self.frames)
 
     def images(self) -> Iterator[ImageArray]:

@@ -27,7 +27,7 @@ FLUSH_ROWS = 256
 
 
 class FlightWriter:
-    """Writes as the flight goes on; ``finish`` closes it in order.
+    """Writes during the flight; ``finish`` closes it in order.
 
     Methods raise OSError or WriterError where it cannot be written. After that only ``finish`` and
     ``close`` may follow; what was written before stays readable.
@@ -54,7 +54,7 @@ class FlightWriter:
         self._folder = folder
         self.meta = meta
         self.video_failure: WriterDiedError | None = None
-        """Why there are no more frames, though the rest goes on."""
+        """Reason why no more frames are recorded, while the rest is."""
         self._schema = DEMONSTRATION_TICKS if with_labels else TICKS_SCHEMA
         self._rows: list[TickRow] = []
         self._flushed_ns = meta.start_ns
@@ -72,7 +72,7 @@ class FlightWriter:
         try:
             write_meta(folder, meta)
             self._table = TableWriter(folder / TICKS, self._schema)
-            # Whatever the first conversion has to import is imported now and not in flight.
+            # The first conversion imports modules: now, and not in flight.
             self._table.append(ticks_batch([], self._schema))
             if wall_offset_ns is not None:
                 self._tlog = TlogWriter(folder / TLOG, wall_offset_ns=wall_offset_ns)

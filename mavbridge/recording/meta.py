@@ -13,7 +13,7 @@ from policy.errors import ContractError
 
 FORMAT = "mavbridge-flight"
 VERSION = 1
-Source = Literal["flight", "demonstration", "dagger", "imagined"]
+FlightSource = Literal["flight", "demonstration", "dagger", "imagined"]
 
 
 class FlightError(MavbridgeError):
@@ -22,14 +22,14 @@ class FlightError(MavbridgeError):
 
 @dataclass(frozen=True, kw_only=True)
 class FlightMeta:
-    """What is known of a flight as a whole; None = not known, or not known yet."""
+    """Facts about a flight as a whole; None = not known, or not known yet."""
 
     started_at: str
     """ISO 8601, UTC."""
     start_ns: int
     """The same moment, on the clock of all stamps."""
     mavbridge_version: str
-    source: Source
+    source: FlightSource
     policy: str | None
     engine: str | None
     mode: Literal["dual", "single"]
@@ -46,7 +46,7 @@ class FlightMeta:
     course_seed: int | None = None
     seed: int | None = None
     finished: bool = False
-    """Whether the recording was closed in order."""
+    """The recording was closed in order."""
     ticks: int | None = None
     frames: int | None = None
     """Number of rows, of ticks and of frames; known at the end."""
@@ -125,7 +125,7 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
         meta = FlightMeta(**known)
     except (TypeError, ContractError) as error:
         raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error
-    if meta.source not in get_args(Source) or meta.mode not in ("dual", "single"):
+    if meta.source not in get_args(FlightSource) or meta.mode not in ("dual", "single"):
         raise FlightError(f"{folder / META}: source {meta.source!r}, mode {meta.mode!r}")
     for name in ("start_ns", "action_hz", "visual_hz"):
         value = getattr(meta, name)

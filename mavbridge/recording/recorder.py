@@ -68,7 +68,7 @@ class Recorder:
         return self._observer.dropped + self._consumer.frames_lost + self._packets.dropped
 
     def summary(self) -> str:
-        """Where the recording is and how it went, in one line, for a person."""
+        """One line for a person: the folder, what it holds and what it lacks."""
         writer = self._consumer.writer
         failure = self._observer.failure or writer.video_failure
         if failure is None and not self.dropped:

@@ -37,7 +37,7 @@ class FrameTruth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameRow:
-    """What is known of a frame besides its pixels."""
+    """Facts about a frame besides its pixels."""
 
     frame_id: int
     captured_ns: int
@@ -49,7 +49,7 @@ class FrameRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TickLabels:
-    """What a demonstration knows of a tick beyond the flight."""
+    """Labels of a tick in a demonstration."""
 
     expert: Sticks | None
     """Sticks that the expert would hold here, without the disturbance that was flown."""

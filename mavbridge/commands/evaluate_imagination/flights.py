@@ -1,4 +1,4 @@
-"""What is evaluated: windows of frames, evenly spaced over recorded flights."""
+"""Windows of frames to evaluate, evenly spaced over recorded flights."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence

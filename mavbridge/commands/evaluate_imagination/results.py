@@ -1,4 +1,4 @@
-"""What an evaluation of a world model found: frozen values, their JSON, and tables of them."""
+"""Results of an evaluation of a world model: frozen values, their JSON, and tables of them."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -20,7 +20,7 @@ RateSource = Literal["real states", "imagined states", "imagined states, sticks 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameQuality:
-    """How like the real frames those of one method are, so many steps ahead: mean of windows."""
+    """Likeness of one method's frames to the real ones, so many steps ahead: mean of windows."""
 
     method: Method
     step: int
@@ -29,7 +29,7 @@ class FrameQuality:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickFollowing:
-    """How imagined body rates follow those of the vehicle, which obeyed the same sticks.
+    """Imagined body rates against those of the vehicle, which obeyed the recorded sticks.
 
     Slope and rank correlation of 1 are perfect. With the sticks of another window both are near 0
     in a model that follows its sticks, and as high as with its own in one that ignores them.
@@ -57,7 +57,7 @@ class DriftIteration:
 
 @dataclass(frozen=True, kw_only=True)
 class Given:
-    """What was evaluated, and on what."""
+    """Settings of the evaluation and its flights."""
 
     world_model: str
     ddim_steps: int

@@ -45,7 +45,7 @@ def evaluate_imagination(flights: Sequence[Path], config: EvaluateImaginationCon
         config: the settings.
 
     Raises:
-        MavbridgeError: for whatever a person can have caused.
+        MavbridgeError: every failure that a user can have caused.
     """
     if config.json is not None:
         require_folder(config.json)
@@ -137,7 +137,7 @@ class _Evaluation:
         return scorer, flights
 
     def _score_chains(self, episodes: list[Episode]) -> tuple[DriftIteration, ...]:
-        """Of the longest chains that any flight has room for, so that all iterations compare."""
+        """Score the longest chains that any flight has room for: all iterations compare."""
         for iterations in range(ITERATIONS, 0, -1):
             steps = (iterations - 1) * self._exe_steps + self._model.frames
             windows, _ = choose_windows(

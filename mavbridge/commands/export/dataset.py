@@ -49,7 +49,7 @@ class DatasetWriter:
         return len(self._episodes)
 
     def add(self, part: Stretch, images: Iterable[ImageArray]) -> int:
-        """Append an episode; the number of its rows.
+        """Append an episode; returns the number of its rows.
 
         Args:
             part: its rows.
@@ -113,7 +113,7 @@ class DatasetWriter:
         }
 
     def _episode_row(self, count: int, table: pa.Table) -> dict[str, Json]:
-        """Write the rows; what ``meta/episodes`` says of the episode but for its statistics."""
+        """Write the rows; returns those columns of ``meta/episodes`` that are no statistics."""
         span = self._video.end()
         chunk, file = self._data.append(table)
         video = f"videos/{names.CAMERA_KEY}/"

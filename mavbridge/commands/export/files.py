@@ -39,7 +39,7 @@ _OPTIONS: dict[str, object] = {
 
 
 class VideoSpan(NamedTuple):
-    """Where the frames of an episode are."""
+    """Place of the frames of an episode."""
 
     chunk_index: int
     file_index: int
@@ -49,7 +49,7 @@ class VideoSpan(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetSpec:
-    """What is the same for all episodes."""
+    """Properties that all episodes share."""
 
     fps: int
     height: int
@@ -79,7 +79,7 @@ class VideoFiles:
         self._frames = self._bytes = 0
         """Contents of the file."""
         self._first = 0
-        """Where in the file the episode begins."""
+        """Frame of the file with which the episode begins."""
         self._all_frames = self._all_bytes = 0
 
     def begin(self, frames: int) -> None:
@@ -102,7 +102,7 @@ class VideoFiles:
         self._all_frames += 1
 
     def end(self) -> VideoSpan:
-        """End the episode; where it is."""
+        """End the episode; returns its place."""
         chunk, file = divmod(self._file, FILES_A_CHUNK)
         fps = self._spec.fps
         return VideoSpan(chunk, file, self._first / fps, self._frames / fps)
@@ -148,7 +148,7 @@ class TableFiles:
         self._bytes = 0
 
     def append(self, table: pa.Table) -> tuple[int, int]:
-        """Write an episode; its chunk and file."""
+        """Write an episode; returns its chunk and file."""
         if self._writer is None or self._bytes + table.nbytes >= self._limit_bytes:
             self.close()
             self._paths.append(_path(self._folder, names.DATA, len(self._paths)))

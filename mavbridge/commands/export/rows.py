@@ -32,7 +32,7 @@ MAX_RATE_OFF = 0.2
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive frames of a flight, in each of which somebody flew: one episode of LeRobot."""
+    """Consecutive frames of a flight in each of which it was flown: one episode of LeRobot."""
 
     episode: Episode
     first_frame: int
@@ -56,7 +56,7 @@ class Stretch:
 
 
 def stretches(episode: Episode) -> list[Stretch]:
-    """Align a flight to its frames, and cut out those that nobody flew.
+    """Align a flight to its frames, and leave out those without a state or sticks.
 
     Args:
         episode: from ``policy.data.flight_folders.read_flight``.

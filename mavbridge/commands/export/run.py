@@ -25,7 +25,7 @@ from policy.data.flight_folders import find_flights, is_exemplary, read_flight
 
 @dataclass(frozen=True, kw_only=True)
 class ExportSummary:
-    """What was written."""
+    """Counts of what was written."""
 
     episodes: int
     rows: int
@@ -37,10 +37,10 @@ class ExportSummary:
 
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
-    """Export flights as the config says.
+    """Export flights.
 
     Raises:
-        MavbridgeError: for whatever a person can have caused.
+        MavbridgeError: every failure that a user can have caused.
     """
     console = Console(stderr=True, highlight=False, emoji=False)
     folders = find_flights(flights)

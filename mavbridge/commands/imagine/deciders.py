@@ -1,4 +1,4 @@
-"""Who holds the sticks of a rollout, and what a decider sees: the last few steps, and no more."""
+"""Deciders choose the sticks of a rollout; they observe the last few steps, and no more."""
 
 from collections import deque
 from typing import Protocol
@@ -22,7 +22,7 @@ SAMPLES_PER_STEP = 8
 class ObservationQueue:
     """The newest latents, states and images, oldest first, and the sticks that were executed.
 
-    Images are appended by whoever decodes them, one by one: there may be fewer than steps.
+    Images are appended by the loop once they are decoded: there may be fewer than steps.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Decider(Protocol):
     """Chooses the sticks."""
 
     images: int
-    """How many of the newest frames it looks at; for one with 0, none are decoded."""
+    """Number of the newest frames that it uses; with 0, none are decoded for it."""
     contract: Contract
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:

@@ -8,17 +8,17 @@ import numpy as np
 from torch import Tensor
 
 from mavbridge.commands.imagine.deciders import Decider, ObservationQueue
-from mavbridge.commands.imagine.sampling import Imagined, Sampler
+from mavbridge.commands.imagine.sampling import ImaginedSteps, Sampler
 from mavbridge.commands.imagine.start import RolloutStart
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
 
 MAX_SEED = 2**63 - 1
-"""What torch's generators take."""
+"""Largest seed that torch's generators accept."""
 
 
 class NoiseStage(IntEnum):
-    """Who draws noise in an iteration. A number here is part of every seed: never renumber."""
+    """Step of an iteration that draws noise. The number is part of every seed: never renumber."""
 
     DECIDE = 0
     SIMULATE = 1
@@ -40,9 +40,9 @@ class RolloutPlan:
 
     iterations: int
     frames: int
-    """How many of each iteration's imagined frames are shown, from the first on."""
+    """Number of each iteration's imagined frames that are shown, from the first on."""
     exe_steps: int
-    """How many of its actions are executed before the next decision."""
+    """Number of its actions that are executed before the next decision."""
     ddim_steps: int
     seed: int
 
@@ -61,7 +61,7 @@ class RolloutPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """What one iteration shows: ``F`` = ``plan.frames`` imagined steps."""
+    """ImaginedSteps steps of one iteration that are shown: ``F`` = ``plan.frames`` of them."""
 
     iteration: int
     latents: Tensor
@@ -71,7 +71,7 @@ class Segment:
     actions: FloatArray
     """[F, 4], each held until the frame of its row."""
     decoded: dict[int, ImageArray]
-    """Frames [H, W, 3] that somebody needed already, by row."""
+    """Frames [H, W, 3] that have been decoded already, by row."""
 
 
 def rollout(
@@ -117,7 +117,7 @@ def rollout(
 
 
 def _decode_needed(
-    sampler: Sampler, imagined: Imagined, images: int, exe_steps: int
+    sampler: Sampler, imagined: ImaginedSteps, images: int, exe_steps: int
 ) -> dict[int, ImageArray]:
     """The newest executed frames that fit into the decider's queue, by row, in one call."""
     if images == 0 or imagined.pixels is not None:

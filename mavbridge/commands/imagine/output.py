@@ -1,4 +1,4 @@
-"""What becomes of a rollout's segments: ``NAME.mp4``, and ``NAME.parquet`` with a row a frame.
+"""Writes a rollout's segments: ``NAME.mp4``, and ``NAME.parquet`` with a row for each frame.
 
 While it grows, and after a crash, the table is ``NAME.arrows``, as with recorded flights.
 """
@@ -115,7 +115,7 @@ class RolloutOutput(ABC):
         clock: Clock,
         on_frame: OnFrame,
     ) -> None:
-        """Create the files, as far as that is done before the first segment.
+        """Open the output.
 
         Args:
             out: from ``prepare_out``.

@@ -40,7 +40,7 @@ def imagine(config: ImagineConfig) -> int:
     """Imagine a flight; the exit status is 130 if interrupted, with what there was by then.
 
     Raises:
-        MavbridgeError: for whatever a person can have caused.
+        MavbridgeError: every failure that a user can have caused.
     """
     console = Console(stderr=True, highlight=False, emoji=False)
     clock = MonotonicClock()
@@ -108,10 +108,10 @@ def run_rollout(
     out: Path,
     console: Console,
 ) -> bool:
-    """Run every iteration, or those until a signal asks for the end; whether one did.
+    """Run the iterations; returns whether a signal ended them early.
 
     Raises:
-        RolloutError: it could not go on; says what is left.
+        RolloutError: it had to end; the message names what is left.
     """
     done = 0
     try:
@@ -177,7 +177,7 @@ def _make_decider(
                 "decides: add --decider toge, or leave it out"
             )
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
-    # One image, one chunk, as in flight; warm starts are for a policy that is asked 100 times a s.
+    # One image, one chunk, as in flight; warm starts are for a policy that runs at 100 Hz.
     loaded = load_configured_policy(replace(config.policy, dual_rate=True, head_steps=None), clock)
     for note in loaded.notes:
         console.print(Text(note, style="yellow" if note.startswith("warning") else "dim"))
@@ -188,7 +188,7 @@ def _make_decider(
 def _viewer(
     config: ImagineConfig, flight: RecordedFlight, sampler: Sampler, start: RolloutStart
 ) -> Iterator[OnFrame]:
-    """The Rerun view of every frame, if one was asked for."""
+    """Open the Rerun view, if one was requested; yields its callback."""
     if config.rerun == "off":
         yield ignore_frame
         return

@@ -66,7 +66,7 @@ class Stopwatch:
 
 
 class Meter:
-    """How long the loop's own thread spends where; written by that thread alone."""
+    """Time that the loop's own thread spends in each part; written by that thread alone."""
 
     def __init__(self, clock: Clock) -> None:
         self.sample = Stopwatch(clock)
@@ -80,7 +80,7 @@ class Meter:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Imagined:
+class ImaginedSteps:
     """One sample of the world model."""
 
     latents: Tensor
@@ -124,7 +124,7 @@ class Sampler:
 
     def sample(
         self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
-    ) -> Imagined:
+    ) -> ImaginedSteps:
         """Decide (actions None) or simulate.
 
         Args:
@@ -152,7 +152,7 @@ class Sampler:
                 "the world model imagined NaN or infinity: its weights are damaged, or it has left "
                 "what it was trained on; try more --ddim-steps, or another checkpoint"
             )
-        return Imagined(
+        return ImaginedSteps(
             latents=imagined.latents[0],
             states=sampled_states,
             actions=sampled_actions,

@@ -1,4 +1,4 @@
-"""Where a rollout starts: the first frames, states and sticks of a recorded flight."""
+"""Start of a rollout: the first frames, states and sticks of a recorded flight."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ class RolloutStart:
     newest_ns: int
     """Exposure of the newest frame, on the flight's clock."""
     sent: tuple[tuple[int, Sticks | None], ...]
-    """What was sent before it, and when; None = released."""
+    """Sticks sent before it, each with its time; None = released."""
 
 
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
@@ -118,7 +118,7 @@ def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
 
 
 class RealFrames:
-    """What the flight's camera really saw after the start, at the world model's times and size.
+    """Images of the flight's camera after the start, at the world model's times and size.
 
     Decodes forward only; keeps as many frames as one segment has, since segments overlap.
     """

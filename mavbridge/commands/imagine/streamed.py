@@ -61,7 +61,7 @@ class FrameDecoder:
     def frames(self, latents: Tensor, ready: torch.cuda.Event | None) -> Iterator[ImageArray]:
         """Images [H, W, 3] of latents [N, C, h, w], each to be used before the next is taken.
 
-        ``ready`` is what must have happened on a GPU before the latents may be read.
+        On a GPU the latents may be read after the event ``ready``.
         """
         if self._stream is None:
             for latent in latents:
@@ -95,7 +95,7 @@ class FrameDecoder:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Job:
+class _DecodeJob:
     """A segment on its way to the thread."""
 
     frames: list[RolloutFrame]
@@ -103,7 +103,7 @@ class _Job:
     missing: Tensor | None
     """Latents of the frames that are not decoded yet, in order; None: no video is wanted."""
     ready: torch.cuda.Event | None
-    """What must have happened on a GPU before they may be read."""
+    """Event of the GPU after which they may be read."""
 
 
 class StreamedOutput(RolloutOutput):
@@ -112,7 +112,7 @@ class StreamedOutput(RolloutOutput):
     def _open(self) -> None:
         """Create the files, start the writer process and the thread."""
         self._decoder = FrameDecoder(self._sampler.model)
-        self._jobs: queue.Queue[_Job | None] = queue.Queue(QUEUED_SEGMENTS)
+        self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
         self._table_path = self._out.with_suffix(".arrows")
         self._video: VideoWriter | None = None
         with writing(self._table_path):
@@ -149,11 +149,11 @@ class StreamedOutput(RolloutOutput):
             missing = segment.latents[[k for k in range(len(frames)) if k not in segment.decoded]]
             if missing.is_cuda:
                 ready = torch.cuda.current_stream(missing.device).record_event()
-        job = _Job(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
+        job = _DecodeJob(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
         with self._sampler.meter.decode:
             self._enqueue(job)
 
-    def _enqueue(self, job: _Job | None, on_wait: Callable[[], None] = lambda: None) -> None:
+    def _enqueue(self, job: _DecodeJob | None, on_wait: Callable[[], None] = lambda: None) -> None:
         def was_put() -> bool:
             if not self._worker.is_alive:
                 self._worker.join(END_S)  # raises what the thread has raised
@@ -212,7 +212,7 @@ class StreamedOutput(RolloutOutput):
                     return
                 self._write(job, stop)
 
-    def _write(self, job: _Job, stop: Event) -> None:
+    def _write(self, job: _DecodeJob, stop: Event) -> None:
         # Rows first: after a crash there may be rows without a frame, but no frame without a row.
         with writing(self._table_path):
             self._table.append(rows_batch(job.frames))

@@ -25,7 +25,7 @@ CRF = "20"
 GOP_FRAMES = 30
 """A second between key frames."""
 TIME_BASE = Fraction(1, 90_000)
-"""What players expect of video; the exact stamps are in the table."""
+"""Usual time base of video; the exact stamps are in the table."""
 _OPTIONS: dict[str, object] = {
     "preset": "veryfast",
     "tune": "zerolatency",  # a frame in, a packet out
@@ -106,7 +106,7 @@ def count_frames(path: Path) -> int:
 
 
 def _frame_ends(path: Path) -> list[int]:
-    """Where in the file each whole frame ends, in bytes."""
+    """Offsets in the file, in bytes, at which its whole frames end."""
     ends, at, size_bytes = [], 0, path.stat().st_size
     with path.open("rb") as file:
         while at + _BOX_HEADER_BYTES <= size_bytes:

@@ -10,14 +10,14 @@ from mavbridge.recording.tables import READ_ERRORS, TableWriter
 from mavbridge.recording.video.file import WRITE_ERRORS, FragmentedMp4
 
 FILE_ERRORS = (*WRITE_ERRORS, *READ_ERRORS)
-"""What ``FrameFiles`` raises."""
+"""Errors that ``FrameFiles`` raises."""
 FLUSH_NS = 500_000_000
 """Longest span of frames whose rows may wait."""
 FLUSH_ROWS = 64
 
 
 class VideoJob(NamedTuple):
-    """What is to be written."""
+    """Files to write."""
 
     video: Path
     """Fragmented MP4; must not exist."""

@@ -1,7 +1,7 @@
 """Frames from one process to another through shared memory: a fixed number of slots.
 
-The two processes say over their pipe who may use which slot, and its messages order the accesses: a
-slot belongs to the producer until ``Submit`` names it, and again from ``Written`` on.
+Messages over the pipe of the two processes pass the slots on and order the accesses: a slot belongs
+to the producer until ``Submit`` names it, and again from ``Written`` on.
 """
 
 import os
@@ -20,7 +20,7 @@ MAX_BYTES = 32 << 20
 
 
 class RingShape(NamedTuple):
-    """What the other process needs to find the frames."""
+    """Name and layout of the memory, for the other process."""
 
     name: str
     slots: int
@@ -69,13 +69,13 @@ class FrameRing:
         return frame
 
     def unlink(self) -> None:
-        """Take the memory's name away, in the producer: nothing stays, whoever is killed."""
+        """Remove the name, in the producer: the memory is freed even if both are killed."""
         if self._is_linked:
             self._is_linked = False
             self._memory.unlink()
 
     def close(self) -> None:
-        """Unmap, and in the producer take the name away. May be called twice."""
+        """Unmap, and in the producer remove the name. May be called twice."""
         self._frames = None
         self._memory.close()
         self.unlink()

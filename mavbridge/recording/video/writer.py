@@ -28,7 +28,7 @@ from mavbridge.recording.video.writer_process import (
 )
 
 Pressure = Literal["online", "offline"]
-"""What a full ring does. online: the frame is dropped and counted. offline: the producer waits."""
+"""With a full ring, online drops and counts the frame, and offline makes the producer wait."""
 
 START_S = 30.0
 STALL_S = 30.0
@@ -132,7 +132,7 @@ class FrameSender:
         """Cannot block: no more messages are under way than there are slots."""
         try:
             self._pipe.send(message)
-        except OSError:  # it is gone: its last message, or else its exit status, says why
+        except OSError:  # it has ended: its last message, or else its exit status, is the reason
             self.receive()
             raise self._died() from None
 

@@ -21,20 +21,20 @@ NICENESS = 10
 
 
 class Submit(NamedTuple):
-    """To the writer: this slot holds a frame."""
+    """Message to the writer: this slot holds a frame."""
 
     slot: int
     row: FrameRow
 
 
 class Written(NamedTuple):
-    """From the writer: the frame of this slot is in the file; the slot is free."""
+    """Message from the writer: the frame of this slot is in the file; the slot is free."""
 
     slot: int
 
 
 class Failed(NamedTuple):
-    """From the writer: it cannot go on; it closes what it has, and ends."""
+    """Message from the writer: it has failed; it closes its files, and ends."""
 
     reason: str
 
@@ -43,13 +43,13 @@ class Notice(Enum):
     """A message without contents."""
 
     FINISH = auto()
-    """To the writer: that was all."""
+    """Sent to the writer: there are no more frames."""
     READY = auto()
-    """From the writer: it runs."""
+    """Sent by the writer: it runs."""
     MAPPED = auto()
-    """From the writer: it has mapped the memory, whose name is not needed any more."""
+    """Sent by the writer: it has mapped the memory, whose name is not needed any more."""
     DONE = auto()
-    """From the writer: everything is closed."""
+    """Sent by the writer: everything is closed."""
 
 
 ToWriter: TypeAlias = RingShape | Submit | Notice
@@ -88,7 +88,7 @@ class WriterService:
             return
 
     def serve(self, timeout_s: float) -> None:
-        """Wait for one message and do what it says."""
+        """Wait for one message and handle it."""
         try:
             if not self._pipe.poll(timeout_s):
                 self._files.flush()
