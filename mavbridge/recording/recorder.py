@@ -5,7 +5,7 @@ these are full, and an error ends the recording alone, with one warning.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mavbridge.core.observers import ObserverThread
@@ -78,22 +78,16 @@ class Recorder:
         return f"recorded in {self._folder}, not completely: {lacks}"
 
 
+@dataclass
 class _FlightConsumer:
     """Runs on the recorder's thread; may raise OSError and WriterError."""
 
-    def __init__(
-        self,
-        writer: FlightWriter,
-        packets: PacketSource,
-        autopilot: Callable[[], str],
-        report: Callable[[str], None],
-    ) -> None:
-        self.writer = writer
-        self._packets = packets
-        self._autopilot = autopilot
-        self._report = report
-        self._seen_frames = 0
-        self._has_failed = False
+    writer: FlightWriter
+    packets: PacketSource
+    autopilot: Callable[[], str]
+    report: Callable[[str], None]
+    _seen_frames: int = 0
+    _has_failed: bool = False
 
     @property
     def frames_lost(self) -> int:
@@ -104,7 +98,7 @@ class _FlightConsumer:
         """Write one batch, and the packets that came meanwhile."""
         seen_frames = self._seen_frames
         try:
-            self.writer.packets(self._packets.drain())
+            self.writer.packets(self.packets.drain())
             for event in batch:
                 self._write(event)
         except BaseException:
@@ -121,18 +115,18 @@ class _FlightConsumer:
         self.writer.frame(event)
         failure = self.writer.video_failure
         if failure is not None and not had_failed:
-            self._report(f"recording no more images: {failure}; the rest is still recorded")
+            self.report(f"recording no more images: {failure}; the rest is still recorded")
 
     def close(self) -> None:
         """Finish in order, or after an error leave things as they are."""
         if self._has_failed:
             self.writer.close()
             return
-        self.writer.packets(self._packets.drain())
+        self.writer.packets(self.packets.drain())
         self.writer.finish(
             replace(
                 self.writer.meta,
-                autopilot=self._autopilot(),
-                packets_dropped=self._packets.dropped,
+                autopilot=self.autopilot(),
+                packets_dropped=self.packets.dropped,
             )
         )

@@ -182,7 +182,7 @@ class FrameSender:
 
 
 class VideoWriter(FrameSender):
-    """One video, written by a process of its own; used by one thread, and a context manager.
+    """One video, written by a process of its own; used by one thread.
 
     A producer that is killed leaves a whole video: the writer notices and finishes it.
     """
@@ -225,17 +225,6 @@ class VideoWriter(FrameSender):
         except WriterError:
             self.close()
             raise
-
-    def __enter__(self) -> "VideoWriter":
-        """The writer runs already."""
-        return self
-
-    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
-        """Finish, or after an exception only close."""
-        if failure is None:
-            self.finish()
-        else:
-            self.close()
 
     def finish(self) -> None:
         """Wait until every frame is on disk and the files are closed, and end the process."""

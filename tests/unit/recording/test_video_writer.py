@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from multiprocessing import Pipe
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -76,19 +76,21 @@ def test_offline_nothing_is_dropped_and_rows_match_frames(tmp_path: Path) -> Non
 
 
 def test_a_video_alone_needs_no_table(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "rollout.mp4", pressure="offline", hz=10) as video:
+    with closing(VideoWriter(tmp_path / "rollout.mp4", pressure="offline", hz=10)) as video:
         submit(video, 40)  # more than a ring: the writer has mapped it by now
         assert video._ring is not None
         name = video._ring.shape.name
         assert not (Path("/dev/shm") / name).exists(), "nothing stays, whoever is killed"
+        video.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["rollout.mp4"]
     assert [number_of(rgb) for rgb in read_video(tmp_path / "rollout.mp4")] == list(range(40))
 
 
 def test_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "odd.mp4", pressure="offline", hz=10) as video:
+    with closing(VideoWriter(tmp_path / "odd.mp4", pressure="offline", hz=10)) as video:
         video.submit(picture(5, height=49, width=67), make_row(0))
         assert video.size == (48, 66)
+        video.finish()
     (rgb,) = read_video(tmp_path / "odd.mp4")
     assert rgb.shape == (48, 66, 3)
     assert number_of(rgb) == 5
