@@ -13,7 +13,12 @@ from cyclopts import App
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from mavbridge.commands.evaluate_imagination.runs import Run, read_runs, survey, with_images
+from mavbridge.commands.evaluate_imagination.flights import (
+    FlightWindow,
+    choose_windows,
+    read_episode,
+    with_images,
+)
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.commands.output import FIGURE_STYLE
@@ -25,6 +30,8 @@ from policy.contract import ACTION_NAMES
 STEPS = (1, 4, 8, 16)
 DPI = 64
 """A frame is two inches wide."""
+MOST_WINDOWS = 1_000_000
+"""All of a flight."""
 app = App(help=__doc__)
 
 
@@ -44,39 +51,40 @@ def main(flight: Path, *, out: Path, at: float = 0.5, world_model: Path | None =
     model = load_model(world_model, ddim_steps=4, device="cpu")
     sampler = Sampler(model, ddim_steps=4, decode_all=False, clock=MonotonicClock())
     config = sampler.config
-    found = survey(flight, config, exe_steps=1, iterations=1)
-    if found is None:
+    every, _ = choose_windows(
+        [read_episode(flight, config)], config, steps=config.frames, count=MOST_WINDOWS
+    )
+    if not every:
         least_s = config.frames * config.frame_dt_s
         raise UserError(f"{flight} is too short: name one that is longer than {least_s:g} s")
-    rows = np.array([round(at * (found.windows - 1))])
+    chosen = every[round(at * (len(every) - 1))]
     steps = range(config.context_frames + config.frames)
-    runs = read_runs(flight, config, config.frames, rows)
-    run, images = next(with_images(runs, steps, config.image_size))
-    draw(strip(sampler, run, images), config.frame_dt_s, out)
+    window, images = next(with_images([chosen], steps, config.image_size))
+    draw(strip(sampler, window, images), config.frame_dt_s, out)
 
 
 def strip(
-    sampler: Sampler, run: Run, images: Mapping[int, ImageArray]
+    sampler: Sampler, window: FlightWindow, images: Mapping[int, ImageArray]
 ) -> dict[str, list[ImageArray]]:
     """Rows of frames at ``STEPS`` by name."""
     now = sampler.config.context_frames - 1
-    turned: FloatArray = run.actions.copy()
+    turned: FloatArray = window.actions.copy()
     turned[:, ACTION_NAMES.index("yaw")] = 1.0
     return {
         "real": [images[now + step] for step in STEPS],
-        "imagined": imagine(sampler, run, images, run.actions),
+        "imagined": imagine(sampler, window, images, window.actions),
         "copy last": [images[now]] * len(STEPS),
-        "yaw full right": imagine(sampler, run, images, turned),
+        "yaw full right": imagine(sampler, window, images, turned),
     }
 
 
 def imagine(
-    sampler: Sampler, run: Run, images: Mapping[int, ImageArray], actions: FloatArray
+    sampler: Sampler, window: FlightWindow, images: Mapping[int, ImageArray], actions: FloatArray
 ) -> list[ImageArray]:
     """The frames at ``STEPS`` that follow from sticks [frames, 4]."""
     context = sampler.config.context_frames
     past = sampler.encode(np.stack([images[step] for step in range(context)]))[None]
-    imagined = sampler.sample(past, run.states[None, :context], actions, seed=0)
+    imagined = sampler.sample(past, window.states[None, :context], actions, seed=0)
     return list(sampler.decode(imagined.latents[[step - 1 for step in STEPS]]))
 
 

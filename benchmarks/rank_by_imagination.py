@@ -21,14 +21,12 @@ from cyclopts import App
 from numpy.typing import NDArray
 
 from mavbridge.commands.bench.tables import make_table
-from mavbridge.commands.evaluate_imagination.metrics import spearman
-from mavbridge.commands.imagine.deciders import Decider, PolicyDecider
-from mavbridge.commands.imagine.loop import rollout
-from mavbridge.commands.imagine.observation import ObservationQueue
-from mavbridge.commands.imagine.plan import RolloutPlan
+from mavbridge.commands.evaluate_imagination.scores import spearman
+from mavbridge.commands.imagine.deciders import Decider, ObservationQueue, PolicyDecider
+from mavbridge.commands.imagine.loop import RolloutPlan, rollout
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.commands.imagine.start import Start, read_start
+from mavbridge.commands.imagine.start import RolloutStart, read_start
 from mavbridge.commands.output import print_status, table_console
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
@@ -52,7 +50,7 @@ app = App(help=__doc__)
 class Case:
     """A moment of a demonstration, and the expert's flight from there on."""
 
-    start: Start
+    start: RolloutStart
     position_ned_m: Points
     course: Course
     next_gate: int
@@ -219,7 +217,8 @@ def main(
         ("gates imagined", [float(one.gates) for one in scores]),
         ("small distance from the expert", [-one.end_error_m for one in scores]),
     ):
-        print_status(f"Spearman of real score and {name}: {spearman(real_scores, figures)}")
+        correlation = spearman(np.array(real_scores), np.array(figures))
+        print_status(f"Spearman of real score and {name}: {correlation}")
 
 
 if __name__ == "__main__":

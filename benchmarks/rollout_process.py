@@ -17,10 +17,10 @@ from rich.console import Console
 
 from mavbridge.commands.bench.results import to_json
 from mavbridge.commands.imagine.deciders import WorldModelDecider
-from mavbridge.commands.imagine.plan import RolloutPlan
+from mavbridge.commands.imagine.loop import RolloutPlan
 from mavbridge.commands.imagine.run import load_model, make_output, run_rollout
 from mavbridge.commands.imagine.sampling import Sampler, cores_left_free
-from mavbridge.commands.imagine.start import Start
+from mavbridge.commands.imagine.start import RolloutStart
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import NEUTRAL, ImageArray, RolloutFrame
 from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM
@@ -149,14 +149,14 @@ def make_sampler(job: RolloutJob) -> Sampler:
     return Sampler(model, ddim_steps=job.ddim_steps, decode_all=decode_all, clock=clock)
 
 
-def still_start(config: WorldModelConfig) -> Start:
+def still_start(config: WorldModelConfig) -> RolloutStart:
     """A ramp of greys, level and still: the time that a rollout takes does not depend on it."""
     size, count = config.image_size, config.context_frames
     ramp = np.linspace(0, 255, size, dtype=np.float32).astype(np.uint8)
     images = np.broadcast_to(ramp[None, :, None, None], (count, size, size, 3)).copy()
     states = np.zeros((count, STATE_DIM), np.float32)
     states[:, QUATERNION.start] = 1.0
-    return Start(images=images, states=states, newest_ns=0, sent=((-1, NEUTRAL),))
+    return RolloutStart(images=images, states=states, newest_ns=0, sent=((-1, NEUTRAL),))
 
 
 def peak_rss_mb(pid: int | str) -> float | None:

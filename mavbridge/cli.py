@@ -2,6 +2,7 @@
 
 import difflib
 import os
+import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.export import ExportConfig
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
-from mavbridge.config.imagine import ImagineConfig, ImagineEvaluateConfig
+from mavbridge.config.imagine import EvaluateImaginationConfig, ImagineConfig
 from mavbridge.config.train import TrainConfig
 from mavbridge.core.errors import UserError
 
@@ -62,12 +63,7 @@ def bench(config: BenchConfig | None = None) -> int:
     return run_bench(BenchConfig() if config is None else config)
 
 
-IMAGINE, EVALUATE = "imagine", "--evaluate"
-imagine_cli = App(name=IMAGINE)
-cli.command(imagine_cli)
-
-
-@imagine_cli.default
+@cli.command
 def imagine(config: ImagineConfig) -> int:
     """Let a policy and a world model imagine a flight, from the start of a recorded one."""
     from mavbridge.recording.folder import require_extra
@@ -78,9 +74,9 @@ def imagine(config: ImagineConfig) -> int:
     return run_rollout(config)
 
 
-@imagine_cli.command(name=EVALUATE)
-def imagine_evaluate(*flights: Path, config: ImagineEvaluateConfig | None = None) -> int:
-    """Say how good a world model is, on recorded flights.
+@cli.command
+def evaluate_imagination(*flights: Path, config: EvaluateImaginationConfig | None = None) -> int:
+    """Measure how good a world model is, on recorded flights.
 
     Args:
         flights: flight folders, or folders of them, that the model was not trained on.
@@ -88,12 +84,12 @@ def imagine_evaluate(*flights: Path, config: ImagineEvaluateConfig | None = None
     """
     from mavbridge.recording.folder import require_extra
 
-    require_extra("imagine --evaluate")
+    require_extra("evaluate-imagination")
     if not flights:
-        raise UserError("name the flights to imagine: mavbridge imagine --evaluate DIR...")
-    from mavbridge.commands.evaluate_imagination.run import evaluate_imagination
+        raise UserError("name the flights to imagine: mavbridge evaluate-imagination DIR...")
+    from mavbridge.commands.evaluate_imagination.run import evaluate_imagination as run_evaluation
 
-    return evaluate_imagination(flights, config or ImagineEvaluateConfig())
+    return run_evaluation(flights, config or EvaluateImaginationConfig())
 
 
 @contextmanager
@@ -181,16 +177,16 @@ def with_config(
     if config is not None:
         _check_toml(config)
     cli.config = [] if config is None else [Toml(config, use_commands_as_keys=False)]
-    status: int | None = cli(_command_first(tokens))
+    status: int | None = cli(_renamed(tokens))
     return status or 0
 
 
-def _command_first(tokens: tuple[str, ...]) -> tuple[str, ...]:
-    """``--evaluate`` is a command and looks like a flag: it may come wherever a flag may."""
-    if tokens[:1] != (IMAGINE,) or EVALUATE not in tokens:
+def _renamed(tokens: tuple[str, ...]) -> tuple[str, ...]:
+    """Replace ``imagine --evaluate``, which was the name of a command until version 0.1."""
+    if tokens[:1] != ("imagine",) or "--evaluate" not in tokens:
         return tokens
-    rest = [token for token in tokens[1:] if token != EVALUATE]
-    return IMAGINE, EVALUATE, *rest
+    print("imagine --evaluate is now called evaluate-imagination", file=sys.stderr)  # noqa: T201
+    return ("evaluate-imagination", *(word for word in tokens[1:] if word != "--evaluate"))
 
 
 def _check_command(tokens: tuple[str, ...]) -> None:

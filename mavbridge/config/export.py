@@ -11,14 +11,14 @@ from mavbridge.core.errors import UserError
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig:
-    """One LeRobot dataset made of flights."""
+    """Settings of ``mavbridge export``."""
 
     out: Path
     """Folder for the dataset, new or empty."""
     task: str = "fly"
-    """What the flights do, in words, for policies that read them."""
+    """Task of the flights, in words, for policies that are given one."""
 
     def __post_init__(self) -> None:
-        """Refuse a task that says nothing."""
+        """Refuse an empty task."""
         if not self.task.strip():
-            raise UserError("--task must say something")
+            raise UserError("--task is empty: describe what the flights do")

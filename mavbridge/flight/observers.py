@@ -104,7 +104,7 @@ class FlightObservers:
                 packets=self.packets,
                 wall_offset_ns=offset_ns,
                 autopilot=lambda: link.autopilot,
-                tell=self.screen.show_message,
+                report=self.screen.show_message,
             )
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error

@@ -1,7 +1,7 @@
 """A rollout in the Rerun viewer: imagined and real frames side by side, states and sticks.
 
-Offline, unlike a flight's view: a viewer that does not keep up slows the rollout down, and an error
-of it ends the rollout.
+Unlike a flight's view: a viewer that does not keep up slows the rollout down, and its errors end
+it.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ STATES = {
 
 
 def rollout_blueprint() -> rrb.Blueprint:
-    """What the viewer opens on."""
+    """Layout of the viewer when it opens."""
     plots = [
         rrb.TimeSeriesView(origin=path, name=name, plot_legend=rrb.PlotLegend(corner="LeftTop"))
         for path, name in [(STICKS, "Sticks"), *((path, STATES[path][0]) for path in STATES)]
@@ -60,26 +60,23 @@ class RolloutView:
 
         Args:
             target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
-            real: what the camera really saw at a step, [H, W, 3]; None if it did not.
+            real: gives what the camera really saw at a step, [H, W, 3], or None.
 
         Raises:
-            MavbridgeError: as ``rerun_target.prepare_target``.
+            MavbridgeError: the target cannot be opened.
         """
         self._real = real
         where = prepare_target(target)
-        rr.unregister_shutdown()  # its atexit hook waits for ever for a viewer that stalls
+        rr.unregister_shutdown()  # its exit hook waits forever for a viewer that stalls
         self._recording = rr.RecordingStream("mavbridge-rollout", recording_id=uuid4())
         blueprint = rollout_blueprint()
         if isinstance(where, RrdFile):
             self._recording.save(where.path, default_blueprint=blueprint)
         else:
             self._recording.connect_grpc(where.url, default_blueprint=blueprint)
-        self._name_lines(STICKS, list(ACTION_NAMES))
-        for path, (_, columns) in STATES.items():
-            self._name_lines(path, list(STATE_NAMES[columns]))
-
-    def _name_lines(self, path: str, names: list[str]) -> None:
-        self._recording.log(path, rr.SeriesLines(names=names), static=True, strict=True)
+        names = {path: list(STATE_NAMES[columns]) for path, (_, columns) in STATES.items()}
+        for path, lines in {STICKS: list(ACTION_NAMES), **names}.items():
+            self._recording.log(path, rr.SeriesLines(names=lines), static=True, strict=True)
 
     def show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
         """Send one frame; blocks while the viewer does not keep up. For one thread.
@@ -113,6 +110,6 @@ class RolloutView:
 
 
 def _png(rgb: ImageArray) -> rr.EncodedImage:
-    """Lossless: these images are small, and what is looked at is how good they are."""
+    """Encode without loss: these images are small, and a person judges their quality."""
     _, encoded = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2BGR))
     return rr.EncodedImage(contents=encoded.tobytes(), media_type="image/png")

@@ -8,10 +8,9 @@ from typing import Any
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.folder import FRAMES, TICKS, VIDEO
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
-from mavbridge.recording.rows import FrameRow, TickRow
-from mavbridge.recording.schema import FRAMES as FRAMES_SCHEMA
-from mavbridge.recording.schema import TICKS as TICKS_SCHEMA
-from mavbridge.recording.schema import read_frames, read_ticks
+from mavbridge.recording.rows import FRAMES as FRAMES_SCHEMA
+from mavbridge.recording.rows import TICKS as TICKS_SCHEMA
+from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
 from mavbridge.recording.tables import read_table
 from mavbridge.recording.video.file import count_frames, read_video
 
@@ -32,7 +31,7 @@ class RecordedFlight:
         return read_ticks(self.ticks)
 
     def frame_rows(self) -> Iterator[FrameRow]:
-        """What is known of each image."""
+        """The row of each image."""
         return read_frames(self.frames)
 
     def images(self) -> Iterator[ImageArray]:
@@ -47,7 +46,7 @@ class RecordedFlight:
 def open_flight(folder: Path) -> RecordedFlight:
     """Read the tables of a flight.
 
-    A flight that was cut off (``meta.finished`` is false) is there up to its last whole batch of
+    A flight that was cut off (``meta.finished`` is false) is read up to its last whole batch of
     rows; frames without a row, and rows without a frame, are left out.
 
     Raises:
@@ -55,8 +54,7 @@ def open_flight(folder: Path) -> RecordedFlight:
     """
     meta = read_meta(folder)
     ticks = read_table(folder / TICKS, TICKS_SCHEMA)
-    frames = _frames(folder, meta)
-    return RecordedFlight(folder=folder, meta=meta, ticks=ticks, frames=frames)
+    return RecordedFlight(folder=folder, meta=meta, ticks=ticks, frames=_frames(folder, meta))
 
 
 def _frames(folder: Path, meta: FlightMeta) -> Any:

@@ -8,9 +8,15 @@ from pathlib import Path
 from mavbridge.core.records import Packet, Tick, VisionTick
 from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
 from mavbridge.recording.meta import FlightMeta, write_meta
-from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow
-from mavbridge.recording.schema import DEMONSTRATION_TICKS, ticks_batch
-from mavbridge.recording.schema import TICKS as TICKS_SCHEMA
+from mavbridge.recording.rows import (
+    DEMONSTRATION_TICKS,
+    FrameRow,
+    FrameTruth,
+    TickLabels,
+    TickRow,
+    ticks_batch,
+)
+from mavbridge.recording.rows import TICKS as TICKS_SCHEMA
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.tlog import TlogWriter
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError
@@ -21,10 +27,10 @@ FLUSH_ROWS = 256
 
 
 class FlightWriter:
-    """Writes as the flight goes on; ``finish`` closes it in order.
+    """Writes during the flight; ``finish`` closes it in order.
 
-    After an error of ``tick``, ``frame`` or ``packets``, only ``finish`` and ``close`` may follow.
-    What was written before stays readable.
+    Methods raise OSError or WriterError where it cannot be written. After that only ``finish`` and
+    ``close`` may follow; what was written before stays readable.
     """
 
     def __init__(
@@ -44,19 +50,18 @@ class FlightWriter:
             pressure: "offline" drops nothing, and waits; see ``VideoWriter``.
             with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
             wall_offset_ns: wall time minus the clock of the stamps, for a tlog; None = no tlog.
-
-        Raises:
-            OSError: the folder cannot be written.
-            WriterError: the writer process does not start.
         """
         self._folder = folder
         self.meta = meta
+        self.video_failure: WriterDiedError | None = None
+        """Reason why no more frames are recorded, while the rest is."""
         self._schema = DEMONSTRATION_TICKS if with_labels else TICKS_SCHEMA
         self._rows: list[TickRow] = []
         self._flushed_ns = meta.start_ns
         self._tick_serial = self._frame_serial = -1
         self._ticks_dropped = 0
         self._source_size: tuple[int, int] | None = None
+        self._tlog: TlogWriter | None = None
         self._video = VideoWriter(
             folder / VIDEO,
             pressure=pressure,
@@ -67,25 +72,16 @@ class FlightWriter:
         try:
             write_meta(folder, meta)
             self._table = TableWriter(folder / TICKS, self._schema)
-            # Now and not in flight: whatever the first conversion has to import.
+            # The first conversion imports modules: now, and not in flight.
             self._table.append(ticks_batch([], self._schema))
-            self._tlog = (
-                None
-                if wall_offset_ns is None
-                else TlogWriter(folder / TLOG, wall_offset_ns=wall_offset_ns)
-            )
+            if wall_offset_ns is not None:
+                self._tlog = TlogWriter(folder / TLOG, wall_offset_ns=wall_offset_ns)
         except OSError:
             self._video.close()
             raise
-        self.video_failure: WriterDiedError | None = None
-        """Why there are no more frames, though the rest goes on."""
 
     def tick(self, tick: Tick, labels: TickLabels | None = None) -> None:
-        """Record a tick; serial numbers that were left out count as dropped.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Record a tick; serial numbers that were left out count as dropped."""
         dropped = tick.serial - self._tick_serial - 1
         self._tick_serial = tick.serial
         self._ticks_dropped += dropped
@@ -98,9 +94,6 @@ class FlightWriter:
         """Record a frame; serial numbers that were left out count as dropped.
 
         A writer process that died costs the frames alone: see ``video_failure``.
-
-        Raises:
-            WriterError: it cannot be written.
         """
         self._flush_if_due(vision.ready_ns)
         dropped = vision.serial - self._frame_serial - 1
@@ -122,11 +115,7 @@ class FlightWriter:
             self.video_failure = error
 
     def packets(self, packets: Iterable[Packet]) -> None:
-        """Append to the tlog.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Append to the tlog, if there is one."""
         if self._tlog is not None:
             self._tlog.append(packets)
 
@@ -137,7 +126,7 @@ class FlightWriter:
 
     def _flush(self) -> None:
         if self._rows:
-            # First: rows that could not be written are not tried again.
+            # Cleared first: rows that could not be written are not tried again.
             rows, self._rows = self._rows, []
             self._table.append(ticks_batch(rows, self._schema))
 
@@ -155,14 +144,15 @@ class FlightWriter:
         """Close everything in order; ``meta`` is completed with what was counted here.
 
         A writer that died leaves its table as it was, and ``finished`` false.
-
-        Raises:
-            OSError, WriterError: it could not all be written.
         """
         try:
             self._flush()
             self._table.finish()
-            self._finish_video()
+            if self.video_failure is None:
+                try:
+                    self._video.finish()
+                except WriterDiedError as error:
+                    self.video_failure = error
         except BaseException:
             self.close()
             raise
@@ -170,13 +160,6 @@ class FlightWriter:
             self._tlog.close()
         self.meta = self._completed(meta)
         write_meta(self._folder, self.meta)
-
-    def _finish_video(self) -> None:
-        if self.video_failure is None:
-            try:
-                self._video.finish()
-            except WriterDiedError as error:
-                self.video_failure = error
 
     def _completed(self, meta: FlightMeta) -> FlightMeta:
         is_whole = self.video_failure is None

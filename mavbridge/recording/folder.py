@@ -13,7 +13,7 @@ VIDEO = "camera.mp4"
 TLOG = "link.tlog"
 
 EXTRA = ("av", "pyarrow")
-"""What ``pip install 'mavbridge[record]'`` brings."""
+"""Packages of ``pip install 'mavbridge[record]'``."""
 
 
 def require_extra(what: str) -> None:

@@ -13,7 +13,7 @@ from policy.errors import ContractError
 
 FORMAT = "mavbridge-flight"
 VERSION = 1
-Source = Literal["flight", "demonstration", "dagger", "imagined"]
+FlightSource = Literal["flight", "demonstration", "dagger", "imagined"]
 
 
 class FlightError(MavbridgeError):
@@ -22,14 +22,14 @@ class FlightError(MavbridgeError):
 
 @dataclass(frozen=True, kw_only=True)
 class FlightMeta:
-    """What is known of a flight as a whole; None = not known, or not known yet."""
+    """Facts about a flight as a whole; None = not known, or not known yet."""
 
     started_at: str
     """ISO 8601, UTC."""
     start_ns: int
-    """The same moment on the clock of all stamps."""
+    """The same moment, on the clock of all stamps."""
     mavbridge_version: str
-    source: Source
+    source: FlightSource
     policy: str | None
     engine: str | None
     mode: Literal["dual", "single"]
@@ -37,28 +37,27 @@ class FlightMeta:
     action_hz: float
     visual_hz: float
     image_height: int | None = None
-    """Of the recorded frames; these three are known with the first frame, and written at the
-    end."""
+    """Height of the recorded frames; the four sizes are written at the end."""
     image_width: int | None = None
     source_height: int | None = None
-    """Of the frames as they came: H.264 cannot have an odd last row or column, which is cut off."""
+    """Height of the frames as they came: H.264 cannot have an odd last row, which is cut off."""
     source_width: int | None = None
     contract: Contract | None
     course_seed: int | None = None
     seed: int | None = None
     finished: bool = False
-    """Closed in order."""
+    """The recording was closed in order."""
     ticks: int | None = None
     frames: int | None = None
-    """Rows; known at the end."""
+    """Number of rows, of ticks and of frames; known at the end."""
     ticks_dropped: int | None = None
     frames_dropped: int | None = None
     packets_dropped: int | None = None
-    """Lost on the way to the recording, up to its last row."""
+    """Each of the three counts what was lost before the last row of its file."""
     success: bool | None = None
     gates_passed: int | None = None
     conditions: dict[str, float] = field(default_factory=dict)
-    """What was randomised."""
+    """Physical quantities that were randomised, by name."""
 
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:
@@ -126,7 +125,7 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
         meta = FlightMeta(**known)
     except (TypeError, ContractError) as error:
         raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error
-    if meta.source not in get_args(Source) or meta.mode not in ("dual", "single"):
+    if meta.source not in get_args(FlightSource) or meta.mode not in ("dual", "single"):
         raise FlightError(f"{folder / META}: source {meta.source!r}, mode {meta.mode!r}")
     for name in ("start_ns", "action_hz", "visual_hz"):
         value = getattr(meta, name)

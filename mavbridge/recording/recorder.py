@@ -1,11 +1,11 @@
-"""Records a flight while it flies: a ``TickSink`` whose work is done on a thread of its own.
+"""Records a flight while it flies: a ``TickSink`` that does its work on a thread of its own.
 
 Cannot hurt the flight: events and packets wait in bounded queues, are dropped and counted when
 these are full, and an error ends the recording alone, with one warning.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mavbridge.core.observers import ObserverThread
@@ -30,7 +30,7 @@ class Recorder:
         packets: PacketSource,
         wall_offset_ns: int,
         autopilot: Callable[[], str],
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
         """Create the files, start the writer process and the thread.
 
@@ -39,8 +39,8 @@ class Recorder:
             meta: what is known at the start.
             packets: what the link sends and receives; drained by the recorder's thread.
             wall_offset_ns: wall time minus the clock of the stamps.
-            autopilot: who flew, asked at the end.
-            tell: shows a person a line; for any thread.
+            autopilot: name of the autopilot, called at the end.
+            report: shows a person a line; called from the recorder's thread.
 
         Raises:
             OSError: the folder cannot be written.
@@ -48,7 +48,7 @@ class Recorder:
         """
         self._folder = folder
         writer = FlightWriter(folder, meta, pressure="online", wall_offset_ns=wall_offset_ns)
-        self._consumer = _FlightConsumer(writer, packets, autopilot, tell)
+        self._consumer = _FlightConsumer(writer, packets, autopilot, report)
         self._packets = packets
         self._observer = ObserverThread(
             "mavbridge-recorder", self._consumer, capacity=CAPACITY, image_capacity=IMAGE_CAPACITY
@@ -59,7 +59,7 @@ class Recorder:
         self._observer.emit(event)
 
     def close(self, timeout_s: float) -> None:
-        """Finish the recording, for at most ``timeout_s``; after the link was closed."""
+        """Finish the recording within ``timeout_s``; call it once the link is closed."""
         self._observer.close(timeout_s)
 
     @property
@@ -68,51 +68,37 @@ class Recorder:
         return self._observer.dropped + self._consumer.frames_lost + self._packets.dropped
 
     def summary(self) -> str:
-        """Where the recording is and how it went, in one line, for a person."""
-        failure = self._observer.failure or self._consumer.failure
+        """One line for a person: the folder, what it holds and what it lacks."""
+        writer = self._consumer.writer
+        failure = self._observer.failure or writer.video_failure
         if failure is None and not self.dropped:
-            return f"recorded {self._consumer.counted} in {self._folder}"
+            counted = f"{writer.ticks} ticks and {writer.frames_written} frames"
+            return f"recorded {counted} in {self._folder}"
         lacks = failure or f"{self.dropped} events were dropped, since the machine was too busy"
         return f"recorded in {self._folder}, not completely: {lacks}"
 
 
+@dataclass
 class _FlightConsumer:
-    """The recorder's thread."""
+    """Runs on the recorder's thread; may raise OSError and WriterError."""
 
-    def __init__(
-        self,
-        writer: FlightWriter,
-        packets: PacketSource,
-        autopilot: Callable[[], str],
-        tell: Callable[[str], None],
-    ) -> None:
-        self._writer = writer
-        self._packets = packets
-        self._autopilot = autopilot
-        self._tell = tell
-        self._seen_frames = 0
-        self._has_failed = False
-        self.failure: str | None = None
+    writer: FlightWriter
+    packets: PacketSource
+    autopilot: Callable[[], str]
+    report: Callable[[str], None]
+    _seen_frames: int = 0
+    _has_failed: bool = False
 
     @property
     def frames_lost(self) -> int:
         """Frames that were taken from the queue and are not in the video."""
-        return max(0, self._seen_frames - self._writer.frames_written)
-
-    @property
-    def counted(self) -> str:
-        """What there is, for a person."""
-        return f"{self._writer.ticks} ticks and {self._writer.frames_written} frames"
+        return max(0, self._seen_frames - self.writer.frames_written)
 
     def consume(self, batch: Sequence[Event]) -> None:
-        """Write one batch, and the packets that came meanwhile.
-
-        Raises:
-            OSError, WriterError: the disk does not take it.
-        """
+        """Write one batch, and the packets that came meanwhile."""
         seen_frames = self._seen_frames
         try:
-            self._writer.packets(self._packets.drain())
+            self.writer.packets(self.packets.drain())
             for event in batch:
                 self._write(event)
         except BaseException:
@@ -122,30 +108,25 @@ class _FlightConsumer:
 
     def _write(self, event: Event) -> None:
         if isinstance(event, Tick):
-            self._writer.tick(event)
+            self.writer.tick(event)
             return
         self._seen_frames += 1
-        self._writer.frame(event)
-        if self._writer.video_failure is not None and self.failure is None:
-            self.failure = str(self._writer.video_failure)
-            self._tell(f"recording no more images: {self.failure}; the rest is still recorded")
+        had_failed = self.writer.video_failure is not None
+        self.writer.frame(event)
+        failure = self.writer.video_failure
+        if failure is not None and not had_failed:
+            self.report(f"recording no more images: {failure}; the rest is still recorded")
 
     def close(self) -> None:
-        """Finish in order, or after an error leave things as they are.
-
-        Raises:
-            OSError, WriterError: it could not all be written.
-        """
+        """Finish in order, or after an error leave things as they are."""
         if self._has_failed:
-            self._writer.close()
+            self.writer.close()
             return
-        self._writer.packets(self._packets.drain())
-        self._writer.finish(
+        self.writer.packets(self.packets.drain())
+        self.writer.finish(
             replace(
-                self._writer.meta,
-                autopilot=self._autopilot(),
-                packets_dropped=self._packets.dropped,
+                self.writer.meta,
+                autopilot=self.autopilot(),
+                packets_dropped=self.packets.dropped,
             )
         )
-        if self._writer.video_failure is not None and self.failure is None:
-            self.failure = str(self._writer.video_failure)

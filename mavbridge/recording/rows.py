@@ -1,9 +1,18 @@
-"""What a row of each table holds, as records; the Arrow side is ``schema``."""
+"""Rows of a flight's two tables: as records, as Arrow schemas, and the conversion both ways.
 
-from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+docs/flight_folder.md is the format. A column is named as the attribute that it holds, and a value
+that was not there is null.
+"""
 
-from mavbridge.core.records import Sticks, Tick
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+
+from mavbridge.core.records import Sticks, StickTrace, Tick, VehicleState
+from policy.contract import ACTION_DIM, STATE_DIM
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -28,7 +37,7 @@ class FrameTruth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameRow:
-    """What is known of a frame besides its pixels."""
+    """Facts about a frame besides its pixels."""
 
     frame_id: int
     captured_ns: int
@@ -40,10 +49,10 @@ class FrameRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TickLabels:
-    """What a demonstration knows of a tick beyond the flight."""
+    """Labels of a tick in a demonstration."""
 
     expert: Sticks | None
-    """Sticks that the expert would hold here, free of the disturbance that was flown."""
+    """Sticks that the expert would hold here, without the disturbance that was flown."""
 
 
 class TickRow(NamedTuple):
@@ -53,3 +62,150 @@ class TickRow(NamedTuple):
     dropped_before: int
     """Ticks lost on the way to the recording, just before this one."""
     labels: TickLabels | None = None
+
+
+_STICKS = pa.list_(pa.float32(), ACTION_DIM)
+_VECTOR = pa.list_(pa.float32(), 3)
+_PLAIN = (
+    *("index", "due_ns", "woke_ns", "sent_ns", "missed_slots", "predict_ns", "feature_frame_id"),
+    *("feature_captured_ns", "release_reason", "mode", "armed"),
+)
+"""Columns that hold an attribute of ``Tick`` as it is."""
+_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
+_TRACE = ("raw", "clipped", "slewed", "smoothed")
+_TRUTH = tuple(field.name for field in fields(FrameTruth))
+
+
+def _fields(kind: pa.DataType, *names: str, nullable: bool = True) -> list[pa.Field]:
+    return [pa.field(name, kind, nullable=nullable) for name in names]
+
+
+TICKS = pa.schema(
+    [
+        *_fields(pa.int64(), "index", "due_ns", "woke_ns", "sent_ns", nullable=False),
+        pa.field("missed_slots", pa.int32(), nullable=False),
+        *_fields(pa.int64(), "predict_ns", "feature_frame_id", "feature_captured_ns"),
+        pa.field("state", pa.list_(pa.float32(), STATE_DIM)),
+        *_fields(pa.int64(), *_STAMPS),
+        *_fields(_STICKS, *_TRACE, "sent", "rc_sticks"),
+        pa.field("rc_channels_us", pa.list_(pa.uint16()), nullable=False),
+        *_fields(pa.string(), "release_reason", "mode"),
+        pa.field("armed", pa.bool_(), nullable=False),
+        pa.field("texts", pa.list_(pa.string()), nullable=False),
+        pa.field("dropped_before", pa.int32(), nullable=False),
+    ]
+)
+DEMONSTRATION_TICKS = TICKS.append(pa.field("expert", _STICKS))
+
+FRAMES = pa.schema(
+    [
+        *_fields(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False),
+        pa.field("dropped_before", pa.int32(), nullable=False),
+    ]
+)
+DEMONSTRATION_FRAMES = pa.schema(
+    [
+        *FRAMES,
+        pa.field("position_ned_m", _VECTOR),
+        pa.field("ned_from_body_wxyz", pa.list_(pa.float32(), 4)),
+        pa.field("velocity_ned_mps", _VECTOR),
+        pa.field("next_gate", pa.int32()),
+        pa.field("gate_body_m", _VECTOR),
+        pa.field("gate_yaw_rad", pa.float32()),
+        pa.field("gate_after_body_m", _VECTOR),
+    ]
+)
+"""All columns of the truth are null where it was not given; its position alone never is."""
+
+_ROWS_AT_ONCE = 4096
+
+
+def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
+    """Rows of the ticks table, in their order.
+
+    Args:
+        rows: of consecutive ticks.
+        schema: ``TICKS``, or ``DEMONSTRATION_TICKS`` to keep the labels.
+    """
+    return pa.RecordBatch.from_pylist([_tick_columns(row) for row in rows], schema=schema)
+
+
+def frames_batch(rows: Sequence[FrameRow], schema: pa.Schema) -> pa.RecordBatch:
+    """Rows of the frames table, in their order.
+
+    Args:
+        rows: of consecutive frames.
+        schema: ``FRAMES``, or ``DEMONSTRATION_FRAMES`` to keep the truth.
+    """
+    return pa.RecordBatch.from_pylist(
+        [_attributes(row, tuple(FRAMES.names)) | _attributes(row.truth, _TRUTH) for row in rows],
+        schema=schema,
+    )
+
+
+def _tick_columns(row: TickRow) -> dict[str, object]:
+    tick = row.tick
+    columns = _attributes(tick, (*_PLAIN, "sent", "rc_sticks", "rc_channels_us", "texts"))
+    columns |= _attributes(tick.state, _STAMPS) | _attributes(tick.trace, _TRACE)
+    columns |= _attributes(row.labels, ("expert",))
+    columns["state"] = None if tick.state is None else tick.state.values.tolist()
+    columns["dropped_before"] = row.dropped_before
+    return columns
+
+
+def _attributes(source: object | None, names: Iterable[str]) -> dict[str, object]:
+    return {} if source is None else {name: getattr(source, name) for name in names}
+
+
+def read_ticks(table: pa.Table) -> Iterator[TickRow]:
+    """Records of a ticks table; whole columns are never turned into Python objects at once."""
+    serial = -1
+    has_labels = "expert" in table.column_names
+    for row in _rows(table):
+        serial += 1 + row["dropped_before"]
+        labels = TickLabels(expert=_sticks(row["expert"])) if has_labels else None
+        yield TickRow(_tick(row, serial), row["dropped_before"], labels)
+
+
+def read_frames(table: pa.Table) -> Iterator[FrameRow]:
+    """Records of a frames table."""
+    for row in _rows(table):
+        truth = None
+        if row.get("position_ned_m") is not None:
+            values: dict[str, Any] = {name: row[name] for name in _TRUTH}
+            lists = {name: tuple(v) for name, v in values.items() if isinstance(v, list)}
+            truth = FrameTruth(**(values | lists))
+        yield FrameRow(**{name: row[name] for name in FRAMES.names}, truth=truth)
+
+
+def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
+    for batch in table.to_batches(max_chunksize=_ROWS_AT_ONCE):
+        yield from batch.to_pylist()
+
+
+def _tick(row: dict[str, Any], serial: int) -> Tick:
+    trace = None
+    if row["raw"] is not None:
+        trace = StickTrace(**{name: Sticks(*row[name]) for name in _TRACE})
+    return Tick(
+        serial=serial,
+        state=_state(row),
+        trace=trace,
+        sent=_sticks(row["sent"]),
+        rc_sticks=_sticks(row["rc_sticks"]),
+        rc_channels_us=tuple(row["rc_channels_us"]),
+        texts=tuple(row["texts"]),
+        **{name: row[name] for name in _PLAIN},
+    )
+
+
+def _state(row: dict[str, Any]) -> VehicleState | None:
+    if row["state"] is None:
+        return None
+    values = np.array(row["state"], np.float32)
+    values.setflags(write=False)
+    return VehicleState(values=values, **{name: row[name] for name in _STAMPS})
+
+
+def _sticks(values: list[float] | None) -> Sticks | None:
+    return None if values is None else Sticks(*values)

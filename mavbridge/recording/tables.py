@@ -10,6 +10,8 @@ import pyarrow.parquet as pq
 from mavbridge.core.errors import MavbridgeError
 
 READ_ERRORS = (pa.ArrowException, OSError)
+_GROUP_ROWS = 2_048
+"""Rows of a Parquet row group: twenty seconds of ticks. Encoding 16,384 at once took 27 MB."""
 
 
 class TableError(MavbridgeError):
@@ -17,18 +19,13 @@ class TableError(MavbridgeError):
 
 
 class TableWriter:
-    """Appends batches to ``STEM.arrows``; ``finish`` makes ``STEM.parquet`` of it."""
+    """Appends batches to ``STEM.arrows``; ``finish`` makes ``STEM.parquet`` of it.
+
+    Methods raise OSError where a file cannot be written; what was written before stays readable.
+    """
 
     def __init__(self, stem: Path, schema: pa.Schema) -> None:
-        """Create the file.
-
-        Args:
-            stem: path without a suffix; neither file may exist.
-            schema: of every batch.
-
-        Raises:
-            OSError: it exists, or cannot be written.
-        """
+        """Create the stream; ``stem`` is a path without a suffix, where no stream may exist."""
         self._stream = stem.with_suffix(".arrows")
         self._parquet = stem.with_suffix(".parquet")
         self._stream.open("xb").close()
@@ -37,20 +34,12 @@ class TableWriter:
         self.rows = 0
 
     def append(self, batch: pa.RecordBatch) -> None:
-        """Hand a batch to the kernel.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Hand a batch to the kernel."""
         self._writer.write_batch(batch)
         self.rows += batch.num_rows
 
     def finish(self) -> None:
-        """Close the stream and replace it by Parquet, a batch at a time.
-
-        Raises:
-            OSError: there is no room for it; the stream stays.
-        """
+        """Close the stream and replace it by Parquet; without room for that, the stream stays."""
         self._writer.close()
         self._sink.close()
         to_parquet(self._stream, self._parquet)
@@ -58,10 +47,6 @@ class TableWriter:
     def abandon(self) -> None:
         """Leave the stream as it is, after an error."""
         self._sink.close()
-
-
-_GROUP_ROWS = 2_048
-"""Rows of a Parquet row group: twenty seconds of ticks. Encoding 16,384 at once took 27 MB."""
 
 
 def to_parquet(stream: Path, parquet: Path) -> None:

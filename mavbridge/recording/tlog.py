@@ -1,7 +1,7 @@
 """Telemetry logs as MAVProxy and the ground stations read them.
 
-Every packet with eight bytes in front: Unix time in microseconds, big-endian, whose lowest two
-bits number the link (pymavlink's mavlogfile takes them so); ours is link 0.
+Eight bytes precede every packet: Unix time in microseconds, big-endian. Its lowest two bits are the
+number of the link (pymavlink's mavlogfile reads them so), here always 0.
 """
 
 import struct
@@ -15,36 +15,23 @@ _LINK_MASK = 0b11
 
 
 class TlogWriter:
-    """One ``.tlog`` file."""
+    """One ``.tlog`` file; every method may raise OSError where it cannot be written."""
 
     def __init__(self, path: Path, *, wall_offset_ns: int) -> None:
-        """Create the file.
+        """Create the file, which must not exist.
 
-        Args:
-            path: must not exist.
-            wall_offset_ns: wall time minus the clock of the stamps, taken once: wall time steps.
-
-        Raises:
-            OSError: it exists, or cannot be written.
+        ``wall_offset_ns`` is wall time minus the clock of the stamps, taken once: wall time steps.
         """
         self._file = path.open("xb")
         self._offset_ns = wall_offset_ns
 
     def append(self, packets: Iterable[Packet]) -> None:
-        """Hand packets to the kernel.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Hand packets to the kernel."""
         for packet in sorted(packets, key=lambda packet: packet.stamp_ns):
             stamp_us = (packet.stamp_ns + self._offset_ns) // 1000 & ~_LINK_MASK
             self._file.write(_STAMP.pack(stamp_us) + packet.data)
         self._file.flush()
 
     def close(self) -> None:
-        """Close the file.
-
-        Raises:
-            OSError: what was left cannot be written.
-        """
+        """Close the file."""
         self._file.close()

@@ -1,43 +1,92 @@
-"""A world painted on the sky, seen by a camera that turns, and recorded flights of it."""
+"""A world painted on the sky, and a camera that turns in it: a check of the model's frame warp."""
 
 import math
-from pathlib import Path
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
-from helpers.recordings import make_meta
-from mavbridge.commands.evaluate_imagination.lens import Array, Lens, Mounting, attitudes, make_lens
-from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import ImageArray, Sticks
-from mavbridge.recording.flight_writer import FlightWriter
-from mavbridge.recording.meta import FlightMeta
+from helpers.factories import make_state
+from mavbridge.core.records import ImageArray
+from policy import rotation
+from policy.contract import QUATERNION
 from sitl.rotation import from_euler
 
-NOMINAL = Mounting(horizontal_fov_rad=math.radians(90.0), tilt_up_rad=math.radians(10.0))
-YAW_RATE_RADPS = math.radians(200.0)
-"""Of a full stick in these flights."""
+Array = NDArray[np.float64]
+FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
+NEAREST = 1e-3
+"""Depth of a unit ray: what is beside or behind the camera ends far outside of the image."""
+FOV_RAD, TILT_RAD = math.radians(90.0), math.radians(10.0)
 
 
-def nominal_lens(size: int) -> Lens:
-    return make_lens(make_meta(), size, NOMINAL)
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Fixed to the body; its images are squares, and its pixel centres are integers.
+
+    Camera axes: x right, y down, z along the optical axis.
+    """
+
+    size: int
+
+    @property
+    def focal_px(self) -> float:
+        return self.size / 2 / math.tan(FOV_RAD / 2)
+
+    @property
+    def frd_from_camera(self) -> Array:
+        sine, cosine = math.sin(TILT_RAD), math.cos(TILT_RAD)
+        return np.array([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
+
+    def rays(self) -> Array:
+        """[size, size, 3] in camera axes, of unit depth."""
+        across = (np.arange(self.size) - (self.size - 1) / 2) / self.focal_px
+        x, y = np.meshgrid(across, across)
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+    def look_up(self, image: ImageArray, rays: Array) -> tuple[ImageArray, NDArray[np.bool_]]:
+        """What an image shows in directions [H, W, 3], and which of them lie inside of it."""
+        depth = np.maximum(rays[..., 2], NEAREST)
+        last = self.size - 1
+        u, v = (self.focal_px * rays[..., axis] / depth + last / 2 for axis in (0, 1))
+        is_inside = (u >= 0) & (u <= last) & (v >= 0) & (v <= last) & (rays[..., 2] > NEAREST)
+        seen = cv2.remap(
+            image,
+            np.clip(u, -1, self.size).astype(np.float32),
+            np.clip(v, -1, self.size).astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        return seen.astype(image.dtype, copy=False), is_inside
+
+    def turned(
+        self, image: ImageArray, ned_from_before: Array, ned_from_after: Array
+    ) -> ImageArray:
+        """The image after a turn of the body [3, 3] each, were all things far away."""
+        axes = self.frd_from_camera
+        before_from_after = axes.T @ ned_from_before.T @ ned_from_after @ axes
+        return self.look_up(image, self.rays() @ before_from_after.T)[0]
+
+
+def nominal_lens(size: int) -> PinholeCamera:
+    return PinholeCamera(size)
 
 
 def state_of(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float32]:
     """A state [13] with this attitude."""
     state = make_state().values.copy()
     quaternion = np.array(from_euler(roll_rad, pitch_rad, yaw_rad))
-    state[3:7] = quaternion if quaternion[0] >= 0 else -quaternion
+    state[QUATERNION] = quaternion if quaternion[0] >= 0 else -quaternion
     return state
 
 
 def attitude(roll_rad: float = 0.0, pitch_rad: float = 0.0, yaw_rad: float = 0.0) -> Array:
     """[3, 3] NED from FRD."""
-    return attitudes(state_of(roll_rad, pitch_rad, yaw_rad), "ned_frd")
+    quaternion = state_of(roll_rad, pitch_rad, yaw_rad)[QUATERNION].astype(np.float64)
+    return rotation.rotate(quaternion, np.eye(3)).T
 
 
-def panorama(lens: Lens, ned_from_frd: Array) -> ImageArray:
+def panorama(lens: PinholeCamera, ned_from_frd: Array) -> ImageArray:
     """The view: smooth colours of all directions, all of them far away."""
     ned = lens.rays() @ (ned_from_frd @ lens.frd_from_camera).T
     ned /= np.linalg.norm(ned, axis=-1, keepdims=True)
@@ -45,37 +94,3 @@ def panorama(lens: Lens, ned_from_frd: Array) -> ImageArray:
     phases = np.random.default_rng(1).uniform(0, 2 * np.pi, (3, 12))
     colours = [np.sin(ned @ (5.0 * waves[c]).T + phases[c]).sum(axis=-1) for c in range(3)]
     return np.clip(128 + 25 * np.stack(colours, axis=-1), 0, 255).round().astype(np.uint8)
-
-
-def yaw_stick(at_s: float, phase: float) -> float:
-    return 0.25 * math.sin(3.0 * at_s + phase)
-
-
-def heading_rad(at_s: float, phase: float) -> float:
-    """The integral of the stick times the yaw rate."""
-    return 0.25 * YAW_RATE_RADPS * (math.cos(phase) - math.cos(3.0 * at_s + phase)) / 3.0
-
-
-def write_turning_flight(
-    folder: Path, *, seconds: float = 4.0, size: int = 32, phase: float = 0.0, **meta: object
-) -> Path:
-    """A flight that stands in the air and yaws as its sticks say, at once; 100 and 30 Hz."""
-    folder.mkdir(parents=True, exist_ok=True)
-    told: FlightMeta = make_meta(
-        **{"conditions": {"pilot_yaw_rate_degps": math.degrees(YAW_RATE_RADPS)}, **meta}
-    )
-    writer = FlightWriter(folder, told, pressure="offline")
-    for index in range(round(100 * seconds)):
-        at_ns, at_s = START_NS + index * TICK_NS, index / 100
-        values = state_of(0.0, 0.0, heading_rad(at_s, phase))
-        values[9] = yaw_stick(at_s, phase) * YAW_RATE_RADPS
-        sticks = Sticks(throttle=0.0, yaw=yaw_stick(at_s, phase), pitch=0.0, roll=0.0)
-        state = make_state(at_ns, values=values)
-        writer.tick(make_tick(index, state=state, sent=sticks, sent_ns=at_ns, woke_ns=at_ns))
-    lens = nominal_lens(size)
-    for frame in range(int(30 * (seconds - 0.05))):
-        rgb = panorama(lens, attitude(yaw_rad=heading_rad(frame / 30, phase)))
-        captured_ns = START_NS + round(frame / 30 * NS_PER_S)
-        writer.frame(make_vision_tick(frame + 1, captured_ns=captured_ns, rgb=rgb))
-    writer.finish(writer.meta)
-    return folder

@@ -1,17 +1,22 @@
-"""Flights to record: images that say which one they are, and a meta."""
+"""Flights to record: images that show their number, a meta, and a writer without a process."""
 
 import os
 import signal
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from helpers.factories import START_NS, make_vision_tick
 from mavbridge.core.records import ImageArray, VisionTick
+from mavbridge.recording import flight_writer
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.video.frame_files import FrameFiles, VideoJob
 from policy.contract import Contract
 
 _BITS = 12
@@ -65,6 +70,48 @@ def make_meta(**changes: Any) -> FlightMeta:
         contract=Contract(),
     )
     return replace(meta, **changes)
+
+
+class InProcessWriter:
+    """Stands in for ``VideoWriter`` where its process is not what is tested: it takes a second."""
+
+    pid = None
+    lost = 0
+
+    def __init__(
+        self,
+        video: Path,
+        *,
+        pressure: str,
+        hz: float,
+        rows: Path | None = None,
+        with_truth: bool = False,
+    ) -> None:
+        self._files = FrameFiles(VideoJob(video, hz, rows, with_truth))
+        self._is_open = True
+        self.size: tuple[int, int] | None = None
+        self.written = 0
+
+    def submit(self, rgb: ImageArray, row: FrameRow) -> bool:
+        height, width = self.size = (rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2)
+        self._files.append(rgb[:height, :width], row)
+        self.written += 1
+        return True
+
+    def finish(self) -> None:
+        self.close()
+
+    def close(self) -> None:
+        if self._is_open:
+            self._is_open = False
+            self._files.finish()
+
+
+@contextmanager
+def without_writer_process() -> Iterator[None]:
+    """Meanwhile flights are written by the calling thread."""
+    with patch.object(flight_writer, "VideoWriter", InProcessWriter):
+        yield
 
 
 def send_signal(pid: int, number: signal.Signals) -> None:

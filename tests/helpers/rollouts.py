@@ -10,22 +10,19 @@ import torch
 from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
-from helpers.recordings import make_meta
-from mavbridge.commands.imagine.collected import CollectedOutput
+from helpers.recordings import make_meta, without_writer_process
 from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
-from mavbridge.commands.imagine.loop import Segment, rollout
-from mavbridge.commands.imagine.output import OnFrame, ignore
-from mavbridge.commands.imagine.plan import RolloutPlan
+from mavbridge.commands.imagine.loop import RolloutPlan, Segment, rollout
+from mavbridge.commands.imagine.output import OnFrame, SerialOutput
+from mavbridge.commands.imagine.run import ignore_frame
 from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.commands.imagine.start import Start, read_start
+from mavbridge.commands.imagine.start import RolloutStart, read_start
 from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import FloatArray, ImageArray, Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
-from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.video.file import FragmentedMp4
 from policy.contract import Contract, Executable
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
@@ -38,30 +35,6 @@ TINY = WorldModelConfig(
     dynamics_width=32,
     dynamics_depth=1,
 )
-
-
-class InProcessWriter:
-    """Stands in for ``VideoWriter`` where its process is not what is tested: it takes seconds."""
-
-    def __init__(self, video: Path, *, pressure: str, hz: float) -> None:
-        assert pressure == "offline"
-        self._file = FragmentedMp4(video, height=SIZE, width=SIZE, hz=hz)
-        self._is_closed = False
-        self.written = self.lost = 0
-
-    def submit(self, rgb: ImageArray, row: FrameRow) -> bool:
-        assert row.frame_id == self.written
-        self._file.append(rgb, row.captured_ns)
-        self.written += 1
-        return True
-
-    def finish(self) -> None:
-        self.close()
-
-    def close(self) -> None:
-        if not self._is_closed:
-            self._is_closed = True
-            self._file.close()
 
 
 class TinyWorld(WorldModel):
@@ -105,10 +78,10 @@ def noise_executable(contract: Contract | None = None) -> Executable:
     )
 
 
-def make_start(config: WorldModelConfig = TINY) -> Start:
+def make_start(config: WorldModelConfig = TINY) -> RolloutStart:
     random = np.random.default_rng(0)
     shape = (config.context_frames, config.image_size, config.image_size, 3)
-    return Start(
+    return RolloutStart(
         images=random.integers(0, 255, shape).astype(np.uint8),
         states=np.stack([make_state().values] * config.context_frames),
         newest_ns=START_NS,
@@ -145,7 +118,7 @@ class Finished:
     sha256: str
     model: TinyWorld
     sampler: Sampler
-    output: StreamedOutput | CollectedOutput
+    output: StreamedOutput | SerialOutput
 
 
 def run(
@@ -156,11 +129,11 @@ def run(
     serial: bool = False,
     decode_video: bool = True,
     model: TinyWorld | None = None,
-    on_frame: OnFrame = ignore,
+    on_frame: OnFrame = ignore_frame,
 ) -> Finished:
     model = model or TinyWorld()
     sampler = make_sampler(model, serial=serial, steps=plan.ddim_steps)
-    kind = CollectedOutput if serial else StreamedOutput
+    kind = SerialOutput if serial else StreamedOutput
     output = kind(
         out,
         sampler,
@@ -193,7 +166,8 @@ def write_flight(
 ) -> Path:
     """A recorded flight: frame k is of ``grey(k)``, tick j has velocity x = j / 100."""
     folder.mkdir(parents=True, exist_ok=True)
-    writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
+    with without_writer_process():
+        writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
     writer_ticks = round(100 * seconds) if ticks else 0
     for index in range(writer_ticks):
         at_ns = START_NS + index * TICK_NS
@@ -214,6 +188,6 @@ def grey(frame: int) -> int:
     return 20 + 7 * (frame % 30)
 
 
-def start_of(folder: Path, start_s: float = 0.0, config: WorldModelConfig = TINY) -> Start:
+def start_of(folder: Path, start_s: float = 0.0, config: WorldModelConfig = TINY) -> RolloutStart:
     flight: RecordedFlight = open_flight(folder)
     return read_start(flight, config, start_s)

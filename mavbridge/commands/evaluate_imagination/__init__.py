@@ -1,7 +1,7 @@
-"""``mavbridge imagine --evaluate``: how good a world model is, on flights that it was not shown.
+"""``mavbridge evaluate-imagination``: how good a world model is, on flights that it has not seen.
 
-    flights --choose--> Run (frames, states, sticks) --with_images--> WindowScorer --> tables, JSON
-                                                                      drift.chain --'
+    flights --choose_windows--> FlightWindow (frames, states, sticks) --with_images--> scorers
+                                                              scorers --> results (tables, JSON)
 
 Images and latents of one window are held at a time; of every window some kilobytes of numbers stay.
 """

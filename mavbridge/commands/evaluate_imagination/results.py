@@ -1,42 +1,42 @@
-"""What an evaluation of a world model found: frozen values, and their JSON."""
+"""Results of an evaluation of a world model: frozen values, their JSON, and tables of them."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
 from mavbridge.commands.evaluate.statistics import Estimate
 
-Method = Literal["imagined", "autoencoder only", "copy last", "gyro warp"]
-METHODS: tuple[Method, ...] = ("imagined", "autoencoder only", "copy last", "gyro warp")
-Axis = Literal["yaw", "pitch", "roll"]
+Method = Literal["imagined", "autoencoder only", "copy last"]
+METHODS: tuple[Method, ...] = ("imagined", "autoencoder only", "copy last")
+Axis = Literal["roll", "pitch", "yaw"]
 AXES: tuple[Axis, ...] = ("roll", "pitch", "yaw")
 """In the order of body rates."""
-Teller = Literal["real states", "imagined states", "real frames", "imagined frames"]
-TELLERS: tuple[Teller, ...] = ("real states", "imagined states", "real frames", "imagined frames")
-Reference = Literal["stick", "real states"]
+RateSource = Literal["real states", "imagined states", "imagined states, sticks swapped"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameQuality:
-    """How like the real frames those of one method are, so many steps ahead: means of windows."""
+    """Likeness of one method's frames to the real ones, so many steps ahead: mean of windows."""
 
     method: Method
     step: int
     psnr_db: float
-    ssim: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Obedience:
-    """How one source of body rates follows another; 1 and 1 would be perfect."""
+class StickFollowing:
+    """Imagined body rates against those of the vehicle, which obeyed the recorded sticks.
+
+    Slope and rank correlation of 1 are perfect. With the sticks of another window both are near 0
+    in a model that follows its sticks, and as high as with its own in one that ignores them.
+    """
 
     axis: Axis
-    reference: Reference
-    """stick: times the yaw rate of a full stick, whatever its dead zone and expo. Roll and pitch
-    sticks ask for angles, not rates, in the modes that are flown: no row has them."""
-    teller: Teller
-    """Frames: recovered from pixels, so "real frames" says what that method itself is worth."""
+    source: RateSource
     slope: float | None
     spearman: float | None
     pairs: int
@@ -44,61 +44,120 @@ class Obedience:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriftIteration:
-    """One iteration of all chains, at its last executed frame."""
+    """Frames at the end of one iteration, mean of all chains."""
 
     iteration: int
-    """From 1."""
+    """Counted from 1."""
     chains: int
-    """Imagined."""
-    scored: int
-    """Of them, those whose flight has a real frame there; the PSNRs are of these."""
-    imagined_psnr_db: float | None
-    autoencoder_psnr_db: float | None
-    copy_last_psnr_db: float | None
-    """Of the last frame before the chain began."""
-    left_range: float
-    """Share of the chains whose latents are unlike any real ones."""
+    imagined_psnr_db: float
+    autoencoder_psnr_db: float
+    copy_last_psnr_db: float
+    """PSNR of the last frame before the chain began."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Given:
-    """What was evaluated, and on what."""
+    """Settings of the evaluation and its flights."""
 
     world_model: str
     ddim_steps: int
     seed: int
     frame_dt_s: float
     exe_steps: int
-    """Of a chain's iteration."""
+    """Frames of a chain's iteration."""
     flights: int
-    """That windows were taken from or could have been."""
+    """Flights that are long enough for a window."""
     flights_too_short: int
     demonstrations_failed: int
     """Left out, as in training."""
-    flights_with_assumed_lens: int
-    flights_with_assumed_yaw_rate: int
     asked_windows: int
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quality:
-    """One run of ``mavbridge imagine --evaluate``; less of it if it was interrupted."""
+class ImaginationQuality:
+    """One evaluation; parts of it are empty if it was interrupted."""
 
     given: Given
     windows: int
-    """Scored."""
+    """Number of windows scored."""
     frames: tuple[FrameQuality, ...]
-    obedience: tuple[Obedience, ...]
+    stick_following: tuple[StickFollowing, ...]
     own_actions_nearer: Estimate | None
     """Share of windows whose latents, imagined with the sticks that were sent, are nearer to the
     real ones than those imagined with the sticks of another window."""
     drift: tuple[DriftIteration, ...]
 
-    def of(self, method: Method) -> Sequence[FrameQuality]:
-        """One method, the nearest step first."""
-        return [one for one in self.frames if one.method == method]
 
-
-def to_json(quality: Quality) -> str:
+def to_json(quality: ImaginationQuality) -> str:
     """Everything as JSON."""
     return json.dumps(asdict(quality), indent=2, allow_nan=False) + "\n"
+
+
+def print_quality(quality: ImaginationQuality, console: Console) -> None:
+    """Print what was evaluated, then a table for each part that there is."""
+    given = quality.given
+    console.print(
+        Text(
+            f"{given.world_model}, {given.ddim_steps} DDIM steps, seed {given.seed}: "
+            f"{quality.windows} windows of {given.flights} flights; left out: "
+            f"{given.flights_too_short} too short, {given.demonstrations_failed} demonstrations "
+            "that failed"
+        ),
+        soft_wrap=True,
+    )
+    if quality.frames:
+        console.print(_frames_table(quality))
+        console.print(_following_table(quality))
+    if (nearer := quality.own_actions_nearer) is not None:
+        console.print(
+            Text(
+                f"action swap: with its own sticks {nearer.value:.1%} of {nearer.count} windows "
+                f"(95 % interval {nearer.low:.1%} to {nearer.high:.1%}) come nearer to what "
+                "happened than with another window's; 50 % would be chance"
+            ),
+            soft_wrap=True,
+        )
+    if quality.drift:
+        console.print(_drift_table(quality))
+
+
+def _table(title: str, texts: int, headings: list[str]) -> Table:
+    """A table whose first columns hold text, and the others numbers."""
+    table = Table(title=title)
+    for column, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if column < texts else "right")
+    return table
+
+
+def _frames_table(quality: ImaginationQuality) -> Table:
+    dt_s = quality.given.frame_dt_s
+    steps = sorted({one.step for one in quality.frames})
+    headings = ["", *(f"{step} ({step * dt_s:.1f} s)" for step in steps)]
+    table = _table("frames: PSNR in dB, by frames ahead", 1, headings)
+    for method in METHODS:
+        rows = (one for one in quality.frames if one.method == method)
+        table.add_row(method, *(f"{one.psnr_db:.2f}" for one in rows))
+    return table
+
+
+def _following_table(quality: ImaginationQuality) -> Table:
+    headings = ["axis", "of", "slope", "Spearman", "steps"]
+    table = _table("body rates against the vehicle's: are the sticks followed?", 2, headings)
+    for one in quality.stick_following:
+        numbers = ("-" if v is None else f"{v:.2f}" for v in (one.slope, one.spearman))
+        table.add_row(one.axis, one.source, *numbers, str(one.pairs))
+    return table
+
+
+def _drift_table(quality: ImaginationQuality) -> Table:
+    given = quality.given
+    title = f"drift: chained iterations of {given.exe_steps} frames, PSNR in dB of the last"
+    table = _table(title, 0, ["iteration", *METHODS, "chains"])
+    for one in quality.drift:
+        values = (one.imagined_psnr_db, one.autoencoder_psnr_db, one.copy_last_psnr_db)
+        table.add_row(
+            f"{one.iteration} ({one.iteration * given.exe_steps * given.frame_dt_s:.1f} s)",
+            *(f"{value:.2f}" for value in values),
+            str(one.chains),
+        )
+    return table

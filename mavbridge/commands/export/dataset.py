@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from typing import TypeAlias
@@ -12,71 +11,45 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from mavbridge.commands.export.files import (
+    DATA_FILE_MB,
+    FILES_A_CHUNK,
+    VIDEO_FILE_MB,
+    DatasetSpec,
+    TableFiles,
+    VideoFiles,
+)
 from mavbridge.commands.export.rows import MIN_ROWS, Stretch
-from mavbridge.commands.export.stats import ImageStats, Stats, vector_stats
-from mavbridge.commands.export.video import FILES_A_CHUNK, VideoFiles, VideoSpan
+from mavbridge.commands.export.stats import ImageStats, vector_stats
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
-from policy.contract import ACTION_NAMES, STATE_NAMES, StateFrame
+from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.data import lerobot_format as names
 
-MB = 1024**2
-DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
-"""LeRobot's defaults (``datasets/utils.py``)."""
-
 Json: TypeAlias = "str | int | float | bool | list[Json] | dict[str, Json] | None"
-_Columns: TypeAlias = dict[str, NDArray[np.generic]]
 
-_VECTORS = (names.STATE_KEY, names.ACTION_KEY, names.SENT)
 _ROW_NUMBERS = ("frame_index", "episode_index", "index", "task_index")
-
-
-@dataclass(frozen=True, kw_only=True)
-class DatasetSpec:
-    """What is the same for all episodes."""
-
-    fps: int
-    height: int
-    width: int
-    state_frame: StateFrame
-    task: str
-    """In words, for policies that read them."""
-    data_file_bytes: int = DATA_FILE_MB * MB
-    video_file_bytes: int = VIDEO_FILE_MB * MB
-    """Of a file; one episode alone may be larger."""
 
 
 class DatasetWriter:
     """A dataset that grows by an episode at a time; whole only after ``finish``."""
 
     def __init__(self, folder: Path, spec: DatasetSpec) -> None:
-        """Nothing is written yet.
-
-        Args:
-            folder: there, and empty.
-            spec: what is the same for all episodes.
-        """
+        """Prepare; nothing is written yet into the folder, which is there and empty."""
         self._folder, self._spec = folder, spec
-        self._video = VideoFiles(
-            folder,
-            fps=spec.fps,
-            height=spec.height,
-            width=spec.width,
-            limit_bytes=spec.video_file_bytes,
-        )
-        self._data = _DataFiles(folder, spec.data_file_bytes)
+        self._video, self._data = VideoFiles(folder, spec), TableFiles(folder, spec)
         self._episodes: list[dict[str, Json]] = []
         self._colours = ImageStats()
         self.rows = 0
-        """So far."""
+        """Number of rows so far."""
 
     @property
     def episodes(self) -> int:
-        """So far."""
+        """Number of episodes so far."""
         return len(self._episodes)
 
     def add(self, part: Stretch, images: Iterable[ImageArray]) -> int:
-        """Append an episode; the number of its rows.
+        """Append an episode; returns the number of its rows.
 
         Args:
             part: its rows.
@@ -100,15 +73,21 @@ class DatasetWriter:
             self._video.append(np.ascontiguousarray(image))
             colours.add(image)
             count += 1
-        span = self._video.end()
-        columns = self._columns(part.part(slice(count)))
+        columns = self._columns(part.part(0, count))
         if len(columns["index"]) != count:
             raise ValueError(f"{count} frames, {len(columns['index'])} rows")
-        chunk, file = self._data.append(_table(columns))
-        stats = {name: vector_stats(_wide(values)) for name, values in columns.items()}
+        table = pa.table({name: _arrow(values) for name, values in columns.items()})
+        stats = {name: vector_stats(values) for name, values in columns.items()}
         stats[names.CAMERA_KEY] = colours.stats()
         self._colours.merge(colours)
-        self._episodes.append(self._episode_row(count, span, chunk, file, stats))
+        self._episodes.append(
+            self._episode_row(count, table)
+            | {
+                f"stats/{feature}/{name}": values.tolist()
+                for feature, found in stats.items()
+                for name, values in found.items()
+            }
+        )
         self.rows += count
         return count
 
@@ -120,29 +99,26 @@ class DatasetWriter:
                 f"{self._spec.width}x{self._spec.height}: export them apart"
             )
 
-    def _columns(self, part: Stretch) -> _Columns:
-        """In the order of the features."""
+    def _columns(self, part: Stretch) -> dict[str, NDArray[np.generic]]:
+        """All columns, in the order of the features."""
         count = len(part)
         frame_index = np.arange(count, dtype=np.int64)
-        stamps = (part.captured_ns, part.tick_ns, part.attitude_ns, part.velocity_ns)
         return {
-            names.STATE_KEY: part.state,
-            names.ACTION_KEY: part.action,
-            names.SENT: part.sent,
-            **dict(zip(names.STAMPS, (*stamps, part.action_ns, part.sent_ns), strict=True)),
+            **part.columns,
             "timestamp": (frame_index / self._spec.fps).astype(np.float32),
             "frame_index": frame_index,
-            "episode_index": np.full(count, len(self._episodes), np.int64),
+            "episode_index": np.full(count, self.episodes, np.int64),
             "index": self.rows + frame_index,
             "task_index": np.zeros(count, np.int64),
         }
 
-    def _episode_row(
-        self, count: int, span: VideoSpan, chunk: int, file: int, stats: dict[str, Stats]
-    ) -> dict[str, Json]:
+    def _episode_row(self, count: int, table: pa.Table) -> dict[str, Json]:
+        """Write the rows; returns those columns of ``meta/episodes`` that are no statistics."""
+        span = self._video.end()
+        chunk, file = self._data.append(table)
         video = f"videos/{names.CAMERA_KEY}/"
         return {
-            "episode_index": len(self._episodes),
+            "episode_index": self.episodes,
             "tasks": [self._spec.task],
             "length": count,
             "data/chunk_index": chunk,
@@ -155,15 +131,10 @@ class DatasetWriter:
             f"{video}to_timestamp": span.to_s,
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
-            **{
-                f"stats/{feature}/{name}": values.tolist()
-                for feature, found in stats.items()
-                for name, values in found.items()
-            },
         }
 
     def finish(self) -> None:
-        """Close the files and write what is said of the whole.
+        """Close the files and write what describes the whole.
 
         Raises:
             VideoError: not one episode had images.
@@ -172,14 +143,12 @@ class DatasetWriter:
         self.close()
         if self.rows == 0:
             raise VideoError("nothing to export: not one image of these flights can be decoded")
-        meta = self._folder / names.INFO
-        meta.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(_tasks(self._spec.task), self._folder / names.TASKS)
         episodes = self._folder / names.EPISODES.format(chunk_index=0, file_index=0)
         episodes.parent.mkdir(parents=True)
+        pq.write_table(_tasks(self._spec.task), self._folder / names.TASKS)
         pq.write_table(pa.Table.from_pylist(self._episodes), episodes)
-        _write_json(self._folder / names.STATS, self._stats())
-        _write_json(meta, self._info())
+        self._write_json(names.STATS, self._stats())
+        self._write_json(names.INFO, self._info())
 
     def close(self) -> None:
         """Close the files, after an error as well."""
@@ -189,10 +158,9 @@ class DatasetWriter:
             self._data.close()
 
     def _stats(self) -> dict[str, Json]:
-        """Over all episodes, one feature after the other so that memory holds one."""
-        found: dict[str, Stats] = {}
-        for name in (*_VECTORS, *names.STAMPS, "timestamp", *_ROW_NUMBERS):
-            found[name] = vector_stats(self._data.column(name))
+        """Statistics over all episodes, one feature after the other so that memory holds one."""
+        columns = (name for name in _features(self._spec) if name != names.CAMERA_KEY)
+        found = {name: vector_stats(self._data.column(name)) for name in columns}
         found[names.CAMERA_KEY] = self._colours.stats()
         return {
             feature: {name: values.tolist() for name, values in stats.items()}
@@ -217,47 +185,8 @@ class DatasetWriter:
             "features": _features(spec),
         }
 
-
-class _DataFiles:
-    """The tables of the rows, one row group an episode, in files of a limited size."""
-
-    def __init__(self, folder: Path, limit_bytes: int) -> None:
-        self._folder, self._limit_bytes = folder, limit_bytes
-        self._writer: pq.ParquetWriter | None = None
-        self._paths: list[Path] = []
-        self._bytes = 0
-
-    def append(self, table: pa.Table) -> tuple[int, int]:
-        """Chunk and file that the episode went into."""
-        writer = self._writer
-        if writer is None or self._bytes + table.nbytes >= self._limit_bytes:
-            writer = self._next_file(table.schema)
-        writer.write_table(table)
-        self._bytes += table.nbytes
-        return divmod(len(self._paths) - 1, FILES_A_CHUNK)
-
-    def _next_file(self, schema: pa.Schema) -> pq.ParquetWriter:
-        self.close()
-        chunk, file = divmod(len(self._paths), FILES_A_CHUNK)
-        path = self._folder / names.DATA.format(chunk_index=chunk, file_index=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        writer = self._writer = pq.ParquetWriter(path, schema, compression="snappy")
-        self._paths.append(path)
-        self._bytes = 0
-        return writer
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-
-    def column(self, name: str) -> NDArray[np.generic]:
-        """[rows, D] of all files."""
-        parts = [pq.read_table(path, columns=[name], partitioning=None) for path in self._paths]
-        column = pa.concat_tables(parts)[name].combine_chunks()
-        if not pa.types.is_fixed_size_list(column.type):
-            return _wide(column.to_numpy())
-        return np.asarray(column.flatten().to_numpy()).reshape(-1, column.type.list_size)
+    def _write_json(self, name: str, document: Json) -> None:
+        (self._folder / name).write_text(json.dumps(document, indent=4, allow_nan=False) + "\n")
 
 
 def even_size(rgb: ImageArray) -> tuple[int, int]:
@@ -266,15 +195,7 @@ def even_size(rgb: ImageArray) -> tuple[int, int]:
     return height - height % 2, width - width % 2
 
 
-def _wide(values: NDArray[np.generic]) -> NDArray[np.generic]:
-    return values.reshape(len(values), -1)
-
-
-def _table(columns: _Columns) -> pa.Table:
-    return pa.table({name: _array(values) for name, values in columns.items()})
-
-
-def _array(values: NDArray[np.generic]) -> pa.Array:
+def _arrow(values: NDArray[np.generic]) -> pa.Array:
     if values.ndim == 1:
         return pa.array(values)
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
@@ -301,41 +222,32 @@ def _tasks(task: str) -> pa.Table:
 
 
 def _features(spec: DatasetSpec) -> dict[str, Json]:
-    video: Json = {
-        "video.height": spec.height,
-        "video.width": spec.width,
-        "video.codec": "h264",
-        "video.pix_fmt": "yuv420p",
-        "video.fps": spec.fps,
-        "video.channels": 3,
-        "is_depth_map": False,
-        "has_audio": False,
-    }
     camera: Json = {
         "dtype": "video",
         "shape": [spec.height, spec.width, 3],
         "names": ["height", "width", "channels"],
-        "info": video,
+        "info": {
+            "video.height": spec.height,
+            "video.width": spec.width,
+            "video.codec": "h264",
+            "video.pix_fmt": "yuv420p",
+            "video.fps": spec.fps,
+            "video.channels": 3,
+            "is_depth_map": False,
+            "has_audio": False,
+        },
     }
-    sticks: list[Json] = list(ACTION_NAMES)
-    state: Json = {
-        **_feature("float32", list(STATE_NAMES)),
-        "info": {names.STATE_FRAME: spec.state_frame},
-    }
+    state = _feature("float32", STATE_NAMES) | {"info": {names.STATE_FRAME: spec.state_frame}}
     return {
         names.CAMERA_KEY: camera,
         names.STATE_KEY: state,
-        names.ACTION_KEY: _feature("float32", sticks),
-        names.SENT: _feature("float32", sticks),
-        **{name: _feature("int64", None) for name in names.STAMPS},
-        "timestamp": _feature("float32", None),
-        **{name: _feature("int64", None) for name in _ROW_NUMBERS},
+        names.ACTION_KEY: _feature("float32", ACTION_NAMES),
+        names.SENT: _feature("float32", ACTION_NAMES),
+        **{name: _feature("int64") for name in names.STAMPS},
+        "timestamp": _feature("float32"),
+        **{name: _feature("int64") for name in _ROW_NUMBERS},
     }
 
 
-def _feature(dtype: str, of: list[Json] | None) -> dict[str, Json]:
-    return {"dtype": dtype, "shape": [1 if of is None else len(of)], "names": of}
-
-
-def _write_json(path: Path, document: Json) -> None:
-    path.write_text(json.dumps(document, indent=4, allow_nan=False) + "\n")
+def _feature(dtype: str, columns: tuple[str, ...] = ()) -> dict[str, Json]:
+    return {"dtype": dtype, "shape": [len(columns) or 1], "names": list(columns) or None}

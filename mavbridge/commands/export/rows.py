@@ -2,78 +2,64 @@
 
 A row holds what was known at the exposure of its image: the state of the newest tick all of whose
 messages had arrived by then, and the newest sticks to imitate of then or before. Nothing is
-interpolated; how late each of them was, the stamps say.
+interpolated; the stamps say how old each of them was.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
-from policy.contract import ACTION_DIM, FloatArray
+from policy.contract import ACTION_DIM
+from policy.data import lerobot_format as names
 from policy.data.episodes import Episode, Nanoseconds
 from policy.data.interpolation import MAX_GAP_NS
 
 MAX_HELD_NS = MAX_GAP_NS
-"""A state or sticks older than this are not those of a frame any more."""
+"""A state or sticks older than this do not belong to a frame any more."""
 MAX_MISSING_FRAMES = 1
-"""In a row; where more are missing, a new episode begins, for rows are taken to be even in time."""
+"""Consecutive frames that may be missing; after more a new episode begins, for LeRobot takes rows
+to be even in time."""
 MIN_ROWS = 2
-"""Less is no motion."""
+"""Fewer rows show no motion."""
 MAX_RATE_OFF = 0.2
-"""Of the common rate; flights further from it than this are of another one."""
+"""Largest share by which the rate of a flight may differ from the common one."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Stretch:
-    """Consecutive frames of a flight, in each of which somebody flew: one episode of LeRobot."""
+    """Consecutive frames of a flight in each of which it was flown: one episode of LeRobot."""
 
     episode: Episode
     first_frame: int
-    """Of the flight's frames."""
-    captured_ns: Nanoseconds
-    """[N] exposures."""
-    tick_ns: Nanoseconds
-    """[N] when a policy looked at the state."""
-    attitude_ns: Nanoseconds
-    """[N] arrival of its attitude."""
-    velocity_ns: Nanoseconds
-    """[N] arrival of its velocity."""
-    state: FloatArray
-    """[N, 13]"""
-    action_ns: Nanoseconds
-    """[N]"""
-    action: FloatArray
-    """[N, 4] sticks to imitate."""
-    sent_ns: Nanoseconds
-    """[N] the exposure, where nothing had been sent yet."""
-    sent: FloatArray
-    """[N, 4] sticks that flew; zeros where they were released."""
+    """Counted in the flight's frames."""
+    columns: dict[str, NDArray[np.generic]]
+    """State [N, 13], action and sent sticks [N, 4], then the stamps [N], under their names in the
+    dataset. Sent sticks are zeros where they were released or nothing had been sent yet."""
 
     def __len__(self) -> int:
         return len(self.captured_ns)
 
-    def part(self, rows: slice) -> "Stretch":
-        """Some consecutive rows of it."""
-        start, _, step = rows.indices(len(self))
-        if step != 1:
-            raise ValueError("consecutive rows")
-        changes = {
-            f.name: getattr(self, f.name)[rows]
-            for f in fields(self)
-            if f.name not in ("episode", "first_frame")
-        }
-        return replace(self, first_frame=self.first_frame + start, **changes)
+    @property
+    def captured_ns(self) -> Nanoseconds:
+        """[N] exposures."""
+        return self.columns[names.CAPTURED].astype(np.int64, copy=False)
+
+    def part(self, start: int, stop: int) -> "Stretch":
+        """The rows from ``start`` up to ``stop``."""
+        columns = {name: values[start:stop] for name, values in self.columns.items()}
+        return Stretch(self.episode, self.first_frame + start, columns)
 
 
 def stretches(episode: Episode) -> list[Stretch]:
-    """Align a flight to its frames, and cut out those that nobody flew.
+    """Align a flight to its frames, and leave out those without a state or sticks.
 
     Args:
-        episode: as ``policy.data.flight_folders.read_flight`` gives it.
+        episode: from ``policy.data.flight_folders.read_flight``.
     """
     captured_ns = episode.captured_ns
     arrived_ns = np.maximum.accumulate(np.maximum(episode.attitude_ns, episode.velocity_ns))
@@ -84,42 +70,37 @@ def stretches(episode: Episode) -> list[Stretch]:
     is_known &= captured_ns - arrived_ns[tick] <= MAX_HELD_NS
     is_known &= captured_ns - episode.target_ns[target] <= MAX_HELD_NS
     is_known &= np.isfinite(episode.state[tick]).all(axis=1)
-    nothing_sent = sent < 0
-    none = np.zeros((1, ACTION_DIM), np.float32)
-    # Index -1 is the row appended.
-    sent_sticks = np.concatenate([episode.sent, none])[sent]
-    sent_ns = np.where(nothing_sent, captured_ns, np.append(episode.sent_ns, 0)[sent])
-    whole = Stretch(
-        episode=episode,
-        first_frame=0,
-        captured_ns=captured_ns,
-        tick_ns=episode.tick_ns[tick],
-        attitude_ns=episode.attitude_ns[tick],
-        velocity_ns=episode.velocity_ns[tick],
-        state=episode.state[tick],
-        action_ns=episode.target_ns[target],
-        action=episode.target[target],
-        sent_ns=sent_ns.astype(np.int64),
-        sent=sent_sticks,
+    # Where nothing had been sent yet, index -1 is the row that is appended.
+    sent_sticks = np.concatenate([episode.sent, np.zeros((1, ACTION_DIM), np.float32)])[sent]
+    sent_ns = np.where(sent < 0, captured_ns, np.append(episode.sent_ns, 0)[sent])
+    stamps = (
+        *(captured_ns, episode.tick_ns[tick], episode.attitude_ns[tick]),
+        *(episode.velocity_ns[tick], episode.target_ns[target], sent_ns.astype(np.int64)),
     )
-    return [whole.part(rows) for rows in _runs(captured_ns, is_known)]
+    columns: dict[str, NDArray[np.generic]] = {
+        names.STATE_KEY: episode.state[tick],
+        names.ACTION_KEY: episode.target[target],
+        names.SENT: sent_sticks,
+        **dict(zip(names.STAMPS, stamps, strict=True)),
+    }
+    whole = Stretch(episode, 0, columns)
+    return [whole.part(start, stop) for start, stop in _runs(captured_ns, is_known)]
 
 
-def _newest(stamps_ns: Nanoseconds, at_ns: Nanoseconds) -> np.ndarray:
+def _newest(stamps_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.intp]:
     """[N] index of the newest stamp at or before each time; -1 where there is none."""
     return np.searchsorted(stamps_ns, at_ns, side="right") - 1
 
 
-def _runs(captured_ns: Nanoseconds, is_known: np.ndarray) -> list[slice]:
-    """Consecutive frames that are known and without a hole between them."""
+def _runs(captured_ns: Nanoseconds, is_known: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Consecutive frames that are known and have no hole between them: from and up to."""
     if len(captured_ns) < MIN_ROWS:
         return []
     periods = np.diff(captured_ns)
     longest = (MAX_MISSING_FRAMES + 1.5) * np.median(periods)
     is_cut = (periods > longest) | (is_known[1:] != is_known[:-1])
     edges = [0, *(np.flatnonzero(is_cut) + 1).tolist(), len(captured_ns)]
-    runs = [slice(a, b) for a, b in pairwise(edges)]
-    return [run for run in runs if is_known[run.start] and run.stop - run.start >= MIN_ROWS]
+    return [(a, b) for a, b in pairwise(edges) if is_known[a] and b - a >= MIN_ROWS]
 
 
 def common_fps(parts: Sequence[Stretch]) -> int:
@@ -146,6 +127,6 @@ def _rate_hz(periods_ns: Nanoseconds) -> float:
 
 
 def worst_shift_ns(part: Stretch, fps: int) -> int:
-    """How far a frame is at most from its place on LeRobot's even grid."""
+    """Largest distance of a frame from its place on LeRobot's even grid."""
     even_ns = np.round(np.arange(len(part)) * (NS_PER_S / fps)).astype(np.int64)
     return int(np.abs(part.captured_ns - part.captured_ns[0] - even_ns).max())

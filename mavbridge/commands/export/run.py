@@ -1,23 +1,18 @@
-"""The whole of ``mavbridge export``: flights in, a LeRobot dataset out, whole or not at all."""
+"""``mavbridge export``: flights in, a LeRobot dataset out, whole or not at all."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from shutil import rmtree
 
 from av.error import FFmpegError
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID
 
-from mavbridge.commands.export.dataset import (
-    MB,
-    VIDEO_FILE_MB,
-    DatasetSpec,
-    DatasetWriter,
-    even_size,
-)
+from mavbridge.commands.export.dataset import DatasetWriter, even_size
+from mavbridge.commands.export.files import DATA_FILE_MB, MB, VIDEO_FILE_MB, DatasetSpec
 from mavbridge.commands.export.rows import Stretch, common_fps, stretches, worst_shift_ns
 from mavbridge.config.export import ExportConfig
 from mavbridge.core.clock import NS_PER_MS
@@ -29,23 +24,23 @@ from policy.data.flight_folders import find_flights, is_exemplary, read_flight
 
 
 @dataclass(frozen=True, kw_only=True)
-class Exported:
-    """What was written."""
+class ExportSummary:
+    """Counts of what was written."""
 
     episodes: int
     rows: int
     fps: int
     frames_lost: int
-    """At the ends of videos that break off."""
+    """Frames missing at the ends of videos that break off."""
     worst_shift_ns: int
-    """Between an exposure and its place on the even grid."""
+    """Largest distance of an exposure from its place on the even grid."""
 
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
-    """Export flights as the config says.
+    """Export flights.
 
     Raises:
-        MavbridgeError, PolicyError: for whatever a person can have caused.
+        MavbridgeError: every failure that a user can have caused.
     """
     console = Console(stderr=True, highlight=False, emoji=False)
     folders = find_flights(flights)
@@ -54,22 +49,26 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         raise UserError("nothing to export: these demonstrations all failed")
     if failed := len(folders) - len(exemplary):
         console.print(f"left out: {failed} of {len(folders)} flights, demonstrations that failed")
-    with stop_on_signals() as stop, _progress(console) as progress, _whole(config.out) as folder:
+    with (
+        stop_on_signals() as stop,
+        Progress(console=console) as progress,
+        _whole_or_nothing(config.out) as folder,
+    ):
+
+        def advance(task: TaskID) -> None:
+            if stop.is_set():
+                raise KeyboardInterrupt
+            progress.advance(task)
+
         reading = progress.add_task("reading flights", total=len(exemplary))
         episodes = []
         for flight in exemplary:
-            _heed(stop.is_set)
             episodes.append(read_flight(flight))
-            progress.advance(reading)
+            advance(reading)
         frames = sum(len(episode.captured_ns) for episode in episodes)
         writing = progress.add_task("writing frames", total=frames)
-
-        def on_frame() -> None:
-            _heed(stop.is_set)
-            progress.advance(writing)
-
-        done = write_dataset(episodes, folder, config, on_frame)
-    _print(done, config.out)
+        done = write_dataset(episodes, folder, config, lambda: advance(writing))
+    _print_summary(done, config.out)
     return 0
 
 
@@ -79,24 +78,24 @@ def write_dataset(
     config: ExportConfig,
     on_frame: Callable[[], None] = lambda: None,
     *,
-    data_file_bytes: int | None = None,
+    data_file_bytes: int = DATA_FILE_MB * MB,
     video_file_bytes: int = VIDEO_FILE_MB * MB,
-) -> Exported:
+) -> ExportSummary:
     """Write flights into an empty folder.
 
     Args:
         episodes: the flights.
         folder: there, and empty.
-        config: says the task.
-        on_frame: called with every frame that was looked at.
-        data_file_bytes: most of a table; LeRobot's default if None.
-        video_file_bytes: most of a video.
+        config: holds the task.
+        on_frame: called for every frame that was decoded.
+        data_file_bytes: largest size of a table.
+        video_file_bytes: largest size of a video.
 
     Raises:
         UserError, VideoError, DatasetError: flights that cannot be in one dataset, or damaged.
     """
-    parts = {index: stretches(episode) for index, episode in enumerate(episodes)}
-    every = [part for inside in parts.values() for part in inside]
+    parts = [stretches(episode) for episode in episodes]
+    every = [part for of_flight in parts for part in of_flight]
     if not every:
         raise UserError(
             f"nothing to export: in {len(episodes)} flights no frame has a state and sticks at "
@@ -110,18 +109,17 @@ def write_dataset(
         width=width,
         state_frame=common_frame(list(episodes)),
         task=config.task,
+        data_file_bytes=data_file_bytes,
         video_file_bytes=video_file_bytes,
     )
-    if data_file_bytes is not None:
-        spec = replace(spec, data_file_bytes=data_file_bytes)
     writer = DatasetWriter(folder, spec)
     try:
-        for index, episode in enumerate(episodes):
-            _write_flight(writer, episode, parts[index], on_frame)
+        for episode, of_flight in zip(episodes, parts, strict=True):
+            _write_flight(writer, episode, of_flight, on_frame)
         writer.finish()
     finally:
         writer.close()
-    return Exported(
+    return ExportSummary(
         episodes=writer.episodes,
         rows=writer.rows,
         fps=fps,
@@ -140,28 +138,22 @@ def _image_size(parts: Sequence[Stretch]) -> tuple[int, int]:
 def _write_flight(
     writer: DatasetWriter, episode: Episode, parts: list[Stretch], on_frame: Callable[[], None]
 ) -> None:
-    """The video is decoded once, from its beginning."""
-    images = _counted(episode.decode(), on_frame)
+    """Decode the video once, from its beginning, and write its stretches."""
+
+    def decoded() -> Iterator[ImageArray]:
+        for image in episode.decode():
+            on_frame()
+            yield image
+
+    images = decoded()
     at = 0
     for part in parts:
         skipped = sum(1 for _ in islice(images, part.first_frame - at))
-        written = writer.add(part, islice(images, len(part)))
-        at += skipped + written
-
-
-def _counted(images: Iterator[ImageArray], on_frame: Callable[[], None]) -> Iterator[ImageArray]:
-    for image in images:
-        on_frame()
-        yield image
-
-
-def _heed(should_stop: Callable[[], bool]) -> None:
-    if should_stop():
-        raise KeyboardInterrupt
+        at += skipped + writer.add(part, islice(images, len(part)))
 
 
 @contextmanager
-def _whole(out: Path) -> Iterator[Path]:
+def _whole_or_nothing(out: Path) -> Iterator[Path]:
     """A folder beside ``out`` that takes its name once the dataset in it is whole.
 
     Raises:
@@ -189,17 +181,7 @@ def _whole(out: Path) -> Iterator[Path]:
         rmtree(part, ignore_errors=True)
 
 
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
-
-
-def _print(done: Exported, out: Path) -> None:
+def _print_summary(done: ExportSummary, out: Path) -> None:
     console = Console(highlight=False)
     console.print(
         f"{out}: {done.episodes} episodes, {done.rows} frames at {done.fps} Hz; an exposure is at "

@@ -1,4 +1,4 @@
-"""The statistics that LeRobot normalises by: of each feature, over an episode and over all.
+"""The statistics by which LeRobot normalises: of each feature, over an episode and over all.
 
 Names, axes and shapes are those of lerobot 0.6.1, ``datasets/compute_stats.py``; the values are
 exact where LeRobot estimates quantiles by a histogram.
@@ -16,17 +16,13 @@ Stats: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 """By name; "count" is [1] int64, the others are as wide as the feature."""
 
 _PIXEL_STEP = 2
-"""Every second pixel in each direction tells enough of an image's colours."""
+"""Every second pixel in each direction represents an image's colours."""
 _LEVELS = 256
 
 
 def vector_stats(values: NDArray[np.generic]) -> Stats:
-    """Of each column.
-
-    Args:
-        values: [N, D], N >= 1.
-    """
-    numbers = values.astype(np.float64)
+    """Statistics of each column of values [N, D] or [N], N >= 1."""
+    numbers = values.reshape(len(values), -1).astype(np.float64)
     return {
         "min": numbers.min(axis=0),
         "max": numbers.max(axis=0),
@@ -52,24 +48,26 @@ class ImageStats:
         self._images += 1
 
     def merge(self, other: "ImageStats") -> None:
-        """Count the images that another has counted."""
+        """Add the images that another has counted."""
         self._counts += other._counts
         self._images += other._images
 
     def stats(self) -> Stats:
-        """Each [3, 1, 1] of colours in [0, 1]; "count" is of images."""
+        """Statistics [3, 1, 1] of colours in [0, 1]; "count" is the number of images."""
         levels = np.arange(_LEVELS) / (_LEVELS - 1)
         total = self._counts.sum(axis=1)
         mean = self._counts @ levels / total
         variance = self._counts @ levels**2 / total - mean**2
+        up_to = np.cumsum(self._counts, axis=1)
         found: dict[str, NDArray[np.float64]] = {
             "min": levels[(self._counts > 0).argmax(axis=1)],
             "max": levels[_LEVELS - 1 - (self._counts[:, ::-1] > 0).argmax(axis=1)],
             "mean": mean,
             "std": np.sqrt(np.maximum(variance, 0.0)),
+            **{
+                name: levels[(up_to >= at * total[:, None]).argmax(axis=1)]
+                for name, at in QUANTILES.items()
+            },
         }
-        up_to = np.cumsum(self._counts, axis=1)
-        for name, at in QUANTILES.items():
-            found[name] = levels[(up_to >= at * total[:, None]).argmax(axis=1)]
         out: Stats = {name: values.reshape(3, 1, 1) for name, values in found.items()}
         return out | {"count": np.array([self._images], np.int64)}

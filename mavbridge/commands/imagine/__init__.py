@@ -7,7 +7,7 @@
                            rollout.mp4 <-- writer process <-- decode thread (or CUDA side stream)
                            rollout.parquet
 
-``loop.rollout`` is the loop and knows no files; ``streamed`` and ``collected`` are what may become
-of its segments: ours, and the plain serial reference, which give the same frames bit for bit.
+``loop.rollout`` is the loop and knows no files. ``StreamedOutput`` writes its segments as they
+come; ``SerialOutput``, the plain reference, writes the same frames, bit for bit, at the end.
 Nothing grows with the number of iterations but the files.
 """

@@ -1,25 +1,88 @@
-"""Who holds the sticks of a rollout."""
+"""Deciders choose the sticks of a rollout; they observe the last few steps, and no more."""
 
+from collections import deque
 from typing import Protocol
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from mavbridge.commands.imagine.observation import ObservationQueue
 from mavbridge.commands.imagine.sampling import Sampler
+from mavbridge.commands.imagine.start import RolloutStart
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import FloatArray
-from mavbridge.flight.history import sample_chunk
+from mavbridge.core.records import FloatArray, ImageArray, Sticks
+from mavbridge.flight.history import SentHistory, sample_chunk
 from policy.contract import SINCE_EXPOSURE_DIM, Contract, Executable
 
-READS_A_STEP = 8
-"""An action of the world model is the mean stick of a step; a chunk is read so often for it."""
+SAMPLES_PER_STEP = 8
+"""An action of the world model is the mean stick of a step: the mean of so many samples."""
+
+
+class ObservationQueue:
+    """The newest latents, states and images, oldest first, and the sticks that were executed.
+
+    Images are appended by the loop once they are decoded: there may be fewer than steps.
+    """
+
+    def __init__(
+        self,
+        start: RolloutStart,
+        latents: Tensor,
+        *,
+        frame_dt_s: float,
+        images: int,
+        contract: Contract,
+    ) -> None:
+        """Begin with what was really seen.
+
+        Args:
+            start: the observed past.
+            latents: [context_frames, C, h, w] of its images.
+            frame_dt_s: time between two steps.
+            images: how many the decider looks at.
+            contract: gives length and spacing of the decider's history.
+        """
+        self._latents = deque(latents, maxlen=len(latents))
+        self._states = deque(start.states, maxlen=len(start.states))
+        self.images: deque[ImageArray] = deque(start.images, maxlen=images)
+        self._step_ns = round(frame_dt_s * NS_PER_S)
+        self._now_ns = start.newest_ns
+        self._history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s)
+        for at_ns, sticks in start.sent:
+            self._history.append(sticks, at_ns)
+
+    def push(self, latent: Tensor, state: FloatArray, action: FloatArray) -> None:
+        """Add one executed step: the sticks that were held, and what came of them.
+
+        Args:
+            latent: [C, h, w]
+            state: [13]
+            action: [4]
+        """
+        self._history.append(Sticks(*action.tolist()), self._now_ns)
+        self._now_ns += self._step_ns
+        self._latents.append(latent)
+        self._states.append(state)
+
+    def latents(self) -> Tensor:
+        """[1, context_frames, C, h, w]"""
+        return torch.stack(tuple(self._latents))[None]
+
+    def states(self) -> FloatArray:
+        """[1, context_frames, 13]"""
+        return np.stack(self._states)[None]
+
+    def history(self) -> FloatArray:
+        """[1, K, 4] as the decider's contract has it, up to now."""
+        return self._history.resample(self._now_ns)
 
 
 class Decider(Protocol):
     """Chooses the sticks."""
 
     images: int
-    """Pixels of how many of the newest frames it looks at; none are decoded for one with 0."""
+    """Number of the newest frames that it uses; with 0, none are decoded for it."""
     contract: Contract
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
@@ -50,7 +113,7 @@ class PolicyDecider:
         self._frame_dt_s = sampler.config.frame_dt_s
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
-        """One chunk, its mean over each step; its noise was fixed when it was loaded."""
+        """The mean of one chunk over each step; its noise was fixed when the policy was loaded."""
         state = seen.states()[:, -1]
         if self.contract.since_exposure:
             # The image is as old as the state: nothing has moved since.
@@ -61,12 +124,12 @@ class PolicyDecider:
             sample_chunk(
                 chunk,
                 chunk_dt_s=self.contract.chunk_dt_s,
-                at_s=(read + 0.5) / READS_A_STEP * self._frame_dt_s,
+                at_s=(sample + 0.5) / SAMPLES_PER_STEP * self._frame_dt_s,
             )
-            for read in range(self._frames * READS_A_STEP)
+            for sample in range(self._frames * SAMPLES_PER_STEP)
         ]
-        means = np.array(sticks, np.float32).reshape(self._frames, READS_A_STEP, -1).mean(axis=1)
-        clipped: FloatArray = np.clip(means, -1.0, 1.0)
+        of_steps = np.array(sticks, np.float32).reshape(self._frames, SAMPLES_PER_STEP, -1)
+        clipped: FloatArray = np.clip(of_steps.mean(axis=1), -1.0, 1.0)
         return clipped
 
 
@@ -77,7 +140,7 @@ class WorldModelDecider:
         """Choose what it looks at.
 
         Args:
-            sampler: of the world model.
+            sampler: calls the world model.
             from_pixels: its own frames, decoded and encoded again, and not their latents.
         """
         self.images = sampler.config.context_frames if from_pixels else 0
@@ -85,7 +148,7 @@ class WorldModelDecider:
         self._sampler = sampler
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
-        """The actions of one sample; its latents are of no use to anybody."""
+        """The actions of one sample, whose latents are not used."""
         if self.images:
             latents = self._sampler.encode(np.stack(seen.images))[None]
         else:

@@ -1,4 +1,4 @@
-"""The whole of ``mavbridge imagine``."""
+"""``mavbridge imagine``: from the settings to the files of a rollout."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,22 +7,26 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
+from rich.progress import Progress
 from rich.text import Text
 
 import policy
-from mavbridge.commands.imagine.collected import CollectedOutput
 from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
-from mavbridge.commands.imagine.files import RolloutError, prepare_out
-from mavbridge.commands.imagine.loop import rollout
-from mavbridge.commands.imagine.output import OnFrame, Output, ignore
-from mavbridge.commands.imagine.plan import RolloutPlan
-from mavbridge.commands.imagine.progress import RolloutProgress
+from mavbridge.commands.imagine.loop import RolloutPlan, rollout
+from mavbridge.commands.imagine.output import (
+    OnFrame,
+    RolloutError,
+    RolloutOutput,
+    SerialOutput,
+    prepare_out,
+)
 from mavbridge.commands.imagine.sampling import Sampler, cores_left_free
-from mavbridge.commands.imagine.start import RealFrames, Start, read_start
+from mavbridge.commands.imagine.start import RealFrames, RolloutStart, read_start
 from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.config.imagine import ImagineConfig
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
@@ -33,10 +37,10 @@ SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 
 
 def imagine(config: ImagineConfig) -> int:
-    """Imagine as the config says; 130 if interrupted, with what there was by then.
+    """Imagine a flight; the exit status is 130 if interrupted, with what there was by then.
 
     Raises:
-        MavbridgeError, PolicyError: for whatever a person can have caused.
+        MavbridgeError: every failure that a user can have caused.
     """
     console = Console(stderr=True, highlight=False, emoji=False)
     clock = MonotonicClock()
@@ -50,12 +54,16 @@ def imagine(config: ImagineConfig) -> int:
     prepare_out(config.out)
     flight = open_flight(config.start)
     model = load_model(config.world_model, ddim_steps=plan.ddim_steps, device=config.policy.device)
-    _require_frames(plan, model)
+    if plan.frames > model.config.frames:
+        raise UserError(
+            f"--frames {plan.frames} is more than the {model.config.frames} that the world model "
+            "imagines: lower it"
+        )
     start = read_start(flight, model.config, config.start_at)
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=config.serial, clock=clock)
-    decider = _decider(config, sampler, clock, console)
+    decider = _make_decider(config, sampler, clock, console)
     # Serially, too: how a sum is split up decides how it is rounded.
-    with cores_left_free(), _onlooker(config, flight, sampler, start) as on_frame:
+    with cores_left_free(), _viewer(config, flight, sampler, start) as on_frame:
         output = make_output(
             config.out,
             sampler,
@@ -66,10 +74,14 @@ def imagine(config: ImagineConfig) -> int:
             on_frame=on_frame,
         )
         was_stopped = run_rollout(sampler, decider, start, plan, output, config.out, console)
-    _print(config, plan, sampler, output)
+    _print_summary(config, sampler, output)
     if was_stopped:
         console.print(Text("interrupted: the files hold what was imagined so far", style="yellow"))
     return INTERRUPTED if was_stopped else 0
+
+
+def ignore_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
+    """Do nothing: nobody observes the rollout."""
 
 
 def make_output(
@@ -80,42 +92,48 @@ def make_output(
     serial: bool,
     decode_video: bool,
     clock: Clock,
-    on_frame: OnFrame = ignore,
-) -> Output:
-    """Ours, or the plain form.
-
-    Raises:
-        MavbridgeError: the files cannot be made.
-    """
-    kind = CollectedOutput if serial else StreamedOutput
+    on_frame: OnFrame = ignore_frame,
+) -> RolloutOutput:
+    """Make the serial form or the streamed one; the arguments are those of ``RolloutOutput``."""
+    kind = SerialOutput if serial else StreamedOutput
     return kind(out, sampler, plan, decode_video=decode_video, clock=clock, on_frame=on_frame)
 
 
 def run_rollout(
     sampler: Sampler,
     decider: Decider,
-    start: Start,
+    start: RolloutStart,
     plan: RolloutPlan,
-    output: Output,
+    output: RolloutOutput,
     out: Path,
     console: Console,
 ) -> bool:
-    """Every iteration, until somebody says stop; whether somebody did.
+    """Run the iterations; returns whether a signal ended them early.
 
     Raises:
-        RolloutError: it could not go on; says what is left.
-        PolicyError: a net failed.
+        RolloutError: it had to end; the message names what is left.
     """
+    done = 0
     try:
-        with stop_on_signals() as stop, RolloutProgress(console, plan, output) as progress:
+        with stop_on_signals() as stop, Progress(console=console) as bar:
+            task = bar.add_task("imagining", total=plan.iterations * plan.frames)
+
+            def refresh() -> None:
+                status = (
+                    f"iteration {done}/{plan.iterations}, to decode {output.decode_queue}, "
+                    f"to write {output.writer_queue}"
+                )
+                bar.update(task, completed=output.frames, description=status)
+
             for segment in rollout(sampler, decider, start, plan):
                 output.put(segment)
-                progress.iterations = segment.iteration + 1
-                progress.refresh()
+                done = segment.iteration + 1
+                refresh()
                 if stop.is_set():
                     break
-            output.finish(progress.refresh)
-            return stop.is_set() and progress.iterations < plan.iterations
+            output.finish(refresh)
+            refresh()
+            return stop.is_set() and done < plan.iterations
     except MavbridgeError as error:
         output.close()
         left = "nothing was written"
@@ -128,12 +146,7 @@ def run_rollout(
 
 
 def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> WorldModel:
-    """A world model on its device.
-
-    Args:
-        world_model: weights; None = those that come with mavbridge.
-        ddim_steps: that it will be asked for.
-        device: of torch.
+    """Load a world model, by default the one that comes with mavbridge, onto a torch device.
 
     Raises:
         UserError: none comes with mavbridge, or there is no such device.
@@ -154,15 +167,9 @@ def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> Wor
         ) from error
 
 
-def _require_frames(plan: RolloutPlan, model: WorldModel) -> None:
-    if plan.frames > model.config.frames:
-        raise UserError(
-            f"--frames {plan.frames} is more than the {model.config.frames} that the world model "
-            "imagines: lower it"
-        )
-
-
-def _decider(config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console) -> Decider:
+def _make_decider(
+    config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console
+) -> Decider:
     if config.decider == "world-model":
         if config.policy.checkpoint is not None:
             raise UserError(
@@ -170,7 +177,7 @@ def _decider(config: ImagineConfig, sampler: Sampler, clock: Clock, console: Con
                 "decides: add --decider toge, or leave it out"
             )
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
-    # One image, one chunk, as in flight; warm starts are for a policy that is asked 100 times a s.
+    # One image, one chunk, as in flight; warm starts are for a policy that runs at 100 Hz.
     loaded = load_configured_policy(replace(config.policy, dual_rate=True, head_steps=None), clock)
     for note in loaded.notes:
         console.print(Text(note, style="yellow" if note.startswith("warning") else "dim"))
@@ -178,12 +185,12 @@ def _decider(config: ImagineConfig, sampler: Sampler, clock: Clock, console: Con
 
 
 @contextmanager
-def _onlooker(
-    config: ImagineConfig, flight: RecordedFlight, sampler: Sampler, start: Start
+def _viewer(
+    config: ImagineConfig, flight: RecordedFlight, sampler: Sampler, start: RolloutStart
 ) -> Iterator[OnFrame]:
-    """The viewer, if one was asked for."""
+    """Open the Rerun view, if one was requested; yields its callback."""
     if config.rerun == "off":
-        yield ignore
+        yield ignore_frame
         return
     from mavbridge.observe.rerun_rollout import RolloutView
 
@@ -195,7 +202,7 @@ def _onlooker(
         view.close()
 
 
-def _print(config: ImagineConfig, plan: RolloutPlan, sampler: Sampler, output: Output) -> None:
+def _print_summary(config: ImagineConfig, sampler: Sampler, output: RolloutOutput) -> None:
     console = Console(highlight=False)
     meter = sampler.meter
     decoded = meter.frames_decoded + output.frames_decoded

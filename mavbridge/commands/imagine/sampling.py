@@ -17,29 +17,29 @@ from policy.world_model.model import WorldModel
 
 
 class ImaginationError(MavbridgeError):
-    """A world model that imagines no numbers."""
+    """A world model that imagines NaN or infinity."""
 
 
 def cores_left_free() -> AbstractContextManager[None]:
-    """Meanwhile torch samples on all of a CPU's cores but one, which is for the decoder.
+    """Let torch use all of a CPU's cores but one, which is for the decoder.
 
-    Torch's threads wait for each other at the end of every operation, spinning: with more of them
+    Torch's threads spin at the end of every operation until the last is done: with more threads
     than cores a rollout takes twice the time.
     """
-    return _threads(torch.get_num_threads() - 1)
+    return _torch_threads(torch.get_num_threads() - 1)
 
 
 def one_core() -> AbstractContextManager[None]:
-    """Meanwhile torch works in this thread alone.
+    """Let torch use the calling thread alone.
 
-    Frames are decoded so wherever it happens: how a sum is split up decides how it is rounded. One
-    frame alone gains little from a second core.
+    All frames are decoded so, because how a sum is split up decides how it is rounded. One frame
+    gains little from a second core.
     """
-    return _threads(1)
+    return _torch_threads(1)
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
+def _torch_threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(max(1, count))
     try:
@@ -57,30 +57,30 @@ class Stopwatch:
         self.seconds = 0.0
 
     def __enter__(self) -> None:
-        """Start."""
+        """Start counting."""
         self._started_ns = self._clock.now_ns()
 
     def __exit__(self, *_: object) -> None:
-        """Stop."""
+        """Add what has passed."""
         self.seconds += (self._clock.now_ns() - self._started_ns) / NS_PER_S
 
 
 class Meter:
-    """Where the loop's own thread spends its time; written by that thread alone."""
+    """Time that the loop's own thread spends in each part; written by that thread alone."""
 
     def __init__(self, clock: Clock) -> None:
         self.sample = Stopwatch(clock)
-        """Inside the world model."""
+        """Time inside the world model."""
         self.decode = Stopwatch(clock)
-        """Waiting for pixels: its own decodes, and room in the decode queue."""
+        """Time for pixels: its own decodes, and waits for room in the decode queue."""
         self.write = Stopwatch(clock)
-        """Waiting for the files: its own writing, or the end of somebody else's."""
+        """Time for the files: its own writing, or waits for the end of the writer's."""
         self.frames_decoded = 0
-        """By that thread."""
+        """Frames decoded by that thread."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sampled:
+class ImaginedSteps:
     """One sample of the world model."""
 
     latents: Tensor
@@ -90,7 +90,7 @@ class Sampled:
     actions: FloatArray
     """[frames, 4]"""
     pixels: NDArray[np.uint8] | None
-    """[frames, H, W, 3], where everything is decoded at once."""
+    """[frames, H, W, 3] where everything is decoded at once, or None."""
 
 
 class Sampler:
@@ -99,13 +99,9 @@ class Sampler:
     def __init__(
         self, model: WorldModel, *, ddim_steps: int, decode_all: bool, clock: Clock
     ) -> None:
-        """Adapt a model.
+        """Adapt a model, which is on its device already.
 
-        Args:
-            model: on its device.
-            ddim_steps: of every sample.
-            decode_all: every sample's frames at once, as the plain path does it.
-            clock: of the meter.
+        ``decode_all`` decodes every sample's frames at once, as the serial way does.
         """
         self.model = model
         self.config: WorldModelConfig = model.config
@@ -128,14 +124,14 @@ class Sampler:
 
     def sample(
         self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
-    ) -> Sampled:
+    ) -> ImaginedSteps:
         """Decide (actions None) or simulate.
 
         Args:
             latents: [1, context_frames, C, h, w]
             states: [1, context_frames, 13]
             actions: [frames, 4] to simulate, or None.
-            seed: of the noise, and of nothing else.
+            seed: of the noise alone.
 
         Raises:
             ImaginationError: what came out is not finite.
@@ -156,7 +152,7 @@ class Sampler:
                 "the world model imagined NaN or infinity: its weights are damaged, or it has left "
                 "what it was trained on; try more --ddim-steps, or another checkpoint"
             )
-        return Sampled(
+        return ImaginedSteps(
             latents=imagined.latents[0],
             states=sampled_states,
             actions=sampled_actions,

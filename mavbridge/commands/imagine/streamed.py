@@ -1,84 +1,127 @@
 """A rollout's output beside its loop: a thread decodes, the writer process writes."""
 
 import queue
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from threading import Event
 
-from mavbridge.commands.imagine.files import RolloutError, RowsWriter, rollout_frames
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
 from mavbridge.commands.imagine.loop import Segment
-from mavbridge.commands.imagine.output import FrameDigest, OnFrame, frame_row
-from mavbridge.commands.imagine.pixels import Latents, make_frame_source
-from mavbridge.commands.imagine.plan import RolloutPlan
-from mavbridge.commands.imagine.sampling import Sampler, one_core
-from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.commands.imagine.output import (
+    SCHEMA,
+    RolloutError,
+    RolloutOutput,
+    captured_ns,
+    rows_batch,
+    writing,
+)
+from mavbridge.commands.imagine.sampling import one_core
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.core.workers import HungError, Worker
+from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.writer import VideoWriter
+from policy.world_model.model import WorldModel
 
 QUEUED_SEGMENTS = 2
-"""That may wait for the decoder; then the loop waits. The slowest part sets the pace."""
+"""Segments that may wait for the decoder; then the loop waits. The slowest part sets the pace."""
 STALL_S = 120.0
 """Longest time in which not one frame gets through."""
 END_S = 45.0
 """Longer than a writer process that hangs is waited for."""
+PINNED_FRAMES = 4
+"""Frames that may be on their way from the GPU at a time."""
 _POLL_S = 0.1
 
 
+class FrameDecoder:
+    """Latents to images, one frame at a time, since the loop wants the processor, too.
+
+    On a GPU, on a stream beside the sampler's: frames come back through a ring of pinned memory.
+    Used by one thread.
+    """
+
+    def __init__(self, model: WorldModel) -> None:
+        self._model = model
+        device = next(model.parameters()).device
+        self._stream: torch.cuda.Stream | None = None
+        if device.type == "cuda":
+            self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+            shape = (PINNED_FRAMES, *(model.config.image_size,) * 2, 3)
+            self._ring = torch.empty(shape, dtype=torch.uint8, pin_memory=True)
+            self._views: NDArray[np.uint8] = self._ring.numpy()
+
+    def frames(self, latents: Tensor, ready: torch.cuda.Event | None) -> Iterator[ImageArray]:
+        """Images [H, W, 3] of latents [N, C, h, w], each to be used before the next is taken.
+
+        On a GPU the latents may be read after the event ``ready``.
+        """
+        if self._stream is None:
+            for latent in latents:
+                with torch.inference_mode():
+                    pixels = self._model.decode(latent[None])
+                yield pixels[0].cpu().numpy()
+            return
+        under_way: deque[tuple[int, torch.cuda.Event]] = deque()
+        if ready is not None:
+            self._stream.wait_event(ready)
+        # Freed by the loop's stream, the memory must not be given away before this one is done.
+        latents.record_stream(self._stream)
+        for row, latent in enumerate(latents):
+            if len(under_way) == PINNED_FRAMES:  # a slot is free once its frame was used
+                yield self._arrived(*under_way.popleft())
+            slot = row % PINNED_FRAMES
+            under_way.append((slot, self._launch(latent, slot, self._stream)))
+        while under_way:
+            yield self._arrived(*under_way.popleft())
+
+    def _launch(self, latent: Tensor, slot: int, stream: torch.cuda.Stream) -> torch.cuda.Event:
+        with torch.inference_mode(), torch.cuda.stream(stream):
+            self._ring[slot].copy_(self._model.decode(latent[None])[0], non_blocking=True)
+            event: torch.cuda.Event = stream.record_event()
+        return event
+
+    def _arrived(self, slot: int, event: torch.cuda.Event) -> ImageArray:
+        event.synchronize()
+        view: ImageArray = self._views[slot]
+        return view
+
+
 @dataclass(frozen=True, kw_only=True)
-class _Job:
+class _DecodeJob:
     """A segment on its way to the thread."""
 
-    frames: tuple[RolloutFrame, ...]
+    frames: list[RolloutFrame]
     decoded: dict[int, ImageArray]
-    missing: Latents | None
-    """Of the frames that are not decoded yet, in order; None: the video is not wanted."""
+    missing: Tensor | None
+    """Latents of the frames that are not decoded yet, in order; None: no video is wanted."""
+    ready: torch.cuda.Event | None
+    """Event of the GPU after which they may be read."""
 
 
-class StreamedOutput:
-    """Frames and rows go to the disk as they come; see ``Output``."""
+class StreamedOutput(RolloutOutput):
+    """Frames and rows go to the disk as they come."""
 
-    def __init__(
-        self,
-        out: Path,
-        sampler: Sampler,
-        plan: RolloutPlan,
-        *,
-        decode_video: bool,
-        clock: Clock,
-        on_frame: OnFrame,
-    ) -> None:
-        """Create the files, start the writer process and the thread.
-
-        Args:
-            out: from ``prepare_out``.
-            sampler: of the rollout.
-            plan: of the rollout.
-            decode_video: whether there is to be a video; the rows are written in any case.
-            clock: for deadlines.
-            on_frame: looks on, from the thread.
-
-        Raises:
-            MavbridgeError: the files cannot be made, or the writer process does not start.
-        """
-        self._plan = plan
-        self._frame_dt_s = sampler.config.frame_dt_s
-        self._meter = sampler.meter
-        self._source = make_frame_source(sampler.model)
-        self._clock = clock
-        self._on_frame = on_frame
-        self._digest = FrameDigest()
-        self.frames = self.frames_decoded = 0
-        self._jobs: queue.Queue[_Job | None] = queue.Queue(QUEUED_SEGMENTS)
-        self._rows = RowsWriter(out)
+    def _open(self) -> None:
+        """Create the files, start the writer process and the thread."""
+        self._decoder = FrameDecoder(self._sampler.model)
+        self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
+        self._table_path = self._out.with_suffix(".arrows")
         self._video: VideoWriter | None = None
-        if decode_video:
+        with writing(self._table_path):
+            self._table = TableWriter(self._out, SCHEMA)
+        if self._decode_video:
             try:
-                self._video = VideoWriter(out, pressure="offline", hz=1 / self._frame_dt_s)
+                self._video = VideoWriter(self._out, pressure="offline", hz=1 / self._frame_dt_s)
             except BaseException:
-                self._rows.abandon()
+                self._table.abandon()
                 raise
         self._worker = Worker("mavbridge-rollout-decode", self._serve)
         self._worker.start()
@@ -95,41 +138,36 @@ class StreamedOutput:
 
     @property
     def writer_pid(self) -> int | None:
-        """The writer process, where there is one."""
+        """Process id of the writer; None where there is none."""
         return None if self._video is None else self._video.pid
 
-    @property
-    def sha256(self) -> str:
-        """Of all frames so far, raw, in their order."""
-        return self._digest.hexdigest()
-
     def put(self, segment: Segment) -> None:
-        """Queue a segment; waits while the queue is full.
-
-        Raises:
-            MavbridgeError: the thread has failed, or is stuck.
-        """
-        frames = tuple(rollout_frames(segment, self._plan, self._frame_dt_s))
-        missing = None
+        """Queue a segment; waits while the queue is full."""
+        frames = self._rows(segment)
+        missing = ready = None
         if self._video is not None:
-            rows = [row for row in range(len(frames)) if row not in segment.decoded]
-            missing = Latents(segment.latents[rows])
-        with self._meter.decode:
-            self._hand_over(_Job(frames=frames, decoded=segment.decoded, missing=missing))
+            missing = segment.latents[[k for k in range(len(frames)) if k not in segment.decoded]]
+            if missing.is_cuda:
+                ready = torch.cuda.current_stream(missing.device).record_event()
+        job = _DecodeJob(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
+        with self._sampler.meter.decode:
+            self._enqueue(job)
 
-    def _hand_over(self, job: _Job | None, on_wait: Callable[[], None] = lambda: None) -> None:
-        def put() -> bool:
-            self._require_worker()
+    def _enqueue(self, job: _DecodeJob | None, on_wait: Callable[[], None] = lambda: None) -> None:
+        def was_put() -> bool:
+            if not self._worker.is_alive:
+                self._worker.join(END_S)  # raises what the thread has raised
+                raise RuntimeError("the thread ended before its work did")
             try:
                 self._jobs.put(job, timeout=_POLL_S)
             except queue.Full:
                 return False
             return True
 
-        self._wait_for(put, on_wait)
+        self._wait_until(was_put, on_wait)
 
-    def _wait_for(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
-        """Until it holds, as long as frames get through; the condition waits a little itself."""
+    def _wait_until(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
+        """Wait as long as frames get through; the condition itself waits a little."""
         seen, since_ns = self.frames, self._clock.now_ns()
         while not condition():
             on_wait()
@@ -138,30 +176,21 @@ class StreamedOutput:
             elif self._clock.now_ns() - since_ns > STALL_S * NS_PER_S:
                 raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
-    def _require_worker(self) -> None:
-        """Raise what the thread has raised."""
-        if not self._worker.is_alive:
-            self._worker.join(END_S)
-            raise RuntimeError("the thread ended before its work did")
-
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Work off the queue, close the files, count.
-
-        Raises:
-            MavbridgeError: it could not all be written.
-        """
-        with self._meter.decode:
-            self._hand_over(None, on_wait)
-            self._wait_for(lambda: self._worker.ends_within(_POLL_S), on_wait)
+        """Work off the queue, close the files, and compare their lengths."""
+        with self._sampler.meter.decode:
+            self._enqueue(None, on_wait)
+            self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
             self._worker.join(END_S)
-        with self._meter.write:
+        with self._sampler.meter.write:
             if self._video is not None:
                 self._video.finish()
-                if self._video.written != self._rows.rows:
+                if self._video.written != self._table.rows:
                     raise RolloutError(
-                        f"{self._video.written} frames were written for {self._rows.rows} rows"
+                        f"{self._video.written} frames were written for {self._table.rows} rows"
                     )
-            self._rows.finish()
+            with writing(self._table_path):
+                self._table.finish()
 
     def close(self) -> None:
         """Stop the thread and the writer; what is written stays readable."""
@@ -169,10 +198,10 @@ class StreamedOutput:
             self._worker.join(END_S)
         if self._video is not None:
             self._video.close()
-        self._rows.abandon()
+        self._table.abandon()
 
     def _serve(self, stop: Event) -> None:
-        """The thread."""
+        """Decode and write jobs, on the thread."""
         with one_core():
             while not stop.is_set():
                 try:
@@ -183,20 +212,26 @@ class StreamedOutput:
                     return
                 self._write(job, stop)
 
-    def _write(self, job: _Job, stop: Event) -> None:
-        # First: after a crash there may be rows without a frame, but no frame without a row.
-        self._rows.append(job.frames)
-        images = None if job.missing is None else self._source.frames(job.missing)
+    def _write(self, job: _DecodeJob, stop: Event) -> None:
+        # Rows first: after a crash there may be rows without a frame, but no frame without a row.
+        with writing(self._table_path):
+            self._table.append(rows_batch(job.frames))
+        images: Iterator[ImageArray] = iter(())
+        if job.missing is not None:
+            images = self._decoder.frames(job.missing, job.ready)
         for frame in job.frames:
             if stop.is_set():
                 return
             rgb = None
-            if self._video is not None and images is not None:
+            if self._video is not None:
                 rgb = job.decoded.get(frame.frame)
                 if rgb is None:
                     rgb = next(images)
                     self.frames_decoded += 1
-                self._digest.add(rgb)
-                self._video.submit(rgb, frame_row(frame, self._clock))
-            self._on_frame(frame, rgb)
-            self.frames += 1
+                row = FrameRow(
+                    frame_id=frame.number,
+                    captured_ns=captured_ns(frame),
+                    ready_ns=self._clock.now_ns(),
+                )
+                self._video.submit(rgb, row)
+            self._show(frame, rgb)

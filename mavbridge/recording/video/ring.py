@@ -1,8 +1,7 @@
 """Frames from one process to another through shared memory: a fixed number of slots.
 
-Who may use which slot is not kept here but told over the pipe of the two processes, whose messages
-also order the accesses. A slot belongs to the producer until ``Submit`` names it, and again from
-``Written`` on.
+Messages over the pipe of the two processes pass the slots on and order the accesses: a slot belongs
+to the producer until ``Submit`` names it, and again from ``Written`` on.
 """
 
 import os
@@ -21,7 +20,7 @@ MAX_BYTES = 32 << 20
 
 
 class RingShape(NamedTuple):
-    """What the other process needs to find the frames."""
+    """Name and layout of the memory, for the other process."""
 
     name: str
     slots: int
@@ -33,7 +32,7 @@ class FrameRing:
     """Slots of [H, W, 3] uint8, mapped."""
 
     def __init__(self, memory: SharedMemory, shape: RingShape) -> None:
-        """See ``create`` and ``attach``."""
+        """Use ``create`` in the producer, and ``attach`` in the consumer."""
         self.shape = shape
         self._memory = memory
         self._is_linked = False
@@ -43,11 +42,7 @@ class FrameRing:
 
     @classmethod
     def create(cls, height: int, width: int) -> "FrameRing":
-        """Producer: acquire the memory.
-
-        Raises:
-            OSError: there is not enough.
-        """
+        """Acquire the memory, in the producer; OSError if there is not enough."""
         frame_bytes = height * width * 3
         slots = max(MIN_SLOTS, min(MAX_SLOTS, MAX_BYTES // frame_bytes))
         memory = SharedMemory(create=True, size=slots * frame_bytes)
@@ -63,11 +58,7 @@ class FrameRing:
 
     @classmethod
     def attach(cls, shape: RingShape) -> "FrameRing":
-        """Consumer: map the memory.
-
-        Raises:
-            OSError: it is gone.
-        """
+        """Map the memory, in the consumer; OSError if it is gone."""
         return cls(SharedMemory(name=shape.name), shape)
 
     def slot(self, index: int) -> ImageArray:
@@ -78,13 +69,13 @@ class FrameRing:
         return frame
 
     def unlink(self) -> None:
-        """Producer: take the name away, so that nothing stays whoever is killed."""
+        """Remove the name, in the producer: the memory is freed even if both are killed."""
         if self._is_linked:
             self._is_linked = False
             self._memory.unlink()
 
     def close(self) -> None:
-        """Unmap; the producer's end also takes the name away. May be called twice."""
+        """Unmap, and in the producer remove the name. May be called twice."""
         self._frames = None
         self._memory.close()
         self.unlink()

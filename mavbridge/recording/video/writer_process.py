@@ -7,145 +7,119 @@ network, so that it starts quickly.
 
 import os
 import signal
+from enum import Enum, auto
 from multiprocessing.connection import Connection
+from typing import NamedTuple, TypeAlias
 
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.schema import DEMONSTRATION_FRAMES, FRAMES, frames_batch
-from mavbridge.recording.tables import READ_ERRORS, TableWriter
-from mavbridge.recording.video.file import WRITE_ERRORS, FragmentedMp4
-from mavbridge.recording.video.messages import (
-    Done,
-    Failed,
-    Finish,
-    FromWriter,
-    Open,
-    Opened,
-    Ready,
-    Submit,
-    ToWriter,
-    VideoJob,
-    Written,
-)
-from mavbridge.recording.video.ring import FrameRing
+from mavbridge.recording.video.frame_files import FILE_ERRORS, FrameFiles, VideoJob
+from mavbridge.recording.video.ring import FrameRing, RingShape
 
-FLUSH_NS = 500_000_000
-"""Longest span of frames whose rows may wait."""
-FLUSH_ROWS = 64
 IDLE_S = 0.5
-"""Rows do not wait longer than this for a next frame, either."""
+"""Longest wait of rows for a next frame."""
 NICENESS = 10
 
 
-def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob) -> None:
+class Submit(NamedTuple):
+    """Message to the writer: this slot holds a frame."""
+
+    slot: int
+    row: FrameRow
+
+
+class Written(NamedTuple):
+    """Message from the writer: the frame of this slot is in the file; the slot is free."""
+
+    slot: int
+
+
+class Failed(NamedTuple):
+    """Message from the writer: it has failed; it closes its files, and ends."""
+
+    reason: str
+
+
+class Notice(Enum):
+    """A message without contents."""
+
+    FINISH = auto()
+    """Sent to the writer: there are no more frames."""
+    READY = auto()
+    """Sent by the writer: it runs."""
+    MAPPED = auto()
+    """Sent by the writer: it has mapped the memory, whose name is not needed any more."""
+    DONE = auto()
+    """Sent by the writer: everything is closed."""
+
+
+ToWriter: TypeAlias = RingShape | Submit | Notice
+"""A ``RingShape`` comes first: the frames will lie there."""
+FromWriter: TypeAlias = Written | Failed | Notice
+
+
+def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob, niceness: int) -> None:
     """Entry point of the process."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    if job.yield_cpu:
-        os.nice(NICENESS)
+    if niceness:
+        os.nice(niceness)
     service = WriterService(pipe, job)
-    service.tell(Ready())
+    service.send(Notice.READY)
     while service.is_open:
         service.serve(IDLE_S)
 
 
 class WriterService:
-    """One job, message by message."""
+    """Does one job, message by message."""
 
     def __init__(self, pipe: "Connection[FromWriter, ToWriter]", job: VideoJob) -> None:
         self._pipe = pipe
-        self._job = job
+        self._files = FrameFiles(job)
+        self._folder = job.video.parent
         self._ring: FrameRing | None = None
-        self._video: FragmentedMp4 | None = None
-        self._table: TableWriter | None = None
-        self._rows: list[FrameRow] = []
         self.is_open = True
 
-    def tell(self, message: FromWriter) -> None:
-        """Say something, if there is still somebody to hear it."""
+    def send(self, message: FromWriter) -> None:
+        """Send a message, if the producer is still there."""
         try:
             self._pipe.send(message)
         except OSError:
             return
 
     def serve(self, timeout_s: float) -> None:
-        """Wait for one message and do what it says."""
+        """Wait for one message and handle it."""
         try:
             if not self._pipe.poll(timeout_s):
-                self._flush()
+                self._files.flush()
                 return
-            self._handle(self._pipe.recv())
+            self._handle(self._receive())
+        except FILE_ERRORS as error:
+            self._files.abandon()
+            self._close()
+            self.send(Failed(f"{self._folder}: {getattr(error, 'strerror', None) or error}"))
+
+    def _receive(self) -> ToWriter:
+        try:
+            message: ToWriter = self._pipe.recv()
         except (EOFError, ConnectionResetError):  # the producer is gone
-            self._end()
-        except WRITE_ERRORS as error:
-            self._fail(error)
+            return Notice.FINISH
+        return message
 
     def _handle(self, message: ToWriter) -> None:
         match message:
-            case Open(shape=shape):
-                self._ring = FrameRing.attach(shape)
-                self.tell(Opened())
-                self._video = FragmentedMp4(
-                    self._job.video, height=shape.height, width=shape.width, hz=self._job.hz
-                )
+            case RingShape():
+                self._ring = FrameRing.attach(message)
+                self.send(Notice.MAPPED)
             case Submit(slot=slot, row=row):
-                self._write(slot, row)
-                self.tell(Written(slot))
-            case Finish():
-                self._end()
-
-    def _write(self, slot: int, row: FrameRow) -> None:
-        if self._ring is None or self._video is None:
-            raise RuntimeError("a frame came before the ring was opened")
-        self._video.append(self._ring.slot(slot), row.captured_ns)
-        self._rows.append(row)
-        is_due = row.captured_ns - self._rows[0].captured_ns >= FLUSH_NS
-        if is_due or len(self._rows) >= FLUSH_ROWS:
-            self._flush()
-
-    def _flush(self) -> None:
-        if self._job.rows is None or not self._rows:
-            self._rows.clear()
-            return
-        schema = DEMONSTRATION_FRAMES if self._job.with_truth else FRAMES
-        if self._table is None:
-            self._table = TableWriter(self._job.rows, schema)
-        self._table.append(frames_batch(self._rows, schema))
-        self._rows.clear()
-
-    def _end(self) -> None:
-        """Close everything in order."""
-        try:
-            if self._video is not None:
-                self._video.close()
-                self._video = None
-            self._flush()
-            if self._table is not None:
-                table, self._table = self._table, None
-                table.finish()
-        except (*WRITE_ERRORS, *READ_ERRORS) as error:
-            self._fail(error)
-            return
-        self._close()
-        self.tell(Done())
-
-    def _fail(self, error: Exception) -> None:
-        """Leave what is written; the file that failed may be cut off at its end."""
-        for finish in (self._close_video, self._flush):
-            try:
-                finish()
-            except (*WRITE_ERRORS, *READ_ERRORS):
-                continue  # the disk that was full still is
-        if self._table is not None:
-            self._table.abandon()
-        self._close()
-        reason = getattr(error, "strerror", None) or str(error)
-        self.tell(Failed(f"{self._job.video.parent}: {reason}"))
-
-    def _close_video(self) -> None:
-        if self._video is not None:
-            video, self._video = self._video, None
-            video.close()
+                if self._ring is None:
+                    raise RuntimeError("a frame came before the ring was opened")
+                self._files.append(self._ring.slot(slot), row)
+                self.send(Written(slot))
+            case Notice.FINISH:
+                self._files.finish()
+                self._close()
+                self.send(Notice.DONE)
 
     def _close(self) -> None:
         self.is_open = False

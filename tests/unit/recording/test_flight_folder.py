@@ -1,11 +1,12 @@
 import json
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from helpers.factories import make_tick
-from helpers.recordings import make_frame, make_meta, number_of
+from helpers.recordings import make_frame, make_meta, number_of, without_writer_process
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import Sticks
 from mavbridge.recording import folder as names
@@ -25,13 +26,24 @@ def record(folder: Path, *, ticks: int = 30, frames: int = 10) -> FlightWriter:
     return writer
 
 
-@pytest.fixture
-def flight(tmp_path: Path) -> Path:
-    """A finished one."""
-    folder = tmp_path / "flight"
-    writer = record(folder)
+@pytest.fixture(autouse=True)
+def _in_process() -> Iterator[None]:
+    with without_writer_process():
+        yield
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished") / "flight"
+    writer = record(folder)  # by a writer process
     writer.finish(writer.meta)
     return folder
+
+
+@pytest.fixture
+def flight(finished: Path, tmp_path: Path) -> Path:
+    """A finished one, to spoil."""
+    return Path(shutil.copytree(finished, tmp_path / "flight"))
 
 
 def test_a_flight_comes_back(flight: Path) -> None:

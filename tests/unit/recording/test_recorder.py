@@ -1,3 +1,4 @@
+import multiprocessing
 import resource
 import signal
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ class Packets:
 
 
 @dataclass
-class Stand:
+class RecorderStand:
     """A recorder and what it told a person."""
 
     folder: Path
@@ -41,27 +42,26 @@ class Stand:
             packets=self.packets,
             wall_offset_ns=10**18,
             autopilot=lambda: "ardupilot 4.6.0",
-            tell=self.told.append,
+            report=self.told.append,
         )
-        self.writer = self.recorder._consumer._writer
-
-    @property
-    def pid(self) -> int:
-        pid = self.writer._video.pid
-        assert pid is not None
-        return pid
+        self.writer = self.recorder._consumer.writer
+        (process,) = (
+            child for child in multiprocessing.active_children() if child.name == "mavbridge-writer"
+        )
+        assert process.pid is not None
+        self.pid = process.pid
 
 
 @contextmanager
-def stand(folder: Path) -> Iterator[Stand]:
-    made = Stand(folder)
+def stand(folder: Path) -> Iterator[RecorderStand]:
+    made = RecorderStand(folder)
     try:
         yield made
     finally:
         made.recorder.close(DEADLINE_S)
 
 
-def until(stood: Stand, ticks: int) -> None:
+def until(stood: RecorderStand, ticks: int) -> None:
     """The thread has taken that many ticks."""
     for _ in range(10_000):
         if stood.writer.ticks >= ticks:

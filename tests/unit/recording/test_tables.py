@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.recordings import make_row
-from mavbridge.recording.schema import FRAMES, TICKS, frames_batch
+from mavbridge.recording.rows import FRAMES, TICKS, frames_batch
 from mavbridge.recording.tables import TableError, TableWriter, read_table
 
 SCHEMA_BYTES = FRAMES.serialize().size

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from multiprocessing import Pipe
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.recordings import make_row, number_of, picture, send_signal
-from mavbridge.recording.schema import DEMONSTRATION_FRAMES, FRAMES, read_frames
+from mavbridge.recording.rows import FRAMES, read_frames
 from mavbridge.recording.tables import read_table
 from mavbridge.recording.video import ring
 from mavbridge.recording.video.file import count_frames, read_video
-from mavbridge.recording.video.messages import Finish, VideoJob
+from mavbridge.recording.video.frame_files import VideoJob
 from mavbridge.recording.video.ring import MIN_SLOTS
 from mavbridge.recording.video.writer import (
     FrameSender,
@@ -29,7 +29,7 @@ from mavbridge.recording.video.writer import (
     WriterDiedError,
     WriterError,
 )
-from mavbridge.recording.video.writer_process import WriterService
+from mavbridge.recording.video.writer_process import Notice, WriterService
 
 DEADLINE_S = 30.0
 
@@ -76,27 +76,24 @@ def test_offline_nothing_is_dropped_and_rows_match_frames(tmp_path: Path) -> Non
 
 
 def test_a_video_alone_needs_no_table(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "rollout.mp4", pressure="offline", hz=10) as video:
-        submit(video, 40)
+    with closing(VideoWriter(tmp_path / "rollout.mp4", pressure="offline", hz=10)) as video:
+        submit(video, 40)  # more than a ring: the writer has mapped it by now
+        assert video._ring is not None
+        name = video._ring.shape.name
+        assert not (Path("/dev/shm") / name).exists(), "nothing stays, whoever is killed"
+        video.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["rollout.mp4"]
     assert [number_of(rgb) for rgb in read_video(tmp_path / "rollout.mp4")] == list(range(40))
 
 
 def test_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "odd.mp4", pressure="offline", hz=10) as video:
+    with closing(VideoWriter(tmp_path / "odd.mp4", pressure="offline", hz=10)) as video:
         video.submit(picture(5, height=49, width=67), make_row(0))
         assert video.size == (48, 66)
+        video.finish()
     (rgb,) = read_video(tmp_path / "odd.mp4")
     assert rgb.shape == (48, 66, 3)
     assert number_of(rgb) == 5
-
-
-def test_a_name_stays_in_no_case(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "a.mp4", pressure="offline", hz=10) as video:
-        submit(video, 40)  # more than a ring: it has been mapped by now
-        ring = video._sender._ring
-        assert ring is not None
-        assert not (Path("/dev/shm") / ring.shape.name).exists()
 
 
 def test_online_a_full_ring_drops_and_the_next_row_says_so(tmp_path: Path) -> None:
@@ -273,12 +270,10 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
         job = VideoJob(
             video=folder / "camera.mp4",
             rows=folder / "frames",
-            with_truth=False,
             hz=30,
-            yield_cpu=False,
         )
         service = WriterService(its, job)
-        sender = FrameSender(ours, Alive(), pressure="online")
+        sender = FrameSender(ours, Alive(), "online")
         offered = lost_upstream = 0
         taken: list[int] = []
         for step in steps:
@@ -291,7 +286,7 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
                 taken.append(offered)
                 lost_upstream_taken = lost_upstream
             offered += 1
-        ours.send(Finish())
+        ours.send(Notice.FINISH)
         while service.is_open:
             service.serve(0)
         sender.receive()
@@ -306,10 +301,3 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
         dropped = sum(row.dropped_before for row in rows)
         assert dropped == lost_upstream_taken + taken[-1] + 1 - len(taken)
         assert sender.written == len(rows)
-
-
-def test_demonstrations_have_room_for_the_truth(tmp_path: Path) -> None:
-    with writer(tmp_path, "offline", with_truth=True) as video:
-        video.submit(picture(0), make_row(0))
-        video.finish()
-    assert read_table(tmp_path / "frames", DEMONSTRATION_FRAMES).num_rows == 1

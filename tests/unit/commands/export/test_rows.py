@@ -14,6 +14,7 @@ from mavbridge.commands.export.rows import (
     worst_shift_ns,
 )
 from mavbridge.core.errors import UserError
+from policy.data import lerobot_format as names
 from policy.data.episodes import GATE_DIM, Episode
 
 
@@ -68,11 +69,15 @@ def test_a_row_holds_what_had_arrived(
         np.testing.assert_array_equal(
             part.captured_ns, flight.captured_ns[part.first_frame : end + 1]
         )
-        assert np.isfinite(part.state).all()
-        for stamps in (part.attitude_ns, part.velocity_ns, part.action_ns):
+        assert np.isfinite(part.columns[names.STATE_KEY]).all()
+        for stamps in (
+            part.columns[names.ATTITUDE],
+            part.columns[names.VELOCITY],
+            part.columns[names.ACTED],
+        ):
             assert (stamps <= part.captured_ns).all()
             assert (part.captured_ns - stamps <= MAX_HELD_NS).all()
-        later = flight.attitude_ns[None] > part.attitude_ns[:, None]
+        later = flight.attitude_ns[None] > part.columns[names.ATTITUDE][:, None]
         assert not (later & (flight.attitude_ns[None] <= part.captured_ns[:, None])).any()
 
 
@@ -87,8 +92,8 @@ def test_a_hole_in_the_camera_makes_two_and_one_frame_does_not() -> None:
 
 def test_before_anything_was_sent_sticks_are_neutral() -> None:
     (part,) = stretches(episode([50, 83, 116], list(range(0, 200, 10)), sent_ms=[100]))
-    np.testing.assert_array_equal(part.sent[:, 0], np.array([0, 0, 0.5], np.float32))
-    np.testing.assert_array_equal(part.sent_ns, np.array([50, 83, 100]) * MS)
+    np.testing.assert_array_equal(part.columns[names.SENT][:, 0], np.array([0, 0, 0.5], np.float32))
+    np.testing.assert_array_equal(part.columns[names.SENT_AT], np.array([50, 83, 100]) * MS)
 
 
 def parts(*periods: list[int]) -> list[Stretch]:

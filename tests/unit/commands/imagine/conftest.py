@@ -1,6 +1,6 @@
 import pytest
 
-from helpers.rollouts import InProcessWriter
+from helpers.recordings import InProcessWriter
 from mavbridge.commands.imagine import streamed
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from helpers.rollouts import DECIDERS, SIZE, make_plan, run
-from mavbridge.commands.imagine.files import read_rows
-from mavbridge.commands.imagine.plan import Stage
+from mavbridge.commands.imagine.loop import NoiseStage
+from mavbridge.commands.imagine.output import read_rows
 from mavbridge.recording.video.file import count_frames, read_video
 
 
 @pytest.mark.parametrize("decider", DECIDERS)
-@pytest.mark.parametrize("exe_steps", [1, 2, 5, 16])
+@pytest.mark.parametrize("exe_steps", [1, 5, 16])
 @pytest.mark.usefixtures("in_process_writer")
 def test_both_paths_give_the_same_frames_rows_and_file(
     tmp_path: Path, decider: str, exe_steps: int
@@ -29,15 +29,13 @@ def test_both_paths_give_the_same_frames_rows_and_file(
 @pytest.mark.usefixtures("in_process_writer")
 def test_every_seed_is_another_flight_and_the_same_each_time(tmp_path: Path) -> None:
     found = []
-    for seed in (0, 1, 2, 2**63 - 1):
-        for again in range(2):
-            plan = make_plan(seed=seed, ddim_steps=2)
-            ours = run(tmp_path / f"{seed}-{again}.mp4", plan, decider="toge")
-            plain = run(tmp_path / f"{seed}-{again}s.mp4", plan, decider="toge", serial=True)
-            assert ours.sha256 == plain.sha256
-            found.append(ours.sha256)
-    assert found[::2] == found[1::2]
-    assert len(set(found)) == 4
+    for seed in (0, 1, 2**63 - 1):
+        plan = make_plan(seed=seed, iterations=2, ddim_steps=2)
+        ours = run(tmp_path / f"{seed}.mp4", plan, decider="toge")
+        again = run(tmp_path / f"{seed}-again.mp4", plan, decider="toge")
+        assert ours.sha256 == again.sha256
+        found.append(ours.sha256)
+    assert len(set(found)) == 3
 
 
 @pytest.mark.usefixtures("in_process_writer")
@@ -51,7 +49,9 @@ def test_more_iterations_only_add_to_a_rollout(tmp_path: Path) -> None:
 
 def test_stages_and_iterations_share_no_noise() -> None:
     plans = [make_plan(seed=seed) for seed in (0, 1, 2**63 - 1)]
-    seeds = [plan.stage_seed(k, stage) for plan in plans for k in range(300) for stage in Stage]
+    seeds = [
+        plan.stage_seed(k, stage) for plan in plans for k in range(300) for stage in NoiseStage
+    ]
     assert len(set(seeds)) == len(seeds)
     assert all(0 <= seed < 2**63 for seed in seeds)
 

@@ -14,7 +14,7 @@ from helpers.recordings import make_meta
 from helpers.rollouts import TINY, TinyWorld, write_flight
 from mavbridge.__main__ import main
 from mavbridge.commands.imagine import run, sampling
-from mavbridge.commands.imagine.files import read_rows
+from mavbridge.commands.imagine.output import read_rows
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.recording.video.file import count_frames
 from policy.checkpoints.world_model_file import save_world_model

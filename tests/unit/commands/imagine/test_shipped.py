@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mavbridge.__main__ import main
-from mavbridge.commands.evaluate_imagination.metrics import psnr_db
-from mavbridge.commands.imagine.files import read_rows
+from mavbridge.commands.evaluate_imagination.scores import psnr_db
+from mavbridge.commands.imagine.output import read_rows
 from mavbridge.commands.imagine.run import SHIPPED
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.video.file import read_video

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from helpers.recordings import send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler
-from mavbridge.commands.imagine.files import RolloutError, read_rows
 from mavbridge.commands.imagine.loop import Segment
-from mavbridge.commands.imagine.output import ignore
+from mavbridge.commands.imagine.output import RolloutError, read_rows
+from mavbridge.commands.imagine.run import ignore_frame
 from mavbridge.commands.imagine.streamed import QUEUED_SEGMENTS, StreamedOutput
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import MavbridgeError
@@ -41,7 +41,7 @@ def output(out: Path, model: TinyWorld | None = None) -> Iterator[StreamedOutput
         PLAN,
         decode_video=True,
         clock=MonotonicClock(),
-        on_frame=ignore,
+        on_frame=ignore_frame,
     )
     try:
         yield made
@@ -196,7 +196,7 @@ def test_files_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
             PLAN,
             decode_video=False,
             clock=MonotonicClock(),
-            on_frame=ignore,
+            on_frame=ignore_frame,
         )
 
 

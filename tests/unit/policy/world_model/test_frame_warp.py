@@ -7,9 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.panoramas import attitude, nominal_lens, panorama, state_of
-from mavbridge.commands.evaluate_imagination.lens import FRD_FROM_FLU
-from mavbridge.commands.evaluate_imagination.metrics import psnr_db
+from helpers.panoramas import FRD_FROM_FLU, attitude, nominal_lens, panorama, state_of
+from mavbridge.commands.evaluate_imagination.scores import psnr_db
 from policy.contract import StateFrame
 from policy.data.samples import mirror_signs
 from policy.world_model.autoencoder import to_bytes, to_unit

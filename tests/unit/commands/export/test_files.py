@@ -6,22 +6,30 @@ import av
 import numpy as np
 import pytest
 
-from mavbridge.commands.export import video
-from mavbridge.commands.export.video import VideoFiles, VideoSpan
+from mavbridge.commands.export import files
+from mavbridge.commands.export.files import DatasetSpec, VideoFiles, VideoSpan
 
 FPS = 10
 
 
 def write(folder: Path, lengths: list[int], limit_bytes: int = 10**9) -> list[VideoSpan]:
-    files = VideoFiles(folder, fps=FPS, height=32, width=32, limit_bytes=limit_bytes)
+    spec = DatasetSpec(
+        fps=FPS,
+        height=32,
+        width=32,
+        state_frame="ned_frd",
+        task="fly",
+        video_file_bytes=limit_bytes,
+    )
+    video = VideoFiles(folder, spec)
     spans = []
     random = np.random.default_rng(0)
     for length in lengths:
-        files.begin(length)
+        video.begin(length)
         for _ in range(length):
-            files.append(random.integers(0, 255, (32, 32, 3), np.uint8))
-        spans.append(files.end())
-    files.close()
+            video.append(random.integers(0, 255, (32, 32, 3), np.uint8))
+        spans.append(video.end())
+    video.close()
     return spans
 
 
@@ -50,12 +58,12 @@ def test_a_file_that_would_grow_too_large_is_followed_by_another(tmp_path: Path)
 def test_a_file_that_would_grow_too_long_is_followed_by_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(video, "MAX_FILE_S", 1.0)
+    monkeypatch.setattr(files, "MAX_FILE_S", 1.0)
     spans = write(tmp_path, [5, 5, 1, 20])
     assert [span.file_index for span in spans] == [0, 0, 1, 2]
 
 
 def test_files_are_grouped_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(video, "FILES_A_CHUNK", 2)
+    monkeypatch.setattr(files, "FILES_A_CHUNK", 2)
     spans = write(tmp_path, [2, 2, 2], limit_bytes=1)
     assert [(span.chunk_index, span.file_index) for span in spans] == [(0, 0), (0, 1), (1, 0)]

@@ -8,12 +8,15 @@ from hypothesis import strategies as st
 from helpers.factories import make_released_tick, make_state, make_tick, make_trace
 from helpers.recordings import make_row
 from mavbridge.core.records import Sticks, Tick, VehicleState
-from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow
-from mavbridge.recording.schema import (
+from mavbridge.recording.rows import (
     DEMONSTRATION_FRAMES,
     DEMONSTRATION_TICKS,
     FRAMES,
     TICKS,
+    FrameRow,
+    FrameTruth,
+    TickLabels,
+    TickRow,
     frames_batch,
     read_frames,
     read_ticks,
