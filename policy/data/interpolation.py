@@ -7,7 +7,6 @@ from policy import rotation
 from policy.contract import FloatArray
 from policy.data.episodes import Nanoseconds
 
-NS_PER_S = 1_000_000_000
 MAX_GAP_NS = 200_000_000
 """Sticks and attitudes further apart are not interpolated."""
 
@@ -34,7 +33,7 @@ class Knots:
 
     def rotations_at(self, at_ns: Nanoseconds) -> NDArray[np.float64]:
         """Between two attitudes, a unit quaternion."""
-        return rotation.interpolate(*self._around(at_ns))
+        return rotation.slerp(*self._around(at_ns))
 
     def _around(
         self, at_ns: Nanoseconds

@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 from policy.contract import ACTION_NAMES, SPECIFIC_FORCE, STATE_NAMES, FloatArray, StateFrame
 from policy.data import lerobot_format as names
 from policy.data.episodes import GATE_DIM, DatasetError, Episode, ImageArray, Nanoseconds
+from policy.observation import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy import rotation
 from policy.contract import (
     ACTION_DIM,
     AGE,
@@ -25,7 +24,8 @@ from policy.contract import (
     FloatArray,
 )
 from policy.data.episodes import GATE_DIM, DatasetError, Episode, Nanoseconds
-from policy.data.interpolation import NS_PER_S, Indices, Knots, covered
+from policy.data.interpolation import Indices, Knots, covered
+from policy.observation import NS_PER_S, history_ages_ns, motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
 """How far the nearest tick may be from the moment that was drawn: two ticks at 100 Hz."""
@@ -168,39 +168,28 @@ class Timeline:
             return state
         captured_ns, attitude_ns = self.captured_ns[frames], self._attitude_ns[ticks]
         # An image newer than the attitude: in flight nothing later is known, so nothing has moved.
-        turned_from = self._attitude.rotations_at(np.minimum(captured_ns, attitude_ns))
-        moved_from = self._velocity.vectors_at(np.minimum(captured_ns, self._velocity_ns[ticks]))
-        then = rotation.conjugate(turned_from)
-        turned = rotation.multiply(then, state[:, QUATERNION].astype(np.float64))
+        attitude_then = self._attitude.rotations_at(np.minimum(captured_ns, attitude_ns))
+        was = self._velocity.vectors_at(np.minimum(captured_ns, self._velocity_ns[ticks]))
         out = np.empty((len(ticks), self.contract.state_dim), np.float32)
         out[:, :STATE_DIM] = state
         out[:, AGE] = (attitude_ns - captured_ns)[:, None] / NS_PER_S
-        out[:, ROTATION] = rotation.rotation_vector(turned)
-        out[:, VELOCITY_CHANGE] = rotation.rotate(then, state[:, VELOCITY] - moved_from)
+        out[:, ROTATION], out[:, VELOCITY_CHANGE] = motion_since_exposure(
+            attitude_then, state[:, QUATERNION].astype(np.float64), state[:, VELOCITY] - was
+        )
         return out
 
     def histories(self, ticks: Indices, random: np.random.Generator | None = None) -> FloatArray:
-        """[B, K, 4] sticks as they were sent, oldest first, held until the next one."""
+        """[B, K, 4] sticks as they were sent, oldest first; augmented by ``random``."""
         count = self.contract.history_len
-        back_s = np.arange(count, 0, -1) * self.contract.history_dt_s
-        at_s = np.broadcast_to(back_s, (len(ticks), count))
+        ages_ns = np.array(history_ages_ns(count, self.contract.history_dt_s))
+        at_ns = self.tick_ns[ticks][:, None] - ages_ns
         if random is not None:
-            at_s = at_s + random.uniform(-HISTORY_JITTER_S, HISTORY_JITTER_S, at_s.shape)
-        at_ns = self.tick_ns[ticks][:, None] - np.round(at_s * NS_PER_S).astype(np.int64)
+            jitter_s = random.uniform(-HISTORY_JITTER_S, HISTORY_JITTER_S, at_ns.shape)
+            at_ns = at_ns - np.round(jitter_s * NS_PER_S).astype(np.int64)
         # Flights are seconds apart, so a time before the first stick finds the neutral row.
         row = np.maximum(np.searchsorted(self._sent_ns, at_ns, side="right") - 1, 0)
         history: FloatArray = self._sent[row]
-        if random is not None:
-            offset = random.normal(0.0, HISTORY_NOISE, (len(ticks), 1, ACTION_DIM))
-            history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
-            chance = random.random(len(ticks))
-            is_fresh = chance < FRESH_START_SHARE
-            neutral = np.where(is_fresh, random.integers(1, count + 1, len(ticks)), 0)
-            neutral = np.where(chance > 1 - BLIND_SHARE, count, neutral)
-            history = np.where(
-                (np.arange(count) < neutral[:, None])[..., None], np.float32(0), history
-            )
-        return history
+        return history if random is None else _forgetful(history, random)
 
     def chunks(self, ticks: Indices) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Sticks [B, horizon, 4] to imitate, and which of them [B, horizon] are known."""
@@ -215,6 +204,17 @@ class Timeline:
         held = np.minimum(np.arange(horizon), last[:, None])
         filled = np.take_along_axis(chunk, held[..., None], axis=1)
         return filled.astype(np.float32), known
+
+
+def _forgetful(history: FloatArray, random: np.random.Generator) -> FloatArray:
+    """Histories [B, K, 4] with offset sticks, some of them partly or wholly neutral."""
+    samples, count, _ = history.shape
+    offset = random.normal(0.0, HISTORY_NOISE, (samples, 1, ACTION_DIM))
+    history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
+    chance = random.random(samples)
+    neutral = np.where(chance < FRESH_START_SHARE, random.integers(1, count + 1, samples), 0)
+    neutral = np.where(chance > 1 - BLIND_SHARE, count, neutral)
+    return np.where((np.arange(count) < neutral[:, None])[..., None], np.float32(0), history)
 
 
 def _start_ns(episode: Episode) -> int:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, VELOCITY, FloatArray
 from policy.data.episodes import DatasetError, Episode, Nanoseconds
-from policy.data.interpolation import NS_PER_S, Indices, Knots
+from policy.data.interpolation import Indices, Knots
+from policy.observation import NS_PER_S
 
 TOLERANCE = 0.25
 """Of the time between two frames: how far a frame may be from its place in a window. A frame in

@@ -163,7 +163,7 @@ def test_the_runtime_tells_the_same_of_an_image() -> None:
         for frame in frames[(age_ns >= 0) & (age_ns < 200 * MS)]:
             expected = runtime.append_to(state, int(episode.captured_ns[frame]))
             told = line.states(np.array([frame]), np.array([tick]))
-            np.testing.assert_allclose(told, expected, atol=2e-5)
+            np.testing.assert_allclose(told, expected, atol=1e-6)
 
 
 def test_without_since_exposure_the_state_has_13_numbers() -> None:
