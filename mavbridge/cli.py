@@ -1,6 +1,6 @@
 """The command line: every flag is a field of a config dataclass."""
 
-import os
+import sys
 import tomllib
 from pathlib import Path
 from typing import Annotated
@@ -9,14 +9,15 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
+from mavbridge.commands.train.checks import prepare as prepare_training
 from mavbridge.config.bench import BenchConfig, RolloutBenchConfig
 from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.export import ExportConfig
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.imagine import ImagineConfig, ImagineEvaluateConfig
-from mavbridge.config.train import TrainConfig
 from mavbridge.core.errors import UserError
+from policy.training.settings import TrainSettings, WorldModelSettings
 
 cli = App(
     name="mavbridge",
@@ -59,6 +60,7 @@ def bench_rollout(config: RolloutBenchConfig | None = None) -> int:
     return run_bench(RolloutBenchConfig() if config is None else config)
 
 
+WORLD_MODEL_FLAG = ("--policy world-model", "--policy=world-model")
 IMAGINE, EVALUATE = "imagine", "--evaluate"
 imagine_cli = App(name=IMAGINE)
 cli.command(imagine_cli)
@@ -125,23 +127,33 @@ def demonstrate(config: DemonstrateConfig) -> int:
 
 
 @cli.command
-def train(*flights: Path, config: TrainConfig | None = None) -> int:
-    """Train a policy, or a world model, from flights.
+def train(*flights: Path, settings: Annotated[TrainSettings, Parameter(name="*")]) -> int:
+    """Train a policy from flights.
 
     Args:
         flights: flight folders, folders of them, or LeRobot datasets (v3).
-        config: the settings.
+        settings: the settings.
     """
-    if not flights:
-        raise UserError("name the flights to learn from: mavbridge train DIR... --out FILE")
-    if config is None or config.out is None:
-        raise UserError("name the checkpoint to write: --out FILE.safetensors")
-    # torch's threads else spin at every barrier: on a core that somebody else uses too, ten times
-    # the time. OpenMP reads it once, as torch is loaded.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    from mavbridge.commands.train.run import train_policy
+    prepare_training("train", flights, settings)
+    from mavbridge.commands.train.run import run_policy_training
 
-    return train_policy(flights, config, config.out)
+    return run_policy_training(flights, settings)
+
+
+@cli.command
+def train_world_model(
+    *flights: Path, settings: Annotated[WorldModelSettings, Parameter(name="*")]
+) -> int:
+    """Train the world model of mavbridge imagine from flights.
+
+    Args:
+        flights: flight folders, folders of them, or LeRobot datasets (v3).
+        settings: the settings.
+    """
+    prepare_training("train-world-model", flights, settings)
+    from mavbridge.commands.train.run import run_world_model_training
+
+    return run_world_model_training(flights, settings)
 
 
 @cli.command
@@ -176,7 +188,7 @@ def with_config(
     if config is not None:
         _check_toml(config)
     cli.config = [] if config is None else [Toml(config, use_commands_as_keys=False)]
-    status: int | None = cli(_command_first(tokens))
+    status: int | None = cli(_command_first(_current_spelling(tokens)))
     return status or 0
 
 
@@ -186,6 +198,18 @@ def _command_first(tokens: tuple[str, ...]) -> tuple[str, ...]:
         return tokens
     rest = [token for token in tokens[1:] if token != EVALUATE]
     return IMAGINE, EVALUATE, *rest
+
+
+def _current_spelling(tokens: tuple[str, ...]) -> tuple[str, ...]:
+    """``train --policy world-model`` was the spelling of ``train-world-model`` in version 0.1."""
+    for at in range(1, len(tokens)):
+        length = 1 if tokens[at] == "--policy=world-model" else 2
+        if tokens[0] == "train" and " ".join(tokens[at : at + length]) in WORLD_MODEL_FLAG:
+            note = "note: train --policy world-model is now spelled train-world-model\n"
+            sys.stderr.write(note)
+            rest = (*tokens[1:at], *tokens[at + length :])
+            return "train-world-model", *filter("--freeze-encoder".__ne__, rest)
+    return tokens
 
 
 def _check_toml(path: Path) -> None:

@@ -49,6 +49,14 @@ def rotate(q: Q, vector: V) -> V:
     )
 
 
+def matrix_columns(w: Any, x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any], ...]:
+    """Columns of the matrix world_from_body: the body's axes in the world; numbers of any kind."""
+    forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    side = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+    up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    return forward, side, up
+
+
 def rotation_vector(q: Quaternion | Array) -> Any:
     """Axis times angle in rad, 3 numbers, the shorter way round."""
     library: Any = math if isinstance(q, tuple) else np

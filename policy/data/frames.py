@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.data.episodes import DatasetError, Episode, ImageArray
+from policy.data.flight_data import DatasetError, FlightData, ImageArray
 from policy.preprocess import resize
 
 _SPARE_BYTES = 1 << 30
@@ -19,37 +19,38 @@ _SPARE_BYTES = 1 << 30
 
 
 class FrameStore:
-    """Images of episodes [N, height, width, 3] uint8, counted over all of them in their order."""
+    """Images of flights [N, height, width, 3] uint8, counted over all of them in their order."""
 
     def __init__(self, arrays: Sequence[ImageArray]) -> None:
         self._arrays = arrays
-        self._starts = np.cumsum([0, *(len(array) for array in arrays)])
+        self.counts = [len(array) for array in arrays]
+        """Images of each flight."""
+        self._starts = np.cumsum([0, *self.counts])
 
-    def __len__(self) -> int:
-        return int(self._starts[-1])
-
-    @property
-    def counts(self) -> list[int]:
-        """Images of each episode."""
-        return [len(array) for array in self._arrays]
-
-    def only(self, episodes: Sequence[int]) -> "FrameStore":
-        """The images of some episodes, counted anew."""
-        return FrameStore([self._arrays[index] for index in episodes])
+    def only(self, flights: Sequence[int]) -> "FrameStore":
+        """The images of some flights, counted anew."""
+        return FrameStore([self._arrays[index] for index in flights])
 
     def read(
-        self, frames: NDArray[np.int64], size: tuple[int, int], shifts: NDArray[np.int64]
+        self,
+        frames: NDArray[np.int64],
+        size: tuple[int, int],
+        shifts: NDArray[np.int64] | None = None,
+        *,
+        is_mirrored: bool = False,
     ) -> ImageArray:
-        """[B, height, width, 3] at ``size``, moved by ``shifts`` [B, 2] pixels down and right.
+        """Images [B, height, width, 3] at ``size``, mirrored or not.
 
-        A shifted image repeats its edge.
+        ``shifts`` [B, 2] are pixels down and right; a shifted image repeats its edge.
         """
         out = np.empty((len(frames), *size, 3), np.uint8)
-        episodes = np.searchsorted(self._starts, frames, side="right") - 1
-        for row, (frame, episode) in enumerate(zip(frames, episodes, strict=True)):
-            image = np.asarray(self._arrays[episode][frame - self._starts[episode]])
-            out[row] = resize(_shift(image, shifts[row]), *size)
-        return out
+        flights = np.searchsorted(self._starts, frames, side="right") - 1
+        for row, (frame, flight) in enumerate(zip(frames, flights, strict=True)):
+            image = np.asarray(self._arrays[flight][frame - self._starts[flight]])
+            if shifts is not None:
+                image = _shift(image, shifts[row])
+            out[row] = resize(image, *size)
+        return np.ascontiguousarray(out[:, :, ::-1]) if is_mirrored else out
 
 
 def _shift(image: ImageArray, shift: NDArray[np.int64]) -> ImageArray:
@@ -65,20 +66,20 @@ def _shift(image: ImageArray, shift: NDArray[np.int64]) -> ImageArray:
 
 
 def store_frames(
-    episodes: Sequence[Episode],
+    flights: Sequence[FlightData],
     *,
     height: int,
     width: int,
     folder: Path,
     progress: Callable[[float], None],
 ) -> FrameStore:
-    """Decode and resize, as in flight, what ``folder`` does not hold yet.
+    """Decode and resize, as in flight, the images that ``folder`` does not hold yet.
 
     Args:
-        episodes: whose images.
-        height: of the stored images, px.
-        width: of the stored images, px.
-        folder: one file an episode, named by the content of its video and the size.
+        flights: whose images.
+        height: height of the stored images, px.
+        width: width of the stored images, px.
+        folder: one file a flight, named by the content of its video and the size.
         progress: called with the fraction done.
 
     Raises:
@@ -86,8 +87,8 @@ def store_frames(
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        paths = [_path(folder, episode, height, width) for episode in episodes]
-        missing = {p: e for p, e in zip(paths, episodes, strict=True) if not p.is_file()}
+        paths = [_path(folder, flight, height, width) for flight in flights]
+        missing = {p: e for p, e in zip(paths, flights, strict=True) if not p.is_file()}
         need = sum(len(e.captured_ns) for e in missing.values()) * height * width * 3
         free = shutil.disk_usage(folder).free
         if need + _SPARE_BYTES > free:
@@ -95,8 +96,8 @@ def store_frames(
                 f"{folder}: the decoded images take {need / 1e9:.1f} GB and {free / 1e9:.1f} GB "
                 "are free: choose a smaller --image-size, fewer flights, or an --out elsewhere"
             )
-        for index, (path, episode) in enumerate(missing.items()):
-            _decode(path, episode, height, width)
+        for index, (path, flight) in enumerate(missing.items()):
+            _decode(path, flight, height, width)
             progress((index + 1) / len(missing))
     except OSError as error:
         raise disk_error(folder, error) from error
@@ -104,20 +105,20 @@ def store_frames(
 
 
 def disk_error(path: Path, error: OSError) -> DatasetError:
-    """What to say of a file that could not be written."""
+    """The error to raise for a file that could not be written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DatasetError(f"{path}: the disk is full: make room, or write --out elsewhere")
     return DatasetError(f"{path}: {error.strerror or error}")
 
 
-def _path(folder: Path, episode: Episode, height: int, width: int) -> Path:
-    key = f"{episode.fingerprint} {len(episode.captured_ns)}"
+def _path(folder: Path, flight: FlightData, height: int, width: int) -> Path:
+    key = f"{flight.fingerprint} {len(flight.captured_ns)}"
     name = hashlib.sha256(key.encode()).hexdigest()[:20]
     return folder / f"{name}.{height}x{width}.rgb"
 
 
-def _decode(path: Path, episode: Episode, height: int, width: int) -> None:
-    """All images that have a row, or those before the video breaks off.
+def _decode(path: Path, flight: FlightData, height: int, width: int) -> None:
+    """Store all images that have a row, or those before the video breaks off.
 
     Written, not mapped: a disk that fills up under a map would kill the process.
     """
@@ -125,11 +126,11 @@ def _decode(path: Path, episode: Episode, height: int, width: int) -> None:
     count = 0
     try:
         with partial.open("wb") as file:
-            for image in islice(episode.decode(), len(episode.captured_ns)):
+            for image in islice(flight.decode(), len(flight.captured_ns)):
                 file.write(np.ascontiguousarray(resize(image, height, width)).data)
                 count += 1
         if count == 0:
-            raise DatasetError(f"{episode.name}: no frame of its video can be read")
+            raise DatasetError(f"{flight.name}: no frame of its video can be read")
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

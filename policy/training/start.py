@@ -1,60 +1,53 @@
-"""The weights that a training run starts from, and what a checkpoint says of its training."""
+"""The weights that a policy's training starts from, and the card that its checkpoint carries."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import torch
 
 from policy.checkpoints.policy_file import BuiltinPolicy, build_policy, load_checkpoint
 from policy.contract import STATE_NAMES
-from policy.data.episodes import Episode, Nanoseconds
+from policy.data.flight_data import FlightData, Nanoseconds
 from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
-from policy.training.plan import TrainSettings
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import TogeConfig
+from policy.training.settings import TrainSettings
 from policy.training.trainee import Trainee
 
+Network: TypeAlias = TogeConfig | ResnetUnetConfig
 AGE_BIN_MS = 5
 
 
-def starting_trainee(settings: TrainSettings) -> Trainee:
-    """The policy to start from, and a new gate head; the process's random stream stays as it was.
+def starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
+    """The policy to start from and a new gate head; torch's global random state is kept.
 
     Raises:
         PolicyError: weights that do not fit.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        return Trainee(_starting_policy(settings))
+        if settings.start_from is not None:
+            return Trainee(_checkpoint(network, settings.start_from))
+        policy = build_policy(network)
+        if settings.backbone_weights is not None:
+            load_imagenet_state(policy.backbone, _state_dict(settings.backbone_weights))
+        return Trainee(policy)
 
 
-def _starting_policy(settings: TrainSettings) -> BuiltinPolicy:
-    """Random weights, an encoder's weights under them, or a checkpoint."""
-    if settings.start_from is not None:
-        return _checkpoint(settings, settings.start_from)
-    policy = build_policy(settings.policy)
-    if settings.backbone_weights is not None:
-        state = _state_dict(settings.backbone_weights)
-        load_imagenet_state(policy.backbone, state)
-    return policy
-
-
-def _checkpoint(settings: TrainSettings, path: Path) -> BuiltinPolicy:
-    policy = load_checkpoint(path, fallback=settings.policy)
-    wanted = settings.policy
-    is_same = replace(policy.config, contract=wanted.contract) == wanted
-    theirs, ours = (
-        policy.contract,
-        replace(wanted.contract, feature_dim=policy.contract.feature_dim),
+def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
+    policy = load_checkpoint(path, fallback=network)
+    wanted = replace(network.contract, feature_dim=policy.contract.feature_dim)
+    asked, held = (
+        {**asdict(config), "contract": None, **asdict(contract)}
+        for config, contract in ((network, wanted), (policy.config, policy.contract))
     )
-    if not is_same or theirs != ours:
-        mine, its = (
-            {**asdict(config), "contract": None, **asdict(config.contract)}
-            for config in (replace(wanted, contract=ours), policy.config)
-        )
-        other = [f"{name} {its[name]!r}" for name in its if mine.get(name) != its[name]]
+    other = [f"{name} {value!r}" for name, value in held.items() if asked.get(name) != value]
+    if other or type(policy.config) is not type(network):
         raise PolicyError(
             f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
         )
@@ -75,20 +68,20 @@ def _state_dict(path: Path) -> dict[str, torch.Tensor]:
 
 def training_card(
     settings: TrainSettings,
-    episodes: Sequence[Episode],
+    flights: Sequence[FlightData],
     ages_ns: Nanoseconds,
     *,
     steps: int,
     validation: Mapping[str, float] | None,
 ) -> str:
-    """What a checkpoint says of its training, as JSON."""
-    state = np.concatenate([episode.state for episode in episodes])
-    target = np.concatenate([episode.target for episode in episodes])
+    """How a checkpoint was trained, as JSON."""
+    state = np.concatenate([flight.state for flight in flights])
+    target = np.concatenate([flight.target for flight in flights])
     ages_ms = ages_ns / 1e6
     edges = np.arange(0, ages_ms.max() + 2 * AGE_BIN_MS, AGE_BIN_MS)
     card = {
-        "flights": len(episodes),
-        "images": sum(len(episode.captured_ns) for episode in episodes),
+        "flights": len(flights),
+        "images": sum(len(flight.captured_ns) for flight in flights),
         "ticks": len(state),
         "steps": steps,
         "batch_size": settings.batch_size,
@@ -97,7 +90,7 @@ def training_card(
         "world_yaw": "drawn evenly",
         "gate_weight": settings.gate_weight,
         "feature_age_ms": {
-            "measured_in": "the flights" if settings.ages_ns is None else "--ages",
+            "measured_in": "the flights" if settings.ages is None else "--ages",
             "bin_ms": AGE_BIN_MS,
             "counts_from_0": np.histogram(ages_ms, edges)[0].tolist(),
         },

@@ -12,7 +12,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.recording.flight_folder import open_flight
-from policy.data.episodes import DatasetError, Episode
+from policy.data.flight_data import DatasetError, FlightData
 from policy.data.flight_folders import find_flights, is_exemplary, read_flight
 from policy.data.windows import Windows, find_windows
 from policy.preprocess import resize
@@ -153,7 +153,7 @@ def with_images(
             kept = {index: image for index, image in kept.items() if index >= first}
 
 
-def _read(folder: Path, config: WorldModelConfig) -> Episode:
+def _read(folder: Path, config: WorldModelConfig) -> FlightData:
     episode = read_flight(folder)
     if episode.state_frame != config.contract.state_frame:
         raise UserError(
@@ -164,7 +164,7 @@ def _read(folder: Path, config: WorldModelConfig) -> Episode:
     return episode.first_frames(open_flight(folder).frames.num_rows)
 
 
-def _find(episode: Episode, config: WorldModelConfig, steps: int) -> Windows | None:
+def _find(episode: FlightData, config: WorldModelConfig, steps: int) -> Windows | None:
     try:
         return find_windows(
             [episode],

@@ -14,7 +14,7 @@ import numpy as np
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from policy.contract import ACTION_DIM, FloatArray
-from policy.data.episodes import Episode, Nanoseconds
+from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.interpolation import MAX_GAP_NS
 
 MAX_HELD_NS = MAX_GAP_NS
@@ -31,7 +31,7 @@ MAX_RATE_OFF = 0.2
 class Stretch:
     """Consecutive frames of a flight, in each of which somebody flew: one episode of LeRobot."""
 
-    episode: Episode
+    episode: FlightData
     first_frame: int
     """Of the flight's frames."""
     captured_ns: Nanoseconds
@@ -69,7 +69,7 @@ class Stretch:
         return replace(self, first_frame=self.first_frame + start, **changes)
 
 
-def stretches(episode: Episode) -> list[Stretch]:
+def stretches(episode: FlightData) -> list[Stretch]:
     """Align a flight to its frames, and cut out those that nobody flew.
 
     Args:

@@ -44,12 +44,12 @@ def batch(tmp_path_factory: pytest.TempPathFactory) -> Batch:
 
 def trainee() -> Trainee:
     torch.manual_seed(0)
-    return Trainee(Toge(TogeConfig(backbone="resnet18", contract=CONTRACT)))
+    return Trainee(Toge(TogeConfig(backbone="resnet8", contract=CONTRACT)))
 
 
 def losses(model: Trainee, batch: Batch) -> StepLoss:
     made = model(batch, torch.ones(4))
-    return StepLoss(total=made.sticks + made.gate, told={"loss": made.sticks})
+    return StepLoss(total=made.sticks + made.gate, metrics={"loss": made.sticks})
 
 
 def frozen(model: Trainee) -> None:

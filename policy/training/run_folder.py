@@ -1,4 +1,4 @@
-"""A training run on disk: its state, to go on after a kill, and its log."""
+"""A training run on disk: its state, to resume it after a kill, and its log."""
 
 import hashlib
 import json
@@ -9,37 +9,38 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from policy.data.episodes import Episode
+from policy.data.flight_data import FlightData
 from policy.data.frames import disk_error
 from policy.errors import PolicyError
-from policy.training.plan import RunSettings
+from policy.training.settings import RunSettings
 
 _STATE, _LOG = "state.pt", "log.jsonl"
 
 
 class TrainingError(PolicyError):
-    """A run that cannot start, go on or be kept; the message says what to do."""
+    """A run that cannot start, be resumed or be kept; the message says what to do."""
 
 
 class TrainingStoppedError(PolicyError):
-    """Somebody wanted the run to end; the message says how it goes on."""
+    """The run was asked to stop; the message says how to resume it."""
 
 
 @dataclass(kw_only=True)
 class Position:
-    """Where a run is."""
+    """Where a run is; saved with its weights."""
 
     step: int = 0
     """Optimiser steps done."""
     stage: int = 0
+    """Index of the current stage."""
     phase_step: int = 0
-    """``step`` at which the phase (encoder and head, or head alone) began."""
+    """``step`` at which the phase began: the encoder learns, or it is frozen."""
     phase_start: float = 0.0
     """Fraction of the budget used up to then."""
     spent_s: float = 0.0
+    """Time used up to the last save."""
     validations: int = 0
     best: float | None = None
     """Score of the exported weights, more is better."""
@@ -48,7 +49,7 @@ class Position:
 
 
 class RunFolder:
-    """What a run keeps until it is over."""
+    """Files that a run keeps until it is over."""
 
     def __init__(self, path: Path, identity: str) -> None:
         self.path = path
@@ -60,7 +61,7 @@ class RunFolder:
 
     @property
     def has_state(self) -> bool:
-        """Whether there is something to go on from."""
+        """Whether there is a state to resume from."""
         return (self.path / _STATE).is_file()
 
     def save(self, position: Position, tensors: Mapping[str, Any]) -> None:
@@ -117,22 +118,22 @@ class RunFolder:
         return self.path / "frames"
 
     @property
-    def pooled(self) -> Path:
-        """File of the kept features."""
-        return self.path / "pooled.f16"
+    def features(self) -> Path:
+        """File of the stored features."""
+        return self.path / "features.f16"
 
     def clear(self) -> None:
-        """The run is over: all but the log goes."""
+        """Remove all but the log."""
         shutil.rmtree(self.frames, ignore_errors=True)
-        self.pooled.unlink(missing_ok=True)
+        self.features.unlink(missing_ok=True)
         (self.path / _STATE).unlink(missing_ok=True)
 
     def start_log(self) -> None:
-        """Forget the log of an earlier run."""
+        """Remove the log of an earlier run."""
         (self.path / _LOG).unlink(missing_ok=True)
 
     def _cut_log(self, step: int) -> None:
-        """Forget what came after the state: it is about to happen again."""
+        """Remove the lines after a step: those steps are about to be repeated."""
         path = self.path / _LOG
         if path.is_file():
             lines = path.read_text().splitlines(keepends=True)
@@ -149,13 +150,10 @@ def _step_of(line: str) -> float:
     return step if isinstance(step, int) else float("inf")
 
 
-def identity_of(settings: RunSettings, episodes: Sequence[Episode]) -> str:
-    """Changes with everything that a resumed run must not change."""
-    told = {
-        name: value.tolist() if isinstance(value, np.ndarray) else str(value)
-        for name, value in vars(settings).items()
-        if name not in ("resume", "device", "out", "check_every")
-    }
-    flights = [(episode.fingerprint, len(episode.tick_ns)) for episode in episodes]
-    text = json.dumps([told, flights], sort_keys=True)
+def identity_of(settings: RunSettings, network: object, flights: Sequence[FlightData]) -> str:
+    """Hash of everything that must be the same when a run is resumed."""
+    free = ("resume", "device", "out", "check_every", "check_flights")
+    fixed = {name: str(value) for name, value in vars(settings).items() if name not in free}
+    videos = [(flight.fingerprint, len(flight.tick_ns)) for flight in flights]
+    text = json.dumps([fixed, str(network), videos], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
