@@ -34,22 +34,22 @@ class FrameStore:
     def read(
         self,
         frames: NDArray[np.int64],
-        size: tuple[int, int],
+        size: int,
         shifts: NDArray[np.int64] | None = None,
         *,
         is_mirrored: bool = False,
     ) -> ImageArray:
-        """Images [B, height, width, 3] at ``size``, mirrored or not.
+        """Images [B, size, size, 3], mirrored or not.
 
         ``shifts`` [B, 2] are pixels down and right; a shifted image repeats its edge.
         """
-        out = np.empty((len(frames), *size, 3), np.uint8)
+        out = np.empty((len(frames), size, size, 3), np.uint8)
         flights = np.searchsorted(self._starts, frames, side="right") - 1
         for row, (frame, flight) in enumerate(zip(frames, flights, strict=True)):
             image = np.asarray(self._arrays[flight][frame - self._starts[flight]])
             if shifts is not None:
                 image = _shift(image, shifts[row])
-            out[row] = resize(image, *size)
+            out[row] = resize(image, size, size)
         return np.ascontiguousarray(out[:, :, ::-1]) if is_mirrored else out
 
 
@@ -67,19 +67,16 @@ def _shift(image: ImageArray, shift: NDArray[np.int64]) -> ImageArray:
 
 def store_frames(
     flights: Sequence[FlightData],
-    *,
-    height: int,
-    width: int,
     folder: Path,
-    progress: Callable[[float], None],
+    size: int,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> FrameStore:
     """Decode and resize, as in flight, the images that ``folder`` does not hold yet.
 
     Args:
         flights: whose images.
-        height: height of the stored images, px.
-        width: width of the stored images, px.
         folder: one file a flight, named by the content of its video and the size.
+        size: pixels along a side of the stored images.
         progress: called with the fraction done.
 
     Raises:
@@ -87,9 +84,9 @@ def store_frames(
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        paths = [_path(folder, flight, height, width) for flight in flights]
-        missing = {p: e for p, e in zip(paths, flights, strict=True) if not p.is_file()}
-        need = sum(len(e.captured_ns) for e in missing.values()) * height * width * 3
+        paths = [_path(folder, flight, size) for flight in flights]
+        missing = {p: f for p, f in zip(paths, flights, strict=True) if not p.is_file()}
+        need = sum(len(flight.captured_ns) for flight in missing.values()) * size * size * 3
         free = shutil.disk_usage(folder).free
         if need + _SPARE_BYTES > free:
             raise DatasetError(
@@ -97,11 +94,11 @@ def store_frames(
                 "are free: choose a smaller --image-size, fewer flights, or an --out elsewhere"
             )
         for index, (path, flight) in enumerate(missing.items()):
-            _decode(path, flight, height, width)
+            _decode(path, flight, size)
             progress((index + 1) / len(missing))
     except OSError as error:
         raise disk_error(folder, error) from error
-    return FrameStore([_load(path, height, width) for path in paths])
+    return FrameStore([np.memmap(p, np.uint8, mode="r").reshape(-1, size, size, 3) for p in paths])
 
 
 def disk_error(path: Path, error: OSError) -> DatasetError:
@@ -111,13 +108,13 @@ def disk_error(path: Path, error: OSError) -> DatasetError:
     return DatasetError(f"{path}: {error.strerror or error}")
 
 
-def _path(folder: Path, flight: FlightData, height: int, width: int) -> Path:
+def _path(folder: Path, flight: FlightData, size: int) -> Path:
     key = f"{flight.fingerprint} {len(flight.captured_ns)}"
     name = hashlib.sha256(key.encode()).hexdigest()[:20]
-    return folder / f"{name}.{height}x{width}.rgb"
+    return folder / f"{name}.{size}x{size}.rgb"
 
 
-def _decode(path: Path, flight: FlightData, height: int, width: int) -> None:
+def _decode(path: Path, flight: FlightData, size: int) -> None:
     """Store all images that have a row, or those before the video breaks off.
 
     Written, not mapped: a disk that fills up under a map would kill the process.
@@ -127,14 +124,10 @@ def _decode(path: Path, flight: FlightData, height: int, width: int) -> None:
     try:
         with partial.open("wb") as file:
             for image in islice(flight.decode(), len(flight.captured_ns)):
-                file.write(np.ascontiguousarray(resize(image, height, width)).data)
+                file.write(np.ascontiguousarray(resize(image, size, size)).data)
                 count += 1
         if count == 0:
             raise DatasetError(f"{flight.name}: no frame of its video can be read")
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
-
-
-def _load(path: Path, height: int, width: int) -> ImageArray:
-    return np.memmap(path, np.uint8, mode="r").reshape(-1, height, width, 3)

@@ -41,8 +41,8 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
     Raises:
         DatasetError: another version, other features, or damaged; the message says what to do.
     """
-    info = _read_info(folder)
-    rows = _read_episodes(info, _camera(info, camera_key))
+    info = _read_info(folder, camera_key)
+    rows = _read_episodes(info)
     digests = {path: file_digest(path) for path in {row.video for row in rows}}
     columns = ["episode_index", "timestamp", names.STATE_KEY, names.ACTION_KEY]
     columns += [name for name in names.STAMPS if name in info.features]
@@ -74,12 +74,9 @@ class _Info:
     features: Mapping[str, Mapping[str, Any]]
     data_path: str
     video_path: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Camera:
-    key: str
+    camera: str
     is_video: bool
+    """Whether the camera's images are in videos, or in the table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,13 +87,12 @@ class _Row:
     episode_index: int
     length: int
     data: Path
-    camera: _Camera
     video: Path
     """The same as ``data`` where the images are in the table."""
     from_s: float
 
 
-def _read_info(folder: Path) -> _Info:
+def _read_info(folder: Path, camera_key: str | None) -> _Info:
     path = folder / names.INFO
     data = read_json(path, "LeRobot dataset")
     version = data.get("codebase_version") if isinstance(data, dict) else None
@@ -112,12 +108,15 @@ def _read_info(folder: Path) -> _Info:
         raise DatasetError(f"{path} describes no features")
     _require_vector(folder, features, names.STATE_KEY, STATE_NAMES)
     _require_vector(folder, features, names.ACTION_KEY, ACTION_NAMES)
+    camera = _choose_camera(folder, features, camera_key)
     return _Info(
         folder=folder,
         fps=float(fps),
         features=features,
         data_path=str(data.get("data_path") or names.DATA),
         video_path=str(data.get("video_path") or names.VIDEO),
+        camera=camera,
+        is_video=features[camera].get("dtype") == "video",
     )
 
 
@@ -142,62 +141,54 @@ def _require_vector(
         )
 
 
-def _camera(info: _Info, asked: str | None) -> _Camera:
-    kinds = {key: f.get("dtype") for key, f in info.features.items()}
-    cameras = sorted(key for key, kind in kinds.items() if kind in ("video", "image"))
+def _choose_camera(
+    folder: Path, features: Mapping[str, Mapping[str, Any]], asked: str | None
+) -> str:
+    cameras = sorted(k for k, f in features.items() if f.get("dtype") in ("video", "image"))
     if not cameras:
-        raise DatasetError(f"{info.folder}: no camera: no feature is a video or image")
+        raise DatasetError(f"{folder}: no camera: no feature is a video or image")
     if asked is None and len(cameras) > 1:
-        raise DatasetError(f"{info.folder}: several cameras {cameras}: name one by --camera-key")
-    key = cameras[0] if asked is None else asked
-    if key not in cameras:
-        raise DatasetError(f"{info.folder}: no camera {key}; it has {cameras}")
-    return _Camera(key=key, is_video=kinds[key] == "video")
+        raise DatasetError(f"{folder}: several cameras {cameras}: name one by --camera-key")
+    if asked is not None and asked not in cameras:
+        raise DatasetError(f"{folder}: no camera {asked}; it has {cameras}")
+    return asked or cameras[0]
 
 
-def _read_episodes(info: _Info, camera: _Camera) -> list[_Row]:
+def _read_episodes(info: _Info) -> list[_Row]:
     files = sorted((info.folder / "meta" / "episodes").glob("*/*.parquet"))
     if not files:
         raise DatasetError(f"{info.folder}: no meta/episodes/*/*.parquet: it is incomplete")
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    if camera.is_video:
+    if info.is_video:
         each = ("chunk_index", "file_index", "from_timestamp")
-        columns += [f"videos/{camera.key}/{name}" for name in each]
+        columns += [f"videos/{info.camera}/{name}" for name in each]
     table = pa.concat_tables([_read_table(file, columns) for file in files])
     if table.num_rows == 0:
         raise DatasetError(f"{info.folder}: no episodes in it")
-    return [_row(info, camera, values) for values in table.to_pylist()]
+    return [_row(info, values) for values in table.to_pylist()]
 
 
-def _row(info: _Info, camera: _Camera, values: Mapping[str, Any]) -> _Row:
+def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
     number = values["episode_index"]
-    name = f"{info.folder}, episode {number}"
-    prefix = f"videos/{camera.key}/"
+    name, prefix = f"{info.folder}, episode {number}", f"videos/{info.camera}/"
     try:
-        data = info.folder / info.data_path.format(
+        video = data = info.folder / info.data_path.format(
             chunk_index=values["data/chunk_index"], file_index=values["data/file_index"]
         )
-        video = data
-        if camera.is_video:
+        if info.is_video:
             video = info.folder / info.video_path.format(
-                video_key=camera.key,
+                video_key=info.camera,
                 chunk_index=values[f"{prefix}chunk_index"],
                 file_index=values[f"{prefix}file_index"],
             )
-        from_s = float(values[f"{prefix}from_timestamp"]) if camera.is_video else 0.0
+        from_s = float(values[f"{prefix}from_timestamp"]) if info.is_video else 0.0
         length = int(values["length"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise DatasetError(f"{name}: meta does not say where its files are: {error!r}") from error
     if not video.is_file():
         raise DatasetError(f"{name}: {video} is not there: copy the dataset again, whole")
     return _Row(
-        name=name,
-        episode_index=number,
-        length=length,
-        data=data,
-        camera=camera,
-        video=video,
-        from_s=from_s,
+        name=name, episode_index=number, length=length, data=data, video=video, from_s=from_s
     )
 
 
@@ -249,8 +240,8 @@ def _flight(info: _Info, row: _Row, table: pa.Table, digest: str) -> FlightData:
         age_ns=np.array([], dtype=np.int64),
         captured_ns=at(names.CAPTURED),
         gate=np.full((row.length, GATE_DIM), np.nan, dtype=np.float32),
-        fingerprint=f"{digest} {row.camera.key} {row.episode_index}",
-        decode=partial(_decode, row, info.fps),
+        fingerprint=f"{digest} {info.camera} {row.episode_index}",
+        decode=partial(_decode, info, row),
     )
 
 
@@ -263,17 +254,16 @@ def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
     return "ned_frd" if np.median(state[:, SPECIFIC_FORCE][:, 2]) < 0 else "enu_flu"
 
 
-def _decode(row: _Row, fps: float) -> Iterator[ImageArray]:
-    images = _decode_video(row, fps) if row.camera.is_video else _decode_table(row)
+def _decode(info: _Info, row: _Row) -> Iterator[ImageArray]:
     count = 0
-    for image in images:
+    for image in _decode_video(info, row) if info.is_video else _decode_table(info, row):
         yield image
         count += 1
     if count != row.length:
         raise DatasetError(f"{row.name}: {row.video} ends after {count} of {row.length} images")
 
 
-def _decode_video(row: _Row, fps: float) -> Iterator[ImageArray]:
+def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
     """Yield the frames nearest to ``from_timestamp + k / fps``, as LeRobot's reader does."""
     try:
         with av.open(str(row.video)) as container:
@@ -284,7 +274,7 @@ def _decode_video(row: _Row, fps: float) -> Iterator[ImageArray]:
             for frame in container.decode(stream):
                 if frame.pts is None:
                     continue
-                number = round((frame.pts * tick_s - row.from_s) * fps)
+                number = round((frame.pts * tick_s - row.from_s) * info.fps)
                 if number > wanted:
                     raise DatasetError(f"{row.name}: {row.video} has no frame for row {wanted}")
                 if number < wanted:
@@ -297,9 +287,9 @@ def _decode_video(row: _Row, fps: float) -> Iterator[ImageArray]:
         raise DatasetError(f"{row.video}: not a readable video ({error})") from error
 
 
-def _decode_table(row: _Row) -> Iterator[ImageArray]:
-    table = _read_table(row.data, ["episode_index", row.camera.key])
-    for value in _rows_of(table, row)[row.camera.key]:
+def _decode_table(info: _Info, row: _Row) -> Iterator[ImageArray]:
+    table = _read_table(row.data, ["episode_index", info.camera])
+    for value in _rows_of(table, row)[info.camera]:
         encoded = value.as_py().get("bytes") if value.is_valid else None
         bgr = cv2.imdecode(np.frombuffer(encoded or b"", np.uint8), cv2.IMREAD_COLOR)
         if bgr is None:

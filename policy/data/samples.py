@@ -14,7 +14,9 @@ from policy.contract import (
     ACTION_DIM,
     AGE,
     QUATERNION,
+    RATE,
     ROTATION,
+    SPECIFIC_FORCE,
     STATE_DIM,
     VELOCITY,
     VELOCITY_CHANGE,
@@ -23,7 +25,6 @@ from policy.contract import (
 )
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, Nanoseconds
 from policy.data.interpolation import Indices, Interpolator, covered
-from policy.data.mirror import GATE_SIGNS, STICK_SIGNS, mirrored, state_signs
 from policy.observation import NS_PER_S, history_ages_ns, motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
@@ -41,6 +42,15 @@ HISTORY_NOISE = 0.1
 
 _BETWEEN_NS = 10 * NS_PER_S
 """Time between two flights on the common axis: far longer than every gap that is bridged."""
+
+
+# In a mirror, the plane of the first and third axis of world and body, vectors change the sign of y
+# and rotations those of x and z. It holds in both state frames.
+_VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
+STICK_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
+"""Factors of throttle, yaw, pitch and roll in a mirror."""
+GATE_SIGNS = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
+"""Factors of ``FlightData.gate`` in a mirror."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +97,7 @@ class Timeline:
         """
         self.contract = contract
         self._ages_ns = ages_ns
-        offsets = _offsets(flights)
+        starts, offsets = _starts_and_offsets(flights)
 
         def stamps(name: str) -> Nanoseconds:
             parts = [getattr(e, name) + o for e, o in zip(flights, offsets, strict=True)]
@@ -103,10 +113,9 @@ class Timeline:
         self._target_ns = stamps("target_ns")
         self._target = np.concatenate([flight.target for flight in flights])
         # Before its first stick, a flight's sticks were neutral.
-        starts = [_start_ns(e) + o - NS_PER_S for e, o in zip(flights, offsets, strict=True)]
         sent_ns = [
-            np.concatenate([[start], e.sent_ns + o])
-            for e, o, start in zip(flights, offsets, starts, strict=True)
+            np.concatenate([[start - NS_PER_S], flight.sent_ns + offset])
+            for flight, offset, start in zip(flights, offsets, starts, strict=True)
         ]
         neutral = np.zeros((1, ACTION_DIM), np.float32)
         self._sent_ns = np.concatenate(sent_ns).astype(np.int64)
@@ -223,18 +232,30 @@ def _forgetful(history: FloatArray, random: np.random.Generator) -> FloatArray:
     return np.where((np.arange(count) < neutral[:, None])[..., None], np.float32(0), history)
 
 
-def _start_ns(flight: FlightData) -> int:
-    stamps = (flight.tick_ns, flight.attitude_ns, flight.velocity_ns, flight.target_ns)
-    firsts = [s.min() for s in (*stamps, flight.sent_ns, flight.captured_ns) if len(s)]
-    return int(min(firsts))
-
-
-def _offsets(flights: Sequence[FlightData]) -> list[int]:
-    """What to add to the stamps of each flight."""
-    offsets, end = [], 0
+def _starts_and_offsets(flights: Sequence[FlightData]) -> tuple[list[int], list[int]]:
+    """Time of each flight's start on the common axis, and times to add to its stamps."""
+    starts, offsets, end = [], [], 0
     for flight in flights:
-        offset = end + _BETWEEN_NS - _start_ns(flight)
-        lists = (flight.tick_ns, flight.target_ns, flight.sent_ns, flight.captured_ns)
-        end = offset + max(int(stamps.max()) for stamps in lists if len(stamps))
-        offsets.append(offset)
-    return offsets
+        lists = (flight.tick_ns, flight.attitude_ns, flight.velocity_ns, flight.target_ns)
+        stamps = np.concatenate([*lists, flight.sent_ns, flight.captured_ns])
+        starts.append(end + _BETWEEN_NS)
+        offsets.append(starts[-1] - int(stamps.min()))
+        end = offsets[-1] + int(stamps.max())
+    return starts, offsets
+
+
+def state_signs(state_dim: int) -> FloatArray:
+    """Factors [state_dim] of a state in a mirror."""
+    signs = np.ones(state_dim, np.float32)
+    signs[VELOCITY] = signs[SPECIFIC_FORCE] = _VECTOR
+    signs[RATE] = signs[QUATERNION.start + 1 : QUATERNION.stop] = _AXIAL
+    if state_dim > STATE_DIM:
+        signs[ROTATION] = _AXIAL
+        signs[VELOCITY_CHANGE] = _VECTOR
+    return signs
+
+
+def mirrored(values: FloatArray, signs: FloatArray, is_mirrored: NDArray[np.bool_]) -> FloatArray:
+    """``values`` [B, ..., D], times ``signs`` [D] where ``is_mirrored`` [B]."""
+    chosen = is_mirrored.reshape(-1, *[1] * (values.ndim - 1))
+    return np.where(chosen, values * signs, values).astype(np.float32)

@@ -23,6 +23,7 @@ from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import Samples, Timeline
 from policy.training.parallel import TensorBatch, row_parts
+from policy.training.settings import TrainSettings
 
 SHIFT = 0.015
 """Images move by at most this share of their side, as a camera mount is off by a degree."""
@@ -129,34 +130,32 @@ class Batches:
     """Makes batches of one set of flights."""
 
     def __init__(
-        self, timeline: Timeline, store: FrameStore, *, timesteps: int, seed: int, mirrors: bool
+        self, timeline: Timeline, store: FrameStore, *, timesteps: int, settings: TrainSettings
     ) -> None:
-        self._timeline = timeline
-        self._store = store
-        self._timesteps = timesteps
-        self._seed = seed
-        self._mirrors = mirrors
+        self._timeline, self._store = timeline, store
+        self._timesteps, self._settings, self._seed = timesteps, settings, settings.seed
         self.frames = timeline.frames
         """Images that can be used."""
 
-    def with_images(self, step: int, *, count: int, repeats: int, size: tuple[int, int]) -> Batch:
+    def with_images(self, step: int, size: int) -> Batch:
         """A batch to train encoder and head."""
+        count = self._settings.batch_size
         random = np.random.default_rng([self._seed, step])
         frames = next_of(self.frames, step, count, self._seed)
         is_mirrored = self._mirrored(random, count)
-        height, width = self._timeline.contract.image_height, self._timeline.contract.image_width
-        most = np.array([round(SHIFT * height), round(SHIFT * width)])
+        most = round(SHIFT * self._settings.image_size)
         shifts = random.integers(-most, most + 1, size=(count, 2))
         images = self._store.read(frames, size, shifts)
         images[is_mirrored] = images[is_mirrored, :, ::-1]
         low = np.array([-CONTRAST, -BRIGHTNESS, -COLOUR, -COLOUR, 0.0])
         high = np.array([CONTRAST, BRIGHTNESS, COLOUR, COLOUR, NOISE])
         look = random.uniform(low, high, (count, 5)).astype(np.float32)
-        samples = self._samples(random, frames, is_mirrored, repeats)
+        samples = self._samples(random, frames, is_mirrored, self._settings.repeats)
         return self._batch(random, samples, len(frames), images=images, look=look)
 
-    def with_features(self, step: int, *, count: int, features: FeatureStore) -> Batch:
+    def with_features(self, step: int, features: FeatureStore) -> Batch:
         """A batch to train the head alone."""
+        count = self._settings.head_batch_size
         random = np.random.default_rng([self._seed, step])
         frames = next_of(features.frames, step, count, self._seed)
         is_mirrored = features.ways(frames, self._mirrored(random, count))
@@ -164,9 +163,9 @@ class Batches:
         samples = self._samples(random, frames, is_mirrored, 1)
         return self._batch(random, samples, len(frames), features=rows)
 
-    def validation(self, *, samples: int, count: int, size: tuple[int, int]) -> Iterator[Batch]:
-        """The same samples at each call, without augmentation, in batches of ``count``."""
-        frames = self.frames
+    def validation(self, samples: int, size: int) -> Iterator[Batch]:
+        """The same samples at each call, without augmentation."""
+        frames, count = self.frames, self._settings.batch_size
         chosen = frames[np.linspace(0, len(frames) - 1, min(samples, len(frames))).astype(int)]
         for start in range(0, len(chosen), count):
             random = np.random.default_rng([self._seed, VALIDATION_KEY, start])
@@ -176,12 +175,13 @@ class Batches:
             images = self._store.read(part, size)
             yield self._batch(random, plain, len(part), images=images)
 
-    def images(self, frames: Indices, size: tuple[int, int], *, is_mirrored: bool) -> Tensor:
-        """[B, height, width, 3] uint8 as they are, or all mirrored."""
+    def images(self, frames: Indices, *, is_mirrored: bool) -> Tensor:
+        """[B, height, width, 3] uint8 at full size, as they are or all mirrored."""
+        size = self._settings.image_size
         return torch.from_numpy(self._store.read(frames, size, is_mirrored=is_mirrored))
 
     def _mirrored(self, random: np.random.Generator, count: int) -> NDArray[np.bool_]:
-        return (random.random(count) < 0.5) & self._mirrors
+        return (random.random(count) < 0.5) & self._settings.mirror
 
     def _samples(
         self,

@@ -13,6 +13,7 @@ from policy.data.interpolation import Indices
 from policy.engines.openvino_bulk import BulkEncoder
 from policy.training.batches import Batches, FeatureStore, normalise_image
 from policy.training.parallel import computing_in
+from policy.training.settings import TrainSettings
 from policy.training.trainee import Trainee, refresh_batch_norm
 
 NORM_BATCHES = 16
@@ -32,6 +33,7 @@ class Encoder:
     ) -> None:
         self._trainee, self._batches = trainee, batches
         self._device, self._bf16 = device, bf16
+        self._contract = trainee.policy.contract
 
     def refresh_norms(self) -> None:
         """Take the statistics of the batch norms anew from images of full size."""
@@ -45,12 +47,12 @@ class Encoder:
             )
 
     def encode_all(
-        self, path: Path, *, mirror: bool, seed: int, should_continue: Callable[[float], bool]
+        self, path: Path, settings: TrainSettings, should_continue: Callable[[float], bool]
     ) -> FeatureStore:
         """Encode the images to ``path``, in a random order; see ``encode_rows``."""
-        frames = np.random.default_rng([seed, 3]).permutation(self._batches.frames)
+        frames = np.random.default_rng([settings.seed, 3]).permutation(self._batches.frames)
         dim = self._trainee.policy.backbone.out_dim
-        jobs = one_way_first(frames, mirror=mirror)
+        jobs = one_way_first(frames, mirror=settings.mirror)
         return encode_rows(path, jobs, self._encode(), dim=dim, should_continue=should_continue)
 
     def _encode(self) -> Encode:
@@ -70,10 +72,8 @@ class Encoder:
         return in_torch
 
     def _images(self, frames: Indices, *, is_mirrored: bool) -> Tensor:
-        contract = self._trainee.policy.contract
-        size = (contract.image_height, contract.image_width)
-        images = self._batches.images(frames, size, is_mirrored=is_mirrored).to(self._device)
-        return normalise_image(images.permute(0, 3, 1, 2).float() / 255, contract)
+        images = self._batches.images(frames, is_mirrored=is_mirrored).to(self._device)
+        return normalise_image(images.permute(0, 3, 1, 2).float() / 255, self._contract)
 
 
 def both_ways(frames: Indices, *, mirror: bool) -> list[Job]:

@@ -13,9 +13,9 @@ from itertools import pairwise
 from typing import Generic, Self, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from policy.training.optimiser import M
+M = TypeVar("M", bound=nn.Module)
 
 
 @dataclass(frozen=True)

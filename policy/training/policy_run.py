@@ -1,19 +1,31 @@
 """Train a policy from flights: encoder and head, then the head alone on stored features."""
 
 import copy
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 import torch
+from torch import nn
 
-from policy.checkpoints.policy_file import save_checkpoint
+from policy.checkpoints.policy_file import (
+    BuiltinPolicy,
+    build_policy,
+    load_checkpoint,
+    save_checkpoint,
+)
+from policy.contract import STATE_NAMES
 from policy.data.flight_data import DatasetError, FlightData, Nanoseconds, common_frame
 from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
 from policy.data.samples import Timeline
+from policy.errors import PolicyError
+from policy.nets.backbones import load_imagenet_state
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import TogeConfig
 from policy.training.batches import Batch, Batches, FeatureStore
 from policy.training.encode import Encoder
 from policy.training.parallel import StepLoss, computing_in
@@ -22,13 +34,14 @@ from policy.training.run import Run, open_run
 from policy.training.run_folder import RunFolder
 from policy.training.settings import MAX_AGE_MS, TrainSettings
 from policy.training.stages import TrainingStage, policy_stages
-from policy.training.start import Network, starting_trainee, training_card
-from policy.training.trainee import StickSpread, Trainee, validate
+from policy.training.trainee import Trainee, validate
 
+Network: TypeAlias = TogeConfig | ResnetUnetConfig
 Check: TypeAlias = Callable[[Path], float]
 """Flies a checkpoint in closed loop and returns a score: more is better."""
 
 VALIDATION_SAMPLES = 256
+AGE_BIN_MS = 5
 FINE_TUNE_RATE = 1 / 3
 """Learning rate over the usual one, for weights that were trained before."""
 NS_PER_MS = 1_000_000
@@ -68,7 +81,7 @@ def train_policy(
 
 
 class _PolicyRun(Run[Trainee, Batch]):
-    validation_type = PolicyValidation
+    validation_type, encoder_learns_alone = PolicyValidation, False
 
     def __init__(
         self,
@@ -82,17 +95,18 @@ class _PolicyRun(Run[Trainee, Batch]):
     ) -> None:
         self.settings: TrainSettings = settings
         self._network, self._ages_ns, self._check = network, ages_ns, check
-        trainee = starting_trainee(network, settings)
+        trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         super().__init__(folder, trainee, policy_stages(settings), hooks)
-        whole, store, kept, held = self.store_flights(flights, self.stages[-1].image_size)
+        whole, store, kept, held = self.store_flights(flights)
         self._flights = [whole[index] for index in kept]
         self._batches = self._batches_of(whole, kept, store)
         self._held = self._batches_of(whole, held, store) if held else None
         if not held:
             self.note("no flight is held out: the last weights will be kept, not the best")
         targets = np.concatenate([flight.target for flight in self._flights])
-        self._spread = StickSpread.of(targets, self.device)
+        for each in (self.trainee, self.average):
+            each.set_sticks(targets)
         self._features: FeatureStore | None = None
         self._held_features: list[Batch] | None = None
 
@@ -105,12 +119,9 @@ class _PolicyRun(Run[Trainee, Batch]):
             return HEAD_RATE * self.settings.learning_rate
         return self.settings.learning_rate * (FINE_TUNE_RATE if self.settings.start_from else 1)
 
-    def choose_trainable(self, *, trains_encoder: bool) -> None:
-        self.trainee.policy.backbone.requires_grad_(trains_encoder)
-
-    def set_mode(self, trainee: Trainee, stage: TrainingStage) -> None:
-        trainee.train()
-        trainee.policy.backbone.train(stage.trains_encoder)
+    def encoder(self, trainee: Trainee) -> nn.Module:
+        backbone: nn.Module = trainee.policy.backbone
+        return backbone
 
     def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
         settings, frames = self.settings, self._batches.frames
@@ -118,44 +129,30 @@ class _PolicyRun(Run[Trainee, Batch]):
         if is_new and not settings.freeze_encoder:
             encoder.refresh_norms()
         self._features = encoder.encode_all(
-            self.folder.features,
-            mirror=settings.mirror,
-            seed=settings.seed,
-            should_continue=self.may_encode(stage),
+            self.folder.features, settings, should_continue=self.may_encode(stage)
         )
         if (left := len(frames) - len(self._features.frames)) > 0:
             self.note(f"{left} images were not encoded for lack of time: the head sees the rest")
 
     def batch_maker(self, stage: TrainingStage) -> Callable[[int], Batch]:
-        settings, features = self.settings, self._features
+        features = self._features
         if features is not None:
-            return lambda step: self._batches.with_features(
-                step, count=settings.head_batch_size, features=features
-            )
-        return lambda step: self._batches.with_images(
-            step, count=settings.batch_size, repeats=settings.repeats, size=stage.image_size
-        )
+            return lambda step: self._batches.with_features(step, features)
+        return lambda step: self._batches.with_images(step, stage.image_size)
 
     def losses(self, trainee: Trainee, batch: Batch) -> StepLoss:
-        losses = trainee(batch, self._spread.scale)
-        return StepLoss(
-            total=losses.sticks + losses.direct + self.settings.gate_weight * losses.gate,
-            metrics={"loss": losses.sticks, "direct_loss": losses.direct, "gate_loss": losses.gate},
-        )
+        loss: StepLoss = trainee(batch)
+        return loss
 
     def validate(self, stage: TrainingStage) -> Validation | None:
         if self._held is None:
             return None
         with computing_in(self.device, self.bf16):
-            return validate(self.average, self._held_batches(self._held, stage), self._spread)
+            return validate(self.average, self._held_batches(self._held, stage))
 
-    def score(
-        self, stage: TrainingStage, validation: Validation | None, *, is_last: bool
-    ) -> float | None:
-        if stage.image_size != self.stages[-1].image_size:
-            return None
+    def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
         if self._check is None:
-            return None if validation is None else -validation.loss
+            return super().score(validation, is_last=is_last)
         position = self.position
         if not is_last and position.validations % self.settings.check_every:
             return None
@@ -177,23 +174,21 @@ class _PolicyRun(Run[Trainee, Batch]):
             Timeline(chosen, self._network.contract, self._ages_ns),
             store.only(indices),
             timesteps=self._network.schedule.num_train_timesteps,
-            seed=self.settings.seed,
-            mirrors=self.settings.mirror,
+            settings=self.settings,
         )
 
     def _held_batches(self, held: Batches, stage: TrainingStage) -> Iterable[Batch]:
         """Always the same samples; once the encoder is frozen, encoded once."""
         if self._held_features is not None:
             return self._held_features
-        count = self.settings.batch_size
-        batches = held.validation(samples=VALIDATION_SAMPLES, count=count, size=stage.image_size)
+        batches = held.validation(VALIDATION_SAMPLES, stage.image_size)
         moved: Iterable[Batch] = (batch.to(self.device) for batch in batches)
         if not stage.trains_encoder:
             moved = self._held_features = [self.average.encoded(batch) for batch in moved]
         return moved
 
     def _write(self, path: Path) -> None:
-        card = training_card(
+        card = _training_card(
             self.settings,
             self._flights,
             self._ages_ns,
@@ -219,3 +214,87 @@ def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds
             "of a policy, or a range, with --ages"
         )
     return ages
+
+
+def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
+    """The policy to start from and a new gate head; torch's global random state is kept.
+
+    Raises:
+        PolicyError: weights that do not fit.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        if settings.start_from is not None:
+            return Trainee(_checkpoint(network, settings.start_from), settings.gate_weight)
+        policy = build_policy(network)
+        if settings.backbone_weights is not None:
+            load_imagenet_state(policy.backbone, _state_dict(settings.backbone_weights))
+        return Trainee(policy, settings.gate_weight)
+
+
+def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
+    policy = load_checkpoint(path, fallback=network)
+    wanted = replace(network.contract, feature_dim=policy.contract.feature_dim)
+    asked, held = (
+        {**asdict(config), "contract": None, **asdict(contract)}
+        for config, contract in ((network, wanted), (policy.config, policy.contract))
+    )
+    other = [f"{name} {value!r}" for name, value in held.items() if asked.get(name) != value]
+    if other or type(policy.config) is not type(network):
+        raise PolicyError(
+            f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
+        )
+    return policy.train()
+
+
+def _state_dict(path: Path) -> dict[str, torch.Tensor]:
+    try:
+        loaded: object = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise PolicyError(
+            f"--backbone-weights {path}: not a readable torch file: {error}"
+        ) from error
+    if not isinstance(loaded, dict):
+        raise PolicyError(f"--backbone-weights {path}: no state dict in it")
+    return {str(name): value for name, value in loaded.items() if isinstance(value, torch.Tensor)}
+
+
+def _training_card(
+    settings: TrainSettings,
+    flights: Sequence[FlightData],
+    ages_ns: Nanoseconds,
+    *,
+    steps: int,
+    validation: Mapping[str, float] | None,
+) -> str:
+    """How a checkpoint was trained, as JSON."""
+    state = np.concatenate([flight.state for flight in flights])
+    target = np.concatenate([flight.target for flight in flights])
+    ages_ms = ages_ns / 1e6
+    edges = np.arange(0, ages_ms.max() + 2 * AGE_BIN_MS, AGE_BIN_MS)
+    card = {
+        "flights": len(flights),
+        "images": sum(len(flight.captured_ns) for flight in flights),
+        "ticks": len(state),
+        "steps": steps,
+        "batch_size": settings.batch_size,
+        "seed": settings.seed,
+        "mirror": settings.mirror,
+        "world_yaw": "drawn evenly",
+        "gate_weight": settings.gate_weight,
+        "feature_age_ms": {
+            "measured_in": "the flights" if settings.ages is None else "--ages",
+            "bin_ms": AGE_BIN_MS,
+            "counts_from_0": np.histogram(ages_ms, edges)[0].tolist(),
+        },
+        "state_mean": _by_name(np.nanmean(state, axis=0)),
+        "state_std": _by_name(np.nanstd(state, axis=0)),
+        "stick_mean": target.mean(axis=0).round(4).tolist(),
+        "stick_std": target.std(axis=0).round(4).tolist(),
+        "validation": validation,
+    }
+    return json.dumps(card, sort_keys=True)
+
+
+def _by_name(values: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> dict[str, float]:
+    return {name: round(float(v), 4) for name, v in zip(STATE_NAMES, values, strict=True)}

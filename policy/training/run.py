@@ -7,6 +7,7 @@ Everything random follows from the seed and the step, so a run that was killed c
 had not been.
 """
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -15,13 +16,12 @@ from typing import ClassVar, Generic
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from policy.data.flight_data import FlightData, hold_out
 from policy.data.frames import FrameStore, store_frames
 from policy.training.batches import ahead
-from policy.training.optimiser import Ema, M, make_optimiser, uses_bf16
-from policy.training.parallel import B, Gradients, StepLoss
+from policy.training.parallel import B, Gradients, M, StepLoss
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
 from policy.training.run_folder import (
     Position,
@@ -30,7 +30,7 @@ from policy.training.run_folder import (
     TrainingStoppedError,
     identity_of,
 )
-from policy.training.settings import RunSettings
+from policy.training.settings import Precision, RunSettings
 from policy.training.stages import TrainingStage, learning_rate_factor
 
 LOG_STEPS = 20
@@ -64,6 +64,7 @@ class Run(ABC, Generic[M, B]):
     """
 
     validation_type: ClassVar[type[Validation]]
+    encoder_learns_alone: ClassVar[bool]
     settings: RunSettings
 
     def __init__(
@@ -81,12 +82,8 @@ class Run(ABC, Generic[M, B]):
     # ---- for subclasses ----
 
     @abstractmethod
-    def choose_trainable(self, *, trains_encoder: bool) -> None:
-        """Freeze what does not learn in a phase."""
-
-    @abstractmethod
-    def set_mode(self, trainee: M, stage: TrainingStage) -> None:
-        """Put the trainee or a replica into training mode."""
+    def encoder(self, trainee: M) -> nn.Module:
+        """The part of a trainee that is frozen in the end."""
 
     @abstractmethod
     def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
@@ -105,12 +102,6 @@ class Run(ABC, Generic[M, B]):
         """Validate the average weights; None where nothing was held out."""
 
     @abstractmethod
-    def score(
-        self, stage: TrainingStage, validation: Validation | None, *, is_last: bool
-    ) -> float | None:
-        """Score of the average weights, more is better; None if they are not to be exported."""
-
-    @abstractmethod
     def export(self) -> None:
         """Write the average weights to ``settings.out``."""
 
@@ -118,21 +109,23 @@ class Run(ABC, Generic[M, B]):
         """Peak learning rate of the stage's phase."""
         return self.settings.learning_rate
 
+    def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
+        """Score of the average weights, more is better; None if they are not to be exported."""
+        return None if validation is None else -validation.loss
+
     @property
     def average(self) -> M:
         """The average of the weights, in eval mode."""
         return self._ema.average
 
     def store_flights(
-        self, flights: Sequence[FlightData], image_size: tuple[int, int]
+        self, flights: Sequence[FlightData]
     ) -> tuple[list[FlightData], FrameStore, list[int], list[int]]:
         """Decode all images; indices of the flights to train on, and of those held out."""
-        height, width = image_size
         store = store_frames(
             flights,
-            height=height,
-            width=width,
-            folder=self.folder.frames,
+            self.folder.frames,
+            self.settings.image_size,
             progress=lambda fraction: self._report_work(f"decoding, {fraction:.0%}"),
         )
         whole = [f.first_frames(n) for f, n in zip(flights, store.counts, strict=True)]
@@ -203,7 +196,7 @@ class Run(ABC, Generic[M, B]):
             Gradients(self.trainee, device=self.device, bf16=self.bf16) as gradients,
             closing(ahead(self.batch_maker(stage), position.step)) as batches,
         ):
-            gradients.each(lambda replica: self.set_mode(replica, stage))
+            gradients.each(lambda replica: self._set_mode(replica, stage))
             since = 0
             while self._fraction < stage.end:
                 metrics = gradients.compute(next(batches).to(self.device), self.losses)
@@ -220,6 +213,10 @@ class Run(ABC, Generic[M, B]):
                 if self.hooks.should_stop():
                     self._save()
                     self._stop()
+
+    def _set_mode(self, trainee: M, stage: TrainingStage) -> None:
+        trainee.train()
+        self.encoder(trainee).train(stage.trains_encoder)
 
     def _step(self, stage: TrainingStage) -> None:
         position = self.position
@@ -240,7 +237,7 @@ class Run(ABC, Generic[M, B]):
             self._report(stage.name, validation=validation)
             record = {"step": position.step, "stage": stage.name}
             self.folder.log({**record, "validation": asdict(validation)})
-        score = self.score(stage, validation, is_last=is_last)
+        score = self.score(validation, is_last=is_last) if stage.is_scored else None
         if score is not None and (position.best is None or score > position.best):
             position.best, position.kept = score, None if validation is None else asdict(validation)
             self.export()
@@ -258,7 +255,8 @@ class Run(ABC, Generic[M, B]):
         return self.position.spent_s + self.hooks.now_s() - self._begun_s
 
     def _new_optimiser(self, stage: TrainingStage) -> torch.optim.AdamW:
-        self.choose_trainable(trains_encoder=stage.trains_encoder)
+        self.trainee.requires_grad_(not (stage.trains_encoder and self.encoder_learns_alone))
+        self.encoder(self.trainee).requires_grad_(stage.trains_encoder)
         return make_optimiser(self.trainee, self.learning_rate(stage), self.settings.weight_decay)
 
     def _restore(self) -> None:
@@ -323,3 +321,47 @@ class Run(ABC, Generic[M, B]):
                 "learning_rate": self._optimiser.param_groups[0]["lr"],
             }
         )
+
+
+class Ema(Generic[M]):
+    """An exponential moving average of a module's weights, itself such a module in eval mode."""
+
+    def __init__(self, trainee: M, decay: float) -> None:
+        self.average = copy.deepcopy(trainee).eval().requires_grad_(False)
+        self._decay = decay
+
+    @torch.no_grad()
+    def update(self, trainee: M, updates: int) -> None:
+        """Move towards ``trainee``, faster in the first of ``updates``; counters are copied.
+
+        Frozen weights are the same in both, and are left alone.
+        """
+        weight = 1.0 - min(self._decay, (1 + updates) / (10 + updates))
+        frozen = {name for name, one in trainee.named_parameters() if not one.requires_grad}
+        new = {name: one for name, one in trainee.state_dict().items() if name not in frozen}
+        old = self.average.state_dict()
+        names = [name for name, value in new.items() if value.is_floating_point()]
+        torch._foreach_lerp_(  # one call for some thousand tensors
+            [old[name] for name in names], [new[name] for name in names], weight
+        )
+        for name in new.keys() - set(names):
+            old[name].copy_(new[name])
+
+
+def make_optimiser(trainee: nn.Module, learning_rate: float, decay: float) -> torch.optim.AdamW:
+    """AdamW over the trainable weights; biases, norms and other vectors are not decayed."""
+    trainable = [p for p in trainee.parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for p in trainable if p.ndim >= 2], "weight_decay": decay},
+        {"params": [p for p in trainable if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.98), fused=True)
+
+
+def uses_bf16(precision: Precision, device: torch.device) -> bool:
+    """Whether to compute in bfloat16; ``auto`` does so where the hardware multiplies it."""
+    if precision != "auto":
+        return precision == "bf16"
+    if device.type == "cuda":
+        return bool(torch.cuda.is_bf16_supported())
+    return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())

@@ -16,8 +16,6 @@ from policy.data.frames import disk_error
 from policy.errors import PolicyError
 from policy.training.settings import RunSettings
 
-_STATE, _LOG = "state.pt", "log.jsonl"
-
 
 class TrainingError(PolicyError):
     """A run that cannot start, be resumed or be kept; the message says what to do."""
@@ -52,8 +50,10 @@ class RunFolder:
     """Files that a run keeps until it is over."""
 
     def __init__(self, path: Path, identity: str) -> None:
-        self.path = path
-        self._identity = identity
+        self.path, self._identity = path, identity
+        self.frames, self.features = path / "frames", path / "features.f16"
+        """Folder of the decoded images, file of the stored features."""
+        self._state, self._log = path / "state.pt", path / "log.jsonl"
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -62,7 +62,7 @@ class RunFolder:
     @property
     def has_state(self) -> bool:
         """Whether there is a state to resume from."""
-        return (self.path / _STATE).is_file()
+        return self._state.is_file()
 
     def save(self, position: Position, tensors: Mapping[str, Any]) -> None:
         """Write the state in one piece or not at all.
@@ -70,7 +70,7 @@ class RunFolder:
         Raises:
             TrainingError: no room.
         """
-        target, partial = self.path / _STATE, self.path / (_STATE + ".partial")
+        target, partial = self._state, self.path / "state.pt.partial"
         contents = {"identity": self._identity, "position": asdict(position), **tensors}
         try:
             torch.save(contents, partial)
@@ -86,7 +86,7 @@ class RunFolder:
         Raises:
             TrainingError: there is none, it is damaged, or of another run.
         """
-        path = self.path / _STATE
+        path = self._state
         if not path.is_file():
             raise TrainingError(f"{self.path} holds no run to resume: leave out --resume")
         try:
@@ -107,47 +107,33 @@ class RunFolder:
     def log(self, record: Mapping[str, object]) -> None:
         """One line of JSON."""
         try:
-            with (self.path / _LOG).open("a") as file:
+            with self._log.open("a") as file:
                 file.write(json.dumps(record) + "\n")
         except OSError as error:
-            raise TrainingError(str(disk_error(self.path / _LOG, error))) from error
-
-    @property
-    def frames(self) -> Path:
-        """Folder of the decoded images."""
-        return self.path / "frames"
-
-    @property
-    def features(self) -> Path:
-        """File of the stored features."""
-        return self.path / "features.f16"
+            raise TrainingError(str(disk_error(self._log, error))) from error
 
     def clear(self) -> None:
         """Remove all but the log."""
         shutil.rmtree(self.frames, ignore_errors=True)
         self.features.unlink(missing_ok=True)
-        (self.path / _STATE).unlink(missing_ok=True)
+        self._state.unlink(missing_ok=True)
 
     def start_log(self) -> None:
         """Remove the log of an earlier run."""
-        (self.path / _LOG).unlink(missing_ok=True)
+        self._log.unlink(missing_ok=True)
 
     def _cut_log(self, step: int) -> None:
         """Remove the lines after a step: those steps are about to be repeated."""
-        path = self.path / _LOG
-        if path.is_file():
-            lines = path.read_text().splitlines(keepends=True)
-            kept = [line for line in lines if _step_of(line) <= step]
-            path.write_text("".join(kept))
+        if self._log.is_file():
+            lines = self._log.read_text().splitlines(keepends=True)
+            self._log.write_text("".join(line for line in lines if _step_of(line) <= step))
 
 
 def _step_of(line: str) -> float:
     try:
-        record: object = json.loads(line)
-    except ValueError:
+        return float(json.loads(line)["step"])
+    except (ValueError, TypeError, KeyError):
         return float("inf")  # the kill cut it short
-    step = record.get("step") if isinstance(record, dict) else None
-    return step if isinstance(step, int) else float("inf")
 
 
 def identity_of(settings: RunSettings, network: object, flights: Sequence[FlightData]) -> str:

@@ -17,17 +17,18 @@ MIN_IMAGE_SIZE = 96
 """Below it, an image costs a CPU hardly less."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TrainingStage:
-    """A part of a run."""
+    """A part of a run, between two fractions of its budget."""
 
     name: str
     start: float
-    """Fraction of the budget."""
     end: float
-    image_size: tuple[int, int]
-    """Height and width, px."""
+    image_size: int
+    """Pixels along a side."""
     trains_encoder: bool
+    is_scored: bool
+    """Whether its weights may be exported."""
 
 
 def policy_stages(settings: TrainSettings) -> tuple[TrainingStage, ...]:
@@ -42,20 +43,20 @@ def policy_stages(settings: TrainSettings) -> tuple[TrainingStage, ...]:
             shares[size] = shares.get(size, 0.0) + share
     stages, start = [], 0.0
     for size, share in shares.items():
-        name = f"encoder and head, {size}x{size}"
-        stages.append(_stage(name, start, start + share, size, trains_encoder=True))
+        name, is_scored = f"encoder and head, {size}x{size}", size == full
+        stages.append(TrainingStage(name, start, start + share, size, True, is_scored))
         start += share
-    return (*stages, _stage("head", start, 1.0, full, trains_encoder=False))
+    return (*stages, TrainingStage("head", start, 1.0, full, False, True))
 
 
 def world_model_stages(settings: WorldModelSettings) -> tuple[TrainingStage, ...]:
     """Autoencoder, unless it is kept, then dynamics."""
     turn, size = settings.autoencoder_share, settings.image_size
     if settings.start_from is not None:
-        return (_stage("dynamics", 0.0, 1.0, size, trains_encoder=False),)
+        return (TrainingStage("dynamics", 0.0, 1.0, size, False, True),)
     return (
-        _stage("autoencoder", 0.0, turn, size, trains_encoder=True),
-        _stage("dynamics", turn, 1.0, size, trains_encoder=False),
+        TrainingStage("autoencoder", 0.0, turn, size, True, False),
+        TrainingStage("dynamics", turn, 1.0, size, False, True),
     )
 
 
@@ -66,11 +67,3 @@ def learning_rate_factor(progress: float) -> float:
         return max(progress / warm_up, 0.01)
     along = min((progress - warm_up) / (1 - warm_up), 1.0)
     return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * along))
-
-
-def _stage(
-    name: str, start: float, end: float, size: int, *, trains_encoder: bool
-) -> TrainingStage:
-    return TrainingStage(
-        name=name, start=start, end=end, image_size=(size, size), trains_encoder=trains_encoder
-    )

@@ -19,11 +19,10 @@ from policy.data.flight_data import FlightData, common_frame
 from policy.data.flight_folders import find_flights, is_exemplary, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.loading import builtin_config
-from policy.training.policy_run import Check, train_policy
+from policy.training.policy_run import Check, Network, train_policy
 from policy.training.report import Hooks, TrainResult
 from policy.training.run_folder import TrainingStoppedError
 from policy.training.settings import TrainSettings, WorldModelSettings
-from policy.training.start import Network
 from policy.training.world_model.run import train_world_model
 from policy.world_model.config import WorldModelConfig
 

@@ -13,10 +13,11 @@ from torch import Tensor
 from policy.contract import FloatArray
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
-from policy.data.mirror import STICK_SIGNS, mirrored, state_signs
+from policy.data.samples import STICK_SIGNS, mirrored, state_signs
 from policy.data.windows import Windows
 from policy.training.batches import VALIDATION_KEY, FeatureStore, next_of
 from policy.training.parallel import TensorBatch
+from policy.training.settings import WorldModelSettings
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.relative_state import MOTION_DIM
 
@@ -67,20 +68,18 @@ def frame_batch(
     store: FrameStore,
     windows: Windows,
     config: WorldModelConfig,
+    settings: WorldModelSettings,
     step: int,
-    *,
-    count: int,
-    seed: int,
-    mirrors: bool,
 ) -> FrameBatch:
     """Two neighbours of each of the ``windows`` that are due in a step of the autoencoder."""
-    random = np.random.default_rng([seed, step])
-    rows = next_of(np.arange(len(windows)), step, count, seed)
+    count = settings.batch_size // 2
+    random = np.random.default_rng([settings.seed, step])
+    rows = next_of(np.arange(len(windows)), step, count, settings.seed)
     first = random.integers(0, windows.frames.shape[1] - 1, count)
     pairs = np.stack([windows.frames[rows, first], windows.frames[rows, first + 1]], axis=1)
-    images = store.read(pairs.ravel(), (config.image_size, config.image_size))
+    images = store.read(pairs.ravel(), config.image_size)
     images = images.reshape(count, 2, *images.shape[1:])
-    is_mirrored = (random.random(count) < 0.5) & mirrors
+    is_mirrored = (random.random(count) < 0.5) & settings.mirror
     images[is_mirrored] = images[is_mirrored, :, :, ::-1]
     noise = random.standard_normal((count, 2, *config.latent_shape), dtype=np.float32)
     return FrameBatch(images=torch.from_numpy(images), noise=torch.from_numpy(noise))
@@ -94,22 +93,21 @@ class WindowBatches:
         windows: Windows,
         latents: FeatureStore,
         config: WorldModelConfig,
-        *,
-        seed: int,
-        mirrors: bool,
-        decision_share: float,
+        settings: WorldModelSettings,
     ) -> None:
-        self._windows, self._latents, self._config = windows, latents, config
-        self._seed, self._mirrors = seed, mirrors and latents.has_mirrored
-        self._decision_share = decision_share
+        self._windows, self._latents = windows, latents
+        self._config, self._settings, self._seed = config, settings, settings.seed
 
-    def batch(self, step: int, count: int) -> WindowBatch:
+    def batch(self, step: int) -> WindowBatch:
         """The windows of a step of the dynamics."""
+        count = self._settings.window_batch_size
         random = np.random.default_rng([self._seed, step])
         rows = next_of(np.arange(len(self._windows)), step, count, self._seed)
-        is_mirrored = (random.random(count) < 0.5) & self._mirrors
+        is_mirrored = (
+            (random.random(count) < 0.5) & self._settings.mirror & self._latents.has_mirrored
+        )
         sigma = random.uniform(0.0, CONTEXT_NOISE, (count, 1, 1, 1, 1)).astype(np.float32)
-        knows_actions = random.random(count) >= self._decision_share
+        knows_actions = random.random(count) >= self._settings.decision_share
         return self._make(random, rows, is_mirrored, sigma, knows_actions)
 
     def validation(self, count: int) -> list[WindowBatch]:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from policy.contract import STATE_DIM, VELOCITY
-from policy.data.mirror import STICK_SIGNS, state_signs
+from policy.data.samples import STICK_SIGNS, state_signs
 from policy.data.windows import Windows
 from policy.training.batches import FeatureStore
 from policy.training.parallel import StepLoss

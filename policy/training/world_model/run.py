@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from policy.checkpoints.world_model_file import load_world_model, save_world_model
 from policy.data.flight_data import DatasetError, FlightData, common_frame
 from policy.data.interpolation import Indices
-from policy.data.windows import Windows, find_windows
+from policy.data.windows import find_windows
 from policy.errors import PolicyError
 from policy.training.batches import FeatureStore
 from policy.training.encode import both_ways, encode_rows
@@ -67,7 +67,7 @@ def train_world_model(
 
 
 class _WorldModelRun(Run[WorldModel, FrameBatch | WindowBatch]):
-    validation_type = WorldModelValidation
+    validation_type, encoder_learns_alone = WorldModelValidation, True
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class _WorldModelRun(Run[WorldModel, FrameBatch | WindowBatch]):
         super().__init__(
             folder, _starting_model(config, settings), world_model_stages(settings), hooks
         )
-        whole, self._store, kept, held = self.store_flights(flights, self.stages[0].image_size)
+        whole, self._store, kept, held = self.store_flights(flights)
         windows = find_windows(
             whole,
             context_frames=config.context_frames,
@@ -103,12 +103,8 @@ class _WorldModelRun(Run[WorldModel, FrameBatch | WindowBatch]):
         if len(self._held) == 0:
             self.note("no flight is held out: the last weights will be kept, not the best")
 
-    def choose_trainable(self, *, trains_encoder: bool) -> None:
-        self.trainee.requires_grad_(not trains_encoder)
-        self.trainee.autoencoder.requires_grad_(trains_encoder)
-
-    def set_mode(self, trainee: WorldModel, stage: TrainingStage) -> None:
-        trainee.train()
+    def encoder(self, trainee: WorldModel) -> nn.Module:
+        return trainee.autoencoder
 
     def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
         # Held-out frames first: without them no weights could be chosen.
@@ -131,23 +127,15 @@ class _WorldModelRun(Run[WorldModel, FrameBatch | WindowBatch]):
         if is_new:
             set_scales(self.trainee, self._windows, latents, mirrors=mirror)
         if len(self._held):
-            batches = self._batches(self._held, latents).validation(IMAGINED_WINDOWS)
-            self._held_batches = [batch.to(self.device) for batch in batches]
+            batches = WindowBatches(self._held, latents, self._config, self.settings)
+            moved = [batch.to(self.device) for batch in batches.validation(IMAGINED_WINDOWS)]
+            self._held_batches = moved
 
     def batch_maker(self, stage: TrainingStage) -> Callable[[int], FrameBatch | WindowBatch]:
-        settings = self.settings
+        config, settings, windows = self._config, self.settings, self._windows
         if self._latents is not None:
-            batches = self._batches(self._windows, self._latents)
-            return lambda step: batches.batch(step, settings.window_batch_size)
-        return lambda step: frame_batch(
-            self._store,
-            self._windows,
-            self._config,
-            step,
-            count=settings.batch_size // 2,
-            seed=settings.seed,
-            mirrors=settings.mirror,
-        )
+            return WindowBatches(windows, self._latents, config, settings).batch
+        return lambda step: frame_batch(self._store, windows, config, settings, step)
 
     def losses(self, trainee: WorldModel, batch: FrameBatch | WindowBatch) -> StepLoss:
         if isinstance(batch, FrameBatch):
@@ -170,11 +158,6 @@ class _WorldModelRun(Run[WorldModel, FrameBatch | WindowBatch]):
                 self.average, self._held_batches, images.reshape(*frames.shape, *images.shape[1:])
             )
 
-    def score(
-        self, stage: TrainingStage, validation: Validation | None, *, is_last: bool
-    ) -> float | None:
-        return None if stage.trains_encoder or validation is None else -validation.loss
-
     def export(self) -> None:
         settings = self.settings
         card = {
@@ -192,16 +175,6 @@ class _WorldModelRun(Run[WorldModel, FrameBatch | WindowBatch]):
         }
         save_world_model(settings.out, self.average, training=json.dumps(card, sort_keys=True))
 
-    def _batches(self, windows: Windows, latents: FeatureStore) -> WindowBatches:
-        return WindowBatches(
-            windows,
-            latents,
-            self._config,
-            seed=self.settings.seed,
-            mirrors=self.settings.mirror,
-            decision_share=self.settings.decision_share,
-        )
-
     @torch.no_grad()
     def _encode_images(self, frames: Indices, is_mirrored: bool) -> Tensor:
         images = to_unit(self._images(frames, is_mirrored=is_mirrored))
@@ -209,8 +182,7 @@ class _WorldModelRun(Run[WorldModel, FrameBatch | WindowBatch]):
             return self.trainee.autoencoder.posterior(images)[0].flatten(1)
 
     def _images(self, frames: Indices, *, is_mirrored: bool = False) -> Tensor:
-        size = (self._config.image_size, self._config.image_size)
-        images = self._store.read(frames, size, is_mirrored=is_mirrored)
+        images = self._store.read(frames, self._config.image_size, is_mirrored=is_mirrored)
         return torch.from_numpy(images).to(self.device)
 
 

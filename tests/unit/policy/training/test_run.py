@@ -24,12 +24,11 @@ from policy.errors import PolicyError
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 from policy.training.batches import Batches
-from policy.training.policy_run import train_policy
+from policy.training.policy_run import Network, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import Position, RunFolder, TrainingError
 from policy.training.settings import TrainSettings
 from policy.training.stages import learning_rate_factor, policy_stages
-from policy.training.start import Network
 from policy.training.trainee import Trainee, gate_labels, gate_loss
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -171,22 +170,21 @@ def test_a_frozen_encoder_stays_and_the_head_learns(
         replace(made, start_from=None)
 
 
-def test_in_training_the_denoiser_sees_a_part_of_many_samples(tmp_path: Path) -> None:
-    flight = read_flight(write_spot_flight(tmp_path / "flight", 0, seconds=1.5))
-    store = store_frames(
-        [flight], height=32, width=32, folder=tmp_path / "frames", progress=lambda _: None
-    )
-    timeline = Timeline([flight], CONTRACT, np.array([40_000_000]))
-    batches = Batches(timeline, store, timesteps=100, seed=0, mirrors=True)
-    trainee = Trainee(Toge(TogeConfig(backbone="resnet8", contract=CONTRACT)))
-    rows: list[int] = []
-    trainee.policy.head.unet.register_forward_hook(lambda _, args, out: rows.append(len(out)))
-    for images in (4, 16, 64):
-        batch = batches.with_images(0, count=images, repeats=2, size=(32, 32))
-        for is_training in (True, False):
-            trainee.train(is_training)
-            trainee(batch, torch.ones(4))
-    assert rows == [8, 8, 16, 32, 32, 128]
+@pytest.mark.parametrize(("images", "rows"), [(4, [8, 8]), (16, [16, 32]), (64, [32, 128])])
+def test_in_training_the_denoiser_sees_a_part_of_many_samples(
+    flights: list[FlightData], tmp_path: Path, images: int, rows: list[int]
+) -> None:
+    asked = settings(tmp_path, batch_size=images)
+    store = store_frames(flights, tmp_path / "frames", 32)
+    timeline = Timeline(flights, CONTRACT, np.array([40_000_000]))
+    batches = Batches(timeline, store, timesteps=100, settings=asked)
+    trainee = Trainee(Toge(NETWORK), gate_weight=0.0)
+    seen: list[int] = []
+    trainee.policy.head.unet.register_forward_hook(lambda _, args, out: seen.append(len(out)))
+    for is_training in (True, False):
+        trainee.train(is_training)
+        trainee(batches.with_images(0, 32))
+    assert seen == rows
 
 
 def test_a_packed_checkpoint_is_smaller_and_flies_alike(
@@ -263,12 +261,12 @@ def test_the_default_budget_is_45_minutes(tmp_path: Path) -> None:
 
 def test_stages_grow_and_fill_the_budget(tmp_path: Path) -> None:
     stages = policy_stages(settings(tmp_path, image_size=224))
-    assert [stage.image_size[0] for stage in stages] == [96, 160, 224, 224]
+    assert [stage.image_size for stage in stages] == [96, 160, 224, 224]
     assert [stage.trains_encoder for stage in stages] == [True, True, True, False]
     assert stages[0].start == 0
     assert stages[-1].end == 1
     assert all(a.end == b.start for a, b in pairwise(stages))
-    assert [s.image_size for s in policy_stages(settings(tmp_path))] == [(32, 32), (32, 32)]
+    assert [s.image_size for s in policy_stages(settings(tmp_path))] == [32, 32]
 
 
 def test_learning_rate_warms_up_and_falls() -> None:

@@ -212,11 +212,12 @@ def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(
 ) -> None:
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
     latents = latents_of(91, tmp_path / "latents", mirror=True)
-    batches = WindowBatches(windows, latents, MODEL, seed=3, mirrors=True, decision_share=0.25)
-    batch = batches.batch(5, 64)
-    for name, value in vars(batches.batch(5, 64)).items():
+    asked = settings(tmp_path, seed=3, mirror=True, decision_share=0.25, window_batch_size=64)
+    batches = WindowBatches(windows, latents, MODEL, asked)
+    batch = batches.batch(5)
+    for name, value in vars(batches.batch(5)).items():
         assert torch.equal(value, getattr(batch, name)), name
-    assert not torch.equal(batches.batch(6, 64).latents, batch.latents)
+    assert not torch.equal(batches.batch(6).latents, batch.latents)
     is_mirrored = batch.latents[:, -1, 0, 0, 0] < 0
     assert 0.3 < is_mirrored.float().mean() < 0.7
     assert 0.1 < (~batch.knows_actions).float().mean() < 0.4
@@ -274,11 +275,9 @@ def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
     latents = latents_of(91, tmp_path / "latents", mirror=False)
     model = WorldModel(MODEL)
     for share, decides in ((0.0, False), (1.0, True)):
-        batches = WindowBatches(
-            windows, latents, MODEL, seed=0, mirrors=False, decision_share=share
-        )
+        batches = WindowBatches(windows, latents, MODEL, settings(tmp_path, decision_share=share))
         with torch.inference_mode():
-            metrics = dynamics_loss(model, batches.batch(0, 8)).metrics
+            metrics = dynamics_loss(model, batches.batch(0)).metrics
         assert (float(metrics["sticks"]) > 0) == decides
         assert float(metrics["motion"]) > 0
         assert float(metrics["latents"]) > 0
@@ -291,7 +290,7 @@ def test_the_change_of_latents_is_in_units_of_what_copying_the_last_frame_costs(
     latents = latents_of(91, tmp_path / "latents", mirror=False)
     model = WorldModel(MODEL)
     set_scales(model, windows, latents, mirrors=False)
-    every = WindowBatches(windows, latents, MODEL, seed=0, mirrors=False, decision_share=0.0)
+    every = WindowBatches(windows, latents, MODEL, settings(tmp_path, decision_share=0.0))
     batch = every.validation(len(windows))[0]
     normal = model.autoencoder.normalise(batch.latents.flatten(0, 1)).unflatten(0, (-1, 6))
     cost = ((normal[:, 2:] - normal[:, 1:2]) / model.change_std).square().mean()
@@ -304,10 +303,8 @@ def test_the_autoencoder_sees_neighbours_and_pays_for_what_changes(tmp_path: Pat
     flight = steered_flight(0)
     windows = find_windows([flight], context_frames=2, frames=4, frame_dt_s=0.1)
     size = MODEL.image_size
-    store = store_frames(
-        [flight], height=size, width=size, folder=tmp_path, progress=lambda _: None
-    )
-    batch = frame_batch(store, windows, MODEL, 3, count=4, seed=0, mirrors=True)
+    store = store_frames([flight], tmp_path, size)
+    batch = frame_batch(store, windows, MODEL, settings(tmp_path, mirror=True), 3)
     assert batch.images.shape == (4, 2, size, size, 3)
     assert (batch.images[:, 0] != batch.images[:, 1]).any()
     still = replace(batch, images=batch.images[:, :1].expand_as(batch.images))

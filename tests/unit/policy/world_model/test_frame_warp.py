@@ -11,7 +11,7 @@ from helpers.panoramas import attitude, nominal_lens, panorama, state_of
 from mavbridge.commands.evaluate_imagination.lens import FRD_FROM_FLU
 from mavbridge.commands.evaluate_imagination.metrics import psnr_db
 from policy.contract import Contract, StateFrame
-from policy.data.mirror import state_signs
+from policy.data.samples import state_signs
 from policy.world_model.autoencoder import to_bytes, to_unit
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.frame_warp import FrameWarp, Poses, SourceFrame
