@@ -1,7 +1,6 @@
 """The command line: every flag is a field of a config dataclass."""
 
 import difflib
-import os
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
+from mavbridge.commands.train.checks import prepare as prepare_training
 from mavbridge.config.bench import BenchConfig
 from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.evaluate import EvaluateConfig
@@ -20,8 +20,8 @@ from mavbridge.config.export import ExportConfig
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
 from mavbridge.config.imagine import EvaluateImaginationConfig, ImagineConfig
-from mavbridge.config.train import TrainConfig
 from mavbridge.core.errors import UserError
+from policy.training.settings import TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
 
@@ -125,23 +125,33 @@ def demonstrate(config: DemonstrateConfig) -> int:
 
 
 @cli.command
-def train(*flights: Path, config: TrainConfig | None = None) -> int:
-    """Train a policy, or a world model, from flights.
+def train(*flights: Path, settings: Annotated[TrainSettings, Parameter(name="*")]) -> int:
+    """Train a policy from flights.
 
     Args:
         flights: flight folders, folders of them, or LeRobot datasets (v3).
-        config: the settings.
+        settings: the settings.
     """
-    if not flights:
-        raise UserError("name the flights to learn from: mavbridge train DIR... --out FILE")
-    if config is None or config.out is None:
-        raise UserError("name the checkpoint to write: --out FILE.safetensors")
-    # torch's threads else spin at every barrier: on a core that somebody else uses too, ten times
-    # the time. OpenMP reads it once, as torch is loaded.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    from mavbridge.commands.train.run import train_policy
+    prepare_training("train", flights, settings)
+    from mavbridge.commands.train.run import run_policy_training
 
-    return train_policy(flights, config, config.out)
+    return run_policy_training(flights, settings)
+
+
+@cli.command
+def train_world_model(
+    *flights: Path, settings: Annotated[WorldModelSettings, Parameter(name="*")]
+) -> int:
+    """Train the world model of mavbridge imagine from flights.
+
+    Args:
+        flights: flight folders, folders of them, or LeRobot datasets (v3).
+        settings: the settings.
+    """
+    prepare_training("train-world-model", flights, settings)
+    from mavbridge.commands.train.run import run_world_model_training
+
+    return run_world_model_training(flights, settings)
 
 
 @cli.command
@@ -177,16 +187,8 @@ def with_config(
     if config is not None:
         _check_toml(config)
     cli.config = [] if config is None else [Toml(config, use_commands_as_keys=False)]
-    status: int | None = cli(_renamed(tokens))
+    status: int | None = cli(_current_spelling(tokens))
     return status or 0
-
-
-def _renamed(tokens: tuple[str, ...]) -> tuple[str, ...]:
-    """Replace ``imagine --evaluate``, which was the name of a command until version 0.1."""
-    if tokens[:1] != ("imagine",) or "--evaluate" not in tokens:
-        return tokens
-    print("imagine --evaluate is now called evaluate-imagination", file=sys.stderr)  # noqa: T201
-    return ("evaluate-imagination", *(word for word in tokens[1:] if word != "--evaluate"))
 
 
 def _check_command(tokens: tuple[str, ...]) -> None:
@@ -197,6 +199,25 @@ def _check_command(tokens: tuple[str, ...]) -> None:
     close = difflib.get_close_matches(tokens[0], commands, n=1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(commands)}"
     raise UserError(f"unknown command {tokens[0]!r}: {hint}")
+
+
+def _current_spelling(tokens: tuple[str, ...]) -> tuple[str, ...]:
+    """Replace the two flags that were commands until version 0.1, and say so."""
+    if tokens[:1] == ("imagine",) and "--evaluate" in tokens:
+        _note("imagine --evaluate is now called evaluate-imagination")
+        return "evaluate-imagination", *(word for word in tokens[1:] if word != "--evaluate")
+    if tokens[:1] != ("train",):
+        return tokens
+    for at, length in ((at, length) for at in range(1, len(tokens)) for length in (1, 2)):
+        if "=".join(tokens[at : at + length]) == "--policy=world-model":
+            _note("train --policy world-model is now called train-world-model")
+            rest = (*tokens[1:at], *tokens[at + length :])
+            return "train-world-model", *(word for word in rest if word != "--freeze-encoder")
+    return tokens
+
+
+def _note(text: str) -> None:
+    sys.stderr.write(f"note: {text}\n")
 
 
 def _check_toml(path: Path) -> None:

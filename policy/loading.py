@@ -129,8 +129,8 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
     kind, *options = spec.split(":")
     if kind not in ("toge", "resnet-unet"):
         raise PolicyError(
-            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
-            "resnet-unet[:SIZE] or world-model"
+            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE] or "
+            "resnet-unet[:SIZE]; a world model is trained by mavbridge train-world-model"
         )
     return _config(kind, options, image_size)
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from policy.contract import Contract, FloatArray
 from policy.errors import PolicyError
+from policy.rotation import matrix_columns
 
 STATE_SCALE = (
     *(5.0, 5.0, 5.0),  # m/s: a brisk pace through gates
@@ -63,10 +64,7 @@ def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
         12 columns, or 19: one fewer than came in.
     """
     vx, vy, vz, w, x, y, z, *rest = columns
-    # Columns of world_from_body, by a unit quaternion; velocity_body = its transpose @ velocity.
-    forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-    side = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
-    up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    forward, side, up = matrix_columns(w, x, y, z)
     velocity_body = [vx * a + vy * b + vz * c for a, b, c in (forward, side, up)]
     return [*velocity_body, forward[2], side[2], up[2], *rest]
 

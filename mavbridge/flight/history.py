@@ -1,11 +1,11 @@
 """Chunks and history in seconds: which action acts now, and which sticks were sent before."""
 
-from collections import deque
+from bisect import bisect_right
 
 import numpy as np
 
-from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import NEUTRAL, FloatArray, Sticks
+from policy.observation import history_ages_ns
 
 
 def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks:
@@ -26,34 +26,23 @@ def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks
 
 
 class SentHistory:
-    """Sticks as they were sent, resampled to the policy's history grid.
-
-    A stick holds until the next one is sent, so the value at a time is that of the last send before
-    it; what is older than the first send, and any release, counts as neutral.
-    """
+    """Sticks as they were sent, resampled to the policy's history grid."""
 
     def __init__(self, *, length: int, dt_s: float) -> None:
-        self._length = length
-        self._dt_ns = round(dt_s * NS_PER_S)
-        self._sent: deque[tuple[int, Sticks]] = deque()
+        self._ages_ns = history_ages_ns(length, dt_s)
+        self._span_ns = self._ages_ns[0] + self._ages_ns[-1]
+        self._sent_ns: list[int] = []
+        self._sent: list[Sticks] = [NEUTRAL]
+        """One more than stamps: what was held before the first of them."""
 
     def append(self, sent: Sticks | None, now_ns: int) -> None:
-        """Remember what left at ``now_ns`` (None = released); forgets what is too old to matter."""
-        self._sent.append((now_ns, NEUTRAL if sent is None else sent))
-        horizon_ns = now_ns - (self._length + 1) * self._dt_ns
-        while len(self._sent) > 1 and self._sent[1][0] <= horizon_ns:
-            self._sent.popleft()
+        """Remember what left at ``now_ns`` (None = released); forget what is too old to matter."""
+        self._sent_ns.append(now_ns)
+        self._sent.append(NEUTRAL if sent is None else sent)
+        if (old := bisect_right(self._sent_ns, now_ns - self._span_ns)) > 1:
+            del self._sent_ns[: old - 1], self._sent[: old - 1]
 
     def resample(self, now_ns: int) -> FloatArray:
-        """[1, K, 4], oldest first; the newest is one ``history_dt_s`` before ``now_ns``."""
-        newest_first: list[Sticks] = []
-        at_ns = now_ns - self._dt_ns
-        for sent_ns, sticks in reversed(self._sent):
-            while at_ns >= sent_ns and len(newest_first) < self._length:
-                newest_first.append(sticks)
-                at_ns -= self._dt_ns
-            if len(newest_first) == self._length:
-                break
-        newest_first += [NEUTRAL] * (self._length - len(newest_first))
-        flat = [value for sticks in reversed(newest_first) for value in sticks]
-        return np.array(flat, dtype=np.float32).reshape(1, self._length, 4)
+        """[1, K, 4], see ``policy.observation.history_ages_ns``."""
+        rows = [self._sent[bisect_right(self._sent_ns, now_ns - age)] for age in self._ages_ns]
+        return np.array([rows], dtype=np.float32)

@@ -21,6 +21,14 @@ from policy.world_model.model import WorldModel
 WORLD_MODEL_KEY = "world_model"
 """Of the header; a policy's file has ``architecture`` in its place."""
 _SUFFIX = ".safetensors"
+_RENAMED = {
+    "foresight.begin.": "motion_predictor.initial_hidden.",
+    "foresight.read.": "motion_predictor.gru.",
+    "foresight.tell.": "motion_predictor.output.",
+    "foresight.usual": "motion_predictor.mean_motion",
+    "carried_view.nearness.": "frame_warp.inverse_depth.",
+}
+"""Prefixes of weights in files of version 0.1, and what they are called now."""
 
 
 def save_world_model(
@@ -60,12 +68,11 @@ def load_world_model(path: Path) -> WorldModel:
     if path.suffix != _SUFFIX:
         raise CheckpointError(f"{path}: world models are stored as {_SUFFIX}")
     require_file(path, (_SUFFIX,))
-    header, state = read_tensors(path)
+    header, tensors = read_tensors(path)
+    state = {_current_name(name): value for name, value in tensors.items()}
     if WORLD_MODEL_KEY not in header or CONTRACT_KEY not in header:
         held = "a policy" if ARCHITECTURE_KEY in header else f"no world model ({sorted(header)})"
-        raise CheckpointError(
-            f"{path} holds {held}: name a file of mavbridge train --policy world-model"
-        )
+        raise CheckpointError(f"{path} holds {held}: name a file of mavbridge train-world-model")
     require_finite(path, state)
     try:
         contract = Contract.from_json(header[CONTRACT_KEY])
@@ -75,3 +82,10 @@ def load_world_model(path: Path) -> WorldModel:
     require_fit(path, model, state)
     model.load_state_dict(state)
     return model.eval()
+
+
+def _current_name(name: str) -> str:
+    for old, new in _RENAMED.items():
+        if name.startswith(old):
+            return new + name.removeprefix(old)
+    return name

@@ -1,11 +1,8 @@
-"""Reads the project's flight folders (docs/flight_folder.md) into episodes."""
+"""Reads the project's flight folders (docs/flight_folder.md)."""
 
-import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import cast, get_args
 
 import av
 import numpy as np
@@ -14,7 +11,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, STATE_DIM, FloatArray, StateFrame
-from policy.data.episodes import GATE_DIM, DatasetError, Episode, ImageArray, Nanoseconds
+from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
+from policy.data.tables import file_digest, parse_state_frame, read_json, stamps, vectors
 
 FORMAT, VERSION = "mavbridge-flight", 1
 VIDEO = "camera.mp4"
@@ -50,7 +48,7 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_exemplary(folder: Path) -> bool:
-    """Not a demonstration that failed: what led into a gate's frame is nothing to imitate.
+    """Whether to imitate a flight: not a demonstration that failed, e.g. hit a gate's frame.
 
     Raises:
         DatasetError: not a flight of ours.
@@ -59,81 +57,71 @@ def is_exemplary(folder: Path) -> bool:
     return meta.get("source") != "demonstration" or meta.get("success") is not False
 
 
-def read_flight(folder: Path) -> Episode:
-    """One flight folder, finished or left behind by a crash.
+def read_flight(folder: Path) -> FlightData:
+    """Read one flight folder, finished or left behind by a crash.
 
-    What is imitated: ``expert`` where there is such a column; otherwise what was sent; in a flight
-    where nothing was sent (``--readonly``), the sticks of the pilot.
+    The sticks to imitate are ``expert`` where there is such a column; otherwise those that were
+    sent; in a flight where nothing was sent (``--readonly``), those of the pilot.
 
     Raises:
         DatasetError: not a flight of ours, or damaged, or nobody flew in it.
     """
     state_frame = _state_frame(folder)
+    name = str(folder)
     ticks = _read_table(folder, "ticks", _TICK_COLUMNS)
     frames = _read_table(folder, "frames", _FRAME_COLUMNS)
     video = folder / VIDEO
     if not video.is_file() or frames.num_rows == 0:
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
-    tick_ns, sent_ns = _stamps(folder, ticks, "woke_ns"), _stamps(folder, ticks, "sent_ns")
-    armed = np.array(ticks["armed"].to_pylist(), dtype=bool)
-    sent = _sent(folder, ticks)
+    tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
+    sent = vectors(name, ticks, "sent", ACTION_DIM)
+    if not _known(sent).any():
+        sent = vectors(name, ticks, "rc_sticks", ACTION_DIM)
+    target_ns, target = sent_ns, sent
     if "expert" in ticks.column_names:
         # The expert looked when the policy would have; its stick is for that moment.
-        target_ns, target = tick_ns, _vectors(folder, ticks, "expert", ACTION_DIM)
-    else:
-        target_ns, target = sent_ns, sent
-    is_target = _known(target) & armed
+        target_ns, target = tick_ns, vectors(name, ticks, "expert", ACTION_DIM)
+    is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
     if not is_target.any():
         raise DatasetError(
             f"{folder}: nobody to learn from: no expert, and no stick was sent while armed"
         )
-    state = _vectors(folder, ticks, "state", STATE_DIM)
+    state = vectors(name, ticks, "state", STATE_DIM)
     state[~is_target] = np.nan
-    # Rows without a state need some stamp; nothing reads it.
-    attitude_ns, velocity_ns = (
-        np.where(_known(state), _stamps_or(ticks, name, tick_ns), tick_ns)
-        for name in ("attitude_ns", "velocity_ns")
-    )
-    captured = ticks["feature_captured_ns"].to_pylist()
-    ages = [t - c for t, c in zip(tick_ns.tolist(), captured, strict=True) if c is not None]
-    with video.open("rb") as file:
-        fingerprint = hashlib.file_digest(file, "sha256").hexdigest()
-    return Episode(
-        name=str(folder),
+    return FlightData(
+        name=name,
         state_frame=state_frame,
         tick_ns=tick_ns,
         state=state,
-        attitude_ns=attitude_ns,
-        velocity_ns=velocity_ns,
+        attitude_ns=_stamps_or(ticks, "attitude_ns", tick_ns, _known(state)),
+        velocity_ns=_stamps_or(ticks, "velocity_ns", tick_ns, _known(state)),
         target_ns=target_ns[is_target],
         target=target[is_target],
         sent_ns=sent_ns,
         sent=np.nan_to_num(sent, nan=0.0),
-        age_ns=np.array(ages, dtype=np.int64),
-        captured_ns=_stamps(folder, frames, "captured_ns"),
-        gate=_gates(folder, frames),
-        fingerprint=fingerprint,
+        age_ns=_ages(ticks),
+        captured_ns=stamps(name, frames, "captured_ns"),
+        gate=_gates(name, frames),
+        fingerprint=file_digest(video),
         decode=partial(decode_video, video),
     )
 
 
 def read_ages(folder: Path) -> Nanoseconds:
-    """Measured ages of the image at each tick of a flight, sorted.
+    """Ages of the image that were measured at the ticks of a flight, sorted.
 
     Raises:
         DatasetError: not a flight, or no policy looked in it.
     """
     _state_frame(folder)
-    ticks = _read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"))
-    tick_ns, captured = ticks["woke_ns"].to_pylist(), ticks["feature_captured_ns"].to_pylist()
-    ages = [t - c for t, c in zip(tick_ns, captured, strict=True) if c is not None and t > c]
-    if not ages:
+    ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns")))
+    if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
-    return np.sort(np.array(ages, dtype=np.int64))
+    return np.sort(ages[ages > 0])
 
 
 def decode_video(path: Path) -> Iterator[ImageArray]:
-    """Frames [H, W, 3] RGB of a video, as far as it is readable.
+    """Yield the frames [H, W, 3] RGB of a video, as far as it is readable.
 
     Raises:
         DatasetError: no video at all.
@@ -157,13 +145,7 @@ def decode_video(path: Path) -> Iterator[ImageArray]:
 
 
 def _read_meta(folder: Path) -> dict[str, object]:
-    path = folder / "meta.json"
-    try:
-        data: object = json.loads(path.read_text())
-    except OSError as error:
-        raise DatasetError(f"{path}: {error.strerror}: is it a flight folder?") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is not JSON: {error}") from error
+    data = read_json(folder / "meta.json", "flight folder")
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise DatasetError(f"{folder}: not a flight of mavbridge (meta.json has no {FORMAT!r})")
     if data.get("version") != VERSION:
@@ -176,10 +158,7 @@ def _read_meta(folder: Path) -> dict[str, object]:
 def _state_frame(folder: Path) -> StateFrame:
     contract = _read_meta(folder).get("contract")
     frame = contract.get("state_frame") if isinstance(contract, dict) else None
-    for known in get_args(StateFrame):
-        if frame == known:
-            return cast(StateFrame, known)
-    raise DatasetError(f"{folder}: its contract names no state frame that we know: {frame!r}")
+    return parse_state_frame(str(folder), frame)
 
 
 def _read_table(folder: Path, stem: str, columns: tuple[str, ...]) -> pa.Table:
@@ -211,51 +190,31 @@ def _read_stream(path: Path) -> pa.Table:
                 return pa.Table.from_batches(batches, schema=reader.schema)
 
 
-def _stamps(folder: Path, table: pa.Table, name: str) -> Nanoseconds:
-    column = table[name]
-    if column.null_count:
-        raise DatasetError(f"{folder}: {name} is missing in {column.null_count} rows")
-    return np.asarray(column.to_numpy(), dtype=np.int64)
+def _stamps_or(
+    table: pa.Table, name: str, otherwise: Nanoseconds, use: NDArray[np.bool_]
+) -> Nanoseconds:
+    """Stamps of the rows to ``use``, and of the others ``otherwise``: nothing reads those."""
+    rows = zip(table[name].to_pylist(), otherwise.tolist(), use, strict=True)
+    return np.array([a if is_used and a is not None else b for a, b, is_used in rows], np.int64)
 
 
-def _stamps_or(table: pa.Table, name: str, otherwise: Nanoseconds) -> Nanoseconds:
-    pairs = zip(table[name].to_pylist(), otherwise.tolist(), strict=True)
-    return np.array([value if value is not None else other for value, other in pairs], np.int64)
+def _ages(ticks: pa.Table) -> Nanoseconds:
+    """Ages of the image at the ticks that had one."""
+    pairs = zip(ticks["woke_ns"].to_pylist(), ticks["feature_captured_ns"].to_pylist(), strict=True)
+    return np.array([woke - exposed for woke, exposed in pairs if exposed is not None], np.int64)
 
 
-def _vectors(folder: Path, table: pa.Table, name: str, width: int) -> FloatArray:
-    """List column -> [rows, width] float32, NaN where null."""
-    out = np.full((table.num_rows, width), np.nan, dtype=np.float32)
-    column = table[name].combine_chunks()
-    valid = column.is_valid().to_numpy(zero_copy_only=False).astype(bool)
-    values = column.drop_null().flatten().to_numpy(zero_copy_only=False).astype(np.float32)
-    if values.size != valid.sum() * width:
-        raise DatasetError(f"{folder}: {name} must hold {width} numbers a row")
-    values = values.reshape(-1, width)
-    if (bad := np.flatnonzero(~np.isfinite(values).all(axis=1))).size:
-        row = int(np.flatnonzero(valid)[bad[0]])
-        raise DatasetError(f"{folder}: {name} holds NaN or infinity in row {row}")
-    out[valid] = values
-    return out
+def _known(values: FloatArray) -> NDArray[np.bool_]:
+    return np.asarray(~np.isnan(values).any(axis=1))
 
 
-def _known(vectors: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(~np.isnan(vectors).any(axis=1))
-
-
-def _sent(folder: Path, ticks: pa.Table) -> FloatArray:
-    """What flew: what was sent, or in a read-only flight what the pilot held."""
-    sent = _vectors(folder, ticks, "sent", ACTION_DIM)
-    return sent if _known(sent).any() else _vectors(folder, ticks, "rc_sticks", ACTION_DIM)
-
-
-def _gates(folder: Path, frames: pa.Table) -> FloatArray:
+def _gates(name: str, frames: pa.Table) -> FloatArray:
     out = np.full((frames.num_rows, GATE_DIM), np.nan, dtype=np.float32)
     if "gate_body_m" in frames.column_names:
-        out[:, :3] = _vectors(folder, frames, "gate_body_m", 3)
+        out[:, :3] = vectors(name, frames, "gate_body_m", 3)
     if "gate_yaw_rad" in frames.column_names:
         yaw = frames["gate_yaw_rad"].to_pylist()
         out[:, 3] = [np.nan if value is None else value for value in yaw]
     if "gate_after_body_m" in frames.column_names:
-        out[:, 4:] = _vectors(folder, frames, "gate_after_body_m", 3)
+        out[:, 4:] = vectors(name, frames, "gate_after_body_m", 3)
     return out

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.data.episodes import DatasetError, Episode, ImageArray
+from policy.data.flight_data import DatasetError, FlightData, ImageArray
 from policy.preprocess import resize
 
 _SPARE_BYTES = 1 << 30
@@ -19,37 +19,38 @@ _SPARE_BYTES = 1 << 30
 
 
 class FrameStore:
-    """Images of episodes [N, height, width, 3] uint8, counted over all of them in their order."""
+    """Images of flights [N, height, width, 3] uint8, counted over all of them in their order."""
 
     def __init__(self, arrays: Sequence[ImageArray]) -> None:
         self._arrays = arrays
-        self._starts = np.cumsum([0, *(len(array) for array in arrays)])
+        self.counts = [len(array) for array in arrays]
+        """Images of each flight."""
+        self._starts = np.cumsum([0, *self.counts])
 
-    def __len__(self) -> int:
-        return int(self._starts[-1])
-
-    @property
-    def counts(self) -> list[int]:
-        """Images of each episode."""
-        return [len(array) for array in self._arrays]
-
-    def only(self, episodes: Sequence[int]) -> "FrameStore":
-        """The images of some episodes, counted anew."""
-        return FrameStore([self._arrays[index] for index in episodes])
+    def only(self, flights: Sequence[int]) -> "FrameStore":
+        """The images of some flights, counted anew."""
+        return FrameStore([self._arrays[index] for index in flights])
 
     def read(
-        self, frames: NDArray[np.int64], size: tuple[int, int], shifts: NDArray[np.int64]
+        self,
+        frames: NDArray[np.int64],
+        size: int,
+        shifts: NDArray[np.int64] | None = None,
+        *,
+        is_mirrored: bool = False,
     ) -> ImageArray:
-        """[B, height, width, 3] at ``size``, moved by ``shifts`` [B, 2] pixels down and right.
+        """Images [B, size, size, 3], mirrored or not.
 
-        A shifted image repeats its edge.
+        ``shifts`` [B, 2] are pixels down and right; a shifted image repeats its edge.
         """
-        out = np.empty((len(frames), *size, 3), np.uint8)
-        episodes = np.searchsorted(self._starts, frames, side="right") - 1
-        for row, (frame, episode) in enumerate(zip(frames, episodes, strict=True)):
-            image = np.asarray(self._arrays[episode][frame - self._starts[episode]])
-            out[row] = resize(_shift(image, shifts[row]), *size)
-        return out
+        out = np.empty((len(frames), size, size, 3), np.uint8)
+        flights = np.searchsorted(self._starts, frames, side="right") - 1
+        for row, (frame, flight) in enumerate(zip(frames, flights, strict=True)):
+            image = np.asarray(self._arrays[flight][frame - self._starts[flight]])
+            if shifts is not None:
+                image = _shift(image, shifts[row])
+            out[row] = resize(image, size, size)
+        return np.ascontiguousarray(out[:, :, ::-1]) if is_mirrored else out
 
 
 def _shift(image: ImageArray, shift: NDArray[np.int64]) -> ImageArray:
@@ -65,20 +66,17 @@ def _shift(image: ImageArray, shift: NDArray[np.int64]) -> ImageArray:
 
 
 def store_frames(
-    episodes: Sequence[Episode],
-    *,
-    height: int,
-    width: int,
+    flights: Sequence[FlightData],
     folder: Path,
-    progress: Callable[[float], None],
+    size: int,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> FrameStore:
-    """Decode and resize, as in flight, what ``folder`` does not hold yet.
+    """Decode and resize, as in flight, the images that ``folder`` does not hold yet.
 
     Args:
-        episodes: whose images.
-        height: of the stored images, px.
-        width: of the stored images, px.
-        folder: one file an episode, named by the content of its video and the size.
+        flights: whose images.
+        folder: one file a flight, named by the content of its video and the size.
+        size: pixels along a side of the stored images.
         progress: called with the fraction done.
 
     Raises:
@@ -86,38 +84,38 @@ def store_frames(
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        paths = [_path(folder, episode, height, width) for episode in episodes]
-        missing = {p: e for p, e in zip(paths, episodes, strict=True) if not p.is_file()}
-        need = sum(len(e.captured_ns) for e in missing.values()) * height * width * 3
+        paths = [_path(folder, flight, size) for flight in flights]
+        missing = {p: f for p, f in zip(paths, flights, strict=True) if not p.is_file()}
+        need = sum(len(flight.captured_ns) for flight in missing.values()) * size * size * 3
         free = shutil.disk_usage(folder).free
         if need + _SPARE_BYTES > free:
             raise DatasetError(
                 f"{folder}: the decoded images take {need / 1e9:.1f} GB and {free / 1e9:.1f} GB "
                 "are free: choose a smaller --image-size, fewer flights, or an --out elsewhere"
             )
-        for index, (path, episode) in enumerate(missing.items()):
-            _decode(path, episode, height, width)
+        for index, (path, flight) in enumerate(missing.items()):
+            _decode(path, flight, size)
             progress((index + 1) / len(missing))
     except OSError as error:
         raise disk_error(folder, error) from error
-    return FrameStore([_load(path, height, width) for path in paths])
+    return FrameStore([np.memmap(p, np.uint8, mode="r").reshape(-1, size, size, 3) for p in paths])
 
 
 def disk_error(path: Path, error: OSError) -> DatasetError:
-    """What to say of a file that could not be written."""
+    """The error to raise for a file that could not be written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DatasetError(f"{path}: the disk is full: make room, or write --out elsewhere")
     return DatasetError(f"{path}: {error.strerror or error}")
 
 
-def _path(folder: Path, episode: Episode, height: int, width: int) -> Path:
-    key = f"{episode.fingerprint} {len(episode.captured_ns)}"
+def _path(folder: Path, flight: FlightData, size: int) -> Path:
+    key = f"{flight.fingerprint} {len(flight.captured_ns)}"
     name = hashlib.sha256(key.encode()).hexdigest()[:20]
-    return folder / f"{name}.{height}x{width}.rgb"
+    return folder / f"{name}.{size}x{size}.rgb"
 
 
-def _decode(path: Path, episode: Episode, height: int, width: int) -> None:
-    """All images that have a row, or those before the video breaks off.
+def _decode(path: Path, flight: FlightData, size: int) -> None:
+    """Store all images that have a row, or those before the video breaks off.
 
     Written, not mapped: a disk that fills up under a map would kill the process.
     """
@@ -125,15 +123,11 @@ def _decode(path: Path, episode: Episode, height: int, width: int) -> None:
     count = 0
     try:
         with partial.open("wb") as file:
-            for image in islice(episode.decode(), len(episode.captured_ns)):
-                file.write(np.ascontiguousarray(resize(image, height, width)).data)
+            for image in islice(flight.decode(), len(flight.captured_ns)):
+                file.write(np.ascontiguousarray(resize(image, size, size)).data)
                 count += 1
         if count == 0:
-            raise DatasetError(f"{episode.name}: no frame of its video can be read")
+            raise DatasetError(f"{flight.name}: no frame of its video can be read")
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
-
-
-def _load(path: Path, height: int, width: int) -> ImageArray:
-    return np.memmap(path, np.uint8, mode="r").reshape(-1, height, width, 3)

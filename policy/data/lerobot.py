@@ -1,13 +1,11 @@
-"""Reads LeRobot datasets of format v3 with the contract's features into episodes."""
+"""Reads LeRobot datasets of format v3 with the contract's features; an episode is a flight."""
 
-import hashlib
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any
 
 import av
 import cv2
@@ -17,9 +15,10 @@ import pyarrow.parquet as pq
 
 from policy.contract import ACTION_NAMES, SPECIFIC_FORCE, STATE_NAMES, FloatArray, StateFrame
 from policy.data import lerobot_format as names
-from policy.data.episodes import GATE_DIM, DatasetError, Episode, ImageArray, Nanoseconds
+from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
+from policy.data.tables import file_digest, numbers, parse_state_frame, read_json, stamps, vectors
+from policy.observation import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
 
@@ -28,12 +27,12 @@ def is_lerobot(folder: Path) -> bool:
     return (folder / names.INFO).is_file()
 
 
-def read_dataset(folder: Path, camera_key: str | None = None) -> list[Episode]:
-    """All episodes of a dataset.
+def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData]:
+    """Read all episodes of a dataset.
 
-    The stamps are those that ``mavbridge export`` adds; without them every row has its
-    ``timestamp`` for the image, the state and the action. A LeRobot dataset does not say how old
-    an image was when a policy acted on it: ``age_ns`` is empty.
+    Stamps are those that ``mavbridge export`` adds; without them, image, state and action of a row
+    are of its ``timestamp``. A LeRobot dataset does not say how old an image was when a policy
+    acted on it: ``age_ns`` is empty.
 
     Args:
         folder: the dataset, with ``meta/info.json``.
@@ -42,71 +41,60 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[Episode]:
     Raises:
         DatasetError: another version, other features, or damaged; the message says what to do.
     """
-    info = _read_info(folder)
-    camera = _camera(info, camera_key)
-    rows = _read_episodes(folder, info, camera)
-    digests = _digests({row.video for row in rows})
-    stamps = [name for name in names.STAMPS if name in info.features]
-    has_sent = names.SENT in info.features and names.SENT_AT in stamps
-    columns = [
-        *("episode_index", "timestamp", names.STATE_KEY, names.ACTION_KEY),
-        *stamps,
-        *([names.SENT] if has_sent else []),
-    ]
-    episodes = []
-    for path, inside in _by_file(rows):
+    info = _read_info(folder, camera_key)
+    rows = _read_episodes(info)
+    digests = {path: file_digest(path) for path in {row.video for row in rows}}
+    columns = ["episode_index", "timestamp", names.STATE_KEY, names.ACTION_KEY]
+    columns += [name for name in names.STAMPS if name in info.features]
+    if names.SENT in info.features and names.SENT_AT in info.features:
+        columns.append(names.SENT)
+    files: dict[Path, list[_Row]] = {}
+    for row in rows:
+        files.setdefault(row.data, []).append(row)
+    flights = []
+    for path, inside in files.items():
         table = _read_table(path, columns)
-        index = table["episode_index"].to_numpy()
         for row in inside:
-            part = table.filter(pa.array(index == row.episode_index))
+            part = _rows_of(table, row)
             if part.num_rows != row.length:
                 raise DatasetError(
                     f"{row.name}: {path} holds {part.num_rows} rows of it, meta/episodes says "
                     f"{row.length}: the dataset is incomplete"
                 )
-            episodes.append(_episode(info, row, part, digests[row.video]))
-    return episodes
+            flights.append(_flight(info, row, part, digests[row.video]))
+    return flights
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Info:
-    """What is needed of ``meta/info.json``."""
+    """The parts of ``meta/info.json`` that are used."""
 
     folder: Path
     fps: float
     features: Mapping[str, Mapping[str, Any]]
     data_path: str
     video_path: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Camera:
-    key: str
+    camera: str
     is_video: bool
+    """Whether the camera's images are in videos, or in the table."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Row:
-    """What is needed of a row of ``meta/episodes``."""
+    """The parts of a row of ``meta/episodes`` that are used."""
 
     name: str
     episode_index: int
     length: int
     data: Path
-    camera: _Camera
     video: Path
     """The same as ``data`` where the images are in the table."""
     from_s: float
 
 
-def _read_info(folder: Path) -> _Info:
+def _read_info(folder: Path, camera_key: str | None) -> _Info:
     path = folder / names.INFO
-    try:
-        data: Any = json.loads(path.read_text())
-    except OSError as error:
-        raise DatasetError(f"{path}: {error.strerror}: is it a LeRobot dataset?") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is not JSON: {error}") from error
+    data = read_json(path, "LeRobot dataset")
     version = data.get("codebase_version") if isinstance(data, dict) else None
     if not isinstance(version, str) or not version.startswith("v3."):
         raise DatasetError(
@@ -120,12 +108,15 @@ def _read_info(folder: Path) -> _Info:
         raise DatasetError(f"{path} describes no features")
     _require_vector(folder, features, names.STATE_KEY, STATE_NAMES)
     _require_vector(folder, features, names.ACTION_KEY, ACTION_NAMES)
+    camera = _choose_camera(folder, features, camera_key)
     return _Info(
         folder=folder,
         fps=float(fps),
         features=features,
         data_path=str(data.get("data_path") or names.DATA),
         video_path=str(data.get("video_path") or names.VIDEO),
+        camera=camera,
+        is_video=features[camera].get("dtype") == "video",
     )
 
 
@@ -150,71 +141,55 @@ def _require_vector(
         )
 
 
-def _camera(info: _Info, asked: str | None) -> _Camera:
-    kinds = {key: f.get("dtype") for key, f in info.features.items()}
-    cameras = sorted(key for key, kind in kinds.items() if kind in ("video", "image"))
+def _choose_camera(
+    folder: Path, features: Mapping[str, Mapping[str, Any]], asked: str | None
+) -> str:
+    cameras = sorted(k for k, f in features.items() if f.get("dtype") in ("video", "image"))
     if not cameras:
-        raise DatasetError(f"{info.folder}: no camera: no feature is a video or image")
+        raise DatasetError(f"{folder}: no camera: no feature is a video or image")
     if asked is None and len(cameras) > 1:
-        raise DatasetError(f"{info.folder}: several cameras {cameras}: name one by --camera-key")
-    key = cameras[0] if asked is None else asked
-    if key not in cameras:
-        raise DatasetError(f"{info.folder}: no camera {key}; it has {cameras}")
-    return _Camera(key=key, is_video=kinds[key] == "video")
+        raise DatasetError(f"{folder}: several cameras {cameras}: name one by --camera-key")
+    if asked is not None and asked not in cameras:
+        raise DatasetError(f"{folder}: no camera {asked}; it has {cameras}")
+    return asked or cameras[0]
 
 
-def _read_episodes(folder: Path, info: _Info, camera: _Camera) -> list[_Row]:
-    files = sorted((folder / "meta" / "episodes").glob("*/*.parquet"))
+def _read_episodes(info: _Info) -> list[_Row]:
+    files = sorted((info.folder / "meta" / "episodes").glob("*/*.parquet"))
     if not files:
-        raise DatasetError(f"{folder}: no meta/episodes/*/*.parquet: the dataset is incomplete")
+        raise DatasetError(f"{info.folder}: no meta/episodes/*/*.parquet: it is incomplete")
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    prefix = f"videos/{camera.key}/"
-    if camera.is_video:
-        columns += [f"{prefix}{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    if info.is_video:
+        each = ("chunk_index", "file_index", "from_timestamp")
+        columns += [f"videos/{info.camera}/{name}" for name in each]
     table = pa.concat_tables([_read_table(file, columns) for file in files])
     if table.num_rows == 0:
-        raise DatasetError(f"{folder}: no episodes in it")
-    return [_row(info, camera, values) for values in table.to_pylist()]
+        raise DatasetError(f"{info.folder}: no episodes in it")
+    return [_row(info, values) for values in table.to_pylist()]
 
 
-def _row(info: _Info, camera: _Camera, values: Mapping[str, Any]) -> _Row:
+def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
     number = values["episode_index"]
-    name = f"{info.folder}, episode {number}"
-    prefix = f"videos/{camera.key}/"
+    name, prefix = f"{info.folder}, episode {number}", f"videos/{info.camera}/"
     try:
-        data = info.folder / info.data_path.format(
+        video = data = info.folder / info.data_path.format(
             chunk_index=values["data/chunk_index"], file_index=values["data/file_index"]
         )
-        video = data
-        if camera.is_video:
+        if info.is_video:
             video = info.folder / info.video_path.format(
-                video_key=camera.key,
+                video_key=info.camera,
                 chunk_index=values[f"{prefix}chunk_index"],
                 file_index=values[f"{prefix}file_index"],
             )
-        from_s = float(values[f"{prefix}from_timestamp"]) if camera.is_video else 0.0
+        from_s = float(values[f"{prefix}from_timestamp"]) if info.is_video else 0.0
         length = int(values["length"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise DatasetError(f"{name}: meta does not say where its files are: {error!r}") from error
     if not video.is_file():
         raise DatasetError(f"{name}: {video} is not there: copy the dataset again, whole")
     return _Row(
-        name=name,
-        episode_index=number,
-        length=length,
-        data=data,
-        camera=camera,
-        video=video,
-        from_s=from_s,
+        name=name, episode_index=number, length=length, data=data, video=video, from_s=from_s
     )
-
-
-def _by_file(rows: Sequence[_Row]) -> list[tuple[Path, list[_Row]]]:
-    """Episodes of each data file, each file read once."""
-    files: dict[Path, list[_Row]] = {}
-    for row in rows:
-        files.setdefault(row.data, []).append(row)
-    return list(files.items())
 
 
 def _read_table(path: Path, columns: Sequence[str]) -> pa.Table:
@@ -229,97 +204,67 @@ def _read_table(path: Path, columns: Sequence[str]) -> pa.Table:
         raise DatasetError(f"{path} cannot be read: {error}") from error
 
 
-def _episode(info: _Info, row: _Row, table: pa.Table, digest: str) -> Episode:
-    state = _vectors(row, table, names.STATE_KEY, len(STATE_NAMES))
-    action = _vectors(row, table, names.ACTION_KEY, len(ACTION_NAMES))
-    seconds = _numbers(row, table, "timestamp", np.float64)
+def _rows_of(table: pa.Table, row: _Row) -> pa.Table:
+    return table.filter(pa.array(table["episode_index"].to_numpy() == row.episode_index))
+
+
+def _flight(info: _Info, row: _Row, table: pa.Table, digest: str) -> FlightData:
+    seconds = numbers(row.name, table, "timestamp").astype(np.float64)
     if not np.isfinite(seconds).all():
         raise DatasetError(f"{row.name}: timestamp holds NaN or infinity")
     timestamp_ns = np.round(seconds * NS_PER_S).astype(np.int64)
 
-    def stamps(name: str) -> Nanoseconds:
-        if name not in table.column_names:
-            return timestamp_ns
-        return _numbers(row, table, name, np.int64).astype(np.int64)
+    def at(name: str) -> Nanoseconds:
+        return stamps(row.name, table, name) if name in table.column_names else timestamp_ns
+
+    def whole(name: str, width: int) -> FloatArray:
+        values = vectors(row.name, table, name, width)
+        if table[name].null_count:
+            raise DatasetError(f"{row.name}: {name} must hold {width} numbers a row")
+        return values
 
     has_sent = names.SENT in table.column_names
-    sent = _vectors(row, table, names.SENT, len(ACTION_NAMES)) if has_sent else action
-    return Episode(
+    state = whole(names.STATE_KEY, len(STATE_NAMES))
+    action = whole(names.ACTION_KEY, len(ACTION_NAMES))
+    return FlightData(
         name=row.name,
         state_frame=_state_frame(info, row, state),
-        tick_ns=stamps(names.TICK),
+        tick_ns=at(names.TICK),
         state=state,
-        attitude_ns=stamps(names.ATTITUDE),
-        velocity_ns=stamps(names.VELOCITY),
-        target_ns=stamps(names.ACTED),
+        attitude_ns=at(names.ATTITUDE),
+        velocity_ns=at(names.VELOCITY),
+        target_ns=at(names.ACTED),
         target=action,
-        sent_ns=stamps(names.SENT_AT if has_sent else names.ACTED),
-        sent=sent,
+        sent_ns=at(names.SENT_AT if has_sent else names.ACTED),
+        sent=whole(names.SENT, len(ACTION_NAMES)) if has_sent else action,
         age_ns=np.array([], dtype=np.int64),
-        captured_ns=stamps(names.CAPTURED),
+        captured_ns=at(names.CAPTURED),
         gate=np.full((row.length, GATE_DIM), np.nan, dtype=np.float32),
-        fingerprint=f"{digest} {row.camera.key} {row.episode_index}",
-        decode=partial(_decode, row, info.fps),
+        fingerprint=f"{digest} {info.camera} {row.episode_index}",
+        decode=partial(_decode, info, row),
     )
 
 
 def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
-    """As the dataset says; else by gravity: what is not falling pushes up, -z in FRD, +z in FLU."""
+    """By the dataset's ``info``; else by gravity: in level flight -z is up in FRD, +z in FLU."""
     about = info.features[names.STATE_KEY].get("info")
-    said = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
-    if said is None:
-        up = float(np.median(state[:, SPECIFIC_FORCE][:, 2]))
-        return "ned_frd" if up < 0 else "enu_flu"
-    if said not in get_args(StateFrame):
-        raise DatasetError(f"{row.name}: its state is in a frame that we do not know: {said!r}")
-    return cast(StateFrame, said)
+    frame = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
+    if frame is not None:
+        return parse_state_frame(row.name, frame)
+    return "ned_frd" if np.median(state[:, SPECIFIC_FORCE][:, 2]) < 0 else "enu_flu"
 
 
-def _numbers(row: _Row, table: pa.Table, name: str, kind: type[np.generic]) -> np.ndarray:
-    column = table[name]
-    if column.null_count:
-        raise DatasetError(f"{row.name}: {name} is missing in {column.null_count} rows")
-    values = column.to_numpy()
-    if values.ndim != 1 or values.dtype.kind not in "if":
-        raise DatasetError(f"{row.name}: {name} must hold a number a row")
-    return np.asarray(values, dtype=kind)
-
-
-def _vectors(row: _Row, table: pa.Table, name: str, width: int) -> FloatArray:
-    """List column -> [rows, width] float32, every one of them finite."""
-    column = table[name].combine_chunks()
-    try:
-        flat = column.flatten().to_numpy(zero_copy_only=False).astype(np.float32)
-    except (AttributeError, TypeError, ValueError) as error:
-        raise DatasetError(f"{row.name}: {name} must hold {width} numbers a row") from error
-    if column.null_count or flat.size != table.num_rows * width:
-        raise DatasetError(f"{row.name}: {name} must hold {width} numbers a row")
-    values: FloatArray = flat.reshape(-1, width)
-    if (bad := np.flatnonzero(~np.isfinite(values).all(axis=1))).size:
-        raise DatasetError(f"{row.name}: {name} holds NaN or infinity in row {bad[0]}")
-    return values
-
-
-def _digests(paths: set[Path]) -> dict[Path, str]:
-    out = {}
-    for path in paths:
-        with path.open("rb") as file:
-            out[path] = hashlib.file_digest(file, "sha256").hexdigest()
-    return out
-
-
-def _decode(row: _Row, fps: float) -> Iterator[ImageArray]:
-    images = _decode_video(row, fps) if row.camera.is_video else _decode_table(row)
+def _decode(info: _Info, row: _Row) -> Iterator[ImageArray]:
     count = 0
-    for image in images:
+    for image in _decode_video(info, row) if info.is_video else _decode_table(info, row):
         yield image
         count += 1
     if count != row.length:
         raise DatasetError(f"{row.name}: {row.video} ends after {count} of {row.length} images")
 
 
-def _decode_video(row: _Row, fps: float) -> Iterator[ImageArray]:
-    """Image k is the frame nearest to ``from_timestamp + k / fps``, as for LeRobot's reader."""
+def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
+    """Yield the frames nearest to ``from_timestamp + k / fps``, as LeRobot's reader does."""
     try:
         with av.open(str(row.video)) as container:
             stream = container.streams.video[0]
@@ -329,7 +274,7 @@ def _decode_video(row: _Row, fps: float) -> Iterator[ImageArray]:
             for frame in container.decode(stream):
                 if frame.pts is None:
                     continue
-                number = round((frame.pts * tick_s - row.from_s) * fps)
+                number = round((frame.pts * tick_s - row.from_s) * info.fps)
                 if number > wanted:
                     raise DatasetError(f"{row.name}: {row.video} has no frame for row {wanted}")
                 if number < wanted:
@@ -342,10 +287,9 @@ def _decode_video(row: _Row, fps: float) -> Iterator[ImageArray]:
         raise DatasetError(f"{row.video}: not a readable video ({error})") from error
 
 
-def _decode_table(row: _Row) -> Iterator[ImageArray]:
-    table = _read_table(row.data, ["episode_index", row.camera.key])
-    index = table["episode_index"].to_numpy()
-    for value in table.filter(pa.array(index == row.episode_index))[row.camera.key]:
+def _decode_table(info: _Info, row: _Row) -> Iterator[ImageArray]:
+    table = _read_table(row.data, ["episode_index", info.camera])
+    for value in _rows_of(table, row)[info.camera]:
         encoded = value.as_py().get("bytes") if value.is_valid else None
         bgr = cv2.imdecode(np.frombuffer(encoded or b"", np.uint8), cv2.IMREAD_COLOR)
         if bgr is None:

@@ -1,7 +1,7 @@
-"""From stamped flights to what a net is told, for any pair of an image and a later moment.
+"""Training samples from stamped flights, for any pair of an image and a later tick.
 
-What is computed here is what the runtime computes in flight, on arrays: the history as
-``SentHistory.resample`` makes it, the chunk as ``sample_chunk`` reads it.
+They hold what a policy is given in flight: history and motion are those of ``policy.observation``,
+and the rows of a chunk are where ``mavbridge.flight.history.sample_chunk`` expects them.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy import rotation
 from policy.contract import (
     ACTION_DIM,
     AGE,
@@ -24,13 +23,14 @@ from policy.contract import (
     Contract,
     FloatArray,
 )
-from policy.data.episodes import GATE_DIM, DatasetError, Episode, Nanoseconds
-from policy.data.interpolation import NS_PER_S, Indices, Knots, covered
+from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, Nanoseconds
+from policy.data.interpolation import Indices, Interpolator, covered
+from policy.observation import NS_PER_S, history_ages_ns, motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
 """How far the nearest tick may be from the moment that was drawn: two ticks at 100 Hz."""
 HISTORY_JITTER_S = 0.005
-"""Slots of the history are taken so much earlier or later: half a tick at 100 Hz."""
+"""The history is sampled up to so much earlier or later: half a tick at 100 Hz."""
 FRESH_START_SHARE = 0.15
 """Samples that look like a policy just engaged: the older part of the history is neutral."""
 BLIND_SHARE = 0.4
@@ -41,15 +41,22 @@ HISTORY_NOISE = 0.1
 """Standard deviation of an offset on the sticks of a history, against the same."""
 
 _BETWEEN_NS = 10 * NS_PER_S
-"""Put between two flights on the common axis of time: far beyond every gap that is bridged."""
+"""Time between two flights on the common axis: far longer than every gap that is bridged."""
+
+
+# In a mirror, the plane of the first and third axis of world and body, vectors change the sign of y
+# and rotations those of x and z. It holds in both state frames.
+_VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
+STICK_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
+"""Factors of throttle, yaw, pitch and roll in a mirror."""
+GATE_SIGNS = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
+"""Factors of ``FlightData.gate`` in a mirror."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """A batch; ``B`` pairs of an image and a later tick."""
+    """``B`` pairs of an image and a later tick."""
 
-    frame: Indices
-    """[B] of the image, counted over all flights."""
     state: FloatArray
     """[B, state_dim]"""
     history: FloatArray
@@ -57,21 +64,31 @@ class Samples:
     chunk: FloatArray
     """[B, horizon, 4]; where the flight ends inside, its last stick is held."""
     known: NDArray[np.bool_]
-    """[B, horizon]: what of the chunk was flown."""
+    """[B, horizon]: which sticks of the chunk were flown."""
     gate: FloatArray
-    """[B, 7] of the image, NaN where unknown."""
+    """[B, 7] at the exposure, NaN where unknown."""
+
+    def mirrored(self, is_mirrored: NDArray[np.bool_]) -> "Samples":
+        """Exchange left and right where ``is_mirrored`` [B]."""
+        return Samples(
+            state=mirrored(self.state, state_signs(self.state.shape[1]), is_mirrored),
+            history=mirrored(self.history, STICK_SIGNS, is_mirrored),
+            chunk=mirrored(self.chunk, STICK_SIGNS, is_mirrored),
+            known=self.known,
+            gate=mirrored(self.gate, GATE_SIGNS, is_mirrored),
+        )
 
 
 class Timeline:
     """All flights on one axis of time, seconds apart, so that one search serves a batch."""
 
     def __init__(
-        self, episodes: Sequence[Episode], contract: Contract, ages_ns: Nanoseconds
+        self, flights: Sequence[FlightData], contract: Contract, ages_ns: Nanoseconds
     ) -> None:
         """Lay out the flights.
 
         Args:
-            episodes: in the order in which their images are counted.
+            flights: in the order in which their images are counted.
             contract: says what a sample holds.
             ages_ns: sorted; an image's age in a sample is drawn from these.
 
@@ -80,32 +97,31 @@ class Timeline:
         """
         self.contract = contract
         self._ages_ns = ages_ns
-        offsets = _offsets(episodes)
+        starts, offsets = _starts_and_offsets(flights)
 
         def stamps(name: str) -> Nanoseconds:
-            parts = [getattr(e, name) + o for e, o in zip(episodes, offsets, strict=True)]
+            parts = [getattr(e, name) + o for e, o in zip(flights, offsets, strict=True)]
             return np.concatenate(parts).astype(np.int64)
 
-        state = np.concatenate([episode.state for episode in episodes])
+        state = np.concatenate([flight.state for flight in flights])
         known = ~np.isnan(state).any(axis=1)
         self.tick_ns, self._attitude_ns = stamps("tick_ns")[known], stamps("attitude_ns")[known]
         self._state = state[known]
-        self._attitude = Knots(self._attitude_ns, self._state[:, QUATERNION])
+        self._attitude = Interpolator(self._attitude_ns, self._state[:, QUATERNION])
         self._velocity_ns = stamps("velocity_ns")[known]
-        self._velocity = Knots(self._velocity_ns, self._state[:, VELOCITY])
+        self._velocity = Interpolator(self._velocity_ns, self._state[:, VELOCITY])
         self._target_ns = stamps("target_ns")
-        self._target = np.concatenate([episode.target for episode in episodes])
+        self._target = np.concatenate([flight.target for flight in flights])
         # Before its first stick, a flight's sticks were neutral.
-        starts = [_start_ns(e) + o - NS_PER_S for e, o in zip(episodes, offsets, strict=True)]
         sent_ns = [
-            np.concatenate([[start], e.sent_ns + o])
-            for e, o, start in zip(episodes, offsets, starts, strict=True)
+            np.concatenate([[start - NS_PER_S], flight.sent_ns + offset])
+            for flight, offset, start in zip(flights, offsets, starts, strict=True)
         ]
         neutral = np.zeros((1, ACTION_DIM), np.float32)
         self._sent_ns = np.concatenate(sent_ns).astype(np.int64)
-        self._sent = np.concatenate([part for e in episodes for part in (neutral, e.sent)])
+        self._sent = np.concatenate([part for e in flights for part in (neutral, e.sent)])
         self.captured_ns = stamps("captured_ns")
-        self.gate = np.concatenate([episode.gate for episode in episodes]).reshape(-1, GATE_DIM)
+        self.gate = np.concatenate([flight.gate for flight in flights]).reshape(-1, GATE_DIM)
         self._usable_ticks = np.flatnonzero(self.chunks(np.arange(len(self.tick_ns)))[1][:, 0])
         self.frames, self._any_tick = self._usable_frames()
 
@@ -150,10 +166,9 @@ class Timeline:
     def samples(
         self, frames: Indices, ticks: Indices, random: np.random.Generator | None = None
     ) -> Samples:
-        """What the net is told at ``ticks`` with the images ``frames``; jittered by ``random``."""
+        """Inputs and labels at ``ticks`` with the images ``frames``; augmented by ``random``."""
         chunk, known = self.chunks(ticks)
         return Samples(
-            frame=frames,
             state=self.states(frames, ticks),
             history=self.histories(ticks, random),
             chunk=chunk,
@@ -162,45 +177,34 @@ class Timeline:
         )
 
     def states(self, frames: Indices, ticks: Indices) -> FloatArray:
-        """[B, state_dim]: the state at the tick and, if asked for, what happened since exposure."""
+        """[B, state_dim]: the state at the tick and, if the contract says so, the motion since."""
         state: FloatArray = self._state[ticks]
         if not self.contract.since_exposure:
             return state
         captured_ns, attitude_ns = self.captured_ns[frames], self._attitude_ns[ticks]
         # An image newer than the attitude: in flight nothing later is known, so nothing has moved.
-        turned_from = self._attitude.rotations_at(np.minimum(captured_ns, attitude_ns))
-        moved_from = self._velocity.vectors_at(np.minimum(captured_ns, self._velocity_ns[ticks]))
-        then = rotation.conjugate(turned_from)
-        turned = rotation.multiply(then, state[:, QUATERNION].astype(np.float64))
+        attitude_then = self._attitude.rotations_at(np.minimum(captured_ns, attitude_ns))
+        was = self._velocity.vectors_at(np.minimum(captured_ns, self._velocity_ns[ticks]))
         out = np.empty((len(ticks), self.contract.state_dim), np.float32)
         out[:, :STATE_DIM] = state
         out[:, AGE] = (attitude_ns - captured_ns)[:, None] / NS_PER_S
-        out[:, ROTATION] = rotation.rotation_vector(turned)
-        out[:, VELOCITY_CHANGE] = rotation.rotate(then, state[:, VELOCITY] - moved_from)
+        out[:, ROTATION], out[:, VELOCITY_CHANGE] = motion_since_exposure(
+            attitude_then, state[:, QUATERNION].astype(np.float64), state[:, VELOCITY] - was
+        )
         return out
 
     def histories(self, ticks: Indices, random: np.random.Generator | None = None) -> FloatArray:
-        """[B, K, 4] sticks as they were sent, oldest first, held until the next one."""
+        """[B, K, 4] sticks as they were sent, oldest first; augmented by ``random``."""
         count = self.contract.history_len
-        back_s = np.arange(count, 0, -1) * self.contract.history_dt_s
-        at_s = np.broadcast_to(back_s, (len(ticks), count))
+        ages_ns = np.array(history_ages_ns(count, self.contract.history_dt_s))
+        at_ns = self.tick_ns[ticks][:, None] - ages_ns
         if random is not None:
-            at_s = at_s + random.uniform(-HISTORY_JITTER_S, HISTORY_JITTER_S, at_s.shape)
-        at_ns = self.tick_ns[ticks][:, None] - np.round(at_s * NS_PER_S).astype(np.int64)
+            jitter_s = random.uniform(-HISTORY_JITTER_S, HISTORY_JITTER_S, at_ns.shape)
+            at_ns = at_ns - np.round(jitter_s * NS_PER_S).astype(np.int64)
         # Flights are seconds apart, so a time before the first stick finds the neutral row.
         row = np.maximum(np.searchsorted(self._sent_ns, at_ns, side="right") - 1, 0)
         history: FloatArray = self._sent[row]
-        if random is not None:
-            offset = random.normal(0.0, HISTORY_NOISE, (len(ticks), 1, ACTION_DIM))
-            history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
-            chance = random.random(len(ticks))
-            is_fresh = chance < FRESH_START_SHARE
-            neutral = np.where(is_fresh, random.integers(1, count + 1, len(ticks)), 0)
-            neutral = np.where(chance > 1 - BLIND_SHARE, count, neutral)
-            history = np.where(
-                (np.arange(count) < neutral[:, None])[..., None], np.float32(0), history
-            )
-        return history
+        return history if random is None else _forgetful(history, random)
 
     def chunks(self, ticks: Indices) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Sticks [B, horizon, 4] to imitate, and which of them [B, horizon] are known."""
@@ -217,30 +221,31 @@ class Timeline:
         return filled.astype(np.float32), known
 
 
-def _start_ns(episode: Episode) -> int:
-    stamps = (episode.tick_ns, episode.attitude_ns, episode.velocity_ns, episode.target_ns)
-    firsts = [s.min() for s in (*stamps, episode.sent_ns, episode.captured_ns) if len(s)]
-    return int(min(firsts))
+def _forgetful(history: FloatArray, random: np.random.Generator) -> FloatArray:
+    """Histories [B, K, 4] with offset sticks, some of them partly or wholly neutral."""
+    samples, count, _ = history.shape
+    offset = random.normal(0.0, HISTORY_NOISE, (samples, 1, ACTION_DIM))
+    history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
+    chance = random.random(samples)
+    neutral = np.where(chance < FRESH_START_SHARE, random.integers(1, count + 1, samples), 0)
+    neutral = np.where(chance > 1 - BLIND_SHARE, count, neutral)
+    return np.where((np.arange(count) < neutral[:, None])[..., None], np.float32(0), history)
 
 
-def _offsets(episodes: Sequence[Episode]) -> list[int]:
-    """What to add to the stamps of each flight."""
-    offsets, end = [], 0
-    for episode in episodes:
-        offset = end + _BETWEEN_NS - _start_ns(episode)
-        lists = (episode.tick_ns, episode.target_ns, episode.sent_ns, episode.captured_ns)
-        end = offset + max(int(stamps.max()) for stamps in lists if len(stamps))
-        offsets.append(offset)
-    return offsets
+def _starts_and_offsets(flights: Sequence[FlightData]) -> tuple[list[int], list[int]]:
+    """Time of each flight's start on the common axis, and times to add to its stamps."""
+    starts, offsets, end = [], [], 0
+    for flight in flights:
+        lists = (flight.tick_ns, flight.attitude_ns, flight.velocity_ns, flight.target_ns)
+        stamps = np.concatenate([*lists, flight.sent_ns, flight.captured_ns])
+        starts.append(end + _BETWEEN_NS)
+        offsets.append(starts[-1] - int(stamps.min()))
+        end = offsets[-1] + int(stamps.max())
+    return starts, offsets
 
 
-_VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
-STICK_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
-"""What a mirror makes of sticks: yaw and roll change their sign."""
-
-
-def mirror_signs(state_dim: int) -> FloatArray:
-    """What a mirror makes of a state [state_dim], as factors of 1 and -1."""
+def state_signs(state_dim: int) -> FloatArray:
+    """Factors [state_dim] of a state in a mirror."""
     signs = np.ones(state_dim, np.float32)
     signs[VELOCITY] = signs[SPECIFIC_FORCE] = _VECTOR
     signs[RATE] = signs[QUATERNION.start + 1 : QUATERNION.stop] = _AXIAL
@@ -254,24 +259,3 @@ def mirrored(values: FloatArray, signs: FloatArray, is_mirrored: NDArray[np.bool
     """``values`` [B, ..., D], times ``signs`` [D] where ``is_mirrored`` [B]."""
     chosen = is_mirrored.reshape(-1, *[1] * (values.ndim - 1))
     return np.where(chosen, values * signs, values).astype(np.float32)
-
-
-def mirror(samples: Samples, is_mirrored: NDArray[np.bool_]) -> Samples:
-    """The flight in a mirror, left and right exchanged, where ``is_mirrored`` [B].
-
-    The mirror is the plane of the first and third axis, of the world and of the body: true vectors
-    lose the sign of y, rotations those of x and z. It holds in both state frames.
-    """
-    gate = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
-
-    def where(values: FloatArray, factor: FloatArray) -> FloatArray:
-        return mirrored(values, factor, is_mirrored)
-
-    return Samples(
-        frame=samples.frame,
-        state=where(samples.state, mirror_signs(samples.state.shape[1])),
-        history=where(samples.history, STICK_SIGNS),
-        chunk=where(samples.chunk, STICK_SIGNS),
-        known=samples.known,
-        gate=where(samples.gate, gate),
-    )

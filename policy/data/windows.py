@@ -1,4 +1,4 @@
-"""What a world model learns from: runs of frames at an even pace, states and sticks beside them."""
+"""Windows of evenly spaced frames, with states and sticks: what a world model learns from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, VELOCITY, FloatArray
-from policy.data.episodes import DatasetError, Episode, Nanoseconds
-from policy.data.interpolation import NS_PER_S, Indices, Knots
+from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
+from policy.data.interpolation import Indices, Interpolator
+from policy.observation import NS_PER_S
 
 TOLERANCE = 0.25
-"""Of the time between two frames: how far a frame may be from its place in a window. A frame in
-three that was dropped leaves a place that no neighbour can take."""
+"""How far a frame may be from its time in a window, over the time between two frames: where one in
+three frames was dropped, no neighbour can take its place."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +25,7 @@ class WindowSamples:
     states: FloatArray
     """[B, K + T, 13] at the exposures."""
     actions: FloatArray
-    """[B, T, 4] mean stick that was sent from the frame before to each frame of the future."""
+    """[B, T, 4] mean stick sent from the frame before to each frame of the future."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class Windows:
         return len(self.frames)
 
     def among(self, frames: Indices) -> "Windows":
-        """The windows that need no others than ``frames``; there may be none."""
+        """The windows all of whose frames are in ``frames``; there may be none."""
         is_there = np.zeros(len(self.states), bool)
         is_there[frames] = True
         return replace(self, frames=self.frames[is_there[self.frames].all(axis=1)])
@@ -56,7 +57,7 @@ class Windows:
         return replace(self, frames=self.frames[rows])
 
     def samples(self, rows: Indices) -> WindowSamples:
-        """Windows [B] by their number."""
+        """The windows with indices [B]."""
         frames = self.frames[rows]
         ends = frames[:, self.context_frames - 1 :]
         elapsed_s = np.diff(self.captured_ns[ends], axis=1)[..., None] / NS_PER_S
@@ -69,7 +70,7 @@ class Windows:
 
 
 def find_windows(
-    episodes: Sequence[Episode], *, context_frames: int, frames: int, frame_dt_s: float
+    flights: Sequence[FlightData], *, context_frames: int, frames: int, frame_dt_s: float
 ) -> Windows:
     """Every run of ``context_frames + frames`` frames, ``frame_dt_s`` apart, of one flight.
 
@@ -80,45 +81,45 @@ def find_windows(
     """
     dt_ns = round(frame_dt_s * NS_PER_S)
     states, sent, windows, first = [], [], [], 0
-    for episode in episodes:
-        state, known = _states_at_exposures(episode)
-        found = _evenly_spaced(episode.captured_ns, known, context_frames + frames, dt_ns)
+    for flight in flights:
+        state, known = _states_at_exposures(flight)
+        found = _evenly_spaced(flight.captured_ns, known, context_frames + frames, dt_ns)
         states.append(state)
-        sent.append(_sent_until(episode, episode.captured_ns))
+        sent.append(_sent_until(flight, flight.captured_ns))
         windows.append(found + first)
         first += len(state)
     every = np.concatenate(windows)
     if len(every) == 0:
-        gaps_ms = np.concatenate([np.diff(e.captured_ns) for e in episodes]) / 1e6
+        gaps_ms = np.concatenate([np.diff(e.captured_ns) for e in flights]) / 1e6
         pace = (
             f"their frames are {np.median(gaps_ms):.0f} ms apart" if len(gaps_ms) else "no frames"
         )
         raise DatasetError(
-            f"none of {len(episodes)} flights holds {context_frames + frames} frames with states, "
+            f"none of {len(flights)} flights holds {context_frames + frames} frames with states, "
             f"{1e3 * frame_dt_s:.0f} ms apart ({pace}): fly longer, or choose another frame_dt_s"
         )
     return Windows(
         frames=every,
         states=np.concatenate(states),
         sent=np.concatenate(sent),
-        captured_ns=np.concatenate([episode.captured_ns for episode in episodes]),
+        captured_ns=np.concatenate([flight.captured_ns for flight in flights]),
         context_frames=context_frames,
     )
 
 
-def _states_at_exposures(episode: Episode) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _states_at_exposures(flight: FlightData) -> tuple[FloatArray, NDArray[np.bool_]]:
     """State [N, 13] between the ticks around each exposure, and where it is known."""
-    captured_ns = episode.captured_ns
+    captured_ns = flight.captured_ns
     state = np.zeros((len(captured_ns), STATE_DIM), np.float32)
-    rows = ~np.isnan(episode.state).any(axis=1)
+    rows = ~np.isnan(flight.state).any(axis=1)
     if not rows.any():
         return state, np.zeros(len(captured_ns), bool)
-    flown = episode.state[rows]
+    flown = flight.state[rows]
     # Body rates come with the attitude; the specific force is as old, give or take a tick.
-    attitude_ns, velocity_ns = episode.attitude_ns[rows], episode.velocity_ns[rows]
-    body = Knots(attitude_ns, flown[:, QUATERNION.stop :])
-    attitude = Knots(attitude_ns, flown[:, QUATERNION])
-    velocity = Knots(velocity_ns, flown[:, VELOCITY])
+    attitude_ns, velocity_ns = flight.attitude_ns[rows], flight.velocity_ns[rows]
+    body = Interpolator(attitude_ns, flown[:, QUATERNION.stop :])
+    attitude = Interpolator(attitude_ns, flown[:, QUATERNION])
+    velocity = Interpolator(velocity_ns, flown[:, VELOCITY])
     quaternion = attitude.rotations_at(captured_ns)
     state[:, VELOCITY] = velocity.vectors_at(captured_ns)
     state[:, QUATERNION] = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
@@ -126,9 +127,9 @@ def _states_at_exposures(episode: Episode) -> tuple[FloatArray, NDArray[np.bool_
     return state, attitude.covers(captured_ns) & velocity.covers(captured_ns)
 
 
-def _sent_until(episode: Episode, at_ns: Nanoseconds) -> NDArray[np.float64]:
+def _sent_until(flight: FlightData, at_ns: Nanoseconds) -> NDArray[np.float64]:
     """Time integral [N, 4] of the sticks up to each time; a stick is held until the next one."""
-    stamps, sticks = episode.sent_ns, episode.sent.astype(np.float64)
+    stamps, sticks = flight.sent_ns, flight.sent.astype(np.float64)
     if len(stamps) == 0:
         return np.zeros((len(at_ns), ACTION_DIM))
     held_s = np.diff(stamps)[:, None] / NS_PER_S

@@ -1,7 +1,7 @@
 """Batches of training samples: a pure function of the seed and the step, prepared ahead.
 
 So a resumed run sees what an uninterrupted one would have seen, and no state of a random generator
-needs to be kept.
+has to be saved.
 """
 
 from collections import deque
@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from policy.contract import Contract, FloatArray
+from policy.data.flight_data import ImageArray
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
-from policy.data.samples import Samples, Timeline, mirror
-from policy.training.parallel import row_parts
+from policy.data.samples import Samples, Timeline
+from policy.training.parallel import TensorBatch, row_parts
+from policy.training.settings import TrainSettings
 
 SHIFT = 0.015
 """Images move by at most this share of their side, as a camera mount is off by a degree."""
@@ -29,7 +31,7 @@ BRIGHTNESS, CONTRAST, COLOUR, NOISE = 0.15, 0.25, 0.08, 0.03
 """Half-ranges of the image augmentations, of full scale; the noise is the largest sigma."""
 AHEAD = 3
 """Batches prepared while the net computes."""
-_OF_SAMPLES = ("state", "history", "chunk", "known", "noise", "timestep")
+_PER_SAMPLE = ("state", "history", "chunk", "known", "noise", "timestep")
 VALIDATION_KEY = 2**31
 """In place of a step; no run has as many."""
 
@@ -37,16 +39,16 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch:
-    """What one step takes: ``B`` images, and ``S`` = R times as many samples; image i serves R."""
+class Batch(TensorBatch):
+    """``B`` images and ``S`` = R times as many samples of a policy; image i serves R samples."""
 
     images: Tensor | None
-    """[B, height, width, 3] uint8, or None where ``pooled`` is given."""
+    """[B, height, width, 3] uint8, or None where ``features`` are given."""
     look: Tensor
-    """[B, 5]: contrast, brightness, gain of red and of blue, sigma of noise; see ``augment``."""
+    """[B, 5]: contrast, brightness, gain of red and of blue, sigma of noise; see ``normalised``."""
     grain: Tensor | None
     """[3, height, width] noise of sigma 1, None where the look is neutral."""
-    pooled: Tensor | None
+    features: Tensor | None
     """[B, D] outputs of the backbone."""
     state: Tensor
     """[S, state_dim]"""
@@ -63,49 +65,38 @@ class Batch:
     timestep: Tensor
     """[S] int64"""
 
-    def to(self, device: torch.device) -> "Batch":
-        """The same on a device."""
-        names = [name for name, value in vars(self).items() if value is not None]
-        moved = {name: getattr(self, name).to(device, non_blocking=True) for name in names}
-        return replace(self, **moved)
-
-    def split(self, count: int) -> "list[Batch]":
+    def split(self, count: int) -> list[Self]:
         """At most ``count`` parts of about the same size, each of two images or more."""
-        images, samples = len(self.look), len(self.state)
-        repeats = samples // images
-        return [
-            self._rows(rows, slice(rows.start * repeats, rows.stop * repeats))
-            for rows in row_parts(images, max(1, min(count, images // 2)))
-        ]
-
-    def _rows(self, images: slice, samples: slice) -> "Batch":
-        return replace(
-            self,
-            images=None if self.images is None else self.images[images],
-            look=self.look[images],
-            pooled=None if self.pooled is None else self.pooled[images],
-            gate=self.gate[images],
-            **{name: getattr(self, name)[samples] for name in _OF_SAMPLES},
-        )
+        images = len(self.look)
+        repeats = len(self.state) // images
+        parts = []
+        for rows in row_parts(images, max(1, min(count, images // 2))):
+            samples = slice(rows.start * repeats, rows.stop * repeats)
+            cut = {name: getattr(self, name)[samples] for name in _PER_SAMPLE}
+            for name in ("images", "look", "features", "gate"):
+                value = getattr(self, name)
+                cut[name] = None if value is None else value[rows]
+            parts.append(replace(self, **cut))
+        return parts
 
 
-class PooledStore:
-    """Outputs of the backbone on disk, of plain and of mirrored images."""
+class FeatureStore:
+    """Features or latents on disk, of plain and of mirrored images."""
 
     def __init__(self, path: Path, dim: int, row_of: Indices) -> None:
         """Open it.
 
         Args:
             path: float16 rows of ``dim``.
-            dim: of the backbone.
+            dim: width of a row.
             row_of: [2, images] row of each image, plain and mirrored; -1 = was not encoded.
         """
         self._rows = np.memmap(path, np.float16, mode="r").reshape(-1, dim)
         self._row_of = row_of
         self.frames = np.flatnonzero((row_of >= 0).any(axis=0))
-        """Images that were encoded, one way or both."""
+        """Images that were encoded, plain or mirrored."""
         self.has_mirrored = bool((row_of[1, self.frames] >= 0).all())
-        """All of them."""
+        """Whether all of them are there mirrored."""
 
     def ways(self, frames: Indices, is_mirrored: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """``is_mirrored`` [B], but the other way where only that one was encoded."""
@@ -119,7 +110,7 @@ class PooledStore:
 
 
 def next_of(among: Indices, step: int, count: int, seed: int) -> Indices:
-    """The ``count`` that are next in ``step``, in an order drawn anew for each pass over all."""
+    """The ``count`` that are due in ``step``, in an order drawn anew for each pass over all."""
     total = len(among)
     at = np.arange(step * count, (step + 1) * count)
     parts = [
@@ -139,110 +130,103 @@ class Batches:
     """Makes batches of one set of flights."""
 
     def __init__(
-        self, timeline: Timeline, store: FrameStore, *, timesteps: int, seed: int, mirrors: bool
+        self, timeline: Timeline, store: FrameStore, *, timesteps: int, settings: TrainSettings
     ) -> None:
-        self._timeline = timeline
-        self._store = store
-        self._timesteps = timesteps
-        self._seed = seed
-        self._mirrors = mirrors
+        self._timeline, self._store = timeline, store
+        self._timesteps, self._settings, self._seed = timesteps, settings, settings.seed
         self.frames = timeline.frames
         """Images that can be used."""
 
-    def with_images(self, step: int, *, count: int, repeats: int, size: tuple[int, int]) -> Batch:
-        """Training of encoder and head."""
+    def with_images(self, step: int, size: int) -> Batch:
+        """A batch to train encoder and head."""
+        count = self._settings.batch_size
         random = np.random.default_rng([self._seed, step])
         frames = next_of(self.frames, step, count, self._seed)
         is_mirrored = self._mirrored(random, count)
-        height, width = self._timeline.contract.image_height, self._timeline.contract.image_width
-        most = np.array([round(SHIFT * height), round(SHIFT * width)])
+        most = round(SHIFT * self._settings.image_size)
         shifts = random.integers(-most, most + 1, size=(count, 2))
         images = self._store.read(frames, size, shifts)
         images[is_mirrored] = images[is_mirrored, :, ::-1]
         low = np.array([-CONTRAST, -BRIGHTNESS, -COLOUR, -COLOUR, 0.0])
         high = np.array([CONTRAST, BRIGHTNESS, COLOUR, COLOUR, NOISE])
         look = random.uniform(low, high, (count, 5)).astype(np.float32)
-        return self._batch(random, frames, is_mirrored, repeats, images=images, look=look)
+        samples = self._samples(random, frames, is_mirrored, self._settings.repeats)
+        return self._batch(random, samples, len(frames), images=images, look=look)
 
-    def with_pooled(self, step: int, *, count: int, pooled: PooledStore) -> Batch:
-        """Training of the head alone."""
+    def with_features(self, step: int, features: FeatureStore) -> Batch:
+        """A batch to train the head alone."""
+        count = self._settings.head_batch_size
         random = np.random.default_rng([self._seed, step])
-        frames = next_of(pooled.frames, step, count, self._seed)
-        is_mirrored = pooled.ways(frames, self._mirrored(random, count))
-        rows = pooled.read(frames, is_mirrored)
-        return self._batch(random, frames, is_mirrored, 1, pooled=rows)
+        frames = next_of(features.frames, step, count, self._seed)
+        is_mirrored = features.ways(frames, self._mirrored(random, count))
+        rows = features.read(frames, is_mirrored)
+        samples = self._samples(random, frames, is_mirrored, 1)
+        return self._batch(random, samples, len(frames), features=rows)
 
-    def validation(self, *, samples: int, count: int, size: tuple[int, int]) -> Iterator[Batch]:
-        """The same samples at each call, as a flight would meet them, in batches of ``count``."""
-        frames = self.frames
+    def validation(self, samples: int, size: int) -> Iterator[Batch]:
+        """The same samples at each call, without augmentation."""
+        frames, count = self.frames, self._settings.batch_size
         chosen = frames[np.linspace(0, len(frames) - 1, min(samples, len(frames))).astype(int)]
         for start in range(0, len(chosen), count):
             random = np.random.default_rng([self._seed, VALIDATION_KEY, start])
             part = chosen[start : start + count]
             ticks = self._timeline.draw_ticks(part, random)
-            images = self._store.read(part, size, np.zeros((len(part), 2), np.int64))
-            yield self._tensors(random, self._timeline.samples(part, ticks), part, images=images)
+            plain = self._timeline.samples(part, ticks)
+            images = self._store.read(part, size)
+            yield self._batch(random, plain, len(part), images=images)
 
-    def images(self, frames: Indices, size: tuple[int, int], *, mirrored: bool) -> Tensor:
-        """[B, height, width, 3] uint8 as they are, or all mirrored."""
-        images = self._store.read(frames, size, np.zeros((len(frames), 2), np.int64))
-        return torch.from_numpy(np.ascontiguousarray(images[:, :, ::-1]) if mirrored else images)
+    def images(self, frames: Indices, *, is_mirrored: bool) -> Tensor:
+        """[B, height, width, 3] uint8 at full size, as they are or all mirrored."""
+        size = self._settings.image_size
+        return torch.from_numpy(self._store.read(frames, size, is_mirrored=is_mirrored))
 
     def _mirrored(self, random: np.random.Generator, count: int) -> NDArray[np.bool_]:
-        return (random.random(count) < 0.5) & self._mirrors
+        return (random.random(count) < 0.5) & self._settings.mirror
 
-    def _batch(
+    def _samples(
         self,
         random: np.random.Generator,
         frames: Indices,
         is_mirrored: NDArray[np.bool_],
         repeats: int,
-        *,
-        images: NDArray[np.uint8] | None = None,
-        look: FloatArray | None = None,
-        pooled: FloatArray | None = None,
-    ) -> Batch:
+    ) -> Samples:
         repeated = np.repeat(frames, repeats)
         ticks = self._timeline.draw_ticks(repeated, random)
         samples = self._timeline.samples(repeated, ticks, random)
-        samples = mirror(samples, np.repeat(is_mirrored, repeats))
-        return self._tensors(random, samples, frames, images=images, look=look, pooled=pooled)
+        return samples.mirrored(np.repeat(is_mirrored, repeats))
 
-    def _tensors(
+    def _batch(
         self,
         random: np.random.Generator,
         samples: Samples,
-        frames: Indices,
+        frames: int,
         *,
-        images: NDArray[np.uint8] | None = None,
+        images: ImageArray | None = None,
         look: FloatArray | None = None,
-        pooled: FloatArray | None = None,
+        features: FloatArray | None = None,
     ) -> Batch:
-        count = len(samples.state)
-        grain = None
-        if look is None or images is None:
-            look = np.zeros((len(frames), 5), np.float32)
-        else:
+        count, grain = len(samples.state), None
+        if look is not None and images is not None:
             grain = random.standard_normal((3, *images.shape[1:3]), dtype=np.float32)
         return Batch(
             images=None if images is None else torch.from_numpy(images),
-            look=torch.from_numpy(look),
+            look=torch.zeros(frames, 5) if look is None else torch.from_numpy(look),
             grain=None if grain is None else torch.from_numpy(grain),
-            pooled=None if pooled is None else torch.from_numpy(pooled),
+            features=None if features is None else torch.from_numpy(features),
             state=torch.from_numpy(samples.state),
             history=torch.from_numpy(samples.history),
             chunk=torch.from_numpy(samples.chunk),
             known=torch.from_numpy(samples.known),
-            gate=torch.from_numpy(samples.gate[:: count // len(frames)].copy()),
+            gate=torch.from_numpy(samples.gate[:: count // frames].copy()),
             noise=torch.from_numpy(random.standard_normal(samples.chunk.shape, dtype=np.float32)),
             timestep=torch.from_numpy(random.integers(0, self._timesteps, count)),
         )
 
 
 def ahead(make: Callable[[int], T], first: int) -> Generator[T]:
-    """``make(first)``, ``make(first + 1)``, ... without end, prepared in one thread.
+    """Yield ``make(first)``, ``make(first + 1)``, ... without end, prepared in one thread.
 
-    Close the iterator to end and join the thread.
+    Close the generator to end and join the thread.
     """
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="train-loader") as pool:
         waiting: deque[Future[T]] = deque()
@@ -261,13 +245,17 @@ def ahead(make: Callable[[int], T], first: int) -> Generator[T]:
 def normalised(batch: Batch, contract: Contract) -> Tensor:
     """Images [B, 3, height, width] as the net takes them, in the look of ``batch.look``.
 
-    In a neutral look the same as ``preprocess.image_to_input``. The memory is channels-last.
+    A look is contrast about mid-grey, brightness, the colour of the light, and the sensor's noise.
+    A neutral one gives what ``preprocess.image_to_input`` gives. The memory is channels-last.
     """
     if batch.images is None:
         raise ValueError("a batch without images")
     image = batch.images.permute(0, 3, 1, 2).float() / 255
     if batch.grain is not None:
-        image = _augmented(image, batch.look, batch.grain)
+        contrast, brightness, red, blue, sigma = batch.look.view(-1, 5, 1, 1, 1).unbind(1)
+        gain = torch.cat([1 + red, torch.ones_like(red), 1 + blue], dim=1)
+        image = ((image - 0.5) * (1 + contrast) + 0.5 + brightness) * gain
+        image = (image + sigma * batch.grain).clamp(0, 1)
     return normalise_image(image, contract)
 
 
@@ -276,11 +264,3 @@ def normalise_image(image: Tensor, contract: Contract) -> Tensor:
     mean = torch.tensor(contract.image_mean_rgb, device=image.device).view(1, 3, 1, 1)
     std = torch.tensor(contract.image_std_rgb, device=image.device).view(1, 3, 1, 1)
     return (image - mean) / std
-
-
-def _augmented(image: Tensor, look: Tensor, grain: Tensor) -> Tensor:
-    """Contrast about mid-grey, brightness, colour of the light, and the sensor's noise."""
-    contrast, brightness, red, blue, sigma = look.view(-1, 5, 1, 1, 1).unbind(1)
-    gain = torch.cat([1 + red, torch.ones_like(red), 1 + blue], dim=1)
-    image = ((image - 0.5) * (1 + contrast) + 0.5 + brightness) * gain
-    return (image + sigma * grain).clamp(0, 1)

@@ -1,17 +1,16 @@
 """One optimiser step on several cores: each works on a part of the batch, alone.
 
-Splitting each operator over cores instead wakes all of them some thousand times a step; on two
-cores that somebody else uses too, that left half of the time unused.
+Splitting each operator over the cores instead wakes all of them some thousand times a step; on two
+cores that something else uses too, that left half of the time unused.
 """
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from types import TracebackType
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -19,33 +18,39 @@ from torch import Tensor, nn
 M = TypeVar("M", bound=nn.Module)
 
 
-class Divisible(Protocol):
-    """A batch."""
+@dataclass(frozen=True)
+class TensorBatch:
+    """A batch: a dataclass of tensors that share their first axis; one may be None."""
 
-    def to(self: "B", device: torch.device) -> "B":
-        """The same on a device."""
-        ...
+    def to(self, device: torch.device) -> Self:
+        """Copy to a device."""
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        return replace(self, **{n: v.to(device, non_blocking=True) for n, v in given.items()})
 
-    def split(self: "B", count: int) -> "list[B]":
-        """At most ``count`` parts of about the same size, none of which a batch norm refuses."""
-        ...
+    def split(self, count: int) -> list[Self]:
+        """At most ``count`` parts of about the same size."""
+        rows = len(next(iter(vars(self).values())))
+        return [
+            replace(self, **{name: value[part] for name, value in vars(self).items()})
+            for part in row_parts(rows, count)
+        ]
 
 
-B = TypeVar("B", bound=Divisible)
+B = TypeVar("B", bound=TensorBatch)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepLoss:
-    """Of one batch."""
+    """Losses of one batch."""
 
     total: Tensor
-    """What is minimised."""
-    told: Mapping[str, Tensor]
-    """What a person is told of it, by name; ``loss`` is among them."""
+    """The one that is minimised."""
+    metrics: Mapping[str, Tensor]
+    """Those that are reported, by name; ``loss`` is among them."""
 
 
 class Gradients(Generic[M]):
-    """Computes losses and gradients of a trainee; close it to join its threads."""
+    """Computes losses and gradients of a module; close it to join its threads."""
 
     def __init__(self, trainee: M, *, device: torch.device, bf16: bool) -> None:
         """Take as many threads as torch has, on a CPU; a GPU takes the whole batch.
@@ -58,22 +63,20 @@ class Gradients(Generic[M]):
         others = [copy.deepcopy(trainee, dict(shared)) for _ in range(threads - 1)]
         self._replicas = [trainee, *others]
         self._pool = ThreadPoolExecutor(
-            threads, thread_name_prefix="train", initializer=_use_one_thread
+            threads,
+            thread_name_prefix="train",
+            initializer=torch.set_num_threads,
+            initargs=(1,),
         )
 
-    def __enter__(self) -> "Gradients[M]":
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pool.shutdown()
 
     def compute(self, batch: B, losses: Callable[[M, B], StepLoss]) -> dict[str, Tensor]:
-        """Set ``grad`` of all weights that may move; returns what is told of the mean loss.
+        """Set ``grad`` of all trainable weights; returns the metrics, means over the parts.
 
         The same numbers for the same batch and count of threads: parts are added in order.
         """
@@ -83,18 +86,18 @@ class Gradients(Generic[M]):
             with computing_in(self._device, self._bf16):
                 loss = losses(replica, part)
             made = torch.autograd.grad(loss.total, weights, materialize_grads=True)
-            return {name: value.detach() for name, value in loss.told.items()}, made
+            return {name: value.detach() for name, value in loss.metrics.items()}, made
 
         results = list(self._pool.map(one, self._replicas, batch.split(len(self._replicas))))
         share = 1.0 / len(results)
-        told = {name: value * share for name, value in results[0][0].items()}
+        metrics = {name: value * share for name, value in results[0][0].items()}
         sums = [gradient * share for gradient in results[0][1]]
         for others, made in results[1:]:
-            told = {name: value + share * others[name] for name, value in told.items()}
+            metrics = {name: value + share * others[name] for name, value in metrics.items()}
             torch._foreach_add_(sums, list(made), alpha=share)
         for weight, gradient in zip(weights, sums, strict=True):
             weight.grad = gradient
-        return told
+        return metrics
 
     def each(self, change: Callable[[M], object]) -> None:
         """Do the same to the trainee and its replicas, such as to choose their mode."""
@@ -113,7 +116,3 @@ def computing_in(device: torch.device, bf16: bool) -> Iterator[None]:
     """Autocast to bfloat16, or nothing."""
     with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
         yield
-
-
-def _use_one_thread() -> None:
-    torch.set_num_threads(1)

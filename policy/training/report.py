@@ -1,4 +1,4 @@
-"""What a training run tells of itself."""
+"""What a training run reports, and how it is watched and stopped."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -7,20 +7,20 @@ from typing import TypeAlias
 
 
 @dataclass(frozen=True, kw_only=True)
-class Validation:
-    """How well a policy meets held-out flights."""
+class PolicyValidation:
+    """How well a policy does on held-out flights."""
 
     loss: float
     gate_loss: float
     stick_error: float
     """Mean absolute error of the sampled sticks, in full deflections."""
     mean_stick_error: float
-    """The same of always flying the mean stick of the training flights."""
+    """The same error if the mean stick of the training flights were always flown."""
     hold_error: float
-    """The same of holding the newest stick of the history."""
+    """The same error if the newest stick of the history were held."""
 
     def describe(self) -> str:
-        """For a person, in a line."""
+        """One line for a person."""
         return (
             f"held-out loss {self.loss:.3f}, stick error {self.stick_error:.3f} of full deflection "
             f"(mean stick {self.mean_stick_error:.3f}, last stick held {self.hold_error:.3f})"
@@ -28,23 +28,23 @@ class Validation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldValidation:
-    """How well a world model foretells held-out flights."""
+class WorldModelValidation:
+    """How well a world model predicts held-out flights."""
 
     loss: float
     reconstruction_psnr_db: float
-    """Of frames that were encoded and decoded: the most that imagined ones can reach."""
+    """PSNR of frames that were encoded and decoded: the most that imagined ones can reach."""
     psnr_db: float | None = None
-    """Of imagined frames, all of a future; None while only the autoencoder learns."""
+    """PSNR of imagined frames, all of a future; None while only the autoencoder learns."""
     copy_psnr_db: float | None = None
-    """The same of showing the last frame again."""
+    """PSNR of showing the last frame again."""
     velocity_error_mps: float | None = None
-    """Of the last imagined state, mean length."""
+    """Mean length of the velocity's error in the last imagined state."""
     held_velocity_error_mps: float | None = None
-    """The same of the velocity staying as it is."""
+    """The same error if the velocity stayed as it is."""
 
     def describe(self) -> str:
-        """For a person, in a line."""
+        """One line for a person."""
         line = (
             f"held-out loss {self.loss:.4f}, frames coded to {self.reconstruction_psnr_db:.1f} dB"
         )
@@ -57,33 +57,41 @@ class WorldValidation:
         )
 
 
-Held: TypeAlias = Validation | WorldValidation
+Validation: TypeAlias = PolicyValidation | WorldModelValidation
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
-    """For a person, a few times a minute."""
+class TrainingProgress:
+    """Progress for a person, a few times a minute."""
 
     stage: str
     fraction: float
-    """Of the whole budget."""
+    """Share of the whole budget that is used."""
     step: int
     losses: Mapping[str, float] | None = None
-    """By name, means over the last steps."""
-    validation: Held | None = None
+    """Means over the last steps, by name."""
+    validation: Validation | None = None
     note: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
+class Hooks:
+    """How a run is watched and stopped from outside."""
+
+    now_s: Callable[[], float]
+    """Monotonic seconds, for a budget in time."""
+    report: Callable[[TrainingProgress], None] = lambda _: None
+    should_stop: Callable[[], bool] = lambda: False
+    """Polled after every step; True ends the run, to be resumed."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainResult:
-    """What came out."""
+    """Result of a finished run."""
 
     checkpoint: Path
     steps: int
-    validation: Held | None
-    """Of the exported weights; None where nothing was held out."""
+    validation: Validation | None
+    """Validation of the exported weights; None where nothing was held out."""
     score: float | None
-    """Of the closed-loop check, if there was one."""
-
-
-Report = Callable[[Progress], None]
+    """Score of the closed-loop check, if there was one."""

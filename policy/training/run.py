@@ -1,304 +1,367 @@
-"""Train a policy from flights: encoder and head, then the head alone on kept features.
+"""What every training run does: stages and steps on a budget, validation, a state on disk.
 
-    flights -> Episodes -> FrameStore (decoded once) -> Timeline -> Batches -> optimiser -> EMA
-                                                                      best on held-out flights
+    flights -> FrameStore (decoded once) -> batches with images -> encoder learns    -> moving
+                `-> features (encoded once) -> batches of features -> the rest learns -> average
 
-``train_plan`` says in which stages, ``train_model`` what is optimised. Everything random follows
-from the seed and the step, so a run that was killed goes on as if it had not been.
+Everything random follows from the seed and the step, so a run that was killed continues as if it
+had not been.
 """
 
 import copy
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict
+from typing import ClassVar, Generic
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
-from policy.checkpoints.policy_file import save_checkpoint
-from policy.data.episodes import (
-    DatasetError,
-    Episode,
-    Nanoseconds,
-    common_frame,
-    hold_out,
-    measured_ages,
-)
+from policy.data.flight_data import FlightData, hold_out
 from policy.data.frames import FrameStore, store_frames
-from policy.data.samples import Timeline
-from policy.training.batches import Batch, Batches, PooledStore
-from policy.training.encode import Encoder
-from policy.training.loop import Loop, open_run
-from policy.training.parallel import StepLoss, computing_in
-from policy.training.plan import Check, Stage, TrainSettings, make_stages
-from policy.training.report import Report, TrainResult, Validation
-from policy.training.start import starting_trainee, training_card
-from policy.training.state import Position, RunFolder
-from policy.training.trainee import Losses, StickSpread, Trainee, validate
+from policy.training.batches import ahead
+from policy.training.parallel import B, Gradients, M, StepLoss
+from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
+from policy.training.run_folder import (
+    Position,
+    RunFolder,
+    TrainingError,
+    TrainingStoppedError,
+    identity_of,
+)
+from policy.training.settings import Precision, RunSettings
+from policy.training.stages import TrainingStage, learning_rate_factor
 
-VALIDATION_SAMPLES = 256
-FINE_TUNE = 1 / 3
-"""Of the learning rate, for weights that were trained before."""
-HEAD_RATE = 3
-"""Times the learning rate, for the head alone: large batches, no convolutions of images."""
+LOG_STEPS = 20
+"""Steps between two lines of the log."""
+GRADIENT_LIMIT = 1.0
+ENCODING_SHARE = 0.4
+"""Share of a stage's time after which images are no longer encoded for it."""
 
 
-def train(
-    episodes: Sequence[Episode],
-    settings: TrainSettings,
-    *,
-    now_s: Callable[[], float],
-    report: Report,
-    should_stop: Callable[[], bool] = lambda: False,
-    check: Check | None = None,
-) -> TrainResult:
-    """Train, and write the best weights on held-out flights to ``settings.out``.
-
-    Args:
-        episodes: the flights.
-        settings: what to train and how long.
-        now_s: monotonic seconds, for a budget in time.
-        report: called with progress, losses and notes.
-        check: flies a checkpoint in closed loop; decides in place of the validation loss.
-        should_stop: asked after every step; True ends the run, to be resumed.
+def open_run(settings: RunSettings, network: object, flights: Sequence[FlightData]) -> RunFolder:
+    """Open the folder of a run, to begin it or to resume it.
 
     Raises:
-        DatasetError: flights that cannot be learned from.
-        TrainingError: a run that cannot be resumed, kept, or that diverged.
-        TrainingStoppedError: ``should_stop`` said so.
-        PolicyError: weights to start from that do not fit.
+        TrainingError: no folder for the checkpoint, or an unfinished run that is not to be resumed.
     """
-    folder = open_run(settings, episodes)
-    run = _Run(list(episodes), settings, folder, now_s, report, should_stop, check)
-    return run.finish()
+    if not settings.out.parent.is_dir():
+        raise TrainingError(f"--out {settings.out}: there is no folder {settings.out.parent}")
+    folder = RunFolder(settings.work_folder, identity_of(settings, network, flights))
+    if folder.has_state and not settings.resume:
+        raise TrainingError(
+            f"{folder.path} holds an unfinished run: continue it with --resume, or remove it"
+        )
+    return folder
 
 
-class _Run:
-    """One run, from its first step or from where it was killed."""
+class Run(ABC, Generic[M, B]):
+    """A run, from its first step or from where it was killed; subclasses say what is trained.
+
+    A phase of a run (the encoder learns, or it is frozen) has one optimiser, and one rise and fall
+    of its learning rate.
+    """
+
+    validation_type: ClassVar[type[Validation]]
+    encoder_learns_alone: ClassVar[bool]
+    settings: RunSettings
 
     def __init__(
-        self,
-        episodes: list[Episode],
-        settings: TrainSettings,
-        folder: RunFolder,
-        now_s: Callable[[], float],
-        report: Report,
-        should_stop: Callable[[], bool],
-        check: Check | None,
+        self, folder: RunFolder, trainee: M, stages: Sequence[TrainingStage], hooks: Hooks
     ) -> None:
-        self._settings, self._folder, self._check = settings, folder, check
-        self._stages = make_stages(settings)
-        self._contract = settings.policy.contract
-        self._ages_ns = _ages(episodes, settings)
-        trainee = starting_trainee(settings)
-        trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        rate = settings.learning_rate * (1.0 if settings.start_from is None else FINE_TUNE)
-        self._loop = Loop(
-            trainee,
-            settings,
-            folder,
-            learning_rate=rate,
-            now_s=now_s,
-            report=report,
-            should_stop=should_stop,
-        )
-        self._load(episodes)
-        self._pooled: PooledStore | None = None
-        self._held_pooled: list[Batch] | None = None
-        if settings.resume:
-            self._loop.restore(self._freeze_again)
-        else:
-            folder.start_log()
+        settings = self.settings
+        self.folder, self.trainee, self.stages, self.hooks = folder, trainee, stages, hooks
+        self.position = Position()
+        self.device = torch.device(settings.device)
+        self.bf16 = uses_bf16(settings.precision, self.device)
+        self._begun_s = hooks.now_s()
+        self._ema = Ema(trainee, settings.ema_decay)
+        self._optimiser = self._new_optimiser(stages[0])
 
-    def finish(self) -> TrainResult:
-        """All stages that are left; then the files of the run are removed."""
-        position = self._loop.position
-        for index in range(position.stage, len(self._stages)):
-            is_new = position.step == 0 or index != position.stage
-            stage = self._stages[index]
-            position.stage = index
-            if not stage.trains_encoder:
-                self._turn_to_head(stage, is_new=is_new)
-            self._train(stage)
-        self._look_back(self._stages[-1], is_last=True)
-        self._folder.clear()
-        return TrainResult(
-            checkpoint=self._settings.out,
-            steps=position.step,
-            validation=None if position.kept is None else Validation(**position.kept),
-            score=position.best if self._check is not None else None,
-        )
+    # ---- for subclasses ----
 
-    # ---- flights ----
+    @abstractmethod
+    def encoder(self, trainee: M) -> nn.Module:
+        """The part of a trainee that is frozen in the end."""
 
-    def _load(self, episodes: list[Episode]) -> None:
-        """Decode; batches of the flights to train on and of those held out."""
-        store = store_frames(
-            episodes,
-            height=self._contract.image_height,
-            width=self._contract.image_width,
-            folder=self._folder.frames,
-            progress=lambda fraction: self._loop.doing(f"decoding, {fraction:.0%}"),
-        )
-        episodes = [e.first_frames(n) for e, n in zip(episodes, store.counts, strict=True)]
-        settings = self._settings
-        kept, held = hold_out(episodes, settings.validation_fraction, settings.seed)
-        self._episodes = [episodes[index] for index in kept]
-        self._batches = self._batches_of(episodes, kept, store)
-        self._held = self._batches_of(episodes, held, store) if held else None
-        if not held:
-            self._loop.note("no flight is held out: the last weights will be kept, not the best")
-        targets = np.concatenate([episode.target for episode in self._episodes])
-        self._spread = StickSpread.of(targets, self._loop.device)
+    @abstractmethod
+    def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
+        """Encode the images once, for a stage on features; a resumed one is not new."""
 
-    def _batches_of(
-        self, episodes: list[Episode], indices: list[int], store: FrameStore
-    ) -> Batches:
-        chosen = [episodes[index] for index in indices]
-        return Batches(
-            Timeline(chosen, self._contract, self._ages_ns),
-            store.only(indices),
-            timesteps=self._settings.policy.schedule.num_train_timesteps,
-            seed=self._settings.seed,
-            mirrors=self._settings.mirror,
-        )
+    @abstractmethod
+    def batch_maker(self, stage: TrainingStage) -> Callable[[int], B]:
+        """What makes the batch of a step; called in another thread."""
 
-    # ---- steps ----
+    @abstractmethod
+    def losses(self, trainee: M, batch: B) -> StepLoss:
+        """Losses of a batch or a part of it, on the device; called in threads."""
 
-    def _train(self, stage: Stage) -> None:
-        def mode(trainee: Trainee) -> None:
-            trainee.train()
-            trainee.policy.backbone.train(stage.trains_encoder)
+    @abstractmethod
+    def validate(self, stage: TrainingStage) -> Validation | None:
+        """Validate the average weights; None where nothing was held out."""
 
-        self._loop.run(
-            stage,
-            self._stages[-1].start if self._pooled is None else 1.0,
-            mode=mode,
-            make=self._maker(stage),
-            losses=self._losses,
-            look_back=lambda: self._look_back(stage, is_last=False),
-        )
+    @abstractmethod
+    def export(self) -> None:
+        """Write the average weights to ``settings.out``."""
 
-    def _maker(self, stage: Stage) -> Callable[[int], Batch]:
-        settings, pooled = self._settings, self._pooled
-        if pooled is not None:
-            return lambda step: self._batches.with_pooled(
-                step, count=settings.head_batch_size, pooled=pooled
-            )
-        return lambda step: self._batches.with_images(
-            step, count=settings.batch_size, repeats=settings.repeats, size=stage.image_size
-        )
+    def learning_rate(self, stage: TrainingStage) -> float:
+        """Peak learning rate of the stage's phase."""
+        return self.settings.learning_rate
 
-    def _losses(self, trainee: Trainee, batch: Batch) -> StepLoss:
-        losses: Losses = trainee(batch, self._spread.scale)
-        return StepLoss(
-            total=losses.sticks + losses.direct + self._settings.gate_weight * losses.gate,
-            told={"loss": losses.sticks, "direct_loss": losses.direct, "gate_loss": losses.gate},
-        )
-
-    # ---- from the encoder to the head ----
-
-    def _turn_to_head(self, stage: Stage, *, is_new: bool) -> None:
-        """Freeze the average encoder and encode all images; a resumed run has its weights."""
-        loop, settings, trainee = self._loop, self._settings, self._loop.trainee
-        encoder = Encoder(trainee, self._batches, device=loop.device, bf16=loop.bf16)
-        if is_new:
-            trainee.load_state_dict(loop.average.state_dict())
-            if not settings.freeze_encoder:
-                encoder.refresh_norms()
-            loop.average.load_state_dict(trainee.state_dict())
-        trainee.policy.backbone.requires_grad_(requires_grad=False).eval()
-        go_on = loop.encoding_in(stage)
-        self._pooled = encoder.encode_all(
-            self._folder.pooled, mirror=settings.mirror, seed=settings.seed, go_on=go_on
-        )
-        if (left := len(self._batches.frames) - len(self._pooled.frames)) > 0:
-            loop.note(f"{left} images were not encoded for lack of time: the head sees the rest")
-        if is_new:
-            loop.begin_phase(self._head_rate)
-
-    def _freeze_again(self, position: Position) -> None:
-        if not self._stages[position.stage].trains_encoder:
-            self._loop.trainee.policy.backbone.requires_grad_(requires_grad=False)
-            self._loop.learning_rate = self._head_rate
+    def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
+        """Score of the average weights, more is better; None if they are not to be exported."""
+        return None if validation is None else -validation.loss
 
     @property
-    def _head_rate(self) -> float:
-        """Learning rate of the head alone."""
-        return HEAD_RATE * self._settings.learning_rate
+    def average(self) -> M:
+        """The average of the weights, in eval mode."""
+        return self._ema.average
 
-    # ---- what is kept ----
-
-    def _look_back(self, stage: Stage, *, is_last: bool) -> None:
-        """Validate the average weights, export them if they are the best, keep the state."""
-        validation = self._validate(stage)
-        score = self._score(stage, validation, is_last=is_last)
-        self._loop.offer(
-            score, validation, lambda: self._export(self._settings.out), is_last=is_last
+    def store_flights(
+        self, flights: Sequence[FlightData]
+    ) -> tuple[list[FlightData], FrameStore, list[int], list[int]]:
+        """Decode all images; indices of the flights to train on, and of those held out."""
+        store = store_frames(
+            flights,
+            self.folder.frames,
+            self.settings.image_size,
+            progress=lambda fraction: self._report_work(f"decoding, {fraction:.0%}"),
         )
+        whole = [f.first_frames(n) for f, n in zip(flights, store.counts, strict=True)]
+        kept, held = hold_out(whole, self.settings.validation_fraction, self.settings.seed)
+        return whole, store, kept, held
 
-    def _validate(self, stage: Stage) -> Validation | None:
-        if self._held is None:
-            return None
-        loop, batches = self._loop, self._held_batches(self._held, stage)
-        with computing_in(loop.device, loop.bf16):
-            validation = validate(loop.average, batches, self._spread)
-        loop.tell(stage, validation)
-        return validation
+    def may_encode(self, stage: TrainingStage) -> Callable[[float], bool]:
+        """A function that takes the share done, and says whether there is time to encode more."""
+        begun = self._fraction
 
-    def _held_batches(self, held: Batches, stage: Stage) -> Iterable[Batch]:
-        """Always the same samples; once the encoder stands still, encoded once."""
-        if self._held_pooled is not None:
-            return self._held_pooled
-        loop = self._loop
-        size, count = stage.image_size, self._settings.batch_size
-        batches = held.validation(samples=VALIDATION_SAMPLES, count=count, size=size)
-        moved: Iterable[Batch] = (batch.to(loop.device) for batch in batches)
-        if not stage.trains_encoder:
-            with computing_in(loop.device, loop.bf16):
-                moved = self._held_pooled = [loop.average.pooled(batch) for batch in moved]
-        return moved
+        def should_continue(done: float) -> bool:
+            self._report_work(f"encoding, {done:.0%}")
+            return self._fraction - begun < ENCODING_SHARE * (stage.end - begun)
 
-    def _score(self, stage: Stage, validation: Validation | None, *, is_last: bool) -> float | None:
-        """More is better; None where these weights are not to be exported."""
-        is_full = stage.image_size == (self._contract.image_height, self._contract.image_width)
-        if not is_full:
-            return None
-        if self._check is None:
-            return None if validation is None else -validation.loss
-        position = self._loop.position
-        if not is_last and position.validations % self._settings.check_every:
-            return None
-        trial = self._folder.path / "trial.safetensors"
-        self._export(trial)
-        score = self._check(trial)
-        trial.unlink(missing_ok=True)
-        self._folder.log({"step": position.step, "score": score})
-        return score
+        return should_continue
 
-    def _export(self, path: Path) -> None:
-        position = self._loop.position
-        card = training_card(
-            self._settings,
-            self._episodes,
-            self._ages_ns,
+    def note(self, text: str) -> None:
+        """Tell a person something."""
+        self.hooks.report(TrainingProgress(stage="", fraction=0.0, step=0, note=text))
+
+    # ---- the run ----
+
+    def finish(self) -> TrainResult:
+        """Run all stages that are left; then the files of the run are removed.
+
+        Raises:
+            TrainingError: a run that cannot be resumed or kept, or that diverged.
+            TrainingStoppedError: the run was stopped, and is kept.
+        """
+        if self.settings.resume:
+            self._restore()
+        else:
+            self.folder.start_log()
+        position = self.position
+        for index in range(position.stage, len(self.stages)):
+            is_new = position.step == 0 or index != position.stage
+            position.stage, stage = index, self.stages[index]
+            if not stage.trains_encoder:
+                self._freeze_encoder(stage, is_new=is_new)
+            self._train(stage)
+        self._validate(self.stages[-1], is_last=True)
+        self.folder.clear()
+        kept = position.kept
+        return TrainResult(
+            checkpoint=self.settings.out,
             steps=position.step,
-            validation=position.kept,
+            validation=None if kept is None else self.validation_type(**kept),
+            score=None,
         )
-        policy = copy.deepcopy(self._loop.average.policy)
-        save_checkpoint(path, policy, training=card, packed=self._settings.pack)
+
+    def _freeze_encoder(self, stage: TrainingStage, *, is_new: bool) -> None:
+        """Train on features of the average encoder from now on; a resumed run has its weights."""
+        if is_new:
+            self.trainee.load_state_dict(self.average.state_dict())
+        self.trainee.eval()
+        self.encode(stage, is_new=is_new)
+        if not is_new:
+            return
+        self.average.load_state_dict(self.trainee.state_dict())
+        self.position.phase_step, self.position.phase_start = self.position.step, self._fraction
+        self.trainee.zero_grad()  # frozen weights, too: their gradients would be clipped
+        self._optimiser = self._new_optimiser(stage)
+
+    def _train(self, stage: TrainingStage) -> None:
+        position, count = self.position, self.settings.validation_count
+        sums: dict[str, Tensor] = {}
+        with (
+            Gradients(self.trainee, device=self.device, bf16=self.bf16) as gradients,
+            closing(ahead(self.batch_maker(stage), position.step)) as batches,
+        ):
+            gradients.each(lambda replica: self._set_mode(replica, stage))
+            since = 0
+            while self._fraction < stage.end:
+                metrics = gradients.compute(next(batches).to(self.device), self.losses)
+                self._step(stage)
+                sums = {name: sums.get(name, 0.0) + value for name, value in metrics.items()}
+                since += 1
+                if since == LOG_STEPS:
+                    self._log(stage, {name: float(value) / since for name, value in sums.items()})
+                    sums, since = {}, 0
+                due = int(self._fraction * count)
+                if position.validations < due < count:
+                    position.validations = due
+                    self._validate(stage, is_last=False)
+                if self.hooks.should_stop():
+                    self._save()
+                    self._stop()
+
+    def _set_mode(self, trainee: M, stage: TrainingStage) -> None:
+        trainee.train()
+        self.encoder(trainee).train(stage.trains_encoder)
+
+    def _step(self, stage: TrainingStage) -> None:
+        position = self.position
+        start = position.phase_start
+        ends = [s.end for s in self.stages if s.trains_encoder == stage.trains_encoder]
+        along = (self._fraction - start) / max(ends[-1] - start, 1e-9)
+        for group in self._optimiser.param_groups:
+            group["lr"] = self.learning_rate(stage) * learning_rate_factor(along)
+        torch.nn.utils.clip_grad_norm_(self.trainee.parameters(), GRADIENT_LIMIT)
+        self._optimiser.step()
+        position.step += 1
+        self._ema.update(self.trainee, position.step - position.phase_step)
+
+    def _validate(self, stage: TrainingStage, *, is_last: bool) -> None:
+        """Validate, export if the score is the best so far, and save the state of the run."""
+        position, validation = self.position, self.validate(stage)
+        if validation is not None:
+            self._report(stage.name, validation=validation)
+            record = {"step": position.step, "stage": stage.name}
+            self.folder.log({**record, "validation": asdict(validation)})
+        score = self.score(validation, is_last=is_last) if stage.is_scored else None
+        if score is not None and (position.best is None or score > position.best):
+            position.best, position.kept = score, None if validation is None else asdict(validation)
+            self.export()
+        elif is_last and position.best is None:
+            self.export()
+        if not is_last:
+            self._save()
+
+    @property
+    def _fraction(self) -> float:
+        return self.settings.fraction(self.position.step, self._spent_s)
+
+    @property
+    def _spent_s(self) -> float:
+        return self.position.spent_s + self.hooks.now_s() - self._begun_s
+
+    def _new_optimiser(self, stage: TrainingStage) -> torch.optim.AdamW:
+        self.trainee.requires_grad_(not (stage.trains_encoder and self.encoder_learns_alone))
+        self.encoder(self.trainee).requires_grad_(stage.trains_encoder)
+        return make_optimiser(self.trainee, self.learning_rate(stage), self.settings.weight_decay)
+
+    def _restore(self) -> None:
+        self.position, state = self.folder.load()
+        self._optimiser = self._new_optimiser(self.stages[self.position.stage])
+        self.trainee.load_state_dict(state["trainee"])
+        self.average.load_state_dict(state["average"])
+        self._optimiser.load_state_dict(state["optimiser"])
+
+    def _save(self) -> None:
+        self.position.spent_s, self._begun_s = self._spent_s, self.hooks.now_s()
+        tensors = {
+            "trainee": self.trainee.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+        }
+        self.folder.save(self.position, tensors)
+
+    def _stop(self) -> None:
+        if not self.folder.has_state:
+            raise TrainingStoppedError("stopped before anything was learned")
+        raise TrainingStoppedError("stopped: the same command with --resume continues from here")
+
+    def _report_work(self, what: str) -> None:
+        """Report what is done in place of steps, and stop if that is wanted."""
+        self._report(what)
+        if self.hooks.should_stop():
+            self._stop()
+
+    def _report(
+        self,
+        stage: str,
+        *,
+        losses: dict[str, float] | None = None,
+        validation: Validation | None = None,
+    ) -> None:
+        self.hooks.report(
+            TrainingProgress(
+                stage=stage,
+                fraction=self._fraction,
+                step=self.position.step,
+                losses=losses,
+                validation=validation,
+            )
+        )
+
+    def _log(self, stage: TrainingStage, losses: dict[str, float]) -> None:
+        step = self.position.step
+        if not np.isfinite(list(losses.values())).all():
+            raise TrainingError(
+                f"the loss is {losses['loss']} at step {step}: the training diverged; look for "
+                "flights with wrong numbers, or start from other weights"
+            )
+        self._report(stage.name, losses=losses)
+        self.folder.log(
+            {
+                "step": step,
+                "stage": stage.name,
+                "fraction": self._fraction,
+                "spent_s": self._spent_s,
+                **losses,
+                "learning_rate": self._optimiser.param_groups[0]["lr"],
+            }
+        )
 
 
-def _ages(episodes: list[Episode], settings: TrainSettings) -> Nanoseconds:
-    """Ages of images to train for, after a look at whether these flights are for this policy."""
-    if (frame := common_frame(episodes)) != settings.policy.contract.state_frame:
-        raise DatasetError(
-            f"the flights hold {frame} states, the policy is to take "
-            f"{settings.policy.contract.state_frame}"
+class Ema(Generic[M]):
+    """An exponential moving average of a module's weights, itself such a module in eval mode."""
+
+    def __init__(self, trainee: M, decay: float) -> None:
+        self.average = copy.deepcopy(trainee).eval().requires_grad_(False)
+        self._decay = decay
+
+    @torch.no_grad()
+    def update(self, trainee: M, updates: int) -> None:
+        """Move towards ``trainee``, faster in the first of ``updates``; counters are copied.
+
+        Frozen weights are the same in both, and are left alone.
+        """
+        weight = 1.0 - min(self._decay, (1 + updates) / (10 + updates))
+        frozen = {name for name, one in trainee.named_parameters() if not one.requires_grad}
+        new = {name: one for name, one in trainee.state_dict().items() if name not in frozen}
+        old = self.average.state_dict()
+        names = [name for name, value in new.items() if value.is_floating_point()]
+        torch._foreach_lerp_(  # one call for some thousand tensors
+            [old[name] for name in names], [new[name] for name in names], weight
         )
-    ages = measured_ages(episodes) if settings.ages_ns is None else settings.ages_ns
-    if len(ages) == 0:
-        raise DatasetError(
-            "no flight says how old its images were at a tick (feature_captured_ns): name a flight "
-            "of a policy, or a range, with --ages"
-        )
-    return ages
+        for name in new.keys() - set(names):
+            old[name].copy_(new[name])
+
+
+def make_optimiser(trainee: nn.Module, learning_rate: float, decay: float) -> torch.optim.AdamW:
+    """AdamW over the trainable weights; biases, norms and other vectors are not decayed."""
+    trainable = [p for p in trainee.parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for p in trainable if p.ndim >= 2], "weight_decay": decay},
+        {"params": [p for p in trainable if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.98), fused=True)
+
+
+def uses_bf16(precision: Precision, device: torch.device) -> bool:
+    """Whether to compute in bfloat16; ``auto`` does so where the hardware multiplies it."""
+    if precision != "auto":
+        return precision == "bf16"
+    if device.type == "cuda":
+        return bool(torch.cuda.is_bf16_supported())
+    return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())

@@ -1,20 +1,19 @@
-"""What is optimised: a policy, a head for the gates that is not shipped, and their losses."""
+"""What is optimised: a policy, a head for the gates that is not exported, and their losses."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.checkpoints.policy_file import BuiltinPolicy
-from policy.contract import FloatArray
+from policy.contract import ACTION_DIM, FloatArray
 from policy.nets.action_head import size_dims
-from policy.nets.diffusion import NoiseSchedule
 from policy.nets.toge import Toge
 from policy.training.batches import Batch, normalised
-from policy.training.parallel import computing_in
-from policy.training.report import Validation
+from policy.training.parallel import StepLoss, computing_in
+from policy.training.report import PolicyValidation
 
 GATE_LABELS = 10
 """Direction [3] and log distance of the next gate, cos and sin of its passage, direction [3] and
@@ -22,58 +21,51 @@ log distance of the gate after it."""
 MIN_STICK_STD = 0.1
 """A stick that hardly moves in the flights does not count more than this makes it."""
 DENOISED = 4
-"""One in so many samples passes through the denoiser in training, where there are many. Its pass
-costs four times as much as all that is before it, and what is hard to learn is before it: which
-sticks a feature and a state ask for. That, all samples teach by what the head reads off the
-condition."""
+"""In training, one in so many samples passes through the denoiser. That costs four times as much as
+everything before it, where the harder part is learned: which sticks a feature and a state ask for.
+All samples teach that, by the sticks that the head reads off the condition."""
 LEAST_DENOISED = 16
 """Samples a step through the denoiser."""
 VALIDATION_STEPS = 10
 """Denoising steps of the sticks that are compared with the flown ones."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Losses:
-    """Of one batch."""
-
-    sticks: Tensor
-    """Squared error over the variance of the flown sticks: 1 is the mean stick."""
-    direct: Tensor
-    """The same of the sticks that are read off the condition."""
-    gate: Tensor
-    """Smooth L1 of the gate labels; 0 where no image has one."""
-
-
 class Trainee(nn.Module):
-    """A policy with its gate head."""
+    """A policy with its gate head, and the mean and spread of the sticks to imitate."""
 
-    def __init__(self, policy: BuiltinPolicy) -> None:
+    def __init__(self, policy: BuiltinPolicy, gate_weight: float) -> None:
         super().__init__()
         self.policy = policy
         self.gate_head = nn.Linear(size_dims(policy.config.size).base_dim, GATE_LABELS)
+        self._gate_weight = gate_weight
+        self.stick_mean: Tensor
+        self.stick_std: Tensor
+        self.register_buffer("stick_mean", torch.zeros(ACTION_DIM))
+        self.register_buffer("stick_std", torch.ones(ACTION_DIM))
 
-    @property
-    def schedule(self) -> NoiseSchedule:
-        """The policy's noise schedule."""
-        return self.policy.config.schedule
+    def set_sticks(self, sticks: FloatArray) -> None:
+        """Take the mean and the spread of all sticks [M, 4]."""
+        values = torch.from_numpy(sticks)
+        self.stick_mean.copy_(values.mean(dim=0))
+        self.stick_std.copy_(values.std(dim=0, correction=0).clamp_min(MIN_STICK_STD))
 
-    def pool(self, batch: Batch) -> Tensor:
-        """Outputs of the backbone [B, D]: kept ones, or of the images."""
-        if batch.pooled is not None:
-            return batch.pooled
+    def encode(self, batch: Batch) -> Tensor:
+        """Outputs of the backbone [B, D], stored ones or of the images."""
+        if batch.features is not None:
+            return batch.features
         image = normalised(batch, self.policy.contract)
         size = (image.shape[2], image.shape[3])
         bf16 = torch.is_autocast_enabled(image.device.type) and (
             not torch.is_grad_enabled() or encoder_learns_in_bf16(image.device, size)
         )
         with computing_in(image.device, bf16):
-            pooled: Tensor = self.policy.backbone(image)
-        return pooled
+            features: Tensor = self.policy.backbone(image)
+        return features
 
     @torch.no_grad()
-    def pooled(self, batch: Batch) -> Batch:
-        """The batch with its images encoded."""
-        return replace(batch, pooled=self.pool(batch), images=None, grain=None)
+    def encoded(self, batch: Batch) -> Batch:
+        """The batch with features in place of its images."""
+        return replace(batch, features=self.encode(batch), images=None, grain=None)
 
     def condition(self, visual: Tensor, batch: Batch) -> Tensor:
         """Projected images [B, C], each for its samples -> conditions [S, C]."""
@@ -82,27 +74,34 @@ class Trainee(nn.Module):
             return self.policy.encode_and_fuse(visual, batch.state, batch.history)
         return self.policy.fuse_visual(visual, batch.state, batch.history)
 
-    def forward(self, batch: Batch, stick_scale: Tensor) -> Losses:
-        """Losses of a batch; ``stick_scale`` [4] is the spread of each flown stick."""
-        visual = self.policy.visual_projection(self.pool(batch))
+    def forward(self, batch: Batch) -> StepLoss:
+        """Losses of a batch.
+
+        ``loss`` and ``direct_loss`` are squared errors of the denoised sticks, and of those read
+        off the condition, over the variance of the flown ones: the mean stick gives 1.
+        ``gate_loss`` is the smooth L1 of the gate labels, 0 where no image has one.
+        """
+        visual = self.policy.visual_projection(self.encode(batch))
         condition = self.condition(visual, batch)
         direct = self.policy.head.read(condition).float()
-        return Losses(
-            sticks=self._denoising_loss(condition, batch, stick_scale),
-            direct=_squared((direct - batch.chunk) / stick_scale, batch.known),
-            gate=gate_loss(self.gate_head(visual).float(), batch.gate),
-        )
+        losses = {
+            "loss": self._denoising_loss(condition, batch),
+            "direct_loss": _squared((direct - batch.chunk) / self.stick_std, batch.known),
+            "gate_loss": gate_loss(self.gate_head(visual).float(), batch.gate),
+        }
+        total = losses["loss"] + losses["direct_loss"] + self._gate_weight * losses["gate_loss"]
+        return StepLoss(total=total, metrics=losses)
 
-    def _denoising_loss(self, condition: Tensor, batch: Batch, stick_scale: Tensor) -> Tensor:
-        """Of all samples in eval mode, in training of one in ``DENOISED``."""
+    def _denoising_loss(self, condition: Tensor, batch: Batch) -> Tensor:
+        """Loss of all samples in eval mode, in training of one in ``DENOISED``."""
         every = max(1, min(DENOISED, len(condition) // LEAST_DENOISED)) if self.training else 1
         chunk, timestep = batch.chunk[::every], batch.timestep[::every]
-        noise = batch.noise[::every]
-        noisy = self.schedule.add_noise(chunk, noise, timestep)
+        noise, schedule = batch.noise[::every], self.policy.config.schedule
+        noisy = schedule.add_noise(chunk, noise, timestep)
         made = self.policy.denoise(noisy, timestep, condition[::every]).float()
-        if self.schedule.prediction == "sample":
-            return _squared((made - chunk) / stick_scale, batch.known[::every])
-        return _squared(made - noise, batch.known[::every])
+        is_sample = schedule.prediction == "sample"
+        error = (made - chunk) / self.stick_std if is_sample else made - noise
+        return _squared(error, batch.known[::every])
 
 
 def _squared(error: Tensor, known: Tensor) -> Tensor:
@@ -134,7 +133,7 @@ def gate_loss(made: Tensor, gate: Tensor) -> Tensor:
 def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
     """Take the statistics of the batch norms anew from images [B, 3, height, width].
 
-    Those that were averaged while weights and image size changed fit neither.
+    The old ones were averaged while weights and image size changed, and fit neither.
     """
     norms = [m for m in trainee.policy.backbone.modules() if isinstance(m, nn.BatchNorm2d)]
     if not norms:
@@ -152,47 +151,31 @@ def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
 
 
 @torch.no_grad()
-def validate(trainee: Trainee, batches: Iterable[Batch], spread: "StickSpread") -> Validation:
+def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
     """Losses and stick errors over all ``batches``, weighted by their size."""
     totals, weight = torch.zeros(5, dtype=torch.float64), 0
     for batch in batches:
-        losses = trainee(batch, spread.scale)
-        visual = trainee.policy.visual_projection(trainee.pool(batch))
-        steps = min(VALIDATION_STEPS, trainee.schedule.num_train_timesteps)
+        losses = trainee(batch).metrics
+        visual = trainee.policy.visual_projection(trainee.encode(batch))
+        steps = min(VALIDATION_STEPS, trainee.policy.config.schedule.num_train_timesteps)
         chunk = trainee.policy.head.sample(trainee.condition(visual, batch), steps).float()
         held = batch.history[:, -1:].expand_as(batch.chunk)
-        guesses = (chunk, spread.mean.expand_as(batch.chunk), held)
+        guesses = (chunk, trainee.stick_mean.expand_as(batch.chunk), held)
         errors = [(guess - batch.chunk).abs()[batch.known].mean() for guess in guesses]
-        values = torch.stack([losses.sticks, losses.gate, *errors]).double().cpu()
+        values = torch.stack([losses["loss"], losses["gate_loss"], *errors]).double().cpu()
         totals += len(batch.state) * values
         weight += len(batch.state)
     loss, gate, sticks, mean, hold = (totals / weight).tolist()
-    return Validation(
+    return PolicyValidation(
         loss=loss, gate_loss=gate, stick_error=sticks, mean_stick_error=mean, hold_error=hold
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class StickSpread:
-    """Mean and spread [4] of the sticks to imitate."""
-
-    mean: Tensor
-    scale: Tensor
-    """Standard deviation, but not below ``MIN_STICK_STD``."""
-
-    @classmethod
-    def of(cls, sticks: FloatArray, device: torch.device) -> "StickSpread":
-        """From all sticks [M, 4]."""
-        values = torch.from_numpy(sticks)
-        scale = values.std(dim=0, correction=0).clamp_min(MIN_STICK_STD)
-        return cls(mean=values.mean(dim=0).to(device), scale=scale.to(device))
 
 
 def encoder_learns_in_bf16(device: torch.device, image_size: tuple[int, int]) -> bool:
     """Whether bfloat16 makes the encoder's backward pass faster, where it is used at all.
 
-    On a CPU without matrix units it does so from about 160x160 pixels on; below, its depthwise
-    convolutions are slower. All other parts gain at every size.
+    On a CPU without matrix units it does so from about 160x160 pixels on; below, depthwise
+    convolutions are slower in it. All other parts gain at every size.
     """
     if device.type != "cpu" or torch.cpu._is_amx_tile_supported():
         return True

@@ -6,12 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTOR = 8
-"""Pixels of a side for one latent."""
 MAX_LOG_VARIANCE = 4.0
-_QUIET = 0.3
-_FIRST_LOG_VARIANCE = -4.0
-"""Of a new encoder: at 0 the noise would drown what little its latents say at first."""
+_RESIDUAL_GAIN = 0.3
+_INITIAL_LOG_VARIANCE = -4.0
+"""At 0, the noise would drown what little a new encoder's latents say."""
 
 
 class ResidualConv(nn.Module):
@@ -23,7 +21,7 @@ class ResidualConv(nn.Module):
         self.conv2 = nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """No norm: a net so shallow needs none, and a CPU would feel it."""
+        """Add a residual. There is no norm: so shallow a net needs none, and it would cost time."""
         out: Tensor = x + self.conv2(F.silu(self.conv1(F.silu(x))))
         return out
 
@@ -31,8 +29,8 @@ class ResidualConv(nn.Module):
 class FrameAutoencoder(nn.Module):
     """Encoder and decoder of single frames; latents are normalised to unit scale per channel.
 
-    Widths are of the levels at a half, a quarter and an eighth of the side. Full resolution is
-    reached by a pixel shuffle alone: there a convolution would cost more than all others together.
+    ``widths`` are those of the levels at a half, a quarter and an eighth of the side. Only a pixel
+    shuffle works at full resolution: a convolution there would cost more than all the others.
     """
 
     def __init__(self, latent_channels: int, widths: tuple[int, int, int]) -> None:
@@ -56,19 +54,19 @@ class FrameAutoencoder(nn.Module):
         self.register_buffer("latent_std", torch.ones(latent_channels))
 
     def _initialise(self, out: nn.Conv2d) -> None:
-        """Signals of one size all the way, and shortcuts that hardly differ from straight ones.
+        """He initialisation and small residuals.
 
-        torch's own start lets them shrink by half from layer to layer, and learns more slowly.
+        With torch's default, signals shrink by half from layer to layer, and learning is slower.
         """
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(_bias(module))
-        quiet = [m.conv2 for m in self.modules() if isinstance(m, ResidualConv)]
-        for conv in (*quiet, out):
-            conv.weight.data.mul_(_QUIET)
+        residuals = [m.conv2 for m in self.modules() if isinstance(m, ResidualConv)]
+        for conv in (*residuals, out):
+            conv.weight.data.mul_(_RESIDUAL_GAIN)
         _, log_variance = _bias(self.moments).data.chunk(2)
-        log_variance.fill_(_FIRST_LOG_VARIANCE)
+        log_variance.fill_(_INITIAL_LOG_VARIANCE)
 
     def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """[N, 3, H, W] in [-1, 1] -> mean and log variance [N, C, h, w], not normalised."""

@@ -1,4 +1,4 @@
-"""The shape of a world model, and what it takes for granted."""
+"""The shape of a world model, and what it assumes of the camera."""
 
 import json
 import math
@@ -7,8 +7,21 @@ from dataclasses import asdict, dataclass, field, fields
 from policy.contract import Contract
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
-from policy.world_model.autoencoder import FACTOR
-from policy.world_model.dynamics import HEAD_DIM
+
+FACTOR = 8
+"""Pixels along a side of one latent."""
+HEAD_DIM = 32
+"""Width of one attention head."""
+
+_RANGES = {
+    "image_size": (16, 1024),
+    "latent_channels": (1, 64),
+    "frames": (1, 256),
+    "context_frames": (1, 16),
+    "patch": (1, 8),
+    "dynamics_width": (HEAD_DIM, 4096),
+    "dynamics_depth": (1, 64),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,30 +43,22 @@ class WorldModelConfig:
     """Time between two frames. Action k is the mean stick from frame k - 1 (the last of the context
     for k = 0) to frame k, state k is that at the exposure of frame k."""
     horizontal_fov_rad: float = math.radians(90.0)
-    """Of the camera: a pinhole without distortion, straight ahead, whose images were squares."""
+    """Field of view of the camera: a pinhole without distortion that looks straight ahead."""
     camera_tilt_rad: float = math.radians(10.0)
-    """Upwards. The defaults of both are the simulator's nominal camera."""
+    """Upward tilt of the camera. Both defaults are those of the simulator's nominal camera."""
     autoencoder_widths: tuple[int, int, int] = (24, 40, 56)
     patch: int = 2
-    """Latents on a side of one token."""
+    """Latents along a side of one token."""
     dynamics_width: int = 128
     dynamics_depth: int = 5
     contract: Contract = field(default_factory=Contract)
-    """Its ``state_frame`` is the states'; a model and a policy of two frames do not go together.
-    What else it says is about policies: ``image_size`` and ``frame_dt_s`` are the model's own."""
+    """Its ``state_frame`` is that of the states. The rest of it is about policies: ``image_size``
+    and ``frame_dt_s`` are the model's own."""
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built."""
-        for name, low, high in (
-            ("image_size", 16, 1024),
-            ("latent_channels", 1, 64),
-            ("frames", 1, 256),
-            ("context_frames", 1, 16),
-            ("patch", 1, 8),
-            ("dynamics_width", HEAD_DIM, 4096),
-            ("dynamics_depth", 1, 64),
-        ):
+        """Refuse a shape that cannot be built."""
+        for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not isinstance(value, int) or not low <= value <= high:
                 raise PolicyError(f"{name} must be an integer in {low}..{high}, got {value!r}")
@@ -66,21 +71,22 @@ class WorldModelConfig:
             raise PolicyError(f"dynamics_width must be a multiple of {HEAD_DIM}")
         if len(self.autoencoder_widths) != 3 or min(self.autoencoder_widths) < 1:
             raise PolicyError(f"autoencoder_widths must be three, got {self.autoencoder_widths}")
-        if not (math.isfinite(self.frame_dt_s) and 0.01 <= self.frame_dt_s <= 1):
-            raise PolicyError(f"frame_dt_s must be 0.01 to 1 second, got {self.frame_dt_s}")
-        if not 0.2 <= self.horizontal_fov_rad <= 2.8:
-            raise PolicyError(
-                f"horizontal_fov_rad must be 0.2 to 2.8 rad, got {self.horizontal_fov_rad}"
-            )
-        if not -1.5 <= self.camera_tilt_rad <= 1.5:
-            raise PolicyError(f"camera_tilt_rad must be -1.5 to 1.5, got {self.camera_tilt_rad}")
+        for name, least, most, unit in (
+            ("frame_dt_s", 0.01, 1.0, "s"),
+            ("horizontal_fov_rad", 0.2, 2.8, "rad"),
+            ("camera_tilt_rad", -1.5, 1.5, "rad"),
+        ):
+            value = getattr(self, name)
+            if not least <= value <= most:  # NaN is in no range
+                raise PolicyError(f"{name} must be {least:g} to {most:g} {unit}, got {value}")
         if self.schedule.prediction != "sample":
             raise PolicyError("the schedule of a world model must predict the sample")
 
     @property
-    def latent_side(self) -> int:
-        """Latents on a side of a frame."""
-        return self.image_size // FACTOR
+    def latent_shape(self) -> tuple[int, int, int]:
+        """Channels, height and width of one frame's latents."""
+        side = self.image_size // FACTOR
+        return self.latent_channels, side, side
 
     def to_json(self) -> str:
         """Header form of a checkpoint, without the contract."""
@@ -92,7 +98,7 @@ class WorldModelConfig:
         """Read the header form.
 
         Raises:
-            PolicyError: not of this form, or values out of range.
+            PolicyError: malformed, or values out of range.
         """
         try:
             data = json.loads(text)

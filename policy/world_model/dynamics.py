@@ -1,9 +1,9 @@
 """The denoiser of the world model: a small factorised space-time transformer.
 
 Each imagined frame is a few tokens: one for each patch of its latents, and one for the vehicle, its
-motion and the stick that led to it. A layer looks back in time at each place, then around within
-each frame, then thinks. Time is causal: a stick changes what comes after it, never what was before,
-however well a pilot's later sticks would give away what he saw.
+motion and the stick that led to it. A layer attends over time at each place, then over each frame.
+Attention over time is causal: a stick must not change what was before it, although a pilot's later
+sticks would give away what he saw.
 """
 
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM
 from policy.nets.unet1d import TIME_DIM, sinusoid_frequencies
+from policy.world_model.config import HEAD_DIM, WorldModelConfig
 from policy.world_model.relative_state import MOTION_DIM, features_dim
 
-HEAD_DIM = 32
 MODULATIONS = 6
 """Scale and shift of each of a layer's three norms."""
-_SMALL = 0.02
+_INITIAL_STD = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,75 +35,66 @@ class Future:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Past:
-    """What the denoiser is told: of the past, of its role, and of what follows from both."""
+class Conditioning:
+    """What the denoiser knows, the same at every step of a sample."""
 
     latents: Tensor
-    """[B, K, C, h, w], oldest first."""
+    """[B, K, C, h, w] of the past, oldest first."""
     features: Tensor
     """[B, D], see ``relative_state.context_features``."""
     knows_actions: Tensor
     """[B] bool: the future's actions are given, not noise."""
-    foreseen: Tensor
-    """[B, T, MOTION_DIM] a first guess of the motion, of about unit scale."""
-    carried: Tensor
-    """[B, T, C, h, w] the newest frame, moved by that motion."""
+    predicted_motion: Tensor
+    """[B, T, MOTION_DIM] of about unit scale."""
+    warped: Tensor
+    """[B, T, C, h, w] the newest frame, warped by that motion."""
     in_view: Tensor
-    """[B, T, 1, h, w] how much of each of its cells was in view, 0 to 1."""
+    """[B, T, 1, h, w] share of each of its cells that was in view."""
 
 
 class LatentDynamics(nn.Module):
-    """The network alone; what its output means is ``WorldModel.denoise``'s business."""
+    """The network alone; ``WorldModel.denoise`` says what its output means."""
 
-    def __init__(
-        self,
-        *,
-        frames: int,
-        context_frames: int,
-        latent_channels: int,
-        latent_side: int,
-        patch: int,
-        width: int,
-        depth: int,
-    ) -> None:
+    def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
-        self._patch, self._grid = patch, latent_side // patch
-        per_patch = latent_channels * patch * patch
-        features = features_dim(context_frames)
-        self.embed_patch = nn.Linear((2 + context_frames) * per_patch + patch * patch, width)
+        frames, width, patch = config.frames, config.dynamics_width, config.patch
+        self._patch, self._grid = patch, config.latent_shape[-1] // patch
+        per_patch = config.latent_channels * patch * patch
+        features = features_dim(config.context_frames)
+        self.embed_patch = nn.Linear((2 + config.context_frames) * per_patch + patch * patch, width)
         self.embed_vehicle = nn.Linear(2 * (MOTION_DIM + ACTION_DIM) + 1, width)
-        self.frame_position = nn.Parameter(_SMALL * torch.randn(frames, 1, width))
-        self.slot_position = nn.Parameter(_SMALL * torch.randn(self._grid**2 + 1, width))
+        self.frame_position = nn.Parameter(_INITIAL_STD * torch.randn(frames, 1, width))
+        self.slot_position = nn.Parameter(_INITIAL_STD * torch.randn(self._grid**2 + 1, width))
         self.condition = nn.Sequential(
             nn.Linear(TIME_DIM + features + 1, width),
             nn.SiLU(),
             nn.Linear(width, MODULATIONS * width),
         )
-        self.layers = nn.ModuleList([_Layer(width) for _ in range(depth)])
+        self.layers = nn.ModuleList([_Layer(width) for _ in range(config.dynamics_depth)])
         self.norm = nn.LayerNorm(width)
         self.out_patch = nn.Linear(width, per_patch)
         self.out_vehicle = nn.Linear(width, MOTION_DIM + ACTION_DIM)
-        for out in (self.out_patch, self.out_vehicle):  # a new net hardly changes its guess
-            nn.init.normal_(out.weight, std=_SMALL)
+        for out in (self.out_patch, self.out_vehicle):  # a new net hardly changes its inputs
+            nn.init.normal_(out.weight, std=_INITIAL_STD)
             nn.init.zeros_(out.bias)
         self._frequencies: Tensor
         self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
 
-    def forward(self, noisy: Future, timestep: Tensor, past: Past) -> Future:
-        """Noisy future, timestep [B] and past -> the net's outputs, shaped as the future."""
+    def forward(self, noisy: Future, timestep: Tensor, known: Conditioning) -> Future:
+        """Noisy future and timestep [B] -> the net's outputs, shaped as the future."""
         frames = noisy.latents.shape[1]
-        known = past.knows_actions.to(noisy.motion.dtype).view(-1, 1)
+        knows = known.knows_actions.to(noisy.motion.dtype).view(-1, 1)
         angle = timestep.to(self._frequencies.dtype).unsqueeze(-1) * self._frequencies
-        told = torch.cat([angle.sin(), angle.cos(), past.features, known], dim=-1)
-        modulation = self.condition(told).unflatten(-1, (MODULATIONS, -1))
-        given = past.latents.flatten(1, 2).unsqueeze(1).expand(-1, frames, -1, -1, -1)
-        seen = torch.cat([noisy.latents, given, past.carried, past.in_view], dim=2)
+        inputs = torch.cat([angle.sin(), angle.cos(), known.features, knows], dim=-1)
+        modulation = self.condition(inputs).unflatten(-1, (MODULATIONS, -1))
+        past = known.latents.flatten(1, 2).unsqueeze(1).expand(-1, frames, -1, -1, -1)
+        seen = torch.cat([noisy.latents, past, known.warped, known.in_view], dim=2)
         patches = self.embed_patch(self._patches(seen))
-        known_of_frame = known.unsqueeze(1).expand(-1, frames, -1)
+        knows_each = knows.unsqueeze(1).expand(-1, frames, -1)
         # Sticks are rates: what they add up to is nearly what they do.
         so_far = noisy.actions.cumsum(dim=1) / frames**0.5
         vehicle = torch.cat(
-            [noisy.motion, past.foreseen, noisy.actions, so_far, known_of_frame], dim=-1
+            [noisy.motion, known.predicted_motion, noisy.actions, so_far, knows_each], dim=-1
         )
         tokens = torch.cat([patches, self.embed_vehicle(vehicle).unsqueeze(2)], dim=2)
         tokens = tokens + self.frame_position + self.slot_position
@@ -138,7 +129,7 @@ class _Layer(nn.Module):
         self.mlp = nn.Sequential(
             nn.Linear(width, 2 * width), nn.GELU(approximate="tanh"), nn.Linear(2 * width, width)
         )
-        self.modulation = nn.Parameter(_SMALL * torch.randn(MODULATIONS, width))
+        self.modulation = nn.Parameter(_INITIAL_STD * torch.randn(MODULATIONS, width))
         self._shape = (width,)
 
     def forward(self, tokens: Tensor, modulation: Tensor) -> Tensor:
@@ -165,7 +156,7 @@ class _Attention(nn.Module):
         self.qkv, self.project = nn.Linear(width, 3 * width), nn.Linear(width, width)
 
     def forward(self, tokens: Tensor, *, is_causal: bool) -> Tensor:
-        """Tokens that have looked at each other, or only at earlier ones."""
+        """Attend to all tokens, or only to earlier ones."""
         batch, count, length, width = tokens.shape
         qkv = self.qkv(tokens).reshape(batch * count, length, 3, width // HEAD_DIM, HEAD_DIM)
         query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)

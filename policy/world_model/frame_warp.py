@@ -1,9 +1,9 @@
-"""The newest frame as it will look from where the vehicle will be: what no net has to paint.
+"""Depth-based warping of the newest frame to where the vehicle will be.
 
-A pixel of a later frame looks along a ray. Turned into the camera of now, that ray says where the
-newest frame shows the same thing, were it far away; how near it is says how much the way that was
-flown moves it. Rotation and way come from a motion that is foreseen, nearness from a small net that
-learns from nothing but pictures that ought to match (T. Zhou et al. 2017).
+A pixel of a later frame looks along a ray. Turned into the camera of now, the ray points at the
+same thing in the newest frame if that is far away; translation moves it by the thing's inverse
+depth. The motion is predicted, and a small net that learns from photometric error alone gives the
+inverse depth (T. Zhou et al. 2017, "Unsupervised Learning of Depth and Ego-Motion from Video").
 """
 
 import math
@@ -14,25 +14,27 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import StateFrame
+from policy.world_model.config import WorldModelConfig
 
-NEARNESS_WIDTH = 32
+DEPTH_WIDTH = 32
 FINER = 2
-"""Nearness is told at so many times the resolution of the latents."""
-_FIRST_NEARNESS = -3.0
-"""Before softplus: a new net takes all things to be 20 m away."""
-_SMALL = 0.02
-_LEAST_DEPTH = 1e-3
-"""Of a ray of about unit length: what is beside or behind the camera ends far outside its view."""
+"""Inverse depth has so many times the resolution of the latents."""
+_INITIAL_INVERSE_DEPTH = -3.0
+"""Before softplus: a new net takes everything to be 20 m away."""
+_INITIAL_STD = 0.02
+_MIN_DEPTH = 1e-3
+"""Along a ray of about unit length: what is beside or behind the camera lands far outside."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
-    """The newest frame."""
+class SourceFrame:
+    """The newest frame, ready to be warped."""
 
     pixels: Tensor
     """[B, 3, H, W] about [-1, 1]"""
-    nearness: Tensor
-    """[B, 2, FINER h, FINER w] before softplus: now, and by how much it grows until the end."""
+    inverse_depth: Tensor
+    """[B, 2, FINER h, FINER w] before softplus, 1/m: now, and by how much it grows until the end of
+    the future."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,88 +46,80 @@ class Poses:
     position_m: Tensor
     """[B, N, 3]"""
     progress: Tensor
-    """[B, N] of the time from now to the end of the future, 0 to 1."""
+    """[B, N] fraction of the time from now to the end of the future."""
 
-    def of(self, moments: Tensor) -> "Poses":
-        """Those with numbers [B, n]."""
+    def at(self, moments: Tensor) -> "Poses":
+        """The poses with indices [B, n]."""
         row = torch.arange(len(moments), device=moments.device)[:, None]
         return Poses(**{name: value[row, moments] for name, value in vars(self).items()})
 
 
-class CarriedView(nn.Module):
-    """Moves frames; a pinhole camera without distortion that looks ahead, its images squares.
+class FrameWarp(nn.Module):
+    """Warps frames of a pinhole camera without distortion that looks ahead; images are squares.
 
     Camera axes: x right, y down, z along the optical axis.
     """
 
-    def __init__(
-        self,
-        *,
-        latent_channels: int,
-        latent_side: int,
-        image_size: int,
-        horizontal_fov_rad: float,
-        camera_tilt_rad: float,
-        state_frame: StateFrame,
-    ) -> None:
+    def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
-        self._half_width = math.tan(horizontal_fov_rad / 2)
+        state_frame = config.contract.state_frame
+        self._half_width = math.tan(config.horizontal_fov_rad / 2)
         self._down_sign = 1.0 if state_frame == "ned_frd" else -1.0
-        width = NEARNESS_WIDTH
-        last = nn.Conv2d(width, 2 * FINER**2, 3, padding=1)
-        nn.init.normal_(last.weight, std=_SMALL)
+        last = nn.Conv2d(DEPTH_WIDTH, 2 * FINER**2, 3, padding=1)
+        nn.init.normal_(last.weight, std=_INITIAL_STD)
         with torch.no_grad():
-            last.bias.copy_(torch.tensor([_FIRST_NEARNESS] * FINER**2 + [0.0] * FINER**2))  # type: ignore[union-attr]
-        self.nearness = nn.Sequential(
-            nn.Conv2d(latent_channels + 1, width, 3, padding=1),
+            bias = torch.tensor([_INITIAL_INVERSE_DEPTH] * FINER**2 + [0.0] * FINER**2)
+            last.bias.copy_(bias)  # type: ignore[union-attr]
+        self.inverse_depth = nn.Sequential(
+            nn.Conv2d(config.latent_channels + 1, DEPTH_WIDTH, 3, padding=1),
             nn.SiLU(),
-            nn.Conv2d(width, width, 3, padding=1),
+            nn.Conv2d(DEPTH_WIDTH, DEPTH_WIDTH, 3, padding=1),
             nn.SiLU(),
             last,
             nn.PixelShuffle(FINER),
         )
-        axes = _body_from_camera(camera_tilt_rad, state_frame)
+        axes = _body_from_camera(config.camera_tilt_rad, state_frame)
         self._rays: Tensor
         self._cell_rays_body: Tensor
         self._body_from_camera: Tensor
-        self.register_buffer("_rays", self._unit_rays(image_size), persistent=False)
-        cells = self._unit_rays(latent_side) @ axes.T
+        self.register_buffer("_rays", self._unit_rays(config.image_size), persistent=False)
+        cells = self._unit_rays(config.latent_shape[-1]) @ axes.T
         self.register_buffer("_cell_rays_body", cells, persistent=False)
         self.register_buffer("_body_from_camera", axes, persistent=False)
 
-    def view(self, pixels: Tensor, latents: Tensor, vertical_body: Tensor) -> View:
-        """The newest frame, and how near things in it are.
+    def source(self, pixels: Tensor, latents: Tensor, vertical_body: Tensor) -> SourceFrame:
+        """Estimate the inverse depth of a frame.
 
         Args:
             pixels: [B, 3, H, W] about [-1, 1].
-            latents: [B, C, h, w] of the same.
-            vertical_body: [B, 3] the third axis of the world, in body axes.
+            latents: [B, C, h, w] of the same frame.
+            vertical_body: [B, 3] third axis of the world, in body axes.
         """
-        # Level ground is the nearer the steeper a ray goes down: only its distance is to be found.
+        # The steeper a ray points down, the nearer is level ground; only its scale is unknown.
         below = (self._cell_rays_body @ (self._down_sign * vertical_body)[:, None, :, None])[..., 0]
-        nearness = self.nearness(torch.cat([latents, below.clamp_min(0.0)[:, None]], dim=1))
-        return View(pixels=pixels, nearness=nearness)
+        inputs = torch.cat([latents, below.clamp_min(0.0)[:, None]], dim=1)
+        return SourceFrame(pixels=pixels, inverse_depth=self.inverse_depth(inputs))
 
-    def moved(self, view: View, poses: Poses) -> tuple[Tensor, Tensor]:
-        """Frames [B, N, 3, H, W] from other poses, and what of them was in view [B, N, H, W].
+    def warp(self, source: SourceFrame, poses: Poses) -> tuple[Tensor, Tensor]:
+        """Frames [B, N, 3, H, W] seen from other poses, and which pixels were in view [B, N, H, W].
 
-        Elsewhere the nearest pixel of the border stands in.
+        A pixel that was not shows the nearest one of the border.
         """
         axes = self._body_from_camera
         turn = axes.T @ poses.rotation @ axes
-        way_m = (poses.position_m @ axes)[:, :, None, None]
+        translation_m = (poses.position_m @ axes)[:, :, None, None]
         rays = self._rays.flatten(0, 1) @ turn.transpose(-1, -2)
         rays = rays.reshape(*turn.shape[:2], *self._rays.shape)
-        far = rays / rays[..., 2:].clamp_min(_LEAST_DEPTH)
-        now, growth = self._sampled(view.nearness, far).unbind(dim=2)
-        nearness_per_m = F.softplus(now + growth * poses.progress[:, :, None, None])
-        seen = far + way_m * nearness_per_m[..., None]
-        is_ahead = (rays[..., 2] > _LEAST_DEPTH) & (seen[..., 2] > _LEAST_DEPTH)
+        far = rays / rays[..., 2:].clamp_min(_MIN_DEPTH)
+        now, growth = self._sampled(source.inverse_depth, far).unbind(dim=2)
+        inverse_depth_per_m = F.softplus(now + growth * poses.progress[:, :, None, None])
+        seen = far + translation_m * inverse_depth_per_m[..., None]
+        is_ahead = (rays[..., 2] > _MIN_DEPTH) & (seen[..., 2] > _MIN_DEPTH)
         is_inside = (self._on_image(seen).abs() <= 1.0).all(dim=-1)
-        return self._sampled(view.pixels, seen), is_ahead & is_inside
+        return self._sampled(source.pixels, seen), is_ahead & is_inside
 
     def _sampled(self, image: Tensor, rays: Tensor) -> Tensor:
-        """What images [B, C, ., .] show along rays [B, N, H, W, 3]: [B, N, C, H, W]."""
+        """Sample images [B, C, ., .] along rays [B, N, H, W, 3]: [B, N, C, H, W]."""
         places = self._on_image(rays)
         seen = F.grid_sample(
             image, places.flatten(1, 2), padding_mode="border", align_corners=False
@@ -135,7 +129,7 @@ class CarriedView(nn.Module):
 
     def _on_image(self, rays: Tensor) -> Tensor:
         """Rays [..., 3] -> places [..., 2], -1 to 1 from border to border."""
-        return rays[..., :2] / (self._half_width * rays[..., 2:].clamp_min(_LEAST_DEPTH))
+        return rays[..., :2] / (self._half_width * rays[..., 2:].clamp_min(_MIN_DEPTH))
 
     def _unit_rays(self, side: int) -> Tensor:
         """[side, side, 3] through the middles of pixels, of unit depth."""
@@ -145,7 +139,7 @@ class CarriedView(nn.Module):
 
 
 def _body_from_camera(tilt_rad: float, state_frame: StateFrame) -> Tensor:
-    """[3, 3]; body axes are FRD or FLU, as the states'."""
+    """[3, 3]; body axes are FRD or FLU, as those of the states."""
     sine, cosine = math.sin(tilt_rad), math.cos(tilt_rad)
     frd = torch.tensor([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
     return frd if state_frame == "ned_frd" else frd * torch.tensor([[1.0], [-1.0], [-1.0]])

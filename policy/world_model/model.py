@@ -5,11 +5,12 @@
 Two frames and states are the context. One net plays both roles: *simulation*, where the actions are
 given and latents and states are denoised, and *decision*, where the actions are denoised too.
 
-Before it denoises, the model foresees the motion and moves the newest frame by it: what was in view
-already is carried along, sharp as it is, and the denoiser has to paint the rest.
+Before it denoises, the model predicts the motion and warps the newest frame by it: what was in view
+already keeps its sharpness, and the denoiser has to paint only the rest.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -18,23 +19,22 @@ from torch import Tensor, nn
 from policy.contract import ACTION_DIM, STATE_DIM
 from policy.errors import PolicyError
 from policy.nets.diffusion import DdimStep
-from policy.world_model.autoencoder import FACTOR, FrameAutoencoder, to_bytes, to_unit
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.dynamics import Future, LatentDynamics, Past
-from policy.world_model.frame_warp import CarriedView, Poses, View
-from policy.world_model.motion_predictor import Foresight
+from policy.world_model.autoencoder import FrameAutoencoder, to_bytes, to_unit
+from policy.world_model.config import FACTOR, WorldModelConfig
+from policy.world_model.dynamics import Conditioning, Future, LatentDynamics
+from policy.world_model.frame_warp import FrameWarp, Poses, SourceFrame
+from policy.world_model.motion_predictor import MotionPredictor
 from policy.world_model.relative_state import (
     MOTION_DIM,
     MOTION_SCALE,
     context_features,
-    features_dim,
     poses_after,
     state_after,
     vertical_in_body,
 )
 
 LIMIT = 6.0
-"""Estimates of what has unit scale are clipped to so many standard deviations."""
+"""Estimates of unit scale are clipped to so many standard deviations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,39 +46,22 @@ class Imagined:
     states: Tensor
     """[B, frames, 13] in SI units, in the contract's frame."""
     actions: Tensor
-    """[B, frames, 4] sticks: those that were given, or those that were decided."""
+    """[B, frames, 4] sticks, given or decided."""
     video: Tensor | None
     """[B, frames, H, W, 3] uint8, None unless it was asked for."""
 
 
 class WorldModel(nn.Module):
-    """Autoencoder and dynamics; everything that they need to know is in the weights."""
+    """Autoencoder and dynamics; all scales are stored with the weights."""
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
         self.config = config
         self.autoencoder = FrameAutoencoder(config.latent_channels, config.autoencoder_widths)
         self.autoencoder.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.dynamics = LatentDynamics(
-            frames=config.frames,
-            context_frames=config.context_frames,
-            latent_channels=config.latent_channels,
-            latent_side=config.latent_side,
-            patch=config.patch,
-            width=config.dynamics_width,
-            depth=config.dynamics_depth,
-        )
-        self.foresight = Foresight(
-            features=features_dim(config.context_frames), frames=config.frames
-        )
-        self.carried_view = CarriedView(
-            latent_channels=config.latent_channels,
-            latent_side=config.latent_side,
-            image_size=config.image_size,
-            horizontal_fov_rad=config.horizontal_fov_rad,
-            camera_tilt_rad=config.camera_tilt_rad,
-            state_frame=config.contract.state_frame,
-        )
+        self.dynamics = LatentDynamics(config)
+        self.motion_predictor = MotionPredictor(config)
+        self.frame_warp = FrameWarp(config)
         self.motion_mean: Tensor
         self.motion_std: Tensor
         self.action_mean: Tensor
@@ -94,8 +77,6 @@ class WorldModel(nn.Module):
     def encode(self, images: Tensor) -> Tensor:
         """Frames [N, H, W, 3] uint8 -> latents [N, C, h, w] of about unit scale.
 
-        Frame by frame, so that a frame's latents do not depend on its neighbours in a batch.
-
         Raises:
             PolicyError: not uint8 frames of the model's size.
         """
@@ -106,36 +87,24 @@ class WorldModel(nn.Module):
                 f"{list(images.shape)}: resize them with policy.preprocess.resize"
             )
         coder = self.autoencoder
-        # A contiguous copy of each: kernels are chosen by the strides, which tell of the batch.
-        means = [coder.posterior(_in_one_layout(to_unit(image[None])))[0] for image in images]
-        if not means:
-            return torch.empty(0, *self._latent_shape, device=images.device)
-        return coder.normalise(torch.cat(means))
+        return coder.normalise(
+            _one_by_one(lambda image: coder.posterior(image)[0], to_unit(images))
+        )
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
         """Latents [N, C, h, w] -> frames [N, H, W, 3] uint8.
 
-        Frame by frame: kernels for batches of other sizes may round otherwise, and a frame is to be
-        the same, bit for bit, with whatever others it is decoded.
-
         Raises:
             PolicyError: not latents of the model's shape.
         """
-        if tuple(latents.shape[1:]) != self._latent_shape:
+        shape = self.config.latent_shape
+        if tuple(latents.shape[1:]) != shape:
             raise PolicyError(
-                f"latents must be [N, {', '.join(map(str, self._latent_shape))}], got "
-                f"{list(latents.shape)}"
+                f"latents must be [N, {', '.join(map(str, shape))}], got {list(latents.shape)}"
             )
         coder = self.autoencoder
-        frames = [
-            to_bytes(coder.reconstruct(_in_one_layout(coder.denormalise(latent[None]))))
-            for latent in latents
-        ]
-        if not frames:
-            size = self.config.image_size
-            return torch.empty(0, size, size, 3, dtype=torch.uint8, device=latents.device)
-        return torch.cat(frames)
+        return to_bytes(_one_by_one(coder.reconstruct, coder.denormalise(latents)))
 
     @torch.no_grad()
     def sample(
@@ -156,8 +125,9 @@ class WorldModel(nn.Module):
             states: [B, context_frames, 13] at their exposures, SI units, the contract's frame.
             actions: [B, frames, 4] in simulation, None in decision.
             ddim_steps: network calls.
-            noise_seed: of the initial noise; the same on every device. A generator is advanced.
-            sim_mode: the role: actions are given, or decided.
+            noise_seed: seed of the initial noise, which is the same on every device; a generator is
+                advanced.
+            sim_mode: True to simulate given actions, False to decide.
             decode_video: whether to decode all frames.
 
         Raises:
@@ -168,14 +138,12 @@ class WorldModel(nn.Module):
         batch, device = len(latents), latents.device
         noisy = self._initial_noise(batch, noise_seed, device)
         if actions is not None:
-            noisy = Future(
-                latents=noisy.latents, motion=noisy.motion, actions=self.normalise_actions(actions)
-            )
+            noisy = replace(noisy, actions=self.normalise_actions(actions))
+        source = self.source_frame(latents[:, -1], states[:, -1])
         knows_actions = torch.full((batch,), sim_mode, device=device)
-        view = self.view(latents[:, -1], states[:, -1])
-        past = self.foresee(view, latents, states, noisy.actions, knows_actions)
+        known = self.predict_motion(source, latents, states, noisy.actions, knows_actions)
         for step in steps:
-            noisy = self._ddim_update(step, noisy, past)
+            noisy = self._ddim_update(step, noisy, known)
         motion = noisy.motion * self.motion_std + self.motion_mean
         decided = (noisy.actions * self.action_std + self.action_mean).clamp(-1.0, 1.0)
         video = self.decode(noisy.latents.flatten(0, 1)) if decode_video else None
@@ -186,49 +154,50 @@ class WorldModel(nn.Module):
             video=None if video is None else video.reshape(batch, -1, *video.shape[1:]),
         )
 
-    def foresee(
+    def source_frame(self, latents: Tensor, state: Tensor) -> SourceFrame:
+        """The newest frame [B, C, h, w] of a vehicle in state [B, 13], to be warped."""
+        coder = self.autoencoder
+        with torch.no_grad():
+            pixels = coder.reconstruct(_channels_last(coder.denormalise(latents)))
+        with torch.autocast(latents.device.type, enabled=False):
+            vertical = vertical_in_body(state)
+            return self.frame_warp.source(pixels.float().clamp(-1.0, 1.0), latents, vertical)
+
+    def predict_motion(
         self,
-        view: View,
+        source: SourceFrame,
         latents: Tensor,
         states: Tensor,
         actions: Tensor,
         knows_actions: Tensor,
-    ) -> Past:
-        """What is known before anything is denoised: the same for every step of a sample.
+    ) -> Conditioning:
+        """Predict the motion and warp the newest frame by it, once for all steps of a sample.
 
-        Takes about as long as two of these steps: each frame that was moved is encoded.
+        Takes about as long as two denoising steps, because each warped frame is encoded.
 
         Args:
-            view: the newest frame.
+            source: the newest frame.
             latents: [B, context_frames, C, h, w] of the last frames, oldest first.
             states: [B, context_frames, 13] at their exposures, SI units, the contract's frame.
-            actions: [B, frames, 4] of about unit scale; anything where they are not known.
+            actions: [B, frames, 4] of about unit scale; ignored where they are not known.
             knows_actions: [B] bool.
         """
         with torch.autocast(latents.device.type, enabled=False):  # angles need all their digits
             features = context_features(states, self.config.contract)
-            foreseen = self.foresight(features, actions, knows_actions)
+            predicted = self.motion_predictor(features, actions, knows_actions)
         with torch.no_grad():
-            motion = foreseen * self.motion_std + self.motion_mean
-            poses = self.poses(states[:, -1], motion)
-            carried, in_view = self._carried(view, poses)
-        return Past(
+            motion = predicted * self.motion_std + self.motion_mean
+            pixels, in_view = self.warp(source, self.poses(states[:, -1], motion))
+            mean, _ = self.autoencoder.posterior(_channels_last(pixels.flatten(0, 1)))
+            warped = self.autoencoder.normalise(mean.float())
+        return Conditioning(
             latents=latents,
             features=features,
             knows_actions=knows_actions,
-            foreseen=foreseen,
-            carried=carried,
-            in_view=in_view,
+            predicted_motion=predicted,
+            warped=warped.reshape(*pixels.shape[:2], *self.config.latent_shape),
+            in_view=F.avg_pool2d(in_view.float(), FACTOR).unsqueeze(2),
         )
-
-    def view(self, latents: Tensor, state: Tensor) -> View:
-        """The newest frame [B, C, h, w], seen in state [B, 13], as ``CarriedView`` moves it."""
-        coder = self.autoencoder
-        with torch.no_grad():
-            pixels = coder.reconstruct(_in_one_layout(coder.denormalise(latents)))
-        with torch.autocast(latents.device.type, enabled=False):
-            vertical = vertical_in_body(state)
-            return self.carried_view.view(pixels.float().clamp(-1.0, 1.0), latents, vertical)
 
     def poses(self, state: Tensor, motion: Tensor) -> Poses:
         """Where motions [B, frames, 15] in SI units lead from a state [B, 13]."""
@@ -239,30 +208,28 @@ class WorldModel(nn.Module):
             rotation=rotation, position_m=position_m, progress=progress.expand(len(state), -1)
         )
 
-    def moved(self, view: View, poses: Poses) -> tuple[Tensor, Tensor]:
-        """Frames [B, N, 3, H, W], and where in them was in view [B, N, H, W] bool."""
-        with torch.autocast(view.pixels.device.type, enabled=False):
-            return self.carried_view.moved(view, poses)
+    def warp(self, source: SourceFrame, poses: Poses) -> tuple[Tensor, Tensor]:
+        """Frames [B, N, 3, H, W], and which of their pixels were in view [B, N, H, W] bool."""
+        with torch.autocast(source.pixels.device.type, enabled=False):
+            return self.frame_warp.warp(source, poses)
 
-    def denoise(self, noisy: Future, timestep: Tensor, past: Past) -> Future:
-        """One network call: the estimate of the clean future, x_0.
+    def denoise(self, noisy: Future, timestep: Tensor, known: Conditioning) -> Future:
+        """Estimate the clean future, x_0, by one network call.
 
-        The net tells latents as a change of the frame that was carried along, in units of how much
-        they change in so many steps, and the motion as a change of what was foreseen: one that
-        knows nothing says that all is as it seemed. Given the actions most of a future is no matter
-        of chance, so x_0 is what it can tell best at every level of noise, and few steps lose
-        little.
+        The net gives latents as a change of the warped frame, in units of how much they change in
+        so many steps, and the motion as a change of the predicted one. Given the actions, little of
+        a future is random: predicting x_0 works at every noise level, and few steps lose little.
 
         Args:
             noisy: the future as ``Future`` has it; known actions in it are clean.
             timestep: [B] int64.
-            past: the context.
+            known: the context.
         """
-        output = self.dynamics(noisy, timestep, past)
+        output = self.dynamics(noisy, timestep, known)
         return Future(
-            latents=past.carried + self.change_std * output.latents,
-            motion=past.foreseen + output.motion,
-            actions=torch.where(past.knows_actions.view(-1, 1, 1), noisy.actions, output.actions),
+            latents=known.warped + self.change_std * output.latents,
+            motion=known.predicted_motion + output.motion,
+            actions=torch.where(known.knows_actions.view(-1, 1, 1), noisy.actions, output.actions),
         )
 
     def normalise_actions(self, actions: Tensor) -> Tensor:
@@ -273,38 +240,24 @@ class WorldModel(nn.Module):
         """Motions [..., frames, 15] -> about unit scale."""
         return (motion - self.motion_mean) / self.motion_std
 
-    @property
-    def _latent_shape(self) -> tuple[int, int, int]:
-        side = self.config.latent_side
-        return self.config.latent_channels, side, side
-
-    def _carried(self, view: View, poses: Poses) -> tuple[Tensor, Tensor]:
-        """Latents of the moved frames, and how much of each of their cells was in view."""
-        pixels, in_view = self.moved(view, poses)
-        mean, _ = self.autoencoder.posterior(_in_one_layout(pixels.flatten(0, 1)))
-        latents = self.autoencoder.normalise(mean.float())
-        share = F.avg_pool2d(in_view.float(), FACTOR)
-        return latents.reshape(*pixels.shape[:2], *self._latent_shape), share.unsqueeze(2)
-
-    def _ddim_update(self, step: DdimStep, noisy: Future, past: Past) -> Future:
+    def _ddim_update(self, step: DdimStep, noisy: Future, known: Conditioning) -> Future:
         timestep = torch.full((len(noisy.latents),), step.timestep, device=noisy.latents.device)
-        clean = self.denoise(noisy, timestep, past)
-        update = self.config.schedule.ddim_update
-        actions = torch.where(
-            past.knows_actions.view(-1, 1, 1),
-            noisy.actions,
-            update(step, noisy.actions, clean.actions, limit=LIMIT),
-        )
+        clean = self.denoise(noisy, timestep, known)
+
+        def update(current: Tensor, estimate: Tensor) -> Tensor:
+            return self.config.schedule.ddim_update(step, current, estimate, limit=LIMIT)
+
+        actions = update(noisy.actions, clean.actions)
         return Future(
-            latents=update(step, noisy.latents, clean.latents, limit=LIMIT),
-            motion=update(step, noisy.motion, clean.motion, limit=LIMIT),
-            actions=actions,
+            latents=update(noisy.latents, clean.latents),
+            motion=update(noisy.motion, clean.motion),
+            actions=torch.where(known.knows_actions.view(-1, 1, 1), noisy.actions, actions),
         )
 
     def _initial_noise(
         self, batch: int, seed: int | torch.Generator, device: torch.device
     ) -> Future:
-        """Drawn in one order, so that both roles begin with the same noise of latents."""
+        """Draw latents first, so that both roles begin with the same noise of latents."""
         generator = seed
         if not isinstance(generator, torch.Generator):
             generator = torch.Generator().manual_seed(generator)
@@ -315,27 +268,41 @@ class WorldModel(nn.Module):
             return drawn.to(device)
 
         return Future(
-            latents=draw(*self._latent_shape), motion=draw(MOTION_DIM), actions=draw(ACTION_DIM)
+            latents=draw(*self.config.latent_shape),
+            motion=draw(MOTION_DIM),
+            actions=draw(ACTION_DIM),
         )
 
     def _require_context(
         self, latents: Tensor, states: Tensor, actions: Tensor | None, *, sim_mode: bool
     ) -> None:
-        batch, past, frames = len(latents), self.config.context_frames, self.config.frames
+        config, batch = self.config, len(latents)
         if sim_mode == (actions is None):
             raise PolicyError(
                 "simulation (sim_mode=True) takes the actions, decision (sim_mode=False) makes "
                 f"them: actions are {'missing' if actions is None else 'not to be given'}"
             )
-        wanted = {"latents": (batch, past, *self._latent_shape), "states": (batch, past, STATE_DIM)}
-        given = {"latents": latents, "states": states}
-        if actions is not None:
-            wanted["actions"], given["actions"] = (batch, frames, ACTION_DIM), actions
-        for name, array in given.items():
-            if tuple(array.shape) != wanted[name]:
-                raise PolicyError(f"{name} must be {list(wanted[name])}, got {list(array.shape)}")
+        past = config.context_frames
+        for name, array, shape in (
+            ("latents", latents, (batch, past, *config.latent_shape)),
+            ("states", states, (batch, past, STATE_DIM)),
+            ("actions", actions, (batch, config.frames, ACTION_DIM)),
+        ):
+            if array is not None and tuple(array.shape) != shape:
+                raise PolicyError(f"{name} must be {list(shape)}, got {list(array.shape)}")
 
 
-def _in_one_layout(images: Tensor) -> Tensor:
+def _one_by_one(net: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:
+    """Apply a net to [N, C, H, W], each alone: kernels for other batch sizes may round otherwise.
+
+    So a frame is the same, bit for bit, whatever others it is coded with. Kernels are also chosen
+    by the strides, which a slice of a batch inherits: each is a copy of its own.
+    """
+    if len(inputs) == 0:
+        return net(_channels_last(inputs.new_zeros(1, *inputs.shape[1:])))[:0]
+    return torch.cat([net(_channels_last(each[None])) for each in inputs])
+
+
+def _channels_last(images: Tensor) -> Tensor:
     """A copy of [N, C, H, W] in the one memory layout that the convolutions are run in."""
     return images.clone(memory_format=torch.channels_last)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from helpers.flight_folders import spot
 from policy import rotation
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY
-from policy.data.episodes import Episode
+from policy.data.flight_data import FlightData
 
 MS = 1_000_000
 YAW_RATE_RADPS = 2.0
@@ -16,7 +16,7 @@ ACCELERATION_MPS2 = 6.0
 FIELD_OF_VIEW_RAD = 2.0
 
 
-def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> Episode:
+def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> FlightData:
     """Yaw turns the view past a bright spot far away; pitch accelerates to where the camera looks.
 
     Ticks at 100 Hz, frames at 30 Hz; the expert's labels are another thing than what was sent.
@@ -45,7 +45,7 @@ def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> Episod
             across = -2 * np.arctan2(np.sin(angle), np.cos(angle)) / FIELD_OF_VIEW_RAD
             yield spot(size, float(across)) if abs(across) <= 1 else spot(size, -9.0)
 
-    return Episode(
+    return FlightData(
         name=f"steered {seed}",
         state_frame="ned_frd",
         tick_ns=tick_ns,

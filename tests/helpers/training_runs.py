@@ -1,70 +1,75 @@
-"""A killed training that goes on must end where one that was not killed ends."""
+"""A killed training that is resumed must end where one that was not killed ends."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Protocol
 
 import pytest
 from safetensors import safe_open
 
-from policy.data.episodes import Episode
-from policy.training.report import Progress, TrainResult
-from policy.training.state import TrainingError, TrainingStoppedError
+from policy.data.flight_data import FlightData
+from policy.training.report import Hooks, TrainingProgress, TrainResult
+from policy.training.run_folder import TrainingError, TrainingStoppedError
 
 
 class Training(Protocol):
-    """One run over flights; what is not resumed must not be there yet."""
+    """One run over flights, always in the same folder."""
 
     def __call__(
-        self,
-        episodes: list[Episode],
-        *,
-        resume: bool = False,
-        report: Callable[[Progress], None] = lambda _: None,
-        should_stop: Callable[[], bool] = lambda: False,
+        self, flights: list[FlightData], hooks: Hooks, *, resume: bool = False
     ) -> TrainResult:
-        """Train to the end, or until ``report`` raises or ``should_stop`` says so."""
+        """Train to the end, or until a hook raises or stops it."""
         ...
 
 
-def check_resuming(
-    train: Training, episodes: list[Episode], whole: TrainResult, *, killed_at: int
-) -> None:
-    """Kill it after the validation of a step; refuse to begin anew or with others; go on."""
+def make_hooks(
+    report: Callable[[TrainingProgress], None] = lambda _: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Hooks:
+    """Every look at the clock takes a tenth of a second."""
+    ticking = count()
+    return Hooks(now_s=lambda: next(ticking) * 0.1, report=report, should_stop=should_stop)
 
-    def kill(progress: Progress) -> None:
+
+def check_resuming(
+    train: Training, flights: list[FlightData], whole: TrainResult, *, killed_at: int
+) -> None:
+    """Kill it after the validation of a step; refuse to begin anew or with others; resume."""
+
+    def kill(progress: TrainingProgress) -> None:
         if progress.validation is not None and progress.step == killed_at:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(episodes, report=kill)
+        train(flights, make_hooks(kill))
     with pytest.raises(TrainingError, match="--resume"):
-        train(episodes)
+        train(flights, make_hooks())
     with pytest.raises(TrainingError, match="other flights or settings"):
-        train(episodes[:2], resume=True)
-    check_same(train(episodes, resume=True), whole)
+        train(flights[:2], make_hooks(), resume=True)
+    check_same(train(flights, make_hooks(), resume=True), whole)
 
 
 def check_stopping(
-    train: Training, episodes: list[Episode], whole: TrainResult, *, validated_at: int
+    train: Training, flights: list[FlightData], whole: TrainResult, *, validated_at: int
 ) -> None:
-    """Stop it a step after a validation, and go on."""
+    """Stop it a step after a validation, and resume."""
     polls_left: int | None = None
 
-    def wait(progress: Progress) -> None:
+    def wait(progress: TrainingProgress) -> None:
         nonlocal polls_left
         if progress.validation is not None and progress.step == validated_at:
             polls_left = 2
 
-    def is_over() -> bool:
+    def should_stop() -> bool:
         nonlocal polls_left
         polls_left = None if polls_left is None else polls_left - 1
         return polls_left == 0
 
     with pytest.raises(TrainingStoppedError, match="--resume"):
-        train(episodes, report=wait, should_stop=is_over)
-    check_same(train(episodes, resume=True), whole)
+        train(flights, make_hooks(wait, should_stop))
+    check_same(train(flights, make_hooks(), resume=True), whole)
 
 
 def check_same(result: TrainResult, whole: TrainResult) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.recording.flight_folder import open_flight
-from policy.data.episodes import DatasetError, Episode
+from policy.data.flight_data import DatasetError, FlightData
 from policy.data.flight_folders import read_flight
 from policy.data.windows import find_windows
 from policy.preprocess import resize
@@ -33,7 +33,7 @@ class FlightWindow:
     """[S, 4] mean stick that was sent from the frame before to each frame after the context."""
 
 
-def read_episode(folder: Path, config: WorldModelConfig) -> Episode:
+def read_episode(folder: Path, config: WorldModelConfig) -> FlightData:
     """Read states, sticks and stamps of a flight, as far as it has whole frames.
 
     Raises:
@@ -51,7 +51,7 @@ def read_episode(folder: Path, config: WorldModelConfig) -> Episode:
 
 
 def choose_windows(
-    episodes: Sequence[Episode], config: WorldModelConfig, *, steps: int, count: int
+    episodes: Sequence[FlightData], config: WorldModelConfig, *, steps: int, count: int
 ) -> tuple[list[FlightWindow], int]:
     """Choose windows with ``steps`` after the context, evenly over all flights.
 

@@ -30,7 +30,7 @@ from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.stopping import INTERRUPTED, StopRequest, stop_on_signals
-from policy.data.episodes import Episode
+from policy.data.flight_data import FlightData
 from policy.data.flight_folders import find_flights, is_exemplary
 
 ITERATIONS = 10
@@ -121,7 +121,7 @@ class _Evaluation:
             drift=self._score_chains(episodes),
         )
 
-    def _score_windows(self, episodes: list[Episode]) -> tuple[WindowScorer, int]:
+    def _score_windows(self, episodes: list[FlightData]) -> tuple[WindowScorer, int]:
         """The scores, and how many flights have windows."""
         scorer = WindowScorer(self._sampler, seed=self._config.seed)
         windows, flights = choose_windows(
@@ -136,7 +136,7 @@ class _Evaluation:
             scorer.add(window, images, index=index, other_actions=other)
         return scorer, flights
 
-    def _score_chains(self, episodes: list[Episode]) -> tuple[DriftIteration, ...]:
+    def _score_chains(self, episodes: list[FlightData]) -> tuple[DriftIteration, ...]:
         """Score the longest chains that any flight has room for: all iterations compare."""
         for iterations in range(ITERATIONS, 0, -1):
             steps = (iterations - 1) * self._exe_steps + self._model.frames

@@ -16,7 +16,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from policy.contract import ACTION_DIM
 from policy.data import lerobot_format as names
-from policy.data.episodes import Episode, Nanoseconds
+from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.interpolation import MAX_GAP_NS
 
 MAX_HELD_NS = MAX_GAP_NS
@@ -34,7 +34,7 @@ MAX_RATE_OFF = 0.2
 class Stretch:
     """Consecutive frames of a flight in each of which it was flown: one episode of LeRobot."""
 
-    episode: Episode
+    episode: FlightData
     first_frame: int
     """Counted in the flight's frames."""
     columns: dict[str, NDArray[np.generic]]
@@ -55,7 +55,7 @@ class Stretch:
         return Stretch(self.episode, self.first_frame + start, columns)
 
 
-def stretches(episode: Episode) -> list[Stretch]:
+def stretches(episode: FlightData) -> list[Stretch]:
     """Align a flight to its frames, and leave out those without a state or sticks.
 
     Args:

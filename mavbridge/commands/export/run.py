@@ -19,7 +19,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import stop_on_signals
-from policy.data.episodes import Episode, common_frame
+from policy.data.flight_data import FlightData, common_frame
 from policy.data.flight_folders import find_flights, is_exemplary, read_flight
 
 
@@ -73,7 +73,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
 
 
 def write_dataset(
-    episodes: Sequence[Episode],
+    episodes: Sequence[FlightData],
     folder: Path,
     config: ExportConfig,
     on_frame: Callable[[], None] = lambda: None,
@@ -136,7 +136,7 @@ def _image_size(parts: Sequence[Stretch]) -> tuple[int, int]:
 
 
 def _write_flight(
-    writer: DatasetWriter, episode: Episode, parts: list[Stretch], on_frame: Callable[[], None]
+    writer: DatasetWriter, episode: FlightData, parts: list[Stretch], on_frame: Callable[[], None]
 ) -> None:
     """Decode the video once, from its beginning, and write its stretches."""
 

@@ -3,7 +3,7 @@
 As those of a policy, a pure function of the seed and the step.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,48 +11,36 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from policy.contract import FloatArray
-from policy.data.episodes import ImageArray
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
-from policy.data.samples import STICK_SIGNS, mirror_signs, mirrored
+from policy.data.samples import STICK_SIGNS, mirrored, state_signs
 from policy.data.windows import Windows
-from policy.training.batches import VALIDATION_KEY, PooledStore, next_of
-from policy.training.parallel import row_parts
+from policy.training.batches import VALIDATION_KEY, FeatureStore, next_of
+from policy.training.parallel import TensorBatch
+from policy.training.settings import WorldModelSettings
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.relative_state import MOTION_DIM
 
 CONTEXT_NOISE = 0.2
 """Largest sigma on the latents of the past, of their unit scale: in a rollout the past is itself
 imagined, and a net that has only seen true ones drifts off."""
-LOOKED_AT = 2
+DECODED = 2
 """Frames of a window that are decoded in a step of the dynamics: all would double its time."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameBatch:
-    """Frames, and what is random about a step."""
+class FrameBatch(TensorBatch):
+    """Pairs of frames, and the noise of a step."""
 
     images: Tensor
     """[B, 2, H, W, 3] uint8: neighbours in a window."""
     noise: Tensor
     """[B, 2, C, h, w] of unit scale, for the latents."""
 
-    def to(self, device: torch.device) -> "FrameBatch":
-        """The same on a device."""
-        images, noise = (x.to(device, non_blocking=True) for x in (self.images, self.noise))
-        return FrameBatch(images=images, noise=noise)
-
-    def split(self, count: int) -> "list[FrameBatch]":
-        """At most ``count`` parts of about the same size."""
-        return [
-            FrameBatch(images=self.images[rows], noise=self.noise[rows])
-            for rows in row_parts(len(self.images), count)
-        ]
-
 
 @dataclass(frozen=True, kw_only=True)
-class WindowBatch:
-    """Windows of K + T frames, and all that is random about a step."""
+class WindowBatch(TensorBatch):
+    """Windows of K + T frames, and everything random about a step."""
 
     latents: Tensor
     """[B, K + T, C, h, w], not normalised."""
@@ -72,54 +60,29 @@ class WindowBatch:
     """[B] int64"""
     knows_actions: Tensor
     """[B] bool"""
-    looked_at: Tensor
-    """[B, LOOKED_AT] int64: frames of the future that are compared as pixels, too."""
-
-    def to(self, device: torch.device) -> "WindowBatch":
-        """The same on a device."""
-        moved = {name: value.to(device, non_blocking=True) for name, value in vars(self).items()}
-        return replace(self, **moved)
-
-    def split(self, count: int) -> "list[WindowBatch]":
-        """At most ``count`` parts of about the same size."""
-        return [
-            replace(self, **{name: value[rows] for name, value in vars(self).items()})
-            for rows in row_parts(len(self.latents), count)
-        ]
+    decoded: Tensor
+    """[B, DECODED] int64: frames of the future that are also compared as pixels."""
 
 
 def frame_batch(
     store: FrameStore,
     windows: Windows,
     config: WorldModelConfig,
+    settings: WorldModelSettings,
     step: int,
-    *,
-    count: int,
-    seed: int,
-    mirrors: bool,
 ) -> FrameBatch:
-    """Two neighbours of each of the ``windows`` that are next in a step of the autoencoder."""
-    random = np.random.default_rng([seed, step])
-    rows = next_of(np.arange(len(windows)), step, count, seed)
+    """Two neighbours of each of the ``windows`` that are due in a step of the autoencoder."""
+    count = settings.batch_size // 2
+    random = np.random.default_rng([settings.seed, step])
+    rows = next_of(np.arange(len(windows)), step, count, settings.seed)
     first = random.integers(0, windows.frames.shape[1] - 1, count)
     pairs = np.stack([windows.frames[rows, first], windows.frames[rows, first + 1]], axis=1)
-    images = _read(store, pairs.ravel(), config.image_size)
+    images = store.read(pairs.ravel(), config.image_size)
     images = images.reshape(count, 2, *images.shape[1:])
-    is_mirrored = (random.random(count) < 0.5) & mirrors
+    is_mirrored = (random.random(count) < 0.5) & settings.mirror
     images[is_mirrored] = images[is_mirrored, :, :, ::-1]
-    shape = (count, 2, config.latent_channels, config.latent_side, config.latent_side)
-    noise = random.standard_normal(shape, dtype=np.float32)
+    noise = random.standard_normal((count, 2, *config.latent_shape), dtype=np.float32)
     return FrameBatch(images=torch.from_numpy(images), noise=torch.from_numpy(noise))
-
-
-def read_frames(store: FrameStore, frames: Indices, size: int, *, is_mirrored: bool) -> Tensor:
-    """[B, size, size, 3] uint8 as they are, or all mirrored."""
-    images = _read(store, frames, size)
-    return torch.from_numpy(np.ascontiguousarray(images[:, :, ::-1]) if is_mirrored else images)
-
-
-def _read(store: FrameStore, frames: Indices, size: int) -> ImageArray:
-    return store.read(frames, (size, size), np.zeros((len(frames), 2), np.int64))
 
 
 class WindowBatches:
@@ -128,28 +91,27 @@ class WindowBatches:
     def __init__(
         self,
         windows: Windows,
-        latents: PooledStore,
+        latents: FeatureStore,
         config: WorldModelConfig,
-        *,
-        seed: int,
-        mirrors: bool,
-        decision_share: float,
+        settings: WorldModelSettings,
     ) -> None:
-        self._windows, self._latents, self._config = windows, latents, config
-        self._seed, self._mirrors = seed, mirrors and latents.has_mirrored
-        self._decision_share = decision_share
+        self._windows, self._latents = windows, latents
+        self._config, self._settings, self._seed = config, settings, settings.seed
 
-    def batch(self, step: int, count: int) -> WindowBatch:
+    def batch(self, step: int) -> WindowBatch:
         """The windows of a step of the dynamics."""
+        count = self._settings.window_batch_size
         random = np.random.default_rng([self._seed, step])
         rows = next_of(np.arange(len(self._windows)), step, count, self._seed)
-        is_mirrored = (random.random(count) < 0.5) & self._mirrors
+        is_mirrored = (
+            (random.random(count) < 0.5) & self._settings.mirror & self._latents.has_mirrored
+        )
         sigma = random.uniform(0.0, CONTEXT_NOISE, (count, 1, 1, 1, 1)).astype(np.float32)
-        knows_actions = random.random(count) >= self._decision_share
+        knows_actions = random.random(count) >= self._settings.decision_share
         return self._make(random, rows, is_mirrored, sigma, knows_actions)
 
     def validation(self, count: int) -> list[WindowBatch]:
-        """All windows in batches of ``count``, the same at each call and in turn in either role.
+        """All windows in batches of ``count``, the same at each call, alternating between roles.
 
         Each batch is spread over all flights.
         """
@@ -174,7 +136,7 @@ class WindowBatches:
     ) -> WindowBatch:
         config, samples = self._config, self._windows.samples(rows)
         count, length = samples.frames.shape
-        shape = (config.latent_channels, config.latent_side, config.latent_side)
+        shape = config.latent_shape
         flat = self._latents.read(samples.frames.ravel(), np.repeat(is_mirrored, length))
 
         def drawn(*size: int) -> FloatArray:
@@ -182,7 +144,7 @@ class WindowBatches:
 
         arrays = {
             "latents": flat.reshape(count, length, *shape),
-            "states": mirrored(samples.states, mirror_signs(samples.states.shape[-1]), is_mirrored),
+            "states": mirrored(samples.states, state_signs(samples.states.shape[-1]), is_mirrored),
             "actions": mirrored(samples.actions, STICK_SIGNS, is_mirrored),
             "context_noise": sigma * drawn(config.context_frames, *shape),
             "latent_noise": drawn(config.frames, *shape),
@@ -190,6 +152,6 @@ class WindowBatches:
             "action_noise": drawn(config.frames, samples.actions.shape[-1]),
             "timestep": random.integers(0, config.schedule.num_train_timesteps, count),
             "knows_actions": knows_actions,
-            "looked_at": random.integers(0, config.frames, (count, LOOKED_AT)),
+            "decoded": random.integers(0, config.frames, (count, DECODED)),
         }
         return WindowBatch(**{name: torch.from_numpy(array) for name, array in arrays.items()})

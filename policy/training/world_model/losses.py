@@ -1,4 +1,4 @@
-"""What is optimised of a world model, the scales that it is told, and how well it foretells."""
+"""What is optimised of a world model, the scales that are stored with it, and its validation."""
 
 from collections.abc import Sequence
 
@@ -7,39 +7,38 @@ import torch
 from torch import Tensor
 
 from policy.contract import STATE_DIM, VELOCITY
-from policy.data.interpolation import Indices
-from policy.data.samples import STICK_SIGNS, mirror_signs
+from policy.data.samples import STICK_SIGNS, state_signs
 from policy.data.windows import Windows
-from policy.training.batches import PooledStore
+from policy.training.batches import FeatureStore
 from policy.training.parallel import StepLoss
-from policy.training.report import WorldValidation
+from policy.training.report import WorldModelValidation
 from policy.training.world_model.batches import FrameBatch, WindowBatch
 from policy.world_model.autoencoder import to_unit
 from policy.world_model.dynamics import Future
-from policy.world_model.frame_warp import Poses, View
 from policy.world_model.model import WorldModel
 from policy.world_model.relative_state import MOTION_SCALE, motion_since
 
 SQUARED_WEIGHT = 5.0
-"""Of the squared error beside the absolute one, which alone is content with a picture without the
-small things in it."""
-GRADIENT_WEIGHT = 1.0
-"""Of the error of differences between neighbouring pixels: a gate is a few pixels of edge."""
+"""Weight of the squared error of pixels beside the absolute one, which alone accepts a picture
+without its small things."""
+EDGE_WEIGHT = 1.0
+"""Weight of the error of differences between neighbours: a gate is a few pixels of edge."""
 KL_WEIGHT = 1e-4
-"""Per latent: keeps them in bounds. More of it gives each the same spread, and so the ground's
-texture, which nobody can foretell, as much of a say as the gates."""
+"""Weight of the KL divergence per latent, which keeps them in bounds. More of it gives each the
+same spread, so that the ground's unpredictable texture counts as much as the gates."""
 UNSTEADY_WEIGHT = 0.03
-"""Of the change of the latents from frame to frame, over their spread. Without it copying the last
-latent is off by half of their variance one frame on; pixels are hardly the worse for it."""
-LOOKED_AT_WEIGHT = 10.0
-"""Of the squared error of decoded pixels, full scale 2: not all errors of latents can be seen."""
+"""Weight of the change of the latents from frame to frame, over their spread. Without it, copying
+the last latent is off by half of their variance one frame on; pixels are hardly worse for it."""
+DECODED_WEIGHT = 10.0
+"""Weight of the squared error of decoded pixels, full scale 2: not all errors of latents show."""
 MOTION_WEIGHT, ACTION_WEIGHT = 0.5, 0.5
-FORESEEN_WEIGHT = 0.5
-"""Of the squared error of the motion that is foreseen before anything is denoised."""
-CARRIED_WEIGHT = 1.0
-"""Of the absolute error of pixels of frames moved by the true motion: what nearness learns from."""
+MOTION_PREDICTION_WEIGHT = 0.5
+"""Weight of the squared error of the motion that is predicted before anything is denoised."""
+WARP_WEIGHT = 1.0
+"""Weight of the absolute error of pixels of frames warped by the true motion: it alone teaches the
+inverse depth."""
 MIN_MOTION_STD = 0.05
-"""Of ``MOTION_SCALE``: what hardly changes does not count more than this makes it."""
+"""Over ``MOTION_SCALE``: what hardly changes does not count more than this makes it."""
 MIN_STICK_STD = 0.1
 SCALE_SAMPLES = 4096
 """Frames and windows from which scales are taken."""
@@ -62,13 +61,13 @@ def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
     kl = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).mean()
     change = mean.reshape(-1, 2, *mean.shape[1:]).diff(dim=1).square().mean()
     unsteady = change / mean.var(dim=(0, 2, 3)).mean().clamp_min(1e-3)
-    loss = pixels + GRADIENT_WEIGHT * edges + KL_WEIGHT * kl + UNSTEADY_WEIGHT * unsteady
-    told = {"loss": loss, "pixels": pixels, "edges": edges, "kl": kl, "unsteady": unsteady}
-    return StepLoss(total=loss, told=told)
+    loss = pixels + EDGE_WEIGHT * edges + KL_WEIGHT * kl + UNSTEADY_WEIGHT * unsteady
+    metrics = {"loss": loss, "pixels": pixels, "edges": edges, "kl": kl, "unsteady": unsteady}
+    return StepLoss(total=loss, metrics=metrics)
 
 
 def reconstruction_errors(made: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Of [B, 3, H, W] in [-1, 1]: L2 and L1 [], and L1 of the differences between neighbours."""
+    """L2 and L1 [] of [B, 3, H, W] in [-1, 1], and L1 of the differences between neighbours."""
     error = made - images
     edges = error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
     return SQUARED_WEIGHT * error.square().mean() + error.abs().mean(), edges
@@ -77,12 +76,12 @@ def reconstruction_errors(made: Tensor, images: Tensor) -> tuple[Tensor, Tensor]
 def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
     """Squared errors of what was denoised, and of some of its frames as pixels.
 
-    Those of latents are over the change since the last frame: 1 is what copying it would give at
-    every step, so that the first steps, from which a rollout goes on, count as much as the last.
+    Errors of latents are over their change since the last frame: copying it would give 1 at every
+    step, so that the first steps, which a rollout continues from, count as much as the last.
     """
     config = model.config
     context = config.context_frames
-    latents = _normalised_latents(model, batch.latents)
+    latents = _normalised(model, batch.latents)
     past_states, states = batch.states[:, :context], batch.states[:, context:]
     with torch.autocast(states.device.type, enabled=False):  # angles need all their digits
         motion = motion_since(past_states[:, -1:], states)
@@ -92,67 +91,61 @@ def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
         actions=model.normalise_actions(batch.actions),
     )
     past_latents = latents[:, :context] + batch.context_noise
-    view = model.view(past_latents[:, -1], past_states[:, -1])
-    past = model.foresee(view, past_latents, past_states, clean.actions, batch.knows_actions)
-    add, timestep = config.schedule.add_noise, batch.timestep
-    knows = batch.knows_actions.view(-1, 1, 1)
-    noisy = Future(
+    source = model.source_frame(past_latents[:, -1], past_states[:, -1])
+    known = model.predict_motion(
+        source, past_latents, past_states, clean.actions, batch.knows_actions
+    )
+    made = model.denoise(_noisy(model, clean, batch), batch.timestep, known)
+    true = _decoded(model, clean.latents, batch.decoded).detach()
+    poses = model.poses(past_states[:, -1], motion).at(batch.decoded)
+    warped, in_view = model.warp(source, poses)
+    errors = {
+        "latents": ((made.latents.float() - clean.latents) / model.change_std).square().mean(),
+        "pixels": (_decoded(model, made.latents, batch.decoded) - true).square().mean(),
+        "warp": ((warped - true).abs().mean(dim=2) * in_view).mean(),
+        "motion": (made.motion.float() - clean.motion).square().mean(),
+        "motion_prediction": (known.predicted_motion - clean.motion).square().mean(),
+        # Known sticks are returned as they were given: no error.
+        "sticks": (made.actions.float() - clean.actions).square().mean(),
+    }
+    loss = (
+        errors["latents"]
+        + DECODED_WEIGHT * errors["pixels"]
+        + WARP_WEIGHT * errors["warp"]
+        + MOTION_WEIGHT * errors["motion"]
+        + MOTION_PREDICTION_WEIGHT * errors["motion_prediction"]
+        + ACTION_WEIGHT * errors["sticks"]
+    )
+    return StepLoss(total=loss, metrics={"loss": loss, **errors})
+
+
+def _noisy(model: WorldModel, clean: Future, batch: WindowBatch) -> Future:
+    add, timestep = model.config.schedule.add_noise, batch.timestep
+    knows, actions = batch.knows_actions.view(-1, 1, 1), clean.actions
+    return Future(
         latents=add(clean.latents, batch.latent_noise, timestep),
         motion=add(clean.motion, batch.motion_noise, timestep),
-        actions=torch.where(knows, clean.actions, add(clean.actions, batch.action_noise, timestep)),
+        actions=torch.where(knows, actions, add(actions, batch.action_noise, timestep)),
     )
-    made = model.denoise(noisy, timestep, past)
-    picture = ((made.latents.float() - clean.latents) / model.change_std).square().mean()
-    true = _seen(model, clean.latents, batch.looked_at).detach()
-    pixels = (_seen(model, made.latents, batch.looked_at) - true).square().mean()
-    poses = model.poses(past_states[:, -1], motion).of(batch.looked_at)
-    carried = _carried_error(model, view, poses, true)
-    vehicle = (made.motion.float() - clean.motion).square().mean()
-    foreseen = (past.foreseen - clean.motion).square().mean()
-    # Known sticks are told as they are given: no error.
-    sticks = (made.actions.float() - clean.actions).square().mean()
-    loss = (
-        picture
-        + LOOKED_AT_WEIGHT * pixels
-        + CARRIED_WEIGHT * carried
-        + MOTION_WEIGHT * vehicle
-        + FORESEEN_WEIGHT * foreseen
-        + ACTION_WEIGHT * sticks
-    )
-    told = {
-        "loss": loss,
-        "latents": picture,
-        "pixels": pixels,
-        "carried": carried,
-        "motion": vehicle,
-        "foreseen": foreseen,
-        "sticks": sticks,
-    }
-    return StepLoss(total=loss, told=told)
 
 
-def _seen(model: WorldModel, latents: Tensor, looked_at: Tensor) -> Tensor:
-    """Frames [B, n, 3, H, W] with numbers [B, n] of futures [B, T, C, h, w]; full scale 2."""
+def _decoded(model: WorldModel, latents: Tensor, chosen: Tensor) -> Tensor:
+    """Frames [B, n, 3, H, W] with indices [B, n] of futures [B, T, C, h, w]; full scale 2."""
     coder, window = model.autoencoder, torch.arange(len(latents), device=latents.device)[:, None]
-    chosen = latents[window, looked_at]
-    seen = coder.reconstruct(coder.denormalise(chosen.flatten(0, 1)))
-    return seen.float().reshape(*chosen.shape[:2], *seen.shape[1:])
+    some = latents[window, chosen]
+    images = coder.reconstruct(coder.denormalise(some.flatten(0, 1)))
+    return images.float().reshape(*some.shape[:2], *images.shape[1:])
 
 
-def _carried_error(model: WorldModel, view: View, poses: Poses, true: Tensor) -> Tensor:
-    """Absolute error [] of the newest frame moved to other poses, where it was in view."""
-    made, in_view = model.moved(view, poses)
-    return ((made - true).abs().mean(dim=2) * in_view).mean()
-
-
-def _normalised_latents(model: WorldModel, latents: Tensor) -> Tensor:
-    flat = model.autoencoder.normalise(latents.flatten(0, 1))
-    return flat.reshape(latents.shape)
+def _normalised(model: WorldModel, latents: Tensor) -> Tensor:
+    return model.autoencoder.normalise(latents.flatten(0, 1)).reshape(latents.shape)
 
 
 @torch.no_grad()
-def set_scales(model: WorldModel, windows: Windows, latents: PooledStore, *, mirrors: bool) -> None:
-    """Tell the model the mean and spread of latents, motions and sticks of the flights."""
+def set_scales(
+    model: WorldModel, windows: Windows, latents: FeatureStore, *, mirrors: bool
+) -> None:
+    """Store the mean and spread of latents, motions and sticks of the flights in the model."""
     config, coder = model.config, model.autoencoder
     total = len(latents.frames)
     frames = latents.frames[np.linspace(0, total - 1, min(SCALE_SAMPLES, total)).astype(np.int64)]
@@ -161,12 +154,11 @@ def set_scales(model: WorldModel, windows: Windows, latents: PooledStore, *, mir
     coder.latent_mean.copy_(values.mean(dim=1))
     coder.latent_std.copy_(values.std(dim=1).clamp_min(1e-3))
     chosen = windows.spread(SCALE_SAMPLES)
+    model.change_std.copy_(_change_std(model, chosen.spread(CHANGE_SAMPLES), latents))
     samples = chosen.samples(np.arange(len(chosen)))
-    model.change_std.copy_(_change_std(model, chosen.spread(CHANGE_SAMPLES).frames, latents))
     states, actions = torch.from_numpy(samples.states), torch.from_numpy(samples.actions)
     if mirrors:
-        signs = torch.from_numpy(mirror_signs(STATE_DIM))
-        states = torch.cat([states, states * signs])
+        states = torch.cat([states, states * torch.from_numpy(state_signs(STATE_DIM))])
         actions = torch.cat([actions, actions * torch.from_numpy(STICK_SIGNS)])
     now = states[:, config.context_frames - 1 : config.context_frames]
     motion = motion_since(now, states[:, config.context_frames :])
@@ -177,26 +169,22 @@ def set_scales(model: WorldModel, windows: Windows, latents: PooledStore, *, mir
     model.action_std.copy_(actions.std(dim=(0, 1), correction=0).clamp_min(MIN_STICK_STD))
 
 
-def _change_std(model: WorldModel, frames: Indices, latents: PooledStore) -> Tensor:
-    """Spread [T, C, 1, 1] of the change of normalised latents in windows of frames [W, K + T]."""
-    config = model.config
+def _change_std(model: WorldModel, windows: Windows, latents: FeatureStore) -> Tensor:
+    """Spread [T, C, 1, 1] of the change of normalised latents in some windows."""
+    context, frames = model.config.context_frames, windows.frames
     rows = torch.from_numpy(latents.read(frames.ravel(), np.zeros(frames.size, bool)))
-    side = config.latent_side
-    raw = rows.reshape(*frames.shape, config.latent_channels, side, side)
-    windows = _normalised_latents(model, raw)
-    now = windows[:, config.context_frames - 1 : config.context_frames]
-    change = windows[:, config.context_frames :] - now
-    std = change.square().mean(dim=(0, 3, 4), keepdim=True).sqrt()
-    return std[0].clamp_min(MIN_CHANGE_STD)
+    normal = _normalised(model, rows.reshape(*frames.shape, *model.config.latent_shape))
+    change = normal[:, context:] - normal[:, context - 1 : context]
+    return change.square().mean(dim=(0, 3, 4))[..., None, None].sqrt().clamp_min(MIN_CHANGE_STD)
 
 
 @torch.no_grad()
-def validate_autoencoder(model: WorldModel, images: Tensor) -> WorldValidation:
-    """How well frames [N, H, W, 3] survive being coded; the loss is that of the pixels."""
+def validate_autoencoder(model: WorldModel, images: Tensor) -> WorldModelValidation:
+    """Errors of frames [N, H, W, 3] after coding; the loss is that of the pixels."""
     made = model.decode(model.encode(images))
     pixels, edges = reconstruction_errors(to_unit(made), to_unit(images))
-    return WorldValidation(
-        loss=float(pixels + GRADIENT_WEIGHT * edges),
+    return WorldModelValidation(
+        loss=float(pixels + EDGE_WEIGHT * edges),
         reconstruction_psnr_db=float(psnr_db(made, images).mean()),
     )
 
@@ -204,17 +192,17 @@ def validate_autoencoder(model: WorldModel, images: Tensor) -> WorldValidation:
 @torch.no_grad()
 def validate_world_model(
     model: WorldModel, batches: Sequence[WindowBatch], frames: Tensor
-) -> WorldValidation:
-    """Losses over all ``batches``, and how well the first of them is imagined.
+) -> WorldModelValidation:
+    """Losses of all ``batches``, and errors of imagining the first of them.
 
     Args:
         model: in eval mode.
-        batches: of held-out windows.
-        frames: [B, K + T, H, W, 3] uint8, those of the first batch as they were seen.
+        batches: held-out windows.
+        frames: [B, K + T, H, W, 3] uint8, true frames of the first batch.
     """
-    losses = [float(dynamics_loss(model, batch).told["loss"]) for batch in batches]
+    losses = [float(dynamics_loss(model, batch).metrics["loss"]) for batch in batches]
     context, first = model.config.context_frames, batches[0]
-    latents, states = _normalised_latents(model, first.latents), first.states
+    latents, states = _normalised(model, first.latents), first.states
     imagined = model.sample(
         latents[:, :context],
         states[:, :context],
@@ -229,7 +217,7 @@ def validate_world_model(
     future, last = frames[:, context:], frames[:, context - 1 : context]
     coded = model.decode(latents[:, context])
     end, now = states[:, -1, VELOCITY], states[:, context - 1, VELOCITY]
-    return WorldValidation(
+    return WorldModelValidation(
         loss=sum(losses) / len(losses),
         reconstruction_psnr_db=float(psnr_db(coded, frames[:, context]).mean()),
         psnr_db=float(psnr_db(imagined.video, future).mean()),

@@ -10,6 +10,15 @@ from policy.contract import QUATERNION, Contract, Executable, FloatArray
 from policy.nets.toge import Toge, TogeConfig
 
 
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """Sums of two threads differ in the last bit; and the other cores are in use, too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="session")
 def small_toge() -> Toge:
     """The cheapest TOGE: seeded random weights, ResNet-18 at 32x32. Not to be changed by a test."""

@@ -40,6 +40,21 @@ def test_rotation_vector_is_axis_times_angle(angle: float, axis: int) -> None:
         np.testing.assert_allclose(made, expected, atol=1e-6)
 
 
-def test_interpolation_takes_the_shorter_way() -> None:
-    half = rotation.interpolate(about(2, 0.2), -about(2, 0.4), np.array([0.5]))
-    assert rotation.rotation_vector(half)[0, 2] == pytest.approx(0.3, abs=1e-9)
+def test_interpolation_takes_the_shorter_way_at_an_even_rate() -> None:
+    made = rotation.slerp(about(2, 0.2), -about(2, 2.2), np.array([0.25]))
+    assert rotation.rotation_vector(made)[0, 2] == pytest.approx(0.7, abs=1e-9)
+
+
+@given(ANGLE, ANGLE, st.integers(0, 2), st.floats(0, 1))
+def test_floats_and_arrays_give_the_same(a: float, b: float, axis: int, share: float) -> None:
+    arrays = rotation.multiply(about(0, a), about(1, 0.3)), about(axis, b)
+    w, x, y, z = arrays[0][0].tolist()
+    p, (w, x, y, z) = (w, x, y, z), arrays[1][0].tolist()
+    turned = rotation.slerp(p, (w, x, y, z), share)
+    assert isinstance(turned, tuple)
+    np.testing.assert_allclose([turned], rotation.slerp(*arrays, np.array([share])), atol=1e-12)
+    np.testing.assert_allclose(
+        [rotation.rotate(p, (w, x, y))],
+        rotation.rotate(arrays[0], arrays[1][:, :3]),
+        atol=1e-12,
+    )

@@ -18,7 +18,7 @@ from mavbridge.__main__ import main
 from mavbridge.commands.export.run import ExportSummary, export, write_dataset
 from mavbridge.config.export import ExportConfig
 from mavbridge.core.errors import MavbridgeError, UserError
-from policy.data.episodes import Episode
+from policy.data.flight_data import FlightData
 from policy.data.flight_folders import read_flight
 from policy.data.lerobot import read_dataset
 
@@ -108,7 +108,7 @@ def test_the_dataset_keeps_the_rules_of_the_reader(dataset: Path) -> None:
     ]
 
 
-def _row(flight: Episode, captured_ns: int) -> tuple[int, int, int]:
+def _row(flight: FlightData, captured_ns: int) -> tuple[int, int, int]:
     """Tick, label and sent sticks of a frame, found the slow way."""
     arrived = [max(a, v) for a, v in zip(flight.attitude_ns, flight.velocity_ns, strict=True)]
     return (
@@ -316,7 +316,7 @@ def test_nothing_is_left_of_an_export_that_breaks(
 def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flight = fly(tmp_path / "a")
 
-    def interrupted(folder: Path) -> Episode:
+    def interrupted(folder: Path) -> FlightData:
         signal.raise_signal(signal.SIGINT)
         return read_flight(folder)
 

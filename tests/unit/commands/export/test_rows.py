@@ -15,7 +15,7 @@ from mavbridge.commands.export.rows import (
 )
 from mavbridge.core.errors import UserError
 from policy.data import lerobot_format as names
-from policy.data.episodes import GATE_DIM, Episode
+from policy.data.flight_data import GATE_DIM, FlightData
 
 
 def episode(
@@ -25,14 +25,14 @@ def episode(
     lag_ms: int = 0,
     unknown: frozenset[int] = frozenset(),
     sent_ms: list[int] | None = None,
-) -> Episode:
+) -> FlightData:
     captured = np.array(captured_ms, np.int64) * MS
     ticks = np.array(tick_ms, np.int64) * MS
     sent = np.array(tick_ms if sent_ms is None else sent_ms, np.int64) * MS
     state = np.tile(np.array(LEVEL, np.float32), (len(ticks), 1))
     state[:, 0] = np.arange(len(ticks)) / 100
     state[[k for k in unknown if k < len(ticks)]] = np.nan
-    return Episode(
+    return FlightData(
         name="a flight",
         state_frame="ned_frd",
         tick_ns=ticks,

@@ -50,6 +50,25 @@ def test_a_file_alone_says_what_it_is(model: WorldModel, tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_weights_under_their_old_names_still_load(model: WorldModel, tmp_path: Path) -> None:
+    path = tmp_path / "world.safetensors"
+    save_world_model(path, model, half=False)
+    header, state = read_tensors(path)
+    old_of = {
+        "motion_predictor.initial_hidden.": "foresight.begin.",
+        "motion_predictor.gru.": "foresight.read.",
+        "motion_predictor.output.": "foresight.tell.",
+        "motion_predictor.mean_motion": "foresight.usual",
+        "frame_warp.inverse_depth.": "carried_view.nearness.",
+    }
+    for new, old in old_of.items():
+        assert any(name.startswith(new) for name in state)
+        state = {name.replace(new, old): value for name, value in state.items()}
+    save_file(state, path, metadata=header)
+    loaded = load_world_model(path).state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in model.state_dict().items())
+
+
 def test_half_precision_halves_the_file_and_hardly_changes_a_frame(
     model: WorldModel, tmp_path: Path
 ) -> None:

@@ -15,7 +15,7 @@ from helpers.flight_folders import (
     write_meta,
     write_spot_flight,
 )
-from policy.data.episodes import DatasetError, common_frame, hold_out, measured_ages
+from policy.data.flight_data import DatasetError, common_frame, hold_out
 from policy.data.flight_folders import find_flights, is_exemplary, read_ages, read_flight
 
 WOKE = [0, 10 * MS, 20 * MS]
@@ -93,8 +93,8 @@ def test_folders_of_flights_are_opened(tmp_path: Path) -> None:
     [
         ({"format": "other"}, "not a flight of mavbridge"),
         ({"version": 2}, "version 2"),
-        ({"contract": {}}, "no state frame"),
-        ({"contract": None}, "no state frame"),
+        ({"contract": {}}, "state frame is"),
+        ({"contract": None}, "state frame is"),
     ],
 )
 def test_a_foreign_folder_is_refused(tmp_path: Path, meta: dict[str, object], says: str) -> None:
@@ -166,7 +166,7 @@ def test_ages_are_measured_where_a_policy_looked(tmp_path: Path) -> None:
     ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3, captured_ns=seen)
     folder = flight(tmp_path / "a", ticks)
     assert read_ages(folder).tolist() == [8 * MS, 15 * MS]
-    assert measured_ages([read_flight(folder)]).tolist() == [8 * MS, 15 * MS]
+    assert sorted(read_flight(folder).age_ns.tolist()) == [8 * MS, 15 * MS]
     blind = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3)
     with pytest.raises(DatasetError, match="no policy looked"):
         read_ages(flight(tmp_path / "b", blind))

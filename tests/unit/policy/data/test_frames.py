@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from helpers.flight_folders import write_spot_flight
 from policy.contract import Contract
 from policy.data import frames as dataset_frames
-from policy.data.episodes import DatasetError, Episode
+from policy.data.flight_data import DatasetError, FlightData
 from policy.data.flight_folders import read_flight
 from policy.data.frames import FrameStore, disk_error, store_frames
 from policy.preprocess import image_to_input
 from policy.training.batches import Batch, normalised
-
-NO_SHIFT = np.zeros((1, 2), np.int64)
 
 
 def make_batch(images: torch.Tensor) -> Batch:
@@ -28,7 +26,7 @@ def make_batch(images: torch.Tensor) -> Batch:
         images=images,
         look=torch.zeros(len(images), 5),
         grain=None,
-        pooled=None,
+        features=None,
         state=nothing,
         history=nothing,
         chunk=nothing,
@@ -40,72 +38,64 @@ def make_batch(images: torch.Tensor) -> Batch:
 
 
 @pytest.fixture(scope="module")
-def episode(tmp_path_factory: pytest.TempPathFactory) -> Episode:
+def episode(tmp_path_factory: pytest.TempPathFactory) -> FlightData:
     return read_flight(write_spot_flight(tmp_path_factory.mktemp("f") / "a", 0, seconds=0.4))
 
 
-def store(episodes: list[Episode], folder: Path, size: int = 32) -> FrameStore:
-    return store_frames(
-        episodes, height=size, width=size, folder=folder, progress=lambda fraction: None
-    )
-
-
-def test_images_are_decoded_once(episode: Episode, tmp_path: Path) -> None:
-    first = store([episode], tmp_path)
+def test_images_are_decoded_once(episode: FlightData, tmp_path: Path) -> None:
+    first = store_frames([episode], tmp_path, 32)
     assert first.counts == [12]
 
     def forbidden() -> Iterator[NDArray[np.uint8]]:
         raise AssertionError("decoded again")
 
-    again = store([replace(episode, decode=forbidden)], tmp_path)
+    again = store_frames([replace(episode, decode=forbidden)], tmp_path, 32)
     frames = np.arange(12)
-    shifts = np.zeros((12, 2), np.int64)
-    np.testing.assert_array_equal(
-        again.read(frames, (32, 32), shifts), np.stack(list(episode.decode()))
-    )
-    assert len(first) == 12
+    np.testing.assert_array_equal(again.read(frames, 32), np.stack(list(episode.decode())))
 
 
-def test_the_net_gets_what_it_gets_in_flight(episode: Episode, tmp_path: Path) -> None:
+def test_the_net_gets_what_it_gets_in_flight(episode: FlightData, tmp_path: Path) -> None:
     """Stored at the net's size and normalised for a step: bit for bit image_to_input."""
     contract = Contract(image_height=20, image_width=20)
-    image = store([episode], tmp_path, 20).read(np.array([3]), (20, 20), NO_SHIFT)
+    image = store_frames([episode], tmp_path, 20).read(np.array([3]), 20)
     batch = make_batch(torch.from_numpy(image))
     expected = image_to_input(list(episode.decode())[3], contract)
     np.testing.assert_allclose(normalised(batch, contract).numpy(), expected, atol=1e-6)
 
 
-def test_a_video_that_breaks_off_gives_its_first_images(episode: Episode, tmp_path: Path) -> None:
+def test_a_video_that_breaks_off_gives_its_first_images(
+    episode: FlightData, tmp_path: Path
+) -> None:
     images = list(episode.decode())[:5]
     broken = replace(episode, fingerprint="broken", decode=lambda: iter(images))
-    both = store([episode, broken], tmp_path)
+    both = store_frames([episode, broken], tmp_path, 32)
     assert both.counts == [12, 5]
-    np.testing.assert_array_equal(both.read(np.array([14]), (32, 32), NO_SHIFT)[0], images[2])
+    np.testing.assert_array_equal(both.read(np.array([14]), 32)[0], images[2])
     assert both.only([1]).counts == [5]
     assert len(broken.first_frames(5).captured_ns) == 5
 
 
 def test_a_shift_moves_down_and_right_and_repeats_the_edge() -> None:
     image = np.arange(16, dtype=np.uint8).reshape(1, 4, 4, 1).repeat(3, axis=3)
-    moved = FrameStore([image]).read(np.array([0]), (4, 4), np.array([[1, -1]]))[0, :, :, 0]
+    moved = FrameStore([image]).read(np.array([0]), 4, np.array([[1, -1]]))[0, :, :, 0]
     assert moved[0].tolist() == [1, 2, 3, 3]
     assert moved[1].tolist() == [1, 2, 3, 3]
     assert moved[3].tolist() == [9, 10, 11, 11]
 
 
-def test_no_image_at_all_is_an_error(episode: Episode, tmp_path: Path) -> None:
+def test_no_image_at_all_is_an_error(episode: FlightData, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no frame of its video"):
-        store([replace(episode, fingerprint="empty", decode=lambda: iter(()))], tmp_path)
+        store_frames([replace(episode, fingerprint="empty", decode=lambda: iter(()))], tmp_path, 32)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_disk_without_room_is_refused_before_decoding(
-    episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    episode: FlightData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = SimpleNamespace(free=1000)
     monkeypatch.setattr(dataset_frames.shutil, "disk_usage", lambda path: full)
     with pytest.raises(DatasetError, match=r"0\.0 GB are free"):
-        store([episode], tmp_path)
+        store_frames([episode], tmp_path, 32)
     assert not list(tmp_path.iterdir())
 
 

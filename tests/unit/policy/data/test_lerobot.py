@@ -14,7 +14,7 @@ import pytest
 
 from helpers.flight_folders import LEVEL, spot
 from policy.contract import ACTION_NAMES, STATE_NAMES
-from policy.data.episodes import DatasetError, measured_ages
+from policy.data.flight_data import DatasetError
 from policy.data.lerobot import is_lerobot, read_dataset
 
 FPS, SIZE = 25, 32
@@ -87,7 +87,7 @@ def test_a_foreign_dataset_has_its_timestamps_for_everything(kind: str, tmp_path
     episodes = read_dataset(tmp_path / "a")
     assert [len(episode.tick_ns) for episode in episodes] == list(LENGTHS)
     assert len({episode.fingerprint for episode in episodes}) == 2
-    assert len(measured_ages(episodes)) == 0
+    assert all(len(episode.age_ns) == 0 for episode in episodes)
     for number, episode in enumerate(episodes):
         for name in ("tick_ns", "attitude_ns", "velocity_ns", "target_ns", "sent_ns"):
             np.testing.assert_array_equal(getattr(episode, name), episode.captured_ns)
@@ -126,7 +126,7 @@ def _second_camera(info: dict[str, Any]) -> None:
         (_state(shape=[14]), r"shape \[14\]"),
         (_state(names=None), "named None"),
         (_state(names=list(STATE_NAMES[::-1])), "in this order"),
-        (_state(info={"state_frame": "body"}), "do not know: 'body'"),
+        (_state(info={"state_frame": "body"}), "state frame is 'body'"),
         (lambda info: info["features"].pop(CAMERA), "no camera"),
         (_second_camera, "--camera-key"),
         (lambda info: info.update(video_path="elsewhere/{video_key}.mp4"), "copy the dataset"),

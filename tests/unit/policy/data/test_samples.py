@@ -12,14 +12,13 @@ from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy import rotation
 from policy.contract import QUATERNION, RATE, VELOCITY, Contract
-from policy.data.episodes import DatasetError, Episode
+from policy.data.flight_data import DatasetError, FlightData
 from policy.data.samples import (
     BLIND_SHARE,
     FRESH_START_SHARE,
     HISTORY_NOISE,
     Samples,
     Timeline,
-    mirror,
 )
 
 MS = 1_000_000
@@ -30,7 +29,7 @@ def no_images() -> Iterator[NDArray[np.uint8]]:
     return iter(())
 
 
-def flown(start_ns: int = 10**12, ticks: int = 200, seed: int = 0, **changes: object) -> Episode:
+def flown(start_ns: int = 10**12, ticks: int = 200, seed: int = 0, **changes: object) -> FlightData:
     """A restless flight at 100 Hz with true stamps that are never quite on the grid."""
     random = np.random.default_rng(seed)
     tick_ns = start_ns + np.arange(ticks) * 10 * MS + random.integers(0, MS, ticks)
@@ -40,7 +39,7 @@ def flown(start_ns: int = 10**12, ticks: int = 200, seed: int = 0, **changes: ob
     state[:, QUATERNION] = rotation.about_z(angle)
     attitude_ns = tick_ns - random.integers(1, 5, ticks) * MS
     captured_ns = start_ns + np.arange(ticks // 3) * 33 * MS
-    episode = Episode(
+    episode = FlightData(
         name="made up",
         state_frame="ned_frd",
         tick_ns=tick_ns,
@@ -60,7 +59,7 @@ def flown(start_ns: int = 10**12, ticks: int = 200, seed: int = 0, **changes: ob
     return replace(episode, **changes)  # type: ignore[arg-type]
 
 
-def timeline(*episodes: Episode, contract: Contract = CONTRACT) -> Timeline:
+def timeline(*episodes: FlightData, contract: Contract = CONTRACT) -> Timeline:
     return Timeline(episodes, contract, np.sort(episodes[0].age_ns))
 
 
@@ -163,7 +162,7 @@ def test_the_runtime_tells_the_same_of_an_image() -> None:
         for frame in frames[(age_ns >= 0) & (age_ns < 200 * MS)]:
             expected = runtime.append_to(state, int(episode.captured_ns[frame]))
             told = line.states(np.array([frame]), np.array([tick]))
-            np.testing.assert_allclose(told, expected, atol=2e-5)
+            np.testing.assert_allclose(told, expected, atol=1e-6)
 
 
 def test_without_since_exposure_the_state_has_13_numbers() -> None:
@@ -220,14 +219,13 @@ def test_a_mirrored_flight_is_a_flight() -> None:
     state = random.normal(size=(30, 20)).astype(np.float32)
     state[:, QUATERNION] = q
     samples = Samples(
-        frame=np.arange(30),
         state=state,
         history=random.normal(size=(30, 4, 4)).astype(np.float32),
         chunk=random.normal(size=(30, 4, 4)).astype(np.float32),
         known=np.ones((30, 4), bool),
         gate=random.normal(size=(30, 7)).astype(np.float32),
     )
-    left = mirror(samples, np.arange(30) % 2 == 0)
+    left = samples.mirrored(np.arange(30) % 2 == 0)
     np.testing.assert_array_equal(left.state[1::2], samples.state[1::2])
     mirrored = left.state[::2]
 

@@ -7,17 +7,17 @@ import pytest
 
 from helpers.steered_flights import ACCELERATION_MPS2, MS, YAW_RATE_RADPS, steered_flight
 from policy.contract import QUATERNION, VELOCITY
-from policy.data.episodes import DatasetError, Episode
+from policy.data.flight_data import DatasetError, FlightData
 from policy.data.windows import TOLERANCE, Windows, find_windows
 
 DT_NS = 100 * MS
 
 
-def windows_of(*episodes: Episode, dt_s: float = 0.1) -> Windows:
+def windows_of(*episodes: FlightData, dt_s: float = 0.1) -> Windows:
     return find_windows(episodes, context_frames=2, frames=4, frame_dt_s=dt_s)
 
 
-def without(episode: Episode, *dropped: int) -> Episode:
+def without(episode: FlightData, *dropped: int) -> FlightData:
     kept = np.setdiff1d(np.arange(len(episode.captured_ns)), dropped)
     return replace(episode, captured_ns=episode.captured_ns[kept], gate=episode.gate[kept])
 

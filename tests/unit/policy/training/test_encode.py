@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from policy.training.batches import PooledStore
+from policy.training.batches import FeatureStore
 from policy.training.encode import ENCODE_BATCH, Job, both_ways, encode_rows, one_way_first
 
 FRAMES = 2 * ENCODE_BATCH + 10
 
 
-def encoded(path: Path, jobs: list[Job], *, jobs_done: int) -> PooledStore:
+def encoded(path: Path, jobs: list[Job], *, jobs_done: int) -> FeatureStore:
     """Outputs that tell their image; negative where it was mirrored."""
     asked = iter(range(1, len(jobs) + 1))
 
@@ -19,7 +19,7 @@ def encoded(path: Path, jobs: list[Job], *, jobs_done: int) -> PooledStore:
         sign = -1.0 if is_mirrored else 1.0
         return sign * (1.0 + torch.from_numpy(frames).float())[:, None].expand(-1, 2)
 
-    return encode_rows(path, jobs, encode, dim=2, go_on=lambda _: next(asked) < jobs_done)
+    return encode_rows(path, jobs, encode, dim=2, should_continue=lambda _: next(asked) < jobs_done)
 
 
 def test_half_of_the_time_encodes_each_image_one_way(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from policy.data.samples import Timeline
 from policy.nets.toge import Toge, TogeConfig
 from policy.training.batches import Batch, Batches
 from policy.training.parallel import Gradients, StepLoss
+from policy.training.settings import TrainSettings
 from policy.training.trainee import Trainee
 
 CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
@@ -32,24 +33,23 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 def batch(tmp_path_factory: pytest.TempPathFactory) -> Batch:
     folder = tmp_path_factory.mktemp("flight")
     flight = read_flight(write_spot_flight(folder / "flight", 0, seconds=0.6))
-    store = store_frames(
-        [flight], height=32, width=32, folder=folder / "frames", progress=lambda _: None
-    )
+    store = store_frames([flight], folder / "frames", 32)
+    settings = TrainSettings(out=folder / "a.safetensors", image_size=32, batch_size=7, repeats=3)
     ages_ns = np.array([20_000_000], np.int64)
     batches = Batches(
-        Timeline([flight], CONTRACT, ages_ns), store, timesteps=100, seed=0, mirrors=True
+        Timeline([flight], CONTRACT, ages_ns), store, timesteps=100, settings=settings
     )
-    return batches.with_images(0, count=7, repeats=3, size=(32, 32))
+    return batches.with_images(0, 32)
 
 
 def trainee() -> Trainee:
     torch.manual_seed(0)
-    return Trainee(Toge(TogeConfig(backbone="resnet18", contract=CONTRACT)))
+    return Trainee(Toge(TogeConfig(backbone="resnet8", contract=CONTRACT)), gate_weight=1.0)
 
 
 def losses(model: Trainee, batch: Batch) -> StepLoss:
-    made = model(batch, torch.ones(4))
-    return StepLoss(total=made.sticks + made.gate, told={"loss": made.sticks})
+    loss: StepLoss = model(batch)
+    return loss
 
 
 def frozen(model: Trainee) -> None:
@@ -97,7 +97,7 @@ def test_statistics_of_norms_are_those_of_the_first_part(batch: Batch, threads: 
         gradients.each(Trainee.train)
         gradients.compute(batch, losses)
     alone = trainee().train()
-    alone(batch.split(threads)[0], torch.ones(4))
+    alone(batch.split(threads)[0])
     after = model.policy.backbone.bn1.running_mean  # type: ignore[union-attr]
     assert not torch.equal(before, after)  # type: ignore[arg-type]
     torch.testing.assert_close(after, alone.policy.backbone.bn1.running_mean)  # type: ignore[union-attr]

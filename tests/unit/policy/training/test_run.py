@@ -1,9 +1,10 @@
 """Training on flights in which the image alone says what to do."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import count, pairwise
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,10 @@ import torch
 from safetensors import safe_open
 
 from helpers.flight_folders import write_spot_flight
-from helpers.training_runs import check_resuming, check_stopping, weights_of
+from helpers.training_runs import check_resuming, check_stopping, make_hooks, weights_of
 from policy.checkpoints.policy_file import TRAINING_KEY, load_checkpoint
 from policy.contract import Contract
-from policy.data.episodes import DatasetError, Episode
+from policy.data.flight_data import DatasetError, FlightData
 from policy.data.flight_folders import read_flight
 from policy.data.frames import store_frames
 from policy.data.samples import Timeline
@@ -23,26 +24,21 @@ from policy.errors import PolicyError
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 from policy.training.batches import Batches
-from policy.training.plan import Budget, TrainSettings, learning_rate_factor, make_stages
-from policy.training.report import Progress, TrainResult
-from policy.training.run import train
-from policy.training.state import Position, RunFolder, TrainingError
+from policy.training.policy_run import Network, train_policy
+from policy.training.report import Hooks, TrainingProgress, TrainResult
+from policy.training.run_folder import Position, RunFolder, TrainingError
+from policy.training.settings import TrainSettings
+from policy.training.stages import learning_rate_factor, policy_stages
 from policy.training.trainee import Trainee, gate_labels, gate_loss
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Sums of two threads differ in the last bit; and the other cores are somebody else's."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+NETWORK = TogeConfig(backbone="resnet8", contract=CONTRACT)
 
 
 @pytest.fixture(scope="module")
-def episodes(tmp_path_factory: pytest.TempPathFactory) -> list[Episode]:
+def flights(tmp_path_factory: pytest.TempPathFactory) -> list[FlightData]:
     """Short ones, to run through."""
     folder = tmp_path_factory.mktemp("flights")
     return [read_flight(write_spot_flight(folder / str(n), n, seconds=0.6)) for n in range(3)]
@@ -50,9 +46,9 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> list[Episode]:
 
 def settings(out: Path, **changes: object) -> TrainSettings:
     made = TrainSettings(
-        policy=TogeConfig(backbone="resnet18", contract=CONTRACT),
         out=out / "trained.safetensors",
-        budget=Budget(steps=4),
+        image_size=32,
+        steps=4,
         batch_size=8,
         repeats=2,
         head_batch_size=32,
@@ -65,123 +61,106 @@ def settings(out: Path, **changes: object) -> TrainSettings:
 
 
 def run(
-    episodes: list[Episode],
+    flights: list[FlightData],
     settings: TrainSettings,
-    report: Callable[[Progress], None] = lambda progress: None,
+    report: Callable[[TrainingProgress], None] = lambda _: None,
     check: Callable[[Path], float] | None = None,
-    should_stop: Callable[[], bool] = lambda: False,
+    network: Network = NETWORK,
 ) -> TrainResult:
-    ticking = count()
-    return train(
-        episodes,
-        settings,
-        now_s=lambda: next(ticking) * 0.1,
-        report=report,
-        should_stop=should_stop,
-        check=check,
-    )
+    return train_policy(flights, network, settings, make_hooks(report), check)
 
 
 def test_learns_where_the_image_says_to_go(tmp_path: Path) -> None:
-    episodes = [read_flight(write_spot_flight(tmp_path / str(n), n)) for n in range(4)]
-    result = run(episodes, settings(tmp_path, budget=Budget(steps=60), batch_size=16))
+    flights = [read_flight(write_spot_flight(tmp_path / str(n), n)) for n in range(4)]
+    asked = settings(tmp_path, steps=60, batch_size=16)
+    result = run(flights, asked)
     held_out = result.validation
     assert held_out is not None
     assert held_out.stick_error < 0.6 * held_out.mean_stick_error
     assert held_out.stick_error < 0.6 * held_out.hold_error
-    policy = load_checkpoint(result.checkpoint, fallback=settings(tmp_path).policy)
+    policy = load_checkpoint(result.checkpoint, fallback=NETWORK)
     assert policy.contract == replace(CONTRACT, feature_dim=256)
     with safe_open(result.checkpoint, framework="pt") as file:
         card = json.loads(file.metadata()[TRAINING_KEY])
     assert card["flights"] == 3
     ages = card["feature_age_ms"]
     assert sum(ages["counts_from_0"][8:15]) == sum(ages["counts_from_0"]) > 1000  # 40..75 ms
-    log = [json.loads(line) for line in _log(settings(tmp_path)).splitlines()]
-    assert {"loss", "gate_loss", "learning_rate", "stage", "fraction"} <= set(log[0])
-    assert list(settings(tmp_path).work_folder.iterdir()) == [
-        settings(tmp_path).work_folder / "log.jsonl"
-    ]
+    log = asked.work_folder / "log.jsonl"
+    first = json.loads(log.read_text().splitlines()[0])
+    assert {"loss", "gate_loss", "learning_rate", "stage", "fraction"} <= set(first)
+    assert list(asked.work_folder.iterdir()) == [log]
 
 
-def _log(of: TrainSettings) -> str:
-    return (of.work_folder / "log.jsonl").read_text()
-
-
-def short_run(out: Path, **changes: object) -> TrainSettings:
-    """Two steps of encoder and head, state kept, two of the head, state kept, two more."""
-    out.mkdir(exist_ok=True)
-    return settings(out, budget=Budget(steps=6), validations=3, **changes)
+def train_shortly(
+    flights: list[FlightData], hooks: Hooks, folder: Path, *, resume: bool = False
+) -> TrainResult:
+    """Two steps of encoder and head, state saved, two of the head, state saved, two more."""
+    asked = settings(folder, steps=6, validations=3, resume=resume)
+    return train_policy(flights, NETWORK, asked, hooks)
 
 
 @pytest.fixture(scope="module")
-def whole(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
-    return run(episodes, short_run(tmp_path_factory.mktemp("whole")))
+def whole(flights: list[FlightData], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
+    return train_shortly(flights, make_hooks(), tmp_path_factory.mktemp("whole"))
 
 
-@pytest.mark.parametrize("killed_at", [4, 6, None])  # in the encoder; in the head; stopped
-def test_a_run_that_was_ended_goes_on_as_if_it_had_not_been(
-    episodes: list[Episode], whole: TrainResult, tmp_path: Path, killed_at: int | None
+@pytest.mark.parametrize("killed_at", [4, 6])  # in the encoder; in the head
+def test_a_run_that_was_killed_resumes_as_if_it_had_not_been(
+    flights: list[FlightData], whole: TrainResult, tmp_path: Path, killed_at: int
 ) -> None:
-    def train_there(
-        episodes: list[Episode],
-        *,
-        resume: bool = False,
-        report: Callable[[Progress], None] = lambda _: None,
-        should_stop: Callable[[], bool] = lambda: False,
-    ) -> TrainResult:
-        return run(episodes, short_run(tmp_path, resume=resume), report, should_stop=should_stop)
+    train = partial(train_shortly, folder=tmp_path)
+    check_resuming(train, flights, whole, killed_at=killed_at)
 
-    if killed_at is None:
-        check_stopping(train_there, episodes, whole, validated_at=4)
-    else:
-        check_resuming(train_there, episodes, whole, killed_at=killed_at)
+
+def test_a_run_that_was_stopped_resumes_as_if_it_had_not_been(
+    flights: list[FlightData], whole: TrainResult, tmp_path: Path
+) -> None:
+    check_stopping(partial(train_shortly, folder=tmp_path), flights, whole, validated_at=4)
 
 
 def test_resnet_unet_trains_too_and_an_ablation_is_a_weight_of_zero(
-    episodes: list[Episode], tmp_path: Path
+    flights: list[FlightData], tmp_path: Path
 ) -> None:
     network = ResnetUnetConfig(contract=CONTRACT)
-    made = settings(tmp_path, policy=network, gate_weight=0.0, mirror=False, validations=1)
-    result = run(episodes[:2], made)
+    made = settings(tmp_path, gate_weight=0.0, mirror=False, validations=1)
+    result = run(flights[:2], made, network=network)
     assert load_checkpoint(result.checkpoint, fallback=network).contract == CONTRACT
 
 
 def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(
-    episodes: list[Episode], tmp_path: Path
+    flights: list[FlightData], tmp_path: Path
 ) -> None:
     scores = iter([0.9, 0.3])
     seen: list[Path] = []
 
     def check(path: Path) -> float:
         seen.append(path)
-        load_checkpoint(path, fallback=settings(tmp_path).policy)
+        load_checkpoint(path, fallback=NETWORK)
         return next(scores)
 
     made = settings(tmp_path, check_every=1, validation_fraction=0.0)
-    result = run(episodes[:2], made, check=check)
+    result = run(flights[:2], made, check=check)
     assert result.score == 0.9
     assert len(seen) == 2
     assert result.validation is None
     further = replace(
         made, start_from=result.checkpoint, out=tmp_path / "next.safetensors", learning_rate=0.0
     )
-    again = weights_of(run(episodes[:2], further).checkpoint)
+    again = weights_of(run(flights[:2], further).checkpoint)
     before = weights_of(result.checkpoint)
     same = [name for name in before if before[name] == again[name]]
     assert "head.unet.out.weight" in same
-    other = replace(further, policy=TogeConfig(backbone="resnet50", contract=CONTRACT))
-    with pytest.raises(PolicyError, match=r"another policy: backbone 'resnet18'"):
-        run(episodes[:2], other)
+    other = TogeConfig(backbone="resnet50", contract=CONTRACT)
+    with pytest.raises(PolicyError, match=r"another policy: backbone 'resnet8'"):
+        run(flights[:2], further, network=other)
 
 
 def test_a_frozen_encoder_stays_and_the_head_learns(
-    episodes: list[Episode], tmp_path: Path, whole: TrainResult
+    flights: list[FlightData], tmp_path: Path, whole: TrainResult
 ) -> None:
-    made = settings(
-        tmp_path, start_from=whole.checkpoint, freeze_encoder=True, budget=Budget(steps=3)
-    )
+    made = settings(tmp_path, start_from=whole.checkpoint, freeze_encoder=True, steps=3)
     stages: list[str] = []
-    result = run(episodes, made, lambda progress: stages.append(progress.stage))
+    result = run(flights, made, lambda progress: stages.append(progress.stage))
     before, after = weights_of(whole.checkpoint), weights_of(result.checkpoint)
     encoder = [name for name in before if name.startswith("backbone.")]
     assert [name for name in encoder if before[name] != after[name]] == []
@@ -191,92 +170,103 @@ def test_a_frozen_encoder_stays_and_the_head_learns(
         replace(made, start_from=None)
 
 
-def test_in_training_the_denoiser_sees_a_part_of_many_samples(tmp_path: Path) -> None:
-    episode = read_flight(write_spot_flight(tmp_path / "flight", 0, seconds=1.5))
-    store = store_frames(
-        [episode], height=32, width=32, folder=tmp_path / "frames", progress=lambda _: None
-    )
-    timeline = Timeline([episode], CONTRACT, np.array([40_000_000]))
-    batches = Batches(timeline, store, timesteps=100, seed=0, mirrors=True)
-    trainee = Trainee(Toge(TogeConfig(backbone="resnet18", contract=CONTRACT)))
-    rows: list[int] = []
-    trainee.policy.head.unet.register_forward_hook(lambda _, args, out: rows.append(len(out)))
-    for images in (4, 16, 64):
-        batch = batches.with_images(0, count=images, repeats=2, size=(32, 32))
-        for is_training in (True, False):
-            trainee.train(is_training)
-            trainee(batch, torch.ones(4))
-    assert rows == [8, 8, 16, 32, 32, 128]
+@pytest.mark.parametrize(("images", "rows"), [(4, [8, 8]), (16, [16, 32]), (64, [32, 128])])
+def test_in_training_the_denoiser_sees_a_part_of_many_samples(
+    flights: list[FlightData], tmp_path: Path, images: int, rows: list[int]
+) -> None:
+    asked = settings(tmp_path, batch_size=images)
+    store = store_frames(flights, tmp_path / "frames", 32)
+    timeline = Timeline(flights, CONTRACT, np.array([40_000_000]))
+    batches = Batches(timeline, store, timesteps=100, settings=asked)
+    trainee = Trainee(Toge(NETWORK), gate_weight=0.0)
+    seen: list[int] = []
+    trainee.policy.head.unet.register_forward_hook(lambda _, args, out: seen.append(len(out)))
+    for is_training in (True, False):
+        trainee.train(is_training)
+        trainee(batches.with_images(0, 32))
+    assert seen == rows
 
 
 def test_a_packed_checkpoint_is_smaller_and_flies_alike(
-    episodes: list[Episode], tmp_path: Path, whole: TrainResult
+    flights: list[FlightData], tmp_path: Path, whole: TrainResult
 ) -> None:
-    result = run(episodes, settings(tmp_path, pack=True))
-    assert result.checkpoint.stat().st_size < whole.checkpoint.stat().st_size / 2.5
-    load_checkpoint(result.checkpoint, fallback=settings(tmp_path).policy)
+    result = run(flights, settings(tmp_path, pack=True))
+    assert result.checkpoint.stat().st_size < whole.checkpoint.stat().st_size / 1.8
+    load_checkpoint(result.checkpoint, fallback=NETWORK)
 
 
 def test_a_budget_of_time_ends_and_has_time_for_the_head(
-    episodes: list[Episode], tmp_path: Path
+    flights: list[FlightData], tmp_path: Path
 ) -> None:
     stages: list[str] = []
     result = run(
-        episodes[:2],
-        settings(tmp_path, budget=Budget(seconds=4.0), validations=1),
+        flights[:2],
+        settings(tmp_path, steps=None, minutes=4 / 60, validations=1),
         lambda progress: stages.append(progress.stage),
     )
     assert 0 < result.steps < 200
     assert "head" in stages
 
 
-def test_weights_that_diverge_are_refused(episodes: list[Episode], tmp_path: Path) -> None:
+def test_weights_that_diverge_are_refused(flights: list[FlightData], tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="diverged"):
-        run(episodes[:2], settings(tmp_path, budget=Budget(steps=44), learning_rate=1e30))
+        run(flights[:2], settings(tmp_path, steps=44, learning_rate=1e30))
 
 
-def test_flights_that_do_not_fit_are_refused(episodes: list[Episode], tmp_path: Path) -> None:
+def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no flights"):
         run([], settings(tmp_path))
-    enu = replace(episodes[0], state_frame="enu_flu")
+    enu = replace(flights[0], state_frame="enu_flu")
     with pytest.raises(DatasetError, match="one kind at a time"):
-        run([episodes[0], enu], settings(tmp_path))
+        run([flights[0], enu], settings(tmp_path))
     with pytest.raises(DatasetError, match="enu_flu states"):
         run([enu], settings(tmp_path))
-    blind = replace(episodes[0], age_ns=np.zeros(0, np.int64))
+    blind = replace(flights[0], age_ns=np.zeros(0, np.int64))
     with pytest.raises(DatasetError, match="--ages"):
         run([blind], settings(tmp_path))
     with pytest.raises(TrainingError, match="no folder"):
-        run(episodes, settings(tmp_path / "missing"))
+        run(flights, settings(tmp_path / "missing"))
     with pytest.raises(TrainingError, match="no run to resume"):
-        run(episodes[:2], settings(tmp_path, resume=True))
+        run(flights[:2], settings(tmp_path, resume=True))
 
 
-def test_settings_that_no_run_could_use_are_refused(tmp_path: Path) -> None:
-    for changes in (
-        {"batch_size": 1},
-        {"validation_fraction": 1.0},
-        {"repeats": 0},
-        {"start_from": tmp_path, "backbone_weights": tmp_path},
-    ):
-        with pytest.raises(PolicyError):
-            settings(tmp_path, **changes)
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"batch_size": 1}, "--batch-size must be between 2 and"),
+        ({"validation_fraction": 1.0}, "--validation-fraction"),
+        ({"repeats": 0}, "--repeats"),
+        ({"start_from": Path(), "backbone_weights": Path()}, "leave out --backbone-weights"),
+        ({"minutes": 1.0}, "contradict"),
+        ({"steps": 0}, "--steps"),
+        ({"steps": None, "minutes": float("nan")}, "--minutes"),
+        ({"ages": "90:40"}, "LOW:HIGH"),
+        ({"ages": "few:many"}, "LOW:HIGH"),
+    ],
+)
+def test_settings_that_no_run_could_use_are_refused(
+    tmp_path: Path, changes: dict[str, object], says: str
+) -> None:
+    with pytest.raises(PolicyError, match=says):
+        settings(tmp_path, **changes)
     with pytest.raises(PolicyError, match="safetensors"):
         replace(settings(tmp_path), out=tmp_path / "a.pt")
-    for budget in ({}, {"steps": 1, "seconds": 1.0}, {"steps": 0}, {"seconds": float("nan")}):
-        with pytest.raises(PolicyError):
-            Budget(**budget)  # type: ignore[arg-type]
+
+
+def test_the_default_budget_is_45_minutes(tmp_path: Path) -> None:
+    made = settings(tmp_path, steps=None, validations=None)
+    assert made.fraction(10**6, 45 * 60 / 2) == 0.5
+    assert made.validation_count == 20
 
 
 def test_stages_grow_and_fill_the_budget(tmp_path: Path) -> None:
-    contract = Contract(image_height=224, image_width=160)
-    stages = make_stages(settings(tmp_path, policy=TogeConfig(contract=contract)))
-    assert [stage.image_size for stage in stages] == [(128, 96), (160, 128), (224, 160), (224, 160)]
+    stages = policy_stages(settings(tmp_path, image_size=224))
+    assert [stage.image_size for stage in stages] == [96, 160, 224, 224]
     assert [stage.trains_encoder for stage in stages] == [True, True, True, False]
     assert stages[0].start == 0
     assert stages[-1].end == 1
     assert all(a.end == b.start for a, b in pairwise(stages))
-    assert [s.image_size for s in make_stages(settings(tmp_path))] == [(32, 32), (32, 32)]
+    assert [s.image_size for s in policy_stages(settings(tmp_path))] == [32, 32]
 
 
 def test_learning_rate_warms_up_and_falls() -> None:

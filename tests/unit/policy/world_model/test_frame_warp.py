@@ -9,29 +9,30 @@ from torch import Tensor
 
 from helpers.panoramas import FRD_FROM_FLU, attitude, nominal_lens, panorama, state_of
 from mavbridge.commands.evaluate_imagination.scores import psnr_db
-from policy.contract import StateFrame
-from policy.data.samples import mirror_signs
+from policy.contract import Contract, StateFrame
+from policy.data.samples import state_signs
 from policy.world_model.autoencoder import to_bytes, to_unit
-from policy.world_model.frame_warp import CarriedView, Poses, View
+from policy.world_model.config import WorldModelConfig
+from policy.world_model.frame_warp import FrameWarp, Poses, SourceFrame
 from policy.world_model.relative_state import motion_since, poses_after, vertical_in_body
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZE, CELLS = 64, 8
 TILT_RAD = math.radians(10.0)
 
 
-def carrier(
-    *, tilt_rad: float = TILT_RAD, state_frame: StateFrame = "ned_frd", channels: int = 1
-) -> CarriedView:
+def make_warp(*, tilt_rad: float = TILT_RAD, state_frame: StateFrame = "ned_frd") -> FrameWarp:
+    config = WorldModelConfig(
+        latent_channels=1,
+        image_size=SIZE,
+        horizontal_fov_rad=math.radians(90.0),
+        camera_tilt_rad=tilt_rad,
+        contract=Contract(state_frame=state_frame),
+    )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return CarriedView(
-            latent_channels=channels,
-            latent_side=CELLS,
-            image_size=SIZE,
-            horizontal_fov_rad=math.radians(90.0),
-            camera_tilt_rad=tilt_rad,
-            state_frame=state_frame,
-        )
+        return FrameWarp(config)
 
 
 def poses(rotation: Tensor, position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Poses:
@@ -57,10 +58,10 @@ def turn(
     return Poses(rotation=rotation, position_m=position_m, progress=torch.ones(1, 1))
 
 
-def seen(pixels: Tensor, nearness: float = -3.0) -> View:
-    """The same nearness everywhere, before softplus."""
-    level = torch.tensor([nearness, 0.0]).view(1, 2, 1, 1).expand(len(pixels), 2, 16, 16)
-    return View(pixels=pixels, nearness=level)
+def seen(pixels: Tensor, inverse_depth: float = -3.0) -> SourceFrame:
+    """The same inverse_depth everywhere, before softplus."""
+    level = torch.tensor([inverse_depth, 0.0]).view(1, 2, 1, 1).expand(len(pixels), 2, 16, 16)
+    return SourceFrame(pixels=pixels, inverse_depth=level)
 
 
 def spot(across_px: float, down_px: float) -> Tensor:
@@ -82,7 +83,7 @@ def place_of(frame: Tensor) -> tuple[float, float]:
 def test_a_turn_moves_things_the_other_way_by_as_many_pixels_as_the_lens_says() -> None:
     focal_px, angle_rad = SIZE / 2, math.radians(12.0)
     away_px = focal_px * math.tan(angle_rad)
-    level = carrier(tilt_rad=0.0)
+    level = make_warp(tilt_rad=0.0)
     sine, cosine = math.sin(angle_rad), math.cos(angle_rad)
     for poses_of, start, end in (
         (turn(yaw_rad=angle_rad), (0.0, 0.0), (-away_px, 0.0)),
@@ -91,7 +92,7 @@ def test_a_turn_moves_things_the_other_way_by_as_many_pixels_as_the_lens_says() 
         (turn(roll_rad=angle_rad), (16.0, 0.0), (16.0 * cosine, -16.0 * sine)),
         (turn(roll_rad=-angle_rad), (16.0, 0.0), (16.0 * cosine, 16.0 * sine)),
     ):
-        made, _ = level.moved(seen(spot(*start)), poses_of)
+        made, _ = level.warp(seen(spot(*start)), poses_of)
         assert place_of(made) == pytest.approx(end, abs=0.4)  # perspective widens the spot
 
 
@@ -108,7 +109,7 @@ def test_a_turn_shows_what_the_lens_of_the_evaluation_shows(
     rotation = before.T @ after
     if state_frame == "enu_flu":
         rotation = FRD_FROM_FLU @ rotation @ FRD_FROM_FLU
-    made, in_view = carrier(state_frame=state_frame).moved(
+    made, in_view = make_warp(state_frame=state_frame).warp(
         seen(to_unit(torch.from_numpy(image[None]))), poses(torch.from_numpy(rotation))
     )
     wanted = lens.turned(image, before, after)
@@ -124,19 +125,19 @@ def test_what_is_ahead_grows_as_it_is_approached() -> None:
     distance_m, flown_m = 10.0, 4.0
     wall = math.log(math.expm1(1.0 / (distance_m - flown_m)))  # softplus makes that of it
     for state_frame in ("ned_frd", "enu_flu"):
-        level = carrier(tilt_rad=0.0, state_frame=state_frame)
+        level = make_warp(tilt_rad=0.0, state_frame=state_frame)
         forward = poses(torch.eye(3), (flown_m, 0.0, 0.0))
-        made, in_view = level.moved(seen(spot(9.0, -6.0), wall), forward)
+        made, in_view = level.warp(seen(spot(9.0, -6.0), wall), forward)
         growth = distance_m / (distance_m - flown_m)
         assert place_of(made) == pytest.approx((9.0 * growth, -6.0 * growth), abs=0.3)
         assert in_view.all()
         down = poses(torch.eye(3), (0.0, 0.0, 1.0 if state_frame == "ned_frd" else -1.0))
-        made, in_view = level.moved(seen(spot(0.0, 0.0), wall), down)
+        made, in_view = level.warp(seen(spot(0.0, 0.0), wall), down)
         assert place_of(made) == pytest.approx((0.0, -32.0 / (distance_m - flown_m)), abs=0.3)
         assert not in_view.all()
 
 
-def test_the_way_is_the_integral_of_the_velocity_in_the_axes_of_now() -> None:
+def test_the_translation_is_the_integral_of_the_velocity_in_the_axes_of_now() -> None:
     ahead = turn(yaw_rad=0.4, speed_mps=5.0)
     torch.testing.assert_close(ahead.position_m[0, 0], torch.tensor([0.5, 0.0, 0.0]))
     now = torch.from_numpy(state_of(0.0, 0.0, math.pi / 2))[None]  # facing east
@@ -150,41 +151,41 @@ def test_the_way_is_the_integral_of_the_velocity_in_the_axes_of_now() -> None:
 
 
 def test_a_mirrored_flight_sees_the_mirrored_frames() -> None:
-    signs = torch.from_numpy(mirror_signs(13))
+    signs = torch.from_numpy(state_signs(13))
     before = torch.from_numpy(state_of(0.1, -0.1, 0.5))[None]
     after = torch.from_numpy(state_of(-0.2, 0.05, 0.9))[None, None]
     before[:, :3] = torch.tensor([3.0, 1.0, 0.4])
     after[..., :3] = torch.tensor([2.0, 2.0, -0.4])
     random = torch.Generator().manual_seed(0)
     pixels = torch.rand(1, 3, SIZE, SIZE, generator=random)
-    nearness = torch.randn(1, 2, 16, 16, generator=random)
-    view = carrier()
+    inverse_depth = torch.randn(1, 2, 16, 16, generator=random)
+    warp = make_warp()
 
-    def moved(pixels: Tensor, nearness: Tensor, before: Tensor, after: Tensor) -> Tensor:
+    def warped(pixels: Tensor, inverse_depth: Tensor, before: Tensor, after: Tensor) -> Tensor:
         rotation, position_m = poses_after(before, motion_since(before[:, None], after), 0.1)
         at = Poses(rotation=rotation, position_m=position_m, progress=torch.full((1, 1), 0.5))
-        frames, in_view = view.moved(View(pixels=pixels, nearness=nearness), at)
+        frames, in_view = warp.warp(SourceFrame(pixels=pixels, inverse_depth=inverse_depth), at)
         return torch.cat([frames[0, 0], in_view[0].float()])
 
-    plain = moved(pixels, nearness, before, after)
-    mirrored = moved(pixels.flip(-1), nearness.flip(-1), before * signs, after * signs)
+    plain = warped(pixels, inverse_depth, before, after)
+    mirrored = warped(pixels.flip(-1), inverse_depth.flip(-1), before * signs, after * signs)
     torch.testing.assert_close(mirrored.flip(-1)[:3], plain[:3], atol=1e-3, rtol=0)
     assert (mirrored.flip(-1)[3] != plain[3]).float().mean() < 0.01  # at the very border
     assert not torch.allclose(plain[:3], pixels[0], atol=0.1)
 
 
 @pytest.mark.parametrize("state_frame", ["ned_frd", "enu_flu"])
-def test_the_ground_is_told_by_the_attitude(state_frame: StateFrame) -> None:
-    view = carrier(state_frame=state_frame)
-    told: list[Tensor] = []
-    view.nearness[0].register_forward_pre_hook(lambda _, given: told.append(given[0]))
+def test_the_attitude_tells_where_the_ground_is(state_frame: StateFrame) -> None:
+    warp = make_warp(state_frame=state_frame)
+    seen_inputs: list[Tensor] = []
+    warp.inverse_depth[0].register_forward_pre_hook(lambda _, given: seen_inputs.append(given[0]))
     state = torch.zeros(2, 13)
     state[0, 3] = 1.0  # level
     state[1, 4] = 1.0  # upside down
-    view.view(
+    warp.source(
         torch.zeros(2, 3, SIZE, SIZE), torch.zeros(2, 1, CELLS, CELLS), vertical_in_body(state)
     )
-    level, inverted = told[0][:, 1]
+    level, inverted = seen_inputs[0][:, 1]
     # At a tilt of 10 degrees the horizon is 5.6 pixels below the middle.
     assert (level[:4] == 0).all()
     assert (level[5:] > 0).all()
@@ -193,22 +194,22 @@ def test_the_ground_is_told_by_the_attitude(state_frame: StateFrame) -> None:
     assert (inverted[5:] == 0).all()
 
 
-def test_nearness_is_learned_from_pictures_alone() -> None:
-    flown_m, nearness_per_m = 1.0, 0.25
-    view = carrier(tilt_rad=0.0)
+def test_inverse_depth_is_learned_from_pictures_alone() -> None:
+    flown_m, inverse_depth_per_m = 1.0, 0.25
+    warp = make_warp(tilt_rad=0.0)
     lens = nominal_lens(SIZE)
     pixels = to_unit(torch.from_numpy(panorama(lens, attitude())[None]))
     forward = poses(torch.eye(3), (flown_m, 0.0, 0.0))
     with torch.no_grad():
-        true, _ = view.moved(seen(pixels, math.log(math.expm1(nearness_per_m))), forward)
+        true, _ = warp.warp(seen(pixels, math.log(math.expm1(inverse_depth_per_m))), forward)
     latents, down = torch.zeros(1, 1, CELLS, CELLS), torch.tensor([[0.0, 0.0, 1.0]])
-    optimiser = torch.optim.Adam(view.parameters(), lr=1e-2)
+    optimiser = torch.optim.Adam(warp.parameters(), lr=1e-2)
     for _ in range(100):
-        made, in_view = view.moved(view.view(pixels, latents, down), forward)
+        made, in_view = warp.warp(warp.source(pixels, latents, down), forward)
         loss = ((made - true).abs().mean(dim=2) * in_view).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    now, growth = view.view(pixels, latents, down).nearness[0]
+    now, growth = warp.source(pixels, latents, down).inverse_depth[0]
     learned = torch.nn.functional.softplus(now + growth)
-    assert np.median(learned.detach().numpy()) == pytest.approx(nearness_per_m, rel=0.2)
+    assert np.median(learned.detach().numpy()) == pytest.approx(inverse_depth_per_m, rel=0.2)

@@ -1,6 +1,5 @@
 """The world model without training: its two roles, its shapes, and what makes it repeatable."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -16,6 +15,8 @@ from policy.world_model.dynamics import Future
 from policy.world_model.model import Imagined, WorldModel
 from policy.world_model.relative_state import MOTION_DIM
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SMALL = WorldModelConfig(
     image_size=32,
     latent_channels=4,
@@ -25,15 +26,6 @@ SMALL = WorldModelConfig(
     dynamics_depth=2,
     contract=Contract(image_height=32, image_width=32),
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """The other cores are somebody else's."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -142,30 +134,30 @@ def test_gradient_reaches_every_weight() -> None:
         actions=torch.randn(2, 4, 4),
     )
     known = torch.tensor([True, False])
-    view = model.view(latents[:, -1], states[:, -1])
-    past = model.foresee(view, latents, states, noisy.actions, known)
-    made = model.denoise(noisy, torch.tensor([3, 99]), past)
+    source = model.source_frame(latents[:, -1], states[:, -1])
+    known_context = model.predict_motion(source, latents, states, noisy.actions, known)
+    made = model.denoise(noisy, torch.tensor([3, 99]), known_context)
     assert torch.equal(made.actions[0], noisy.actions[0])
     loss = loss + sum(part.square().mean() for part in vars(made).values())
     poses = model.poses(states[:, -1], torch.ones(2, 4, MOTION_DIM))
-    loss = loss + model.moved(view, poses)[0].square().mean()
+    loss = loss + model.warp(source, poses)[0].square().mean()
     loss.backward()
     for name, weight in model.named_parameters():
         assert weight.grad is not None, name
         assert weight.grad.abs().sum() > 0, name
 
 
-def test_what_is_not_known_of_the_sticks_is_not_looked_at(model: WorldModel) -> None:
+def test_what_is_not_known_of_the_sticks_is_not_decoded(model: WorldModel) -> None:
     latents, states = context(2)
-    view = model.view(latents[:, -1], states[:, -1])
+    source = model.source_frame(latents[:, -1], states[:, -1])
     known, unknown = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool)
 
-    def foreseen(knows: Tensor, given: Tensor) -> Tensor:
-        return model.foresee(view, latents, states, given, knows).carried
+    def warped(knows: Tensor, given: Tensor) -> Tensor:
+        return model.predict_motion(source, latents, states, given, knows).warped
 
     given, other = actions(2), -actions(2)
-    assert torch.equal(foreseen(unknown, given), foreseen(unknown, other))
-    assert not torch.equal(foreseen(known, given), foreseen(known, other))
+    assert torch.equal(warped(unknown, given), warped(unknown, other))
+    assert not torch.equal(warped(known, given), warped(known, other))
 
 
 class CellCoder(nn.Module):
@@ -183,8 +175,8 @@ class CellCoder(nn.Module):
     denormalise = normalise
 
 
-class Prophet(nn.Module):
-    """In place of a foresight: knows the yaw of each frame, of unit scale as it is given."""
+class KnownYaw(nn.Module):
+    """In place of a motion predictor: knows the yaw of each frame, of unit scale as it is given."""
 
     def __init__(self, yaw_rad: Tensor) -> None:
         super().__init__()
@@ -197,12 +189,12 @@ class Prophet(nn.Module):
         return motion
 
 
-def test_a_net_that_says_nothing_shows_the_last_frame_turned_as_was_foreseen() -> None:
+def test_a_net_that_says_nothing_shows_the_last_frame_turned_as_was_warped() -> None:
     config = replace(SMALL, image_size=64, latent_channels=3, camera_tilt_rad=0.0)
     model = WorldModel(config).eval()
     # By the first yaw, a column of cells comes to where its left neighbour was, in the middle.
     yaw_rad = torch.tensor([0.0, 1.0, -1.0, 3.0]) * torch.tensor(8 / 32).atan()
-    model.autoencoder, model.foresight = CellCoder(), Prophet(yaw_rad)  # type: ignore[assignment]
+    model.autoencoder, model.motion_predictor = CellCoder(), KnownYaw(yaw_rad)  # type: ignore[assignment]
     model.motion_std.fill_(1.0)
     for out in (model.dynamics.out_patch, model.dynamics.out_vehicle):
         out.weight.data.zero_()
@@ -216,9 +208,9 @@ def test_a_net_that_says_nothing_shows_the_last_frame_turned_as_was_foreseen() -
     torch.testing.assert_close(made[0], latents[0, 1, 0], atol=1e-4, rtol=0)
     assert (made[1, 3:5].argmax(dim=-1) == 3).all()
     assert (made[2, 3:5].argmax(dim=-1) == 5).all()
-    view = model.view(latents[:, -1], states[:, -1])
+    source = model.source_frame(latents[:, -1], states[:, -1])
     known = torch.ones(1, dtype=torch.bool)
-    in_view = model.foresee(view, latents, states, actions(1), known).in_view[0, :, 0]
+    in_view = model.predict_motion(source, latents, states, actions(1), known).in_view[0, :, 0]
     assert (in_view[0] == 1).all()
     assert (in_view[3, :, -1] == 0).all()  # has come in from the right
     assert (in_view[3, 3:5, 0] == 1).all()

@@ -1,4 +1,4 @@
-"""A training run on disk: its state, to go on after a kill, and its log."""
+"""A training run on disk: its state, to resume it after a kill, and its log."""
 
 import hashlib
 import json
@@ -9,37 +9,36 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from policy.data.episodes import Episode
+from policy.data.flight_data import FlightData
 from policy.data.frames import disk_error
 from policy.errors import PolicyError
-from policy.training.plan import RunSettings
-
-_STATE, _LOG = "state.pt", "log.jsonl"
+from policy.training.settings import RunSettings
 
 
 class TrainingError(PolicyError):
-    """A run that cannot start, go on or be kept; the message says what to do."""
+    """A run that cannot start, be resumed or be kept; the message says what to do."""
 
 
 class TrainingStoppedError(PolicyError):
-    """Somebody wanted the run to end; the message says how it goes on."""
+    """The run was asked to stop; the message says how to resume it."""
 
 
 @dataclass(kw_only=True)
 class Position:
-    """Where a run is."""
+    """Where a run is; saved with its weights."""
 
     step: int = 0
     """Optimiser steps done."""
     stage: int = 0
+    """Index of the current stage."""
     phase_step: int = 0
-    """``step`` at which the phase (encoder and head, or head alone) began."""
+    """``step`` at which the phase began: the encoder learns, or it is frozen."""
     phase_start: float = 0.0
     """Fraction of the budget used up to then."""
     spent_s: float = 0.0
+    """Time used up to the last save."""
     validations: int = 0
     best: float | None = None
     """Score of the exported weights, more is better."""
@@ -48,11 +47,13 @@ class Position:
 
 
 class RunFolder:
-    """What a run keeps until it is over."""
+    """Files that a run keeps until it is over."""
 
     def __init__(self, path: Path, identity: str) -> None:
-        self.path = path
-        self._identity = identity
+        self.path, self._identity = path, identity
+        self.frames, self.features = path / "frames", path / "features.f16"
+        """Folder of the decoded images, file of the stored features."""
+        self._state, self._log = path / "state.pt", path / "log.jsonl"
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -60,8 +61,8 @@ class RunFolder:
 
     @property
     def has_state(self) -> bool:
-        """Whether there is something to go on from."""
-        return (self.path / _STATE).is_file()
+        """Whether there is a state to resume from."""
+        return self._state.is_file()
 
     def save(self, position: Position, tensors: Mapping[str, Any]) -> None:
         """Write the state in one piece or not at all.
@@ -69,7 +70,7 @@ class RunFolder:
         Raises:
             TrainingError: no room.
         """
-        target, partial = self.path / _STATE, self.path / (_STATE + ".partial")
+        target, partial = self._state, self.path / "state.pt.partial"
         contents = {"identity": self._identity, "position": asdict(position), **tensors}
         try:
             torch.save(contents, partial)
@@ -85,7 +86,7 @@ class RunFolder:
         Raises:
             TrainingError: there is none, it is damaged, or of another run.
         """
-        path = self.path / _STATE
+        path = self._state
         if not path.is_file():
             raise TrainingError(f"{self.path} holds no run to resume: leave out --resume")
         try:
@@ -106,56 +107,39 @@ class RunFolder:
     def log(self, record: Mapping[str, object]) -> None:
         """One line of JSON."""
         try:
-            with (self.path / _LOG).open("a") as file:
+            with self._log.open("a") as file:
                 file.write(json.dumps(record) + "\n")
         except OSError as error:
-            raise TrainingError(str(disk_error(self.path / _LOG, error))) from error
-
-    @property
-    def frames(self) -> Path:
-        """Folder of the decoded images."""
-        return self.path / "frames"
-
-    @property
-    def pooled(self) -> Path:
-        """File of the kept features."""
-        return self.path / "pooled.f16"
+            raise TrainingError(str(disk_error(self._log, error))) from error
 
     def clear(self) -> None:
-        """The run is over: all but the log goes."""
+        """Remove all but the log."""
         shutil.rmtree(self.frames, ignore_errors=True)
-        self.pooled.unlink(missing_ok=True)
-        (self.path / _STATE).unlink(missing_ok=True)
+        self.features.unlink(missing_ok=True)
+        self._state.unlink(missing_ok=True)
 
     def start_log(self) -> None:
-        """Forget the log of an earlier run."""
-        (self.path / _LOG).unlink(missing_ok=True)
+        """Remove the log of an earlier run."""
+        self._log.unlink(missing_ok=True)
 
     def _cut_log(self, step: int) -> None:
-        """Forget what came after the state: it is about to happen again."""
-        path = self.path / _LOG
-        if path.is_file():
-            lines = path.read_text().splitlines(keepends=True)
-            kept = [line for line in lines if _step_of(line) <= step]
-            path.write_text("".join(kept))
+        """Remove the lines after a step: those steps are about to be repeated."""
+        if self._log.is_file():
+            lines = self._log.read_text().splitlines(keepends=True)
+            self._log.write_text("".join(line for line in lines if _step_of(line) <= step))
 
 
 def _step_of(line: str) -> float:
     try:
-        record: object = json.loads(line)
-    except ValueError:
+        return float(json.loads(line)["step"])
+    except (ValueError, TypeError, KeyError):
         return float("inf")  # the kill cut it short
-    step = record.get("step") if isinstance(record, dict) else None
-    return step if isinstance(step, int) else float("inf")
 
 
-def identity_of(settings: RunSettings, episodes: Sequence[Episode]) -> str:
-    """Changes with everything that a resumed run must not change."""
-    told = {
-        name: value.tolist() if isinstance(value, np.ndarray) else str(value)
-        for name, value in vars(settings).items()
-        if name not in ("resume", "device", "out", "check_every")
-    }
-    flights = [(episode.fingerprint, len(episode.tick_ns)) for episode in episodes]
-    text = json.dumps([told, flights], sort_keys=True)
+def identity_of(settings: RunSettings, network: object, flights: Sequence[FlightData]) -> str:
+    """Hash of everything that must be the same when a run is resumed."""
+    free = ("resume", "device", "out", "check_every", "check_flights")
+    fixed = {name: str(value) for name, value in vars(settings).items() if name not in free}
+    videos = [(flight.fingerprint, len(flight.tick_ns)) for flight in flights]
+    text = json.dumps([fixed, str(network), videos], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

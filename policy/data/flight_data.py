@@ -1,10 +1,9 @@
-"""What a policy learns from: flights as arrays, whatever the format that they came in.
+"""One flight as arrays, whatever the format that it was read from.
 
-An ``Episode`` is one flight; ``dataset_flights`` reads the project's own folders into episodes.
 Everything keeps its true stamp, so the rates of camera, telemetry and sticks need not match.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +22,6 @@ after it [3] m; all at the exposure, NaN where unknown."""
 
 MAX_STATE_SCALES = 30.0
 """A state so many times its usual size has another unit: 150 m/s, or milli-g taken for m/s^2."""
-MAX_AGE_NS = 1_000_000_000
 
 
 class DatasetError(PolicyError):
@@ -31,20 +29,20 @@ class DatasetError(PolicyError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Episode:
-    """One flight; stamps are of one monotonic clock, each list of them does not fall.
+class FlightData:
+    """One flight; its stamps are of one monotonic clock, and no list of them ever falls.
 
     Raises:
         DatasetError: shapes that do not fit, stamps that run backwards, numbers that are not.
     """
 
     name: str
-    """For a person, e.g. its folder."""
+    """For messages, e.g. its folder."""
     state_frame: StateFrame
     tick_ns: Nanoseconds
     """[T] when the policy looked: image age and action history count from here."""
     state: FloatArray
-    """[T, 13] as it was flown; a row of NaN where there was none or nobody was to be imitated."""
+    """[T, 13] as it was flown; NaN where it is unknown, or nobody is to be imitated."""
     attitude_ns: Nanoseconds
     """[T] arrival of its attitude: the first action of a chunk acts then."""
     velocity_ns: Nanoseconds
@@ -66,31 +64,31 @@ class Episode:
     fingerprint: str
     """Changes with the images."""
     decode: Callable[[], Iterator[ImageArray]]
-    """The images [H, W, 3] uint8 RGB in the order of ``captured_ns``; may stop early."""
+    """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``; may stop early."""
 
     def __post_init__(self) -> None:
         """Refuse what would train a net on nonsense."""
-        for names, width in (
-            (("tick_ns", "state"), STATE_DIM),
-            (("target_ns", "target"), ACTION_DIM),
-            (("sent_ns", "sent"), ACTION_DIM),
-            (("captured_ns", "gate"), GATE_DIM),
+        for at, of, width in (
+            ("tick_ns", "state", STATE_DIM),
+            ("target_ns", "target", ACTION_DIM),
+            ("sent_ns", "sent", ACTION_DIM),
+            ("captured_ns", "gate", GATE_DIM),
         ):
-            stamps, values = (getattr(self, name) for name in names)
+            stamps, values = getattr(self, at), getattr(self, of)
             if stamps.ndim != 1 or values.shape != (len(stamps), width):
                 raise DatasetError(
-                    f"{self.name}: {names[1]} must be [{len(stamps)}, {width}] beside {names[0]}, "
-                    f"got {list(values.shape)}"
+                    f"{self.name}: {of} must be [{len(stamps)}, {width}] beside {at}, got "
+                    f"{list(values.shape)}"
                 )
             if (backwards := np.flatnonzero(np.diff(stamps) < 0)).size:
                 row = int(backwards[0]) + 1
-                raise DatasetError(f"{self.name}: {names[0]} runs backwards at row {row}")
+                raise DatasetError(f"{self.name}: {at} runs backwards at row {row}")
         if not (len(self.attitude_ns) == len(self.velocity_ns) == len(self.tick_ns)):
-            raise DatasetError(f"{self.name}: a stamp of the attitude and velocity for each tick")
-        for name in ("target", "sent"):
-            values = getattr(self, name)
+            raise DatasetError(f"{self.name}: each tick needs the stamps of attitude and velocity")
+        for of in ("target", "sent"):
+            values = getattr(self, of)
             if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > 1.0:
-                raise DatasetError(f"{self.name}: {name} must be sticks in [-1, 1]")
+                raise DatasetError(f"{self.name}: {of} must be sticks in [-1, 1]")
         self._check_state()
 
     def _check_state(self) -> None:
@@ -111,40 +109,36 @@ class Episode:
         if np.abs(length - 1.0).max() > 0.01:
             raise DatasetError(f"{self.name}: the attitude is not a unit quaternion")
 
-    def first_frames(self, count: int) -> "Episode":
+    def first_frames(self, count: int) -> "FlightData":
         """The same flight with the first ``count`` images."""
         return replace(self, captured_ns=self.captured_ns[:count], gate=self.gate[:count])
 
 
-def common_frame(episodes: list[Episode]) -> StateFrame:
-    """The frame of the state that all flights share.
+def common_frame(flights: Sequence[FlightData]) -> StateFrame:
+    """The state frame that all flights share.
 
     Raises:
-        DatasetError: no flights, or two kinds of them.
+        DatasetError: no flights, or two frames.
     """
-    if not episodes:
+    if not flights:
         raise DatasetError("no flights to learn from: name at least one flight folder")
-    first = episodes[0]
-    for episode in episodes:
-        if episode.state_frame != first.state_frame:
+    first = flights[0]
+    for flight in flights:
+        if flight.state_frame != first.state_frame:
             raise DatasetError(
-                f"{first.name} holds its state in {first.state_frame}, {episode.name} in "
-                f"{episode.state_frame}: train on one kind at a time"
+                f"{first.name} holds its state in {first.state_frame}, {flight.name} in "
+                f"{flight.state_frame}: train on one kind at a time"
             )
     return first.state_frame
 
 
-def measured_ages(episodes: list[Episode]) -> Nanoseconds:
-    """All measured ages of images, sorted; empty if no flight had a policy that looked."""
-    ages = np.concatenate([episode.age_ns for episode in episodes])
-    return np.sort(ages[(ages > 0) & (ages <= MAX_AGE_NS)])
-
-
-def hold_out(episodes: list[Episode], fraction: float, seed: int) -> tuple[list[int], list[int]]:
+def hold_out(
+    flights: Sequence[FlightData], fraction: float, seed: int
+) -> tuple[list[int], list[int]]:
     """Indices of the flights to train on and to validate on.
 
     With two flights or more and a fraction above 0, at least one is held out and one is kept.
     """
-    order = np.random.default_rng([seed, 1]).permutation(len(episodes)).tolist()
-    count = min(max(1, round(fraction * len(episodes))), len(episodes) - 1) if fraction > 0 else 0
+    order = np.random.default_rng([seed, 1]).permutation(len(flights)).tolist()
+    count = min(max(1, round(fraction * len(flights))), len(flights) - 1) if fraction > 0 else 0
     return sorted(order[count:]), sorted(order[:count])

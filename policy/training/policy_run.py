@@ -1,0 +1,300 @@
+"""Train a policy from flights: encoder and head, then the head alone on stored features."""
+
+import copy
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from torch import nn
+
+from policy.checkpoints.policy_file import (
+    BuiltinPolicy,
+    build_policy,
+    load_checkpoint,
+    save_checkpoint,
+)
+from policy.contract import STATE_NAMES
+from policy.data.flight_data import DatasetError, FlightData, Nanoseconds, common_frame
+from policy.data.flight_folders import read_ages
+from policy.data.frames import FrameStore
+from policy.data.samples import Timeline
+from policy.errors import PolicyError
+from policy.nets.backbones import load_imagenet_state
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import TogeConfig
+from policy.training.batches import Batch, Batches, FeatureStore
+from policy.training.encode import Encoder
+from policy.training.parallel import StepLoss, computing_in
+from policy.training.report import Hooks, PolicyValidation, TrainResult, Validation
+from policy.training.run import Run, open_run
+from policy.training.run_folder import RunFolder
+from policy.training.settings import MAX_AGE_MS, TrainSettings
+from policy.training.stages import TrainingStage, policy_stages
+from policy.training.trainee import Trainee, validate
+
+Network: TypeAlias = TogeConfig | ResnetUnetConfig
+Check: TypeAlias = Callable[[Path], float]
+"""Flies a checkpoint in closed loop and returns a score: more is better."""
+
+VALIDATION_SAMPLES = 256
+AGE_BIN_MS = 5
+FINE_TUNE_RATE = 1 / 3
+"""Learning rate over the usual one, for weights that were trained before."""
+NS_PER_MS = 1_000_000
+HEAD_RATE = 3
+"""Learning rate over the usual one, for the head alone: large batches, no convolutions."""
+
+
+def train_policy(
+    flights: Sequence[FlightData],
+    network: Network,
+    settings: TrainSettings,
+    hooks: Hooks,
+    check: Check | None = None,
+) -> TrainResult:
+    """Train, and write the best weights on held-out flights to ``settings.out``.
+
+    Args:
+        flights: what to learn from.
+        network: what to train; its contract's ``state_frame`` must be that of the flights.
+        settings: how, and how long.
+        hooks: clock, progress, and a request to stop.
+        check: scores a checkpoint, in place of the validation loss.
+
+    Raises:
+        DatasetError: flights that cannot be learned from.
+        TrainingError: a run that cannot be resumed or kept, or that diverged.
+        TrainingStoppedError: ``hooks.should_stop`` ended it.
+        PolicyError: weights to start from that do not fit.
+    """
+    folder = open_run(settings, network, flights)
+    if (frame := common_frame(flights)) != network.contract.state_frame:
+        raise DatasetError(
+            f"the flights hold {frame} states, the policy takes {network.contract.state_frame}"
+        )
+    ages_ns = _ages(flights, settings)
+    return _PolicyRun(flights, ages_ns, network, settings, folder, hooks, check).finish()
+
+
+class _PolicyRun(Run[Trainee, Batch]):
+    validation_type, encoder_learns_alone = PolicyValidation, False
+
+    def __init__(
+        self,
+        flights: Sequence[FlightData],
+        ages_ns: Nanoseconds,
+        network: Network,
+        settings: TrainSettings,
+        folder: RunFolder,
+        hooks: Hooks,
+        check: Check | None,
+    ) -> None:
+        self.settings: TrainSettings = settings
+        self._network, self._ages_ns, self._check = network, ages_ns, check
+        trainee = _starting_trainee(network, settings)
+        trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        super().__init__(folder, trainee, policy_stages(settings), hooks)
+        whole, store, kept, held = self.store_flights(flights)
+        self._flights = [whole[index] for index in kept]
+        self._batches = self._batches_of(whole, kept, store)
+        self._held = self._batches_of(whole, held, store) if held else None
+        if not held:
+            self.note("no flight is held out: the last weights will be kept, not the best")
+        targets = np.concatenate([flight.target for flight in self._flights])
+        for each in (self.trainee, self.average):
+            each.set_sticks(targets)
+        self._features: FeatureStore | None = None
+        self._held_features: list[Batch] | None = None
+
+    def finish(self) -> TrainResult:
+        result = super().finish()
+        return result if self._check is None else replace(result, score=self.position.best)
+
+    def learning_rate(self, stage: TrainingStage) -> float:
+        if not stage.trains_encoder:
+            return HEAD_RATE * self.settings.learning_rate
+        return self.settings.learning_rate * (FINE_TUNE_RATE if self.settings.start_from else 1)
+
+    def encoder(self, trainee: Trainee) -> nn.Module:
+        backbone: nn.Module = trainee.policy.backbone
+        return backbone
+
+    def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
+        settings, frames = self.settings, self._batches.frames
+        encoder = Encoder(self.trainee, self._batches, device=self.device, bf16=self.bf16)
+        if is_new and not settings.freeze_encoder:
+            encoder.refresh_norms()
+        self._features = encoder.encode_all(
+            self.folder.features, settings, should_continue=self.may_encode(stage)
+        )
+        if (left := len(frames) - len(self._features.frames)) > 0:
+            self.note(f"{left} images were not encoded for lack of time: the head sees the rest")
+
+    def batch_maker(self, stage: TrainingStage) -> Callable[[int], Batch]:
+        features = self._features
+        if features is not None:
+            return lambda step: self._batches.with_features(step, features)
+        return lambda step: self._batches.with_images(step, stage.image_size)
+
+    def losses(self, trainee: Trainee, batch: Batch) -> StepLoss:
+        loss: StepLoss = trainee(batch)
+        return loss
+
+    def validate(self, stage: TrainingStage) -> Validation | None:
+        if self._held is None:
+            return None
+        with computing_in(self.device, self.bf16):
+            return validate(self.average, self._held_batches(self._held, stage))
+
+    def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
+        if self._check is None:
+            return super().score(validation, is_last=is_last)
+        position = self.position
+        if not is_last and position.validations % self.settings.check_every:
+            return None
+        trial = self.folder.path / "trial.safetensors"
+        self._write(trial)
+        score = self._check(trial)
+        trial.unlink(missing_ok=True)
+        self.folder.log({"step": position.step, "score": score})
+        return score
+
+    def export(self) -> None:
+        self._write(self.settings.out)
+
+    def _batches_of(
+        self, flights: list[FlightData], indices: list[int], store: FrameStore
+    ) -> Batches:
+        chosen = [flights[index] for index in indices]
+        return Batches(
+            Timeline(chosen, self._network.contract, self._ages_ns),
+            store.only(indices),
+            timesteps=self._network.schedule.num_train_timesteps,
+            settings=self.settings,
+        )
+
+    def _held_batches(self, held: Batches, stage: TrainingStage) -> Iterable[Batch]:
+        """Always the same samples; once the encoder is frozen, encoded once."""
+        if self._held_features is not None:
+            return self._held_features
+        batches = held.validation(VALIDATION_SAMPLES, stage.image_size)
+        moved: Iterable[Batch] = (batch.to(self.device) for batch in batches)
+        if not stage.trains_encoder:
+            moved = self._held_features = [self.average.encoded(batch) for batch in moved]
+        return moved
+
+    def _write(self, path: Path) -> None:
+        card = _training_card(
+            self.settings,
+            self._flights,
+            self._ages_ns,
+            steps=self.position.step,
+            validation=self.position.kept,
+        )
+        policy = copy.deepcopy(self.average.policy)
+        save_checkpoint(path, policy, training=card, packed=self.settings.pack)
+
+
+def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds:
+    """Sorted ages of images to train for: measured ones, or a range that is drawn from evenly."""
+    if settings.age_range_ms is not None:
+        low_ms, high_ms = settings.age_range_ms
+        return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
+    if settings.ages is not None:
+        return read_ages(Path(settings.ages))
+    ages = np.concatenate([flight.age_ns for flight in flights])
+    ages = np.sort(ages[(ages > 0) & (ages <= MAX_AGE_MS * NS_PER_MS)])
+    if len(ages) == 0:
+        raise DatasetError(
+            "no flight says how old its images were at a tick (feature_captured_ns): name a flight "
+            "of a policy, or a range, with --ages"
+        )
+    return ages
+
+
+def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
+    """The policy to start from and a new gate head; torch's global random state is kept.
+
+    Raises:
+        PolicyError: weights that do not fit.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        if settings.start_from is not None:
+            return Trainee(_checkpoint(network, settings.start_from), settings.gate_weight)
+        policy = build_policy(network)
+        if settings.backbone_weights is not None:
+            load_imagenet_state(policy.backbone, _state_dict(settings.backbone_weights))
+        return Trainee(policy, settings.gate_weight)
+
+
+def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
+    policy = load_checkpoint(path, fallback=network)
+    wanted = replace(network.contract, feature_dim=policy.contract.feature_dim)
+    asked, held = (
+        {**asdict(config), "contract": None, **asdict(contract)}
+        for config, contract in ((network, wanted), (policy.config, policy.contract))
+    )
+    other = [f"{name} {value!r}" for name, value in held.items() if asked.get(name) != value]
+    if other or type(policy.config) is not type(network):
+        raise PolicyError(
+            f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
+        )
+    return policy.train()
+
+
+def _state_dict(path: Path) -> dict[str, torch.Tensor]:
+    try:
+        loaded: object = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise PolicyError(
+            f"--backbone-weights {path}: not a readable torch file: {error}"
+        ) from error
+    if not isinstance(loaded, dict):
+        raise PolicyError(f"--backbone-weights {path}: no state dict in it")
+    return {str(name): value for name, value in loaded.items() if isinstance(value, torch.Tensor)}
+
+
+def _training_card(
+    settings: TrainSettings,
+    flights: Sequence[FlightData],
+    ages_ns: Nanoseconds,
+    *,
+    steps: int,
+    validation: Mapping[str, float] | None,
+) -> str:
+    """How a checkpoint was trained, as JSON."""
+    state = np.concatenate([flight.state for flight in flights])
+    target = np.concatenate([flight.target for flight in flights])
+    ages_ms = ages_ns / 1e6
+    edges = np.arange(0, ages_ms.max() + 2 * AGE_BIN_MS, AGE_BIN_MS)
+    card = {
+        "flights": len(flights),
+        "images": sum(len(flight.captured_ns) for flight in flights),
+        "ticks": len(state),
+        "steps": steps,
+        "batch_size": settings.batch_size,
+        "seed": settings.seed,
+        "mirror": settings.mirror,
+        "world_yaw": "drawn evenly",
+        "gate_weight": settings.gate_weight,
+        "feature_age_ms": {
+            "measured_in": "the flights" if settings.ages is None else "--ages",
+            "bin_ms": AGE_BIN_MS,
+            "counts_from_0": np.histogram(ages_ms, edges)[0].tolist(),
+        },
+        "state_mean": _by_name(np.nanmean(state, axis=0)),
+        "state_std": _by_name(np.nanstd(state, axis=0)),
+        "stick_mean": target.mean(axis=0).round(4).tolist(),
+        "stick_std": target.std(axis=0).round(4).tolist(),
+        "validation": validation,
+    }
+    return json.dumps(card, sort_keys=True)
+
+
+def _by_name(values: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> dict[str, float]:
+    return {name: round(float(v), 4) for name, v in zip(STATE_NAMES, values, strict=True)}

@@ -1,0 +1,195 @@
+"""Settings of training: each field is a flag of ``mavbridge train`` or ``train-world-model``."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from policy.errors import PolicyError
+
+Precision = Literal["auto", "bf16", "f32"]
+DEFAULT_MINUTES = 45.0
+MAX_AGE_MS = 1000
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "minutes": (0.01, 100_000),
+    "steps": (1, 10**9),
+    "image_size": (32, 1024),
+    "batch_size": (2, 4096),
+    "learning_rate": (0, 1e30),
+    "weight_decay": (0, 1),
+    "ema_decay": (0, 1),
+    "seed": (0, 2**63 - 1),
+    "validation_fraction": (0, 0.9),
+    "validations": (1, 10_000),
+    "repeats": (1, 100),
+    "head_batch_size": (1, 100_000),
+    "gate_weight": (0, 10_000),
+    "check_flights": (0, 10_000),
+    "check_every": (1, 10_000),
+    "window_batch_size": (1, 4096),
+    "autoencoder_share": (0.01, 0.99),
+    "decision_share": (0, 1),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings:
+    """Settings of every training run.
+
+    Raises:
+        PolicyError: a value is out of its range; the message names its flag.
+    """
+
+    out: Path
+    """Checkpoint to write (.safetensors); an unfinished run is kept beside it."""
+    minutes: float | None = None
+    """How long to train; 45 if neither this nor --steps is given."""
+    steps: int | None = None
+    """How many optimiser steps to train, in place of --minutes."""
+    image_size: int = 224
+    """Pixels along a side of the images that the encoder takes."""
+    batch_size: int = 32
+    """Images a step while the encoder learns."""
+    learning_rate: float = 1e-3
+    """Peak learning rate of AdamW."""
+    weight_decay: float = 0.02
+    """Weight decay of AdamW."""
+    ema_decay: float = 0.999
+    """Decay of the moving average of the weights, which is what gets exported."""
+    mirror: bool = True
+    """Mirror half of the samples; --no-mirror for a camera that does not look straight ahead."""
+    seed: int = 0
+    """Seed of weights, order and noise."""
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1."""
+    precision: Precision = "auto"
+    """Number format of the computation; auto takes bf16 where the hardware multiplies it."""
+    resume: bool = False
+    """Continue the unfinished run of --out."""
+    validation_fraction: float = 0.1
+    """Share of the flights that are held out."""
+    validations: int | None = None
+    """Validations in the run, evenly spaced, each of which also saves the state of the run; one
+    every two minutes or fifty steps, 4 to 20, if not given."""
+    camera_key: str | None = None
+    """Camera of a LeRobot dataset that has several, e.g. observation.images.front."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that no run could use."""
+        if self.out.suffix != ".safetensors":
+            raise PolicyError(f"--out {self.out}: checkpoints are written as .safetensors")
+        if self.minutes is not None and self.steps is not None:
+            raise PolicyError("--minutes and --steps contradict each other: give one of them")
+        for name, value in vars(self).items():
+            low, high = _RANGES.get(name, (None, None))
+            if value is None or low is None or high is None or low <= value <= high:
+                continue
+            flag = name.replace("_", "-")
+            raise PolicyError(f"--{flag} must be between {low:g} and {high:g}, got {value:g}")
+
+    def fraction(self, step: int, spent_s: float) -> float:
+        """Share of the budget that is used after so many steps and seconds, 0 to 1."""
+        if self.steps is not None:
+            return min(step / self.steps, 1.0)
+        return min(spent_s / (60.0 * (self.minutes or DEFAULT_MINUTES)), 1.0)
+
+    @property
+    def validation_count(self) -> int:
+        """Validations in the run."""
+        if self.validations is not None:
+            return self.validations
+        due = (self.minutes or DEFAULT_MINUTES) / 2 if self.steps is None else self.steps / 50
+        return max(4, min(20, int(due)))
+
+    @property
+    def work_folder(self) -> Path:
+        """Where an unfinished run is kept."""
+        return self.out.with_name(self.out.stem + ".training")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(RunSettings):
+    """Settings of the training of a policy.
+
+    Raises:
+        PolicyError: a value is out of its range; the message names its flag.
+    """
+
+    policy: str = "toge"
+    """toge[:small|medium|large][:BACKBONE] or resnet-unet[:SIZE]."""
+    since_exposure: bool = True
+    """Give the policy its image's age and the motion since; --no-since-exposure to leave it out."""
+    ages: str | None = None
+    """Image ages to train for: the flight folder that they were measured in, or LOW:HIGH in ms; by
+    default those measured in the flights."""
+    start_from: Path | None = None
+    """Checkpoint to start from, e.g. after more flights were added."""
+    freeze_encoder: bool = False
+    """Train the head alone, on the features of the encoder of --start-from."""
+    backbone_weights: Path | None = None
+    """torchvision's ImageNet weights of the encoder (.pth)."""
+    repeats: int = 2
+    """Moments after its exposure for which an encoded image is used in a step."""
+    head_batch_size: int = 256
+    """Samples a step while the head learns alone."""
+    gate_weight: float = 100.0
+    """Weight of the loss by which the feature must tell where the gates are, in flights that know
+    it; 0 = off. The sticks of a few flights alone teach an encoder those flights' courses."""
+    pack: bool = False
+    """Write a checkpoint to ship, a third of the size: the encoder in int8, the rest in float16."""
+    check_flights: int = 0
+    """Courses to fly with the weights now and then; those that fly best are kept, not those with
+    the least loss. Takes the extra "sitl"."""
+    check_every: int = 5
+    """Validations between two such checks."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that no run could use."""
+        super().__post_init__()
+        if self.start_from is not None and self.backbone_weights is not None:
+            raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
+        if self.freeze_encoder and self.start_from is None:
+            raise PolicyError("--freeze-encoder needs a trained one: give --start-from CHECKPOINT")
+        _ = self.age_range_ms
+
+    @property
+    def age_range_ms(self) -> tuple[float, float] | None:
+        """The range of ``--ages LOW:HIGH``; None where it names a flight, or nothing."""
+        if self.ages is None or ":" not in self.ages or Path(self.ages).is_dir():
+            return None
+        low, _, high = self.ages.partition(":")
+        try:
+            low_ms, high_ms = float(low), float(high)
+        except ValueError:
+            low_ms, high_ms = math.nan, math.nan
+        if not 0 < low_ms <= high_ms <= MAX_AGE_MS:
+            raise PolicyError(
+                f"--ages {self.ages} is neither a flight folder nor LOW:HIGH with 0 < LOW <= HIGH "
+                f"<= {MAX_AGE_MS} ms"
+            )
+        return low_ms, high_ms
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelSettings(RunSettings):
+    """Settings of the training of a world model.
+
+    Raises:
+        PolicyError: a value is out of its range; the message names its flag.
+    """
+
+    image_size: int = 64
+    """Pixels along a side of the frames."""
+    batch_size: int = 8
+    """Frames a step while the autoencoder learns."""
+    learning_rate: float = 2e-3
+    """Peak learning rate of AdamW."""
+    window_batch_size: int = 8
+    """Windows a step while the dynamics learns."""
+    start_from: Path | None = None
+    """World model whose autoencoder is kept as it is; the dynamics learns anew."""
+    autoencoder_share: float = 0.25
+    """Share of the run in which the autoencoder learns, unless it is kept."""
+    decision_share: float = 0.3
+    """Share of the windows in which the model has to find the actions."""
