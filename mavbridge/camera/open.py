@@ -1,6 +1,7 @@
 """Opens the camera that ``--camera`` describes."""
 
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 from mavbridge.camera.capture import open_device, open_stream
@@ -12,10 +13,31 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.ports import Camera
 
 STREAM_SCHEMES = ("rtsp://", "udp://", "tcp://", "http://", "https://")
+SCREEN_PACKAGES = ("mss", "Xlib")
+"""The extra "screen"."""
 FORMS = (
     "a device (0, /dev/video0), a stream (rtsp://, udp://, tcp://, http://, https://), "
     "a video file, shm:NAME or screen:WINDOW TITLE (screen: alone = the whole screen)"
 )
+
+
+def check_camera(spec: str) -> None:
+    """Refuse a source that cannot be opened, as far as that can be told without opening it.
+
+    Raises:
+        UserError: ``spec`` has no known form, names no file, or needs a package that is missing.
+    """
+    kind = spec.partition(":")[0]
+    if kind == "screen":
+        missing = [name for name in SCREEN_PACKAGES if find_spec(name) is None]
+        if missing:
+            raise UserError(
+                f"--camera screen: needs the package {missing[0]}: pip install 'mavbridge[screen]'"
+            )
+        return
+    is_known = kind == "shm" or spec.startswith((*STREAM_SCHEMES, "/dev/video")) or spec.isdecimal()
+    if not is_known and not Path(spec).is_file():
+        raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
 
 
 def open_camera(spec: str, *, image_size: int, clock: Clock) -> Camera:
@@ -28,30 +50,18 @@ def open_camera(spec: str, *, image_size: int, clock: Clock) -> Camera:
         UserError: ``spec`` has no known form, names no file, or needs a package that is missing.
         CameraError: the source cannot be opened.
     """
+    check_camera(spec)
     kind, _, rest = spec.partition(":")
     if kind == "shm":
         return SharedMemoryCamera(rest, clock=clock)
     if kind == "screen":
-        return _open_screen(rest, clock)
+        from mavbridge.camera.screen import ScreenCamera
+
+        return ScreenCamera(rest, clock=clock)
     if spec.startswith(STREAM_SCHEMES):
         return Grabber(partial(open_stream, spec, clock=clock), clock=clock)
     if spec.isdecimal() or spec.startswith("/dev/video"):
         device = int(spec) if spec.isdecimal() else Path(spec)
         opener = partial(open_device, device, image_size=image_size, clock=clock)
         return Grabber(opener, clock=clock)
-    path = Path(spec)
-    if not path.is_file():
-        raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
-    return VideoFileCamera(path, clock=clock)
-
-
-def _open_screen(title: str, clock: Clock) -> Camera:
-    try:
-        from mavbridge.camera.screen import ScreenCamera
-    except ModuleNotFoundError as error:
-        if error.name not in ("mss", "Xlib"):
-            raise
-        raise UserError(
-            f"--camera screen: needs the package {error.name}: pip install 'mavbridge[screen]'"
-        ) from error
-    return ScreenCamera(title, clock=clock)
+    return VideoFileCamera(Path(spec), clock=clock)

@@ -8,7 +8,7 @@ import cv2
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.camera.open import open_camera
+from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
@@ -20,11 +20,12 @@ from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import build_bridge
 from mavbridge.flight.observers import FlightObservers
-from mavbridge.flight.policies import load_configured_policy
+from mavbridge.flight.policies import load_configured_policy, policy_request
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.recording.folder import prepare_folder
 from policy.contract import Executable
+from policy.loading import check_request
 
 JOIN_S = 2.0
 HANG_NS = NS_PER_S
@@ -48,8 +49,10 @@ def fly(config: FlyConfig) -> int:
 
 
 def _check_quickly(config: FlyConfig, clock: Clock) -> None:
-    """Check address, report and folder at once, before weights take seconds to load."""
+    """Check what takes no time, before weights take seconds to load."""
     make_transport(config.link.connect, clock)
+    check_camera(config.camera.source)
+    check_request(policy_request(config.policy))
     require_writable(config.report, "--report")
     if config.record is not None:
         prepare_folder(config.record)

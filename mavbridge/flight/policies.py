@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
-from policy.loading import LoadedPolicy, load_policy
+from policy.loading import LoadedPolicy, PolicyRequest, load_policy
 
 BUILT_IN = ("toge", "resnet-unet")
 
@@ -20,8 +20,13 @@ def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)  # a user's module:Class lies in the working directory
-    return load_policy(
-        wanted.policy,
+    return load_policy(policy_request(wanted), now_s=lambda: clock.now_ns() / NS_PER_S)
+
+
+def policy_request(wanted: PolicyConfig) -> PolicyRequest:
+    """Translate the flags into the request that ``policy.loading`` takes."""
+    return PolicyRequest(
+        spec=wanted.policy,
         checkpoint=wanted.checkpoint,
         allow_untrained=wanted.allow_untrained,
         engine=wanted.engine,
@@ -33,7 +38,6 @@ def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
         head_steps=wanted.head_steps,
         image_size=wanted.image_size,
         seed=wanted.seed,
-        now_s=lambda: clock.now_ns() / NS_PER_S,
     )
 
 

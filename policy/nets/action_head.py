@@ -1,7 +1,6 @@
 """The diffusion action head: a condition vector in, a chunk of stick positions out."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -9,10 +8,8 @@ from torch import Tensor, nn
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule, ddim_solve
+from policy.nets.names import SIZE_NAMES, Size
 from policy.nets.unet1d import UNet1d, UNet1dConfig
-
-Size = Literal["small", "medium", "large"]
-SIZE_NAMES: tuple[Size, ...] = get_args(Size)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +79,15 @@ class DiffusionHead(nn.Module):
         """Draw the initial noise of a flight, the same for the same seed on every device."""
         generator = torch.Generator().manual_seed(seed)
         self.initial_noise.copy_(torch.randn(self.initial_noise.shape, generator=generator))
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with.
+
+        Raises:
+            PolicyError: the schedule has no such number of steps.
+        """
+        step = self.schedule.ddim_steps(num_diffusion_steps)[first]
+        return step.signal, step.noise
 
     def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
         """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""

@@ -7,10 +7,11 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import ContractError
-from policy.nets.action_head import DiffusionHead, Size, size_dims
+from policy.nets.action_head import DiffusionHead, size_dims
 from policy.nets.backbones import build_backbone
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.encoders import StateEncoder, require_shape
+from policy.nets.names import Size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,11 @@ class ResnetUnet(nn.Module):
 
     def fuse_visual(self, visual: Tensor, state: Tensor, action_history: Tensor) -> Tensor:
         """Projected image [B, C], state, history [B, K, 4] -> condition [B, C]."""
-        parts = [visual, self.state_encoder(state), action_history.flatten(1)]
+        return self.condition(visual, self.state_encoder(state), action_history)
+
+    def condition(self, visual: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
+        """Projected image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C]."""
+        parts = [visual, state_token, action_history.flatten(1)]
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition
 
