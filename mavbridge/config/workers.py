@@ -15,7 +15,9 @@ class WorkersConfig:
 
     workers: int = 1
     """Episodes at a time, each in a process of its own."""
-    ray: Annotated[bool | str, Parameter(negative="")] = False
+    ray: Annotated[
+        bool | str, Parameter(negative="", show_default=False, metavar="[HOST:PORT]")
+    ] = False
     """Fly on the Ray cluster that this machine belongs to, or on the one at HOST:PORT. Its machines
     must share the folders of files that are read and written. Needs the extra "cluster"."""
 

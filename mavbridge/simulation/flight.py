@@ -34,7 +34,7 @@ from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 MAX_TIME_S = 60.0
-"""For a course of some 80 m: a policy slower than 1.5 m/s does not race."""
+"""Default limit: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
 MODE = "ALT_HOLD"
 
 
@@ -70,10 +70,10 @@ class SimulatedFlight:
         """Put the vehicle on the course.
 
         Args:
-            course_seed: which course.
+            course_seed: the course of ``sitl.course.course.make_course``.
             seed: decides the delays and the phases of vehicle and camera.
-            settings: of the bridge and the delays.
-            vehicle: also decides how the course looks.
+            settings: by default those of ``mavbridge fly`` and the delays of two shared cores.
+            vehicle: its conditions also decide how the course looks.
 
         Raises:
             UserError: ``seed`` is negative.
@@ -83,7 +83,7 @@ class SimulatedFlight:
         self._seed = seed
         self._random = _RandomStreams(seed)
         self.clock = SteppedClock()
-        # Two computers never tick in phase, and keep the phase that they have for a whole flight.
+        # Vehicle and bridge are never in phase, and their phase stays for a whole flight.
         boot_ns = self.clock.now_ns() + self._random.below(6, STEP_NS)
         self.course = make_course(course_seed)
         self._vehicle_config = vehicle

@@ -1,4 +1,4 @@
-"""Flies gate courses in stepped time: vehicle and expert in one process, no wire in between."""
+"""Flies gate courses in stepped time: vehicle and expert without a link in between."""
 
 import math
 from dataclasses import dataclass
@@ -47,8 +47,8 @@ class CourseFlight:
         """Along the straight legs between the first gate passed and the last."""
         passed = self.vehicle.log.summary(self.vehicle.ap, 0)["gates"]["passed"]
         centers = [self.course.gates[entry["index"]].center_ned_m for entry in passed]
-        way_m = sum(math.dist(a, b) for a, b in pairwise(centers))
-        return way_m / (passed[-1]["t_s"] - passed[0]["t_s"]) if len(passed) > 1 else math.nan
+        distance_m = sum(math.dist(a, b) for a, b in pairwise(centers))
+        return distance_m / (passed[-1]["t_s"] - passed[0]["t_s"]) if len(passed) > 1 else math.nan
 
     def misses_m(self) -> list[float]:
         """How far from the centre, sideways or up, each gate was passed."""

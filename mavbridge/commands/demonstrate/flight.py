@@ -8,7 +8,7 @@ from shutil import rmtree
 
 import mavbridge
 from mavbridge.commands.demonstrate.pilot import Pilot
-from mavbridge.commands.demonstrate.variation import draw_variation
+from mavbridge.commands.demonstrate.variation import Variation, draw_variation
 from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import MonotonicClock
@@ -50,7 +50,13 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
     """
     rmtree(spec.folder, ignore_errors=True)
     prepare_folder(spec.folder)
-    variation, student = draw_variation(spec.seed), _load_student(spec.config)
+    variation, wanted = draw_variation(spec.seed), spec.config.policy
+    student: Executable | None = None
+    size_px = wanted.image_size or SIM_CAMERA_PX
+    contract = Contract(feature_dim=1, arrays="numpy", image_height=size_px, image_width=size_px)
+    if wanted.checkpoint is not None:
+        student = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock()).executable
+        contract = student.contract
     flight = SimulatedFlight(
         course_seed=spec.seed,
         seed=spec.seed,
@@ -60,25 +66,10 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
         ),
         vehicle=replace(NOMINAL_VEHICLE, conditions=variation.conditions),
     )
-    contract = student.contract if student else _expert_contract(spec.config)
     pilot = Pilot(
         flight, variation, speed_mps=spec.config.speed, contract=contract, student=student
     )
-    meta = FlightMeta(
-        started_at=datetime.now(UTC).isoformat(),
-        start_ns=0,
-        mavbridge_version=mavbridge.__version__,
-        source="dagger" if student else "demonstration",
-        policy=pilot.executable.name,
-        engine=pilot.executable.engine,
-        mode="dual",
-        action_hz=Rates().action_rate,
-        visual_hz=Rates().visual_limits_hz[1],
-        contract=contract,
-        course_seed=spec.seed,
-        seed=spec.seed,
-        conditions=variation.conditions.numbers(),
-    )
+    meta = _meta(spec, variation, pilot.executable)
     writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
     recorder = _LabelledRecorder(flight, pilot, writer)
     try:
@@ -98,18 +89,22 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
     return success
 
 
-def _load_student(config: DemonstrateConfig) -> Executable | None:
-    if config.policy.checkpoint is None:
-        return None
-    return load_for_episodes(replace(config.policy, dual_rate=True), MonotonicClock()).executable
-
-
-def _expert_contract(config: DemonstrateConfig) -> Contract:
-    contract = Contract(feature_dim=1, arrays="numpy")
-    size_px = config.policy.image_size
-    if size_px is None:
-        return contract
-    return replace(contract, image_height=size_px, image_width=size_px)
+def _meta(spec: DemonstrationSpec, variation: Variation, executable: Executable) -> FlightMeta:
+    return FlightMeta(
+        started_at=datetime.now(UTC).isoformat(),
+        start_ns=0,
+        mavbridge_version=mavbridge.__version__,
+        source="dagger" if spec.config.policy.checkpoint else "demonstration",
+        policy=executable.name,
+        engine=executable.engine,
+        mode="dual",
+        action_hz=Rates().action_rate,
+        visual_hz=Rates().visual_limits_hz[1],
+        contract=executable.contract,
+        course_seed=spec.seed,
+        seed=spec.seed,
+        conditions=variation.conditions.numbers(),
+    )
 
 
 class _LabelledRecorder:
