@@ -25,8 +25,7 @@ from mavbridge.commands.output import (
     GREY,
     RED,
     print_status,
-    require_matplotlib,
-    require_writable,
+    require_outputs,
     table_console,
 )
 from mavbridge.core.processes import running, wait
@@ -76,10 +75,7 @@ def main(
         world_model: weights; by default those that come with mavbridge.
         device: torch device of the world model.
     """
-    require_writable(json, "--json")
-    require_writable(plot, "--plot")
-    if plot is not None:
-        require_matplotlib()
+    require_outputs(json, plot)
     load_model(world_model, ddim_steps=STEPS, device=device)  # refused before the first process
     iterations, steps, repeats = QUICK if quick else FULL
     job = RolloutJob(

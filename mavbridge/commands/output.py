@@ -1,4 +1,4 @@
-"""What every command writes for a person: tables, progress, figures, and checks of output files."""
+"""Output that the commands share: tables, progress, figures, and checks of output files."""
 
 import importlib.util
 from pathlib import Path
@@ -77,6 +77,18 @@ def require_matplotlib(flag: str = "--plot") -> None:
     """
     if importlib.util.find_spec("matplotlib") is None:
         raise UserError(f"{flag} needs matplotlib: pip install 'mavbridge[bench]'")
+
+
+def require_outputs(json: Path | None, plot: Path | None) -> None:
+    """Check the flags ``--json`` and ``--plot`` before a long run.
+
+    Raises:
+        UserError: a file cannot be written, or matplotlib is not installed.
+    """
+    require_writable(json, "--json")
+    require_writable(plot, "--plot")
+    if plot is not None:
+        require_matplotlib()
 
 
 def table_console() -> Console:
