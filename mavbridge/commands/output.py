@@ -101,7 +101,7 @@ def table_console() -> Console:
 
 def print_status(line: str) -> None:
     """Print what is being done to standard error, apart from the results."""
-    Console(stderr=True, highlight=False).print(Text(line, style="dim"))
+    Console(stderr=True).print(Text(line, style="dim"), soft_wrap=True)
 
 
 class _StatusColumn(ProgressColumn):

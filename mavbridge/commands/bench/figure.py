@@ -95,7 +95,7 @@ def draw_rates(axes: Axes, flights: Sequence[Flight]) -> None:
             axes.vlines(asked, row + shift - 0.17, row + shift + 0.17, color=RED)
     axes.set_yticks(range(len(flights)), [_in_two_lines(flight.label) for flight in flights])
     axes.set_ylim(len(flights) - 0.5, -0.5)
-    axes.set_xlim(0, 1.25 * max((flight.asked_action_hz for flight in flights), default=1))
+    axes.set_xlim(0, 1.35 * max((flight.asked_action_hz for flight in flights), default=1))
     axes.set_xlabel("Hz; red: what was asked for")
     axes.set_title("Rates")
 
