@@ -127,12 +127,12 @@ def median_trial(trials: Sequence[Trial]) -> Trial:
 def print_pairs(pairs: Sequence[Pair], console: Console) -> None:
     """Print two rows for each pair."""
     header = (
-        *("way", "iterations", "steps", "threads", "decoded", "wall", "sampling"),
+        *("way", "iterations", "steps", "decoded", "wall", "sampling"),
         *("pixels", "files", "nets", "writer", "speed-up", "bound"),
     )
     rows = [
         (
-            *(one.way, str(one.iterations), str(one.ddim_steps), str(one.torch_threads)),
+            *(one.way, str(one.iterations), str(one.ddim_steps)),
             *(str(one.frames_decoded), number(one.wall_s, 2), number(one.sample_s, 2)),
             *(number(one.decode_s, 2), number(one.write_s, 2)),
             *(number(one.peak_rss_mb, 0), number(one.writer_rss_mb, 0)),
