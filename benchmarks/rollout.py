@@ -25,10 +25,9 @@ from mavbridge.commands.output import (
     GREY,
     RED,
     print_status,
-    require_matplotlib,
+    require_outputs,
     table_console,
 )
-from mavbridge.core.files import require_writable
 from mavbridge.core.processes import running, wait
 
 TIMEOUT_S = 3600.0
@@ -76,10 +75,7 @@ def main(
         world_model: weights; by default those that come with mavbridge.
         device: torch device of the world model.
     """
-    require_writable(json, "--json")
-    require_writable(plot, "--plot")
-    if plot is not None:
-        require_matplotlib()
+    require_outputs(json, plot)
     load_model(world_model, ddim_steps=STEPS, device=device)  # refused before the first process
     iterations, steps, repeats = QUICK if quick else FULL
     job = RolloutJob(
@@ -131,12 +127,12 @@ def median_trial(trials: Sequence[Trial]) -> Trial:
 def print_pairs(pairs: Sequence[Pair], console: Console) -> None:
     """Print two rows for each pair."""
     header = (
-        *("way", "iterations", "steps", "threads", "decoded", "wall", "sampling"),
+        *("way", "iterations", "steps", "decoded", "wall", "sampling"),
         *("pixels", "files", "nets", "writer", "speed-up", "bound"),
     )
     rows = [
         (
-            *(one.way, str(one.iterations), str(one.ddim_steps), str(one.torch_threads)),
+            *(one.way, str(one.iterations), str(one.ddim_steps)),
             *(str(one.frames_decoded), number(one.wall_s, 2), number(one.sample_s, 2)),
             *(number(one.decode_s, 2), number(one.write_s, 2)),
             *(number(one.peak_rss_mb, 0), number(one.writer_rss_mb, 0)),

@@ -28,7 +28,7 @@ from policy.world_model.config import WorldModelConfig
 
 COMMAND = "from benchmarks.rollout_process import app; app()"
 FRAMES, EXE_STEPS = 16, 1
-"""Of an iteration, as ``mavbridge imagine`` has them by default."""
+"""Frames and executed steps of an iteration: the defaults of ``mavbridge imagine``."""
 app = App(help=__doc__)
 
 

@@ -30,7 +30,7 @@ TRIALS, TRIAL_NS = 5, 20 * NS_PER_MS
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What one call computes and reads, whatever the engine."""
+    """Arithmetic and reads of one call, whatever the engine."""
 
     flop: int
     weight_uses: int

@@ -25,10 +25,9 @@ from mavbridge.commands.output import (
     FIGURE_DPI,
     FIGURE_STYLE,
     MUTED,
-    require_matplotlib,
+    require_outputs,
     table_console,
 )
-from mavbridge.core.files import require_writable
 from policy.loading import SHIPPED
 
 DUAL = "--dual-rate --head-steps 2"
@@ -83,7 +82,7 @@ SETTINGS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Score:
+class SettingScore:
     """One evaluated setting; intervals are 95 %."""
 
     group: str
@@ -120,10 +119,7 @@ def main(
         episodes: courses for each setting.
         workers: episodes at a time.
     """
-    require_writable(json, "--json")
-    require_writable(plot, "--plot")
-    if plot is not None:
-        require_matplotlib()
+    require_outputs(json, plot)
     scores = stored(json, episodes)
     rows = []
     for setting in SETTINGS:
@@ -142,13 +138,13 @@ def main(
         draw(rows, plot)
 
 
-def stored(path: Path, episodes: int) -> dict[tuple[str, str], Score]:
+def stored(path: Path, episodes: int) -> dict[tuple[str, str], SettingScore]:
     """Scores of earlier runs with as many episodes, by name and hash of the checkpoint."""
-    scores = [Score(**one) for one in loads(path.read_text())] if path.exists() else []
+    scores = [SettingScore(**one) for one in loads(path.read_text())] if path.exists() else []
     return {(one.name, one.checkpoint_sha256): one for one in scores if one.episodes == episodes}
 
 
-def evaluate(setting: Setting, checkpoint: Path, episodes: int, workers: int) -> Score:
+def evaluate(setting: Setting, checkpoint: Path, episodes: int, workers: int) -> SettingScore:
     """Fly one setting.
 
     Raises:
@@ -161,7 +157,7 @@ def evaluate(setting: Setting, checkpoint: Path, episodes: int, workers: int) ->
         command = [sys.executable, "-m", "mavbridge", "evaluate", *flags, *files]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         summary = loads(out.read_text())["summary"]
-    return Score(
+    return SettingScore(
         group=setting.group,
         name=setting.name,
         command=f"mavbridge evaluate {' '.join(flags)}",
@@ -176,7 +172,7 @@ def evaluate(setting: Setting, checkpoint: Path, episodes: int, workers: int) ->
     )
 
 
-def print_scores(scores: Sequence[Score]) -> None:
+def print_scores(scores: Sequence[SettingScore]) -> None:
     """Print the table of docs/study.md."""
     rows = [
         (
@@ -189,7 +185,7 @@ def print_scores(scores: Sequence[Score]) -> None:
     table_console().print(make_table("Held-out courses", header, rows))
 
 
-def draw(scores: Sequence[Score], path: Path) -> None:
+def draw(scores: Sequence[SettingScore], path: Path) -> None:
     """Write a PNG: success by setting, and by the delay of the images."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -203,7 +199,7 @@ def draw(scores: Sequence[Score], path: Path) -> None:
         figure.savefig(path)
 
 
-def draw_settings(axes: Any, scores: Sequence[Score]) -> None:
+def draw_settings(axes: Any, scores: Sequence[SettingScore]) -> None:
     """A bar for each setting, in percent, with its interval; the first one at the top."""
     for row, one in enumerate(reversed(scores)):
         axes.barh(one.name, 100 * one.success, 0.6, color=BLUE)
@@ -213,7 +209,7 @@ def draw_settings(axes: Any, scores: Sequence[Score]) -> None:
     axes.set_title("Held-out courses flown, %, with 95 % interval")
 
 
-def draw_delays(axes: Any, scores: Sequence[Score]) -> None:
+def draw_delays(axes: Any, scores: Sequence[SettingScore]) -> None:
     """Success in percent by delay, with its interval: a line with the age and one without."""
     for group, color, name in (
         (DELAYED, BLUE, "with their age"),

@@ -1,6 +1,7 @@
-"""What every command writes for a person: tables, progress bars and figures."""
+"""Output that the commands share: tables, progress bars and figures."""
 
 import importlib.util
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -17,6 +18,7 @@ from rich.progress import (
 from rich.text import Text
 
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import require_writable
 
 PIPED_WIDTH = 120
 """Columns of the tables where there is no terminal."""
@@ -53,6 +55,18 @@ def require_matplotlib(flag: str = "--plot") -> None:
         raise UserError(f"{flag} needs matplotlib: pip install 'mavbridge[bench]'")
 
 
+def require_outputs(json: Path | None, plot: Path | None) -> None:
+    """Check the flags ``--json`` and ``--plot`` before a long run.
+
+    Raises:
+        UserError: a file cannot be written, or matplotlib is not installed.
+    """
+    require_writable(json, "--json")
+    require_writable(plot, "--plot")
+    if plot is not None:
+        require_matplotlib()
+
+
 def table_console() -> Console:
     """A console for tables on standard output: as wide as the terminal, or ``PIPED_WIDTH``."""
     console = Console(highlight=False)
@@ -63,7 +77,7 @@ def table_console() -> Console:
 
 def print_status(line: str) -> None:
     """Print what is being done to standard error, apart from the results."""
-    Console(stderr=True, highlight=False).print(Text(line, style="dim"))
+    Console(stderr=True).print(Text(line, style="dim"), soft_wrap=True)
 
 
 class _StatusColumn(ProgressColumn):

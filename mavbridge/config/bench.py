@@ -12,7 +12,7 @@ from mavbridge.config.rates import Rates
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class BenchOutputs:
-    """How thoroughly to measure, and where the results go."""
+    """Duration of the measurement, and destinations of its results."""
 
     quick: bool = False
     """Measure for seconds instead of minutes: figures to look at, not to quote."""

@@ -26,7 +26,7 @@ from mavbridge.commands.output import (
 STYLE = FIGURE_STYLE | {"axes.grid.axis": "x", "axes.spines.left": False, "ytick.left": False}
 
 
-class Span(NamedTuple):
+class LatencyRow(NamedTuple):
     """A row of a latency panel, in ms."""
 
     label: str
@@ -95,12 +95,12 @@ def draw_rates(axes: Axes, flights: Sequence[Flight]) -> None:
             axes.vlines(asked, row + shift - 0.17, row + shift + 0.17, color=RED)
     axes.set_yticks(range(len(flights)), [_in_two_lines(flight.label) for flight in flights])
     axes.set_ylim(len(flights) - 0.5, -0.5)
-    axes.set_xlim(0, 1.25 * max((flight.asked_action_hz for flight in flights), default=1))
+    axes.set_xlim(0, 1.35 * max((flight.asked_action_hz for flight in flights), default=1))
     axes.set_xlabel("Hz; red: what was asked for")
     axes.set_title("Rates")
 
 
-def draw_spans(axes: Axes, title: str, spans: Sequence[Span]) -> None:
+def draw_spans(axes: Axes, title: str, spans: Sequence[LatencyRow]) -> None:
     """A dot at each median and a line to the 99th percentile."""
     axes.set_title(title)
     if not spans:
@@ -125,19 +125,19 @@ def draw_spans(axes: Axes, title: str, spans: Sequence[Span]) -> None:
     axes.set_xlabel("ms")
 
 
-def flight_spans(flights: Sequence[Flight]) -> list[Span]:
+def flight_spans(flights: Sequence[Flight]) -> list[LatencyRow]:
     """Latencies of the flights that sent sticks."""
     return [
-        Span(flight.label, latency.p50, latency.p99, _color(flight))
+        LatencyRow(flight.label, latency.p50, latency.p99, _color(flight))
         for flight in flights
         if (latency := flight.state_to_wire_ms) is not None
     ]
 
 
-def link_spans(links: Sequence[LinkLatency]) -> list[Span]:
+def link_spans(links: Sequence[LinkLatency]) -> list[LatencyRow]:
     """Round trips of all clients."""
     return [
-        Span(
+        LatencyRow(
             link.client,
             link.round_trip_ms.p50,
             link.round_trip_ms.p99,

@@ -64,7 +64,7 @@ def main(*, port: int, attitudes: int, out: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """What came back."""
+    """Counts and times of a client's answers."""
 
     sent: int
     answered: int

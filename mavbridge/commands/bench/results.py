@@ -51,7 +51,7 @@ class Flight:
     runner: str
     policy: str
     solves: str
-    """How chunks are sampled, as ``solves_of`` names it."""
+    """Kind of solve, as ``solves_of`` names it."""
     engine: str
     asked_action_hz: float
     asked_vision_hz: float
@@ -78,7 +78,7 @@ class Flight:
 
     @property
     def label(self) -> str:
-        """What flew."""
+        """Runner, policy, kind of solve and engine."""
         return f"{self.runner}, {self.policy}, {self.solves}, {self.engine}"
 
     @property
@@ -90,7 +90,7 @@ class Flight:
 
 @dataclass(frozen=True, kw_only=True)
 class ClientTiming:
-    """What a client of the link test measured of itself; None = not measured."""
+    """Figures that a client of the link test measures itself; None = not measured."""
 
     state_to_wire_ms: Percentiles | None = None
     """From the kernel's arrival stamp of an attitude to the send."""
@@ -120,7 +120,7 @@ class BenchResult:
     flights: tuple[Flight, ...]
     links: tuple[LinkLatency, ...]
     notes: tuple[str, ...]
-    """What was left out, and why."""
+    """Parts that were left out, with the reasons."""
 
 
 def name_of(policy: PolicyConfig) -> str:
@@ -129,7 +129,7 @@ def name_of(policy: PolicyConfig) -> str:
 
 
 def solves_of(policy: PolicyConfig) -> str:
-    """How chunks are sampled, for tables."""
+    """The kind of solve that makes a policy's chunks, for tables."""
     if not policy.dual_rate:
         return "single rate"
     return "full solves" if policy.head_steps is None else f"warm start of {policy.head_steps}"

@@ -12,16 +12,15 @@ from mavbridge.commands.bench.flight import fly
 from mavbridge.commands.bench.link import OUR_CLIENTS, time_link
 from mavbridge.commands.bench.results import BenchResult, this_machine, to_json
 from mavbridge.commands.bench.tables import print_result
-from mavbridge.commands.output import require_matplotlib, table_console
+from mavbridge.commands.output import require_outputs, table_console
 from mavbridge.config.bench import BenchConfig, BenchOutputs
 from mavbridge.core.errors import UserError
-from mavbridge.core.files import require_writable
 from mavbridge.core.stopping import INTERRUPTED
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
-    """How long everything is measured."""
+    """Durations and repeats of all measurements."""
 
     engine_rounds: int
     engine_block_s: float
@@ -66,10 +65,7 @@ def run_and_report(outputs: BenchOutputs, measure: Callable[[Effort], BenchResul
         UserError: an output cannot be written, the budget cannot be read, or a package is missing.
     """
     budget = None if outputs.check is None else read_budget(outputs.check)
-    require_writable(outputs.json, "--json")
-    require_writable(outputs.plot, "--plot")
-    if outputs.plot is not None:
-        require_matplotlib()
+    require_outputs(outputs.json, outputs.plot)
     if find_spec("mujoco") is None:
         raise UserError("bench needs the simulator's dynamics: pip install 'mavbridge[sitl]'")
     console = table_console()

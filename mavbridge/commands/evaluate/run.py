@@ -10,10 +10,9 @@ from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode, fly_simulated
 from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
 from mavbridge.commands.evaluate.wall_clock import fly_on_wall_clock
-from mavbridge.commands.output import progress_bar, require_matplotlib
+from mavbridge.commands.output import progress_bar, require_outputs
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.files import require_writable
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 
 
@@ -23,10 +22,8 @@ def evaluate(config: EvaluateConfig) -> int:
     Raises:
         MavbridgeError: an episode cannot be flown, or the results cannot be written.
     """
-    # Refused now, not after an hour.
+    require_outputs(config.json, config.plot)
     draw = None if config.plot is None else _drawing(config.plot)
-    require_writable(config.json, "--json")
-    require_writable(config.plot, "--plot")
     console = Console(stderr=True, emoji=False)
     if config.realtime is not None:
         names = ("--realtime", "wall") if config.realtime else ("--lockstep", "simulated")
@@ -80,7 +77,6 @@ def _fly(
 
 def _drawing(path: Path) -> Callable[[Evaluation], None]:
     """The function that draws to ``path``; imported before the run."""
-    require_matplotlib()
     from mavbridge.commands.evaluate.figure import draw
 
     return lambda evaluation: draw(evaluation, path)

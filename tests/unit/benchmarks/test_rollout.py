@@ -10,6 +10,7 @@ from rich.console import Console
 from benchmarks import rollout
 from benchmarks.rollout import Pair, median_trial, print_pairs, write_json
 from benchmarks.rollout_process import Trial
+from mavbridge.commands.output import PIPED_WIDTH
 
 
 def make_trial(way: str, *, iterations: int = 8, steps: int = 4, wall_s: float = 10.0) -> Trial:
@@ -45,7 +46,7 @@ BY_STEPS = (make_pair(steps=1), make_pair(steps=4))
 
 def printed(*pairs: Pair) -> str:
     text = StringIO()
-    print_pairs(pairs, Console(file=text, width=140))
+    print_pairs(pairs, Console(file=text, width=PIPED_WIDTH))
     return text.getvalue()
 
 
@@ -62,8 +63,8 @@ def test_the_median_run_counts() -> None:
 
 def test_the_table_shows_both_ways() -> None:
     text = printed(*BY_ITERATIONS, *BY_STEPS)
-    assert re.search(r"serial +│ +8 │ +4 │ +2 │ +256 ", text), "two threads"
-    assert re.search(r"streamed +│ +8 │ +4 │ +1 │ +128 ", text), "one thread"
+    assert re.search(r"serial +│ +8 │ +4 │ +256 ", text)
+    assert re.search(r"streamed +│ +8 │ +4 │ +128 ", text)
     for part in ("329", "123", "1.25", "1.67", "0 of 4 pairs differ in their frames"):
         assert part in text
 

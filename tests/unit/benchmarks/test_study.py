@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 
 from benchmarks import study
-from benchmarks.study import DELAYED, DELAYED_WITHOUT_AGE, SETTINGS, Score, Setting
+from benchmarks.study import DELAYED, DELAYED_WITHOUT_AGE, SETTINGS, Setting, SettingScore
 
 
-def make_score(setting: Setting, checkpoint: Path, episodes: int, success: float = 0.5) -> Score:
-    return Score(
+def make_score(
+    setting: Setting, checkpoint: Path, episodes: int, success: float = 0.5
+) -> SettingScore:
+    return SettingScore(
         group=setting.group,
         name=setting.name,
         command=f"mavbridge evaluate {setting.flags}",
@@ -33,7 +35,9 @@ class Evaluations:
         self.flown: list[tuple[str, str]] = []
         self.most = 100
 
-    def evaluate(self, setting: Setting, checkpoint: Path, episodes: int, _workers: int) -> Score:
+    def evaluate(
+        self, setting: Setting, checkpoint: Path, episodes: int, _workers: int
+    ) -> SettingScore:
         if len(self.flown) == self.most:
             raise KeyboardInterrupt
         self.flown.append((checkpoint.stem, setting.name))

@@ -38,7 +38,7 @@ def test_rates_are_drawn_beside_what_was_asked(axes) -> None:
 
 
 def test_latencies_run_from_the_median_to_the_99th_percentile(axes) -> None:
-    span = figure.Span("one, two", 2.0, 30.0, "black")
+    span = figure.LatencyRow("one, two", 2.0, 30.0, "black")
     figure.draw_spans(axes, "title", [span])
     line, dot = axes.lines
     assert list(line.get_xdata()) == [2.0, 30.0]
