@@ -66,11 +66,6 @@ class TickRow(NamedTuple):
 
 _STICKS = pa.list_(pa.float32(), ACTION_DIM)
 _VECTOR = pa.list_(pa.float32(), 3)
-_PLAIN = (
-    *("index", "due_ns", "woke_ns", "sent_ns", "missed_slots", "predict_ns", "feature_frame_id"),
-    *("feature_captured_ns", "release_reason", "mode", "armed"),
-)
-"""Columns that hold an attribute of ``Tick`` as it is."""
 _STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
 _TRACE = ("raw", "clipped", "slewed", "smoothed")
 _TRUTH = tuple(field.name for field in fields(FrameTruth))
@@ -117,6 +112,8 @@ DEMONSTRATION_FRAMES = pa.schema(
 )
 """All columns of the truth are null where it was not given; its position alone never is."""
 
+_TICK = tuple(field.name for field in fields(Tick) if field.name in TICKS.names)
+"""Columns that hold an attribute of ``Tick``."""
 _ROWS_AT_ONCE = 4096
 
 
@@ -145,12 +142,14 @@ def frames_batch(rows: Sequence[FrameRow], schema: pa.Schema) -> pa.RecordBatch:
 
 def _tick_columns(row: TickRow) -> dict[str, object]:
     tick = row.tick
-    columns = _attributes(tick, (*_PLAIN, "sent", "rc_sticks", "rc_channels_us", "texts"))
-    columns |= _attributes(tick.state, _STAMPS) | _attributes(tick.trace, _TRACE)
-    columns |= _attributes(row.labels, ("expert",))
-    columns["state"] = None if tick.state is None else tick.state.values.tolist()
-    columns["dropped_before"] = row.dropped_before
-    return columns
+    return {
+        **_attributes(tick, _TICK),
+        **_attributes(tick.state, _STAMPS),
+        **_attributes(tick.trace, _TRACE),
+        **_attributes(row.labels, ("expert",)),
+        "state": None if tick.state is None else tick.state.values.tolist(),
+        "dropped_before": row.dropped_before,
+    }
 
 
 def _attributes(source: object | None, names: Iterable[str]) -> dict[str, object]:
@@ -184,19 +183,14 @@ def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _tick(row: dict[str, Any], serial: int) -> Tick:
+    values = {name: row[name] for name in _TICK}
+    values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
+    values |= {name: _sticks(row[name]) for name in ("sent", "rc_sticks")}
+    values["state"] = _state(row)
     trace = None
     if row["raw"] is not None:
         trace = StickTrace(**{name: Sticks(*row[name]) for name in _TRACE})
-    return Tick(
-        serial=serial,
-        state=_state(row),
-        trace=trace,
-        sent=_sticks(row["sent"]),
-        rc_sticks=_sticks(row["rc_sticks"]),
-        rc_channels_us=tuple(row["rc_channels_us"]),
-        texts=tuple(row["texts"]),
-        **{name: row[name] for name in _PLAIN},
-    )
+    return Tick(serial=serial, trace=trace, **values)
 
 
 def _state(row: dict[str, Any]) -> VehicleState | None:

@@ -158,7 +158,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
 
     def make(*arguments: object, **named: object) -> object:
         made = make_output(*arguments, **named)  # type: ignore[arg-type]
-        os.kill(made._video.pid, signal.SIGKILL)  # type: ignore[attr-defined]
+        os.kill(made.writer_pid, signal.SIGKILL)  # type: ignore[attr-defined, arg-type]
         return made
 
     monkeypatch.setattr(run, "make_output", make)

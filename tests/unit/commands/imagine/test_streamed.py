@@ -47,7 +47,7 @@ def output(out: Path, model: TinyWorld | None = None) -> Iterator[StreamedOutput
         yield made
     finally:
         made.close()
-    assert not made._worker.is_alive
+    assert "mavbridge-rollout-decode" not in {thread.name for thread in threading.enumerate()}
 
 
 def make_segment(iteration: int) -> Segment:
@@ -62,9 +62,8 @@ def make_segment(iteration: int) -> Segment:
 
 
 def pid_of(made: StreamedOutput) -> int:
-    assert made._video is not None
-    assert made._video.pid is not None
-    return made._video.pid
+    assert made.writer_pid is not None
+    return made.writer_pid
 
 
 def require_whole(out: Path, at_least: int) -> None:
