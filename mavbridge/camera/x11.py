@@ -43,7 +43,8 @@ class X11Screen:
             raise CameraError(
                 f"cannot search for windows without an X11 display: {error}; is DISPLAY set?"
             ) from error
-        self._root = self._display.screen().root
+        self._screen = self._display.screen()
+        self._root = self._screen.root
         self._title_atoms = [
             self._display.intern_atom(name) for name in ("_NET_WM_NAME", "WM_NAME")
         ]
@@ -75,7 +76,7 @@ class X11Screen:
         """
         window = self._display.create_resource_object("window", window_id)
         try:
-            size, screen = window.get_geometry(), self._root.get_geometry()
+            size = window.get_geometry()
             origin = self._root.translate_coords(window, 0, 0)
             is_viewable = window.get_attributes().map_state == X.IsViewable
         except XError:
@@ -83,8 +84,8 @@ class X11Screen:
         except ConnectionClosedError as error:
             raise CameraError(f"the X server has closed the connection: {error}") from error
         left, top = max(origin.x, 0), max(origin.y, 0)
-        right = min(origin.x + size.width, screen.width)
-        bottom = min(origin.y + size.height, screen.height)
+        right = min(origin.x + size.width, self._screen.width_in_pixels)
+        bottom = min(origin.y + size.height, self._screen.height_in_pixels)
         if not is_viewable or right <= left or bottom <= top:
             return None
         return Region(left, top, right - left, bottom - top)

@@ -24,40 +24,40 @@ class ParamReader:
     """Reads a list of parameters by name, a few at a time, and repeats requests that get lost."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
-        self._waiting = dict.fromkeys(names)
-        self._requested: dict[str, tuple[int, int]] = {}
+        self._open: dict[str, tuple[int, int]] = {}
         """Time of the last request and number of requests."""
         self.values: dict[str, float] = {}
+        self.request(names)
 
     def request(self, names: tuple[str, ...]) -> None:
         """Read these parameters as well."""
-        self._waiting |= dict.fromkeys(names)
+        self._open |= dict.fromkeys(names, (0, 0))
 
     @property
     def is_done(self) -> bool:
         """Every parameter has arrived or was given up."""
-        return not self._waiting and not self._requested
+        return not self._open
 
     def receive(self, param: ParamValue) -> None:
         """Take a PARAM_VALUE, requested or not."""
-        self._requested.pop(param.name, None)
-        self._waiting.pop(param.name, None)
+        self._open.pop(param.name, None)
         self.values[param.name] = param.value
 
     def step(self, now_ns: int) -> Iterator[ParamRequest]:
-        """Requests that are due."""
-        for name, (requested_ns, attempts) in list(self._requested.items()):
-            if now_ns - requested_ns < _TIMEOUT_NS:
+        """Requests that are due: repeated ones first, then new ones up to the window."""
+        in_flight = sum(attempts > 0 for _, attempts in self._open.values())
+        for name, (requested_ns, attempts) in list(self._open.items()):
+            if attempts == 0:
+                if in_flight >= _WINDOW:
+                    continue
+                in_flight += 1
+            elif now_ns - requested_ns < _TIMEOUT_NS:
                 continue
-            if attempts >= _ATTEMPTS:
-                del self._requested[name]
+            elif attempts >= _ATTEMPTS:
+                del self._open[name]
+                in_flight -= 1
                 continue
-            self._requested[name] = (now_ns, attempts + 1)
-            yield ParamRequest(name)
-        while self._waiting and len(self._requested) < _WINDOW:
-            name = next(iter(self._waiting))
-            del self._waiting[name]
-            self._requested[name] = (now_ns, 1)
+            self._open[name] = (now_ns, attempts + 1)
             yield ParamRequest(name)
 
 

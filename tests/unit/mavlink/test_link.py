@@ -21,7 +21,7 @@ PARAMS = CALIBRATION | {"MAV_GCS_SYSID": 255.0, "RC_OVERRIDE_TIME": 3.0}
 
 
 class Vehicle:
-    """Both ends' wire, and a vehicle that answers what a handshake asks."""
+    """A transport, and a vehicle behind it that answers the requests of a handshake."""
 
     def __init__(self, clock: FakeClock) -> None:
         self.clock = clock
@@ -31,7 +31,7 @@ class Vehicle:
         self.params = dict(PARAMS)
         self.mode, self.armed = 2, False
         self.channels = [1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500]
-        self.obeys = True
+        self.follows_overrides = True
         self.shows_rc = True
         self.is_down = False
         self.is_deaf = False
@@ -39,7 +39,7 @@ class Vehicle:
         self.answered_to: Address | None = None
         self.opened = 0
         self.boot_ns = clock.now_ns()
-        self.beats = True
+        self.is_alive = True
 
     # transport
 
@@ -58,7 +58,7 @@ class Vehicle:
         """The next message comes 3 ms from now, or after the wait."""
         arrival_ns = self.clock.now_ns() + 3 * MS
         self.clock.sleep_until_ns(min(arrival_ns, until_ns))
-        if arrival_ns <= until_ns and self.beats:
+        if arrival_ns <= until_ns and self.is_alive:
             self.tick(1)
 
     def answer_to(self, sender: Address | None) -> None:
@@ -87,7 +87,7 @@ class Vehicle:
                 self.put(mav.param_value_encode(message.param_id.encode(), value, 9, 99, 0))
             case "COMMAND_LONG":
                 self.put(mav.command_ack_encode(message.command, 0))
-            case "RC_CHANNELS_OVERRIDE" if self.obeys:
+            case "RC_CHANNELS_OVERRIDE" if self.follows_overrides:
                 for k in range(8):
                     value = getattr(message, f"chan{k + 1}_raw")
                     if value not in (0, 65535):
@@ -95,7 +95,7 @@ class Vehicle:
 
     def tick(self, tick: int) -> None:
         mav, ms = self.end.mav, (self.clock.now_ns() - self.boot_ns) // MS
-        if tick % 100 == 0 and self.beats:
+        if tick % 100 == 0 and self.is_alive:
             self.inbox.append(
                 Chunk(
                     self.end.heartbeat(mode=self.mode, armed=self.armed),
@@ -113,7 +113,7 @@ class Vehicle:
         return [message.get_type() for message in self.received]
 
 
-class Bench:
+class Rig:
     """Ticks both at 100 Hz."""
 
     def __init__(self, **config: Any) -> None:
@@ -155,345 +155,343 @@ RELEASE_US = [0, 0, 0, 0, 65535, 65535, 65535, 65535]
 
 
 def test_from_first_heartbeat_to_ready() -> None:
-    bench = Bench()
-    assert bench.run(1.0).problem == "waiting for the vehicle's heartbeat"
-    snapshot = bench.run(9.0)
+    rig = Rig()
+    assert rig.run(1.0).problem == "waiting for the vehicle's heartbeat"
+    snapshot = rig.run(9.0)
     assert snapshot.problem is None
     assert not snapshot.echo_confirmed
     assert snapshot.status is not None
     assert (snapshot.status.mode, snapshot.status.armed) == ("ALT_HOLD", False)
     assert snapshot.status.rc_channels_us[:4] == (1500, 1500, 1000, 1500)
-    assert bench.overrides() == []
+    assert rig.overrides() == []
     intervals = {
         int(message.param1): int(message.param2)
-        for message in bench.vehicle.received
+        for message in rig.vehicle.received
         if message.get_type() == "COMMAND_LONG" and message.command == 511
     }
     assert intervals == {31: 10000, 32: 10000, 105: 10000, 65: 50000}
-    assert any("RC_OVERRIDE_TIME is 3" in text for text in bench.texts)
+    assert any("RC_OVERRIDE_TIME is 3" in text for text in rig.texts)
 
 
 def test_the_packet_log_has_both_directions_and_only_what_left() -> None:
-    bench = Bench()
-    bench.run(9.5)
-    bench.vehicle.is_deaf = True
-    bench.run(1.0)
-    bench.vehicle.is_deaf = False
-    packets = bench.packet_log.drain()
-    assert bench.packet_log.dropped == 0
+    rig = Rig()
+    rig.run(9.5)
+    rig.vehicle.is_deaf = True
+    rig.run(1.0)
+    rig.vehicle.is_deaf = False
+    packets = rig.packet_log.drain()
+    assert rig.packet_log.dropped == 0
     end = WireEnd()
     read = [message for packet in packets for message in end.read(packet.data)]
     assert len(read) == len(packets)
     sent = [message for message in read if message.get_srcSystem() == 255]
-    assert [m.get_type() for m in sent] == bench.vehicle.names()
-    assert sum(m.get_type() == "ATTITUDE_QUATERNION" for m in read) == bench.ticks
-    assert all(packet.stamp_ns <= bench.clock.now_ns() for packet in packets)
+    assert [m.get_type() for m in sent] == rig.vehicle.names()
+    assert sum(m.get_type() == "ATTITUDE_QUATERNION" for m in read) == rig.ticks
+    assert all(packet.stamp_ns <= rig.clock.now_ns() for packet in packets)
 
 
-def test_we_beat_once_a_second_and_only_while_polled() -> None:
-    bench = Bench()
-    bench.run(5.0)
-    assert bench.vehicle.names().count("HEARTBEAT") == 5
-    bench.clock.advance_ns(10 * NS_PER_S)
-    assert bench.vehicle.names().count("HEARTBEAT") == 5
+def test_heartbeats_go_out_once_a_second_and_only_while_serviced() -> None:
+    rig = Rig()
+    rig.run(5.0)
+    assert rig.vehicle.names().count("HEARTBEAT") == 5
+    rig.clock.advance_ns(10 * NS_PER_S)
+    assert rig.vehicle.names().count("HEARTBEAT") == 5
 
 
 def test_commands_are_echoed_and_confirmed() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    snapshot = bench.run(0.2, Command(sticks=IDLE))
+    rig = Rig()
+    rig.run(8.0)
+    snapshot = rig.run(0.2, Command(sticks=IDLE))
     assert snapshot.echo_confirmed
     assert snapshot.problem is None
-    assert bench.overrides()[-1] == IDLE_US
-    assert bench.link.send(Command(sticks=Sticks(0.0, 0.0, 0.001, 0.5))) == Sticks(0, 0, 0, 0.5)
-    assert bench.link.stats().echo_confirmed is True
+    assert rig.overrides()[-1] == IDLE_US
+    assert rig.link.send(Command(sticks=Sticks(0.0, 0.0, 0.001, 0.5))) == Sticks(0, 0, 0, 0.5)
+    assert rig.link.stats().echo_confirmed is True
 
 
 @pytest.mark.parametrize(
-    ("params", "told"),
+    ("params", "expected"),
     [
         ({"MAV_GCS_SYSID": 42.0}, "--source-system 42"),
         ({"RC_OPTIONS": 2.0}, "RC_OPTIONS bit 1"),
         ({"RC_OVERRIDE_TIME": 0.0}, "RC_OVERRIDE_TIME is 0"),
     ],
 )
-def test_a_vehicle_that_would_not_obey_is_told_before_a_stick_is_sent(
-    params: dict[str, float], told: str
+def test_a_vehicle_that_would_ignore_us_is_reported_before_a_stick_is_sent(
+    params: dict[str, float], expected: str
 ) -> None:
-    bench = Bench()
-    bench.vehicle.params |= params
-    problem = bench.run(8.0).problem
+    rig = Rig()
+    rig.vehicle.params |= params
+    problem = rig.run(8.0).problem
     assert problem is not None
     assert "would ignore our sticks" in problem
-    assert told in problem
+    assert expected in problem
 
 
 @pytest.mark.parametrize("resting_throttle_us", [1000, 1100])
-def test_a_vehicle_that_does_not_obey_is_noticed(resting_throttle_us: int) -> None:
-    bench = Bench()
-    bench.vehicle.channels[2] = resting_throttle_us  # 1100: just where IDLE is
-    bench.vehicle.obeys = False
-    bench.run(8.0)
-    assert bench.run(0.9, Command(sticks=IDLE)).problem is None
-    snapshot = bench.run(0.3, Command(sticks=IDLE))
+def test_a_vehicle_that_ignores_us_is_noticed(resting_throttle_us: int) -> None:
+    rig = Rig()
+    rig.vehicle.channels[2] = resting_throttle_us  # 1100: just where IDLE is
+    rig.vehicle.follows_overrides = False
+    rig.run(8.0)
+    assert rig.run(0.9, Command(sticks=IDLE)).problem is None
+    snapshot = rig.run(0.3, Command(sticks=IDLE))
     assert "another station may be overriding" in (snapshot.problem or "")
     assert snapshot.is_overruled
     assert not snapshot.echo_confirmed
-    assert bench.link.stats().echo_confirmed is False
+    assert rig.link.stats().echo_confirmed is False
 
 
 def test_without_rc_channels_there_is_nothing_to_check_against() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.vehicle.shows_rc = False
-    bench.vehicle.obeys = False
-    assert "no RC_CHANNELS" in (bench.run(1.3, Command(sticks=IDLE)).problem or "")
+    rig = Rig()
+    rig.run(8.0)
+    rig.vehicle.shows_rc = False
+    rig.vehicle.follows_overrides = False
+    assert "no RC_CHANNELS" in (rig.run(1.3, Command(sticks=IDLE)).problem or "")
 
 
-def test_release_is_said_ten_times_and_then_the_wire_is_silent() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.run(0.2, Command(sticks=IDLE))
-    bench.run(3.0, Release("pilot"))
-    assert bench.overrides()[20:] == [RELEASE_US] * 10
-    bench.run(1.0, Command(sticks=IDLE))
-    count = len(bench.overrides())
-    bench.link.send(Release("end"))
-    bench.link.hand_back()
-    assert bench.overrides()[count:] == [RELEASE_US] * 10
-    assert bench.link.stats().sent_overrides == 120
+def test_a_release_is_sent_ten_times_and_then_nothing() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.run(0.2, Command(sticks=IDLE))
+    rig.run(3.0, Release("pilot"))
+    assert rig.overrides()[20:] == [RELEASE_US] * 10
+    rig.run(1.0, Command(sticks=IDLE))
+    count = len(rig.overrides())
+    rig.link.send(Release("end"))
+    rig.link.hand_back()
+    assert rig.overrides()[count:] == [RELEASE_US] * 10
+    assert rig.link.stats().sent_overrides == 120
 
 
-def test_releases_that_could_not_leave_are_said_later() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.run(0.2, Command(sticks=IDLE))
-    bench.vehicle.is_deaf = True
-    bench.run(1.0, Release("pilot"))
-    assert RELEASE_US not in bench.overrides()
-    bench.vehicle.is_deaf = False
-    bench.run(1.0, Release("pilot"))
-    assert bench.overrides()[20:] == [RELEASE_US] * 10
+def test_releases_that_could_not_be_sent_are_sent_later() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.run(0.2, Command(sticks=IDLE))
+    rig.vehicle.is_deaf = True
+    rig.run(1.0, Release("pilot"))
+    assert RELEASE_US not in rig.overrides()
+    rig.vehicle.is_deaf = False
+    rig.run(1.0, Release("pilot"))
+    assert rig.overrides()[20:] == [RELEASE_US] * 10
 
 
-def test_what_did_not_leave_was_not_sent() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.run(0.2, Command(sticks=IDLE))
-    bench.vehicle.is_deaf = True
-    assert bench.link.send(Command(sticks=IDLE)) is None
-    bench.vehicle.is_down = True
-    assert bench.run(0.1).problem == "the connection to the vehicle is lost: reconnecting"
-    assert bench.link.send(Command(sticks=IDLE)) is None
-    assert bench.link.stats().sent_overrides == 20
+def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.run(0.2, Command(sticks=IDLE))
+    rig.vehicle.is_deaf = True
+    assert rig.link.send(Command(sticks=IDLE)) is None
+    rig.vehicle.is_down = True
+    assert rig.run(0.1).problem == "the connection to the vehicle is lost: reconnecting"
+    assert rig.link.send(Command(sticks=IDLE)) is None
+    assert rig.link.stats().sent_overrides == 20
 
 
 def test_after_a_forced_release_only_releases_leave() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.run(0.2, Command(sticks=IDLE))
-    bench.link.force_release()
-    assert bench.overrides()[20:] == [RELEASE_US] * 10
-    count = len(bench.vehicle.received)
-    bench.run(1.0, Command(sticks=IDLE))  # the owner has come back
-    bench.link.hand_back()
-    assert len(bench.vehicle.received) == count
+    rig = Rig()
+    rig.run(8.0)
+    rig.run(0.2, Command(sticks=IDLE))
+    rig.link.force_release()
+    assert rig.overrides()[20:] == [RELEASE_US] * 10
+    count = len(rig.vehicle.received)
+    rig.run(1.0, Command(sticks=IDLE))  # the owner has come back
+    rig.link.hand_back()
+    assert len(rig.vehicle.received) == count
 
 
-def test_nothing_is_released_that_was_never_taken() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.run(1.0, Release("disarmed"))
-    bench.link.hand_back()
-    assert bench.overrides() == []
+def test_nothing_is_released_that_was_never_overridden() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.run(1.0, Release("disarmed"))
+    rig.link.hand_back()
+    assert rig.overrides() == []
 
 
 def test_readonly_sends_no_stick() -> None:
-    bench = Bench(readonly=True)
-    bench.run(8.0)
-    bench.run(1.0, Command(sticks=IDLE))
-    bench.link.hand_back()
-    assert bench.overrides() == []
+    rig = Rig(readonly=True)
+    rig.run(8.0)
+    rig.run(1.0, Command(sticks=IDLE))
+    rig.link.hand_back()
+    assert rig.overrides() == []
 
 
 def test_the_override_switch_decides() -> None:
-    bench = Bench()
-    bench.vehicle.params["RC7_OPTION"] = 46.0
-    bench.vehicle.channels[6] = 1000
-    assert "override switch (RC7) is off" in (bench.run(9.0).problem or "")
-    bench.vehicle.channels[6] = 2000
-    assert bench.run(0.1).problem is None
+    rig = Rig()
+    rig.vehicle.params["RC7_OPTION"] = 46.0
+    rig.vehicle.channels[6] = 1000
+    assert "override switch (RC7) is off" in (rig.run(9.0).problem or "")
+    rig.vehicle.channels[6] = 2000
+    assert rig.run(0.1).problem is None
 
 
 def test_a_silent_vehicle_is_lost_after_three_beats_and_found_again() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.vehicle.beats = False
-    assert bench.run(1.9).problem is None  # the last beat was a second before
-    assert bench.run(0.3).problem == "the vehicle's heartbeat is lost"
-    bench.vehicle.beats = True
-    assert bench.run(1.0).problem is None
+    rig = Rig()
+    rig.run(8.0)
+    rig.vehicle.is_alive = False
+    assert rig.run(1.9).problem is None  # the last beat was a second before
+    assert rig.run(0.3).problem == "the vehicle's heartbeat is lost"
+    rig.vehicle.is_alive = True
+    assert rig.run(1.0).problem is None
 
 
 def test_a_lost_connection_is_opened_again_once_a_second() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.vehicle.is_down = True
-    bench.run(3.05)
-    assert bench.vehicle.opened == 1 + 3
-    bench.vehicle.is_down = False
-    assert bench.run(2.0).problem is None
-    assert any("connection lost" in text for text in bench.texts)
+    rig = Rig()
+    rig.run(8.0)
+    rig.vehicle.is_down = True
+    rig.run(3.05)
+    assert rig.vehicle.opened == 1 + 3
+    rig.vehicle.is_down = False
+    assert rig.run(2.0).problem is None
+    assert any("connection lost" in text for text in rig.texts)
 
 
-def test_after_reconnecting_the_same_peer_is_answered() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.vehicle.is_down = True
-    bench.run(0.5)
-    bench.vehicle.is_down, bench.vehicle.answered_to = False, None
-    bench.run(2.0)
-    assert bench.vehicle.answered_to == ("127.0.0.1", 1)
+def test_after_reconnecting_packets_go_to_the_same_peer() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.vehicle.is_down = True
+    rig.run(0.5)
+    rig.vehicle.is_down, rig.vehicle.answered_to = False, None
+    rig.run(2.0)
+    assert rig.vehicle.answered_to == ("127.0.0.1", 1)
 
 
 def test_a_vehicle_that_comes_back_from_another_port_is_followed() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.vehicle.address = ("127.0.0.1", 2)
-    assert bench.run(2.2).problem is not None
-    assert bench.vehicle.answered_to == ("127.0.0.1", 2)
-    assert bench.run(5.0).problem is None
-    assert any("now sends from" in text for text in bench.texts)
+    rig = Rig()
+    rig.run(8.0)
+    rig.vehicle.address = ("127.0.0.1", 2)
+    assert rig.run(2.2).problem is not None
+    assert rig.vehicle.answered_to == ("127.0.0.1", 2)
+    assert rig.run(5.0).problem is None
+    assert any("now sends from" in text for text in rig.texts)
 
 
 def test_one_old_stamp_is_no_reboot_and_costs_no_release() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    bench.run(0.2, Command(sticks=IDLE))
-    mav = bench.vehicle.end.mav
-    bench.vehicle.put(mav.attitude_quaternion_encode(3, 1, 0, 0, 0, 0, 0, 0))
-    assert bench.run(0.2, Command(sticks=IDLE)).problem is None
-    assert not any("rebooted" in text for text in bench.texts)
-    bench.vehicle.boot_ns = bench.clock.now_ns()
-    assert bench.run(0.05).problem is not None
-    bench.link.hand_back()
-    assert bench.overrides()[-10:] == [RELEASE_US] * 10
+    rig = Rig()
+    rig.run(8.0)
+    rig.run(0.2, Command(sticks=IDLE))
+    mav = rig.vehicle.end.mav
+    rig.vehicle.put(mav.attitude_quaternion_encode(3, 1, 0, 0, 0, 0, 0, 0))
+    assert rig.run(0.2, Command(sticks=IDLE)).problem is None
+    assert not any("rebooted" in text for text in rig.texts)
+    rig.vehicle.boot_ns = rig.clock.now_ns()
+    assert rig.run(0.05).problem is not None
+    rig.link.hand_back()
+    assert rig.overrides()[-10:] == [RELEASE_US] * 10
 
 
 def test_a_reboot_starts_the_handshake_again() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    reads = bench.vehicle.names().count("PARAM_REQUEST_READ")
-    bench.vehicle.boot_ns = bench.clock.now_ns()
-    assert bench.run(0.05).problem is not None
-    assert bench.run(5.0).problem is None
-    assert bench.vehicle.names().count("PARAM_REQUEST_READ") == 2 * reads
-    assert any("rebooted" in text for text in bench.texts)
+    rig = Rig()
+    rig.run(8.0)
+    reads = rig.vehicle.names().count("PARAM_REQUEST_READ")
+    rig.vehicle.boot_ns = rig.clock.now_ns()
+    assert rig.run(0.05).problem is not None
+    assert rig.run(5.0).problem is None
+    assert rig.vehicle.names().count("PARAM_REQUEST_READ") == 2 * reads
+    assert any("rebooted" in text for text in rig.texts)
 
 
-def test_mode_and_arm_are_asked_once_a_second_and_refusals_are_told() -> None:
-    bench = Bench()
-    bench.run(8.0)
+def test_mode_and_arm_are_requested_once_a_second_and_refusals_are_reported() -> None:
+    rig = Rig()
+    rig.run(8.0)
     for _ in range(150):
-        bench.link.set_mode("ACRO")
-        bench.link.arm()
-        bench.run(0.01)
+        rig.link.set_mode("ACRO")
+        rig.link.arm()
+        rig.run(0.01)
     commands = [
         (message.command, message.param1, message.param2)
-        for message in bench.vehicle.received
+        for message in rig.vehicle.received
         if message.get_type() == "COMMAND_LONG" and message.command in (176, 400)
     ]
     assert sorted(commands) == [(176, 1, 1), (176, 1, 1), (400, 1, 0), (400, 1, 0)]
-    bench.vehicle.put(bench.vehicle.end.mav.command_ack_encode(400, dialect.MAV_RESULT_FAILED))
-    bench.vehicle.put(bench.vehicle.end.mav.statustext_encode(2, b"Arm: Throttle too high"))
-    bench.run(0.01)
-    assert "the vehicle answered COMPONENT_ARM_DISARM with FAILED" in bench.texts
-    assert "vehicle: Arm: Throttle too high" in bench.texts
+    rig.vehicle.put(rig.vehicle.end.mav.command_ack_encode(400, dialect.MAV_RESULT_FAILED))
+    rig.vehicle.put(rig.vehicle.end.mav.statustext_encode(2, b"Arm: Throttle too high"))
+    rig.run(0.01)
+    assert "the vehicle answered COMPONENT_ARM_DISARM with FAILED" in rig.texts
+    assert "vehicle: Arm: Throttle too high" in rig.texts
 
 
-def test_nobody_there_is_an_error_with_advice() -> None:
-    bench = Bench(connect_timeout=2.0)
-    bench.vehicle.beats = False
+def test_no_vehicle_is_an_error_with_advice() -> None:
+    rig = Rig(connect_timeout=2.0)
+    rig.vehicle.is_alive = False
     with pytest.raises(PeerError, match="no vehicle on memory after 2 s: heard nothing"):
-        bench.run(3.0)
+        rig.run(3.0)
 
 
 def test_a_vehicle_heard_in_time_is_not_given_up_while_it_settles() -> None:
-    assert Bench(connect_timeout=0.1).run(8.0).problem is None
+    assert Rig(connect_timeout=0.1).run(8.0).problem is None
 
 
 def test_it_waits_for_the_attitude_and_no_longer() -> None:
-    bench = Bench()
-    bench.run(8.0)
-    now_ns = bench.clock.now_ns()
-    newest_ns = bench.link.wait_for_attitude(newer_than_ns=now_ns, until_ns=now_ns + 10 * MS)
-    assert newest_ns == bench.clock.now_ns() == now_ns + 3 * MS
-    newest_ns = bench.link.wait_for_attitude(
-        newer_than_ns=now_ns + 5 * MS, until_ns=now_ns + 12 * MS
-    )
-    assert newest_ns == bench.clock.now_ns() == now_ns + 6 * MS
-    bench.vehicle.beats = False
-    bench.link.wait_for_attitude(newer_than_ns=now_ns + 7 * MS, until_ns=now_ns + 12 * MS)
-    assert bench.clock.now_ns() == now_ns + 12 * MS
-    bench.vehicle.is_down = True
-    bench.link.wait_for_attitude(newer_than_ns=now_ns + 13 * MS, until_ns=now_ns + 20 * MS)
-    assert bench.clock.now_ns() == now_ns + 20 * MS
+    rig = Rig()
+    rig.run(8.0)
+    now_ns = rig.clock.now_ns()
+    newest_ns = rig.link.wait_for_attitude(newer_than_ns=now_ns, until_ns=now_ns + 10 * MS)
+    assert newest_ns == rig.clock.now_ns() == now_ns + 3 * MS
+    newest_ns = rig.link.wait_for_attitude(newer_than_ns=now_ns + 5 * MS, until_ns=now_ns + 12 * MS)
+    assert newest_ns == rig.clock.now_ns() == now_ns + 6 * MS
+    rig.vehicle.is_alive = False
+    rig.link.wait_for_attitude(newer_than_ns=now_ns + 7 * MS, until_ns=now_ns + 12 * MS)
+    assert rig.clock.now_ns() == now_ns + 12 * MS
+    rig.vehicle.is_down = True
+    rig.link.wait_for_attitude(newer_than_ns=now_ns + 13 * MS, until_ns=now_ns + 20 * MS)
+    assert rig.clock.now_ns() == now_ns + 20 * MS
 
 
-def test_other_systems_on_the_link_are_not_listened_to() -> None:
-    bench = Bench()
-    bench.run(8.0)
+def test_other_systems_on_the_link_are_ignored() -> None:
+    rig = Rig()
+    rig.run(8.0)
     stranger = WireEnd(system=9)
-    bench.vehicle.inbox.append(
+    rig.vehicle.inbox.append(
         Chunk(
             stranger.pack(stranger.mav.attitude_encode(0, 1, 1, 1, 1, 1, 1)),
             0,
-            bench.vehicle.address,
+            rig.vehicle.address,
         )
     )
-    snapshot = bench.run(0.01)
+    snapshot = rig.run(0.01)
     assert snapshot.telemetry.rate_body_radps is not None
     assert snapshot.telemetry.rate_body_radps.values == (0, 0, 0)
 
 
-def px4_bench(**config: Any) -> Bench:
-    bench = Bench(**config)
-    beat = bench.vehicle.end.heartbeat
-    bench.vehicle.end.heartbeat = (  # type: ignore[method-assign]
+def px4_rig(**config: Any) -> Rig:
+    rig = Rig(**config)
+    beat = rig.vehicle.end.heartbeat
+    rig.vehicle.end.heartbeat = (  # type: ignore[method-assign]
         lambda **options: beat(**(options | {"autopilot": 12, "mode": 2 << 16}))
     )
-    return bench
+    return rig
 
 
 def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
-    bench = px4_bench(output="manual-control")
-    snapshot = bench.run(8.0)
+    rig = px4_rig(output="manual-control")
+    snapshot = rig.run(8.0)
     assert snapshot.problem is None
     assert snapshot.echo_confirmed
     assert snapshot.status is not None
     assert snapshot.status.mode == "ALTCTL"
-    bench.run(0.1, Command(sticks=IDLE))
-    bench.run(0.1, Release("pilot"))
-    assert bench.vehicle.names().count("MANUAL_CONTROL") == 10
-    assert bench.overrides() == []
+    rig.run(0.1, Command(sticks=IDLE))
+    rig.run(0.1, Release("pilot"))
+    assert rig.vehicle.names().count("MANUAL_CONTROL") == 10
+    assert rig.overrides() == []
 
 
 def test_ardupilot_with_manual_control_is_refused() -> None:
     with pytest.raises(PeerError, match="--output rc-override"):
-        Bench(output="manual-control").run(3.0)
+        Rig(output="manual-control").run(3.0)
 
 
-def test_acks_for_others_do_not_steer_us() -> None:
-    bench = Bench()
-    bench.run(2.0)
+def test_acks_for_other_stations_are_ignored() -> None:
+    rig = Rig()
+    rig.run(2.0)
     for _ in range(6):
         denied = dialect.MAV_RESULT_DENIED
-        bench.vehicle.put(bench.vehicle.end.mav.command_ack_encode(511, denied, 0, 0, 250, 190))
-        bench.run(0.01)
-    bench.run(6.0)
+        rig.vehicle.put(rig.vehicle.end.mav.command_ack_encode(511, denied, 0, 0, 250, 190))
+        rig.run(0.01)
+    rig.run(6.0)
     intervals = [
         int(message.param1)
-        for message in bench.vehicle.received
+        for message in rig.vehicle.received
         if message.get_type() == "COMMAND_LONG" and message.command == 511
     ]
     assert intervals == [31, 32, 105, 65]
@@ -501,4 +499,4 @@ def test_acks_for_others_do_not_steer_us() -> None:
 
 def test_px4_with_rc_override_is_refused() -> None:
     with pytest.raises(PeerError, match="--output manual-control"):
-        px4_bench().run(3.0)
+        px4_rig().run(3.0)

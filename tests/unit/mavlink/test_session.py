@@ -28,7 +28,7 @@ from mavbridge.mavlink.session.timesync import TimesyncFilter
 S = NS_PER_S
 
 
-def beat(vehicle_type: int = 2, autopilot: int = 3) -> Heartbeat:
+def heartbeat(vehicle_type: int = 2, autopilot: int = 3) -> Heartbeat:
     return Heartbeat(vehicle_type=vehicle_type, autopilot=autopilot, base_mode=1, custom_mode=0)
 
 
@@ -37,10 +37,10 @@ def beat(vehicle_type: int = 2, autopilot: int = 3) -> Heartbeat:
 
 def test_one_vehicle_is_chosen_once_a_second_one_would_have_been_heard() -> None:
     discovery = VehicleDiscovery(target_system=0)
-    discovery.receive(Endpoint(255, 190), beat(dialect.MAV_TYPE_GCS, 8), None, 0)
-    discovery.receive(Endpoint(1, 154), beat(dialect.MAV_TYPE_GIMBAL, 8), None, 0)
+    discovery.receive(Endpoint(255, 190), heartbeat(dialect.MAV_TYPE_GCS, 8), None, 0)
+    discovery.receive(Endpoint(1, 154), heartbeat(dialect.MAV_TYPE_GIMBAL, 8), None, 0)
     assert discovery.choose(10 * S) is None
-    discovery.receive(Endpoint(1, 1), beat(), ("host", 5), 10 * S)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), 10 * S)
     assert discovery.choose(11 * S) is None
     peer = discovery.choose(12 * S)
     assert peer is not None
@@ -49,15 +49,15 @@ def test_one_vehicle_is_chosen_once_a_second_one_would_have_been_heard() -> None
 
 def test_two_vehicles_need_a_choice() -> None:
     discovery = VehicleDiscovery(target_system=0)
-    discovery.receive(Endpoint(1, 1), beat(), None, 0)
-    discovery.receive(Endpoint(7, 1), beat(), None, S)
+    discovery.receive(Endpoint(1, 1), heartbeat(), None, 0)
+    discovery.receive(Endpoint(7, 1), heartbeat(), None, S)
     with pytest.raises(PeerError, match=r"\[1, 7\].*--target-system"):
         discovery.choose(2 * S)
     chosen = VehicleDiscovery(target_system=7)
-    chosen.receive(Endpoint(1, 1), beat(), None, 0)
+    chosen.receive(Endpoint(1, 1), heartbeat(), None, 0)
     assert chosen.choose(9 * S) is None
     assert "--target-system" in chosen.describe()
-    chosen.receive(Endpoint(7, 1), beat(autopilot=12), None, S)
+    chosen.receive(Endpoint(7, 1), heartbeat(autopilot=12), None, S)
     peer = chosen.choose(3 * S)
     assert peer is not None
     assert peer.autopilot == "px4"
@@ -65,20 +65,20 @@ def test_two_vehicles_need_a_choice() -> None:
 
 def test_two_vehicles_of_one_id_cannot_be_told_apart() -> None:
     discovery = VehicleDiscovery(target_system=1)
-    discovery.receive(Endpoint(1, 1), beat(), ("host", 5), 0)
-    discovery.receive(Endpoint(1, 1), beat(), ("host", 6), S)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), 0)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 6), S)
     with pytest.raises(PeerError, match=r"id 1 .*5.*6.*another id"):
         discovery.choose(2 * S)
 
 
 def test_a_vehicle_that_speaks_from_a_new_address_has_moved() -> None:
     discovery = VehicleDiscovery(target_system=0)
-    discovery.receive(Endpoint(1, 1), beat(), ("host", 5), 0)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), 0)
     old = discovery.choose(2 * S)
     assert old is not None
-    discovery.receive(Endpoint(1, 1), beat(), ("host", 6), 2 * S)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 6), 2 * S)
     assert discovery.moved(old, 5 * S // 2) is None  # it was heard at both just now
-    discovery.receive(Endpoint(1, 1), beat(), ("host", 6), 4 * S)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 6), 4 * S)
     moved = discovery.moved(old, 4 * S)
     assert moved is not None
     assert moved.address == ("host", 6)
@@ -88,8 +88,8 @@ def test_a_vehicle_that_speaks_from_a_new_address_has_moved() -> None:
     ("heard", "expected"),
     [
         ([], "heard nothing"),
-        ([(Endpoint(255, 190), beat(6, 8))], "heard only GCS (system 255, component 190)"),
-        ([(Endpoint(1, 1), beat(2, 8))], "no autopilot"),  # quadrotor type, but no autopilot
+        ([(Endpoint(255, 190), heartbeat(6, 8))], "heard only GCS (system 255, component 190)"),
+        ([(Endpoint(1, 1), heartbeat(2, 8))], "no autopilot"),  # quadrotor type, but no autopilot
     ],
 )
 def test_other_senders_are_described(
@@ -120,15 +120,7 @@ def test_mode_names_of_both_autopilots() -> None:
 # --- parameters
 
 
-def answer(reader: params.ParamReader, now_ns: int, known: dict[str, float]) -> list[str]:
-    asked = [request.name for request in reader.step(now_ns)]
-    for name in asked:
-        if name in known:
-            reader.receive(ParamValue(name=name, value=known[name]))
-    return asked
-
-
-def test_parameters_are_asked_a_few_at_a_time_and_again_when_lost() -> None:
+def test_parameters_are_requested_a_few_at_a_time_and_again_when_lost() -> None:
     names = tuple(f"P{k}" for k in range(20))
     reader = params.ParamReader(names)
     first = [request.name for request in reader.step(0)]
@@ -146,8 +138,8 @@ def test_parameters_are_asked_a_few_at_a_time_and_again_when_lost() -> None:
 
 def test_a_parameter_that_does_not_exist_is_given_up() -> None:
     reader = params.ParamReader(("NONE",))
-    asked = sum(len(list(reader.step(k * S))) for k in range(20))
-    assert asked == 4
+    requested = sum(len(list(reader.step(k * S))) for k in range(20))
+    assert requested == 4
     assert reader.is_done
     assert reader.values == {}
 
@@ -217,36 +209,36 @@ def one_group() -> streams.StreamRequester:
     return streams.StreamRequester(streams.telemetry_streams(state_hz=100, rc_hz=20)[:1])
 
 
-def test_streams_are_asked_one_after_the_other_at_the_action_rate() -> None:
+def test_streams_are_requested_one_after_the_other_at_the_action_rate() -> None:
     requester = streams.StreamRequester(streams.telemetry_streams(state_hz=100, rc_hz=20))
-    asked = []
+    requested = []
     for k in range(4):
-        asked.append(ids(requester.step(k)))
+        requested.append(ids(requester.step(k)))
         assert requester.step(k) is None  # acks carry no id: one at a time
-        requester.receive_ack(ack(0, command=400))  # somebody else's ack
+        requester.receive_ack(ack(0, command=400))  # an ack of another command
         assert requester.step(k) is None
         requester.receive_ack(ack(0))
-    assert asked == [(31, 10000), (32, 10000), (105, 10000), (65, 50000)]
+    assert requested == [(31, 10000), (32, 10000), (105, 10000), (65, 50000)]
     assert requester.is_settled
 
 
 def test_denied_means_slower_then_another_message_then_the_legacy_stream() -> None:
-    requester, asked = one_group(), []
+    requester, requested = one_group(), []
     for k in range(6):
-        asked.append(ids(requester.step(k)))
+        requested.append(ids(requester.step(k)))
         requester.receive_ack(ack(dialect.MAV_RESULT_DENIED))
-    assert asked == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
+    assert requested == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
     assert requester.step(9) == StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
     assert requester.is_settled
 
 
-def test_silence_is_asked_again_and_then_taken_for_an_old_vehicle() -> None:
+def test_an_unanswered_request_is_repeated_and_then_the_legacy_stream_used() -> None:
     requester = one_group()
     requests = [requester.step(k * S) for k in range(5)]
     assert [type(request) for request in requests] == [CommandRequest] * 4 + [StreamRequest]
 
 
-def test_a_stream_that_slows_down_is_asked_for_again() -> None:
+def test_a_stream_that_slows_down_is_requested_again() -> None:
     requester = one_group()
     requester.step(0)
     requester.receive_ack(ack(0))
