@@ -20,7 +20,6 @@ from sitl.errors import UsageError
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
-TILT_UP_RAD = NOMINAL.camera_tilt_rad
 NEAR_M = 0.05  # what is nearer than this, or behind, is cut off before it is projected
 LOWEST_EYE_M = 0.12
 """The eye is drawn at least this high, so that a vehicle on the ground sees ground."""

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.ports import free_port
 from sitl.clock import NS_PER_S, Clock
 from sitl.vehicle.params import Params
 
@@ -28,12 +29,6 @@ pytestmark = pytest.mark.peers
 def need(program: str) -> None:
     if not (PEERS / program).exists():
         pytest.skip(f"{program} is not installed in .venv-peers")
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager

@@ -214,15 +214,7 @@ class _Pilot:
         if self._expert is None:
             self._expert = self._begin(now_ns)
         body = self._episode.vehicle.ap.truth
-        self.opinion = Sticks(
-            *self._expert.sticks(
-                body.position_ned_m,
-                body.velocity_ned_mps,
-                body.ned_from_body_wxyz,
-                body.rate_body_radps,
-                now_ns / NS_PER_S,
-            )
-        )
+        self.opinion = Sticks(*self._expert.sticks(body, now_ns / NS_PER_S))
         demonstrated = self._expert_chunk()
         if self._student is None:
             return demonstrated

@@ -6,6 +6,7 @@ from contextlib import closing, suppress
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.ports import free_port
 from sitl.clock import NS_PER_S, Clock
 from sitl.errors import UsageError
 from sitl.link.transport import FOLLOWER_KINDS, MAX_PEERS, open_transport, split_frames
@@ -13,12 +14,6 @@ from sitl.link.transport import FOLLOWER_KINDS, MAX_PEERS, open_transport, split
 DEADLINE_S = 5.0
 UNREAD_NS = 80_000_000
 """How long a datagram waits in the socket, so that its arrival and its reading differ."""
-
-
-def free_port(kind=socket.SOCK_DGRAM):
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def drain_until(transport, count):

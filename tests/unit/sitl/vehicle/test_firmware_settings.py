@@ -17,6 +17,7 @@ from sitl.rotation import IDENTITY, to_euler
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.dynamics import Quadrotor
 from sitl.vehicle.params import Params
 
 ALOFT = AirborneStart(
@@ -211,7 +212,7 @@ def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_different
     course = make_course(3)
     gate = course.gates[2]
     position = tuple(part - 3.0 for part in gate.center_ned_m[:2])
-    pose = ((*position, -1.0), (2.0, -1.0, 0.0), IDENTITY, (0.0, 0.0, 0.0), 0.0)
+    body = Quadrotor().airborne((*position, -1.0), (2.0, -1.0, 0.0), IDENTITY).body
     nominal = replace(NOMINAL, rc_dead_zones_us=(0.0,) * 4, throttle_dead_zone_permille=0.0)
     other = replace(
         nominal,
@@ -221,7 +222,7 @@ def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_different
         pilot_speed_down_cmps=500,
     )
     first, second = (
-        Expert(course, 5.0, next_gate=2, params=Params(conditions)).sticks(*pose)
+        Expert(course, 5.0, next_gate=2, params=Params(conditions)).sticks(body, 0.0)
         for conditions in (nominal, other)
     )
     assert min(map(abs, first)) > 0.02
