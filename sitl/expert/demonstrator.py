@@ -1,9 +1,9 @@
 """An expert that flies a gate course with sticks alone, in ALT_HOLD, from the true pose.
 
-Its sticks follow from pose, velocity, the next gate and the two after it: what a policy could see
-or be told. Its one memory is which gate comes next. It predicts the state by the vehicle's own lag,
-plans the path of least acceleration through the gates ahead (`guidance`), and leans along it; it
-slows down where the path would need more lean than there is. After a miss it backs off, nose
+Its sticks follow from pose, velocity, the next gate and the two after it, which a policy could see
+or have as input; its one memory is which gate comes next. It predicts the state by the vehicle's
+lag, plans the path of least acceleration through the gates ahead (`guidance`), and leans along it;
+it slows down where the path would need more lean than there is. After a miss it backs off, nose
 towards the gate, and flies at it again. After the last gate it brakes and hovers.
 
 Horizontal vectors are complex numbers, north + 1j * east: a product with the conjugate of a unit
@@ -147,7 +147,7 @@ def _predict(body: BodyState, lag_s: float) -> _State:
 
 
 def _approach(state: _State, ahead: tuple[Gate, ...], speed_mps: float) -> Demand:
-    """Along the path through the gates ahead, at the speed that it allows."""
+    """Fly along the path through the gates ahead, at the speed that it allows."""
     velocity = state.velocity_mps
     to_aim_m = _aim_point(state, ahead) - complex(*state.position_ned_m[:2])
     distance_m = max(_length(to_aim_m), 1e-3)
@@ -223,7 +223,7 @@ def _corner_speed(plan: Plan, waypoints: list[Waypoint]) -> float:
 
 
 def _corner_ratio(accel_mps2: float) -> float:
-    """How much faster a corner can be flown than at this lateral acceleration."""
+    """Factor by which a corner can be flown faster than at this lateral acceleration."""
     return math.sqrt(CORNER_ACCEL_MPS2 / max(abs(accel_mps2), 1e-3))
 
 
@@ -243,7 +243,7 @@ def _back_off_share(state: _State, gate: Gate) -> float:
 
 
 def _back_off(state: _State, gate: Gate) -> Demand:
-    """Backwards beside the gate, nose along its passage, until it is in front again."""
+    """Fly backwards beside the gate, nose along its passage, until it is in front again."""
     forward_m, right_m, down_m = gate.offset_m(state.position_ned_m)
     is_beside = forward_m > -1.0 and abs(right_m) < CLEAR_OF_FRAME_M
     side_m = math.copysign(CLEAR_OF_FRAME_M, right_m) if is_beside else right_m
@@ -258,7 +258,7 @@ def _back_off(state: _State, gate: Gate) -> Demand:
 
 
 def _brake(state: _State) -> Demand:
-    """To a hover, wherever that is."""
+    """Brake to a hover."""
     most_mps = -ALONG_ACCEL_MPS2[0] / BRAKING_GAIN_PER_S
     gain = BRAKING_GAIN_PER_S * min(1.0, most_mps / max(1e-6, _length(state.velocity_mps)))
     return Demand(-gain * state.velocity_mps, 0.0, 0.0)

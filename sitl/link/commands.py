@@ -25,7 +25,7 @@ class Command(NamedTuple):
     params: tuple[float, ...]
 
     def finite(self, *numbers: int) -> bool:
-        """Whether all of these parameters (counted from 1) are numbers."""
+        """True if all of these parameters (counted from 1) are finite numbers."""
         return all(math.isfinite(self.params[number - 1]) for number in numbers)
 
 

@@ -130,7 +130,7 @@ class _Draw:
         return (self.factor(most), self.factor(most), self.factor(most))
 
     def angle_rad(self) -> float:
-        """Any direction, whatever the strength."""
+        """Any direction; the strength does not matter."""
         return float(self.random.uniform(-math.pi, math.pi))
 
     def dead_zone_us(self) -> float:

@@ -66,7 +66,7 @@ class FlightControl:
         return IDLE
 
     def wants_takeoff(self, mode: Mode, sticks: Sticks) -> bool:
-        """The pilot asks a landed vehicle for thrust."""
+        """True if the sticks command a landed vehicle to take off."""
         if mode.manual_throttle:
             return sticks.throttle > 0.0
         return mode is Mode.ALT_HOLD and pilot.climb_rate_mps(sticks, self._params) > 0.0

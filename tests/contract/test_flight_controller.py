@@ -1,4 +1,4 @@
-"""What the bridge relies on in an ArduCopter, as measured on the firmware; for any peer."""
+"""Behaviour of ArduCopter that the bridge relies on, as measured on the firmware; for any peer."""
 
 import math
 

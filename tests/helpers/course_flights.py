@@ -51,7 +51,7 @@ class CourseFlight:
         return way_m / (passed[-1]["t_s"] - passed[0]["t_s"]) if len(passed) > 1 else math.nan
 
     def misses_m(self) -> list[float]:
-        """How far from the centre, sideways or up, each gate was passed."""
+        """Distance from the centre, sideways or up, at which each gate was passed."""
         misses = []
         for before, after in pairwise(self.ticks):
             if after.next_gate != before.next_gate:

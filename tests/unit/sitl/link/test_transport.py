@@ -13,7 +13,7 @@ from sitl.link.transport import FOLLOWER_KINDS, MAX_PEERS, open_transport, split
 
 DEADLINE_S = 5.0
 UNREAD_NS = 80_000_000
-"""How long a datagram waits in the socket, so that its arrival and its reading differ."""
+"""Time that a datagram waits in the socket, so that its arrival and its reading differ."""
 
 
 def drain_until(transport, count):
