@@ -27,7 +27,7 @@ def test_heartbeat_names_a_quadrotor_with_ardupilot(companion):
     assert heartbeat.get_msgbuf()[0] == 0xFD
 
 
-def test_version_is_told_on_request(companion):
+def test_the_version_comes_on_request(companion):
     result = companion.command(
         mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 100_000
     )

@@ -45,7 +45,7 @@ def roll_deg(body):
     return math.degrees(to_euler(body.ned_from_body_wxyz)[0])
 
 
-def told(vehicle, name):
+def read_param(vehicle, name):
     """PARAM_REQUEST_READ over the wire."""
     station = mav.MAVLink(None, srcSystem=255, srcComponent=190)
     request = mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1)
@@ -77,7 +77,7 @@ def test_the_vehicle_tells_what_its_conditions_are():
         "ATC_RATE_R_MAX": drawn.lean_rate_max_degps,
         "ATC_ACCEL_P_MAX": drawn.lean_accel_max_cdegps2,
     }
-    assert {name: told(vehicle, name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
+    assert {name: read_param(vehicle, name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
     nominal = Params()
     assert not [name for name, value in wanted.items() if value == nominal[name]]
 
