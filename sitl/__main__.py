@@ -37,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.set_defaults(run=_fly)
     add = parser.add_argument
-    connect_help = "udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeat for several"
+    connect_help = "MAVLink: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeatable"
     add("--connect", action="append", metavar="LINK", help=connect_help)
     add("--report", type=Path, metavar="FILE", help="write a report (docs/flight_report.md)")
     add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--camera", type=_shm_name, metavar="shm:NAME", help="publish frames under this name")
-    add("--course", type=_SEED, default=0, metavar="SEED", help="its gates (default: 0)")
+    add("--course", type=_SEED, default=0, metavar="SEED", help="seed of the gates (default: 0)")
     size_help = "side of the square image (default: 224)"
     add("--image-size", type=_IMAGE_SIZE, default=224, metavar="PIXELS", help=size_help)
     add("--fps", type=_POSITIVE, default=30.0, metavar="HZ", help="frame rate (default: 30)")

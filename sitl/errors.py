@@ -2,4 +2,4 @@
 
 
 class UsageError(Exception):
-    """A flag, address or port that cannot be used; the message says why and what would do."""
+    """A flag, address or port that cannot be used; the message says why and what would work."""

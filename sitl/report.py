@@ -57,7 +57,7 @@ class FlightLog:
 
     @property
     def crashed(self) -> bool:
-        """Whether the frame of a gate, or the ground, was hit hard."""
+        """True once the frame of a gate, or the ground, was hit hard."""
         return self.crash is not None
 
     @property

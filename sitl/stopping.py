@@ -20,7 +20,7 @@ class StopRequest:
         self._is_set = True
 
     def is_set(self) -> bool:
-        """Whether a stop was requested."""
+        """True once a stop was requested."""
         return self._is_set
 
 

@@ -20,7 +20,6 @@ from sitl.errors import UsageError
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
-TILT_UP_RAD = NOMINAL.camera_tilt_rad
 NEAR_M = 0.05  # what is nearer than this, or behind, is cut off before it is projected
 LOWEST_EYE_M = 0.12
 """The eye is drawn at least this high, so that a vehicle on the ground sees ground."""
@@ -32,7 +31,7 @@ SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraOptions:
-    """Where and how a camera publishes its frames."""
+    """Name, size and rate of the frames that a camera publishes."""
 
     shm_name: str
     image_size: int  # side of the square image, in pixels
@@ -69,7 +68,7 @@ class FpvRenderer:
         self._centers_ned_m = np.array([gate.center_ned_m for gate in course.gates])
 
     def render(self, position_ned_m: Vec3, ned_from_body_wxyz: Quat) -> Image:
-        """The view as [H, W, 3] uint8 RGB, a new array."""
+        """Draw the view as [H, W, 3] uint8 RGB, a new array."""
         eye_ned_m = np.array(position_ned_m, dtype=np.float64)
         if any(self._offset_body_m):
             eye_ned_m += rotate(ned_from_body_wxyz, self._offset_body_m)
@@ -82,7 +81,7 @@ class FpvRenderer:
         return self._imager.expose(image)
 
     def _draw_backdrop(self, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> Image:
-        """Sky and ground. A ray of unit depth falls by a linear function of the pixel."""
+        """Draw sky and ground; a ray of unit depth falls by a linear function of the pixel."""
         ned_ray_from_pixel = ned_from_camera @ self._ray_from_pixel
         per_u, per_v, offset = ned_ray_from_pixel[2].astype(np.float32)
         falls = per_u * self._u_px + (per_v * self._v_px + offset)
@@ -124,7 +123,7 @@ class FpvRenderer:
         image[:] = cv2.blendLinear(ground, image, weight, 1 - weight)
 
     def _draw_gates(self, image: Image, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> None:
-        """Far gates first; within a gate, in the order of its faces."""
+        """Paint far gates first, and the faces of a gate in their order."""
         faces = self._faces
         from_eye_m = faces.corners_ned_m - eye_ned_m
         facing = np.einsum("nk,nk->n", faces.normals_ned, from_eye_m[:, 0]) <= 0
@@ -152,7 +151,7 @@ class FpvRenderer:
         return np.rint(points_px * (1 << SUBPIXEL_BITS)).astype(np.int32)
 
     def _in_view(self, corners_m: FloatArray) -> NDArray[np.bool_]:
-        """Whether each of [N, 4, 3] is not wholly behind the near plane or one image border."""
+        """Mask [N] of faces [N, 4, 3] that are not wholly behind a side of the view frustum."""
         x, y, z = np.moveaxis(corners_m, -1, 0)
         half_width, half_height = (self._center_px + 1) / self._focal_px
         is_left, is_right = x < -half_width * z, x > half_width * z
@@ -162,7 +161,7 @@ class FpvRenderer:
 
 
 def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
-    """[3, 3] from camera axes (x right, y down, z forward) to FRD body axes."""
+    """Rotation matrix [3, 3] from camera axes (x right, y down, z forward) to FRD body axes."""
     sine, cosine = math.sin(conditions.camera_tilt_rad), math.cos(conditions.camera_tilt_rad)
     tilted = np.array([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
     roll_rad, yaw_rad = conditions.camera_roll_rad, conditions.camera_yaw_rad
@@ -174,7 +173,7 @@ def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
 
 
 def clip_near(corners_m: FloatArray) -> FloatArray:
-    """The part of a convex polygon [N, 3] with z >= NEAR_M (Sutherland and Hodgman)."""
+    """Cut a convex polygon [N, 3] to z >= NEAR_M (Sutherland and Hodgman, 1974)."""
     kept = []
     for start, end in zip(corners_m, np.roll(corners_m, -1, axis=0), strict=True):
         if start[2] >= NEAR_M:
@@ -186,5 +185,5 @@ def clip_near(corners_m: FloatArray) -> FloatArray:
 
 
 def rotation_matrix(wxyz: Quat) -> FloatArray:
-    """[3, 3]: its columns are the rotated unit vectors."""
+    """Rotation matrix [3, 3] of a quaternion: its columns are the rotated unit vectors."""
     return np.array([rotate(wxyz, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]).T

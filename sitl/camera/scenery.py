@@ -36,7 +36,6 @@ GRID_RGB = (196, 200, 160)
 LEG_RGB = (58, 60, 68)
 PIP_RGB = (255, 248, 232)
 BACK_RGB = (96, 98, 112)  # a gate is grey from behind: it must not be passed from there
-FRONT_RGB = NOMINAL.gate_rgb  # even gates, odd gates
 BACKDROP_RGB = (
     (-1.0, (78, 98, 66)),
     (-0.30, (92, 108, 76)),

@@ -6,7 +6,7 @@ from sitl.course.layout import BAR_M, DEPTH_M, Course, Gate
 from sitl.rotation import Vec3
 
 VEHICLE_RADIUS_M = 0.25
-"""To the tips of the rotors; the vehicle is taken for a cube of twice this side."""
+"""Distance to the rotor tips; the vehicle is treated as a cube of twice this side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +66,7 @@ class GateCounter:
 
 
 def crossing(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> float | None:
-    """Where on the segment, 0 to 1, it passes forward through the opening; None if it does not."""
+    """Fraction of the segment at which it passes forward through the opening, or None."""
     start_forward_m, start_right_m, start_down_m = gate.offset_m(start_ned_m)
     end_forward_m, end_right_m, end_down_m = gate.offset_m(end_ned_m)
     if not start_forward_m < 0.0 <= end_forward_m:
@@ -82,7 +82,7 @@ def struck_gate(course: Course, start_ned_m: Vec3, end_ned_m: Vec3) -> int | Non
     """Index of the first gate whose frame the straight segment touches; None if it touches none.
 
     The frame is the square ring between the opening and its outer edge, ``DEPTH_M`` deep, without
-    the posts below it. The physics knows of no gates.
+    the posts below it; nothing stops the vehicle there, since the physics has no gates.
     """
     for gate in course.gates:
         if _is_near(gate, start_ned_m, end_ned_m) and _strikes(gate, start_ned_m, end_ned_m):

@@ -1,9 +1,9 @@
 """An expert that flies a gate course with sticks alone, in ALT_HOLD, from the true pose.
 
-Its sticks follow from pose, velocity, the next gate and the two after it: what a policy could see
-or be told. Its one memory is which gate comes next. It predicts the state by the vehicle's own lag,
-plans the path of least acceleration through the gates ahead (`guidance`), and leans along it; it
-slows down where the path would need more lean than there is. After a miss it backs off, nose
+Its sticks follow from pose, velocity, the next gate and the two after it, which a policy could see
+or have as input; its one memory is which gate comes next. It predicts the state by the vehicle's
+lag, plans the path of least acceleration through the gates ahead (`guidance`), and leans along it;
+it slows down where the path would need more lean than there is. After a miss it backs off, nose
 towards the gate, and flies at it again. After the last gate it brakes and hovers.
 
 Horizontal vectors are complex numbers, north + 1j * east: a product with the conjugate of a unit
@@ -19,10 +19,10 @@ from sitl.course.referee import GateCounter, crossing
 from sitl.errors import UsageError
 from sitl.expert.guidance import Plan, Waypoint, least_acceleration
 from sitl.expert.stick_response import DRAG_PER_S, Demand, StickPositions, StickResponse
-from sitl.rotation import Quat, Vec3, rotate, to_euler, wrap_pi
+from sitl.rotation import Vec3, rotate, to_euler, wrap_pi
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.control import clamp
-from sitl.vehicle.dynamics import GRAVITY_MPS2
+from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
 from sitl.vehicle.params import Params
 
 LAG_S = 0.17  # from stick to lean, of the nominal vehicle
@@ -85,20 +85,11 @@ class Expert:
         """Index of the gate to be passed next; None after the last."""
         return self._referee.next_gate
 
-    def sticks(
-        self,
-        position_ned_m: Vec3,
-        velocity_ned_mps: Vec3,
-        ned_from_body_wxyz: Quat,
-        rate_body_radps: Vec3,
-        t_s: float,
-    ) -> StickPositions:
+    def sticks(self, body: BodyState, t_s: float) -> StickPositions:
         """Sticks for this state; the positions of successive calls are the flown trajectory."""
-        self._referee.update(position_ned_m, t_s)
-        state = _predict(
-            position_ned_m, velocity_ned_mps, ned_from_body_wxyz, rate_body_radps, self._lag_s
-        )
-        ahead = self._gates_ahead(position_ned_m, state)
+        self._referee.update(body.position_ned_m, t_s)
+        state = _predict(body, self._lag_s)
+        ahead = self._gates_ahead(body.position_ned_m, state)
         demand = _approach(state, ahead[:GATES_AHEAD], self._speed_mps)
         if len(ahead) <= GATES_AHEAD:
             beyond_m, _, _ = self._last.offset_m(state.position_ned_m)
@@ -134,22 +125,16 @@ class _State:
         return complex(north, east)
 
 
-def _predict(
-    position_ned_m: Vec3,
-    velocity_ned_mps: Vec3,
-    ned_from_body: Quat,
-    rate_body_radps: Vec3,
-    lag_s: float,
-) -> _State:
+def _predict(body: BodyState, lag_s: float) -> _State:
     """Extrapolate by the lag, with the acceleration of the present lean in level flight."""
-    thrust_n, thrust_e, thrust_d = rotate(ned_from_body, (0.0, 0.0, -1.0))
+    thrust_n, thrust_e, thrust_d = rotate(body.ned_from_body_wxyz, (0.0, 0.0, -1.0))
     per_g = GRAVITY_MPS2 / max(0.5, -thrust_d)
-    velocity_n, velocity_e, velocity_d = velocity_ned_mps
+    velocity_n, velocity_e, velocity_d = body.velocity_ned_mps
     accel_n = thrust_n * per_g - DRAG_PER_S * velocity_n
     accel_e = thrust_e * per_g - DRAG_PER_S * velocity_e
     half = lag_s * lag_s / 2
-    north_m, east_m, down_m = position_ned_m
-    _, _, yaw = to_euler(ned_from_body)
+    north_m, east_m, down_m = body.position_ned_m
+    _, _, yaw = to_euler(body.ned_from_body_wxyz)
     return _State(
         position_ned_m=(
             north_m + velocity_n * lag_s + accel_n * half,
@@ -157,12 +142,12 @@ def _predict(
             down_m + velocity_d * lag_s,
         ),
         velocity_ned_mps=(velocity_n + accel_n * lag_s, velocity_e + accel_e * lag_s, velocity_d),
-        yaw_rad=wrap_pi(yaw + rate_body_radps[2] * lag_s),
+        yaw_rad=wrap_pi(yaw + body.rate_body_radps[2] * lag_s),
     )
 
 
 def _approach(state: _State, ahead: tuple[Gate, ...], speed_mps: float) -> Demand:
-    """Along the path through the gates ahead, at the speed that it allows."""
+    """Fly along the path through the gates ahead, at the speed that it allows."""
     velocity = state.velocity_mps
     to_aim_m = _aim_point(state, ahead) - complex(*state.position_ned_m[:2])
     distance_m = max(_length(to_aim_m), 1e-3)
@@ -238,7 +223,7 @@ def _corner_speed(plan: Plan, waypoints: list[Waypoint]) -> float:
 
 
 def _corner_ratio(accel_mps2: float) -> float:
-    """How much faster a corner can be flown than at this lateral acceleration."""
+    """Factor by which a corner can be flown faster than at this lateral acceleration."""
     return math.sqrt(CORNER_ACCEL_MPS2 / max(abs(accel_mps2), 1e-3))
 
 
@@ -258,7 +243,7 @@ def _back_off_share(state: _State, gate: Gate) -> float:
 
 
 def _back_off(state: _State, gate: Gate) -> Demand:
-    """Backwards beside the gate, nose along its passage, until it is in front again."""
+    """Fly backwards beside the gate, nose along its passage, until it is in front again."""
     forward_m, right_m, down_m = gate.offset_m(state.position_ned_m)
     is_beside = forward_m > -1.0 and abs(right_m) < CLEAR_OF_FRAME_M
     side_m = math.copysign(CLEAR_OF_FRAME_M, right_m) if is_beside else right_m
@@ -273,7 +258,7 @@ def _back_off(state: _State, gate: Gate) -> Demand:
 
 
 def _brake(state: _State) -> Demand:
-    """To a hover, wherever that is."""
+    """Brake to a hover."""
     most_mps = -ALONG_ACCEL_MPS2[0] / BRAKING_GAIN_PER_S
     gain = BRAKING_GAIN_PER_S * min(1.0, most_mps / max(1e-6, _length(state.velocity_mps)))
     return Demand(-gain * state.velocity_mps, 0.0, 0.0)

@@ -52,7 +52,7 @@ class StickDisturbance:
 
     @property
     def active(self) -> bool:
-        """Whether the last call of `flown` disturbed the sticks."""
+        """True if the last call of `flown` disturbed the sticks."""
         return self._strength > 0.0 and self._stretch.kind != "quiet"
 
     def flown(self, wanted: StickPositions, t_s: float) -> StickPositions:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
@@ -18,24 +18,14 @@ FORCE = 21196.0  # param 2 of ARM_DISARM that overrules every check (MAVLink com
 UINT16_MAX = 65535
 
 
-class Command(NamedTuple):
-    """A received command; ``params`` holds param1..7."""
-
-    number: int
-    params: tuple[float, ...]
-
-    def finite(self, *numbers: int) -> bool:
-        """Whether all of these parameters (counted from 1) are numbers."""
-        return all(math.isfinite(self.params[number - 1]) for number in numbers)
+Params7: TypeAlias = tuple[float, ...]  # param1..7 of a command, the first at index 0
+Handler: TypeAlias = Callable[[Params7, Autopilot, MavlinkEndpoint], int]
 
 
-Handler: TypeAlias = Callable[[Command, Autopilot, MavlinkEndpoint], int]
-
-
-def execute(command: Command, ap: Autopilot, link: MavlinkEndpoint) -> int:
+def execute(number: int, params: Params7, ap: Autopilot, link: MavlinkEndpoint) -> int:
     """Execute a command that came on a link; returns the MAV_RESULT for its ack."""
-    handler = _HANDLERS.get(command.number)
-    return UNSUPPORTED if handler is None else handler(command, ap, link)
+    handler = _HANDLERS.get(number)
+    return UNSUPPORTED if handler is None else handler(params, ap, link)
 
 
 def mode_by_number(number: float, ap: Autopilot) -> int:
@@ -47,57 +37,61 @@ def mode_by_number(number: float, ap: Autopilot) -> int:
     return ACCEPTED if ap.set_mode(mode) else FAILED
 
 
-def _arm_disarm(command: Command, ap: Autopilot, _link: MavlinkEndpoint) -> int:
-    if not command.finite(1) or command.params[0] not in (0.0, 1.0):
+def _are_finite(params: Params7) -> bool:
+    return all(map(math.isfinite, params))
+
+
+def _arm_disarm(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int:
+    if params[0] not in (0.0, 1.0):
         return UNSUPPORTED
-    force = command.params[1] == FORCE
-    done = ap.arm(force=force) if command.params[0] else ap.disarm(force=force)
+    force = params[1] == FORCE
+    done = ap.arm(force=force) if params[0] else ap.disarm(force=force)
     return ACCEPTED if done else FAILED
 
 
-def _set_mode(command: Command, ap: Autopilot, _link: MavlinkEndpoint) -> int:
-    if not command.finite(1, 2):
+def _set_mode(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int:
+    if not _are_finite(params[:2]):
         return DENIED
-    if not int(command.params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+    if not int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return DENIED
-    return mode_by_number(command.params[1], ap)
+    return mode_by_number(params[1], ap)
 
 
-def _set_interval(command: Command, _ap: Autopilot, link: MavlinkEndpoint) -> int:
-    if not command.finite(1, 2) or command.params[2] != 0.0:
+def _set_interval(params: Params7, _ap: Autopilot, link: MavlinkEndpoint) -> int:
+    if not _are_finite(params[:2]) or params[2] != 0.0:
         return DENIED
-    refusal = link.set_interval(int(command.params[0]), int(command.params[1]))
+    refusal = link.set_interval(int(params[0]), int(params[1]))
     if refusal is None:
         return ACCEPTED
     link.send_text(mav.MAV_SEVERITY_INFO, refusal)
     return DENIED
 
 
-def _get_interval(command: Command, _ap: Autopilot, link: MavlinkEndpoint) -> int:
-    if not command.finite(1) or not 0 <= command.params[0] <= UINT16_MAX:
+def _get_interval(params: Params7, _ap: Autopilot, link: MavlinkEndpoint) -> int:
+    if not _are_finite(params[:1]) or not 0 <= params[0] <= UINT16_MAX:
         return DENIED
-    link.send_interval(int(command.params[0]))
+    link.send_interval(int(params[0]))
     return ACCEPTED
 
 
-def _request_message(command: Command, ap: Autopilot, link: MavlinkEndpoint) -> int:
-    if not command.finite(1):
+def _request_message(params: Params7, ap: Autopilot, link: MavlinkEndpoint) -> int:
+    if not _are_finite(params[:1]):
         return DENIED
-    if int(command.params[0]) == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
-        return _get_interval(Command(command.number, command.params[1:]), ap, link)
-    return ACCEPTED if link.send_now(int(command.params[0])) else FAILED
+    if int(params[0]) == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
+        return _get_interval(params[1:], ap, link)
+    return ACCEPTED if link.send_now(int(params[0])) else FAILED
 
 
 def _send(message_id: int) -> Handler:
-    def handler(_command: Command, _ap: Autopilot, link: MavlinkEndpoint) -> int:
+    def handler(_params: Params7, _ap: Autopilot, link: MavlinkEndpoint) -> int:
         link.send_now(message_id)
         return ACCEPTED
 
     return handler
 
 
-def _reboot(command: Command, ap: Autopilot, link: MavlinkEndpoint) -> int:
-    if command.params[0] != 1.0:
+def _reboot(params: Params7, ap: Autopilot, link: MavlinkEndpoint) -> int:
+    if params[0] != 1.0:
         return UNSUPPORTED
     if ap.armed:
         return FAILED
@@ -106,8 +100,8 @@ def _reboot(command: Command, ap: Autopilot, link: MavlinkEndpoint) -> int:
 
 
 _HANDLERS: dict[int, Handler] = {
-    mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _command, ap, _link: mode_by_number(Mode.RTL, ap),
-    mav.MAV_CMD_NAV_LAND: lambda _command, ap, _link: mode_by_number(Mode.LAND, ap),
+    mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _params, ap, _link: mode_by_number(Mode.RTL, ap),
+    mav.MAV_CMD_NAV_LAND: lambda _params, ap, _link: mode_by_number(Mode.LAND, ap),
     mav.MAV_CMD_DO_SET_MODE: _set_mode,
     mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     mav.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,

@@ -207,6 +207,15 @@ def _gps_raw_int(ap: Autopilot) -> Message:
     )
 
 
+def _battery_status(_ap: Autopilot) -> Message:
+    """A full pack that never empties."""
+    function, chemistry = mav.MAV_BATTERY_FUNCTION_ALL, mav.MAV_BATTERY_TYPE_LIPO
+    cells_mv = [BATTERY_MV] + [65535] * 9
+    return mav.MAVLink_battery_status_message(
+        0, function, chemistry, _INT16, cells_mv, BATTERY_CA, 0, 0, 100
+    )
+
+
 def _extended_sys_state(ap: Autopilot) -> Message:
     if ap.landed:
         state = mav.MAV_LANDED_STATE_ON_GROUND
@@ -274,18 +283,7 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     mav.MAVLINK_MSG_ID_SCALED_IMU2: lambda ap: mav.MAVLink_scaled_imu2_message(
         _ms(ap), *_scaled_imu_fields(ap), TEMPERATURE_CDEG
     ),
-    # A full pack that never empties.
-    mav.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: mav.MAVLink_battery_status_message(
-        0,
-        mav.MAV_BATTERY_FUNCTION_ALL,
-        mav.MAV_BATTERY_TYPE_LIPO,
-        _INT16,
-        [BATTERY_MV] + [65535] * 9,
-        BATTERY_CA,
-        0,
-        0,
-        100,
-    ),
+    mav.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
     mav.MAVLINK_MSG_ID_HOME_POSITION: _home_position,

@@ -8,7 +8,7 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.link.commands import DENIED, Command, execute, mode_by_number
+from sitl.link.commands import DENIED, execute, mode_by_number
 from sitl.link.endpoint import MavlinkEndpoint
 from sitl.link.messages import Message
 from sitl.report import FlightLog
@@ -37,7 +37,7 @@ class MavlinkServer:
             "COMMAND_LONG": self._command,
             "COMMAND_INT": self._command,
             "SET_MODE": self._set_mode,
-            "REQUEST_DATA_STREAM": self._request_data_stream,
+            "REQUEST_DATA_STREAM": self._data_stream,
             "PARAM_REQUEST_LIST": self._param_list,
             "PARAM_REQUEST_READ": self._param_read,
             "PARAM_SET": self._param_set,
@@ -123,7 +123,7 @@ class MavlinkServer:
     def _command(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:
         fields = _COMMAND_FIELDS[message.get_type()]
         params = tuple(float(getattr(message, name)) for name in fields)
-        result = execute(Command(message.command, params), self._ap, link)
+        result = execute(message.command, params, self._ap, link)
         _send_ack(link, message, message.command, result)
 
     def _set_mode(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:
@@ -131,9 +131,7 @@ class MavlinkServer:
         result = mode_by_number(message.custom_mode, self._ap) if has_mode else DENIED
         _send_ack(link, message, mav.MAVLINK_MSG_ID_SET_MODE, result)
 
-    def _request_data_stream(
-        self, link: MavlinkEndpoint, message: Message, _arrived_ns: int
-    ) -> None:
+    def _data_stream(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:
         rate_hz = message.req_message_rate if message.start_stop else 0
         link.set_group(message.req_stream_id, rate_hz)
 

@@ -73,7 +73,9 @@ class Streams:
         """
         if message_id not in self._known:
             return f"No ap_message for mavlink id ({message_id})"
-        interval_ms = self._rounded_ms(message_id, interval_us)
+        interval_ms = max(1, min(interval_us, MAX_INTERVAL_US) // 1000) if interval_us > 0 else 0
+        if interval_us == 0 and message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
+            interval_ms = HEARTBEAT_INTERVAL_MS
         if 0 < interval_ms < shortest_ms(loop_hz):
             return f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE"
         self._start(message_id, interval_ms, now_ns)
@@ -107,14 +109,6 @@ class Streams:
 
     def _random_ns(self, most_ns: float) -> int:
         return int(self._random.uniform(0.0, most_ns)) if most_ns else 0
-
-    @staticmethod
-    def _rounded_ms(message_id: int, interval_us: int) -> int:
-        if interval_us < 0:
-            return 0
-        if interval_us == 0:
-            return HEARTBEAT_INTERVAL_MS if message_id == mav.MAVLINK_MSG_ID_HEARTBEAT else 0
-        return max(1, min(interval_us, MAX_INTERVAL_US) // 1000)
 
     def _start(self, message_id: int, interval_ms: int, now_ns: int) -> None:
         self._streams.pop(message_id, None)

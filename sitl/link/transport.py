@@ -89,7 +89,7 @@ class UdpLink:
                 data, ancillary, _, sender = self._socket.recvmsg(MAX_DATAGRAM, _ANCILLARY_BYTES)
             except BlockingIOError:
                 return
-            except ConnectionError:  # an earlier datagram found nobody there
+            except ConnectionError:  # an earlier datagram was rejected
                 continue
             if self._listen:
                 others = [peer for peer in self._peers if peer != sender]
@@ -137,7 +137,7 @@ class TcpLink:
         while self._server is not None and len(self._connections) < MAX_PEERS:
             try:
                 self._add(self._server.accept()[0])
-            except OSError:  # nobody waits, or who waited has gone
+            except OSError:  # no client waits, or it has gone
                 break
         for connection in tuple(self._connections):
             try:

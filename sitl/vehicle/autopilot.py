@@ -36,7 +36,7 @@ RC_OPTION_SKIP_NEUTRAL_CHECK = 64
 
 
 class StatusText(NamedTuple):
-    """A line for the ground station, with MAVLink's severity (2 critical, 4 warning, 6 info)."""
+    """STATUSTEXT for the ground station, with MAVLink's severity."""
 
     severity: int
     text: str
@@ -90,7 +90,7 @@ class Autopilot:
 
     @property
     def truth(self) -> BodyState:
-        """Where the vehicle really is, whatever its sensors say."""
+        """True state of the vehicle, without sensor faults and noise."""
         return self._physics.body
 
     @property
@@ -100,19 +100,16 @@ class Autopilot:
 
     @property
     def estimator_ready(self) -> bool:
-        """Attitude is aligned: arming is possible."""
+        """True once the attitude is aligned: arming is possible."""
         return self.uptime_ns >= self.config.estimator_ready_s * NS_PER_S
 
     @property
     def position_ready(self) -> bool:
-        """The estimator has a position: LOCAL_POSITION_NED flows, RTL is possible."""
+        """True once there is a position: LOCAL_POSITION_NED flows, RTL is possible."""
         return self.uptime_ns >= self.config.position_ready_s * NS_PER_S
 
     def prearm_refusal(self) -> str | None:
-        """Why the vehicle is not ready to arm, whatever the mode and the sticks; or None.
-
-        SYS_STATUS reports it as PREARM_CHECK; the words are ArduCopter's.
-        """
+        """ArduCopter's reason why the vehicle is not ready to arm in any mode (PREARM_CHECK)."""
         if not self.estimator_ready:
             return "AHRS: EKF3 not started"
         if not self.rc.found:
@@ -125,7 +122,7 @@ class Autopilot:
         return None
 
     def _stick_refusal(self) -> str | None:
-        """Why mode and sticks keep a vehicle that is ready from arming, or None."""
+        """ArduCopter's reason why mode or sticks forbid arming, or None."""
         if not self.mode.piloted:
             return f"{self.mode.name} mode not armable"
         sticks = read_sticks(self.rc, self.params)
@@ -198,9 +195,9 @@ class Autopilot:
     def launch(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> None:
-        """Be flying in this state from now on, armed and in ALT_HOLD, without having taken off.
+        """Put the vehicle in the air in this state, armed and in ALT_HOLD.
 
-        What the sticks say counts from the next step: an idle receiver asks for a descent.
+        The sticks count from the next step: an idle receiver commands a descent.
         """
         self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
         self.sensed = self.gps = self._physics.body
@@ -249,7 +246,7 @@ class Autopilot:
             self.disarm(force=True)
 
     def _since(self, since_ns: int | None, condition: bool) -> int | None:
-        """When the condition began to hold; None if it does not."""
+        """Start of the time for which the condition has held; None if it does not hold."""
         if not condition:
             return None
         return self.now_ns if since_ns is None else since_ns

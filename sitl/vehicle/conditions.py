@@ -129,8 +129,14 @@ class _Draw:
         """A factor for each of red, green and blue."""
         return (self.factor(most), self.factor(most), self.factor(most))
 
+    def light(self, most_tint: float, most_brightness: float) -> Vec3:
+        """A tint of any brightness."""
+        red, green, blue = self.tint(most_tint)
+        brightness = self.factor(most_brightness)
+        return (brightness * red, brightness * green, brightness * blue)
+
     def angle_rad(self) -> float:
-        """Any direction, whatever the strength."""
+        """Any direction; the strength does not matter."""
         return float(self.random.uniform(-math.pi, math.pi))
 
     def dead_zone_us(self) -> float:
@@ -186,8 +192,8 @@ def _vary_scene(nominal: Conditions, draw: _Draw) -> Conditions:
     return replace(
         nominal,
         gate_rgb=(draw.shade(first), draw.shade(second)),
-        ground_tint=_scaled(draw.tint(1.25), draw.factor(1.3)),
-        sky_tint=_scaled(draw.tint(1.1), draw.factor(1.15)),
+        ground_tint=draw.light(1.25, 1.3),
+        sky_tint=draw.light(1.1, 1.15),
         ground_seed=int(draw.random.integers(1 << 16)),
         sun_ned=(
             math.cos(elevation_rad) * math.cos(azimuth_rad),
@@ -237,8 +243,3 @@ def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
         stream_jitter_ms=draw.amount(5.0),
         stream_phase_spread=min(1.0, draw.amount(1.0)),
     )
-
-
-def _scaled(tint: Vec3, brightness: float) -> Vec3:
-    red, green, blue = tint
-    return (brightness * red, brightness * green, brightness * blue)

@@ -83,7 +83,7 @@ def _model_xml(conditions: Conditions) -> str:
 
 
 class BodyState(NamedTuple):
-    """The vehicle at one instant, NED world and FRD body."""
+    """State of the vehicle at one instant, in NED world and FRD body axes."""
 
     position_ned_m: Vec3
     ned_from_body_wxyz: Quat
@@ -103,7 +103,7 @@ class PhysicsState:
 
 
 def _flip(v: Sequence[float]) -> Vec3:
-    """A vector between NWU and NED, or between FLU and FRD: the same in both directions."""
+    """Convert a vector between NWU and NED, or FLU and FRD, in either direction."""
     return (v[0], -v[1], -v[2])
 
 
@@ -120,7 +120,7 @@ class Quadrotor:
         self._state_size = mujoco.mj_stateSize(self._model, _FULL_STATE)
 
     def at_rest(self) -> PhysicsState:
-        """On the ground at the origin, heading north, motors stopped."""
+        """State on the ground at the origin, heading north, motors stopped."""
         mujoco.mj_resetData(self._model, self._data)
         mujoco.mj_forward(self._model, self._data)
         return self._capture()
@@ -128,7 +128,7 @@ class Quadrotor:
     def airborne(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> PhysicsState:
-        """In the air and not turning, motors at the thrust that carries the weight."""
+        """State in the air, not rotating, with motors at hover thrust."""
         mujoco.mj_resetData(self._model, self._data)
         w, *vector = ned_from_body_wxyz
         self._data.qpos[:] = (*_flip(position_ned_m), w, *_flip(vector))
@@ -149,7 +149,7 @@ class Quadrotor:
         """The state ``substeps`` physics steps later, with the four commands (0..1) and wind held.
 
         MuJoCo's body drag knows the wind; its damping, the rotors' drag, is against the ground, so
-        what the moving air adds to it is a force.
+        the effect of moving air is added as a force.
         """
         mujoco.mj_setState(self._model, self._data, state.integration, _FULL_STATE)
         self._data.ctrl[:] = motor_commands

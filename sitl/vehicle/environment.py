@@ -39,7 +39,7 @@ class Wind:
 
 
 class SensorNoise:
-    """White noise on what the autopilot senses; position and attitude stay exact."""
+    """White noise on sensed velocity, rates and specific force; position and attitude are exact."""
 
     def __init__(self, conditions: Conditions) -> None:
         self._random = np.random.Generator(np.random.PCG64((conditions.seed, 2)))

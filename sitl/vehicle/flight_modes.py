@@ -66,7 +66,7 @@ class FlightControl:
         return IDLE
 
     def wants_takeoff(self, mode: Mode, sticks: Sticks) -> bool:
-        """The pilot asks a landed vehicle for thrust."""
+        """True if the sticks command a landed vehicle to take off."""
         if mode.manual_throttle:
             return sticks.throttle > 0.0
         return mode is Mode.ALT_HOLD and pilot.climb_rate_mps(sticks, self._params) > 0.0
@@ -115,15 +115,8 @@ class FlightControl:
             elif -down > self._params["RTL_ALT"] / 100.0 - RTL_ARRIVED_M:
                 speed = min(RTL_SPEED_MPS, POSITION_GAIN_PER_S * distance)
                 wanted_n, wanted_e = -north / distance * speed, -east / distance * speed
-        return self._lean_for(
-            VELOCITY_GAIN_PER_S * (wanted_n - body.velocity_ned_mps[0]),
-            VELOCITY_GAIN_PER_S * (wanted_e - body.velocity_ned_mps[1]),
-            body,
-        )
-
-    def _lean_for(
-        self, accel_n_mps2: float, accel_e_mps2: float, body: BodyState
-    ) -> tuple[float, float]:
+        accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n - body.velocity_ned_mps[0])
+        accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e - body.velocity_ned_mps[1])
         limit = GRAVITY_MPS2 * math.tan(math.radians(self._params["ANGLE_MAX"] / 100.0))
         scale = limit / max(limit, math.hypot(accel_n_mps2, accel_e_mps2))
         _, _, yaw = to_euler(body.ned_from_body_wxyz)

@@ -38,7 +38,7 @@ class RcEngine:
         self.channels_us = [0] * CHANNELS
         """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
         self.found = receiver_us is not None
-        """Whether there is a receiver, or an override has come."""
+        """True with a receiver, or once an override has come."""
 
     def override(self, raw_us: Sequence[int], now_ns: int) -> None:
         """Apply the 18 fields of one RC_CHANNELS_OVERRIDE."""

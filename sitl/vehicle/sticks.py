@@ -1,4 +1,4 @@
-"""From PWM to what the pilot commands: dead zones, curves and rates of ArduCopter's manual modes.
+"""Turns PWM into pilot commands: dead zones, curves and rates of ArduCopter's manual modes.
 
 Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_throttle`` and
 ``get_pilot_desired_climb_rate``; pinned by leans and rates measured on the firmware.

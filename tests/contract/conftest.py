@@ -1,4 +1,4 @@
-"""What the contract suite talks to: the mock in process on a stepped clock, or a real peer by UDP.
+"""Peers of the contract suite: the simulator in process on a stepped clock, or a real one by UDP.
 
 ``MAVBRIDGE_TEST_PEER=udp:HOST:PORT`` (a port of ours that the peer sends to) puts that flight
 controller through the same suite, in real time.
@@ -157,7 +157,7 @@ class Companion:
         return messages
 
     def channels(self) -> tuple[int, ...]:
-        """What the vehicle says it acts on; needs RC_CHANNELS to be streamed."""
+        """Channels that the vehicle uses; needs RC_CHANNELS to be streamed."""
         message = self.wait("RC_CHANNELS")
         return tuple(getattr(message, f"chan{n}_raw") for n in range(1, 17))
 

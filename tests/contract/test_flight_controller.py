@@ -1,4 +1,4 @@
-"""What the bridge relies on in an ArduCopter, as measured on the firmware; for any peer."""
+"""Behaviour of ArduCopter that the bridge relies on, as measured on the firmware; for any peer."""
 
 import math
 
@@ -27,7 +27,7 @@ def test_heartbeat_names_a_quadrotor_with_ardupilot(companion):
     assert heartbeat.get_msgbuf()[0] == 0xFD
 
 
-def test_version_is_told_on_request(companion):
+def test_the_version_comes_on_request(companion):
     result = companion.command(
         mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 100_000
     )

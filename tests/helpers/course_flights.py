@@ -51,7 +51,7 @@ class CourseFlight:
         return distance_m / (passed[-1]["t_s"] - passed[0]["t_s"]) if len(passed) > 1 else math.nan
 
     def misses_m(self) -> list[float]:
-        """How far from the centre, sideways or up, each gate was passed."""
+        """Distance from the centre, sideways or up, at which each gate was passed."""
         misses = []
         for before, after in pairwise(self.ticks):
             if after.next_gate != before.next_gate:
@@ -97,13 +97,7 @@ def fly_course(
             if now_ns >= over_ns:
                 break
         body, t_s = pose.body, now_ns / NS_PER_S
-        label = expert.sticks(
-            body.position_ned_m,
-            body.velocity_ned_mps,
-            body.ned_from_body_wxyz,
-            body.rate_body_radps,
-            t_s,
-        )
+        label = expert.sticks(body, t_s)
         flown = disturbance.flown(label, t_s) if disturbance else label
         ticks.append(Tick(pose=pose, next_gate=next_gate, label=label, flown=flown))
         vehicle.ap.rc.override(pwm_us(flown), now_ns)

@@ -1,4 +1,4 @@
-"""Run by the interpreter that has MAVSDK: what a MAVSDK program gets from the vehicle, as JSON."""
+"""Prints as JSON what a MAVSDK program reads from the vehicle; needs MAVSDK's interpreter."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""The other end of the wire, written with the dialect alone: packs messages and reads ours."""
+"""A MAVLink peer for tests, built on the dialect alone: packs messages and reads ours."""
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -11,7 +11,7 @@ ARDUPILOT = RcCalibration(
     roll=RcChannel(number=1, min_us=1100, trim_us=1500, max_us=1900),
     throttle_floor_us=985,
 )
-"""ArduPilot SITL's stick calibration, as our code reads it."""
+"""Stick calibration of ArduPilot SITL, as our code reads it."""
 
 CALIBRATION = {
     **dict(
@@ -24,7 +24,7 @@ CALIBRATION = {
     },
     "FS_THR_VALUE": 975,
 }
-"""The parameters that it comes from."""
+"""Parameters that give this calibration."""
 
 
 class WireEnd:

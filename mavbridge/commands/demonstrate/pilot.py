@@ -65,13 +65,7 @@ class Pilot:
         if self._expert is None:
             self._expert = self._begin(now_ns)
         now_s, body = now_ns / NS_PER_S, self._flight.vehicle.ap.truth
-        sticks = self._expert.sticks(
-            body.position_ned_m,
-            body.velocity_ned_mps,
-            body.ned_from_body_wxyz,
-            body.rate_body_radps,
-            now_s,
-        )
+        sticks = self._expert.sticks(body, now_s)
         self.expert_sticks = Sticks(*sticks)
         disturbed = self._disturbance.flown(StickPositions(*sticks), now_s)
         horizon = self.executable.contract.horizon

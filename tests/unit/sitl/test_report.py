@@ -50,7 +50,7 @@ def test_a_report_without_overrides_holds_nulls_not_zeros():
     }
 
 
-def test_releases_and_foreign_overrides_on_the_wire_are_told_apart():
+def test_releases_and_foreign_overrides_on_the_link_are_distinguished():
     vehicle = SimulatedVehicle(links=1, boot_ns=0)
     sender = mav.MAVLink(None, srcSystem=255)
     for primary in ([1500] * 8, [1500, 0, *[65535] * 6], [0] * 8, [0, *[65535] * 7], [65535] * 8):

@@ -6,18 +6,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.camera import scenery
-from sitl.camera.fpv import NEAR_M, TILT_UP_RAD, FpvRenderer, clip_near
+from sitl.camera.fpv import NEAR_M, FpvRenderer, clip_near
 from sitl.course.layout import Course, Gate, make_course
 from sitl.errors import UsageError
 from sitl.rotation import IDENTITY, from_euler
+from sitl.vehicle.conditions import NOMINAL
 
+TILT_UP_RAD = NOMINAL.camera_tilt_rad
 SIZE_PX = 201
 FOCAL_PX = SIZE_PX / 2
 MIDDLE_PX = (SIZE_PX - 1) / 2
 COURSE = Course(
     seed=0, gates=(Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0),)
 )
-ORANGE = np.array(scenery.FRONT_RGB[0])
+ORANGE = np.array(NOMINAL.gate_rgb[0])
 LEVEL_CAMERA = from_euler(0.0, -TILT_UP_RAD, 0.0)
 """Body pitch that makes the optical axis horizontal."""
 

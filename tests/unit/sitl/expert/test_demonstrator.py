@@ -18,6 +18,7 @@ from sitl.expert.disturbance import StickDisturbance, random_start
 from sitl.expert.guidance import Waypoint, least_acceleration
 from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import random_conditions
+from sitl.vehicle.dynamics import Quadrotor
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +61,8 @@ def test_the_next_gate_is_in_the_picture(nominal_flight):
 
 def test_what_it_holds_depends_on_the_present_alone(nominal_flight):
     for tick in nominal_flight.ticks[50:-320:40]:
-        body = tick.pose.body
         fresh = Expert(nominal_flight.course, 6.0, next_gate=tick.next_gate)
-        assert tick.label == fresh.sticks(
-            body.position_ned_m,
-            body.velocity_ned_mps,
-            body.ned_from_body_wxyz,
-            body.rate_body_radps,
-            0.0,
-        )
+        assert tick.label == fresh.sticks(tick.pose.body, 0.0)
 
 
 def test_it_flies_another_vehicle_in_wind_with_a_bad_thumb():
@@ -149,9 +143,7 @@ def test_truth_by_hand():
 def test_disturbances_come_in_stretches_and_by_seed():
     def flown(seed):
         disturbance = StickDisturbance(seed)
-        wanted = Expert(make_course(0), 5.0).sticks(
-            (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), IDENTITY, (0.0, 0.0, 0.0), 0.0
-        )
+        wanted = Expert(make_course(0), 5.0).sticks(Quadrotor().at_rest().body, 0.0)
         return [disturbance.flown(wanted, k / 100) != wanted for k in range(3000)]
 
     assert flown(3) == flown(3)

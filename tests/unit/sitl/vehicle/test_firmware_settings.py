@@ -17,6 +17,7 @@ from sitl.rotation import IDENTITY, to_euler
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.dynamics import Quadrotor
 from sitl.vehicle.params import Params
 
 ALOFT = AirborneStart(
@@ -44,7 +45,7 @@ def roll_deg(body):
     return math.degrees(to_euler(body.ned_from_body_wxyz)[0])
 
 
-def told(vehicle, name):
+def read_param(vehicle, name):
     """PARAM_REQUEST_READ over the wire."""
     station = mav.MAVLink(None, srcSystem=255, srcComponent=190)
     request = mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1)
@@ -76,7 +77,7 @@ def test_the_vehicle_tells_what_its_conditions_are():
         "ATC_RATE_R_MAX": drawn.lean_rate_max_degps,
         "ATC_ACCEL_P_MAX": drawn.lean_accel_max_cdegps2,
     }
-    assert {name: told(vehicle, name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
+    assert {name: read_param(vehicle, name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
     nominal = Params()
     assert not [name for name, value in wanted.items() if value == nominal[name]]
 
@@ -211,7 +212,7 @@ def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_different
     course = make_course(3)
     gate = course.gates[2]
     position = tuple(part - 3.0 for part in gate.center_ned_m[:2])
-    pose = ((*position, -1.0), (2.0, -1.0, 0.0), IDENTITY, (0.0, 0.0, 0.0), 0.0)
+    body = Quadrotor().airborne((*position, -1.0), (2.0, -1.0, 0.0), IDENTITY).body
     nominal = replace(NOMINAL, rc_dead_zones_us=(0.0,) * 4, throttle_dead_zone_permille=0.0)
     other = replace(
         nominal,
@@ -221,7 +222,7 @@ def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_different
         pilot_speed_down_cmps=500,
     )
     first, second = (
-        Expert(course, 5.0, next_gate=2, params=Params(conditions)).sticks(*pose)
+        Expert(course, 5.0, next_gate=2, params=Params(conditions)).sticks(body, 0.0)
         for conditions in (nominal, other)
     )
     assert min(map(abs, first)) > 0.02
