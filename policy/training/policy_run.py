@@ -30,7 +30,7 @@ from policy.training.batches import Batch, Batches, FeatureStore
 from policy.training.encode import Encoder
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, PolicyValidation, TrainResult, Validation
-from policy.training.run import Run, open_run
+from policy.training.run import TrainingRun, open_run
 from policy.training.run_folder import RunFolder
 from policy.training.settings import MAX_AGE_MS, TrainSettings
 from policy.training.stages import TrainingStage, policy_stages
@@ -80,7 +80,7 @@ def train_policy(
     return _PolicyRun(flights, ages_ns, network, settings, folder, hooks, check).finish()
 
 
-class _PolicyRun(Run[Trainee, Batch]):
+class _PolicyRun(TrainingRun[Trainee, Batch]):
     validation_type, encoder_learns_alone = PolicyValidation, False
 
     def __init__(
@@ -267,7 +267,7 @@ def _training_card(
     steps: int,
     validation: Mapping[str, float] | None,
 ) -> str:
-    """How a checkpoint was trained, as JSON."""
+    """Facts about the training of a checkpoint, as JSON."""
     state = np.concatenate([flight.state for flight in flights])
     target = np.concatenate([flight.target for flight in flights])
     ages_ms = ages_ns / 1e6
