@@ -80,8 +80,7 @@ def train_policy(
         raise DatasetError(
             f"the flights hold {frame} states, the policy takes {network.contract.state_frame}"
         )
-    ages_ns = _ages(flights, settings)
-    return _PolicyRun(flights, ages_ns, network, settings, folder, hooks, check).finish()
+    return _PolicyRun(flights, network, settings, folder, hooks, check).finish()
 
 
 class _PolicyRun(TrainingRun[Trainee, Batch]):
@@ -90,7 +89,6 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     def __init__(
         self,
         flights: Sequence[FlightData],
-        ages_ns: Nanoseconds,
         network: Network,
         settings: TrainSettings,
         folder: RunFolder,
@@ -98,7 +96,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         check: Check | None,
     ) -> None:
         self.settings: TrainSettings = settings
-        self._network, self._ages_ns, self._check = network, ages_ns, check
+        self._network, self._check = network, check
+        self._ages_ns = _ages(flights, settings)
         trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         super().__init__(folder, trainee, policy_stages(settings), hooks)
