@@ -1,4 +1,4 @@
-"""What a policy is told beside the image and the state, defined once for flight and training.
+"""Inputs of a policy beside image and state, defined once for flight and training.
 
 The 100 Hz loop evaluates it for one tick (``mavbridge.flight.history`` and ``ego_motion``),
 training for a batch (``policy.data.samples``); a test checks that both agree.

@@ -1,4 +1,4 @@
-"""How old the image is and how the vehicle moved since: what a contract may append to the state."""
+"""Age of the image and motion since its exposure, which a contract may append to the state."""
 
 from collections import deque
 
@@ -19,7 +19,7 @@ from policy.observation import motion_since_exposure
 from policy.rotation import Quaternion, Vector, slerp
 
 MAX_READINGS = 1024
-"""Of each kind: five seconds of the fastest attitude stream that a link carries."""
+"""Readings of each kind: five seconds of the fastest attitude stream that a link carries."""
 
 
 class EgoMotion:

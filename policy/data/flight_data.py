@@ -42,7 +42,7 @@ class FlightData:
     tick_ns: Nanoseconds
     """[T] when the policy looked: image age and action history count from here."""
     state: FloatArray
-    """[T, 13] as it was flown; NaN where it is unknown, or nobody is to be imitated."""
+    """[T, 13] as it was flown; NaN where it is unknown or not to be imitated."""
     attitude_ns: Nanoseconds
     """[T] arrival of its attitude: the first action of a chunk acts then."""
     velocity_ns: Nanoseconds

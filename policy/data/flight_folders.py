@@ -48,7 +48,7 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_exemplary(folder: Path) -> bool:
-    """Whether to imitate a flight: not a demonstration that failed, e.g. hit a gate's frame.
+    """False for a demonstration that failed: flying into a gate's frame is not to be imitated.
 
     Raises:
         DatasetError: not a flight of ours.

@@ -24,7 +24,7 @@ class Interpolator:
         self._at_ns, self._values = at_ns[is_last], values[is_last].astype(np.float64)
 
     def covers(self, at_ns: Nanoseconds) -> NDArray[np.bool_]:
-        """Whether each time lies between two measurements that are not too far apart."""
+        """True where a time lies between two measurements that are not too far apart."""
         return covered(self._at_ns, at_ns)
 
     def vectors_at(self, at_ns: Nanoseconds) -> NDArray[np.float64]:
@@ -47,7 +47,7 @@ class Interpolator:
 
 
 def covered(known_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.bool_]:
-    """Whether each time is one of ``known_ns``, or between two that are not too far apart."""
+    """True where a time is one of ``known_ns``, or between two that are not too far apart."""
     if len(known_ns) == 0:
         return np.zeros(at_ns.shape, bool)
     after = np.searchsorted(known_ns, at_ns, side="left")
@@ -57,3 +57,11 @@ def covered(known_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.bool_]:
     is_between = (after > 0) & (after < len(known_ns)) & is_near
     out: NDArray[np.bool_] = is_between | (known_ns[inside] == at_ns)
     return out
+
+
+def nearest(known_ns: Nanoseconds, at_ns: Nanoseconds) -> Indices:
+    """Index of the one of ``known_ns`` that is nearest to each time; of two, the earlier."""
+    last = len(known_ns) - 1
+    after = np.minimum(np.clip(np.searchsorted(known_ns, at_ns), 1, max(last, 1)), last)
+    before = np.maximum(after - 1, 0)
+    return np.where(at_ns - known_ns[before] <= known_ns[after] - at_ns, before, after)

@@ -23,7 +23,7 @@ _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
 
 def is_lerobot(folder: Path) -> bool:
-    """Whether the folder is a LeRobot dataset, of whatever version."""
+    """True for a LeRobot dataset of any version."""
     return (folder / names.INFO).is_file()
 
 
@@ -76,7 +76,7 @@ class _Info:
     video_path: str
     camera: str
     is_video: bool
-    """Whether the camera's images are in videos, or in the table."""
+    """The images are in videos, not in the table."""
 
 
 @dataclass(frozen=True, kw_only=True)

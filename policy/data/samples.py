@@ -24,11 +24,11 @@ from policy.contract import (
     FloatArray,
 )
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, Nanoseconds
-from policy.data.interpolation import Indices, Interpolator, covered
+from policy.data.interpolation import Indices, Interpolator, covered, nearest
 from policy.observation import NS_PER_S, history_ages_ns, motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
-"""How far the nearest tick may be from the moment that was drawn: two ticks at 100 Hz."""
+"""Largest distance of a tick from the moment that was drawn: two ticks at 100 Hz."""
 HISTORY_JITTER_S = 0.005
 """The history is sampled up to so much earlier or later: half a tick at 100 Hz."""
 FRESH_START_SHARE = 0.15
@@ -136,7 +136,7 @@ class Timeline:
         if len(ticks_ns):
             has_tick &= ticks_ns[any_tick] <= high
         has_past = self._attitude.covers(self.captured_ns) & self._velocity.covers(self.captured_ns)
-        # Whoever labelled the sticks knew of a gate behind the camera; one image does not show it.
+        # The expert knew of a gate behind the camera, which the image does not show.
         is_behind = self.gate[:, 0] < 0
         usable = np.flatnonzero(has_tick & has_past & ~is_behind)
         if len(usable) == 0:
@@ -153,14 +153,11 @@ class Timeline:
         ages = self._ages_ns[random.integers(len(self._ages_ns), size=len(frames))]
         wanted = self.captured_ns[frames] + ages
         ticks_ns = self.tick_ns[self._usable_ticks]
-        after = np.clip(np.searchsorted(ticks_ns, wanted), 1, max(len(ticks_ns) - 1, 1))
-        after = np.minimum(after, len(ticks_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        nearest = np.where(wanted - ticks_ns[before] <= ticks_ns[after] - wanted, before, after)
-        misses = (np.abs(ticks_ns[nearest] - wanted) > TICK_TOLERANCE_NS) | (
-            ticks_ns[nearest] < self.captured_ns[frames]
+        near = nearest(ticks_ns, wanted)
+        misses = (np.abs(ticks_ns[near] - wanted) > TICK_TOLERANCE_NS) | (
+            ticks_ns[near] < self.captured_ns[frames]
         )
-        chosen: Indices = self._usable_ticks[np.where(misses, self._any_tick[frames], nearest)]
+        chosen: Indices = self._usable_ticks[np.where(misses, self._any_tick[frames], near)]
         return chosen
 
     def samples(

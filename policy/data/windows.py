@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, VELOCITY, FloatArray
 from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
-from policy.data.interpolation import Indices, Interpolator
+from policy.data.interpolation import Indices, Interpolator, nearest
 from policy.observation import NS_PER_S
 
 TOLERANCE = 0.25
-"""How far a frame may be from its time in a window, over the time between two frames: where one in
-three frames was dropped, no neighbour can take its place."""
+"""Largest distance of a frame from its time in a window, over the time between two frames: no
+neighbour can take the place of one in three frames that was dropped."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,13 +90,12 @@ def find_windows(
         first += len(state)
     every = np.concatenate(windows)
     if len(every) == 0:
-        gaps_ms = np.concatenate([np.diff(e.captured_ns) for e in flights]) / 1e6
-        pace = (
-            f"their frames are {np.median(gaps_ms):.0f} ms apart" if len(gaps_ms) else "no frames"
-        )
+        gaps_ms = np.concatenate([np.diff(flight.captured_ns) / 1e6 for flight in flights])
+        pace_ms = np.median(gaps_ms) if len(gaps_ms) else np.nan
         raise DatasetError(
             f"none of {len(flights)} flights holds {context_frames + frames} frames with states, "
-            f"{1e3 * frame_dt_s:.0f} ms apart ({pace}): fly longer, or choose another frame_dt_s"
+            f"{1e3 * frame_dt_s:.0f} ms apart (theirs are {pace_ms:.0f} ms apart): "
+            "fly longer, or choose another frame_dt_s"
         )
     return Windows(
         frames=every,
@@ -147,11 +146,7 @@ def _evenly_spaced(
     if len(captured_ns) < count:
         return np.zeros((0, count), np.int64)
     wanted = captured_ns[:, None] + dt_ns * np.arange(count)
-    after = np.clip(np.searchsorted(captured_ns, wanted), 1, len(captured_ns) - 1)
-    before = after - 1
-    is_before = wanted - captured_ns[before] <= captured_ns[after] - wanted
-    nearest = np.where(is_before, before, after)
-    misses = np.abs(captured_ns[nearest] - wanted) > TOLERANCE * dt_ns
-    is_window = (~misses & usable[nearest]).all(axis=1) & (np.diff(nearest, axis=1) > 0).all(axis=1)
-    runs: Indices = nearest[is_window]
+    near = nearest(captured_ns, wanted)
+    fits = usable[near] & (np.abs(captured_ns[near] - wanted) <= TOLERANCE * dt_ns)
+    runs: Indices = near[fits.all(axis=1) & (np.diff(near, axis=1) > 0).all(axis=1)]
     return runs

@@ -96,7 +96,7 @@ class FeatureStore:
         self.frames = np.flatnonzero((row_of >= 0).any(axis=0))
         """Images that were encoded, plain or mirrored."""
         self.has_mirrored = bool((row_of[1, self.frames] >= 0).all())
-        """Whether all of them are there mirrored."""
+        """All of them are there mirrored, too."""
 
     def ways(self, frames: Indices, is_mirrored: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """``is_mirrored`` [B], but the other way where only that one was encoded."""

@@ -10,70 +10,14 @@ from torch import Tensor
 
 from policy.data.frames import disk_error
 from policy.data.interpolation import Indices
-from policy.engines.openvino_bulk import BulkEncoder
-from policy.training.batches import Batches, FeatureStore, normalise_image
-from policy.training.parallel import computing_in
-from policy.training.settings import TrainSettings
-from policy.training.trainee import Trainee, refresh_batch_norm
+from policy.training.batches import FeatureStore
 
-NORM_BATCHES = 16
 ENCODE_BATCH = 64
 
 Encode: TypeAlias = Callable[[Indices, bool], Tensor]
 """(images, whether to mirror them all) -> [B, D]."""
 Job: TypeAlias = tuple[tuple[Indices, bool], ...]
 """Images to encode between two checks of the time, each part as it is or mirrored."""
-
-
-class Encoder:
-    """The backbone of a trainee on stored images, without augmentation."""
-
-    def __init__(
-        self, trainee: Trainee, batches: Batches, *, device: torch.device, bf16: bool
-    ) -> None:
-        self._trainee, self._batches = trainee, batches
-        self._device, self._bf16 = device, bf16
-        self._contract = trainee.policy.contract
-
-    def refresh_norms(self) -> None:
-        """Take the statistics of the batch norms anew from images of full size."""
-        frames = self._batches.frames
-        count = min(NORM_BATCHES * ENCODE_BATCH, len(frames))
-        chosen = frames[np.linspace(0, len(frames) - 1, count).astype(int)]
-        parts = np.array_split(chosen, max(1, count // ENCODE_BATCH))
-        with computing_in(self._device, self._bf16):
-            refresh_batch_norm(
-                self._trainee, (self._images(part, is_mirrored=False) for part in parts)
-            )
-
-    def encode_all(
-        self, path: Path, settings: TrainSettings, should_continue: Callable[[float], bool]
-    ) -> FeatureStore:
-        """Encode the images to ``path``, in a random order; see ``encode_rows``."""
-        frames = np.random.default_rng([settings.seed, 3]).permutation(self._batches.frames)
-        dim = self._trainee.policy.backbone.out_dim
-        jobs = one_way_first(frames, mirror=settings.mirror)
-        return encode_rows(path, jobs, self._encode(), dim=dim, should_continue=should_continue)
-
-    def _encode(self) -> Encode:
-        if self._device.type == "cpu":
-            bulk = BulkEncoder(self._trainee.policy, "bf16" if self._bf16 else "f32")
-            return lambda frames, is_mirrored: torch.from_numpy(
-                bulk(self._images(frames, is_mirrored=is_mirrored).numpy())
-            )
-
-        @torch.inference_mode()
-        def in_torch(frames: Indices, is_mirrored: bool) -> Tensor:
-            images = self._images(frames, is_mirrored=is_mirrored)
-            with computing_in(self._device, self._bf16):
-                features: Tensor = self._trainee.policy.backbone(images)
-            return features
-
-        return in_torch
-
-    def _images(self, frames: Indices, *, is_mirrored: bool) -> Tensor:
-        images = self._batches.images(frames, is_mirrored=is_mirrored).to(self._device)
-        return normalise_image(images.permute(0, 3, 1, 2).float() / 255, self._contract)
 
 
 def both_ways(frames: Indices, *, mirror: bool) -> list[Job]:

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from policy.checkpoints.policy_file import (
     BuiltinPolicy,
@@ -21,26 +21,30 @@ from policy.contract import STATE_NAMES
 from policy.data.flight_data import DatasetError, FlightData, Nanoseconds, common_frame
 from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
+from policy.data.interpolation import Indices
 from policy.data.samples import Timeline
+from policy.engines.openvino_bulk import BulkEncoder
 from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import TogeConfig
-from policy.training.batches import Batch, Batches, FeatureStore
-from policy.training.encode import Encoder
+from policy.training.batches import Batch, Batches, FeatureStore, normalise_image
+from policy.training.encode import ENCODE_BATCH, Encode, encode_rows, one_way_first
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, PolicyValidation, TrainResult, Validation
-from policy.training.run import Run, open_run
+from policy.training.run import TrainingRun, open_run
 from policy.training.run_folder import RunFolder
 from policy.training.settings import MAX_AGE_MS, TrainSettings
 from policy.training.stages import TrainingStage, policy_stages
-from policy.training.trainee import Trainee, validate
+from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
 Network: TypeAlias = TogeConfig | ResnetUnetConfig
 Check: TypeAlias = Callable[[Path], float]
 """Flies a checkpoint in closed loop and returns a score: more is better."""
 
 VALIDATION_SAMPLES = 256
+NORM_IMAGES = 1024
+"""Images from which batch norms take their final statistics."""
 AGE_BIN_MS = 5
 FINE_TUNE_RATE = 1 / 3
 """Learning rate over the usual one, for weights that were trained before."""
@@ -76,17 +80,15 @@ def train_policy(
         raise DatasetError(
             f"the flights hold {frame} states, the policy takes {network.contract.state_frame}"
         )
-    ages_ns = _ages(flights, settings)
-    return _PolicyRun(flights, ages_ns, network, settings, folder, hooks, check).finish()
+    return _PolicyRun(flights, network, settings, folder, hooks, check).finish()
 
 
-class _PolicyRun(Run[Trainee, Batch]):
+class _PolicyRun(TrainingRun[Trainee, Batch]):
     validation_type, encoder_learns_alone = PolicyValidation, False
 
     def __init__(
         self,
         flights: Sequence[FlightData],
-        ages_ns: Nanoseconds,
         network: Network,
         settings: TrainSettings,
         folder: RunFolder,
@@ -94,7 +96,8 @@ class _PolicyRun(Run[Trainee, Batch]):
         check: Check | None,
     ) -> None:
         self.settings: TrainSettings = settings
-        self._network, self._ages_ns, self._check = network, ages_ns, check
+        self._network, self._check = network, check
+        self._ages_ns = _ages(flights, settings)
         trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         super().__init__(folder, trainee, policy_stages(settings), hooks)
@@ -124,15 +127,45 @@ class _PolicyRun(Run[Trainee, Batch]):
         return backbone
 
     def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
-        settings, frames = self.settings, self._batches.frames
-        encoder = Encoder(self.trainee, self._batches, device=self.device, bf16=self.bf16)
+        settings, trainee, every = self.settings, self.trainee, self._batches.frames
         if is_new and not settings.freeze_encoder:
-            encoder.refresh_norms()
-        self._features = encoder.encode_all(
-            self.folder.features, settings, should_continue=self.may_encode(stage)
+            count = min(NORM_IMAGES, len(every))
+            chosen = every[np.linspace(0, len(every) - 1, count).astype(int)]
+            parts = np.array_split(chosen, max(1, count // ENCODE_BATCH))
+            with computing_in(self.device, self.bf16):
+                refresh_batch_norm(trainee, (self._images(part, False) for part in parts))
+        frames = np.random.default_rng([settings.seed, 3]).permutation(every)
+        self._features = encode_rows(
+            self.folder.features,
+            one_way_first(frames, mirror=settings.mirror),
+            self._bulk_encode(),
+            dim=trainee.policy.backbone.out_dim,
+            should_continue=self.may_encode(stage),
         )
-        if (left := len(frames) - len(self._features.frames)) > 0:
+        if (left := len(every) - len(self._features.frames)) > 0:
             self.note(f"{left} images were not encoded for lack of time: the head sees the rest")
+
+    def _bulk_encode(self) -> Encode:
+        """The frozen backbone, by the fastest engine."""
+        if self.device.type == "cpu":
+            bulk = BulkEncoder(self.trainee.policy, "bf16" if self.bf16 else "f32")
+            return lambda frames, is_mirrored: torch.from_numpy(
+                bulk(self._images(frames, is_mirrored).numpy())
+            )
+
+        @torch.inference_mode()
+        def in_torch(frames: Indices, is_mirrored: bool) -> Tensor:
+            images = self._images(frames, is_mirrored)
+            with computing_in(self.device, self.bf16):
+                features: Tensor = self.trainee.policy.backbone(images)
+            return features
+
+        return in_torch
+
+    def _images(self, frames: Indices, is_mirrored: bool) -> Tensor:
+        """Normalised images [B, 3, H, W] of full size, without augmentation."""
+        images = self._batches.images(frames, is_mirrored=is_mirrored).to(self.device)
+        return normalise_image(images.permute(0, 3, 1, 2).float() / 255, self._network.contract)
 
     def batch_maker(self, stage: TrainingStage) -> Callable[[int], Batch]:
         features = self._features
@@ -267,7 +300,7 @@ def _training_card(
     steps: int,
     validation: Mapping[str, float] | None,
 ) -> str:
-    """How a checkpoint was trained, as JSON."""
+    """Facts about the training of a checkpoint, as JSON."""
     state = np.concatenate([flight.state for flight in flights])
     target = np.concatenate([flight.target for flight in flights])
     ages_ms = ages_ns / 1e6

@@ -1,4 +1,4 @@
-"""What a training run reports, and how it is watched and stopped."""
+"""Reports of a training run, and the hooks by which it is watched and stopped."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyValidation:
-    """How well a policy does on held-out flights."""
+    """Errors of a policy on held-out flights."""
 
     loss: float
     gate_loss: float
@@ -29,7 +29,7 @@ class PolicyValidation:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelValidation:
-    """How well a world model predicts held-out flights."""
+    """Errors of a world model on held-out flights."""
 
     loss: float
     reconstruction_psnr_db: float
@@ -76,7 +76,7 @@ class TrainingProgress:
 
 @dataclass(frozen=True, kw_only=True)
 class Hooks:
-    """How a run is watched and stopped from outside."""
+    """Clock, progress and a request to stop, for a run."""
 
     now_s: Callable[[], float]
     """Monotonic seconds, for a budget in time."""

@@ -1,4 +1,4 @@
-"""What every training run does: stages and steps on a budget, validation, a state on disk.
+"""The common part of all training runs: stages on a budget, validation, a state on disk.
 
     flights -> FrameStore (decoded once) -> batches with images -> encoder learns    -> moving
                 `-> features (encoded once) -> batches of features -> the rest learns -> average
@@ -56,7 +56,7 @@ def open_run(settings: RunSettings, network: object, flights: Sequence[FlightDat
     return folder
 
 
-class Run(ABC, Generic[M, B]):
+class TrainingRun(ABC, Generic[M, B]):
     """A run, from its first step or from where it was killed; subclasses say what is trained.
 
     A phase of a run (the encoder learns, or it is frozen) has one optimiser, and one rise and fall
@@ -91,7 +91,7 @@ class Run(ABC, Generic[M, B]):
 
     @abstractmethod
     def batch_maker(self, stage: TrainingStage) -> Callable[[int], B]:
-        """What makes the batch of a step; called in another thread."""
+        """A function that makes the batch of a step; called in another thread."""
 
     @abstractmethod
     def losses(self, trainee: M, batch: B) -> StepLoss:
@@ -359,7 +359,7 @@ def make_optimiser(trainee: nn.Module, learning_rate: float, decay: float) -> to
 
 
 def uses_bf16(precision: Precision, device: torch.device) -> bool:
-    """Whether to compute in bfloat16; ``auto`` does so where the hardware multiplies it."""
+    """True if to compute in bfloat16; ``auto`` does so where the hardware multiplies it."""
     if precision != "auto":
         return precision == "bf16"
     if device.type == "cuda":

@@ -61,7 +61,7 @@ class RunFolder:
 
     @property
     def has_state(self) -> bool:
-        """Whether there is a state to resume from."""
+        """True if there is a state to resume from."""
         return self._state.is_file()
 
     def save(self, position: Position, tensors: Mapping[str, Any]) -> None:

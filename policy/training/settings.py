@@ -44,9 +44,9 @@ class RunSettings:
     out: Path
     """Checkpoint to write (.safetensors); an unfinished run is kept beside it."""
     minutes: float | None = None
-    """How long to train; 45 if neither this nor --steps is given."""
+    """Length of the training; 45 if neither this nor --steps is given."""
     steps: int | None = None
-    """How many optimiser steps to train, in place of --minutes."""
+    """Length of the training in optimiser steps, in place of --minutes."""
     image_size: int = 224
     """Pixels along a side of the images that the encoder takes."""
     batch_size: int = 32
@@ -134,8 +134,8 @@ class TrainSettings(RunSettings):
     head_batch_size: int = 256
     """Samples a step while the head learns alone."""
     gate_weight: float = 100.0
-    """Weight of the loss by which the feature must tell where the gates are, in flights that know
-    it; 0 = off. The sticks of a few flights alone teach an encoder those flights' courses."""
+    """Weight of the loss of gate positions that are read off the feature, in flights that hold
+    them; 0 = off. The sticks of a few flights alone teach an encoder those flights' courses."""
     pack: bool = False
     """Write a checkpoint to ship, a third of the size: the encoder in int8, the rest in float16."""
     check_flights: int = 0

@@ -28,7 +28,7 @@ class TrainingStage:
     """Pixels along a side."""
     trains_encoder: bool
     is_scored: bool
-    """Whether its weights may be exported."""
+    """Its weights may be exported."""
 
 
 def policy_stages(settings: TrainSettings) -> tuple[TrainingStage, ...]:

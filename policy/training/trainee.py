@@ -1,4 +1,4 @@
-"""What is optimised: a policy, a head for the gates that is not exported, and their losses."""
+"""The module that is optimised: a policy, a gate head that is not exported, and their losses."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -172,7 +172,7 @@ def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
 
 
 def encoder_learns_in_bf16(device: torch.device, image_size: tuple[int, int]) -> bool:
-    """Whether bfloat16 makes the encoder's backward pass faster, where it is used at all.
+    """True if bfloat16 makes the encoder's backward pass faster, where it is used at all.
 
     On a CPU without matrix units it does so from about 160x160 pixels on; below, depthwise
     convolutions are slower in it. All other parts gain at every size.

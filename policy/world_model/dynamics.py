@@ -24,7 +24,7 @@ _INITIAL_STD = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class Future:
-    """What is denoised, or an estimate of it; every part has about unit scale."""
+    """The unknown that is denoised, or an estimate of it; every part has about unit scale."""
 
     latents: Tensor
     """[B, T, C, h, w]"""
@@ -36,7 +36,7 @@ class Future:
 
 @dataclass(frozen=True, kw_only=True)
 class Conditioning:
-    """What the denoiser knows, the same at every step of a sample."""
+    """Inputs of the denoiser that are the same at every step of a sample."""
 
     latents: Tensor
     """[B, K, C, h, w] of the past, oldest first."""

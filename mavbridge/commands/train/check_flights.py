@@ -1,4 +1,4 @@
-"""What a training run flies to see how well its policy does: a few courses, in lockstep."""
+"""The closed-loop check of a training run: a few courses, flown in lockstep."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What a person sees of a training run."""
+"""Progress and result of a training run, for a person."""
 
 import sys
 from typing import Self

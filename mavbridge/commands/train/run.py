@@ -58,7 +58,7 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
 def fit_to_flights(
     network: Network, flights: Sequence[FlightData], settings: TrainSettings
 ) -> Network:
-    """The network with the state frame of the flights, and the inputs that are asked for."""
+    """The network with the state frame of the flights, and the inputs of the settings."""
     contract = replace(
         network.contract,
         state_frame=common_frame(flights),

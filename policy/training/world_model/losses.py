@@ -1,4 +1,4 @@
-"""What is optimised of a world model, the scales that are stored with it, and its validation."""
+"""Losses of a world model, the scales that are stored with it, and its validation."""
 
 from collections.abc import Sequence
 
@@ -45,7 +45,7 @@ SCALE_SAMPLES = 4096
 CHANGE_SAMPLES = 1024
 """Windows of them whose latents are read."""
 MIN_CHANGE_STD = 0.05
-"""Of unit scale, as ``MIN_MOTION_STD``."""
+"""Least spread of a change, of unit scale."""
 VALIDATION_STEPS = 4
 """Denoising steps of imagined futures."""
 

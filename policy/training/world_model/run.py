@@ -16,7 +16,7 @@ from policy.training.batches import FeatureStore
 from policy.training.encode import both_ways, encode_rows
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, TrainResult, Validation, WorldModelValidation
-from policy.training.run import Run, open_run
+from policy.training.run import TrainingRun, open_run
 from policy.training.run_folder import RunFolder
 from policy.training.settings import WorldModelSettings
 from policy.training.stages import TrainingStage, world_model_stages
@@ -66,7 +66,7 @@ def train_world_model(
     return _WorldModelRun(flights, config, settings, folder, hooks).finish()
 
 
-class _WorldModelRun(Run[WorldModel, FrameBatch | WindowBatch]):
+class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
     validation_type, encoder_learns_alone = WorldModelValidation, True
 
     def __init__(

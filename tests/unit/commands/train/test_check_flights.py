@@ -1,6 +1,7 @@
 """The check of a training run flies, on courses of its own."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,12 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from mavbridge.flight.assembly import load_configured_policy
 
 from mavbridge.commands.train import check_flights as train_check
 from mavbridge.config.courses import CHECK_COURSE_SEED, HELD_OUT_COURSE_SEED, MAX_EPISODES
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import Clock
 from mavbridge.simulation.result import EpisodeResult
 from policy.checkpoints.policy_file import save_checkpoint
 from policy.contract import Contract, Executable, FloatArray
+from policy.loading import LoadedPolicy
 from policy.nets.toge import Toge, TogeConfig
 
 
@@ -54,6 +59,11 @@ def test_counts_the_gates_of_courses_that_nothing_else_flies_with_the_weights_in
         return result(course_seed, seed, gates=2 * seed)
 
     monkeypatch.setattr(train_check, "SimulatedFlight", flights_by(fly))
+
+    def load_for_torch(config: PolicyConfig, clock: Clock) -> LoadedPolicy:
+        return load_configured_policy(replace(config, engine="torch"), clock)
+
+    monkeypatch.setattr(train_check, "load_configured_policy", load_for_torch)  # compiles nothing
     path = tmp_path / "toge.safetensors"
     assert train_check.share_of_gates(save(path, 0), "toge", 3) == pytest.approx((0 + 2 + 4) / 24)
     assert flown == [CHECK_COURSE_SEED, CHECK_COURSE_SEED + 1, CHECK_COURSE_SEED + 2]

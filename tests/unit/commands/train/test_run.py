@@ -22,6 +22,7 @@ from policy.training.report import TrainingProgress
 from policy.training.settings import TrainSettings
 
 SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")
+OLD = ["--policy", "world-model"]
 OUT = ["flights", "--out", "a.safetensors"]
 
 
@@ -109,6 +110,11 @@ def test_a_world_model_is_trained_also_by_the_old_spelling(
         (["train-world-model", *OUT, "--ages", "40:90"], "Unknown option"),
         (["train-world-model", *OUT, "--start-from", "b.safetensors"], "no such file"),
         (["train-world-model", *OUT, "--image-size", "40"], "multiple of 16"),
+        (
+            ["train", *OUT, *OLD, "--start-from", "b.safetensors", "--freeze-encoder"],
+            "no such file",
+        ),
+        (["train", *OUT, "--policy=world-model", "--pack"], "Unknown option"),
         (["train-world-model", *OUT], "fly longer"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What the net is told in training is what the runtime tells it in flight."""
+"""A policy is given in training what the runtime gives it in flight."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -143,7 +143,7 @@ def test_since_exposure_by_hand() -> None:
     np.testing.assert_allclose(told[1], [0.05, 0, 0, np.pi / 4, -half, -half, 0], atol=1e-5)
 
 
-def test_the_runtime_tells_the_same_of_an_image() -> None:
+def test_the_runtime_gives_the_same_motion_since_exposure() -> None:
     episode = flown(ticks=60)
     line = timeline(episode)
     runtime = EgoMotion(span_ns=300 * MS)
