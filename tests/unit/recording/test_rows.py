@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.factories import make_released_tick, make_state, make_tick, make_trace
@@ -81,6 +81,7 @@ def same_state(one: VehicleState | None, other: VehicleState | None) -> bool:
     return values and replace(one, values=other.values) == other
 
 
+@settings(max_examples=30)
 @given(st.lists(tick_rows, max_size=8))
 def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
     table = pa.Table.from_batches([ticks_batch(rows, DEMONSTRATION_TICKS)])

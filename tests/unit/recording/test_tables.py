@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.recordings import make_row
@@ -51,6 +51,7 @@ def test_finishing_leaves_parquet_alone(tmp_path: Path) -> None:
     assert read_table(tmp_path / "frames", FRAMES)["frame_id"].to_pylist() == [0, 1, 2, 3, 4]
 
 
+@settings(max_examples=40)
 @given(st.floats(0, 1))
 def test_a_stream_cut_off_anywhere_has_its_whole_batches(share: float) -> None:
     with TemporaryDirectory() as folder:
