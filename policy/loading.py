@@ -140,7 +140,7 @@ def _executable(
 ) -> tuple[Executable, tuple[str, ...]]:
     """An engine that takes the policy's kind of arrays, and what to say of it."""
     if policy.contract.arrays == "numpy":
-        from policy.engines.direct import make_numpy_executable
+        from policy.engines.numpy_eager import make_numpy_executable
 
         if engine != "auto":
             raise PolicyError(

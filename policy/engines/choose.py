@@ -10,6 +10,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import torch
+from torch import nn
 
 from policy.contract import Executable, FloatArray, SingleRatePolicy
 from policy.engines.executable import EngineName, Precision, Settings
@@ -19,7 +20,6 @@ from policy.errors import PolicyError
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 
-BUILTIN = (Toge, ResnetUnet)
 PROBE_ELAPSED_S = 0.02
 """Between the two chunks of a sample: with a warm start, the second one is a refinement."""
 
@@ -41,19 +41,19 @@ def choose_executable(
         PolicyError: the engine asked for is absent here or does not serve this policy or device;
             or the policy itself failed.
     """
-    if engine == "torch" or (engine == "auto" and not isinstance(policy, BUILTIN)):
+    if engine == "torch" or (engine == "auto" and not isinstance(policy, Toge | ResnetUnet)):
         return make_torch_executable(policy, settings), ()
-    if not isinstance(policy, BUILTIN):
+    if not isinstance(policy, nn.Module):
         raise PolicyError(
-            f"--engine {engine} knows toge and resnet-unet only: leave it out, and "
-            f"{settings.name} runs on torch"
+            f"--engine {engine} takes a torch.nn.Module: leave it out, and {settings.name} runs on "
+            "torch"
         )
     candidates = _candidates(policy, engine, settings)
     return first_faithful(policy, candidates, settings)
 
 
 def first_faithful(
-    policy: Toge | ResnetUnet, candidates: list[Candidate], settings: Settings
+    policy: SingleRatePolicy, candidates: list[Candidate], settings: Settings
 ) -> tuple[Executable, tuple[str, ...]]:
     """The first candidate that passes the gate, or torch, with a line for each one passed over.
 
@@ -88,7 +88,7 @@ def probe_chunks(executable: Executable, probe: Probe) -> FloatArray:
 
 
 def _candidates(
-    policy: Toge | ResnetUnet, engine: EngineName, settings: Settings
+    policy: SingleRatePolicy, engine: EngineName, settings: Settings
 ) -> list[Candidate]:
     devices = {settings.vision_device.split(":")[0], settings.action_device.split(":")[0]}
     if engine == "openvino" and devices != {"cpu"}:
@@ -104,7 +104,7 @@ def _candidates(
     return []
 
 
-def _openvino(policy: Toge | ResnetUnet, settings: Settings) -> list[Candidate]:
+def _openvino(policy: SingleRatePolicy, settings: Settings) -> list[Candidate]:
     from policy.engines.openvino_cpu import make_openvino_executable, precisions
 
     def candidate(vision: Precision, action: Precision) -> Candidate:
@@ -116,7 +116,7 @@ def _openvino(policy: Toge | ResnetUnet, settings: Settings) -> list[Candidate]:
     return [candidate(vision, action) for vision, action in precisions()]
 
 
-def _cuda_graph(policy: Toge | ResnetUnet, settings: Settings) -> Candidate:
+def _cuda_graph(policy: SingleRatePolicy, settings: Settings) -> Candidate:
     from policy.engines.cuda_graph import make_cuda_graph_executable
 
     return Candidate(label="cuda-graph", make=lambda: make_cuda_graph_executable(policy, settings))

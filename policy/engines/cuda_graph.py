@@ -11,61 +11,47 @@ left in flight, and encoded images are handed over as arrays, so no tensor has t
 
 import copy
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from policy.contract import ACTION_DIM, Executable, FloatArray
-from policy.engines.executable import Settings, always_full, assemble, warm_started
+from policy.contract import Executable, FloatArray, SingleRatePolicy
+from policy.engines.executable import Settings, Shape, make_executable
 from policy.errors import PolicyError
-from policy.nets.resnet_unet import ResnetUnet
-from policy.nets.toge import Toge
 
 NAME = "cuda-graph"
 WARM_UP_CALLS = 3
 """Before a capture, so that libraries have their choices and handles (PyTorch's CUDA notes)."""
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
-"""Of CUDA streams."""
+"""Priorities of CUDA streams."""
 
 
-def make_cuda_graph_executable(policy: Toge | ResnetUnet, settings: Settings) -> Executable:
+def make_cuda_graph_executable(policy: SingleRatePolicy, settings: Settings) -> Executable:
     """Capture a copy of the policy for the loops; tried once.
 
     Raises:
-        PolicyError: it failed on a dummy sample.
+        PolicyError: it is no torch module, has no fast path where one was asked for, or failed on a
+            dummy sample.
         RuntimeError: a capture failed.
     """
-    contract, steps = policy.contract, settings.num_diffusion_steps
+    if not isinstance(policy, nn.Module):
+        raise PolicyError(f"{settings.name} is no torch.nn.Module, so its work cannot be captured")
     action_device = torch.device(settings.action_device)
-    action = copy.deepcopy(policy).to(action_device).eval()
-    image = (1, 3, contract.image_height, contract.image_width)
-    rest = ((1, contract.state_dim), (1, contract.history_len, ACTION_DIM))
-    stream = _stream(action_device, HIGH_PRIORITY)
-    if not settings.dual_rate or not isinstance(action, Toge):
-        if settings.dual_rate:
-            raise PolicyError(f"{settings.name} has no fast path: fly it single-rate")
-        predict = _Graph(lambda i, s, h: action.predict(i, s, h, steps), (image, *rest), stream)
-        return assemble(contract, lambda array: array, always_full(predict), NAME, settings)
-    toge = action
     vision_device = torch.device(settings.vision_device)
-    vision = toge if vision_device == action_device else copy.deepcopy(toge).to(vision_device)
-    encode = _Graph(vision.encode_visual, (image,), _stream(vision_device, NORMAL_PRIORITY))
-    fast = ((1, contract.feature_dim), *rest)
-    if settings.head_steps is None:
-        sample = _Graph(lambda e, s, h: toge.predict_fast(e, s, h, steps), fast, stream)
-        return assemble(contract, encode, always_full(sample), NAME, settings)
-
-    def segment(first: int, count: int) -> _Graph:
-        return _Graph(
-            lambda e, s, h, noisy: toge.denoise_fast(e, s, h, noisy, steps, first, count),
-            (*fast, (1, contract.horizon, ACTION_DIM)),
-            stream,
-        )
-
-    noise = toge.initial_noise.cpu().numpy()
-    act = warm_started(toge, noise, steps, settings.head_steps, segment)
-    return assemble(contract, encode, act, NAME, settings)
+    action = copy.deepcopy(policy).to(action_device).eval()
+    vision = action
+    if vision_device != action_device:
+        vision = copy.deepcopy(action).to(vision_device)
+    return make_executable(
+        vision,
+        action,
+        partial(_Graph, stream=_stream(vision_device, NORMAL_PRIORITY)),
+        partial(_Graph, stream=_stream(action_device, HIGH_PRIORITY)),
+        engine=NAME,
+        settings=settings,
+    )
 
 
 def _stream(device: torch.device, priority: int) -> torch.cuda.Stream:
@@ -78,7 +64,7 @@ class _Graph:
     def __init__(
         self,
         function: Callable[..., Tensor],
-        shapes: Sequence[tuple[int, ...]],
+        shapes: Sequence[Shape],
         stream: torch.cuda.Stream,
     ) -> None:
         self._stream = stream

@@ -1,9 +1,8 @@
 """What all engines share: the policy's methods as an ``Executable``, tried once before it flies."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from policy.contract import (
     SingleRatePolicy,
     WarmStartPolicy,
 )
-from policy.engines.warm_start import Segment, Solve, WarmStart, segment_spans
+from policy.engines.warm_start import Segment, WarmStart, make_solve
 from policy.errors import PolicyError
 from policy.preprocess import image_to_input
 from policy.user_code import user_code
@@ -26,8 +25,6 @@ EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
 Act = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
 """``Executable.act``."""
-Sample = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""(encoded image, state, history) -> chunk [1, horizon, 4], from noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,98 +45,79 @@ class Settings:
     """Whether encode runs the image path; needs a ``DualRatePolicy``."""
 
 
-class Run(Protocol):
-    """How an engine calls a method of a policy: arrays of its own kind in, numpy out."""
-
-    def __call__(self, method: Callable[..., Any], *arrays: FloatArray) -> FloatArray:
-        """Call ``method`` with the arrays, converted."""
-        ...
+ArrayFunction = Callable[..., FloatArray]
+"""float32 arrays in, one of the caller's own out."""
+Shape = tuple[int, ...]
+Compile = Callable[[Callable[..., Any], Sequence[Shape]], ArrayFunction]
+"""How an engine runs a function of its own kind of arrays, whose float32 inputs have the shapes."""
 
 
 def make_executable(
     vision: SingleRatePolicy,
     action: SingleRatePolicy,
-    run_vision: Run,
-    run_action: Run,
+    compile_vision: Compile,
+    compile_action: Compile,
     *,
     engine: str,
     settings: Settings,
 ) -> Executable:
-    """Wrap a policy's methods for the loops and try them on a dummy sample.
+    """Compile a policy's methods for the loops and try them on a dummy sample.
 
     Args:
         vision: the policy where images are encoded.
         action: the same policy where chunks are sampled.
-        run_vision: how ``vision``'s methods are called.
-        run_action: how ``action``'s methods are called.
+        compile_vision: how ``vision``'s methods are run.
+        compile_action: how ``action``'s methods are run.
         engine: its name.
         settings: what was asked for.
 
     Raises:
         PolicyError: no fast path where one was asked for, or the policy failed on the sample.
     """
-    steps = settings.num_diffusion_steps
+    contract, steps = action.contract, settings.num_diffusion_steps
+    image = (1, 3, contract.image_height, contract.image_width)
+    rest = ((1, contract.state_dim), (1, contract.history_len, ACTION_DIM))
     if not settings.dual_rate:
-        act = always_full(partial(run_action, lambda e, s, h: action.predict(e, s, h, steps)))
-        return assemble(action.contract, lambda image: image, act, engine, settings)
+        predict = compile_action(lambda i, s, h: action.predict(i, s, h, steps), (image, *rest))
+        return assemble(contract, lambda array: array, always_full(predict), engine, settings)
     if not isinstance(vision, DualRatePolicy) or not isinstance(action, DualRatePolicy):
         raise PolicyError(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
         )
-    encode = partial(run_vision, vision.encode_visual)
+    encode = compile_vision(vision.encode_visual, (image,))
+    fast = ((1, contract.feature_dim), *rest)
     if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
-        act = _warm_started(action, settings.head_steps, run_action, settings)
-        return assemble(action.contract, encode, act, engine, settings)
-    fast = action
-    act = always_full(partial(run_action, lambda e, s, h: fast.predict_fast(e, s, h, steps)))
-    return assemble(action.contract, encode, act, engine, settings)
+        act = _warm_started(action, fast, compile_action, settings, settings.head_steps)
+    else:
+        sampler = action
+        sample = compile_action(lambda e, s, h: sampler.predict_fast(e, s, h, steps), fast)
+        act = always_full(sample)
+    return assemble(contract, encode, act, engine, settings)
 
 
-def _warm_started(policy: WarmStartPolicy, head_steps: int, run: Run, settings: Settings) -> Act:
+def _warm_started(
+    policy: WarmStartPolicy,
+    shapes: Sequence[Shape],
+    compile_: Compile,
+    settings: Settings,
+    head_steps: int,
+) -> Act:
     steps = settings.num_diffusion_steps
+    noisy = (1, policy.contract.horizon, ACTION_DIM)
 
     def segment(first: int, count: int) -> Segment:
-        return partial(
-            run, lambda e, s, h, noisy: policy.denoise_fast(e, s, h, noisy, steps, first, count)
+        return compile_(
+            lambda e, s, h, n: policy.denoise_fast(e, s, h, n, steps, first, count),
+            (*shapes, noisy),
         )
 
     with user_code(f"{settings.name} failed to prepare its warm start"):
-        noise = run(lambda: policy.initial_noise)
-        return warm_started(policy, noise, steps, head_steps, segment)
-
-
-def warm_started(
-    policy: WarmStartPolicy,
-    noise: FloatArray,
-    num_diffusion_steps: int,
-    head_steps: int,
-    segment: Callable[[int, int], Segment],
-) -> Act:
-    """Warm starts, and full solves spread over ticks, by an engine's segments.
-
-    Args:
-        policy: whose shares of noise count; the engine runs it.
-        noise: its initial noise [1, horizon, 4].
-        num_diffusion_steps: of a full solve.
-        head_steps: of a warm start, and of each segment but the first, which may have fewer.
-        segment: (first step, number of steps) -> what runs them.
-
-    Raises:
-        PolicyError: there are not that many steps.
-    """
-    spans = segment_spans(num_diffusion_steps, head_steps)
-    guess_share, noise_share = policy.noise_shares(num_diffusion_steps, spans[-1][0])
-    solve = Solve(
-        noise=noise,
-        segments=tuple(segment(first, count) for first, count in spans),
-        guess_share=guess_share,
-        noise_share=noise_share,
-    )
+        solve = make_solve(policy, segment, steps, head_steps)
     return WarmStart(solve, chunk_dt_s=policy.contract.chunk_dt_s)
 
 
-def always_full(sample: Sample) -> Act:
-    """Every chunk from noise, whenever the last one was."""
+def always_full(sample: ArrayFunction) -> Act:
+    """Every chunk by ``sample(encoded, state, history)``, whenever the last one was."""
     return lambda encoded, state, history, _elapsed_s: sample(encoded, state, history)
 
 

@@ -6,7 +6,7 @@ import openvino as ov
 from policy.contract import FloatArray
 from policy.engines.executable import Precision
 from policy.engines.openvino_cpu import DEVICE
-from policy.engines.openvino_graph import backbone_graph
+from policy.engines.openvino_graph import convert
 from policy.engines.signal_stack import signal_stack_kept
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
@@ -24,8 +24,10 @@ class BulkEncoder:
             "PERFORMANCE_HINT": "THROUGHPUT",
             "INFERENCE_PRECISION_HINT": precision,
         }
+        image = (1, 3, policy.contract.image_height, policy.contract.image_width)
+        graph = convert(policy.backbone, policy.backbone, [image])
         with signal_stack_kept():
-            compiled = ov.Core().compile_model(backbone_graph(policy), DEVICE, properties)
+            compiled = ov.Core().compile_model(graph, DEVICE, properties)
             self._queue = ov.AsyncInferQueue(compiled, 0)
         self._dim = policy.backbone.out_dim
 

@@ -11,13 +11,23 @@ from pathlib import Path
 
 import numpy as np
 import openvino as ov
+import torch
+from torch import nn
 
-from policy.contract import Executable, FloatArray
+from policy.contract import Executable, FloatArray, SingleRatePolicy
 from policy.engines.compile_cache import CompileCache, user_cache_folder
-from policy.engines.executable import Precision, Settings, always_full, assemble, warm_started
-from policy.engines.openvino_graph import denoise_graph, step_inputs, vision_graph
+from policy.engines.executable import (
+    Act,
+    Compile,
+    Precision,
+    Settings,
+    always_full,
+    assemble,
+    make_executable,
+)
+from policy.engines.openvino_graph import convert, denoise_graph, step_inputs, vision_graph
 from policy.engines.signal_stack import signal_stack_kept
-from policy.engines.warm_start import Segment
+from policy.engines.warm_start import Segment, WarmStart, make_solve
 from policy.errors import PolicyError
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
@@ -26,12 +36,8 @@ from policy.preprocess import egocentric
 NAME = "openvino"
 DEVICE = "CPU"
 
-_PROPERTIES = {
-    "PERFORMANCE_HINT": "LATENCY",
-    "NUM_STREAMS": "1",
-    "INFERENCE_NUM_THREADS": "1",
-    "ENABLE_CPU_PINNING": "NO",
-}
+MAX_UNROLLED = 10
+"""Denoising steps in one graph: each takes a third of a second to convert, the first time."""
 
 
 @signal_stack_kept()
@@ -47,40 +53,58 @@ def precisions() -> tuple[tuple[Precision, Precision], ...]:
 
 @signal_stack_kept()
 def make_openvino_executable(
-    policy: Toge | ResnetUnet, settings: Settings, vision: Precision, action: Precision
+    policy: SingleRatePolicy, settings: Settings, vision: Precision, action: Precision
 ) -> Executable:
     """Compile a policy for the loops, or take it from the user's cache; tried once.
 
+    A module of a user is traced, so what it decides by a tensor's values, or keeps between calls,
+    is frozen. It is not cached: its code may change where its weights do not.
+
     Args:
-        policy: on the CPU; its initial noise is taken as it is now.
+        policy: a torch module on the CPU; its initial noise is taken as it is now.
         settings: what was asked for.
         vision: precision of the image path.
         action: precision of the action path.
 
     Raises:
-        PolicyError: the policy failed on a dummy sample.
+        PolicyError: it is no torch module, cannot be converted, has no fast path where one was
+            asked for, or failed on a dummy sample.
         RuntimeError: OpenVINO cannot compile it.
     """
-    compiler = _Compiler(policy)
-    noise = policy.head.initial_noise.cpu().numpy().copy()
     name = f"{NAME}-{vision}" if vision == action else f"{NAME}-{vision}-{action}"
-    steps = settings.num_diffusion_steps
+    if isinstance(policy, Toge | ResnetUnet):
+        return _make_builtin(policy, settings, vision, action, name)
+    if not isinstance(policy, nn.Module):
+        raise PolicyError(f"{settings.name} is no torch.nn.Module, so it cannot be converted")
+    module = policy.eval()
+
+    def compile_as(precision: Precision) -> Compile:
+        return lambda function, shapes: _Graph(
+            ov.Core().compile_model(
+                convert(module, function, shapes), DEVICE, _properties(precision)
+            )
+        )
+
+    return make_executable(
+        policy, policy, compile_as(vision), compile_as(action), engine=name, settings=settings
+    )
+
+
+def _make_builtin(
+    policy: Toge | ResnetUnet, settings: Settings, vision: Precision, action: Precision, name: str
+) -> Executable:
+    compiler, steps = _Compiler(policy), settings.num_diffusion_steps
     encode = compiler.compile("vision", vision, lambda: vision_graph(policy))
-    if settings.dual_rate and settings.head_steps is not None and isinstance(policy, Toge):
-        segment = _segments(compiler, policy, action, steps, settings.head_steps)
-        act = warm_started(policy, noise, steps, settings.head_steps, segment)
+    warm_steps = settings.head_steps if settings.dual_rate and isinstance(policy, Toge) else None
+    at_once = min(steps, MAX_UNROLLED) if warm_steps is None else warm_steps
+    segment = _segments(compiler, policy, action, steps, at_once)
+    solve = make_solve(policy.head, segment, steps, at_once)
+    if warm_steps is not None:
+        act: Act = WarmStart(solve, chunk_dt_s=policy.contract.chunk_dt_s)
         return assemble(policy.contract, encode, act, name, settings)
-    whole = _segments(compiler, policy, action, steps, steps)(0, steps)
-
-    def sample(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        return whole(encoded, state, history, noise)
-
-    def from_image(image: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        return sample(encode(image), state, history)
-
     if settings.dual_rate:
-        return assemble(policy.contract, encode, always_full(sample), name, settings)
-    act = always_full(from_image)
+        return assemble(policy.contract, encode, always_full(solve.sample), name, settings)
+    act = always_full(lambda image, s, h: solve.sample(encode(image), s, h))
     return assemble(policy.contract, lambda image: image, act, name, settings)
 
 
@@ -101,36 +125,33 @@ def _segments(
 
     def segment(first: int, count: int) -> Segment:
         films, updates = step_inputs(policy.head, steps, first, count, unrolled)
-
-        def run(
-            encoded: FloatArray, state: FloatArray, history: FloatArray, noisy: FloatArray
-        ) -> FloatArray:
-            known = egocentric(state, policy.contract)
-            return denoise(encoded, known, history, noisy, films, updates)
-
-        return run
+        return lambda encoded, state, history, noisy: denoise(
+            encoded, egocentric(state, policy.contract), history, noisy, films, updates
+        )
 
     return segment
 
 
 class _Compiler:
-    """Compiles the graphs of one policy; a key holds all that the result depends on."""
+    """Compiles the graphs of a policy of ours; a key holds all that the result depends on."""
 
     def __init__(self, policy: Toge | ResnetUnet) -> None:
         self._core = ov.Core()
         self._cache = CompileCache(user_cache_folder() / NAME)
         digest = hashlib.sha256()
-        for source in sorted(Path(__file__).parent.glob("openvino_*.py")):
+        here = Path(__file__).parent
+        for source in sorted([*here.glob("openvino_*.py"), *here.parent.glob("nets/*.py")]):
             digest.update(source.read_bytes())
         for name, value in policy.state_dict().items():
             digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
             digest.update(value.cpu().contiguous().numpy())
         cpu = self._core.get_property(DEVICE, "FULL_DEVICE_NAME")
         capabilities = self._core.get_property(DEVICE, "OPTIMIZATION_CAPABILITIES")
-        self._key = f"{digest.hexdigest()} {policy.config} {ov.__version__} {cpu} {capabilities}"
+        versions = f"{ov.__version__} {torch.__version__}"
+        self._key = f"{digest.hexdigest()} {policy.config} {versions} {cpu} {capabilities}"
 
     def compile(self, name: str, precision: Precision, build: Callable[[], "ov.Model"]) -> "_Graph":
-        properties = {**_PROPERTIES, "INFERENCE_PRECISION_HINT": precision}
+        properties = _properties(precision)
         key = f"{self._key} {name} {properties}"
         stored = self._cache.load(key)
         if stored is not None:
@@ -141,6 +162,16 @@ class _Compiler:
         compiled = self._core.compile_model(build(), DEVICE, properties)
         self._cache.store(key, compiled.export_model().getvalue())
         return _Graph(compiled)
+
+
+def _properties(precision: Precision) -> dict[str, str]:
+    return {
+        "PERFORMANCE_HINT": "LATENCY",
+        "NUM_STREAMS": "1",
+        "INFERENCE_NUM_THREADS": "1",
+        "ENABLE_CPU_PINNING": "NO",
+        "INFERENCE_PRECISION_HINT": precision,
+    }
 
 
 class _Graph:

@@ -1,7 +1,7 @@
 """Plain torch, operator by operator: the reference for every other engine."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import Executable, FloatArray, SingleRatePolicy
-from policy.engines.executable import Run, Settings, make_executable
+from policy.engines.executable import ArrayFunction, Compile, Settings, Shape, make_executable
 from policy.errors import PolicyError
 
 NAME = "torch"
@@ -34,23 +34,26 @@ def make_torch_executable(policy: SingleRatePolicy, settings: Settings) -> Execu
     return make_executable(
         vision,
         action,
-        _run(settings.name, settings.vision_device),
-        _run(settings.name, settings.action_device),
+        _compile(settings.name, settings.vision_device),
+        _compile(settings.name, settings.action_device),
         engine=NAME,
         settings=settings,
     )
 
 
-def _run(name: str, device: str) -> Run:
-    def run(method: Callable[..., Any], *arrays: FloatArray) -> FloatArray:
-        with torch.inference_mode():
-            # torch.tensor copies: published arrays are read-only, which torch cannot express.
-            result = method(*[torch.tensor(array, device=device) for array in arrays])
-            if not isinstance(result, Tensor):
-                raise PolicyError(
-                    f"{name} returned {type(result).__name__}; its contract says torch tensors"
-                )
-            # A copy, too: a policy may return a buffer that it writes to again.
-            return np.array(result.cpu().numpy(), np.float32)
+def _compile(name: str, device: str) -> Compile:
+    def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
+        def run(*arrays: FloatArray) -> FloatArray:
+            with torch.inference_mode():
+                # torch.tensor copies: published arrays are read-only, which torch cannot express.
+                result = method(*[torch.tensor(array, device=device) for array in arrays])
+                if not isinstance(result, Tensor):
+                    raise PolicyError(
+                        f"{name} returned {type(result).__name__}; its contract says torch tensors"
+                    )
+                # A copy, too: a policy may return a buffer that it writes to again.
+                return np.array(result.cpu().numpy(), np.float32)
 
-    return run
+        return run
+
+    return compile_

@@ -9,6 +9,7 @@ more than twice the steps of a warm start.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -21,6 +22,19 @@ the states that the chunks belong to."""
 
 Segment = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 """(encoded image, state, history, noisy chunk [1, horizon, 4]) -> less noisy chunk."""
+
+
+class NoiseModel(Protocol):
+    """What a solve starts from; a ``WarmStartPolicy`` is one."""
+
+    @property
+    def initial_noise(self) -> Any:
+        """[1, horizon, 4]; the same for a whole flight."""
+        ...
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,19 +64,38 @@ class Solve:
         return self.segments[-1](encoded, state, history, noisy)
 
 
-def segment_spans(num_diffusion_steps: int, head_steps: int) -> list[tuple[int, int]]:
-    """(first step, number of steps) of each segment; only the first one may have fewer.
+def make_solve(
+    start: NoiseModel,
+    segment: Callable[[int, int], Segment],
+    num_diffusion_steps: int,
+    segment_steps: int,
+) -> Solve:
+    """A solve of ``num_diffusion_steps`` in segments; only the first may have fewer steps.
+
+    Args:
+        start: its initial noise is taken as it is now.
+        segment: (first step, number of steps) -> what runs them.
+        num_diffusion_steps: in all.
+        segment_steps: in each segment.
 
     Raises:
-        PolicyError: the solve does not have ``head_steps``.
+        PolicyError: the solve does not have ``segment_steps``.
     """
-    if not 1 <= head_steps <= num_diffusion_steps:
+    if not 1 <= segment_steps <= num_diffusion_steps:
         raise PolicyError(
             f"head_steps must be in 1..{num_diffusion_steps} (num_diffusion_steps), "
-            f"got {head_steps}"
+            f"got {segment_steps}"
         )
-    ends = reversed(range(num_diffusion_steps, 0, -head_steps))
-    return [(max(end - head_steps, 0), min(end, head_steps)) for end in ends]
+    ends = reversed(range(num_diffusion_steps, 0, -segment_steps))
+    spans = [(max(end - segment_steps, 0), min(end, segment_steps)) for end in ends]
+    guess_share, noise_share = start.noise_shares(num_diffusion_steps, spans[-1][0])
+    noise = start.initial_noise  # of any kind of arrays, on any device
+    return Solve(
+        noise=np.array(noise.cpu().numpy() if hasattr(noise, "cpu") else noise, np.float32),
+        segments=tuple(segment(first, count) for first, count in spans),
+        guess_share=guess_share,
+        noise_share=noise_share,
+    )
 
 
 def moved_chunk(chunk: FloatArray, periods: float) -> FloatArray:

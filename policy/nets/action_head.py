@@ -83,6 +83,15 @@ class DiffusionHead(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         self.initial_noise.copy_(torch.randn(self.initial_noise.shape, generator=generator))
 
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with.
+
+        Raises:
+            PolicyError: the schedule has no such number of steps.
+        """
+        step = self.schedule.ddim_steps(num_diffusion_steps)[first]
+        return step.signal, step.noise
+
     def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
         """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
         film = self.unet.film_of_timestep(timestep) + self.unet.film_of_condition(condition)

@@ -55,8 +55,14 @@ class AttentionBlock(nn.Module):
         """Tokens that have looked at each other."""
         batch, count, dim = tokens.shape
         qkv = self.qkv(self.norm1(tokens)).reshape(batch, count, 3, HEADS, dim // HEADS)
-        query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)
-        attended = F.scaled_dot_product_attention(query, key, value)
+        heads = qkv.permute(2, 0, 3, 1, 4)
+        if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
+            # For OpenVINO (2026.4), whose fused attention over so few tokens is wrong in float32.
+            query, key, value = heads.chunk(3)
+            scores = query @ key.transpose(-2, -1) * (dim // HEADS) ** -0.5
+            attended = (scores.softmax(dim=-1) @ value).squeeze(0)
+        else:
+            attended = F.scaled_dot_product_attention(*heads.unbind(0))
         tokens = tokens + self.project(attended.transpose(1, 2).reshape(batch, count, dim))
         out: Tensor = tokens + self.mlp(self.norm2(tokens))
         return out

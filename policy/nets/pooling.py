@@ -20,7 +20,7 @@ MOMENTS = 3
 
 def moments(features: Tensor) -> Tensor:
     """Map [B, C, H, W] -> [B, 3, C]."""
-    height, width = features.shape[2:]
+    height, width = (int(size) for size in features.shape[2:])  # plain numbers also in a trace
     weights = torch.from_numpy(moment_weights(height, width)).to(features)
     return torch.matmul(features.flatten(2), weights).transpose(1, 2)
 

@@ -73,7 +73,11 @@ class ResnetUnet(nn.Module):
 
     def fuse_visual(self, visual: Tensor, state: Tensor, action_history: Tensor) -> Tensor:
         """Projected image [B, C], state, history [B, K, 4] -> condition [B, C]."""
-        parts = [visual, self.state_encoder(state), action_history.flatten(1)]
+        return self.condition(visual, self.state_encoder(state), action_history)
+
+    def condition(self, visual: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
+        """Projected image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C]."""
+        parts = [visual, state_token, action_history.flatten(1)]
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition
 

@@ -101,9 +101,11 @@ class Toge(nn.Module):
         if action_history is None:
             action_history = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
         require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
-        condition: Tensor = self.fusion(
-            feature, self.state_encoder(state), self.history_encoder(action_history)
-        )
+        return self.condition(feature, self.state_encoder(state), action_history)
+
+    def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
+        """Feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
+        condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
         return condition
 
     def encode_observation(
@@ -142,8 +144,7 @@ class Toge(nn.Module):
         Raises:
             PolicyError: the steps are not 1..100.
         """
-        step = self.head.schedule.ddim_steps(num_diffusion_steps)[first]
-        return step.signal, step.noise
+        return self.head.noise_shares(num_diffusion_steps, first)
 
     def denoise_fast(
         self,

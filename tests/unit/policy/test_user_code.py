@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from policy.contract import Contract
-from policy.engines.direct import make_numpy_executable
 from policy.engines.executable import Settings
+from policy.engines.numpy_eager import make_numpy_executable
 from policy.errors import PolicyError
 from policy.user_code import user_code
 

@@ -61,7 +61,7 @@ def test_the_default_on_a_gpu_is_the_graph(small_toge: Toge) -> None:
 
 
 def test_the_same_flight_gives_the_same_sticks(small_toge: Toge, fly: Fly) -> None:
-    first, second = (fly(make_cuda_graph_executable(small_toge, ON_GPU), 0.01) for _ in range(2))
+    first, second = (fly(make_cuda_graph_executable(small_toge, ON_GPU), 0.02) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
@@ -71,8 +71,8 @@ def test_a_flight_with_a_spread_solve_is_that_of_torch(
 ) -> None:
     on_gpu = replace(ON_GPU, head_steps=head_steps)
     settings = Settings(name="t", head_steps=head_steps)
-    expected = fly(make_torch_executable(trained_toge, settings), 0.01)
-    chunks = fly(make_cuda_graph_executable(trained_toge, on_gpu), 0.01)
+    expected = fly(make_torch_executable(trained_toge, settings), 0.02)
+    chunks = fly(make_cuda_graph_executable(trained_toge, on_gpu), 0.02)
     assert disagreement(expected, chunks) is None
 
 

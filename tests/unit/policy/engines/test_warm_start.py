@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from policy.contract import Contract, Executable, FloatArray
-from policy.engines.direct import make_numpy_executable
 from policy.engines.executable import Settings
+from policy.engines.numpy_eager import make_numpy_executable
 from policy.engines.torch_eager import make_torch_executable
 from policy.engines.warm_start import FULL_EVERY_S, Solve, WarmStart, moved_chunk
 from policy.errors import PolicyError
@@ -203,7 +203,8 @@ def test_on_torch_the_spread_solve_is_the_whole_one_bit_for_bit(
 ) -> None:
     random = np.random.default_rng(1)
     feature = random.normal(size=(1, 256)).astype(np.float32)
-    states = [STATE + np.float32(0.01 * tick) for tick in range(9)]
+    level = np.eye(1, trained_toge.contract.state_dim, 3, dtype=np.float32)
+    states = [level + np.float32(0.01 * tick) for tick in range(9)]
     warm = make_torch_executable(trained_toge, Settings(name="t", head_steps=head_steps))
     full = make_torch_executable(trained_toge, Settings(name="t"))
     segments = len(SEGMENTS[head_steps])
@@ -222,16 +223,20 @@ def test_on_torch_the_spread_solve_is_the_whole_one_bit_for_bit(
 
 
 # Furthest and mean distance from the full solve, in sticks: about twice what was measured.
-BOUNDS = {1: (0.05, 0.01), 3: (0.03, 0.006), 10: (1e-3, 1e-4)}
+BOUNDS = {1: (0.6, 0.05), 3: (0.15, 0.02), 10: (1e-3, 1e-4)}
+
+
+@pytest.fixture(scope="module")
+def full(trained_toge: Toge, fly: Fly) -> FloatArray:
+    return fly(make_torch_executable(trained_toge, Settings(name="toge")), None)
 
 
 @pytest.mark.parametrize("head_steps", BOUNDS)
 def test_warm_chunks_stay_near_the_full_solve(
-    trained_toge: Toge, fly: Fly, head_steps: int
+    trained_toge: Toge, fly: Fly, full: FloatArray, head_steps: int
 ) -> None:
     settings = Settings(name="toge", head_steps=head_steps)
-    warm = fly(make_torch_executable(trained_toge, settings), 0.01)
-    full = fly(make_torch_executable(trained_toge, Settings(name="toge")), None)
+    warm = fly(make_torch_executable(trained_toge, settings), 0.02)
     distance = np.abs(warm - full)
     furthest, mean = BOUNDS[head_steps]
     assert distance.max() <= furthest
@@ -242,7 +247,7 @@ def test_warm_chunks_stay_near_the_full_solve(
 
 def test_the_same_flight_gives_the_same_sticks(trained_toge: Toge, fly: Fly) -> None:
     settings = Settings(name="toge", head_steps=2)
-    first, second = (fly(make_torch_executable(trained_toge, settings), 0.01) for _ in range(2))
+    first, second = (fly(make_torch_executable(trained_toge, settings), 0.02) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
