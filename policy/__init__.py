@@ -1,1 +1,4 @@
-"""Vision policies: nets only, no MAVLink, threads or clock. ``policy.contract`` is the way in."""
+"""Vision policies: networks, how they run, train and are stored; ``policy.contract`` is the way in.
+
+Nothing here speaks MAVLink or reads a clock of its own.
+"""

@@ -14,3 +14,7 @@ class PolicyError(MavbridgeError):
 
 class ContractError(PolicyError):
     """A contract that is malformed or that the bridge cannot keep."""
+
+
+class CheckpointError(PolicyError):
+    """A checkpoint that cannot be read, or does not fit; the message says what to do."""

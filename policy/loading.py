@@ -10,14 +10,18 @@ torch is imported only where a policy needs it.
 
 import importlib
 import inspect
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from policy.checkpoints.header import read_contract
 from policy.contract import Contract, DualRatePolicy, Executable, SingleRatePolicy, WarmStartPolicy
-from policy.engines.executable import EngineName, Settings
+from policy.engines.executable import EngineName, ExecutionSettings
 from policy.errors import PolicyError
+from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 from policy.scripted import ScriptedPolicy
 from policy.user_code import user_code
 
@@ -26,7 +30,39 @@ if TYPE_CHECKING:
 
 SHIPPED = Path(__file__).parent / "weights" / "toge.safetensors"
 """Flown by ``toge`` where no other weights are named; its card is beside it."""
+BUILTIN_KINDS = ("toge", "resnet-unet")
 _FORMS = "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM] or package.module:Class"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyRequest:
+    """The policy that a user asked for, and how it is to run."""
+
+    spec: str
+    """One of the forms in the module's docstring."""
+    checkpoint: Path | None = None
+    """Weights; a user's class gets them as ``Class(checkpoint=path)``. Without any, ``toge`` takes
+    the shipped ones."""
+    allow_untrained: bool = False
+    """Whether seeded random weights will do where there is no checkpoint."""
+    engine: EngineName = "auto"
+    """What runs the network; auto = the fastest that passes the parity gate."""
+    device: str = "cpu"
+    """torch's name of where to run: cpu, cuda, cuda:0, mps."""
+    vision_device: str | None = None
+    """Where to encode images, if that is another one."""
+    action_device: str | None = None
+    """Where to sample chunks, if that is another one."""
+    dual_rate: bool = True
+    """A policy without a fast path is made single-rate, with a note."""
+    num_diffusion_steps: int = 10
+    """Denoising steps of a full solve."""
+    head_steps: int | None = None
+    """Denoising steps of a solve from the last chunk; None = all solves are full."""
+    image_size: int | None = None
+    """Height and width that the policy takes; None leaves it to the contract."""
+    seed: int = 0
+    """Seed of untrained weights and of the flight's initial noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,85 +74,68 @@ class LoadedPolicy:
     """Lines to show before take-off."""
 
 
-def load_policy(
-    spec: str,
-    *,
-    checkpoint: Path | None,
-    allow_untrained: bool,
-    engine: EngineName = "auto",
-    device: str,
-    vision_device: str | None = None,
-    action_device: str | None = None,
-    dual_rate: bool,
-    num_diffusion_steps: int,
-    head_steps: int | None = None,
-    image_size: int | None,
-    seed: int,
-    now_s: Callable[[], float],
-) -> LoadedPolicy:
-    """Find, build, load and try the policy that ``spec`` names.
+def check_request(request: PolicyRequest) -> None:
+    """Refuse what can be refused in milliseconds: before weights, torch or a user's code is loaded.
+
+    That is the spec, the checkpoint's file and contract, the image size, and the device. Only to
+    look for a device other than the CPU is torch imported.
+
+    Raises:
+        PolicyError: with what was wrong, what was available and what to do.
+    """
+    kind, *options = request.spec.split(":")
+    if kind == "scripted":
+        _scripted(options, request, lambda: 0.0)
+    elif kind in BUILTIN_KINDS:
+        _parse_builtin(kind, options)
+        _contract(request.image_size)
+        checkpoint = _checkpoint(request)
+        contract = None if checkpoint is None else read_contract(checkpoint)
+        if contract is not None:
+            _require_image_size(contract, request.image_size)
+        _require_devices(request)
+    else:
+        package = _user_class_name(request.spec)[0].partition(".")[0]
+        if package not in sys.modules and find_spec(package) is None:
+            raise PolicyError(
+                f"--policy {request.spec}: there is no module {package}; put its folder on "
+                f"PYTHONPATH or install it, or write {_FORMS}"
+            )
+
+
+def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
+    """Find, build, load and try a policy.
 
     Args:
-        spec: one of the forms in the module's docstring.
-        checkpoint: weights; a user's class gets it as ``Class(checkpoint=path)``. Without it,
-            ``toge`` takes the shipped ones.
-        allow_untrained: whether seeded random weights will do where there is no checkpoint.
-        engine: what runs the network; auto = the fastest that passes the parity gate.
-        device: torch's name of where to run: cpu, cuda, cuda:0, mps.
-        vision_device: where to encode images, if that is another one.
-        action_device: where to sample chunks, if that is another one.
-        dual_rate: asked for; a policy without a fast path is made single-rate, with a note.
-        num_diffusion_steps: denoising steps of a full solve.
-        head_steps: denoising steps of a solve from the last chunk; None = all solves are full.
-        image_size: height and width that the policy takes; None leaves it to the contract.
-        seed: of untrained weights and of the flight's initial noise.
+        request: which one.
         now_s: monotonic seconds, for scripted programs.
 
     Raises:
         PolicyError: with what was wrong, what was available and what to do.
     """
-    kind, *options = spec.split(":")
-    policy: SingleRatePolicy
-    if kind == "scripted":
-        policy = _scripted(options, checkpoint, image_size, now_s)
-        notes = [f"{spec}: flies a fixed program, the camera is not looked at"]
-    elif kind in ("toge", "resnet-unet"):
-        config = _config(kind, options, image_size)
-        if spec == "toge" and not allow_untrained and SHIPPED.is_file():
-            checkpoint = checkpoint or SHIPPED
-        if checkpoint is not None:
-            policy, notes = _trained(config, options, checkpoint, seed)
-        elif allow_untrained:
-            policy, notes = _untrained(config, seed)
-        else:
-            raise PolicyError(
-                f"{kind} needs trained weights: give --checkpoint FILE, or --allow-untrained for "
-                "seeded random ones (timing and bring-up), or fly --policy scripted"
-            )
-    else:
-        policy = _user_class(spec, checkpoint)
-        notes = [f"{spec}: a class of yours"]
-    _require_image_size(policy.contract, image_size)
-    if dual_rate and not isinstance(policy, DualRatePolicy):
-        dual_rate = False
+    check_request(request)
+    policy, notes = _find(request, now_s)
+    _require_image_size(policy.contract, request.image_size)
+    dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
+    if request.dual_rate and not dual_rate:
         notes.append(
-            f"warning: {spec} has no fast path (encode_visual and predict_fast), so it flies in "
-            "single-rate mode, the whole network for every action"
+            f"warning: {request.spec} has no fast path (encode_visual and predict_fast), so it "
+            "flies in single-rate mode, the whole network for every action"
         )
-    if head_steps is not None and not (dual_rate and isinstance(policy, WarmStartPolicy)):
+    if request.head_steps is not None and not (dual_rate and isinstance(policy, WarmStartPolicy)):
         notes.append(
-            f"warning: --head-steps {head_steps} is not used: it takes --dual-rate and a policy "
-            "with denoise_fast, such as toge; every solve is a full one"
+            f"warning: --head-steps {request.head_steps} is not used: it takes --dual-rate and a "
+            "policy with denoise_fast, such as toge; every solve is a full one"
         )
-    settings = Settings(
-        name=spec,
-        vision_device=vision_device or device,
-        action_device=action_device or device,
-        num_diffusion_steps=num_diffusion_steps,
-        head_steps=head_steps,
+    settings = ExecutionSettings(
+        name=request.spec,
+        vision_device=request.vision_device or request.device,
+        action_device=request.action_device or request.device,
+        num_diffusion_steps=request.num_diffusion_steps,
+        head_steps=request.head_steps,
         dual_rate=dual_rate,
     )
-    executable, engine_notes = _executable(policy, engine, settings)
+    executable, engine_notes = _executable(policy, request, settings)
     return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes))
 
 
@@ -127,7 +146,7 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
         PolicyError: it names none.
     """
     kind, *options = spec.split(":")
-    if kind not in ("toge", "resnet-unet"):
+    if kind not in BUILTIN_KINDS:
         raise PolicyError(
             f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
             "resnet-unet[:SIZE] or world-model"
@@ -135,59 +154,84 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
     return _config(kind, options, image_size)
 
 
+def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:
+    kind, *options = request.spec.split(":")
+    if kind == "scripted":
+        note = f"{request.spec}: flies a fixed program, the camera is not looked at"
+        return _scripted(options, request, now_s), [note]
+    if kind not in BUILTIN_KINDS:
+        return _user_class(request.spec, request.checkpoint), [f"{request.spec}: a class of yours"]
+    config, checkpoint = _config(kind, options, request.image_size), _checkpoint(request)
+    if checkpoint is None:
+        return _untrained(config, request.seed)
+    return _trained(config, options, checkpoint, request.seed)
+
+
+def _checkpoint(request: PolicyRequest) -> Path | None:
+    """The weights of a network of ours; None where random ones will do."""
+    if request.checkpoint is not None or request.allow_untrained:
+        return request.checkpoint
+    if request.spec == "toge" and SHIPPED.is_file():
+        return SHIPPED
+    raise PolicyError(
+        f"{request.spec} needs trained weights: give --checkpoint FILE, or --allow-untrained for "
+        "seeded random ones (timing and bring-up), or fly --policy scripted"
+    )
+
+
 def _executable(
-    policy: SingleRatePolicy, engine: EngineName, settings: Settings
+    policy: SingleRatePolicy, request: PolicyRequest, settings: ExecutionSettings
 ) -> tuple[Executable, tuple[str, ...]]:
-    """An engine that takes the policy's kind of arrays, and what to say of it."""
+    """An engine that takes the policy's kind of arrays, and notes about the choice."""
     if policy.contract.arrays == "numpy":
         from policy.engines.numpy_eager import make_numpy_executable
 
-        if engine != "auto":
+        if request.engine != "auto":
             raise PolicyError(
-                f"{settings.name} computes in numpy, which --engine {engine} cannot run: leave "
-                "the flag out"
+                f"{request.spec} computes in numpy, which --engine {request.engine} cannot run: "
+                "leave the flag out"
             )
         return make_numpy_executable(policy, settings), ()
     from policy.engines.choose import choose_executable
 
-    for device in (settings.vision_device, settings.action_device):
-        _require_device(device)
-    return choose_executable(policy, engine, settings)
+    _require_devices(request)
+    return choose_executable(policy, request.engine, settings)
 
 
 def _scripted(
-    options: list[str],
-    checkpoint: Path | None,
-    image_size: int | None,
-    now_s: Callable[[], float],
+    options: list[str], request: PolicyRequest, now_s: Callable[[], float]
 ) -> ScriptedPolicy:
-    if checkpoint is not None:
-        raise PolicyError(f"scripted policies have no weights: leave out --checkpoint {checkpoint}")
+    if request.checkpoint is not None:
+        raise PolicyError(
+            f"scripted policies have no weights: leave out --checkpoint {request.checkpoint}"
+        )
     program = ":".join(options) or "hover"
-    return ScriptedPolicy(program, now_s, contract=_contract(image_size))
+    return ScriptedPolicy(program, now_s, contract=_contract(request.image_size))
+
+
+def _parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | None]:
+    """Size and backbone that a spec asks for; a checkpoint that says more overrules them."""
+    rest: list[Any] = list(options)
+    size: Size = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
+    if len(rest) > (1 if kind == "toge" else 0):
+        raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {_FORMS}")
+    if rest and rest[0] not in BACKBONE_NAMES:
+        raise PolicyError(
+            f"--policy toge:{':'.join(options)}: {rest[0]!r} is neither a size "
+            f"({', '.join(SIZE_NAMES)}) nor an encoder ({', '.join(BACKBONE_NAMES)})"
+        )
+    return size, rest[0] if rest else None
 
 
 def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinConfig":
-    """What the spec asks for; a checkpoint that says more overrules it."""
-    from policy.nets.action_head import SIZE_NAMES
-    from policy.nets.backbones import BACKBONE_NAMES
     from policy.nets.resnet_unet import ResnetUnetConfig
     from policy.nets.toge import TogeConfig
 
-    rest: list[Any] = list(options)
-    chosen_size: Any = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
+    size, backbone = _parse_builtin(kind, options)
     contract = _contract(image_size)
-    if kind == "toge" and len(rest) <= 1:
-        if rest and rest[0] not in BACKBONE_NAMES:
-            raise PolicyError(
-                f"--policy toge:{':'.join(options)}: {rest[0]!r} is neither a size "
-                f"({', '.join(SIZE_NAMES)}) nor an encoder ({', '.join(BACKBONE_NAMES)})"
-            )
-        backbone = rest[0] if rest else TogeConfig.backbone
-        return TogeConfig(size=chosen_size, backbone=backbone, contract=contract)
-    if rest:
-        raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {_FORMS}")
-    return ResnetUnetConfig(size=chosen_size, contract=contract)
+    if kind == "toge":
+        return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
+    return ResnetUnetConfig(size=size, contract=contract)
 
 
 def _trained(
@@ -232,11 +276,16 @@ def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", lis
     return policy, [note]
 
 
-def _user_class(spec: str, checkpoint: Path | None) -> SingleRatePolicy:
+def _user_class_name(spec: str) -> tuple[str, str]:
+    """(package.module, Class)."""
     module_name, _, class_name = spec.partition(":")
-    names = (*module_name.split("."), class_name)
-    if not all(name.isidentifier() for name in names):
+    if not all(name.isidentifier() for name in (*module_name.split("."), class_name)):
         raise PolicyError(f"policy {spec!r} is unknown; write {_FORMS}")
+    return module_name, class_name
+
+
+def _user_class(spec: str, checkpoint: Path | None) -> SingleRatePolicy:
+    module_name, class_name = _user_class_name(spec)
     try:
         with user_code(f"importing {module_name} failed"):
             module = importlib.import_module(module_name)
@@ -294,12 +343,15 @@ def _require_image_size(contract: Contract, image_size: int | None) -> None:
         )
 
 
-def _require_device(device: str) -> None:
+def _require_devices(request: PolicyRequest) -> None:
+    wanted = {request.vision_device or request.device, request.action_device or request.device}
+    if wanted == {"cpu"}:
+        return
     import torch
 
     available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
     if torch.backends.mps.is_available():
         available.append("mps")
-    wanted = "cuda:0" if device == "cuda" else device
-    if wanted not in available:
-        raise PolicyError(f"device {device!r} is not available; this machine has {available}")
+    for device in sorted(wanted):
+        if (device if device != "cuda" else "cuda:0") not in available:
+            raise PolicyError(f"device {device!r} is not available; this machine has {available}")

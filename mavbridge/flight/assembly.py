@@ -18,7 +18,7 @@ from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.gate.engagement import Engagement
 from mavbridge.gate.smoothing import Smoothing, StickSmoother
 from policy.contract import Executable
-from policy.loading import LoadedPolicy, load_policy
+from policy.loading import LoadedPolicy, PolicyRequest, load_policy
 
 BUILT_IN = ("toge", "resnet-unet")
 
@@ -32,8 +32,8 @@ def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)  # a person's own module:Class lies where they work
-    return load_policy(
-        wanted.policy,
+    request = PolicyRequest(
+        spec=wanted.policy,
         checkpoint=wanted.checkpoint,
         allow_untrained=wanted.allow_untrained,
         engine=wanted.engine,
@@ -45,8 +45,8 @@ def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
         head_steps=wanted.head_steps,
         image_size=wanted.image_size,
         seed=wanted.seed,
-        now_s=lambda: clock.now_ns() / NS_PER_S,
     )
+    return load_policy(request, now_s=lambda: clock.now_ns() / NS_PER_S)
 
 
 def is_stateless(policy: PolicyConfig) -> bool:

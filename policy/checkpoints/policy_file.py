@@ -19,18 +19,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from policy.checkpoints.packing import pack, unpack
-from policy.checkpoints.tensors import (
-    CheckpointError,
-    read_tensors,
+from policy.checkpoints.header import (
+    ARCHITECTURE_KEY,
+    CONTRACT_KEY,
+    HEADER_KEYS,
+    SUFFIXES,
+    TRAINING_KEY,
     require_file,
-    require_finite,
-    require_fit,
-    write_tensors,
+    require_header,
 )
+from policy.checkpoints.packing import pack, unpack
+from policy.checkpoints.tensors import read_tensors, require_finite, require_fit, write_tensors
 from policy.contract import Contract, FloatArray
-from policy.engines.parity import Probe, disagreement, make_probe
-from policy.errors import PolicyError
+from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
+from policy.errors import CheckpointError, PolicyError
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
@@ -39,16 +41,11 @@ from policy.preprocess import image_to_input
 BuiltinPolicy: TypeAlias = Toge | ResnetUnet
 BuiltinConfig: TypeAlias = TogeConfig | ResnetUnetConfig
 
-CONTRACT_KEY = "contract"
-ARCHITECTURE_KEY = "architecture"
-TRAINING_KEY = "training"
-HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
 VECTOR_PREFIX = "test_vector."
 BACKBONE_PREFIX = "backbone."
 VECTOR_NAMES = ("rgb", "state", "history", "chunks")
 VECTOR_STEPS = 10
 """Denoising steps of a test vector, or all if the schedule has fewer; its noise is reset(0)'s."""
-SUFFIXES = (".safetensors", ".pt", ".pth")
 
 _DAMAGED = (
     *(OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError),
@@ -133,8 +130,8 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
 def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
     """Inputs and what plain torch in float32 on a CPU makes of them."""
     reference = copy.deepcopy(policy).cpu().eval()
-    probe = make_probe(policy.contract)
-    arrays = (probe.rgb, probe.state, probe.history, _chunks(reference, probe))
+    samples = make_parity_samples(policy.contract)
+    arrays = (samples.rgb, samples.state, samples.history, _chunks(reference, samples))
     return {
         name: torch.from_numpy(np.ascontiguousarray(array))  # safetensors takes no other
         for name, array in zip(VECTOR_NAMES, arrays, strict=True)
@@ -142,11 +139,11 @@ def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
 
 
 @torch.inference_mode()
-def _chunks(policy: BuiltinPolicy, probe: Probe) -> FloatArray:
+def _chunks(policy: BuiltinPolicy, samples: ParitySamples) -> FloatArray:
     policy.reset(0)
-    images = np.concatenate([image_to_input(rgb, policy.contract) for rgb in probe.rgb])
+    images = np.concatenate([image_to_input(rgb, policy.contract) for rgb in samples.rgb])
     steps = min(VECTOR_STEPS, policy.config.schedule.num_train_timesteps)
-    image, state, history = map(torch.from_numpy, (images, probe.state, probe.history))
+    image, state, history = map(torch.from_numpy, (images, samples.state, samples.history))
     chunks: FloatArray = policy.predict(image, state, history, steps).numpy()
     return chunks
 
@@ -157,10 +154,10 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
         raise CheckpointError(f"{damaged}: it must hold {list(VECTOR_NAMES)}, not {sorted(vector)}")
     rgb, state, history, chunks = (vector[name].numpy() for name in VECTOR_NAMES)
     try:
-        made = _chunks(policy, Probe(rgb=rgb, state=state, history=history))
+        made = _chunks(policy, ParitySamples(rgb=rgb, state=state, history=history))
     except (PolicyError, RuntimeError, ValueError) as error:
         raise CheckpointError(f"{damaged}: {error}; copy the file again") from error
-    if (reason := disagreement(chunks, made)) is not None:
+    if (reason := parity_failure(chunks, made)) is not None:
         raise CheckpointError(
             f"{path}: these weights do not make the sticks that they made where they were saved: "
             f"{reason}. The file is damaged, or of another version: copy or export it again"
@@ -211,21 +208,13 @@ def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
 
 
 def _read(path: Path) -> _Contents:
-    if path.suffix not in SUFFIXES:
-        raise CheckpointError(f"{path}: not a checkpoint; use one of {', '.join(SUFFIXES)}")
     require_file(path, SUFFIXES)
     return _read_safetensors(path) if path.suffix == ".safetensors" else _read_torch(path)
 
 
 def _read_safetensors(path: Path) -> _Contents:
     header, state = read_tensors(path)
-    for key in HEADER_KEYS:
-        if key not in header:
-            raise CheckpointError(
-                f"{path}: no {key!r} in the header (it holds {sorted(header)}), so it was not "
-                "written by this project; load the weights as .pt and save them with "
-                "policy.checkpoints.policy_file.save_checkpoint"
-            )
+    require_header(path, header)
     vector = {
         name.removeprefix(VECTOR_PREFIX): state.pop(name)
         for name in list(state)

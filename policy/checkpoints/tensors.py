@@ -1,18 +1,15 @@
 """Files of weights, whatever the network: read, written, and refused in the same words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from policy.errors import PolicyError
-
-
-class CheckpointError(PolicyError):
-    """A checkpoint that cannot be read, or does not fit; the message says what to do."""
+from policy.checkpoints.header import open_safetensors
+from policy.errors import CheckpointError
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
@@ -38,26 +35,9 @@ def read_tensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     Raises:
         CheckpointError: damaged, or of another format.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(
-            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
-        ) from error
-
-
-def require_file(path: Path, suffixes: Sequence[str]) -> None:
-    """Refuse a path without a file, and say what is there.
-
-    Raises:
-        CheckpointError: no such file.
-    """
-    if not path.is_file():
-        near = sorted(p.name for p in path.parent.glob("*") if p.suffix in suffixes)
-        there = f"its folder holds {near}" if near else "its folder holds no checkpoint"
-        raise CheckpointError(f"{path}: no such file; {there}")
+    with open_safetensors(path, "pt") as file:
+        header = file.metadata() or {}
+        return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
 
 
 def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:

@@ -4,17 +4,10 @@ from pathlib import Path
 
 import torch
 
-from policy.checkpoints.policy_file import ARCHITECTURE_KEY, CONTRACT_KEY, TRAINING_KEY
-from policy.checkpoints.tensors import (
-    CheckpointError,
-    read_tensors,
-    require_file,
-    require_finite,
-    require_fit,
-    write_tensors,
-)
+from policy.checkpoints.header import ARCHITECTURE_KEY, CONTRACT_KEY, TRAINING_KEY, require_file
+from policy.checkpoints.tensors import read_tensors, require_finite, require_fit, write_tensors
 from policy.contract import Contract
-from policy.errors import PolicyError
+from policy.errors import CheckpointError, PolicyError
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
 

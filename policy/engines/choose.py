@@ -13,14 +13,14 @@ import torch
 from torch import nn
 
 from policy.contract import Executable, FloatArray, SingleRatePolicy
-from policy.engines.executable import EngineName, Precision, Settings
-from policy.engines.parity import Probe, disagreement, make_probe
+from policy.engines.executable import EngineName, ExecutionSettings, Precision
+from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 
-PROBE_ELAPSED_S = 0.02
+SAMPLE_ELAPSED_S = 0.02
 """Between the two chunks of a sample: with a warm start, the second one is a refinement."""
 
 
@@ -33,7 +33,7 @@ class Candidate:
 
 
 def choose_executable(
-    policy: SingleRatePolicy, engine: EngineName, settings: Settings
+    policy: SingleRatePolicy, engine: EngineName, settings: ExecutionSettings
 ) -> tuple[Executable, tuple[str, ...]]:
     """The executable and lines for a person: the engine, and why faster ones were passed over.
 
@@ -53,7 +53,7 @@ def choose_executable(
 
 
 def first_faithful(
-    policy: SingleRatePolicy, candidates: list[Candidate], settings: Settings
+    policy: SingleRatePolicy, candidates: list[Candidate], settings: ExecutionSettings
 ) -> tuple[Executable, tuple[str, ...]]:
     """The first candidate that passes the gate, or torch, with a line for each one passed over.
 
@@ -63,12 +63,12 @@ def first_faithful(
     notes: list[str] = []
     if candidates:
         on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
-        probe = make_probe(policy.contract)
-        expected = probe_chunks(make_torch_executable(policy, on_cpu), probe)
+        samples = make_parity_samples(policy.contract)
+        expected = chunks_of_samples(make_torch_executable(policy, on_cpu), samples)
     for candidate in candidates:
         try:
             executable = candidate.make()
-            reason = disagreement(expected, probe_chunks(executable, probe))
+            reason = parity_failure(expected, chunks_of_samples(executable, samples))
         except (PolicyError, RuntimeError, TypeError) as error:
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
         if reason is None:
@@ -77,18 +77,18 @@ def first_faithful(
     return make_torch_executable(policy, settings), tuple(notes)
 
 
-def probe_chunks(executable: Executable, probe: Probe) -> FloatArray:
+def chunks_of_samples(executable: Executable, samples: ParitySamples) -> FloatArray:
     """Chunks [2 * samples, horizon, 4] from image to stick: each sample afresh, then once more."""
     chunks = []
-    for rgb, state, history in zip(probe.rgb, probe.state, probe.history, strict=True):
+    for rgb, state, history in zip(samples.rgb, samples.state, samples.history, strict=True):
         encoded = executable.encode(rgb)
-        for elapsed_s in (None, PROBE_ELAPSED_S):
+        for elapsed_s in (None, SAMPLE_ELAPSED_S):
             chunks.append(executable.act(encoded, state[None], history[None], elapsed_s)[0])
     return np.stack(chunks)
 
 
 def _candidates(
-    policy: SingleRatePolicy, engine: EngineName, settings: Settings
+    policy: SingleRatePolicy, engine: EngineName, settings: ExecutionSettings
 ) -> list[Candidate]:
     devices = {settings.vision_device.split(":")[0], settings.action_device.split(":")[0]}
     if engine == "openvino" and devices != {"cpu"}:
@@ -104,7 +104,7 @@ def _candidates(
     return []
 
 
-def _openvino(policy: SingleRatePolicy, settings: Settings) -> list[Candidate]:
+def _openvino(policy: SingleRatePolicy, settings: ExecutionSettings) -> list[Candidate]:
     from policy.engines.openvino_cpu import make_openvino_executable, precisions
 
     def candidate(vision: Precision, action: Precision) -> Candidate:
@@ -116,7 +116,7 @@ def _openvino(policy: SingleRatePolicy, settings: Settings) -> list[Candidate]:
     return [candidate(vision, action) for vision, action in precisions()]
 
 
-def _cuda_graph(policy: SingleRatePolicy, settings: Settings) -> Candidate:
+def _cuda_graph(policy: SingleRatePolicy, settings: ExecutionSettings) -> Candidate:
     from policy.engines.cuda_graph import make_cuda_graph_executable
 
     return Candidate(label="cuda-graph", make=lambda: make_cuda_graph_executable(policy, settings))

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import Executable, FloatArray, SingleRatePolicy
-from policy.engines.executable import Settings, Shape, make_executable
+from policy.engines.executable import ExecutionSettings, Shape, make_executable
 from policy.errors import PolicyError
 
 NAME = "cuda-graph"
@@ -28,7 +28,7 @@ HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 """Priorities of CUDA streams."""
 
 
-def make_cuda_graph_executable(policy: SingleRatePolicy, settings: Settings) -> Executable:
+def make_cuda_graph_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
     """Capture a copy of the policy for the loops; tried once.
 
     Raises:

@@ -28,7 +28,7 @@ Act = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class ExecutionSettings:
     """How a policy is to be executed, whatever the engine."""
 
     name: str
@@ -59,7 +59,7 @@ def make_executable(
     compile_action: Compile,
     *,
     engine: str,
-    settings: Settings,
+    settings: ExecutionSettings,
 ) -> Executable:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
@@ -99,7 +99,7 @@ def _warm_started(
     policy: WarmStartPolicy,
     shapes: Sequence[Shape],
     compile_: Compile,
-    settings: Settings,
+    settings: ExecutionSettings,
     head_steps: int,
 ) -> Act:
     steps = settings.num_diffusion_steps
@@ -126,7 +126,7 @@ def assemble(
     encode: Callable[[FloatArray], FloatArray],
     act: Act,
     engine: str,
-    settings: Settings,
+    settings: ExecutionSettings,
 ) -> Executable:
     """An executable of an engine's two functions, tried on a dummy sample, which warms it up.
 

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from policy.contract import Executable, FloatArray, SingleRatePolicy
-from policy.engines.executable import ArrayFunction, Settings, Shape, make_executable
+from policy.engines.executable import ArrayFunction, ExecutionSettings, Shape, make_executable
 from policy.errors import PolicyError
 
 NAME = "numpy"
 
 
-def make_numpy_executable(policy: SingleRatePolicy, settings: Settings) -> Executable:
+def make_numpy_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
     """Wrap a numpy policy for the loops; tried once.
 
     Raises:

@@ -19,8 +19,8 @@ from policy.engines.compile_cache import CompileCache, user_cache_folder
 from policy.engines.executable import (
     Act,
     Compile,
+    ExecutionSettings,
     Precision,
-    Settings,
     always_full,
     assemble,
     make_executable,
@@ -53,7 +53,7 @@ def precisions() -> tuple[tuple[Precision, Precision], ...]:
 
 @signal_stack_kept()
 def make_openvino_executable(
-    policy: SingleRatePolicy, settings: Settings, vision: Precision, action: Precision
+    policy: SingleRatePolicy, settings: ExecutionSettings, vision: Precision, action: Precision
 ) -> Executable:
     """Compile a policy for the loops, or take it from the user's cache; tried once.
 
@@ -91,7 +91,11 @@ def make_openvino_executable(
 
 
 def _make_builtin(
-    policy: Toge | ResnetUnet, settings: Settings, vision: Precision, action: Precision, name: str
+    policy: Toge | ResnetUnet,
+    settings: ExecutionSettings,
+    vision: Precision,
+    action: Precision,
+    name: str,
 ) -> Executable:
     compiler, steps = _Compiler(policy), settings.num_diffusion_steps
     encode = compiler.compile("vision", vision, lambda: vision_graph(policy))

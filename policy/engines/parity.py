@@ -23,7 +23,7 @@ SAMPLES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Probe:
+class ParitySamples:
     """Made-up inputs that reach all of a policy; the same for the same contract."""
 
     rgb: NDArray[np.uint8]
@@ -34,7 +34,7 @@ class Probe:
     """[samples, K, 4]"""
 
 
-def make_probe(contract: Contract) -> Probe:
+def make_parity_samples(contract: Contract) -> ParitySamples:
     """Soft random images, and states and sticks of a brisk flight."""
     random = np.random.default_rng(0)
     height, width = contract.image_height, contract.image_width
@@ -49,14 +49,14 @@ def make_probe(contract: Contract) -> Probe:
         since = random.uniform(-1.0, 1.0, (SAMPLES, SINCE_EXPOSURE_DIM)) * SINCE_EXPOSURE_SCALE
         since[:, 0] = np.abs(since[:, 0])
         state = np.concatenate([state, since], axis=1)
-    return Probe(
+    return ParitySamples(
         rgb=rgb.astype(np.uint8),
         state=state.astype(np.float32),
         history=history.astype(np.float32),
     )
 
 
-def disagreement(expected: FloatArray, chunks: FloatArray) -> str | None:
+def parity_failure(expected: FloatArray, chunks: FloatArray) -> str | None:
     """Why two arrays of chunks [samples, horizon, 4] are not the same policy, or None."""
     if expected.shape != chunks.shape:
         return f"chunks of shape {list(chunks.shape)} instead of {list(expected.shape)}"

@@ -9,13 +9,19 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import Executable, FloatArray, SingleRatePolicy
-from policy.engines.executable import ArrayFunction, Compile, Settings, Shape, make_executable
+from policy.engines.executable import (
+    ArrayFunction,
+    Compile,
+    ExecutionSettings,
+    Shape,
+    make_executable,
+)
 from policy.errors import PolicyError
 
 NAME = "torch"
 
 
-def make_torch_executable(policy: SingleRatePolicy, settings: Settings) -> Executable:
+def make_torch_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
     """Wrap a torch policy for the loops: numpy in and out, no gradients, tried once.
 
     A module is moved to the action device, and copied to the vision device where that is another

@@ -98,7 +98,7 @@ def make_solve(
     )
 
 
-def moved_chunk(chunk: FloatArray, periods: float) -> FloatArray:
+def shift_chunk(chunk: FloatArray, periods: float) -> FloatArray:
     """What a chunk says ``periods`` of its actions later, its last action held.
 
     Args:
@@ -166,7 +166,7 @@ class WarmStart:
         guess.age_s += elapsed_s
         if guess.age_s >= FULL_EVERY_S:
             return self._afresh(encoded, state, history)
-        moved = moved_chunk(guess.chunk, guess.age_s / self._chunk_dt_s)
+        moved = shift_chunk(guess.chunk, guess.age_s / self._chunk_dt_s)
         chunk = self._solve.refine(encoded, state, history, moved)
         self._guess = _Guess(chunk, 0.0)
         self._since_full_s += elapsed_s

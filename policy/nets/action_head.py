@@ -1,7 +1,6 @@
 """The diffusion action head: a condition vector in, a chunk of stick positions out."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -9,10 +8,8 @@ from torch import Tensor, nn
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule, ddim_solve
+from policy.nets.names import SIZE_NAMES, Size
 from policy.nets.unet1d import UNet1d, UNet1dConfig
-
-Size = Literal["small", "medium", "large"]
-SIZE_NAMES: tuple[Size, ...] = get_args(Size)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,17 +5,15 @@ loads as it is, but for the 1000-class layer at its end, which ``load_imagenet_s
 """
 
 from collections.abc import Mapping
-from typing import Literal, TypeAlias, get_args
+from typing import TypeAlias
 
 from torch import Tensor, nn
 
 from policy.errors import PolicyError
 from policy.nets.convnext import ConvNextTiny
 from policy.nets.efficientnet import EfficientNetB3
+from policy.nets.names import BackboneName
 from policy.nets.resnet import BasicBlock, Bottleneck, ResNet, ResNet8
-
-BackboneName = Literal["efficientnet_b3", "convnext_tiny", "resnet8", "resnet18", "resnet50"]
-BACKBONE_NAMES: tuple[BackboneName, ...] = get_args(BackboneName)
 
 Backbone: TypeAlias = EfficientNetB3 | ConvNextTiny | ResNet | ResNet8
 """Image [B, 3, H, W] normalised -> feature [B, out_dim]."""

@@ -7,10 +7,11 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import ContractError
-from policy.nets.action_head import DiffusionHead, Size, size_dims
+from policy.nets.action_head import DiffusionHead, size_dims
 from policy.nets.backbones import build_backbone
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.encoders import StateEncoder, require_shape
+from policy.nets.names import Size
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,10 +13,11 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import ContractError, PolicyError
-from policy.nets.action_head import DiffusionHead, Size, size_dims
-from policy.nets.backbones import BACKBONE_NAMES, BackboneName, build_backbone
+from policy.nets.action_head import DiffusionHead, size_dims
+from policy.nets.backbones import build_backbone
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.encoders import Fusion, HistoryEncoder, StateEncoder, require_shape
+from policy.nets.names import BACKBONE_NAMES, BackboneName, Size
 
 
 @dataclass(frozen=True, kw_only=True)

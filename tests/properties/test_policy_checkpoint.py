@@ -8,8 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save
 
-from policy.checkpoints.policy_file import CheckpointError, load_checkpoint
+from policy.checkpoints.policy_file import load_checkpoint
 from policy.contract import Contract
+from policy.errors import CheckpointError
 from policy.nets.toge import TogeConfig
 
 FALLBACK = TogeConfig(

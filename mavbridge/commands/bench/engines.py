@@ -6,7 +6,7 @@ from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from policy.checkpoints.policy_file import BuiltinPolicy, build_policy, load_checkpoint
 from policy.contract import Executable
 from policy.engines.executable import EngineName
-from policy.loading import SHIPPED, load_policy
+from policy.loading import SHIPPED, PolicyRequest, load_policy
 from policy.nets.toge import Toge, TogeConfig
 
 EAGER: EngineName = "torch"
@@ -30,19 +30,15 @@ def load(policy: str, engine: EngineName, *, head_steps: int | None = None) -> E
         PolicyError: the engine cannot run here.
     """
     clock = MonotonicClock()
-    executable = load_policy(
-        policy,
-        checkpoint=None,
+    request = PolicyRequest(
+        spec=policy,
         allow_untrained=policy != SHIPPED_POLICY,
         engine=engine,
-        device="cpu",
-        dual_rate=True,
         num_diffusion_steps=STEPS,
         head_steps=head_steps,
-        image_size=None,
         seed=SEED,
-        now_s=lambda: clock.now_ns() / NS_PER_S,
-    ).executable
+    )
+    executable = load_policy(request, now_s=lambda: clock.now_ns() / NS_PER_S).executable
     if not executable.engine.startswith(engine):  # it may name its precisions, too
         raise ValueError(f"asked for the engine {engine}, got {executable.engine}")
     return executable

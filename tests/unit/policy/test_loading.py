@@ -10,7 +10,7 @@ import torch
 from policy.checkpoints.policy_file import build_policy, save_checkpoint
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.loading import LoadedPolicy, load_policy
+from policy.loading import LoadedPolicy, PolicyRequest, check_request, load_policy
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge
 
@@ -20,20 +20,10 @@ HISTORY = np.zeros((1, 4, 4), np.float32)
 
 
 def load(spec: str, **changes: Any) -> LoadedPolicy:
-    arguments: dict[str, Any] = {
-        "checkpoint": None,
-        "allow_untrained": False,
-        "engine": "torch",
-        "device": "cpu",
-        "dual_rate": True,
-        "num_diffusion_steps": 2,
-        "image_size": None,
-        "seed": 0,
-        "now_s": lambda: 0.0,
-    }
-    if spec.startswith(("scripted", "my_user_policies")):
-        arguments["engine"] = "auto"  # what they compute in has no choice of engines
-    return load_policy(spec, **{**arguments, **changes})
+    # Policies that compute in numpy have no choice of engines.
+    engine = "auto" if spec.startswith(("scripted", "my_user_policies")) else "torch"
+    request = PolicyRequest(**{"spec": spec, "engine": engine, "num_diffusion_steps": 2, **changes})
+    return load_policy(request, now_s=lambda: 0.0)
 
 
 def act(loaded: LoadedPolicy) -> np.ndarray:
@@ -56,11 +46,11 @@ def test_scripted_flies_dual_rate_without_weights(spec: str) -> None:
     assert act(loaded).shape == (1, 16, 4)
 
 
-def test_scripted_does_not_import_torch() -> None:
+def test_torch_is_imported_by_neither_scripted_policies_nor_cheap_checks() -> None:
     program = (
-        "import sys; from policy.loading import load_policy; load_policy('scripted:square', "
-        "checkpoint=None, allow_untrained=False, device='cpu', dual_rate=True, "
-        "num_diffusion_steps=1, image_size=None, seed=0, now_s=lambda: 0.0); "
+        "import sys; from policy.loading import PolicyRequest, check_request, load_policy; "
+        "check_request(PolicyRequest(spec='toge')); "
+        "load_policy(PolicyRequest(spec='scripted:square'), now_s=lambda: 0.0); "
         "sys.exit('torch' in sys.modules)"
     )
     result = subprocess.run([sys.executable, "-c", program], timeout=60, check=False)
@@ -184,7 +174,7 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("toge:resnet18", {"allow_untrained": True, "image_size": 32, "head_steps": 3}, r"1\.\.2"),
         ("scripted:yaw", {"engine": "openvino"}, "computes in numpy"),
         ("resnet-unet", {"allow_untrained": True, "num_diffusion_steps": 101}, r"1\.\.100"),
-        ("no_such_module:Policy", {}, "importing no_such_module failed"),
+        ("no_such_module:Policy", {}, "there is no module no_such_module"),
         ("policy.contract:Nothing", {}, "no class Nothing"),
         ("policy.contract:STATE_DIM", {}, "no class STATE_DIM"),
     ],
@@ -192,6 +182,33 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
 def test_refusals_say_what_to_do(spec: str, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(PolicyError, match=message):
         load(spec, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"checkpoint": Path("absent.safetensors")}, "no such file"),
+        ({"checkpoint": Path("weights.bin")}, "not a checkpoint"),
+        ({"image_size": 64}, "--image-size 64 contradicts"),
+        ({"device": "cuda:99"}, "this machine has"),
+        ({"spec": "toge:huge"}, "neither a size"),
+        ({"spec": "toge:medium", "checkpoint": None}, "--allow-untrained"),
+    ],
+)
+def test_cheap_checks_refuse_without_loading(
+    checkpoint: Path, changes: dict[str, Any], message: str
+) -> None:
+    good = {"spec": "toge", "checkpoint": checkpoint}
+    check_request(PolicyRequest(**good))
+    with pytest.raises(PolicyError, match=message):
+        check_request(PolicyRequest(**{**good, **changes}))
+
+
+def test_cheap_checks_read_the_header(checkpoint: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "a.safetensors"
+    damaged.write_bytes(checkpoint.read_bytes()[:100])
+    with pytest.raises(PolicyError, match="not a readable safetensors file"):
+        check_request(PolicyRequest(spec="toge", checkpoint=damaged))
 
 
 USER_CLASSES = """

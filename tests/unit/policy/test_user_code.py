@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from policy.contract import Contract
-from policy.engines.executable import Settings
+from policy.engines.executable import ExecutionSettings
 from policy.engines.numpy_eager import make_numpy_executable
 from policy.errors import PolicyError
 from policy.user_code import user_code
@@ -50,7 +50,7 @@ class Careless:
 
 
 def test_a_careless_policy_harms_nobody() -> None:
-    executable = make_numpy_executable(Careless(), Settings(name="careless"))
+    executable = make_numpy_executable(Careless(), ExecutionSettings(name="careless"))
     first = executable.encode(np.zeros((8, 8, 3), np.uint8))
     first.setflags(write=False)  # as the vision loop publishes it
     before = first.copy()

@@ -16,7 +16,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED
 from policy.checkpoints.world_model_file import load_world_model
 from policy.data.flight_folders import read_ages, read_flight
-from policy.loading import load_policy
+from policy.loading import PolicyRequest, load_policy
 from policy.nets.toge import TogeConfig
 from policy.training.loop import Loop
 
@@ -53,18 +53,8 @@ def test_a_checkpoint_is_trained_and_loads_to_fly(
     printed = capsys.readouterr()
     assert "held-out loss" in printed.out
     assert "stick error" in printed.out
-    loaded = load_policy(
-        "toge",
-        checkpoint=out,
-        allow_untrained=False,
-        engine="torch",
-        device="cpu",
-        dual_rate=True,
-        num_diffusion_steps=2,
-        image_size=None,
-        seed=0,
-        now_s=lambda: 0.0,
-    )
+    request = PolicyRequest(spec="toge", checkpoint=out, engine="torch", num_diffusion_steps=2)
+    loaded = load_policy(request, now_s=lambda: 0.0)
     executable = loaded.executable
     assert executable.contract.since_exposure
     feature = executable.encode(np.zeros((48, 64, 3), np.uint8))

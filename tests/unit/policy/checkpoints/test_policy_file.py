@@ -11,13 +11,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from policy.checkpoints.policy_file import (
-    CheckpointError,
     build_policy,
     load_checkpoint,
     save_checkpoint,
 )
 from policy.contract import Contract
-from policy.errors import PolicyError
+from policy.errors import CheckpointError, PolicyError
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig

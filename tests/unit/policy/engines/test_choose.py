@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from policy.contract import Contract, Executable, FloatArray
-from policy.engines.choose import Candidate, choose_executable, first_faithful, probe_chunks
-from policy.engines.executable import EngineName, Settings
+from policy.engines.choose import Candidate, choose_executable, chunks_of_samples, first_faithful
+from policy.engines.executable import EngineName, ExecutionSettings
 from policy.engines.openvino_cpu import make_openvino_executable, precisions
-from policy.engines.parity import MAX_STICK_ERROR, disagreement, make_probe
+from policy.engines.parity import MAX_STICK_ERROR, make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
 
-SETTINGS = Settings(name="toge", num_diffusion_steps=2, head_steps=1)
+SETTINGS = ExecutionSettings(name="toge", num_diffusion_steps=2, head_steps=1)
 
 
 def altered(policy: Toge, alter: Callable[[FloatArray], FloatArray]) -> Candidate:
@@ -104,22 +104,27 @@ def test_the_default_on_a_cpu_is_openvino(small_toge: Toge) -> None:
     executable, notes = choose_executable(small_toge, "auto", SETTINGS)
     assert executable.engine.startswith("openvino")
     assert "agrees with torch" in notes[-1]
-    probe = make_probe(small_toge.contract)
+    samples = make_parity_samples(small_toge.contract)
     reference, quiet = choose_executable(small_toge, "torch", SETTINGS)
     assert (reference.engine, quiet) == ("torch", ())
-    assert disagreement(probe_chunks(reference, probe), probe_chunks(executable, probe)) is None
+    assert (
+        parity_failure(
+            chunks_of_samples(reference, samples), chunks_of_samples(executable, samples)
+        )
+        is None
+    )
 
 
 def test_the_fastest_precision_that_passes_is_taken_and_the_others_are_named(
     trained_toge: Toge,
 ) -> None:
-    policy, settings = trained_toge, Settings(name="toge", head_steps=2)
-    probe = make_probe(policy.contract)
-    expected = probe_chunks(make_torch_executable(policy, settings), probe)
+    policy, settings = trained_toge, ExecutionSettings(name="toge", head_steps=2)
+    samples = make_parity_samples(policy.contract)
+    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
     failed = []
     for vision, action in precisions():
         first = make_openvino_executable(policy, settings, vision, action)
-        if disagreement(expected, probe_chunks(first, probe)) is None:
+        if parity_failure(expected, chunks_of_samples(first, samples)) is None:
             break
         failed.append(f"openvino (images {vision}, actions {action}) is passed over: a stick is")
     executable, notes = choose_executable(policy, "auto", settings)
@@ -167,13 +172,13 @@ def test_engines_of_our_networks_do_not_take_others() -> None:
 
 
 def test_the_probe_reaches_all_that_a_policy_looks_at(small_toge: Toge) -> None:
-    probe = make_probe(small_toge.contract)
-    again = make_probe(small_toge.contract)
-    np.testing.assert_array_equal(probe.rgb, again.rgb)
-    assert probe.rgb.min() < 30 < 220 < probe.rgb.max()
-    assert not np.array_equal(probe.rgb[0], probe.rgb[1])
-    np.testing.assert_allclose(np.linalg.norm(probe.state[:, 3:7], axis=1), 1, rtol=1e-6)
-    asked = make_probe(replace(small_toge.contract, since_exposure=True))
-    np.testing.assert_array_equal(asked.state[:, :13], probe.state)
+    samples = make_parity_samples(small_toge.contract)
+    again = make_parity_samples(small_toge.contract)
+    np.testing.assert_array_equal(samples.rgb, again.rgb)
+    assert samples.rgb.min() < 30 < 220 < samples.rgb.max()
+    assert not np.array_equal(samples.rgb[0], samples.rgb[1])
+    np.testing.assert_allclose(np.linalg.norm(samples.state[:, 3:7], axis=1), 1, rtol=1e-6)
+    asked = make_parity_samples(replace(small_toge.contract, since_exposure=True))
+    np.testing.assert_array_equal(asked.state[:, :13], samples.state)
     assert asked.state.shape == (4, 20)
     assert (asked.state[:, 13:] != 0).all()

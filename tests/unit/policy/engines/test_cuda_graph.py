@@ -10,12 +10,12 @@ import torch
 
 from policy.checkpoints.policy_file import BuiltinConfig, build_policy
 from policy.contract import Contract, Executable, FloatArray
-from policy.engines.choose import choose_executable, probe_chunks
+from policy.engines.choose import choose_executable, chunks_of_samples
 from policy.engines.cuda_graph import make_cuda_graph_executable
-from policy.engines.executable import Settings
-from policy.engines.parity import disagreement, make_probe
+from policy.engines.executable import ExecutionSettings
+from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
-from policy.nets.action_head import Size
+from policy.nets.names import Size
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 
@@ -26,7 +26,7 @@ pytestmark = [
 
 Fly = Callable[[Executable, float | None], FloatArray]
 SMALL = Contract(image_height=64, image_width=64)
-ON_GPU = Settings(name="toge", vision_device="cuda", action_device="cuda", head_steps=2)
+ON_GPU = ExecutionSettings(name="toge", vision_device="cuda", action_device="cuda", head_steps=2)
 
 
 @pytest.mark.parametrize(
@@ -37,20 +37,29 @@ def test_toge_computes_what_torch_computes(size: Size, since_exposure: bool) -> 
     torch.manual_seed(0)
     contract = replace(SMALL, since_exposure=since_exposure)
     config: BuiltinConfig = TogeConfig(size=size, contract=contract)
-    policy, probe = build_policy(config).eval(), make_probe(contract)
-    expected = probe_chunks(make_torch_executable(policy, Settings(name="t", head_steps=2)), probe)
-    chunks = probe_chunks(make_cuda_graph_executable(policy, ON_GPU), probe)
-    assert disagreement(expected, chunks) is None
+    policy, samples = build_policy(config).eval(), make_parity_samples(contract)
+    expected = chunks_of_samples(
+        make_torch_executable(policy, ExecutionSettings(name="t", head_steps=2)), samples
+    )
+    chunks = chunks_of_samples(make_cuda_graph_executable(policy, ON_GPU), samples)
+    assert parity_failure(expected, chunks) is None
 
 
 def test_single_rate_computes_what_torch_computes() -> None:
     torch.manual_seed(0)
-    policy, probe = build_policy(ResnetUnetConfig(contract=SMALL)).eval(), make_probe(SMALL)
-    settings = Settings(name="r", dual_rate=False)
-    expected = probe_chunks(make_torch_executable(policy, settings), probe)
-    on_gpu = Settings(name="r", dual_rate=False, vision_device="cuda", action_device="cuda")
+    policy, samples = (
+        build_policy(ResnetUnetConfig(contract=SMALL)).eval(),
+        make_parity_samples(SMALL),
+    )
+    settings = ExecutionSettings(name="r", dual_rate=False)
+    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
+    on_gpu = ExecutionSettings(
+        name="r", dual_rate=False, vision_device="cuda", action_device="cuda"
+    )
     assert (
-        disagreement(expected, probe_chunks(make_cuda_graph_executable(policy, on_gpu), probe))
+        parity_failure(
+            expected, chunks_of_samples(make_cuda_graph_executable(policy, on_gpu), samples)
+        )
         is None
     )
 
@@ -70,17 +79,17 @@ def test_a_flight_with_a_spread_solve_is_that_of_torch(
     trained_toge: Toge, fly: Fly, head_steps: int
 ) -> None:
     on_gpu = replace(ON_GPU, head_steps=head_steps)
-    settings = Settings(name="t", head_steps=head_steps)
+    settings = ExecutionSettings(name="t", head_steps=head_steps)
     expected = fly(make_torch_executable(trained_toge, settings), 0.02)
     chunks = fly(make_cuda_graph_executable(trained_toge, on_gpu), 0.02)
-    assert disagreement(expected, chunks) is None
+    assert parity_failure(expected, chunks) is None
 
 
 def test_both_paths_at_once_do_not_touch_each_other(small_toge: Toge) -> None:
-    executable, probe = make_cuda_graph_executable(small_toge, ON_GPU), make_probe(SMALL)
-    rgb = probe.rgb[:, :32, :32]
+    executable, samples = make_cuda_graph_executable(small_toge, ON_GPU), make_parity_samples(SMALL)
+    rgb = samples.rgb[:, :32, :32]
     features = [executable.encode(image) for image in rgb]
-    state, history = probe.state[:1], probe.history[:1]
+    state, history = samples.state[:1], samples.history[:1]
     chunk = executable.act(features[0], state, history, None)
 
     def encode_all() -> list[FloatArray]:

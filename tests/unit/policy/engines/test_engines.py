@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from policy.contract import Contract, Executable, SingleRatePolicy
-from policy.engines.executable import Settings
+from policy.engines.executable import ExecutionSettings
 from policy.engines.numpy_eager import make_numpy_executable
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
@@ -28,7 +28,9 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> None:
-    executable = make_torch_executable(small_toge, Settings(name="toge", num_diffusion_steps=3))
+    executable = make_torch_executable(
+        small_toge, ExecutionSettings(name="toge", num_diffusion_steps=3)
+    )
     assert (executable.engine, executable.dual_rate) == ("torch", True)
     feature = executable.encode(RGB)
     chunk = executable.act(frozen(feature), frozen(STATE), frozen(HISTORY), None)
@@ -42,7 +44,7 @@ def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> No
 def test_single_rate_carries_the_image_to_act(small_toge: Toge) -> None:
     dual, single = (
         make_torch_executable(
-            small_toge, Settings(name="toge", num_diffusion_steps=2, dual_rate=dual_rate)
+            small_toge, ExecutionSettings(name="toge", num_diffusion_steps=2, dual_rate=dual_rate)
         )
         for dual_rate in (True, False)
     )
@@ -56,7 +58,9 @@ def test_single_rate_carries_the_image_to_act(small_toge: Toge) -> None:
 @pytest.mark.parametrize("dual_rate", [True, False])
 def test_numpy_policies_are_called_as_they_are(dual_rate: bool) -> None:
     policy = ScriptedPolicy("hover", lambda: 0.0)
-    executable = make_numpy_executable(policy, Settings(name="scripted", dual_rate=dual_rate))
+    executable = make_numpy_executable(
+        policy, ExecutionSettings(name="scripted", dual_rate=dual_rate)
+    )
     assert executable.engine == "numpy"
     encoded = executable.encode(RGB)
     assert encoded.shape == ((1, 8) if dual_rate else (1, 3, 224, 224))
@@ -79,7 +83,7 @@ def test_a_persons_policy_that_asks_gets_the_motion_since_the_exposure(
             act=lambda feature, state: seen.append(tuple(state.shape)) or torch.tensor(CHUNK),
         )
         policy.contract = replace(policy.contract, since_exposure=True, arrays="torch")
-    make(policy, Settings(name="fake"))
+    make(policy, ExecutionSettings(name="fake"))
     assert set(seen) == {(1, 20)}
 
 
@@ -125,14 +129,14 @@ def test_a_policy_that_breaks_its_contract_never_flies(
     parts: dict[str, Callable[..., Any]], message: str
 ) -> None:
     with pytest.raises(PolicyError, match=message):
-        make_numpy_executable(Fake(**parts), Settings(name="fake"))
+        make_numpy_executable(Fake(**parts), ExecutionSettings(name="fake"))
 
 
 def test_torch_policies_must_return_tensors() -> None:
     policy = Fake()
     policy.contract = replace(policy.contract, arrays="torch")
     with pytest.raises(PolicyError, match="returned ndarray; its contract says torch"):
-        make_torch_executable(policy, Settings(name="fake"))
+        make_torch_executable(policy, ExecutionSettings(name="fake"))
 
 
 def test_dual_rate_needs_a_fast_path() -> None:
@@ -142,4 +146,4 @@ def test_dual_rate_needs_a_fast_path() -> None:
 
     policy: SingleRatePolicy = Slow()
     with pytest.raises(PolicyError, match="fly it single-rate"):
-        make_numpy_executable(policy, Settings(name="slow"))
+        make_numpy_executable(policy, ExecutionSettings(name="slow"))

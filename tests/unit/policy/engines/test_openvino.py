@@ -15,23 +15,23 @@ from torch import Tensor, nn
 from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, Executable, FloatArray
 from policy.engines import openvino_cpu
-from policy.engines.choose import choose_executable, probe_chunks
-from policy.engines.executable import Precision, Settings
+from policy.engines.choose import choose_executable, chunks_of_samples
+from policy.engines.executable import ExecutionSettings, Precision
 from policy.engines.openvino_bulk import BulkEncoder
 from policy.engines.openvino_cpu import make_openvino_executable, precisions
 from policy.engines.openvino_graph import denoise_graph
-from policy.engines.parity import make_probe
+from policy.engines.parity import make_parity_samples
 from policy.engines.signal_stack import signal_stack_kept
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
-from policy.nets.backbones import BACKBONE_NAMES, BackboneName
 from policy.nets.diffusion import NoiseSchedule, Prediction
+from policy.nets.names import BACKBONE_NAMES, BackboneName
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 
 Fly = Callable[[Executable, float | None], FloatArray]
 SMALL = Contract(image_height=32, image_width=32)
-WARM = Settings(name="toge", head_steps=2)
+WARM = ExecutionSettings(name="toge", head_steps=2)
 
 
 def seeded(config: BuiltinConfig) -> BuiltinPolicy:
@@ -42,13 +42,13 @@ def seeded(config: BuiltinConfig) -> BuiltinPolicy:
     return policy
 
 
-def both(policy: BuiltinPolicy, settings: Settings) -> tuple[FloatArray, FloatArray]:
+def both(policy: BuiltinPolicy, settings: ExecutionSettings) -> tuple[FloatArray, FloatArray]:
     """Chunks by plain torch, and by OpenVINO in float32."""
-    probe = make_probe(policy.contract)
+    samples = make_parity_samples(policy.contract)
     reference = make_torch_executable(policy, settings)
     executable = make_openvino_executable(policy, settings, "f32", "f32")
     assert executable.engine == "openvino-f32"
-    return probe_chunks(reference, probe), probe_chunks(executable, probe)
+    return chunks_of_samples(reference, samples), chunks_of_samples(executable, samples)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_every_backbone_computes_what_torch_computes(backbone: BackboneName) -> 
     ids=["large", "resnet-unet", "other-contract"],
 )
 def test_single_rate_computes_what_torch_computes(config: BuiltinConfig) -> None:
-    settings = Settings(name="toge", num_diffusion_steps=1, dual_rate=False)
+    settings = ExecutionSettings(name="toge", num_diffusion_steps=1, dual_rate=False)
     expected, chunks = both(seeded(config), settings)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(chunks, expected, atol=2e-3)
@@ -95,7 +95,7 @@ def test_segments_compute_what_a_whole_solve_on_torch_does(
     """Five steps by a graph of two: the first segment is padded."""
     schedule = NoiseSchedule(prediction=prediction)
     policy = seeded(TogeConfig(backbone="resnet8", contract=SMALL, schedule=schedule))
-    full = Settings(name="toge", num_diffusion_steps=5)
+    full = ExecutionSettings(name="toge", num_diffusion_steps=5)
     expected, chunks = both(policy, replace(full, head_steps=2))
     np.testing.assert_allclose(chunks, expected, atol=2e-3)
     monkeypatch.setattr(openvino_cpu, "MAX_UNROLLED", 2)
@@ -106,12 +106,12 @@ def test_segments_compute_what_a_whole_solve_on_torch_does(
 def test_every_precision_of_this_cpu_is_near(
     trained_toge: Toge, warm_started: dict[tuple[Precision, Precision], Executable]
 ) -> None:
-    probe = make_probe(trained_toge.contract)
-    expected = probe_chunks(make_torch_executable(trained_toge, WARM), probe)
+    samples = make_parity_samples(trained_toge.contract)
+    expected = chunks_of_samples(make_torch_executable(trained_toge, WARM), samples)
     for (vision, _), executable in warm_started.items():
         assert executable.engine.startswith(f"openvino-{vision}")
         # Three significant digits of bfloat16; whether that is near enough the gate decides.
-        assert np.abs(probe_chunks(executable, probe) - expected).max() < 0.05
+        assert np.abs(chunks_of_samples(executable, samples) - expected).max() < 0.05
 
 
 @pytest.mark.parametrize("action", sorted({action for _, action in precisions()}))
@@ -147,10 +147,10 @@ def test_results_belong_to_the_caller(
     warm_started: dict[tuple[Precision, Precision], Executable],
 ) -> None:
     executable = warm_started["f32", "f32"]
-    probe = make_probe(executable.contract)
-    first = executable.encode(probe.rgb[0])
+    samples = make_parity_samples(executable.contract)
+    first = executable.encode(samples.rgb[0])
     kept = first.copy()
-    second = executable.encode(probe.rgb[1])
+    second = executable.encode(samples.rgb[1])
     assert not np.array_equal(first, second)
     np.testing.assert_array_equal(first, kept)
 
@@ -196,7 +196,7 @@ class UserModule(nn.Module):
     "changes", [{}, {"dual_rate": False}, {"head_steps": 1, "num_diffusion_steps": 2}]
 )
 def test_a_users_module_is_converted_where_it_is_asked_for(changes: dict[str, Any]) -> None:
-    policy, settings = UserModule(), replace(Settings(name="mine"), **changes)
+    policy, settings = UserModule(), replace(ExecutionSettings(name="mine"), **changes)
     reference, _ = choose_executable(policy, "auto", settings)
     converted, notes = choose_executable(policy, "openvino", settings)
     assert reference.engine == "torch"  # by itself no engine freezes what a person's code decides
@@ -207,7 +207,7 @@ def test_a_users_module_is_converted_where_it_is_asked_for(changes: dict[str, An
 def test_a_users_module_that_cannot_be_traced_flies_on_torch() -> None:
     policy = UserModule()
     policy.encode_visual = lambda image: torch.linalg.qr(image)[0].mean(dim=(2, 3))  # type: ignore[method-assign]
-    executable, notes = choose_executable(policy, "openvino", Settings(name="mine"))
+    executable, notes = choose_executable(policy, "openvino", ExecutionSettings(name="mine"))
     assert executable.engine == "torch"
     assert all("is passed over" in note for note in notes)
 
@@ -221,12 +221,12 @@ def test_compiled_graphs_are_cached_and_damage_does_no_harm(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     policy = seeded(TogeConfig(backbone="resnet8", contract=SMALL))
-    probe = make_probe(SMALL)
+    samples = make_parity_samples(SMALL)
 
     def chunks(seed: int = 0, steps: int = 1) -> FloatArray:
         policy.reset(seed)
-        settings = Settings(name="toge", num_diffusion_steps=steps)
-        return probe_chunks(make_openvino_executable(policy, settings, "f32", "f32"), probe)
+        settings = ExecutionSettings(name="toge", num_diffusion_steps=steps)
+        return chunks_of_samples(make_openvino_executable(policy, settings, "f32", "f32"), samples)
 
     first = chunks()
     assert len(cached(tmp_path)) == 2
@@ -240,7 +240,7 @@ def test_compiled_graphs_are_cached_and_damage_does_no_harm(
     assert len(cached(tmp_path)) == 3
     with torch.no_grad():
         policy.head.unet.out.bias += 0.1
-    expected, anew = both(policy, Settings(name="toge", num_diffusion_steps=1))
+    expected, anew = both(policy, ExecutionSettings(name="toge", num_diffusion_steps=1))
     np.testing.assert_allclose(anew, expected, atol=2e-3)
     assert len(cached(tmp_path)) == 5
 

@@ -5,12 +5,13 @@ import pytest
 
 SCRIPT = """
 import ctypes, gc, os, signal
-from policy.loading import load_policy
+from policy.loading import PolicyRequest, load_policy
 
-loaded = load_policy(
-    "toge:small:resnet18", checkpoint=None, allow_untrained=True, engine="openvino", device="cpu",
-    dual_rate=True, num_diffusion_steps=1, image_size=32, seed=0, now_s=lambda: 0.0,
+request = PolicyRequest(
+    spec="toge:small:resnet8", allow_untrained=True, engine="openvino", num_diffusion_steps=1,
+    image_size=32,
 )
+loaded = load_policy(request, now_s=lambda: 0.0)
 heard = []
 signal.signal(signal.SIGINT, lambda *_: heard.append("in flight"))
 os.kill(os.getpid(), signal.SIGINT)

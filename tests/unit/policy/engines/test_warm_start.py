@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from policy.contract import Contract, Executable, FloatArray
-from policy.engines.executable import Settings
+from policy.engines.executable import ExecutionSettings
 from policy.engines.numpy_eager import make_numpy_executable
 from policy.engines.torch_eager import make_torch_executable
-from policy.engines.warm_start import FULL_EVERY_S, Solve, WarmStart, moved_chunk
+from policy.engines.warm_start import FULL_EVERY_S, Solve, WarmStart, shift_chunk
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
 
@@ -23,12 +23,12 @@ CHUNK = np.random.default_rng(0).uniform(-1, 1, (1, 16, 4)).astype(np.float32)
 def test_a_moved_chunk_is_the_chunk_read_later(periods: float) -> None:
     at = np.arange(16) + periods
     expected = np.stack([np.interp(at, np.arange(16), CHUNK[0, :, k]) for k in range(4)], axis=1)
-    np.testing.assert_allclose(moved_chunk(CHUNK, periods)[0], expected, atol=1e-5)
+    np.testing.assert_allclose(shift_chunk(CHUNK, periods)[0], expected, atol=1e-5)
 
 
 def test_a_chunk_moved_by_nothing_is_itself() -> None:
-    np.testing.assert_array_equal(moved_chunk(CHUNK, 0.0), CHUNK)
-    np.testing.assert_array_equal(moved_chunk(CHUNK, 1e9), np.repeat(CHUNK[:, -1:], 16, axis=1))
+    np.testing.assert_array_equal(shift_chunk(CHUNK, 0.0), CHUNK)
+    np.testing.assert_array_equal(shift_chunk(CHUNK, 1e9), np.repeat(CHUNK[:, -1:], 16, axis=1))
 
 
 TICK_S = 1 / 256
@@ -75,7 +75,9 @@ class Flight:
 
     def __init__(self, *elapsed_s: float | None, head_steps: int) -> None:
         policy = CountingPolicy()
-        act = make_numpy_executable(policy, Settings(name="count", head_steps=head_steps)).act
+        act = make_numpy_executable(
+            policy, ExecutionSettings(name="count", head_steps=head_steps)
+        ).act
         self.took: list[int] = []
         self.chunks: list[int] = []
         for since_s in elapsed_s:
@@ -158,7 +160,7 @@ def test_a_guess_is_the_last_chunk_moved_by_the_elapsed_time_and_noised() -> Non
     warm = WarmStart(solve, chunk_dt_s=0.05)
     warm(FEATURE, STATE, HISTORY, None)
     warm(FEATURE, STATE, HISTORY, 0.02)
-    np.testing.assert_array_equal(seen[-1][3], 0.5 * moved_chunk(CHUNK + 1 + 1, 0.4) + 0.25 * CHUNK)
+    np.testing.assert_array_equal(seen[-1][3], 0.5 * shift_chunk(CHUNK + 1 + 1, 0.4) + 0.25 * CHUNK)
 
 
 def test_a_spread_solve_is_that_of_the_tick_where_it_began() -> None:
@@ -174,7 +176,7 @@ def test_a_spread_solve_is_that_of_the_tick_where_it_began() -> None:
     assert ticks == [[tick] * 3 for tick in (0, 0, 1, 2, 2, 3, 2, 4)]
     np.testing.assert_array_equal(seen[4][3], CHUNK)
     np.testing.assert_array_equal(seen[6][3], CHUNK + 1)
-    guess = moved_chunk(CHUNK + 1 + 1, (0.125 + 0.25) / 0.25)
+    guess = shift_chunk(CHUNK + 1 + 1, (0.125 + 0.25) / 0.25)
     np.testing.assert_array_equal(seen[7][3], 0.5 * guess + 0.25 * CHUNK)
 
 
@@ -205,14 +207,14 @@ def test_on_torch_the_spread_solve_is_the_whole_one_bit_for_bit(
     feature = random.normal(size=(1, 256)).astype(np.float32)
     level = np.eye(1, trained_toge.contract.state_dim, 3, dtype=np.float32)
     states = [level + np.float32(0.01 * tick) for tick in range(9)]
-    warm = make_torch_executable(trained_toge, Settings(name="t", head_steps=head_steps))
-    full = make_torch_executable(trained_toge, Settings(name="t"))
+    warm = make_torch_executable(trained_toge, ExecutionSettings(name="t", head_steps=head_steps))
+    full = make_torch_executable(trained_toge, ExecutionSettings(name="t"))
     segments = len(SEGMENTS[head_steps])
     elapsed_s = [None, 0.5, 0.5, *[0.01] * segments]
     for state, since_s in zip(states, elapsed_s, strict=False):
         chunk = warm.act(feature, state, HISTORY, since_s)
     began, ended = 2, 2 + segments
-    guess = moved_chunk(
+    guess = shift_chunk(
         full.act(feature, states[began], HISTORY, None), sum([0.01] * segments) / 0.05
     )
     signal, noise = trained_toge.noise_shares(10, 10 - head_steps)
@@ -228,14 +230,14 @@ BOUNDS = {1: (0.6, 0.05), 3: (0.15, 0.02), 10: (1e-3, 1e-4)}
 
 @pytest.fixture(scope="module")
 def full(trained_toge: Toge, fly: Fly) -> FloatArray:
-    return fly(make_torch_executable(trained_toge, Settings(name="toge")), None)
+    return fly(make_torch_executable(trained_toge, ExecutionSettings(name="toge")), None)
 
 
 @pytest.mark.parametrize("head_steps", BOUNDS)
 def test_warm_chunks_stay_near_the_full_solve(
     trained_toge: Toge, fly: Fly, full: FloatArray, head_steps: int
 ) -> None:
-    settings = Settings(name="toge", head_steps=head_steps)
+    settings = ExecutionSettings(name="toge", head_steps=head_steps)
     warm = fly(make_torch_executable(trained_toge, settings), 0.02)
     distance = np.abs(warm - full)
     furthest, mean = BOUNDS[head_steps]
@@ -246,7 +248,7 @@ def test_warm_chunks_stay_near_the_full_solve(
 
 
 def test_the_same_flight_gives_the_same_sticks(trained_toge: Toge, fly: Fly) -> None:
-    settings = Settings(name="toge", head_steps=2)
+    settings = ExecutionSettings(name="toge", head_steps=2)
     first, second = (fly(make_torch_executable(trained_toge, settings), 0.02) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
@@ -254,4 +256,4 @@ def test_the_same_flight_gives_the_same_sticks(trained_toge: Toge, fly: Fly) -> 
 @pytest.mark.parametrize("head_steps", [0, 11])
 def test_refuses_steps_that_the_solve_does_not_have(small_toge: Toge, head_steps: int) -> None:
     with pytest.raises(PolicyError, match=r"head_steps must be in 1\.\.10"):
-        make_torch_executable(small_toge, Settings(name="toge", head_steps=head_steps))
+        make_torch_executable(small_toge, ExecutionSettings(name="toge", head_steps=head_steps))

@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from policy.errors import PolicyError
-from policy.nets.backbones import BACKBONE_NAMES, BackboneName, build_backbone, load_imagenet_state
+from policy.nets.backbones import build_backbone, load_imagenet_state
+from policy.nets.names import BACKBONE_NAMES, BackboneName
 
 # Names and shapes of torchvision's published ImageNet state dicts.
 KNOWN_PARAMETERS: list[tuple[BackboneName, str, tuple[int, ...]]] = [

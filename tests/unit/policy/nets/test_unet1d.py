@@ -4,8 +4,9 @@ import torch.nn.functional as F
 
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.nets.action_head import DiffusionHead, Size
+from policy.nets.action_head import DiffusionHead
 from policy.nets.diffusion import NoiseSchedule
+from policy.nets.names import Size
 from policy.nets.unet1d import Conv, UNet1d, UNet1dConfig
 
 

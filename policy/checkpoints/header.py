@@ -1,0 +1,78 @@
+"""What a checkpoint says of itself, read without torch and without its weights."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+
+from policy.contract import Contract
+from policy.errors import CheckpointError
+
+CONTRACT_KEY = "contract"
+ARCHITECTURE_KEY = "architecture"
+TRAINING_KEY = "training"
+HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
+SUFFIXES = (".safetensors", ".pt", ".pth")
+
+
+@contextmanager
+def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
+    """An open file of safetensors.
+
+    Raises:
+        CheckpointError: damaged, or of another format; also while it is read.
+    """
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(
+            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
+        ) from error
+
+
+def require_file(path: Path, suffixes: Sequence[str]) -> None:
+    """Refuse a path that is not a file of one of these suffixes, and say what is there.
+
+    Raises:
+        CheckpointError: another suffix, or no such file.
+    """
+    if path.suffix not in suffixes:
+        raise CheckpointError(f"{path}: not a checkpoint; use one of {', '.join(suffixes)}")
+    if not path.is_file():
+        near = sorted(p.name for p in path.parent.glob("*") if p.suffix in suffixes)
+        there = f"its folder holds {near}" if near else "its folder holds no checkpoint"
+        raise CheckpointError(f"{path}: no such file; {there}")
+
+
+def require_header(path: Path, header: dict[str, str]) -> None:
+    """Refuse a file that does not say what it is.
+
+    Raises:
+        CheckpointError: a key is missing.
+    """
+    for key in HEADER_KEYS:
+        if key not in header:
+            raise CheckpointError(
+                f"{path}: no {key!r} in the header (it holds {sorted(header)}), so it was not "
+                "written by this project; load the weights as .pt and save them with "
+                "policy.checkpoints.policy_file.save_checkpoint"
+            )
+
+
+def read_contract(path: Path) -> Contract | None:
+    """The contract in a policy's file; None where it is a ``.pt``, which only torch can read.
+
+    Raises:
+        CheckpointError: missing, damaged, or not a policy's file.
+        ContractError: its contract is malformed or of another version.
+    """
+    require_file(path, SUFFIXES)
+    if path.suffix != ".safetensors":
+        return None
+    with open_safetensors(path, "numpy") as file:
+        header: dict[str, str] = file.metadata() or {}
+    require_header(path, header)
+    return Contract.from_json(header[CONTRACT_KEY])
