@@ -1,4 +1,4 @@
-"""What goes into a policy and what comes out: names, order, frame, shapes, times.
+"""A policy's inputs and outputs: names, order, frames, shapes, times.
 
 This is the only module of ``policy`` that the loops see; it imports numpy alone. A checkpoint
 carries its ``Contract`` in the header, and the bridge refuses one that it cannot keep.
@@ -79,13 +79,13 @@ class Contract:
     history_dt_s: float = 0.05
     """Time between them; the newest is history_dt_s before the state."""
     arrays: Arrays = "torch"
-    """What the policy takes and returns."""
+    """Kind of arrays that the policy takes and returns."""
     since_exposure: bool = False
-    """Whether the state is followed by ``SINCE_EXPOSURE_NAMES``."""
+    """The state is followed by ``SINCE_EXPOSURE_NAMES``."""
     version: int = CONTRACT_VERSION
 
     def __post_init__(self) -> None:
-        """Refuse what no runtime could serve."""
+        """Refuse values that no runtime could serve."""
         if self.version != CONTRACT_VERSION:
             raise ContractError(
                 f"contract version {self.version} is not supported; this build reads version "
@@ -167,7 +167,7 @@ def _rgb(name: str, value: object) -> tuple[float, float, float]:
 
 @runtime_checkable
 class SingleRatePolicy(Protocol):
-    """The least that flies: image, state and history in, a chunk out.
+    """The minimum that flies: image, state and history in, a chunk out.
 
     Shapes, float32: image [B, 3, H, W] normalised by the contract, state [B, state_dim] in SI
     units, action_history [B, K, 4]; returns [B, horizon, 4] sticks in [-1, 1]. Arrays are numpy or
@@ -196,12 +196,8 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
         ...
 
 
-@runtime_checkable
-class WarmStartPolicy(DualRatePolicy, Protocol):
-    """A policy whose solve can be entered before any of its steps, and left after any.
-
-    ``predict_fast`` is ``denoise_fast`` by all steps from ``initial_noise``.
-    """
+class NoiseModel(Protocol):
+    """The noise that a diffusion solve starts from."""
 
     @property
     def initial_noise(self) -> Any:
@@ -211,6 +207,14 @@ class WarmStartPolicy(DualRatePolicy, Protocol):
     def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
         """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
         ...
+
+
+@runtime_checkable
+class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
+    """A policy whose solve can be entered before any of its steps, and left after any.
+
+    ``predict_fast`` is ``denoise_fast`` by all steps from ``initial_noise``.
+    """
 
     def denoise_fast(
         self,

@@ -44,9 +44,9 @@ class PolicyRequest:
     """Weights; a user's class gets them as ``Class(checkpoint=path)``. Without any, ``toge`` takes
     the shipped ones."""
     allow_untrained: bool = False
-    """Whether seeded random weights will do where there is no checkpoint."""
+    """Accept seeded random weights where there is no checkpoint."""
     engine: EngineName = "auto"
-    """What runs the network; auto = the fastest that passes the parity gate."""
+    """Engine that runs the network; auto = the fastest that passes the parity gate."""
     device: str = "cpu"
     """torch's name of where to run: cpu, cuda, cuda:0, mps."""
     vision_device: str | None = None
@@ -67,7 +67,7 @@ class PolicyRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedPolicy:
-    """A policy that may fly, and what a person should know of it."""
+    """A policy that may fly, and notes about it for the user."""
 
     executable: Executable
     notes: tuple[str, ...]
@@ -148,8 +148,8 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
-            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE] or "
-            "resnet-unet[:SIZE]; a world model is trained by mavbridge train-world-model"
+            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
+            "resnet-unet[:SIZE] or world-model"
         )
     return _config(kind, options, image_size)
 
@@ -311,21 +311,18 @@ def _instance(spec: str, found: type, checkpoint: Path | None) -> SingleRatePoli
     with user_code(f"--policy {spec}: making it failed"):
         policy: object = found(**arguments)
     contract = getattr(policy, "contract", None)
+    lacking = [] if isinstance(contract, Contract) else ["contract"]
+    lacking += [] if hasattr(policy, "predict") else ["predict"]
     if not isinstance(policy, SingleRatePolicy) or not isinstance(contract, Contract):
         raise PolicyError(
             f"--policy {spec}: a policy needs a member contract (a policy.contract.Contract) and "
             "predict(image, state, action_history, num_diffusion_steps); for the dual-rate mode "
             "also encode_visual(image) and predict_fast(feature, state, action_history, "
-            f"num_diffusion_steps). Missing or wrong here: {_lacking(policy)}"
+            f"num_diffusion_steps). Missing or wrong here: {lacking}"
         )
     if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
         raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")
     return policy
-
-
-def _lacking(policy: object) -> list[str]:
-    lacking = [] if isinstance(getattr(policy, "contract", None), Contract) else ["contract"]
-    return lacking + ([] if hasattr(policy, "predict") else ["predict"])
 
 
 def _contract(image_size: int | None) -> Contract:

@@ -46,16 +46,16 @@ EGOCENTRIC_SCALE = (
 
 
 def egocentric_scale(contract: Contract) -> tuple[float, ...]:
-    """What each dimension of what a net sees of the state is divided by."""
+    """The divisor of each dimension of ``egocentric_columns``."""
     return EGOCENTRIC_SCALE + (SINCE_EXPOSURE_SCALE if contract.since_exposure else ())
 
 
 def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
-    """The state as the vehicle feels it: the same on every heading, and for q as for -q.
+    """The state relative to the vehicle: the same on every heading, and for q as for -q.
 
     Velocity in body axes, the world's vertical axis in body axes, then rates, specific force and
-    whatever the contract appends, unchanged. No net has to learn what a rotation is, and none can
-    know a course by its compass.
+    whatever the contract appends, unchanged. No net has to learn rotations, and none can recognise
+    a course by its heading.
 
     Args:
         columns: of the state, in the contract's order; floats, or arrays of any kind.
@@ -70,7 +70,7 @@ def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
 
 
 def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
-    """State [B, state_dim] in SI units -> what a net sees of it [B, state_dim - 1], normalised."""
+    """State [B, state_dim] in SI units -> normalised input of a net [B, state_dim - 1]."""
     scale = egocentric_scale(contract)
     rows = [
         [value / unit for value, unit in zip(egocentric_columns(row), scale, strict=True)]

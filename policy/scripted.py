@@ -46,7 +46,7 @@ MAX_STEP_S = 0.2
 
 
 class Motion(NamedTuple):
-    """What the program asks for, in the horizontal frame that turns with the nose."""
+    """Motion that the program demands, in the horizontal frame that turns with the nose."""
 
     forward_mps: float = 0.0
     right_mps: float = 0.0
@@ -60,28 +60,12 @@ class _Measured(NamedTuple):
     yaw_rate_radps: float
 
 
-def _hover(time_s: float) -> Motion:
-    return Motion()
-
-
-def _square(time_s: float) -> Motion:
-    legs = (Motion(LEG_MPS), Motion(0.0, LEG_MPS), Motion(-LEG_MPS), Motion(0.0, -LEG_MPS))
-    return legs[int(time_s / LEG_S) % len(legs)]
-
-
-def _circle(time_s: float) -> Motion:
-    return Motion(forward_mps=LEG_MPS, yaw_rate_radps=YAW_RATE_RADPS)
-
-
-def _yaw(time_s: float) -> Motion:
-    return Motion(yaw_rate_radps=YAW_RATE_RADPS)
-
-
+_LEGS = (Motion(LEG_MPS), Motion(0.0, LEG_MPS), Motion(-LEG_MPS), Motion(0.0, -LEG_MPS))
 _PROGRAMS: dict[str, Callable[[float], Motion]] = {
-    "hover": _hover,
-    "square": _square,
-    "circle": _circle,
-    "yaw": _yaw,
+    "hover": lambda _: Motion(),
+    "square": lambda time_s: _LEGS[int(time_s / LEG_S) % len(_LEGS)],
+    "circle": lambda _: Motion(forward_mps=LEG_MPS, yaw_rate_radps=YAW_RATE_RADPS),
+    "yaw": lambda _: Motion(yaw_rate_radps=YAW_RATE_RADPS),
 }
 PROGRAM_NAMES = tuple(_PROGRAMS)
 

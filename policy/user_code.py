@@ -1,4 +1,4 @@
-"""The boundary to code that is not ours: what it raises becomes one message that says where."""
+"""The boundary to a user's code: an exception there becomes one message with its file and line."""
 
 import traceback
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ _OURS = Path(__file__).parent
 
 @contextmanager
 def user_code(doing: str) -> Iterator[None]:
-    """Turn whatever a person's policy raises into a ``PolicyError`` with its file and line.
+    """Turn any exception of a user's policy into a ``PolicyError`` with its file and line.
 
     Args:
         doing: what was being done, for the message.

@@ -1,4 +1,4 @@
-"""What a checkpoint says of itself, read without torch and without its weights."""
+"""The header of a checkpoint, read without torch and without the weights."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""Weights on disk: the only module of the flight path that touches files.
+"""Policies on disk.
 
 ``.safetensors`` holds the contract and the architecture in its header, so the file alone says what
 it is. It also holds a test vector, inputs and the chunks that plain torch made of them where it was
@@ -51,12 +51,12 @@ _DAMAGED = (
     *(OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError),
     *(AssertionError, ArithmeticError, MemoryError, struct.error),
 )
-"""What torch.load raises on flipped bytes: its reader interprets them before it checks them."""
+"""Raised by torch.load on flipped bytes, which its reader interprets before it checks them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Contents:
-    """What a file held; None where it does not say."""
+    """Contents of a file; None where it does not say."""
 
     state: dict[str, Tensor]
     vector: dict[str, Tensor]
@@ -128,7 +128,7 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
 
 
 def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
-    """Inputs and what plain torch in float32 on a CPU makes of them."""
+    """Inputs, and the chunks that plain torch in float32 on a CPU computes from them."""
     reference = copy.deepcopy(policy).cpu().eval()
     samples = make_parity_samples(policy.contract)
     arrays = (samples.rgb, samples.state, samples.history, _chunks(reference, samples))

@@ -12,7 +12,7 @@ from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
 
 WORLD_MODEL_KEY = "world_model"
-"""Of the header; a policy's file has ``architecture`` in its place."""
+"""Key in the header; a policy's file has ``architecture`` instead."""
 _SUFFIX = ".safetensors"
 _RENAMED = {
     "foresight.begin.": "motion_predictor.initial_hidden.",

@@ -1,7 +1,7 @@
-"""How a policy is executed: each module makes a ``contract.Executable`` of one engine."""
+"""Engines that execute a policy; each makes a ``contract.Executable``."""
 
 import sys
 
-# On import openvino reports to its makers' analytics server and writes an id into the home folder,
-# unless this package of theirs cannot be imported. A flight computer calls nobody.
+# On import openvino reports to its vendor's analytics server and writes an id into the home folder,
+# unless its telemetry package cannot be imported. A flight computer reports to nobody.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]

@@ -1,11 +1,12 @@
 """Which engine runs a policy: the fastest that is present and computes what plain torch computes.
 
-An engine that cannot be made, or fails the parity gate, is passed over with its reason said; torch,
-the reference, is last.
+An engine that cannot be made, or fails the parity gate, is passed over with a note of the reason.
+Torch, the reference, is last.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from torch import nn
 
 from policy.contract import Executable, FloatArray, SingleRatePolicy
-from policy.engines.executable import EngineName, ExecutionSettings, Precision
+from policy.engines.executable import EngineName, ExecutionSettings
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
@@ -21,15 +22,11 @@ from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 
 SAMPLE_ELAPSED_S = 0.02
-"""Between the two chunks of a sample: with a warm start, the second one is a refinement."""
+"""Time between the two chunks of a sample: with a warm start, the second is a refinement."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Candidate:
-    """An engine to try."""
-
-    label: str
-    make: Callable[[], Executable]
+Candidate = tuple[str, Callable[[], Executable]]
+"""The name of an engine to try, and what makes it."""
 
 
 def choose_executable(
@@ -49,10 +46,10 @@ def choose_executable(
             "torch"
         )
     candidates = _candidates(policy, engine, settings)
-    return first_faithful(policy, candidates, settings)
+    return first_that_agrees(policy, candidates, settings)
 
 
-def first_faithful(
+def first_that_agrees(
     policy: SingleRatePolicy, candidates: list[Candidate], settings: ExecutionSettings
 ) -> tuple[Executable, tuple[str, ...]]:
     """The first candidate that passes the gate, or torch, with a line for each one passed over.
@@ -65,15 +62,15 @@ def first_faithful(
         on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
         samples = make_parity_samples(policy.contract)
         expected = chunks_of_samples(make_torch_executable(policy, on_cpu), samples)
-    for candidate in candidates:
+    for label, make in candidates:
         try:
-            executable = candidate.make()
+            executable = make()
             reason = parity_failure(expected, chunks_of_samples(executable, samples))
         except (PolicyError, RuntimeError, TypeError) as error:
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
         if reason is None:
             return executable, (*notes, f"engine {executable.engine}: agrees with torch")
-        notes.append(f"warning: engine {candidate.label} is passed over: {reason}")
+        notes.append(f"warning: engine {label} is passed over: {reason}")
     return make_torch_executable(policy, settings), tuple(notes)
 
 
@@ -96,27 +93,19 @@ def _candidates(
     if engine == "cuda-graph" and devices != {"cuda"}:
         raise PolicyError(f"--engine cuda-graph runs on --device cuda, not on {sorted(devices)}")
     if devices == {"cpu"} and find_spec("openvino") is not None:
-        return _openvino(policy, settings)
+        from policy.engines.openvino_cpu import make_openvino_executable, precisions
+
+        return [
+            (
+                f"openvino (images {vision}, actions {action})",
+                partial(make_openvino_executable, policy, settings, vision, action),
+            )
+            for vision, action in precisions()
+        ]
     if engine == "openvino":
         raise PolicyError("--engine openvino: the package is missing; pip install openvino")
     if devices == {"cuda"} and torch.cuda.is_available():
-        return [_cuda_graph(policy, settings)]
+        from policy.engines.cuda_graph import make_cuda_graph_executable
+
+        return [("cuda-graph", partial(make_cuda_graph_executable, policy, settings))]
     return []
-
-
-def _openvino(policy: SingleRatePolicy, settings: ExecutionSettings) -> list[Candidate]:
-    from policy.engines.openvino_cpu import make_openvino_executable, precisions
-
-    def candidate(vision: Precision, action: Precision) -> Candidate:
-        return Candidate(
-            label=f"openvino (images {vision}, actions {action})",
-            make=lambda: make_openvino_executable(policy, settings, vision, action),
-        )
-
-    return [candidate(vision, action) for vision, action in precisions()]
-
-
-def _cuda_graph(policy: SingleRatePolicy, settings: ExecutionSettings) -> Candidate:
-    from policy.engines.cuda_graph import make_cuda_graph_executable
-
-    return Candidate(label="cuda-graph", make=lambda: make_cuda_graph_executable(policy, settings))

@@ -1,7 +1,7 @@
 """Compiled graphs on disk, so that the second start of a policy is a quick one.
 
-A cache and nothing more: whatever goes wrong with a file or its folder means that a graph is
-compiled again. Entries carry a checksum, because an engine that reads half a file may crash.
+Any problem with a file or its folder only means that a graph is compiled again. Entries carry a
+checksum, because an engine that reads half a file may crash.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 MAX_ENTRIES = 12
-"""Files kept, the least recently used goes first: about six policies of two graphs each."""
+"""Files kept, about six policies of two graphs each; the least recently used is dropped first."""
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
@@ -30,7 +30,7 @@ class CompileCache:
         self._folder = folder
 
     def load(self, key: str) -> bytes | None:
-        """What was stored under ``key``; None where that is nothing, unreadable or damaged."""
+        """The bytes stored under ``key``; None if there are none, or they are damaged."""
         path = self._path(key)
         try:
             content = path.read_bytes()
@@ -41,7 +41,7 @@ class CompileCache:
         return blob if hashlib.sha256(blob).digest() == digest else None
 
     def store(self, key: str, blob: bytes) -> None:
-        """Keep ``blob``, if that is possible; older entries give way."""
+        """Keep ``blob`` if possible; the oldest entries beyond ``MAX_ENTRIES`` are deleted."""
         path = self._path(key)
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
         try:

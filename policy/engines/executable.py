@@ -1,4 +1,4 @@
-"""What all engines share: the policy's methods as an ``Executable``, tried once before it flies."""
+"""Shared by all engines: a policy becomes an ``Executable``, tried once before it flies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,27 +29,27 @@ Act = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
 
 @dataclass(frozen=True, kw_only=True)
 class ExecutionSettings:
-    """How a policy is to be executed, whatever the engine."""
+    """Settings of an execution that do not depend on the engine."""
 
     name: str
-    """Of the policy, shown to people."""
+    """The policy's name in messages."""
     vision_device: str = "cpu"
     """torch's name of where images are encoded."""
     action_device: str = "cpu"
     """torch's name of where chunks are sampled."""
     num_diffusion_steps: int = 10
-    """Of a full solve."""
+    """Denoising steps of a full solve."""
     head_steps: int | None = None
-    """Of a solve from the last chunk; None = always a full one."""
+    """Denoising steps of a solve from the last chunk; None = always a full solve."""
     dual_rate: bool = True
-    """Whether encode runs the image path; needs a ``DualRatePolicy``."""
+    """``encode`` runs the image path; needs a ``DualRatePolicy``."""
 
 
 ArrayFunction = Callable[..., FloatArray]
 """float32 arrays in, one of the caller's own out."""
 Shape = tuple[int, ...]
 Compile = Callable[[Callable[..., Any], Sequence[Shape]], ArrayFunction]
-"""How an engine runs a function of its own kind of arrays, whose float32 inputs have the shapes."""
+"""(function of the engine's own kind of arrays, shapes of its float32 inputs) -> compiled."""
 
 
 def make_executable(

@@ -93,7 +93,7 @@ def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
 def step_inputs(
     head: DiffusionHead, num_diffusion_steps: int, first: int, count: int, unrolled: int
 ) -> tuple[FloatArray, FloatArray]:
-    """What makes a graph of ``unrolled`` steps the steps ``first`` to ``first + count`` of a solve.
+    """Inputs that make a graph of ``unrolled`` steps run ``first`` to ``first + count`` of a solve.
 
     Where those are fewer, steps that change nothing come before them.
 

@@ -1,4 +1,4 @@
-"""Whether two ways to compute a policy agree, from image to stick."""
+"""The parity gate: do two ways to compute a policy agree, from image to stick?"""
 
 from dataclasses import dataclass
 
@@ -16,15 +16,15 @@ from policy.contract import (
 from policy.preprocess import SINCE_EXPOSURE_SCALE
 
 MIN_COSINE = 0.999
-"""Of two chunks as vectors, of each sample."""
+"""Least cosine between the two chunks of a sample, taken as vectors."""
 MAX_STICK_ERROR = 0.01
-"""In full deflections: 5 us of PWM on the usual 1000..2000 us."""
+"""Largest difference in full deflections: 5 us of PWM on the usual 1000..2000 us."""
 SAMPLES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class ParitySamples:
-    """Made-up inputs that reach all of a policy; the same for the same contract."""
+    """Synthetic inputs that exercise every input of a policy; the same for the same contract."""
 
     rgb: NDArray[np.uint8]
     """[samples, image_height, image_width, 3]"""

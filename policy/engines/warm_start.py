@@ -9,32 +9,18 @@ more than twice the steps of a warm start.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 
-from policy.contract import FloatArray
+from policy.contract import FloatArray, NoiseModel
 from policy.errors import PolicyError
 
 FULL_EVERY_S = 1.0
-"""Between the starts of full solves, and the age of a guess that is none any more; in seconds of
+"""Time between the starts of full solves, and the age at which a guess is dropped; measured between
 the states that the chunks belong to."""
 
 Segment = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 """(encoded image, state, history, noisy chunk [1, horizon, 4]) -> less noisy chunk."""
-
-
-class NoiseModel(Protocol):
-    """What a solve starts from; a ``WarmStartPolicy`` is one."""
-
-    @property
-    def initial_noise(self) -> Any:
-        """[1, horizon, 4]; the same for a whole flight."""
-        ...
-
-    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +33,7 @@ class Solve:
     """Each starts with what the one before made; the last one makes the chunk."""
     guess_share: float
     noise_share: float
-    """Of a guess and of noise, in what the last segment starts with."""
+    """Shares of a guess and of noise in what the last segment starts with."""
 
     def sample(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         """All segments, from noise -> chunk [1, horizon, 4]."""
@@ -99,7 +85,7 @@ def make_solve(
 
 
 def shift_chunk(chunk: FloatArray, periods: float) -> FloatArray:
-    """What a chunk says ``periods`` of its actions later, its last action held.
+    """The chunk as it is ``periods`` of its actions later, its last action held.
 
     Args:
         chunk: [1, horizon, 4].
@@ -158,14 +144,14 @@ class WarmStart:
         elapsed_s: float | None,
     ) -> FloatArray:
         """A whole solve where there is no guess, or time went backwards; else a refinement."""
-        # Taken, not read: a solve that fails leaves nothing behind.
+        # Taken out of the object: a solve that fails leaves no guess behind.
         guess, self._guess = self._guess, None
         spread, self._spread = self._spread, None
         if guess is None or elapsed_s is None or elapsed_s < 0:
-            return self._afresh(encoded, state, history)
+            return self._solve_fully(encoded, state, history)
         guess.age_s += elapsed_s
         if guess.age_s >= FULL_EVERY_S:
-            return self._afresh(encoded, state, history)
+            return self._solve_fully(encoded, state, history)
         moved = shift_chunk(guess.chunk, guess.age_s / self._chunk_dt_s)
         chunk = self._solve.refine(encoded, state, history, moved)
         self._guess = _Guess(chunk, 0.0)
@@ -179,7 +165,9 @@ class WarmStart:
             self._run_segment(spread)
         return chunk
 
-    def _afresh(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+    def _solve_fully(
+        self, encoded: FloatArray, state: FloatArray, history: FloatArray
+    ) -> FloatArray:
         self._since_full_s = 0.0
         chunk = self._solve.sample(encoded, state, history)
         self._guess = _Guess(chunk, 0.0)

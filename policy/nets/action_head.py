@@ -14,12 +14,12 @@ from policy.nets.unet1d import UNet1d, UNet1dConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SizeDims:
-    """Dimensions that go with a size."""
+    """Dimensions of the network of one size."""
 
     base_dim: int
-    """Of the feature, the tokens and the condition."""
+    """Width of the feature, the tokens and the condition."""
     widths: tuple[int, ...]
-    """Of the U-Net's levels."""
+    """Channels of the U-Net's levels."""
 
 
 def size_dims(size: Size) -> SizeDims:
@@ -45,10 +45,10 @@ def size_dims(size: Size) -> SizeDims:
 class DiffusionHead(nn.Module):
     """Denoiser, noise schedule and initial noise.
 
-    Where the net predicts the clean chunk, it is the sum of what a linear layer reads off the
-    condition and of what the U-Net makes of the noisy chunk. The first learns the mean chunk within
-    minutes, and what is left to the second is how flights differ from it; at the noisiest step that
-    is nothing. So few steps of a head that was trained for little time still steer.
+    Where the net predicts the clean chunk, its prediction is the sum of a linear layer's output for
+    the condition and of the U-Net's output for the noisy chunk. The linear layer learns the mean
+    chunk within minutes, and the U-Net is left with the deviations from it, which are nothing at
+    the noisiest step. So a head steers in few steps and after little training.
 
     The initial noise is fixed for a flight: the same inputs then give the same sticks, and chunks
     do not jitter from sample to sample. It is not part of a checkpoint.
@@ -97,7 +97,7 @@ class DiffusionHead(nn.Module):
 
     @property
     def reads_condition(self) -> bool:
-        """Whether ``read`` is part of the net's prediction: it is, of the clean chunk."""
+        """True where ``read`` is part of the prediction: where the net predicts the clean chunk."""
         return self.schedule.prediction == "sample"
 
     def read(self, condition: Tensor) -> Tensor:

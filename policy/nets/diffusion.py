@@ -46,7 +46,7 @@ class DdimStep:
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseSchedule:
-    """How noise was added in training, and what the net was trained to predict.
+    """The noise schedule of training, and which quantity the net was trained to predict.
 
     Raises:
         PolicyError: a field is out of its range.
@@ -59,7 +59,7 @@ class NoiseSchedule:
     is divided by sqrt(a_t), which is 5e-4 at t = 99: with few steps ``sample`` is the safer one."""
 
     def __post_init__(self) -> None:
-        """Refuse what has no schedule."""
+        """Refuse a value that has no schedule."""
         if not (
             isinstance(self.num_train_timesteps, int) and 1 <= self.num_train_timesteps <= 1000
         ):

@@ -1,4 +1,4 @@
-"""What turns the state, the history of actions and the visual feature into one condition vector."""
+"""Encoders of the state and the action history, and their fusion with the visual feature."""
 
 import torch
 import torch.nn.functional as F
@@ -52,7 +52,7 @@ class AttentionBlock(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(dim, 2 * dim), nn.SiLU(), nn.Linear(2 * dim, dim))
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Tokens that have looked at each other."""
+        """Tokens [B, T, dim] -> the same, each informed by all."""
         batch, count, dim = tokens.shape
         qkv = self.qkv(self.norm1(tokens)).reshape(batch, count, 3, HEADS, dim // HEADS)
         heads = qkv.permute(2, 0, 3, 1, 4)
@@ -69,7 +69,7 @@ class AttentionBlock(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """Past actions [B, K, 4], oldest first, that have looked at each other -> [B, out_dim]."""
+    """Past actions [B, K, 4], oldest first, through self-attention -> [B, out_dim]."""
 
     def __init__(self, dim: int, history_len: int) -> None:
         super().__init__()
@@ -85,11 +85,11 @@ class HistoryEncoder(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Visual token, state token and what the history encoder made -> condition [B, dim].
+    """Visual token, state token and encoded history -> condition [B, dim].
 
-    Which sticks to hold is a product of what is seen and of how the vehicle moves, so it takes
-    depth, and here depth is cheapest: a layer costs a hundredth of the denoiser. With attention
-    among the tokens instead, the same time of training ended at a stick error of 0.091, not 0.085.
+    The right sticks depend jointly on the view and on the vehicle's motion, which takes depth, and
+    depth is cheapest here: a layer costs a hundredth of the denoiser. Attention among the tokens
+    instead reached a stick error of 0.091 in the same training time, this reaches 0.085.
     """
 
     def __init__(self, dim: int, history_dim: int) -> None:

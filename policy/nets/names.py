@@ -1,4 +1,4 @@
-"""What a user may name of a network: sizes and image encoders; imports no torch."""
+"""Names of sizes and image encoders, as a user writes them; imports no torch."""
 
 from typing import Literal, get_args
 

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from policy.nets.pooling import MOMENTS, moments
 
 RESNET8_CHANNELS = (24, 48, 96, 128)
-"""Of the first convolution and of the three blocks."""
+"""Channels out of the first convolution and of the three blocks."""
 RESNET8_CELLS = 6
-"""Cells on a side of the map that the last layer sees: what an image of 96 pixels has."""
+"""Cells on a side of the map that the last layer sees: those of an image of 96 pixels."""
 RESNET8_CELL_CHANNELS = 32
 
 
@@ -117,7 +117,7 @@ class ResNet8(nn.Module):
         self.fc = nn.Linear(RESNET8_CELL_CHANNELS * RESNET8_CELLS**2, self.out_dim)
 
     def forward(self, image: Tensor) -> Tensor:
-        """What a fully connected layer makes of the cells of the last map."""
+        """A fully connected layer over the cells of the last map."""
         x = self.layers(self.relu(self.bn1(self.conv1(image))))
         cells = F.adaptive_avg_pool2d(self.relu(self.bn2(self.conv2(x))), RESNET8_CELLS)
         feature: Tensor = self.relu(self.fc(cells.flatten(1)))

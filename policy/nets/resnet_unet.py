@@ -60,18 +60,6 @@ class ResnetUnet(nn.Module):
         """Start a flight: fixes the initial noise of all samples to come."""
         self.head.reset(seed)
 
-    def encode_observation(self, image: Tensor, state: Tensor, action_history: Tensor) -> Tensor:
-        """Image [B, 3, H, W], state [B, state_dim], history [B, K, 4] -> condition [B, C].
-
-        Raises:
-            PolicyError: a shape is not the contract's.
-        """
-        contract = self.contract
-        require_shape("image", image, 3, contract.image_height, contract.image_width)
-        require_shape("state", state, contract.state_dim)
-        require_shape("action_history", action_history, contract.history_len, ACTION_DIM)
-        return self.fuse_visual(self.visual_projection(self.backbone(image)), state, action_history)
-
     def fuse_visual(self, visual: Tensor, state: Tensor, action_history: Tensor) -> Tensor:
         """Projected image [B, C], state, history [B, K, 4] -> condition [B, C]."""
         return self.condition(visual, self.state_encoder(state), action_history)
@@ -94,5 +82,10 @@ class ResnetUnet(nn.Module):
         Raises:
             PolicyError: a shape is not the contract's, or the steps are not 1..100.
         """
-        condition = self.encode_observation(image, state, action_history)
+        contract = self.contract
+        require_shape("image", image, 3, contract.image_height, contract.image_width)
+        require_shape("state", state, contract.state_dim)
+        require_shape("action_history", action_history, contract.history_len, ACTION_DIM)
+        visual = self.visual_projection(self.backbone(image))
+        condition = self.fuse_visual(visual, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)

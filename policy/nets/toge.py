@@ -109,12 +109,6 @@ class Toge(nn.Module):
         condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
         return condition
 
-    def encode_observation(
-        self, image: Tensor, state: Tensor, action_history: Tensor | None
-    ) -> Tensor:
-        """``encode_visual`` and ``encode_and_fuse`` in sequence -> condition [B, C]."""
-        return self.encode_and_fuse(self.encode_visual(image), state, action_history)
-
     def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
         """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
         return self.head.denoise(noisy, timestep, condition)

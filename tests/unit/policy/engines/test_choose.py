@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from policy.contract import Contract, Executable, FloatArray
-from policy.engines.choose import Candidate, choose_executable, chunks_of_samples, first_faithful
+from policy.engines.choose import Candidate, choose_executable, chunks_of_samples, first_that_agrees
 from policy.engines.executable import EngineName, ExecutionSettings
 from policy.engines.openvino_cpu import make_openvino_executable, precisions
 from policy.engines.parity import MAX_STICK_ERROR, make_parity_samples, parity_failure
@@ -32,14 +32,14 @@ def altered(policy: Toge, alter: Callable[[FloatArray], FloatArray]) -> Candidat
 
         return replace(right, engine="wrong", act=act)
 
-    return Candidate(label="wrong", make=make)
+    return ("wrong", make)
 
 
 def failing(error: Exception) -> Candidate:
     def make() -> Executable:
         raise error
 
-    return Candidate(label="broken", make=make)
+    return ("broken", make)
 
 
 def one_bad_stick(chunk: FloatArray) -> FloatArray:
@@ -65,7 +65,7 @@ def shifted(chunk: FloatArray) -> FloatArray:
 def test_a_wrong_engine_is_passed_over_with_its_reason(
     small_toge: Toge, alter: Callable[[FloatArray], FloatArray], reason: str
 ) -> None:
-    executable, notes = first_faithful(small_toge, [altered(small_toge, alter)], SETTINGS)
+    executable, notes = first_that_agrees(small_toge, [altered(small_toge, alter)], SETTINGS)
     assert executable.engine == "torch"
     assert len(notes) == 1
     assert notes[0].startswith("warning: engine wrong is passed over: ")
@@ -78,7 +78,7 @@ def test_a_wrong_engine_is_passed_over_with_its_reason(
 )
 def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception) -> None:
     right = altered(small_toge, lambda chunk: chunk)
-    executable, notes = first_faithful(small_toge, [failing(error), right], SETTINGS)
+    executable, notes = first_that_agrees(small_toge, [failing(error), right], SETTINGS)
     assert executable.engine == "wrong"  # by name only
     assert "engine broken is passed over" in notes[0]
     assert notes[0].endswith("no memory")
@@ -95,7 +95,7 @@ def test_an_engine_that_only_refines_wrongly_is_passed_over(small_toge: Toge) ->
 
         return replace(right, act=act)
 
-    executable, notes = first_faithful(small_toge, [Candidate(label="x", make=make)], SETTINGS)
+    executable, notes = first_that_agrees(small_toge, [("x", make)], SETTINGS)
     assert executable.engine == "torch"
     assert "passed over" in notes[0]
 
