@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from mavbridge.flight.assembly import load_configured_policy
 
 from mavbridge.commands.train import check_flights as train_check
 from mavbridge.config.courses import CHECK_COURSE_SEED, HELD_OUT_COURSE_SEED, MAX_EPISODES
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import Clock
+from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.result import EpisodeResult
 from policy.checkpoints.policy_file import save_checkpoint
 from policy.contract import Contract, Executable, FloatArray
