@@ -29,7 +29,6 @@ from mavbridge.core.processes import IMPORT_ROOT
 
 BASELINE_PROCESS = "benchmarks.baseline"
 PEERS_PYTHON = IMPORT_ROOT / ".venv-peers" / "bin" / "python"
-"""``make bench`` installs it."""
 SHIPPED = PolicyConfig(dual_rate=True, head_steps=2, engine="openvino")
 LARGE = replace(SHIPPED, policy="toge:small", allow_untrained=True)
 FLIGHTS = (

@@ -44,7 +44,6 @@ class RolloutJob:
     ddim_steps: int
     device: str = "cpu"
     world_model: Path | None = None
-    """Weights; by default those that come with mavbridge."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +57,10 @@ class Trial:
     torch_threads: int
     """The serial form takes every core, the streamed one leaves one for the decoder."""
     frames: int
-    """In the video."""
     frames_decoded: int
     wall_s: float
     """From the first decision to closed files."""
     start_s: float
-    """Before that: files and the writer process."""
     sample_s: float
     """The loop's thread inside the world model."""
     decode_s: float
@@ -73,9 +70,7 @@ class Trial:
     peak_rss_mb: float | None
     """Process with the networks."""
     writer_rss_mb: float | None
-    """Writer process, if there is one."""
     sha256: str
-    """All frames."""
 
 
 @app.default

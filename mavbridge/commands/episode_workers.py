@@ -36,7 +36,6 @@ END_TIMEOUT_S = 10.0
 """Limit for a process to end by itself, and then on SIGTERM, before it is killed."""
 _SPAWN = multiprocessing.get_context("spawn")
 _POLL_S = 0.1
-"""Interval at which the stop flag is checked."""
 
 
 def fly_jobs(

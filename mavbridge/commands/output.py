@@ -1,6 +1,7 @@
 """Output that the commands share: tables, progress bars and figures."""
 
 import importlib.util
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 from rich.text import Text
 
 from mavbridge.core.errors import UserError
@@ -42,7 +44,6 @@ FIGURE_STYLE: dict[Any, Any] = {
     "ytick.color": INK,
     "legend.frameon": False,
 }
-"""For ``matplotlib.rc_context``."""
 
 
 def require_matplotlib(flag: str = "--plot") -> None:
@@ -73,6 +74,18 @@ def table_console() -> Console:
     if not console.is_terminal:
         console.width = PIPED_WIDTH
     return console
+
+
+def make_table(
+    title: str, header: Iterable[str], rows: Iterable[Iterable[str]], *, left_columns: int = 1
+) -> Table:
+    """A table whose first columns are text and whose others are right-aligned figures."""
+    table = Table(title=title, title_justify="left")
+    for index, name in enumerate(header):
+        table.add_column(name, justify="left" if index < left_columns else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def print_status(line: str) -> None:

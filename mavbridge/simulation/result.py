@@ -20,7 +20,6 @@ class EpisodeResult:
     outcome: Outcome
     gates_total: int
     gate_times_s: tuple[float, ...]
-    """When each gate was passed, in order."""
     flown_s: float
     """Until the end of the episode: one second after the last gate, the crash, or the limit."""
     distance_m: float
@@ -55,7 +54,6 @@ class StickMeter:
 
     def __init__(self) -> None:
         self.engaged_ns: int | None = None
-        """When the policy's first tick began."""
         self._last: tuple[int, Sticks] | None = None
         self._travel = 0.0
         self._moved_ns = 0

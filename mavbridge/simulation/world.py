@@ -65,7 +65,6 @@ class VehicleStepper:
         self._to_vehicle = to_vehicle
         self._from_vehicle = from_vehicle
         self.watchers: list[Callable[[], None]] = []
-        """Called after each step."""
         clock.schedule(boot_ns + STEP_NS, self._step)
 
     def _step(self) -> None:

@@ -85,7 +85,6 @@ class FlightMeter:
         self._cpu_start_ns: int | None = None
         self._stolen_start_ns: int | None = None
         self.cpu_ns = 0
-        """Processor time of this process while the policy flew."""
 
     def emit(self, event: Event) -> None:
         """Count the event."""

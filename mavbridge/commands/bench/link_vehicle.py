@@ -26,7 +26,6 @@ CODES = 1000
 CODE_SPAN = 500
 """A code k stands for a stick of (k - 500) / 500, which is 1000 + k us of PWM."""
 WARM_ANSWERS = 100
-"""Answers in a row before counting starts."""
 CONNECT_S = 30.0
 PENDING_LIMIT = 200
 """Answers later than two seconds count as lost."""

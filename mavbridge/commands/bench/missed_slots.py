@@ -25,11 +25,8 @@ class Counters(NamedTuple):
     """Time lost outside the loop's own work; each only ever grows, and stays 0 where unknown."""
 
     host_ns: int
-    """Processor time taken by the hypervisor, all processors."""
     kernel_ns: int
-    """Time that the reading thread stood in a run queue."""
     gc_ns: int
-    """Time inside the garbage collector, whichever thread ran it."""
 
 
 def stolen_ns() -> int | None:

@@ -10,8 +10,7 @@ from mavbridge.commands.bench.budget import ratios, read_budget, violations
 from mavbridge.commands.bench.engines import time_engines
 from mavbridge.commands.bench.flight import fly
 from mavbridge.commands.bench.link import OUR_CLIENTS, time_link
-from mavbridge.commands.bench.results import BenchResult, this_machine, to_json
-from mavbridge.commands.bench.tables import print_result
+from mavbridge.commands.bench.results import BenchResult, print_result, this_machine, to_json
 from mavbridge.commands.output import require_outputs, table_console
 from mavbridge.config.bench import BenchConfig, BenchOutputs
 from mavbridge.core.errors import UserError

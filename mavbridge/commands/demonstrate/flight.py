@@ -34,7 +34,6 @@ class DemonstrationSpec:
     folder: Path
     """Its contents are replaced."""
     seed: int
-    """Decides the course and everything random."""
     config: DemonstrateConfig
 
     def __str__(self) -> str:

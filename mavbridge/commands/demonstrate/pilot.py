@@ -45,7 +45,6 @@ class Pilot:
         self._turns = TurnSchedule(variation.seed)
         self._expert: Expert | None = None
         self.expert_sticks: Sticks | None = None
-        """Sticks that the expert would hold now; None before the first action."""
         self.begin_ns: int | None = None
         """When the demonstration begins; None before the first action."""
         expert = Executable(

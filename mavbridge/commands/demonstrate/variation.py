@@ -25,7 +25,6 @@ class Variation:
     delays: Delays
     starts_airborne: bool
     disturbance: float
-    """Strength of ``StickDisturbance``."""
 
 
 def draw_variation(seed: int) -> Variation:

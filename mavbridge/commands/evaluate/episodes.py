@@ -47,7 +47,6 @@ class FlownEpisode:
 
     engine: str
     notes: tuple[str, ...] = ()
-    """Remarks on the policy, for the user."""
     result: EpisodeResult
 
 

@@ -1,7 +1,6 @@
 """The picture of an evaluation: gates passed, outcomes, speed against smoothness."""
 
 from pathlib import Path
-from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -9,27 +8,7 @@ from matplotlib.figure import Figure
 
 from mavbridge.commands.evaluate.results import Evaluation
 from mavbridge.commands.evaluate.statistics import rate
-
-INK, MUTED, GRID, BLUE, RED = "#1f2933", "#6b7885", "#dfe4ea", "#2b6cb0", "#d1495b"
-SIZE_INCHES = (12.0, 4.2)
-DOTS_PER_INCH = 150
-STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "text.color": INK,
-    "axes.labelcolor": MUTED,
-    "axes.edgecolor": GRID,
-    "axes.titlesize": 12,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": GRID,
-    "xtick.color": MUTED,
-    "ytick.color": INK,
-    "legend.frameon": False,
-}
+from mavbridge.commands.output import BLUE, FIGURE_DPI, FIGURE_STYLE, MUTED, RED
 
 
 def draw(evaluation: Evaluation, path: Path) -> None:
@@ -39,8 +18,8 @@ def draw(evaluation: Evaluation, path: Path) -> None:
 
 def make_figure(evaluation: Evaluation) -> Figure:
     """Plots, left to right: share of flights by gate, outcomes, speed against smoothness."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor="white")
+    with rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(12.0, 4.2), dpi=FIGURE_DPI, facecolor="white")
         axes = figure.subplots(1, 3)
         _draw_gates(axes[0], evaluation)
         _draw_outcomes(axes[1], evaluation)

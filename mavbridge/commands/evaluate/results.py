@@ -30,7 +30,6 @@ class Summary:
     course_s: Estimate | None
     """First action to last gate, of the successful flights."""
     outcomes: tuple[tuple[Outcome, int], ...]
-    """Most frequent first."""
 
 
 def summarise(episodes: Sequence[EpisodeResult]) -> Summary:

@@ -24,7 +24,6 @@ class FlightWindow:
     """``K`` = context_frames and ``S`` later steps of one flight, ``frame_dt_s`` apart."""
 
     folder: Path
-    """Folder of the flight."""
     frames: NDArray[np.int64]
     """[K + S] rows of the flight's frames."""
     states: FloatArray

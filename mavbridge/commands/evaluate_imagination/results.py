@@ -47,7 +47,6 @@ class DriftIteration:
     """Frames at the end of one iteration, mean of all chains."""
 
     iteration: int
-    """Counted from 1."""
     chains: int
     imagined_psnr_db: float
     autoencoder_psnr_db: float
@@ -64,12 +63,10 @@ class Given:
     seed: int
     frame_dt_s: float
     exe_steps: int
-    """Frames of a chain's iteration."""
     flights: int
     """Flights that are long enough for a window."""
     flights_too_short: int
     demonstrations_failed: int
-    """Left out, as in training."""
     asked_windows: int
 
 
@@ -79,7 +76,6 @@ class ImaginationQuality:
 
     given: Given
     windows: int
-    """Number of windows scored."""
     frames: tuple[FrameQuality, ...]
     stick_following: tuple[StickFollowing, ...]
     own_actions_nearer: Estimate | None

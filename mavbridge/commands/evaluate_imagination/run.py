@@ -24,7 +24,7 @@ from mavbridge.commands.evaluate_imagination.results import (
 from mavbridge.commands.evaluate_imagination.scores import DriftScorer, WindowScorer
 from mavbridge.commands.imagine.run import SHIPPED, load_model
 from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.commands.output import table_console
+from mavbridge.commands.output import progress_bar, table_console
 from mavbridge.config.imagine import EvaluateImaginationConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
@@ -53,7 +53,7 @@ def evaluate_imagination(flights: Sequence[Path], config: EvaluateImaginationCon
     model = load_model(config.world_model, ddim_steps=config.ddim_steps, device=config.device)
     sampler = Sampler(model, ddim_steps=config.ddim_steps, decode_all=False, clock=MonotonicClock())
     errors = Console(stderr=True, highlight=False, emoji=False)
-    with stop_on_signals() as stop, Progress(console=errors) as progress:
+    with stop_on_signals() as stop, progress_bar(errors) as progress:
         quality = _Evaluation(config, sampler, progress, stop).run(flights)
         was_stopped = stop.is_set()
     print_quality(quality, table_console())

@@ -41,7 +41,6 @@ class DatasetWriter:
         self._episodes: list[dict[str, Json]] = []
         self._colours = ImageStats()
         self.rows = 0
-        """Number of rows so far."""
 
     @property
     def episodes(self) -> int:

@@ -77,9 +77,7 @@ class VideoFiles:
         self._stream: VideoStream | None = None
         self._file = -1
         self._frames = self._bytes = 0
-        """Contents of the file."""
         self._first = 0
-        """Frame of the file with which the episode begins."""
         self._all_frames = self._all_bytes = 0
 
     def begin(self, frames: int) -> None:

@@ -36,7 +36,6 @@ class Stretch:
 
     episode: FlightData
     first_frame: int
-    """Counted in the flight's frames."""
     columns: dict[str, NDArray[np.generic]]
     """State [N, 13], action and sent sticks [N, 4], then the stamps [N], under their names in the
     dataset. Sent sticks are zeros where they were released or nothing had been sent yet."""

@@ -134,7 +134,6 @@ class RolloutOutput(ABC):
         self._on_frame = on_frame
         self._digest = hashlib.sha256()
         self.frames = 0
-        """Frames that have left the decoder."""
         self.frames_decoded = 0
         """Frames decoded beside the loop's thread, whose own are in its meter."""
         self._open()

@@ -70,13 +70,11 @@ class Meter:
 
     def __init__(self, clock: Clock) -> None:
         self.sample = Stopwatch(clock)
-        """Time inside the world model."""
         self.decode = Stopwatch(clock)
         """Time for pixels: its own decodes, and waits for room in the decode queue."""
         self.write = Stopwatch(clock)
         """Time for the files: its own writing, or waits for the end of the writer's."""
         self.frames_decoded = 0
-        """Frames decoded by that thread."""
 
 
 @dataclass(frozen=True, kw_only=True)

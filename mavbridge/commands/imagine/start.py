@@ -131,7 +131,6 @@ class RealFrames:
         self._decoded = 0
         self._newest_step = 0
         self._window: deque[ImageArray] = deque(maxlen=config.frames)
-        """Images of consecutive steps, up to the newest."""
 
     def at(self, step: int) -> ImageArray | None:
         """The frame ``step`` times ``frame_dt_s`` after the start; None once the flight is over.

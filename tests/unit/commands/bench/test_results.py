@@ -12,10 +12,10 @@ from mavbridge.commands.bench.results import (
     Flight,
     from_json,
     name_of,
+    print_result,
     solves_of,
     to_json,
 )
-from mavbridge.commands.bench.tables import print_result
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.records import Percentiles
 
