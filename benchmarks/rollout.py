@@ -15,7 +15,7 @@ from cyclopts import App
 from rich.console import Console
 
 from benchmarks.rollout_process import COMMAND, RolloutJob, Trial
-from mavbridge.commands.bench.results import from_json, number, this_machine
+from mavbridge.commands.bench.results import from_json, this_machine
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.output import (
     BLUE,
@@ -24,6 +24,7 @@ from mavbridge.commands.output import (
     GREY,
     RED,
     make_table,
+    number,
     print_status,
     require_outputs,
     table_console,

@@ -88,6 +88,11 @@ def make_table(
     return table
 
 
+def number(value: float | None, digits: int) -> str:
+    """A figure, or a dash for what was not measured."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
 def print_status(line: str) -> None:
     """Print what is being done to standard error, apart from the results."""
     Console(stderr=True).print(Text(line, style="dim"), soft_wrap=True)

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mavbridge.commands.output import make_table
+from mavbridge.commands.output import make_table, number
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.records import Percentiles
 
@@ -184,11 +184,6 @@ def print_result(result: BenchResult, console: Console) -> None:
         console.print(table)
     for note in result.notes:
         console.print(Text(note, style="yellow"))
-
-
-def number(value: float | None, digits: int) -> str:
-    """A figure, or a dash for what was not measured."""
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def spread(percentiles: Percentiles | None, digits: int = 1) -> str:

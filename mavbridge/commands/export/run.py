@@ -9,11 +9,12 @@ from shutil import rmtree
 
 from av.error import FFmpegError
 from rich.console import Console
-from rich.progress import Progress, TaskID
+from rich.progress import TaskID
 
 from mavbridge.commands.export.dataset import DatasetWriter, even_size
 from mavbridge.commands.export.files import DATA_FILE_MB, MB, VIDEO_FILE_MB, DatasetSpec
 from mavbridge.commands.export.rows import Stretch, common_fps, stretches, worst_shift_ns
+from mavbridge.commands.output import progress_bar
 from mavbridge.config.export import ExportConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
@@ -51,7 +52,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         console.print(f"left out: {failed} of {len(folders)} flights, demonstrations that failed")
     with (
         stop_on_signals() as stop,
-        Progress(console=console) as progress,
+        progress_bar(console) as progress,
         _whole_or_nothing(config.out) as folder,
     ):
 

@@ -17,6 +17,7 @@ from mavbridge.commands.imagine.loop import RolloutPlan, Segment
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.recording.folder import require_extra
 from mavbridge.recording.tables import TableWriter, read_table
@@ -55,15 +56,7 @@ def prepare_out(out: Path) -> None:
     for path in (out, out.with_suffix(".arrows"), out.with_suffix(".parquet")):
         if path.exists():
             raise UserError(f"{path} is there already: remove it, or name another --out")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.open("xb").close()
-        out.unlink()
-    except OSError as error:
-        raise UserError(
-            f"--out {out} cannot be written ({error.strerror}); name a file in a folder that you "
-            "may write to"
-        ) from error
+    require_writable(out, "--out")
 
 
 def read_rows(out: Path) -> Any:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 from rich.text import Text
 
 import policy
@@ -23,6 +22,7 @@ from mavbridge.commands.imagine.output import (
 from mavbridge.commands.imagine.sampling import Sampler, cores_left_free
 from mavbridge.commands.imagine.start import RealFrames, RolloutStart, read_start
 from mavbridge.commands.imagine.streamed import StreamedOutput
+from mavbridge.commands.output import progress_bar
 from mavbridge.config.imagine import ImagineConfig
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -115,7 +115,7 @@ def run_rollout(
     """
     done = 0
     try:
-        with stop_on_signals() as stop, Progress(console=console) as bar:
+        with stop_on_signals() as stop, progress_bar(console) as bar:
             task = bar.add_task("imagining", total=plan.iterations * plan.frames)
 
             def refresh() -> None:
@@ -123,7 +123,7 @@ def run_rollout(
                     f"iteration {done}/{plan.iterations}, to decode {output.decode_queue}, "
                     f"to write {output.writer_queue}"
                 )
-                bar.update(task, completed=output.frames, description=status)
+                bar.update(task, completed=output.frames, status=status)
 
             for segment in rollout(sampler, decider, start, plan):
                 output.put(segment)

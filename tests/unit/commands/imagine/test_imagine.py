@@ -192,7 +192,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
         (["--rerun", "a.txt"], ".rrd"),
         (["--out", "taken.mp4"], "taken.mp4 is there already"),
         (["--out", "a.avi"], "must end in .mp4"),
-        (["--out", "taken.mp4/a.mp4"], "cannot be written"),
+        (["--out", "taken.mp4/a.mp4"], "cannot write --out"),
     ],
 )
 def test_bad_input_is_one_message(
