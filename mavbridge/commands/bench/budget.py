@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from mavbridge.commands.bench.engines import EAGER
-from mavbridge.commands.bench.results import BASELINE, OURS, BenchResult, Flight
+from mavbridge.commands.bench.results import BASELINE, OURS, BenchResult
 from mavbridge.core.errors import UserError
 
 ROOFLINE = "roofline f32"
@@ -49,16 +49,12 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
         if baseline is None or not baseline.action_hz:
             continue
         yield f"{name}: period / {BASELINE}", baseline.action_hz / flight.action_hz
-        yield f"{name}: cpu an action / {BASELINE}", _cpu_ratio(flight, baseline)
+        least_cpu = baseline.cpu_cores / baseline.action_hz
+        cpu_ratio = flight.cpu_cores / flight.action_hz / least_cpu if least_cpu else math.inf
+        yield f"{name}: cpu an action / {BASELINE}", cpu_ratio
         ours, theirs = flight.state_to_wire_ms, baseline.state_to_wire_ms
         if ours is not None and theirs is not None and theirs.p50 > 0:
             yield f"{name}: state to wire / {BASELINE}", ours.p50 / theirs.p50
-
-
-def _cpu_ratio(flight: Flight, baseline: Flight) -> float:
-    if not (flight.action_hz and baseline.action_hz and baseline.cpu_cores):
-        return math.inf
-    return (flight.cpu_cores / flight.action_hz) / (baseline.cpu_cores / baseline.action_hz)
 
 
 def _link_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:

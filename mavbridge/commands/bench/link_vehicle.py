@@ -9,6 +9,7 @@ answers by the kernel as they arrive: nothing that this process does is in the f
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from cyclopts import App
@@ -140,21 +141,17 @@ class LinkVehicle:
         Raises:
             TimeoutError: no client answered steadily.
         """
-        due_ns = self._warm_up()
+        due_ns = self._clock.now_ns()
+        for number in count():
+            if self._round_trips.answered_in_a_row >= WARM_ANSWERS:
+                break
+            if self._clock.now_ns() - self._start_ns > CONNECT_S * NS_PER_S:
+                raise TimeoutError(f"no client has answered steadily within {CONNECT_S:g} s")
+            due_ns = self._exchange(number, due_ns)
         self._round_trips.start()
         for number in range(attitudes):
             due_ns = self._exchange(number, due_ns)
         return self._round_trips.answers()
-
-    def _warm_up(self) -> int:
-        due_ns = self._clock.now_ns()
-        number = 0
-        while self._round_trips.answered_in_a_row < WARM_ANSWERS:
-            if self._clock.now_ns() - self._start_ns > CONNECT_S * NS_PER_S:
-                raise TimeoutError(f"no client has answered steadily within {CONNECT_S:g} s")
-            due_ns = self._exchange(number, due_ns)
-            number += 1
-        return due_ns
 
     def _exchange(self, number: int, due_ns: int) -> int:
         """One attitude; half a period later its answers and all other messages; the next due."""

@@ -35,11 +35,6 @@ class _BridgeJob(NamedTuple):
     camera: str
 
 
-class _BridgeReport(NamedTuple):
-    engine: str
-    meter: StickMeter
-
-
 def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEpisode:
     """Fly one episode in real time.
 
@@ -61,19 +56,19 @@ def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> Flo
         )
         with running(*command, log=log) as vehicle:
             try:
-                bridge = _run_bridge(_BridgeJob(spec, port, camera), vehicle, should_stop)
+                engine, meter = _run_bridge(_BridgeJob(spec, port, camera), vehicle, should_stop)
             except MavbridgeError:
                 if vehicle.poll():  # then the vehicle's failure is the reason
                     wait(vehicle, "python -m sitl", log, END_TIMEOUT_S)
                 raise
             end(vehicle)
             wait(vehicle, "python -m sitl", log, END_TIMEOUT_S)
-        return FlownEpisode(engine=bridge.engine, result=_read_result(spec, bridge.meter, report))
+        return FlownEpisode(engine=engine, result=_read_result(spec, meter, report))
 
 
 def _run_bridge(
     job: _BridgeJob, vehicle: "Popen[bytes]", should_stop: Callable[[], bool]
-) -> _BridgeReport:
+) -> tuple[str, StickMeter]:
     """Run the bridge in a process of its own until it or the vehicle has ended."""
     clock, spec = MonotonicClock(), job.spec
     deadline_ns = clock.now_ns() + round((spec.config.max_time + STARTUP_S) * NS_PER_S)
@@ -95,7 +90,7 @@ def _run_bridge(
     return raise_failure(outcome)
 
 
-def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> _BridgeReport:
+def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> tuple[str, StickMeter]:
     """Fly once, as ``mavbridge fly`` does; ended by signals, like that."""
     settings, clock, meter = job.spec.config, MonotonicClock(), StickMeter()
     config = FlyConfig(
@@ -112,7 +107,7 @@ def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> _BridgeReport:
     with Path("/dev/null").open("w") as nowhere:
         console = Console(file=nowhere)
         fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))
-    return _BridgeReport(executable.engine, meter)
+    return executable.engine, meter
 
 
 def _read_result(spec: EpisodeSpec, meter: StickMeter, path: Path) -> EpisodeResult:
