@@ -124,7 +124,6 @@ class Baseline:
 
     @torch.no_grad()
     def _sample(self, feature: torch.Tensor, state: np.ndarray) -> list[float]:
-        """The first action of a new chunk."""
         history, steps = torch.from_numpy(self._history), self._job.policy.num_diffusion_steps
         chunk = self._net.predict_fast(feature, torch.from_numpy(state), history, steps)
         action: list[float] = chunk[0, 0].tolist()

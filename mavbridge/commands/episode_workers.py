@@ -119,7 +119,6 @@ class WorkerProcess(Generic[Job, Result]):
 
 
 def _serve(connection: Connection, fly: FlyJob[Job, Result], stop: Event) -> None:
-    """Main function of a worker process; ends with the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which sets the event
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:

@@ -99,8 +99,6 @@ def print_status(line: str) -> None:
 
 
 class _StatusColumn(ProgressColumn):
-    """The task's field ``status``, if it has one."""
-
     def render(self, task: Task) -> Text:
         """Show it."""
         return Text(str(task.fields.get("status", "")))

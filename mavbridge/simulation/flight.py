@@ -67,13 +67,10 @@ class SimulatedFlight:
         settings: SimulationSettings | None = None,
         vehicle: VehicleConfig = NOMINAL_VEHICLE,
     ) -> None:
-        """Put the vehicle on the course.
+        """Put the vehicle on the course of ``sitl.course.layout.make_course``.
 
-        Args:
-            course_seed: the course of ``sitl.course.layout.make_course``.
-            seed: decides the delays and the phases of vehicle and camera.
-            settings: by default those of ``mavbridge fly`` and the delays of two shared cores.
-            vehicle: its conditions also decide how the course looks.
+        ``seed`` decides the delays and the phases of vehicle and camera; the vehicle's conditions
+        also decide how the course looks.
 
         Raises:
             UserError: ``seed`` is negative.
@@ -123,11 +120,8 @@ class SimulatedFlight:
     ) -> EpisodeResult:
         """Arm, fly, and give the sticks back; ends with the last gate, a crash, or the time.
 
-        Args:
-            executable: the policy; it must not remember earlier flights.
-            max_time_s: counted from the policy's first action.
-            sinks: see every tick and vision tick, in order of time.
-            should_stop: called after each step of the vehicle; True ends the flight.
+        The executable must not remember earlier flights; ``max_time_s`` counts from its first
+        action. ``should_stop`` is called after each step of the vehicle.
 
         Raises:
             EpisodeInterruptedError: ``should_stop`` ended the flight.
@@ -145,7 +139,6 @@ class SimulatedFlight:
         return referee.result(course_seed=self._course_seed, seed=self._seed)
 
     def _compose(self, executable: Executable, sinks: tuple[TickSink, ...]) -> ActionLoop:
-        """Build the bridge, with its vision loop on the clock's queue."""
         config = FlyConfig(
             link=LinkConfig(connect="lockstep"),
             rates=self._settings.rates,

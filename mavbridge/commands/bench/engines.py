@@ -33,14 +33,9 @@ class _Case:
 def time_engines(
     policies: Sequence[PolicyConfig], *, rounds: int, block_s: float
 ) -> tuple[tuple[EngineTiming, ...], tuple[str, ...]]:
-    """Time every policy on every engine that runs it; and notes on the engines that do not.
+    """Time each policy on its engine, or with ``auto`` on all of this device; notes on failures.
 
-    Each round goes through all cases, so that a slow minute of the host is shared by all engines.
-
-    Args:
-        policies: their ``engine`` picks one engine, or with ``auto`` all of this device.
-        rounds: how often each case is measured.
-        block_s: how long each time.
+    Each round times every case for ``block_s``: a slow minute of the host is shared by all engines.
 
     Raises:
         PolicyError: a policy cannot be loaded on any engine.

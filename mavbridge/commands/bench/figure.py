@@ -148,7 +148,6 @@ def link_spans(links: Sequence[LinkLatency]) -> list[LatencyRow]:
 
 
 def _in_two_lines(label: str) -> str:
-    """Break a label at its middle comma."""
     parts = label.split(", ")
     half = len(parts) // 2
     return "\n".join((", ".join(parts[:half]), ", ".join(parts[half:]))).strip()

@@ -36,7 +36,6 @@ def make_figure(evaluation: Evaluation) -> Figure:
 
 
 def _draw_gates(axes: Axes, evaluation: Evaluation) -> None:
-    """Share of the flights that passed each gate, with the interval of the share."""
     episodes = evaluation.episodes
     gates = range(1, episodes[0].gates_total + 1)
     shares = [
@@ -68,7 +67,6 @@ def _draw_outcomes(axes: Axes, evaluation: Evaluation) -> None:
 
 
 def _draw_smoothness(axes: Axes, evaluation: Evaluation) -> None:
-    """Speed against smoothness, a dot for each flight."""
     for has_finished, colour, label in ((True, BLUE, "finished"), (False, RED, "not finished")):
         dots = [
             (one.mean_speed_mps, one.stick_rate_per_s)

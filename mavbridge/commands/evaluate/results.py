@@ -121,7 +121,6 @@ def print_evaluation(evaluation: Evaluation, console: Console) -> None:
 
 
 def _cells(estimate: Estimate | None, form: str) -> tuple[str, str, str]:
-    """Value, interval and count."""
     if estimate is None:
         return "-", "-", "0"
     interval = "-"

@@ -39,11 +39,7 @@ _T = TypeVar("_T")
 
 
 def evaluate_imagination(flights: Sequence[Path], config: EvaluateImaginationConfig) -> int:
-    """Evaluate a world model; the exit status is 130 if interrupted, with what there was by then.
-
-    Args:
-        flights: flight folders, or folders of them.
-        config: the settings.
+    """Evaluate a world model on flight folders, or folders of them; 130 if interrupted.
 
     Raises:
         MavbridgeError: every failure that a user can have caused.
@@ -65,8 +61,6 @@ def evaluate_imagination(flights: Sequence[Path], config: EvaluateImaginationCon
 
 
 class _Evaluation:
-    """One evaluation, part by part; ends early once a stop is requested."""
-
     def __init__(
         self,
         config: EvaluateImaginationConfig,

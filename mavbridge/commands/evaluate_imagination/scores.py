@@ -80,13 +80,10 @@ class WindowScorer:
         index: int,
         other_actions: FloatArray | None,
     ) -> None:
-        """Imagine and score one window.
+        """Imagine and score one window with the images of its steps ``wanted``.
 
-        Args:
-            window: with ``frames`` steps after the context.
-            images: of the steps ``wanted``.
-            index: of the window; with the seed, it determines the noise.
-            other_actions: [frames, 4] of another window; None where there is no other.
+        The seed and ``index`` determine the noise; ``other_actions`` [frames, 4] are those of
+        another window, if there is one.
 
         Raises:
             ImaginationError: the world model imagines NaN or infinity.
@@ -116,7 +113,6 @@ class WindowScorer:
         self.windows += 1
 
     def _note_rates(self, source: RateSource, now: FloatArray, states: FloatArray) -> None:
-        """Keep the mean body rates [3] of each scored step."""
         rates = np.concatenate([now[None], states])[:, RATE].astype(np.float64)
         self._rates[source] += [rates[step - 1 : step + 1].mean(axis=0) for step in self._steps]
 
@@ -166,12 +162,7 @@ class DriftScorer:
         """Steps of a window, counted from the first of its context, whose images are used."""
 
     def add(self, window: FlightWindow, images: dict[int, ImageArray], *, index: int) -> None:
-        """Imagine and score one chain.
-
-        Args:
-            window: with the sticks of all iterations.
-            images: of the steps ``wanted``.
-            index: of the chain; with the seed, it determines the noise.
+        """Imagine and score one chain with the images of its steps ``wanted``.
 
         Raises:
             ImaginationError: the world model imagines NaN or infinity.

@@ -50,10 +50,7 @@ class DatasetWriter:
     def add(self, part: Stretch, images: Iterable[ImageArray]) -> int:
         """Append an episode; returns the number of its rows.
 
-        Args:
-            part: its rows.
-            images: of the rows, in their order; the episode ends with them if they end early, and
-                is left out if there are fewer than ``MIN_ROWS``.
+        It ends with its images where they end early, and is left out with fewer than ``MIN_ROWS``.
 
         Raises:
             VideoError: images of another size.
@@ -99,7 +96,6 @@ class DatasetWriter:
             )
 
     def _columns(self, part: Stretch) -> dict[str, NDArray[np.generic]]:
-        """All columns, in the order of the features."""
         count = len(part)
         frame_index = np.arange(count, dtype=np.int64)
         return {

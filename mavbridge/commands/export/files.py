@@ -171,7 +171,6 @@ class TableFiles:
 
 
 def _path(folder: Path, pattern: str, number: int) -> Path:
-    """Path of a data or video file by its number; makes its folder."""
     chunk, file = divmod(number, FILES_A_CHUNK)
     path = folder / pattern.format(video_key=names.CAMERA_KEY, chunk_index=chunk, file_index=file)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from shutil import rmtree
 
@@ -82,28 +82,23 @@ def write_dataset(
     data_file_bytes: int = DATA_FILE_MB * MB,
     video_file_bytes: int = VIDEO_FILE_MB * MB,
 ) -> ExportSummary:
-    """Write flights into an empty folder.
-
-    Args:
-        episodes: the flights.
-        folder: there, and empty.
-        config: holds the task.
-        on_frame: called for every frame that was decoded.
-        data_file_bytes: largest size of a table.
-        video_file_bytes: largest size of a video.
+    """Write flights into an empty folder; ``on_frame`` is called for every decoded frame.
 
     Raises:
         UserError, VideoError, DatasetError: flights that cannot be in one dataset, or damaged.
     """
     parts = [stretches(episode) for episode in episodes]
-    every = [part for of_flight in parts for part in of_flight]
+    every = list(chain.from_iterable(parts))
     if not every:
         raise UserError(
             f"nothing to export: in {len(episodes)} flights no frame has a state and sticks at "
             "its exposure: are camera and telemetry of one clock?"
         )
     fps = common_fps(every)
-    height, width = _image_size(every)
+    first = next(chain.from_iterable(part.episode.decode() for part in every), None)
+    if first is None:
+        raise UserError("nothing to export: not one image of these flights can be decoded")
+    height, width = even_size(first)
     spec = DatasetSpec(
         fps=fps,
         height=height,
@@ -127,13 +122,6 @@ def write_dataset(
         frames_lost=sum(map(len, every)) - writer.rows,
         worst_shift_ns=max(worst_shift_ns(part, fps) for part in every),
     )
-
-
-def _image_size(parts: Sequence[Stretch]) -> tuple[int, int]:
-    for part in parts:
-        for image in part.episode.decode():
-            return even_size(image)
-    raise UserError("nothing to export: not one image of these flights can be decoded")
 
 
 def _write_flight(

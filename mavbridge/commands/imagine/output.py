@@ -162,7 +162,6 @@ class RolloutOutput(ABC):
         """Leave things as they are, after an error; may be called twice."""
 
     def _rows(self, segment: Segment) -> list[RolloutFrame]:
-        """The rows of a segment, without pixels."""
         plan = self._plan
         return [
             RolloutFrame(

@@ -110,13 +110,10 @@ class Sampler:
     def sample(
         self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
     ) -> ImaginedSteps:
-        """Decide (actions None) or simulate.
+        """Simulate the actions [frames, 4], or decide on some where they are None.
 
-        Args:
-            latents: [1, context_frames, C, h, w]
-            states: [1, context_frames, 13]
-            actions: [frames, 4] to simulate, or None.
-            seed: of the noise alone.
+        Latents are [1, context_frames, C, h, w], states [1, context_frames, 13]; ``seed`` is that
+        of the noise.
 
         Raises:
             ImaginationError: what came out is not finite.

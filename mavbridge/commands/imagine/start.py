@@ -35,12 +35,7 @@ class RolloutStart:
 
 
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
-    """Read the context that a world model continues from.
-
-    Args:
-        flight: from ``open_flight``.
-        config: of the world model.
-        start_s: time of the first frame, since the first one that has a state.
+    """Read the context, from ``start_s`` after the first frame that has a state.
 
     Raises:
         UserError: the flight is too short, has no states, or they are in another frame.
@@ -113,7 +108,6 @@ def _images(flight: RecordedFlight, frames: list[int], size: int) -> NDArray[np.
 
 
 def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
-    """Index of the stamp nearest to a time."""
     return int(np.abs(stamps_ns - at_ns).argmin())
 
 

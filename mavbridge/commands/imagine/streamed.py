@@ -96,8 +96,6 @@ class FrameDecoder:
 
 @dataclass(frozen=True, kw_only=True)
 class _DecodeJob:
-    """A segment on its way to the thread."""
-
     frames: list[RolloutFrame]
     decoded: dict[int, ImageArray]
     missing: Tensor | None
@@ -110,7 +108,6 @@ class StreamedOutput(RolloutOutput):
     """Frames and rows go to the disk as they come."""
 
     def _open(self) -> None:
-        """Create the files, start the writer process and the thread."""
         self._decoder = FrameDecoder(self._sampler.model)
         self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
         self._table_path = self.out.with_suffix(".arrows")
@@ -201,7 +198,6 @@ class StreamedOutput(RolloutOutput):
         self._table.abandon()
 
     def _serve(self, stop: Event) -> None:
-        """Decode and write jobs, on the thread."""
         with torch_threads(1):
             while not stop.is_set():
                 try:

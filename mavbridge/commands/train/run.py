@@ -31,9 +31,7 @@ from policy.world_model.config import WorldModelConfig
 def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     """Train a policy; 0 when the checkpoint is written, 130 if interrupted.
 
-    Args:
-        paths: flight folders, folders of them, or LeRobot datasets.
-        settings: what to train and how.
+    Paths are flight folders, folders of them, or LeRobot datasets.
 
     Raises:
         UserError: a flag that cannot be used.
@@ -100,7 +98,6 @@ class Display:
 
 
 def _finish(train: Callable[[Hooks], TrainResult]) -> int:
-    """Run to the end, or until Ctrl-C, which keeps the run."""
     clock = MonotonicClock()
     try:
         with stop_on_signals() as stop, Display() as display:
@@ -124,7 +121,6 @@ def _finish(train: Callable[[Hooks], TrainResult]) -> int:
 
 
 def _read_flights(paths: Sequence[Path], camera_key: str | None) -> list[FlightData]:
-    """Read LeRobot datasets (folders with meta/info.json) and flights of ours."""
     datasets = [path for path in paths if is_lerobot(path)]
     if camera_key is not None and not datasets:
         raise UserError("--camera-key is for LeRobot datasets; flights have one camera")
@@ -135,7 +131,6 @@ def _read_flights(paths: Sequence[Path], camera_key: str | None) -> list[FlightD
 
 
 def _check(settings: TrainSettings) -> Check | None:
-    """The closed-loop check, if there is to be one."""
     check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
     if settings.check_flights == 0:
         return None
