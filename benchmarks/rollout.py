@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from cyclopts import App
 from rich.console import Console
@@ -29,6 +30,9 @@ from mavbridge.commands.output import (
     table_console,
 )
 from mavbridge.core.processes import running, wait
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TIMEOUT_S = 3600.0
 STEPS, ITERATIONS = 4, 8
@@ -87,7 +91,7 @@ def main(
     if json is not None:
         write_json(pairs, json)
     if plot is not None:
-        draw(by_iterations, by_steps, plot)
+        draw(by_iterations, by_steps).savefig(plot)
     return 0 if all(pair.serial.sha256 == pair.streamed.sha256 for pair in pairs) else 1
 
 
@@ -149,8 +153,8 @@ def write_json(pairs: Sequence[Pair], path: Path) -> None:
     path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
 
 
-def draw(by_iterations: Sequence[Pair], by_steps: Sequence[Pair], path: Path) -> None:
-    """Write a PNG: speed-up by steps, memory by iterations."""
+def draw(by_iterations: Sequence[Pair], by_steps: Sequence[Pair]) -> "Figure":
+    """Plots, left to right: speed-up by steps, memory by iterations."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -174,7 +178,7 @@ def draw(by_iterations: Sequence[Pair], by_steps: Sequence[Pair], path: Path) ->
             axes.set_ylim(0, 1.2 * axes.get_ylim()[1])
             axes.legend(loc="best")
         figure.tight_layout(w_pad=3)
-        figure.savefig(path)
+    return figure
 
 
 if __name__ == "__main__":
