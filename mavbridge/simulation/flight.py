@@ -17,15 +17,16 @@ from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.delays import Delays
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
-from mavbridge.simulation.referee import Referee
-from mavbridge.simulation.result import EpisodeResult
-from mavbridge.simulation.vision import DelayedFeatureCache, DelayedSink, VisionStepper
+from mavbridge.simulation.referee import EpisodeResult, Referee
 from mavbridge.simulation.world import (
     NOMINAL_VEHICLE,
     BlankRenderer,
+    DelayedFeatureCache,
+    DelayedSink,
     Exposure,
     SimulatedCamera,
     VehicleStepper,
+    VisionStepper,
 )
 from policy.contract import Executable, FloatArray
 from sitl.camera.fpv import FpvRenderer

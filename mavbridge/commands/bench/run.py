@@ -77,9 +77,9 @@ def run_and_report(outputs: BenchOutputs, measure: Callable[[Effort], BenchResul
     if outputs.json is not None:
         outputs.json.write_text(to_json(result))
     if outputs.plot is not None:
-        from mavbridge.commands.bench.figure import draw
+        from mavbridge.commands.bench.figure import make_figure
 
-        draw(result, outputs.plot)
+        make_figure(result).savefig(outputs.plot)
     if budget is None:
         return 0
     exceeded = violations(ratios(result), budget)

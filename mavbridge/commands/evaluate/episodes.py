@@ -9,7 +9,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.flight.policies import load_for_episodes
 from mavbridge.simulation.delays import Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
-from mavbridge.simulation.result import EpisodeResult
+from mavbridge.simulation.referee import EpisodeResult
 from mavbridge.simulation.world import NOMINAL_VEHICLE, random_vehicle
 
 SCRIPTED = "scripted"

@@ -1,7 +1,5 @@
 """The picture of an evaluation: gates passed, outcomes, speed against smoothness."""
 
-from pathlib import Path
-
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,13 +9,8 @@ from mavbridge.commands.evaluate.statistics import rate
 from mavbridge.commands.output import BLUE, FIGURE_DPI, FIGURE_STYLE, MUTED, RED
 
 
-def draw(evaluation: Evaluation, path: Path) -> None:
-    """Write the PNG; the evaluation holds at least one episode."""
-    make_figure(evaluation).savefig(path)
-
-
 def make_figure(evaluation: Evaluation) -> Figure:
-    """Plots, left to right: share of flights by gate, outcomes, speed against smoothness."""
+    """Share of flights by gate, outcomes, and speed against smoothness, of one or more episodes."""
     with rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(12.0, 4.2), dpi=FIGURE_DPI, facecolor="white")
         axes = figure.subplots(1, 3)

@@ -12,7 +12,7 @@ from rich.text import Text
 from mavbridge.commands.evaluate.statistics import Estimate, mean, rate
 from mavbridge.commands.output import make_table
 from mavbridge.config.evaluate import EvaluateConfig
-from mavbridge.simulation.result import EpisodeResult, Outcome
+from mavbridge.simulation.referee import EpisodeResult, Outcome
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

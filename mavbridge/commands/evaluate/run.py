@@ -1,7 +1,6 @@
 """``mavbridge evaluate`` from its config to its exit status: fly, print, write, draw."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
@@ -23,7 +22,6 @@ def evaluate(config: EvaluateConfig) -> int:
         MavbridgeError: an episode cannot be flown, or the results cannot be written.
     """
     require_outputs(config.json, config.plot)
-    draw = None if config.plot is None else _drawing(config.plot)
     console = Console(stderr=True, emoji=False)
     if config.realtime is not None:
         names = ("--realtime", "wall") if config.realtime else ("--lockstep", "simulated")
@@ -44,8 +42,10 @@ def evaluate(config: EvaluateConfig) -> int:
     )
     if episodes:
         print_evaluation(evaluation, Console())
-        if draw is not None:
-            draw(evaluation)
+        if config.plot is not None:
+            from mavbridge.commands.evaluate.figure import make_figure
+
+            make_figure(evaluation).savefig(config.plot)
     if config.json is not None and (episodes or failure is None):
         config.json.write_text(to_json(evaluation))
     if failure is not None or was_stopped:
@@ -73,10 +73,3 @@ def _fly(
             flown[index] = episode
             finished = sum(one.result.has_finished for one in flown.values())
             progress.update(bar, advance=1, status=f"{finished} of {len(flown)} finished")
-
-
-def _drawing(path: Path) -> Callable[[Evaluation], None]:
-    """The function that draws to ``path``; imported before the run."""
-    from mavbridge.commands.evaluate.figure import draw
-
-    return lambda evaluation: draw(evaluation, path)

@@ -21,8 +21,7 @@ from mavbridge.core.processes import END_TIMEOUT_S, end, free_port, running, wai
 from mavbridge.flight.app import fly_executable
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.flight import MODE
-from mavbridge.simulation.referee import EpisodeInterruptedError
-from mavbridge.simulation.result import EpisodeResult, Outcome, StickMeter
+from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult, Outcome, StickMeter
 
 STARTUP_S = 90.0
 """Limit on a flight's time beyond its own: imports, compiling an engine, arming."""
