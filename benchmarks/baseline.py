@@ -95,7 +95,14 @@ class Baseline:
         self._sample(
             torch.zeros(1, contract.feature_dim), np.zeros((1, contract.state_dim), np.float32)
         )
-        self._connect()
+        self._connection.wait_heartbeat()
+        for message in STREAMS:
+            self._connection.mav.command_long_send(
+                self._connection.target_system,
+                self._connection.target_component,
+                mav.MAV_CMD_SET_MESSAGE_INTERVAL,
+                *(0, message, 1e6 / self._job.rates.action_rate, 0, 0, 0, 0, 0),
+            )
         vision = threading.Thread(target=self._vision_loop, name="baseline-vision")
         vision.start()
         try:
@@ -105,17 +112,6 @@ class Baseline:
             vision.join()
             self._camera.close()
             self._connection.close()
-
-    def _connect(self) -> None:
-        self._connection.wait_heartbeat()
-        interval_us = 1e6 / self._job.rates.action_rate
-        for message in STREAMS:
-            self._connection.mav.command_long_send(
-                self._connection.target_system,
-                self._connection.target_component,
-                mav.MAV_CMD_SET_MESSAGE_INTERVAL,
-                *(0, message, interval_us, 0, 0, 0, 0, 0),
-            )
 
     @torch.no_grad()
     def _encode_image(self, rgb: np.ndarray) -> torch.Tensor:

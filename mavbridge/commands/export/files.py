@@ -86,7 +86,16 @@ class VideoFiles:
         is_large = expected >= self._spec.video_file_bytes
         is_long = self._frames + frames > MAX_FILE_S * self._spec.fps
         if self._container is None or ((is_large or is_long) and self._frames > 0):
-            self._next_file()
+            self.close()
+            self._file += 1
+            self._frames = self._bytes = 0
+            path = _path(self._folder, names.VIDEO, self._file)
+            self._container = av.open(str(path), "w", options={"movflags": "faststart"})
+            stream = self._container.add_stream("libx264", self._spec.fps)
+            stream.height, stream.width = self._spec.height, self._spec.width
+            stream.pix_fmt, stream.options = "yuv420p", dict(_OPTIONS)
+            stream.codec_context.time_base = Fraction(1, self._spec.fps)
+            self._stream = stream
         self._first = self._frames
 
     def append(self, rgb: ImageArray) -> None:
@@ -113,18 +122,6 @@ class VideoFiles:
             finally:
                 self._container.close()
                 self._container = self._stream = None
-
-    def _next_file(self) -> None:
-        self.close()
-        self._file += 1
-        self._frames = self._bytes = 0
-        path = _path(self._folder, names.VIDEO, self._file)
-        self._container = av.open(str(path), "w", options={"movflags": "faststart"})
-        stream = self._container.add_stream("libx264", self._spec.fps)
-        stream.height, stream.width = self._spec.height, self._spec.width
-        stream.pix_fmt, stream.options = "yuv420p", dict(_OPTIONS)
-        stream.codec_context.time_base = Fraction(1, self._spec.fps)
-        self._stream = stream
 
     def _mux(self, frame: av.VideoFrame | None) -> None:
         if self._container is None or self._stream is None:

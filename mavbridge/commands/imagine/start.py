@@ -134,24 +134,17 @@ class RealFrames:
             VideoError: the video is damaged.
         """
         while self._newest_step < step:
-            rgb = self._decode(self._newest_step + 1)
-            if rgb is None:
+            dt_s, size = self._config.frame_dt_s, self._config.image_size
+            at_ns = self._newest_ns + round((self._newest_step + 1) * dt_s * NS_PER_S)
+            if at_ns > self._captured_ns[-1]:
                 return None
+            rgb = None
+            while self._decoded <= _nearest(self._captured_ns, at_ns):
+                rgb = next(self._images)
+                self._decoded += 1
             self._newest_step += 1
-            self._window.append(rgb)
+            # Two steps share a frame only where the camera is slower than the world model.
+            self._window.append(self._window[-1] if rgb is None else resize(rgb, size, size))
         if self._newest_step - step >= len(self._window):
             raise ValueError(f"step {step} has left the window")
         return self._window[step - self._newest_step - 1]
-
-    def _decode(self, step: int) -> ImageArray | None:
-        at_ns = self._newest_ns + round(step * self._config.frame_dt_s * NS_PER_S)
-        if at_ns > self._captured_ns[-1]:
-            return None
-        index = _nearest(self._captured_ns, at_ns)
-        rgb = None
-        while self._decoded <= index:
-            rgb = next(self._images)
-            self._decoded += 1
-        # Two steps share a frame only where the camera is slower than the world model.
-        size = self._config.image_size
-        return self._window[-1] if rgb is None else resize(rgb, size, size)

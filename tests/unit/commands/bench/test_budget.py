@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from helpers.bench_results import RESULT, make_flight
-from mavbridge.commands.bench.budget import ratios, read_budget, violations
+from mavbridge.commands.bench.run import ratios, read_budget, violations
 from mavbridge.core.errors import UserError
 
 
