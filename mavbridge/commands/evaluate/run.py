@@ -6,9 +6,13 @@ from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode, fly_simulated
+from mavbridge.commands.evaluate.episodes import (
+    EpisodeSpec,
+    FlownEpisode,
+    fly_on_wall_clock,
+    fly_simulated,
+)
 from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
-from mavbridge.commands.evaluate.wall_clock import fly_on_wall_clock
 from mavbridge.commands.output import progress_bar, require_outputs
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.errors import MavbridgeError

@@ -1,7 +1,6 @@
 """``mavbridge imagine``: from the settings to the files of a rollout."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.recording.flight_folder import open_flight
 from policy.checkpoints.world_model_file import load_world_model
 from policy.world_model.model import WorldModel
 
@@ -65,7 +64,14 @@ def imagine(config: ImagineConfig) -> int:
     # One core is left for the decoder: torch's threads spin at the end of every operation until the
     # last is done. Serially, too: how a sum is split up decides how it is rounded.
     free = torch.get_num_threads() - 1
-    with torch_threads(free), _viewer(config, flight, sampler, start) as on_frame:
+    with torch_threads(free), ExitStack() as stack:
+        on_frame: OnFrame = ignore_frame
+        if config.rerun != "off":
+            from mavbridge.observe.rerun_rollout import RolloutView
+
+            real = RealFrames(flight, model.config, start.newest_ns)
+            view = stack.enter_context(closing(RolloutView(config.rerun, real=real.at)))
+            on_frame = view.show
         kind = SerialOutput if config.serial else StreamedOutput
         output = kind(
             config.out, sampler, plan, decode_video=config.decode_video, on_frame=on_frame
@@ -159,24 +165,6 @@ def _make_decider(
     for note in loaded.notes:
         console.print(Text(note, style="yellow" if note.startswith("warning") else "dim"))
     return PolicyDecider(loaded.executable, sampler)
-
-
-@contextmanager
-def _viewer(
-    config: ImagineConfig, flight: RecordedFlight, sampler: Sampler, start: RolloutStart
-) -> Iterator[OnFrame]:
-    """Open the Rerun view, if one was requested; yields its callback."""
-    if config.rerun == "off":
-        yield ignore_frame
-        return
-    from mavbridge.observe.rerun_rollout import RolloutView
-
-    real = RealFrames(flight, sampler.config, start.newest_ns)
-    view = RolloutView(config.rerun, real=real.at)
-    try:
-        yield view.show
-    finally:
-        view.close()
 
 
 def _print_summary(config: ImagineConfig, sampler: Sampler, output: RolloutOutput) -> None:
