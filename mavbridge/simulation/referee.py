@@ -31,7 +31,6 @@ class EpisodeResult:
     flown_s: float
     """Until the end of the episode: one second after the last gate, the crash, or the limit."""
     distance_m: float
-    """Along the path, to the end of the episode."""
     stick_rate_per_s: float | None
     """Mean over the four sticks of |change| per second, as sent; full deflection is 1. None = the
     policy never had the sticks for two actions in a row."""

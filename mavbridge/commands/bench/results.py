@@ -28,7 +28,6 @@ class Machine:
 
     cpu: str
     cores: int
-    """Usable by this process."""
     python: str
     torch: str
 
@@ -66,7 +65,6 @@ class Flight:
     predict_ms: Percentiles | None
     encode_ms: Percentiles | None
     feature_age_ms: Percentiles | None
-    """From exposure to send."""
     state_to_wire_ms: Percentiles | None
     """From an attitude's arrival at this computer to the send of the first sticks made from it."""
     cpu_cores: float

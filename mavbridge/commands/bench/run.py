@@ -114,16 +114,20 @@ def ratios(result: BenchResult) -> dict[str, float]:
     asked one; and period, processor time an action and latency over the baseline's with the same
     policy. Link: what a client does once it is awake, over the bare loop's round trip.
     """
-    return dict((*_engine_ratios(result), *_flight_ratios(result), *_link_ratios(result)))
-
-
-def _engine_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
+    found = dict(_flight_ratios(result))
     times = {(one.policy, one.work, one.engine): one.p50_ms for one in result.engines}
     for (policy, work, engine), time_ms in times.items():
         for reference in (EAGER, ROOFLINE):
             least_ms = times.get((policy, work, reference))
             if least_ms and engine != reference and not engine.startswith("roofline"):
-                yield f"{policy}, {work}: {engine} / {reference}", time_ms / least_ms
+                found[f"{policy}, {work}: {engine} / {reference}"] = time_ms / least_ms
+    bare = next((link for link in result.links if link.client == BARE_CLIENT), None)
+    for link in result.links:
+        work_ms = link.timing.work_ms
+        if bare is not None and bare.round_trip_ms.p50 > 0 and work_ms is not None:
+            ratio = work_ms.p50 / bare.round_trip_ms.p50
+            found[f"link: {link.client}: work / {BARE_CLIENT}"] = ratio
+    return found
 
 
 def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
@@ -145,15 +149,6 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
         ours, theirs = flight.state_to_wire_ms, baseline.state_to_wire_ms
         if ours is not None and theirs is not None and theirs.p50 > 0:
             yield f"{name}: state to wire / {BASELINE}", ours.p50 / theirs.p50
-
-
-def _link_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
-    bare = next((link for link in result.links if link.client == BARE_CLIENT), None)
-    if bare is None or bare.round_trip_ms.p50 <= 0:
-        return
-    for link in result.links:
-        if (work_ms := link.timing.work_ms) is not None:
-            yield f"link: {link.client}: work / {BARE_CLIENT}", work_ms.p50 / bare.round_trip_ms.p50
 
 
 def read_budget(path: Path) -> dict[str, float]:

@@ -65,7 +65,6 @@ class Given:
     frame_dt_s: float
     exe_steps: int
     flights: int
-    """Flights that are long enough for a window."""
     flights_too_short: int
     demonstrations_failed: int
     asked_windows: int

@@ -57,7 +57,6 @@ class DatasetSpec:
     width: int
     state_frame: StateFrame
     task: str
-    """In words, for policies that read them."""
     data_file_bytes: int = DATA_FILE_MB * MB
     video_file_bytes: int = VIDEO_FILE_MB * MB
     """Size of a file; one episode alone may be larger."""

@@ -32,7 +32,6 @@ class ExportSummary:
     rows: int
     fps: int
     frames_lost: int
-    """Frames missing at the ends of videos that break off."""
     worst_shift_ns: int
     """Largest distance of an exposure from its place on the even grid."""
 

@@ -39,7 +39,19 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     """
     _require_device(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
-    check = _check(settings)
+    check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
+    check: Check | None = None
+    if settings.check_flights:
+        try:
+            from mavbridge.commands.train.check_flights import share_of_gates
+        except ImportError as error:
+            raise UserError(
+                f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
+            ) from error
+
+        def check(checkpoint: Path) -> float:
+            return share_of_gates(checkpoint, settings.policy, settings.check_flights)
+
     flights = _read_flights(paths, settings.camera_key)
     network = fit_to_flights(network, flights, settings)
     return _finish(lambda hooks: train_policy(flights, network, settings, hooks, check))
@@ -128,19 +140,6 @@ def _read_flights(paths: Sequence[Path], camera_key: str | None) -> list[FlightD
     folders = find_flights(own) if own else []
     flights = [read_flight(folder) for folder in folders if is_exemplary(folder)]
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]
-
-
-def _check(settings: TrainSettings) -> Check | None:
-    check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
-    if settings.check_flights == 0:
-        return None
-    try:
-        from mavbridge.commands.train.check_flights import share_of_gates
-    except ImportError as error:
-        raise UserError(
-            f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
-        ) from error
-    return lambda checkpoint: share_of_gates(checkpoint, settings.policy, settings.check_flights)
 
 
 def _require_device(device: str) -> None:
