@@ -221,7 +221,7 @@ class Baseline:
 
     def _sleep(self, period_s: float, started_ns: int) -> None:
         elapsed_s = (self._clock.now_ns() - started_ns) / NS_PER_S
-        time.sleep(max(0.0, period_s - elapsed_s))  # noqa: TID251 - the habit under test
+        time.sleep(max(0.0, period_s - elapsed_s))  # noqa: TID251 - common practice, under test
 
     def _flight(self, cpu_ns: int, stolen_ms: float | None) -> Flight:
         action_hz = self._job.rates.action_rate

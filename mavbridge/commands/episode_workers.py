@@ -26,7 +26,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 ShouldStop: TypeAlias = Callable[[], bool]
 FlyJob: TypeAlias = Callable[[Job, ShouldStop], Result]
-"""Importable in another process; raises ``EpisodeInterruptedError`` when told to stop."""
+"""Importable in another process; raises ``EpisodeInterruptedError`` when ``ShouldStop`` says so."""
 
 MAX_RETRIES = 3
 """Lost workers of one episode before it is held to be the cause."""
@@ -43,7 +43,7 @@ def fly_jobs(
     config: WorkersConfig,
     should_stop: ShouldStop,
 ) -> Iterator[tuple[int, Result]]:
-    """Fly every job, and yield its index and result when it is ready; ends early when told to stop.
+    """Fly every job, and yield its index and result when ready; ends early on ``should_stop``.
 
     Raises:
         UserError: Ray is missing, or its cluster cannot be reached.

@@ -30,7 +30,7 @@ class FrameQuality:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickFollowing:
-    """Imagined body rates against those of the vehicle, which obeyed the recorded sticks.
+    """Imagined body rates against those of the vehicle, which flew the recorded sticks.
 
     Slope and rank correlation of 1 are perfect. With the sticks of another window both are near 0
     in a model that follows its sticks, and as high as with its own in one that ignores them.

@@ -41,11 +41,7 @@ _T = TypeVar("_T")
 
 
 def evaluate_imagination(flights: Sequence[Path], config: EvaluateImaginationConfig) -> int:
-    """Evaluate a world model on flight folders, or folders of them; 130 if interrupted.
-
-    Raises:
-        MavbridgeError: every failure that a user can have caused.
-    """
+    """Evaluate a world model on flight folders, or folders of them; 130 if interrupted."""
     require_writable(config.json, "--json")
     cv2.setNumThreads(1)  # images this small are not worth a pool
     model = load_model(config.world_model, ddim_steps=config.ddim_steps, device=config.device)
@@ -122,7 +118,7 @@ class _Evaluation:
             episodes, self.model, steps=self.model.frames, count=self.config.windows
         )
         count = len(windows)
-        seen = with_images(windows, scorer.wanted, self.model.image_size)
+        seen = with_images(windows, scorer.image_steps, self.model.image_size)
         imagining = self._until_stopped(seen, "imagining windows", count)
         for index, (window, images) in enumerate(imagining):
             # Half of all windows away: of another flight, or of another time.
@@ -143,7 +139,7 @@ class _Evaluation:
             exe_steps=self.exe_steps,
             iterations=iterations,
         )
-        seen = with_images(windows, scorer.wanted, self.model.image_size)
+        seen = with_images(windows, scorer.image_steps, self.model.image_size)
         chains = self._until_stopped(seen, "imagining chains", len(windows))
         for index, (window, images) in enumerate(chains):
             scorer.add(window, images, index=index)

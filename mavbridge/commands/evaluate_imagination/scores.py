@@ -65,7 +65,7 @@ class WindowScorer:
         self._seed = seed
         self._now = sampler.config.context_frames - 1
         self._steps = [step for step in STEPS if step <= sampler.config.frames]
-        self.wanted = [*range(self._now + 1), *(self._now + step for step in self._steps)]
+        self.image_steps = [*range(self._now + 1), *(self._now + step for step in self._steps)]
         """Steps of a window, counted from the first of its context, whose images are used."""
         self.windows = 0
         self._psnr_db = {method: np.zeros(len(self._steps)) for method in METHODS}
@@ -80,7 +80,7 @@ class WindowScorer:
         index: int,
         other_actions: FloatArray | None,
     ) -> None:
-        """Imagine and score one window with the images of its steps ``wanted``.
+        """Imagine and score one window with the images of ``image_steps``.
 
         The seed and ``index`` determine the noise; ``other_actions`` [frames, 4] are those of
         another window, if there is one.
@@ -158,11 +158,11 @@ class DriftScorer:
         self._psnr_db = np.zeros((iterations, len(METHODS)))
         now = sampler.config.context_frames - 1
         self._ends = [now + exe_steps * (n + 1) for n in range(iterations)]
-        self.wanted = [*range(now + 1), *self._ends]
+        self.image_steps = [*range(now + 1), *self._ends]
         """Steps of a window, counted from the first of its context, whose images are used."""
 
     def add(self, window: FlightWindow, images: dict[int, ImageArray], *, index: int) -> None:
-        """Imagine and score one chain with the images of its steps ``wanted``.
+        """Imagine and score one chain with the images of ``image_steps``.
 
         Raises:
             ImaginationError: the world model imagines NaN or infinity.

@@ -37,11 +37,7 @@ class ExportSummary:
 
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
-    """Export flights.
-
-    Raises:
-        MavbridgeError: every failure that a user can have caused.
-    """
+    """Export flights."""
     console = Console(stderr=True, highlight=False, emoji=False)
     folders = find_flights(flights)
     exemplary = [folder for folder in folders if is_exemplary(folder)]

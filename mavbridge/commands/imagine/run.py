@@ -36,11 +36,7 @@ SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 
 
 def imagine(config: ImagineConfig) -> int:
-    """Imagine a flight; the exit status is 130 if interrupted, with what there was by then.
-
-    Raises:
-        MavbridgeError: every failure that a user can have caused.
-    """
+    """Imagine a flight; the exit status is 130 if interrupted, with what there was by then."""
     console = Console(stderr=True, highlight=False, emoji=False)
     clock = MonotonicClock()
     plan = RolloutPlan(
