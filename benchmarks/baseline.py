@@ -95,7 +95,14 @@ class Baseline:
         self._sample(
             torch.zeros(1, contract.feature_dim), np.zeros((1, contract.state_dim), np.float32)
         )
-        self._connect()
+        self._connection.wait_heartbeat()
+        for message in STREAMS:
+            self._connection.mav.command_long_send(
+                self._connection.target_system,
+                self._connection.target_component,
+                mav.MAV_CMD_SET_MESSAGE_INTERVAL,
+                *(0, message, 1e6 / self._job.rates.action_rate, 0, 0, 0, 0, 0),
+            )
         vision = threading.Thread(target=self._vision_loop, name="baseline-vision")
         vision.start()
         try:
@@ -106,17 +113,6 @@ class Baseline:
             self._camera.close()
             self._connection.close()
 
-    def _connect(self) -> None:
-        self._connection.wait_heartbeat()
-        interval_us = 1e6 / self._job.rates.action_rate
-        for message in STREAMS:
-            self._connection.mav.command_long_send(
-                self._connection.target_system,
-                self._connection.target_component,
-                mav.MAV_CMD_SET_MESSAGE_INTERVAL,
-                *(0, message, interval_us, 0, 0, 0, 0, 0),
-            )
-
     @torch.no_grad()
     def _encode_image(self, rgb: np.ndarray) -> torch.Tensor:
         image = torch.from_numpy(image_to_input(rgb, self._net.contract))
@@ -124,7 +120,6 @@ class Baseline:
 
     @torch.no_grad()
     def _sample(self, feature: torch.Tensor, state: np.ndarray) -> list[float]:
-        """The first action of a new chunk."""
         history, steps = torch.from_numpy(self._history), self._job.policy.num_diffusion_steps
         chunk = self._net.predict_fast(feature, torch.from_numpy(state), history, steps)
         action: list[float] = chunk[0, 0].tolist()
@@ -226,7 +221,7 @@ class Baseline:
 
     def _sleep(self, period_s: float, started_ns: int) -> None:
         elapsed_s = (self._clock.now_ns() - started_ns) / NS_PER_S
-        time.sleep(max(0.0, period_s - elapsed_s))  # noqa: TID251 - the habit under test
+        time.sleep(max(0.0, period_s - elapsed_s))  # noqa: TID251 - common practice, under test
 
     def _flight(self, cpu_ns: int, stolen_ms: float | None) -> Flight:
         action_hz = self._job.rates.action_rate

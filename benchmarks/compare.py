@@ -15,12 +15,11 @@ from itertools import takewhile
 from cyclopts import App
 
 from benchmarks.roofline import time_rooflines
-from mavbridge.commands.bench.budget import BARE_CLIENT
 from mavbridge.commands.bench.engines import EAGER, time_engines
 from mavbridge.commands.bench.flight import FLIGHT_PROCESS, fly
 from mavbridge.commands.bench.link import OUR_CLIENTS, LinkClient, time_link
 from mavbridge.commands.bench.results import BenchResult, this_machine
-from mavbridge.commands.bench.run import QUICK, Effort, run_and_report
+from mavbridge.commands.bench.run import BARE_CLIENT, QUICK, Effort, run_and_report
 from mavbridge.commands.output import print_status
 from mavbridge.config.bench import BenchOutputs
 from mavbridge.config.policy import PolicyConfig
@@ -29,7 +28,6 @@ from mavbridge.core.processes import IMPORT_ROOT
 
 BASELINE_PROCESS = "benchmarks.baseline"
 PEERS_PYTHON = IMPORT_ROOT / ".venv-peers" / "bin" / "python"
-"""``make bench`` installs it."""
 SHIPPED = PolicyConfig(dual_rate=True, head_steps=2, engine="openvino")
 LARGE = replace(SHIPPED, policy="toge:small", allow_untrained=True)
 FLIGHTS = (

@@ -31,7 +31,6 @@ STEPS = (1, 4, 8, 16)
 DPI = 64
 """A frame is two inches wide."""
 MOST_WINDOWS = 1_000_000
-"""All of a flight."""
 app = App(help=__doc__)
 
 

@@ -9,14 +9,13 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING
 
 from cyclopts import App
 from rich.console import Console
 
 from benchmarks.rollout_process import COMMAND, RolloutJob, Trial
 from mavbridge.commands.bench.results import from_json, this_machine
-from mavbridge.commands.bench.tables import make_table, number
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.output import (
     BLUE,
@@ -24,11 +23,16 @@ from mavbridge.commands.output import (
     FIGURE_STYLE,
     GREY,
     RED,
+    make_table,
+    number,
     print_status,
     require_outputs,
     table_console,
 )
 from mavbridge.core.processes import running, wait
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TIMEOUT_S = 3600.0
 STEPS, ITERATIONS = 4, 8
@@ -78,21 +82,16 @@ def main(
     require_outputs(json, plot)
     load_model(world_model, ddim_steps=STEPS, device=device)  # refused before the first process
     iterations, steps, repeats = QUICK if quick else FULL
-    job = RolloutJob(
-        way="serial",
-        iterations=ITERATIONS,
-        ddim_steps=STEPS,
-        device=device,
-        world_model=world_model,
-    )
+    default = RolloutJob(way="serial", iterations=ITERATIONS, ddim_steps=STEPS)
+    job = replace(default, device=device, world_model=world_model)
     by_iterations = [measure(replace(job, iterations=count), repeats) for count in iterations]
     by_steps = [measure(replace(job, ddim_steps=count), repeats) for count in steps]
-    print_pairs([*by_iterations, *by_steps], table_console())
-    if json is not None:
-        write_json([*by_iterations, *by_steps], json)
-    if plot is not None:
-        draw(by_iterations, by_steps, plot)
     pairs = [*by_iterations, *by_steps]
+    print_pairs(pairs, table_console())
+    if json is not None:
+        write_json(pairs, json)
+    if plot is not None:
+        draw(by_iterations, by_steps).savefig(plot)
     return 0 if all(pair.serial.sha256 == pair.streamed.sha256 for pair in pairs) else 1
 
 
@@ -154,47 +153,32 @@ def write_json(pairs: Sequence[Pair], path: Path) -> None:
     path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
 
 
-def draw(by_iterations: Sequence[Pair], by_steps: Sequence[Pair], path: Path) -> None:
-    """Write a PNG: speed-up by steps, memory by iterations."""
+def draw(by_iterations: Sequence[Pair], by_steps: Sequence[Pair]) -> "Figure":
+    """Plots, left to right: speed-up by steps, memory by iterations."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(FIGURE_STYLE | {"axes.grid.axis": "y"}):
         figure = Figure(figsize=(11.0, 4.4), dpi=FIGURE_DPI, facecolor="white")
         left, right = figure.subplots(1, 2)
-        draw_speed_up(left, by_steps)
-        draw_memory(right, by_iterations)
-        for axes, values in (
-            (left, [pair.serial.ddim_steps for pair in by_steps]),
-            (right, [pair.serial.iterations for pair in by_iterations]),
-        ):
+        steps = [pair.serial.ddim_steps for pair in by_steps]
+        left.plot(steps, [one.speed_up for one in by_steps], "o-", color=BLUE, label="measured")
+        left.plot(steps, [one.bound for one in by_steps], color=RED, label="Amdahl's bound")
+        left.set(xlabel="DDIM steps of a sample", title="Speed-up over the serial path")
+        iterations = [pair.serial.iterations for pair in by_iterations]
+        for way, color in (("serial", GREY), ("streamed", BLUE)):
+            memory_mb = [getattr(pair, way).peak_rss_mb for pair in by_iterations]
+            right.plot(iterations, memory_mb, "o-", color=color, label=way)
+        right.set(xlabel="iterations", ylabel="peak RSS, MB")
+        right.set_title("Memory of the process with the networks")
+        for axes, values in ((left, steps), (right, iterations)):
             axes.set_xscale("log", base=2)
             axes.set_xticks(values, [str(value) for value in values])
             axes.minorticks_off()
             axes.set_ylim(0, 1.2 * axes.get_ylim()[1])
             axes.legend(loc="best")
         figure.tight_layout(w_pad=3)
-        figure.savefig(path)
-
-
-def draw_speed_up(axes: Any, pairs: Sequence[Pair]) -> None:
-    """Measured speed-up and its bound by steps."""
-    steps = [pair.serial.ddim_steps for pair in pairs]
-    axes.plot(steps, [one.speed_up for one in pairs], "o-", color=BLUE, label="measured")
-    axes.plot(steps, [one.bound for one in pairs], color=RED, label="Amdahl's bound")
-    axes.set_xlabel("DDIM steps of a sample")
-    axes.set_title("Speed-up over the serial path")
-
-
-def draw_memory(axes: Any, pairs: Sequence[Pair]) -> None:
-    """Peak memory by iterations, a line for each way."""
-    iterations = [pair.serial.iterations for pair in pairs]
-    for way, color in (("serial", GREY), ("streamed", BLUE)):
-        memory_mb = [getattr(pair, way).peak_rss_mb for pair in pairs]
-        axes.plot(iterations, memory_mb, "o-", color=color, label=way)
-    axes.set_xlabel("iterations")
-    axes.set_ylabel("peak RSS, MB")
-    axes.set_title("Memory of the process with the networks")
+    return figure
 
 
 if __name__ == "__main__":

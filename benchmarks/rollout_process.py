@@ -4,7 +4,6 @@ It is started with ``python -c``, because a main module is imported again by the
 which is spawned and would take torch into its memory and its start.
 """
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,17 +17,17 @@ from rich.console import Console
 from mavbridge.commands.bench.results import to_json
 from mavbridge.commands.imagine.deciders import WorldModelDecider
 from mavbridge.commands.imagine.loop import RolloutPlan
-from mavbridge.commands.imagine.run import load_model, make_output, run_rollout
-from mavbridge.commands.imagine.sampling import Sampler, cores_left_free
+from mavbridge.commands.imagine.output import SerialOutput
+from mavbridge.commands.imagine.run import load_model, run_rollout
+from mavbridge.commands.imagine.sampling import Sampler, torch_threads
 from mavbridge.commands.imagine.start import RolloutStart
+from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import NEUTRAL, ImageArray, RolloutFrame
 from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM
 from policy.world_model.config import WorldModelConfig
 
 COMMAND = "from benchmarks.rollout_process import app; app()"
-FRAMES, EXE_STEPS = 16, 1
-"""Frames and executed steps of an iteration: the defaults of ``mavbridge imagine``."""
 app = App(help=__doc__)
 
 
@@ -44,7 +43,6 @@ class RolloutJob:
     ddim_steps: int
     device: str = "cpu"
     world_model: Path | None = None
-    """Weights; by default those that come with mavbridge."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +56,10 @@ class Trial:
     torch_threads: int
     """The serial form takes every core, the streamed one leaves one for the decoder."""
     frames: int
-    """In the video."""
     frames_decoded: int
     wall_s: float
     """From the first decision to closed files."""
     start_s: float
-    """Before that: files and the writer process."""
     sample_s: float
     """The loop's thread inside the world model."""
     decode_s: float
@@ -73,31 +69,25 @@ class Trial:
     peak_rss_mb: float | None
     """Process with the networks."""
     writer_rss_mb: float | None
-    """Writer process, if there is one."""
     sha256: str
-    """All frames."""
 
 
 @app.default
 def main(job: RolloutJob, *, out: Path) -> None:
     """Imagine once and write the ``Trial`` as JSON."""
-    with nullcontext() if job.way == "serial" else cores_left_free(), TemporaryDirectory() as name:
+    threads = torch.get_num_threads() - (job.way == "streamed")
+    with torch_threads(threads), TemporaryDirectory() as name:
         out.write_text(to_json(measure(job, Path(name) / "rollout.mp4")))
 
 
 def measure(job: RolloutJob, video: Path) -> Trial:
-    """Imagine once."""
+    """Imagine once, with frames and executed steps as ``mavbridge imagine`` has them by default."""
     clock = MonotonicClock()
     plan = RolloutPlan(
-        iterations=job.iterations,
-        frames=FRAMES,
-        exe_steps=EXE_STEPS,
-        ddim_steps=job.ddim_steps,
-        seed=0,
+        iterations=job.iterations, frames=16, exe_steps=1, ddim_steps=job.ddim_steps, seed=0
     )
     sampler = make_sampler(job)
-    start = still_start(sampler.config)
-    decider = WorldModelDecider(sampler, from_pixels=False)
+    start, decider = still_start(sampler.config), WorldModelDecider(sampler, from_pixels=False)
     writer_rss_mb: float | None = None
 
     def on_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
@@ -106,17 +96,11 @@ def measure(job: RolloutJob, video: Path) -> Trial:
             writer_rss_mb = peak_rss_mb(output.writer_pid)  # the writer still runs
 
     before_ns = clock.now_ns()
-    output = make_output(
-        video,
-        sampler,
-        plan,
-        serial=job.way == "serial",
-        decode_video=True,
-        clock=clock,
-        on_frame=on_frame,
+    output = (SerialOutput if job.way == "serial" else StreamedOutput)(
+        video, sampler, plan, on_frame=on_frame
     )
     start_ns = clock.now_ns()
-    run_rollout(sampler, decider, start, plan, output, video, Console(stderr=True))
+    run_rollout(sampler, decider, start, plan, output, Console(stderr=True))
     end_ns = clock.now_ns()
     return Trial(
         way=job.way,
@@ -143,7 +127,9 @@ def make_sampler(job: RolloutJob) -> Sampler:
     once = Sampler(model, ddim_steps=1, decode_all=True, clock=MonotonicClock())
     start = still_start(model.config)
     past = once.encode(start.images)[None]
-    once.sample(past, start.states[None], np.zeros((FRAMES, ACTION_DIM), np.float32), seed=0)
+    once.sample(
+        past, start.states[None], np.zeros((model.config.frames, ACTION_DIM), np.float32), seed=0
+    )
     decode_all = job.way == "serial"
     clock = MonotonicClock()
     return Sampler(model, ddim_steps=job.ddim_steps, decode_all=decode_all, clock=clock)

@@ -19,12 +19,12 @@ from typing import Any, NamedTuple
 
 from cyclopts import App
 
-from mavbridge.commands.bench.tables import make_table
 from mavbridge.commands.output import (
     BLUE,
     FIGURE_DPI,
     FIGURE_STYLE,
     MUTED,
+    make_table,
     require_outputs,
     table_console,
 )
@@ -42,7 +42,6 @@ class Setting(NamedTuple):
     group: str
     name: str
     flags: str
-    """For ``mavbridge evaluate``."""
 
 
 SETTINGS = (

@@ -14,7 +14,6 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.synchronize import Event
 from typing import Any, Generic, TypeAlias, TypeVar
@@ -27,7 +26,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 ShouldStop: TypeAlias = Callable[[], bool]
 FlyJob: TypeAlias = Callable[[Job, ShouldStop], Result]
-"""Importable in another process; raises ``EpisodeInterruptedError`` when told to stop."""
+"""Importable in another process; raises ``EpisodeInterruptedError`` when ``ShouldStop`` says so."""
 
 MAX_RETRIES = 3
 """Lost workers of one episode before it is held to be the cause."""
@@ -36,7 +35,6 @@ END_TIMEOUT_S = 10.0
 """Limit for a process to end by itself, and then on SIGTERM, before it is killed."""
 _SPAWN = multiprocessing.get_context("spawn")
 _POLL_S = 0.1
-"""Interval at which the stop flag is checked."""
 
 
 def fly_jobs(
@@ -45,7 +43,7 @@ def fly_jobs(
     config: WorkersConfig,
     should_stop: ShouldStop,
 ) -> Iterator[tuple[int, Result]]:
-    """Fly every job, and yield its index and result when it is ready; ends early when told to stop.
+    """Fly every job, and yield its index and result when ready; ends early on ``should_stop``.
 
     Raises:
         UserError: Ray is missing, or its cluster cannot be reached.
@@ -64,28 +62,21 @@ def fly_jobs(
                 yield index, fly(job, should_stop)
 
 
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """An exception on its way from a worker."""
-
-    error: Exception
-
-
-def _attempt(fly: FlyJob[Job, Result], job: Job, should_stop: ShouldStop) -> Result | Failure:
+def _attempt(fly: FlyJob[Job, Result], job: Job, should_stop: ShouldStop) -> Result | Exception:
     """Fly in a worker; an unexpected error takes its traceback along."""
     try:
         return fly(job, should_stop)
     except MavbridgeError as error:
-        return Failure(error)
+        return error
     except Exception as error:  # noqa: BLE001 - raised again where the results are awaited
         error.add_note(traceback.format_exc())
-        return Failure(error)
+        return error
 
 
-def raise_failure(outcome: Result | Failure) -> Result:
+def raise_failure(outcome: Result | Exception) -> Result:
     """Return the result, or raise what the worker's job raised."""
-    if isinstance(outcome, Failure):
-        raise outcome.error
+    if isinstance(outcome, Exception):
+        raise outcome
     return outcome
 
 
@@ -104,11 +95,11 @@ class WorkerProcess(Generic[Job, Result]):
         with suppress(BrokenPipeError):  # it has died, which ``receive`` reports
             self.connection.send(job)
 
-    def receive(self) -> Result | Failure | None:
+    def receive(self) -> Result | Exception | None:
         """Outcome of the job; None if the process has died, or hangs."""
         with suppress(EOFError, ConnectionResetError):
             if self.connection.poll(END_TIMEOUT_S):
-                outcome: Result | Failure = self.connection.recv()
+                outcome: Result | Exception = self.connection.recv()
                 return outcome
         return None
 
@@ -128,7 +119,6 @@ class WorkerProcess(Generic[Job, Result]):
 
 
 def _serve(connection: Connection, fly: FlyJob[Job, Result], stop: Event) -> None:
-    """Main function of a worker process; ends with the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which sets the event
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
@@ -209,7 +199,7 @@ def _fly_on_ray(
             for reference in ray.wait(list(busy), num_returns=1, timeout=_POLL_S)[0]:
                 index = busy.pop(reference)
                 try:
-                    outcome: Result | Failure = ray.get(reference)
+                    outcome: Result | Exception = ray.get(reference)
                 except ray.exceptions.RayTaskError:
                     raise  # a bug, and not the worker's end: its traceback helps
                 except ray.exceptions.RayError as error:

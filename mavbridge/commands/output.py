@@ -1,6 +1,7 @@
 """Output that the commands share: tables, progress bars and figures."""
 
 import importlib.util
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 from rich.text import Text
 
 from mavbridge.core.errors import UserError
@@ -42,7 +44,6 @@ FIGURE_STYLE: dict[Any, Any] = {
     "ytick.color": INK,
     "legend.frameon": False,
 }
-"""For ``matplotlib.rc_context``."""
 
 
 def require_matplotlib(flag: str = "--plot") -> None:
@@ -75,14 +76,29 @@ def table_console() -> Console:
     return console
 
 
+def make_table(
+    title: str, header: Iterable[str], rows: Iterable[Iterable[str]], *, left_columns: int = 1
+) -> Table:
+    """A table whose first columns are text and whose others are right-aligned figures."""
+    table = Table(title=title, title_justify="left")
+    for index, name in enumerate(header):
+        table.add_column(name, justify="left" if index < left_columns else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def number(value: float | None, digits: int) -> str:
+    """A figure, or a dash for what was not measured."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
 def print_status(line: str) -> None:
     """Print what is being done to standard error, apart from the results."""
     Console(stderr=True).print(Text(line, style="dim"), soft_wrap=True)
 
 
 class _StatusColumn(ProgressColumn):
-    """The task's field ``status``, if it has one."""
-
     def render(self, task: Task) -> Text:
         """Show it."""
         return Text(str(task.fields.get("status", "")))

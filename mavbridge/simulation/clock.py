@@ -65,7 +65,6 @@ class AheadClock:
     def __init__(self, world: SteppedClock) -> None:
         self._world = world
         self.ahead_ns = 0
-        """Time worked since the event began."""
 
     def now_ns(self) -> int:
         """Simulated time plus the time worked."""

@@ -24,7 +24,6 @@ class Delay:
     p99_ns: int | None = None
     """None = every sample is p50_ns."""
     offset_ns: int = 0
-    """Added to every sample."""
 
     def __post_init__(self) -> None:
         """Refuse negative times and percentiles that no log-normal distribution has."""
@@ -55,6 +54,4 @@ class Delays:
     action: Delay = Delay(p50_ns=3 * NS_PER_MS, p99_ns=6 * NS_PER_MS)
     """State to chunk; in single-rate mode the time for the image comes on top."""
     uplink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
-    """Bridge to vehicle."""
     downlink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
-    """Vehicle to bridge."""

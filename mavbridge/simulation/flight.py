@@ -1,6 +1,6 @@
 """One simulated flight of one course: the real bridge, its world on a stepped clock."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -15,17 +15,18 @@ from mavbridge.flight.action_loop import ActionLoop
 from mavbridge.flight.bridge import build_bridge
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
-from mavbridge.simulation.delays import Delay, Delays
+from mavbridge.simulation.delays import Delays
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
-from mavbridge.simulation.referee import Referee
-from mavbridge.simulation.result import EpisodeResult
-from mavbridge.simulation.vision import DelayedFeatureCache, DelayedSink, VisionStepper
+from mavbridge.simulation.referee import EpisodeResult, Referee
 from mavbridge.simulation.world import (
     NOMINAL_VEHICLE,
     BlankRenderer,
+    DelayedFeatureCache,
+    DelayedSink,
     Exposure,
     SimulatedCamera,
     VehicleStepper,
+    VisionStepper,
 )
 from policy.contract import Executable, FloatArray
 from sitl.camera.fpv import FpvRenderer
@@ -67,38 +68,40 @@ class SimulatedFlight:
         settings: SimulationSettings | None = None,
         vehicle: VehicleConfig = NOMINAL_VEHICLE,
     ) -> None:
-        """Put the vehicle on the course.
+        """Put the vehicle on the course of ``sitl.course.layout.make_course``.
 
-        Args:
-            course_seed: the course of ``sitl.course.course.make_course``.
-            seed: decides the delays and the phases of vehicle and camera.
-            settings: by default those of ``mavbridge fly`` and the delays of two shared cores.
-            vehicle: its conditions also decide how the course looks.
+        ``seed`` decides the delays and the phases of vehicle and camera; the vehicle's conditions
+        also decide how the course looks.
 
         Raises:
             UserError: ``seed`` is negative.
         """
+        if seed < 0:
+            raise UserError(f"a seed is a non-negative integer, got {seed}")
         self._settings = settings or SimulationSettings()
         self._course_seed = course_seed
         self._seed = seed
-        self._random = _RandomStreams(seed)
         self.clock = SteppedClock()
         # Vehicle and bridge are never in phase, and their phase stays for a whole flight.
-        boot_ns = self.clock.now_ns() + self._random.below(6, STEP_NS)
+        boot_ns = self.clock.now_ns() + int(self._random(6).integers(STEP_NS))
         self.course = make_course(course_seed)
         self._vehicle_config = vehicle
         self.vehicle = SimulatedVehicle(
             links=1, boot_ns=boot_ns, config=vehicle, course=self.course
         )
         delays = self._settings.delays
-        uplink = DelayedChannel(self.clock, self._random.samples_ns(0, delays.uplink))
-        downlink = DelayedChannel(self.clock, self._random.samples_ns(1, delays.downlink))
+        uplink = DelayedChannel(self.clock, delays.uplink.samples_ns(self._random(0)))
+        downlink = DelayedChannel(self.clock, delays.downlink.samples_ns(self._random(1)))
         self._transport = MemoryTransport(self.clock, to_vehicle=uplink, from_vehicle=downlink)
         self._stepper = VehicleStepper(
             self.clock, self.vehicle, boot_ns, to_vehicle=uplink, from_vehicle=downlink
         )
         self._exposure_watchers: list[Callable[[Exposure], None]] = []
         self._has_flown = False
+
+    def _random(self, purpose: int) -> np.random.Generator:
+        """Random numbers of one purpose: changing one delay leaves the others alone."""
+        return np.random.Generator(np.random.PCG64((self._seed, purpose)))
 
     def watch_exposures(self, watch: Callable[[Exposure], None]) -> None:
         """Call ``watch`` at each exposure, also of frames that are never read."""
@@ -118,11 +121,8 @@ class SimulatedFlight:
     ) -> EpisodeResult:
         """Arm, fly, and give the sticks back; ends with the last gate, a crash, or the time.
 
-        Args:
-            executable: the policy; it must not remember earlier flights.
-            max_time_s: counted from the policy's first action.
-            sinks: see every tick and vision tick, in order of time.
-            should_stop: called after each step of the vehicle; True ends the flight.
+        The executable must not remember earlier flights; ``max_time_s`` counts from its first
+        action. ``should_stop`` is called after each step of the vehicle.
 
         Raises:
             EpisodeInterruptedError: ``should_stop`` ended the flight.
@@ -140,7 +140,6 @@ class SimulatedFlight:
         return referee.result(course_seed=self._course_seed, seed=self._seed)
 
     def _compose(self, executable: Executable, sinks: tuple[TickSink, ...]) -> ActionLoop:
-        """Build the bridge, with its vision loop on the clock's queue."""
         config = FlyConfig(
             link=LinkConfig(connect="lockstep"),
             rates=self._settings.rates,
@@ -177,8 +176,8 @@ class SimulatedFlight:
             if self._settings.draw_images
             else BlankRenderer(width, height),
             period_ns=camera_period_ns,
-            phase_ns=self._random.below(2, camera_period_ns),
-            delays_ns=self._random.samples_ns(3, self._settings.delays.camera),
+            phase_ns=int(self._random(2).integers(camera_period_ns)),
+            delays_ns=self._settings.delays.camera.samples_ns(self._random(3)),
         )
         camera.exposure_watchers += self._exposure_watchers
         return camera
@@ -188,8 +187,8 @@ class SimulatedFlight:
 
         Without a fast path the whole network runs for every action, which then takes both times.
         """
-        vision_ns = self._random.samples_ns(4, self._settings.delays.vision)
-        action_ns = self._random.samples_ns(5, self._settings.delays.action)
+        vision_ns = self._settings.delays.vision.samples_ns(self._random(4))
+        action_ns = self._settings.delays.action.samples_ns(self._random(5))
         is_dual = executable.dual_rate
 
         def encode(rgb: ImageArray) -> FloatArray:
@@ -205,23 +204,3 @@ class SimulatedFlight:
             return chunk
 
         return replace(executable, encode=encode, act=act)
-
-
-class _RandomStreams:
-    """Independent random numbers for each purpose: changing one delay leaves the others alone."""
-
-    def __init__(self, seed: int) -> None:
-        if seed < 0:
-            raise UserError(f"a seed is a non-negative integer, got {seed}")
-        self._seed = seed
-
-    def _generator(self, purpose: int) -> np.random.Generator:
-        return np.random.Generator(np.random.PCG64((self._seed, purpose)))
-
-    def samples_ns(self, purpose: int, delay: Delay) -> Iterator[int]:
-        """Samples of a delay without end."""
-        return delay.samples_ns(self._generator(purpose))
-
-    def below(self, purpose: int, limit: int) -> int:
-        """One integer in [0, limit)."""
-        return int(self._generator(purpose).integers(limit))

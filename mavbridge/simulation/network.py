@@ -7,7 +7,6 @@ from mavbridge.mavlink.transport.sockets import Address, Chunk
 from mavbridge.simulation.clock import SteppedClock
 
 VEHICLE: Address = ("sitl", 1)
-"""Sender of the vehicle's datagrams."""
 
 
 class DelayedChannel:

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from mavbridge.simulation.result import EpisodeResult
+from mavbridge.simulation.referee import EpisodeResult
 
 FINISHED = EpisodeResult(
     course_seed=1_000_000,

@@ -13,8 +13,7 @@ from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vis
 from helpers.recordings import make_meta, without_writer_process
 from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
 from mavbridge.commands.imagine.loop import RolloutPlan, Segment, rollout
-from mavbridge.commands.imagine.output import OnFrame, SerialOutput
-from mavbridge.commands.imagine.run import ignore_frame
+from mavbridge.commands.imagine.output import OnFrame, SerialOutput, ignore_frame
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.commands.imagine.start import RolloutStart, read_start
 from mavbridge.commands.imagine.streamed import StreamedOutput
@@ -134,14 +133,7 @@ def run(
     model = model or TinyWorld()
     sampler = make_sampler(model, serial=serial, steps=plan.ddim_steps)
     kind = SerialOutput if serial else StreamedOutput
-    output = kind(
-        out,
-        sampler,
-        plan,
-        decode_video=decode_video,
-        clock=MonotonicClock(),
-        on_frame=on_frame,
-    )
+    output = kind(out, sampler, plan, decode_video=decode_video, on_frame=on_frame)
     try:
         for segment in segments(sampler, plan, decider):
             output.put(segment)

@@ -18,8 +18,7 @@ from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.network import MemoryTransport
-from mavbridge.simulation.referee import EpisodeInterruptedError
-from mavbridge.simulation.result import EpisodeResult
+from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult
 from mavbridge.simulation.world import Exposure
 from policy.contract import Executable, FloatArray
 from policy.errors import PolicyError

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.evaluate.episodes import EpisodeSpec
+from mavbridge.commands.evaluate.episodes import EpisodeSpec, fly_on_wall_clock
 from mavbridge.commands.evaluate.run import evaluate
-from mavbridge.commands.evaluate.wall_clock import fly_on_wall_clock
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.workers import WorkersConfig

@@ -33,14 +33,9 @@ class _Case:
 def time_engines(
     policies: Sequence[PolicyConfig], *, rounds: int, block_s: float
 ) -> tuple[tuple[EngineTiming, ...], tuple[str, ...]]:
-    """Time every policy on every engine that runs it; and notes on the engines that do not.
+    """Time each policy on its engine, or with ``auto`` on all of this device; notes on failures.
 
-    Each round goes through all cases, so that a slow minute of the host is shared by all engines.
-
-    Args:
-        policies: their ``engine`` picks one engine, or with ``auto`` all of this device.
-        rounds: how often each case is measured.
-        block_s: how long each time.
+    Each round times every case for ``block_s``: a slow minute of the host is shared by all engines.
 
     Raises:
         PolicyError: a policy cannot be loaded on any engine.
@@ -76,7 +71,12 @@ def _cases(policy: PolicyConfig) -> tuple[list[_Case], list[str]]:
 
 def _cases_on(policy: PolicyConfig) -> list[_Case]:
     full = _load(replace(policy, head_steps=None))
-    rgb, state, history = _sample(full)
+    contract = full.contract
+    shape = (contract.image_height, contract.image_width, 3)
+    rgb = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    state = np.zeros((1, contract.state_dim), np.float32)
+    state[0, QUATERNION.start] = 1.0  # level
+    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     feature = full.encode(rgb)
     engine = full.engine if policy.engine == "auto" else policy.engine
 
@@ -102,16 +102,6 @@ def _load(policy: PolicyConfig) -> Executable:
     if policy.engine != "auto" and not loaded.executable.engine.startswith(policy.engine):
         raise PolicyError("; ".join(loaded.notes))  # says why the engine was passed over
     return loaded.executable
-
-
-def _sample(executable: Executable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A random image, a level state and an empty history in the shapes of the contract."""
-    contract = executable.contract
-    shape = (contract.image_height, contract.image_width, 3)
-    state = np.zeros((1, contract.state_dim), np.float32)
-    state[0, QUATERNION.start] = 1.0
-    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
-    return np.random.default_rng(0).integers(0, 256, shape, np.uint8), state, history
 
 
 def _time(case: _Case, block_s: float) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from math import floor, log10
-from pathlib import Path
 from typing import NamedTuple
 
 from matplotlib import rc_context
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from mavbridge.commands.bench.engines import EAGER
-from mavbridge.commands.bench.results import OURS, BenchResult, EngineTiming, Flight, LinkLatency
+from mavbridge.commands.bench.results import OURS, BenchResult, EngineTiming, Flight
 from mavbridge.commands.output import (
     BLUE,
     FIGURE_DPI,
@@ -35,24 +34,33 @@ class LatencyRow(NamedTuple):
     color: str
 
 
-def draw(result: BenchResult, path: Path) -> None:
-    """Write the PNG, as high as its rows need."""
+def make_figure(result: BenchResult) -> Figure:
+    """Four panels, as high as their rows need."""
     with rc_context(STYLE):
         height = 5.0 + 0.65 * max(len(result.flights), len(result.links))
         figure = Figure(figsize=(12.0, height), dpi=FIGURE_DPI, facecolor="white")
         panels = figure.subplots(2, 2)
         draw_engines(panels[0][0], result.engines)
         draw_rates(panels[0][1], result.flights)
-        flights = flight_spans(result.flights)
-        draw_spans(panels[1][0], "Flying: attitude in to sticks out", flights)
-        draw_spans(panels[1][1], "Link alone: vehicle to vehicle", link_spans(result.links))
+        flights = [
+            LatencyRow(flight.label, latency.p50, latency.p99, _color(flight))
+            for flight in result.flights
+            if (latency := flight.state_to_wire_ms) is not None
+        ]
+        draw_latencies(panels[1][0], "Flying: attitude in to sticks out", flights)
+        links = []
+        for link in result.links:
+            color = BLUE if link.client.startswith(OURS) else MUTED
+            trip_ms = link.round_trip_ms
+            links.append(LatencyRow(link.client, trip_ms.p50, trip_ms.p99, color))
+        draw_latencies(panels[1][1], "Link alone: vehicle to vehicle", links)
         caption = (
             f"{result.machine.cpu}, {result.machine.cores} cores, which the simulated vehicle "
             "shares.\nLatency: dot = median, line to the 99th percentile, logarithmic."
         )
         figure.text(0.012, 0.012, caption, color=MUTED, fontsize=8.5)
         figure.tight_layout(rect=(0, 0.35 / height, 1, 1), w_pad=3, h_pad=2.5)
-        figure.savefig(path)
+    return figure
 
 
 def draw_engines(axes: Axes, timings: Sequence[EngineTiming]) -> None:
@@ -100,55 +108,27 @@ def draw_rates(axes: Axes, flights: Sequence[Flight]) -> None:
     axes.set_title("Rates")
 
 
-def draw_spans(axes: Axes, title: str, spans: Sequence[LatencyRow]) -> None:
+def draw_latencies(axes: Axes, title: str, rows: Sequence[LatencyRow]) -> None:
     """A dot at each median and a line to the 99th percentile."""
     axes.set_title(title)
-    if not spans:
+    if not rows:
         axes.set_axis_off()
         return
-    for row, span in enumerate(spans):
-        axes.plot([span.p50, span.p99], [row, row], color=span.color, linewidth=5, alpha=0.55)
-        axes.plot(span.p50, row, "o", color=span.color, markersize=10)
-        text = f"{_digits(span.p50)} ms  (p99 {_digits(span.p99)})"
-        axes.annotate(
-            text, (span.p50, row), (0, 10), textcoords="offset points", ha="left", fontsize=9
-        )
-    axes.set_xscale("log")
-    low, high = min(span.p50 for span in spans), max(span.p99 for span in spans)
-    axes.set_xlim(
-        10 ** floor(log10(low)), 2 * high * (high / low) ** 0.35
-    )  # room for the words at the right
+    for place, row in enumerate(rows):
+        axes.plot([row.p50, row.p99], [place, place], color=row.color, linewidth=5, alpha=0.55)
+        axes.plot(row.p50, place, "o", color=row.color, markersize=10)
+        text = f"{_digits(row.p50)} ms  (p99 {_digits(row.p99)})"
+        axes.annotate(text, (row.p50, place), (0, 10), textcoords="offset points", fontsize=9)
+    low, high = min(row.p50 for row in rows), max(row.p99 for row in rows)
+    room_for_text = 2 * (high / low) ** 0.35
+    axes.set(xscale="log", xlabel="ms", xlim=(10 ** floor(log10(low)), high * room_for_text))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.set_yticks(range(len(spans)), [_in_two_lines(span.label) for span in spans])
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylim(len(spans) - 0.5, -0.6)
-    axes.set_xlabel("ms")
-
-
-def flight_spans(flights: Sequence[Flight]) -> list[LatencyRow]:
-    """Latencies of the flights that sent sticks."""
-    return [
-        LatencyRow(flight.label, latency.p50, latency.p99, _color(flight))
-        for flight in flights
-        if (latency := flight.state_to_wire_ms) is not None
-    ]
-
-
-def link_spans(links: Sequence[LinkLatency]) -> list[LatencyRow]:
-    """Round trips of all clients."""
-    return [
-        LatencyRow(
-            link.client,
-            link.round_trip_ms.p50,
-            link.round_trip_ms.p99,
-            BLUE if link.client.startswith(OURS) else MUTED,
-        )
-        for link in links
-    ]
+    axes.set_yticks(range(len(rows)), [_in_two_lines(row.label) for row in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.6)
 
 
 def _in_two_lines(label: str) -> str:
-    """Break a label at its middle comma."""
     parts = label.split(", ")
     half = len(parts) // 2
     return "\n".join((", ".join(parts[:half]), ", ".join(parts[half:]))).strip()

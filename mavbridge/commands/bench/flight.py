@@ -26,12 +26,10 @@ class FlightJob:
     """The command line of a program that flies once and is measured."""
 
     port: int
-    """UDP port to which the vehicle sends."""
     camera: str
     duration: float
     """Seconds from the policy's first action."""
     out: Path
-    """Where the program writes its ``Flight`` as JSON."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     rates: Rates = field(default_factory=Rates)
 

@@ -83,23 +83,17 @@ class FlightMeter:
     def __init__(self, *, action_hz: float, vision_hz: float) -> None:
         self._timing = FlightTiming(action_hz=action_hz, vision_hz=vision_hz)
         self._cpu_start_ns: int | None = None
-        self._stolen_start_ns: int | None = None
+        self.stolen_start_ns: int | None = None
         self.cpu_ns = 0
-        """Processor time of this process while the policy flew."""
 
     def emit(self, event: Event) -> None:
         """Count the event."""
         if isinstance(event, Tick) and event.trace is not None:
             if self._cpu_start_ns is None:
-                self._cpu_start_ns, self._stolen_start_ns = time.process_time_ns(), stolen_ns()
+                self._cpu_start_ns, self.stolen_start_ns = time.process_time_ns(), stolen_ns()
             self.cpu_ns = time.process_time_ns() - self._cpu_start_ns
         if self._cpu_start_ns is not None:
             self._timing.emit(event)
-
-    @property
-    def stolen_ms(self) -> float | None:
-        """Processor time taken by the hypervisor since the first action; None = not known."""
-        return stolen_ms_since(self._stolen_start_ns)
 
     def report(self) -> TimingReport:
         """Figures of the flight so far; names and link are left empty."""
@@ -131,7 +125,7 @@ def _flight(
         feature_age_ms=report.feature_age_ms,
         state_to_wire_ms=report.state_to_wire_ms,
         cpu_cores=round(meter.cpu_ns / (report.duration_s * NS_PER_S), 3),
-        stolen_ms=meter.stolen_ms,
+        stolen_ms=stolen_ms_since(meter.stolen_start_ns),
         missed_by_cause=probe.missed_by_cause,
     )
 

@@ -9,6 +9,7 @@ answers by the kernel as they arrive: nothing that this process does is in the f
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from cyclopts import App
@@ -26,7 +27,6 @@ CODES = 1000
 CODE_SPAN = 500
 """A code k stands for a stick of (k - 500) / 500, which is 1000 + k us of PWM."""
 WARM_ANSWERS = 100
-"""Answers in a row before counting starts."""
 CONNECT_S = 30.0
 PENDING_LIMIT = 200
 """Answers later than two seconds count as lost."""
@@ -141,21 +141,17 @@ class LinkVehicle:
         Raises:
             TimeoutError: no client answered steadily.
         """
-        due_ns = self._warm_up()
+        due_ns = self._clock.now_ns()
+        for number in count():
+            if self._round_trips.answered_in_a_row >= WARM_ANSWERS:
+                break
+            if self._clock.now_ns() - self._start_ns > CONNECT_S * NS_PER_S:
+                raise TimeoutError(f"no client has answered steadily within {CONNECT_S:g} s")
+            due_ns = self._exchange(number, due_ns)
         self._round_trips.start()
         for number in range(attitudes):
             due_ns = self._exchange(number, due_ns)
         return self._round_trips.answers()
-
-    def _warm_up(self) -> int:
-        due_ns = self._clock.now_ns()
-        number = 0
-        while self._round_trips.answered_in_a_row < WARM_ANSWERS:
-            if self._clock.now_ns() - self._start_ns > CONNECT_S * NS_PER_S:
-                raise TimeoutError(f"no client has answered steadily within {CONNECT_S:g} s")
-            due_ns = self._exchange(number, due_ns)
-            number += 1
-        return due_ns
 
     def _exchange(self, number: int, due_ns: int) -> int:
         """One attitude; half a period later its answers and all other messages; the next due."""

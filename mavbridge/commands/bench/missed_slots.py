@@ -25,11 +25,8 @@ class Counters(NamedTuple):
     """Time lost outside the loop's own work; each only ever grows, and stays 0 where unknown."""
 
     host_ns: int
-    """Processor time taken by the hypervisor, all processors."""
     kernel_ns: int
-    """Time that the reading thread stood in a run queue."""
     gc_ns: int
-    """Time inside the garbage collector, whichever thread ran it."""
 
 
 def stolen_ns() -> int | None:
@@ -56,13 +53,8 @@ def find_cause(first: Tick, second: Tick, lost: Counters, period_ns: int) -> Cau
 
     Time that the hypervisor or the kernel took is inside everything else that was slow meanwhile,
     so they come first. What no counter explains was work if the first tick outlasted its period,
-    and waiting if it did not.
-
-    Args:
-        first: a tick.
-        second: the next one, with missed slots between them.
-        lost: how much the counters grew from the end of the first to the end of the second.
-        period_ns: of the loop.
+    and waiting if it did not. ``lost`` is how much the counters grew between the ends of two
+    consecutive ticks.
     """
     overrun_ns = second.woke_ns - first.woke_ns - period_ns
     for cause, lost_ns in zip(CAUSES, lost, strict=False):

@@ -1,20 +1,24 @@
-"""Results of a benchmark as frozen values, and their JSON."""
+"""Results of a benchmark as frozen values, their JSON, and tables of them."""
 
 import json
 import os
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mavbridge.commands.output import make_table, number
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.records import Percentiles
 
 OURS, BASELINE = "mavbridge", "baseline"
-"""Runners of a flight."""
 T = TypeVar("T")
 
 
@@ -24,7 +28,6 @@ class Machine:
 
     cpu: str
     cores: int
-    """Usable by this process."""
     python: str
     torch: str
 
@@ -51,7 +54,6 @@ class Flight:
     runner: str
     policy: str
     solves: str
-    """Kind of solve, as ``solves_of`` names it."""
     engine: str
     asked_action_hz: float
     asked_vision_hz: float
@@ -59,20 +61,16 @@ class Flight:
     action_hz: float | None
     vision_hz: float | None
     missed_slots: int
-    """Ticks of the asked grid that did not happen."""
     period_ms: Percentiles | None
     predict_ms: Percentiles | None
     encode_ms: Percentiles | None
     feature_age_ms: Percentiles | None
-    """From exposure to send."""
     state_to_wire_ms: Percentiles | None
     """From an attitude's arrival at this computer to the send of the first sticks made from it."""
     cpu_cores: float
     """Processor time of the bridge's process over elapsed time."""
     stolen_ms: float | None
-    """Processor time that the hypervisor gave to others meanwhile."""
     missed_by_cause: Mapping[str, int] | None
-    """Missed slots by ``missed_slots.Cause``."""
     vehicle_gap_ms: Mapping[str, float] | None = None
     """p50, p99 and max between stick messages, as the vehicle saw them arrive."""
 
@@ -120,7 +118,6 @@ class BenchResult:
     flights: tuple[Flight, ...]
     links: tuple[LinkLatency, ...]
     notes: tuple[str, ...]
-    """Parts that were left out, with the reasons."""
 
 
 def name_of(policy: PolicyConfig) -> str:
@@ -171,3 +168,95 @@ def _build(kind: type[T], document: Mapping[str, Any]) -> T:
         return _build(nested, value) if nested and isinstance(value, dict) else value
 
     return kind(**{name: value_of(name, value) for name, value in document.items()})
+
+
+def print_result(result: BenchResult, console: Console) -> None:
+    """Print the machine, all tables, and what was left out."""
+    here = result.machine
+    console.print(Text(f"{here.cpu}, {here.cores} cores, Python {here.python}, torch {here.torch}"))
+    for table in (
+        engine_table(result.engines),
+        flight_table(result.flights),
+        link_table(result.links),
+    ):
+        console.print(table)
+    for note in result.notes:
+        console.print(Text(note, style="yellow"))
+
+
+def spread(percentiles: Percentiles | None, digits: int = 1) -> str:
+    """p50 / p99 / max, or a dash."""
+    if percentiles is None:
+        return "-"
+    values = (percentiles.p50, percentiles.p99, percentiles.max)
+    return " / ".join(number(value, digits) for value in values)
+
+
+def engine_table(timings: Iterable[EngineTiming]) -> Table:
+    """A row for each piece of work, a column for each engine."""
+    cells = {
+        (one.policy, one.work, one.engine): f"{one.p50_ms:.2f} / {one.p99_ms:.2f}"
+        for one in timings
+    }
+    engines = tuple(dict.fromkeys(engine for _, _, engine in cells))
+    works = tuple(dict.fromkeys((policy, work) for policy, work, _ in cells))
+    rows = [
+        (policy, work, *(cells.get((policy, work, engine), "-") for engine in engines))
+        for policy, work in works
+    ]
+    title = "Inference on one thread, ms (p50 / p99)"
+    return make_table(title, ("policy", "work", *engines), rows, left_columns=2)
+
+
+_FLIGHT_ROWS: tuple[tuple[str, Callable[[Flight], str]], ...] = (
+    ("actions, Hz", lambda f: f"{number(f.action_hz, 1)} of {f.asked_action_hz:g}"),
+    ("images, Hz", lambda f: f"{number(f.vision_hz, 1)} of {f.asked_vision_hz:g}"),
+    ("missed slots", lambda f: f"{f.missed_slots} ({f.missed_fraction:.2%})"),
+    ("by cause", lambda f: _causes(f.missed_by_cause)),
+    ("action period, ms", lambda f: spread(f.period_ms)),
+    ("sample one chunk, ms", lambda f: spread(f.predict_ms)),
+    ("encode one image, ms", lambda f: spread(f.encode_ms)),
+    ("feature age at send, ms", lambda f: spread(f.feature_age_ms)),
+    ("attitude to wire, ms", lambda f: spread(f.state_to_wire_ms)),
+    ("gaps at the vehicle, ms", lambda f: _gaps(f.vehicle_gap_ms)),
+    ("processor time, cores", lambda f: number(f.cpu_cores, 2)),
+    ("stolen by the host, ms", lambda f: number(f.stolen_ms, 0)),
+)
+
+
+def flight_table(flights: Iterable[Flight]) -> Table:
+    """A column for each flight, a row for each figure."""
+    flights = tuple(flights)
+    header = ("", *(f"{one.label}, {one.duration_s:.0f} s".replace(", ", "\n") for one in flights))
+    rows = [(name, *(cell(one) for one in flights)) for name, cell in _FLIGHT_ROWS]
+    title = "Both loops against the simulated vehicle (p50 / p99 / max)"
+    return make_table(title, header, rows)
+
+
+def _causes(slots_by_cause: Mapping[str, int] | None) -> str:
+    if slots_by_cause is None:
+        return "-"
+    return ", ".join(f"{cause} {slots}" for cause, slots in slots_by_cause.items()) or "none"
+
+
+def _gaps(gap_ms: Mapping[str, float] | None) -> str:
+    if gap_ms is None:
+        return "-"
+    return " / ".join(number(gap_ms[name], 1) for name in ("p50", "p99", "max"))
+
+
+def link_table(links: Iterable[LinkLatency]) -> Table:
+    """A row for each client."""
+    rows = [
+        (
+            link.client,
+            f"{link.answered} of {link.sent}",
+            spread(link.round_trip_ms, 2),
+            spread(link.timing.state_to_wire_ms, 2),
+            spread(link.timing.work_ms, 2),
+        )
+        for link in links
+    ]
+    header = ("client", "answered", "round trip", "attitude to wire", "work")
+    title = "Link alone: attitude out of the vehicle to sticks back in, ms (p50 / p99 / max)"
+    return make_table(title, header, rows)

@@ -1,21 +1,37 @@
-"""The whole benchmark: check the flags, measure, and report."""
+"""The whole benchmark: check the flags, measure, report, and compare with a budget of ratios.
 
-from collections.abc import Callable
+Each ratio compares two figures of one run, so that no machine is too slow for it, and is the
+smaller the better. The file is JSON, ``{"ratios": {name: most}}``; the names are those of
+``ratios``.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 
 from rich.text import Text
 
-from mavbridge.commands.bench.budget import ratios, read_budget, violations
-from mavbridge.commands.bench.engines import time_engines
+from mavbridge.commands.bench.engines import EAGER, time_engines
 from mavbridge.commands.bench.flight import fly
 from mavbridge.commands.bench.link import OUR_CLIENTS, time_link
-from mavbridge.commands.bench.results import BenchResult, this_machine, to_json
-from mavbridge.commands.bench.tables import print_result
+from mavbridge.commands.bench.results import (
+    BASELINE,
+    OURS,
+    BenchResult,
+    print_result,
+    this_machine,
+    to_json,
+)
 from mavbridge.commands.output import require_outputs, table_console
 from mavbridge.config.bench import BenchConfig, BenchOutputs
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED
+
+ROOFLINE = "roofline f32"
+BARE_CLIENT = "bare pymavlink loop"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +94,9 @@ def run_and_report(outputs: BenchOutputs, measure: Callable[[Effort], BenchResul
     if outputs.json is not None:
         outputs.json.write_text(to_json(result))
     if outputs.plot is not None:
-        from mavbridge.commands.bench.figure import draw
+        from mavbridge.commands.bench.figure import make_figure
 
-        draw(result, outputs.plot)
+        make_figure(result).savefig(outputs.plot)
     if budget is None:
         return 0
     exceeded = violations(ratios(result), budget)
@@ -89,3 +105,85 @@ def run_and_report(outputs: BenchOutputs, measure: Callable[[Effort], BenchResul
     if not exceeded:
         console.print(Text(f"within the budget of {outputs.check}", style="green"))
     return 1 if exceeded else 0
+
+
+def ratios(result: BenchResult) -> dict[str, float]:
+    """Every ratio that the run allows, by name.
+
+    Engines: median time over that of eager torch and over the roofline. Flights: period over the
+    asked one; and period, processor time an action and latency over the baseline's with the same
+    policy. Link: what a client does once it is awake, over the bare loop's round trip.
+    """
+    found = dict(_flight_ratios(result))
+    times = {(one.policy, one.work, one.engine): one.p50_ms for one in result.engines}
+    for (policy, work, engine), time_ms in times.items():
+        for reference in (EAGER, ROOFLINE):
+            least_ms = times.get((policy, work, reference))
+            if least_ms and engine != reference and not engine.startswith("roofline"):
+                found[f"{policy}, {work}: {engine} / {reference}"] = time_ms / least_ms
+    bare = next((link for link in result.links if link.client == BARE_CLIENT), None)
+    for link in result.links:
+        work_ms = link.timing.work_ms
+        if bare is not None and bare.round_trip_ms.p50 > 0 and work_ms is not None:
+            ratio = work_ms.p50 / bare.round_trip_ms.p50
+            found[f"link: {link.client}: work / {BARE_CLIENT}"] = ratio
+    return found
+
+
+def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
+    baselines = {one.policy: one for one in result.flights if one.runner == BASELINE}
+    for flight in result.flights:
+        if flight.runner != OURS or not flight.action_hz:
+            continue
+        # Without the precision, which depends on the processor: one budget serves them all.
+        engine = flight.engine.partition("-")[0]
+        name = f"flight: {flight.policy}, {flight.solves}, {engine}"
+        yield f"{name}: period / asked period", flight.asked_action_hz / flight.action_hz
+        baseline = baselines.get(flight.policy)
+        if baseline is None or not baseline.action_hz:
+            continue
+        yield f"{name}: period / {BASELINE}", baseline.action_hz / flight.action_hz
+        least_cpu = baseline.cpu_cores / baseline.action_hz
+        cpu_ratio = flight.cpu_cores / flight.action_hz / least_cpu if least_cpu else math.inf
+        yield f"{name}: cpu an action / {BASELINE}", cpu_ratio
+        ours, theirs = flight.state_to_wire_ms, baseline.state_to_wire_ms
+        if ours is not None and theirs is not None and theirs.p50 > 0:
+            yield f"{name}: state to wire / {BASELINE}", ours.p50 / theirs.p50
+
+
+def read_budget(path: Path) -> dict[str, float]:
+    """The largest allowed ratios, by name.
+
+    Raises:
+        UserError: no such file, or not a budget.
+    """
+    try:
+        document = json.loads(path.read_text())
+    except OSError as error:
+        raise UserError(f"cannot read --check {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"--check {path} is not JSON: {error}") from error
+    entries = document.get("ratios") if isinstance(document, dict) else None
+    if not isinstance(entries, dict) or not entries or not all(map(_is_limit, entries.values())):
+        raise UserError(
+            f'--check {path} is no budget: it must hold {{"ratios": {{name: positive number}}}}'
+        )
+    return {str(name): float(most) for name, most in entries.items()}
+
+
+def _is_limit(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return math.isfinite(value) and value > 0
+
+
+def violations(measured: Mapping[str, float], budget: Mapping[str, float]) -> tuple[str, ...]:
+    """A line for each ratio that is over the budget or was not measured."""
+    lines = []
+    for name, most in budget.items():
+        if name not in measured:
+            known = ", ".join(sorted(measured)) or "nothing"
+            lines.append(f"{name}: not measured in this run (measured: {known})")
+        elif not measured[name] <= most:
+            lines.append(f"{name}: {measured[name]:.3g}, at most {most:.3g} is allowed")
+    return tuple(lines)

@@ -7,8 +7,7 @@ from pathlib import Path
 from shutil import rmtree
 
 import mavbridge
-from mavbridge.commands.demonstrate.pilot import Pilot
-from mavbridge.commands.demonstrate.variation import Variation, draw_variation
+from mavbridge.commands.demonstrate.pilot import Pilot, Variation, draw_variation
 from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import MonotonicClock
@@ -34,7 +33,6 @@ class DemonstrationSpec:
     folder: Path
     """Its contents are replaced."""
     seed: int
-    """Decides the course and everything random."""
     config: DemonstrateConfig
 
     def __str__(self) -> str:

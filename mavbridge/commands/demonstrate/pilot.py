@@ -1,17 +1,21 @@
-"""The pilot of a demonstration: an expert, or a student whose every action the expert labels."""
+"""The pilot of a demonstration, and what is random about it.
 
-from dataclasses import replace
+An expert flies, or a student whose every action the expert labels.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mavbridge.commands.demonstrate.variation import Variation
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Sticks
+from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight
 from policy.contract import Contract, Executable, FloatArray
 from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance, random_start
 from sitl.expert.stick_response import StickPositions
+from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
 
 SETTLE_NS = 300 * NS_PER_MS
 """After a start in the air: until the last frame and state from the ground are gone."""
@@ -19,6 +23,54 @@ STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
 """Least and most length of a turn. Where a student flies, the expert takes over now and then: a
 student that crashes at the first gate would otherwise learn nothing about the later ones (DAgger,
 Ross et al. 2011, mixes the two at random)."""
+NOMINAL_SHARE = 0.25
+"""Flights without random conditions: what most users fly first."""
+AIRBORNE_SHARE = 0.35
+"""Flights that start in the air and off the course."""
+UNDISTURBED_SHARE = 0.3
+"""Flights without disturbed sticks: examples of a good flight."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """The random part of one demonstration; everything follows from ``seed``."""
+
+    seed: int
+    conditions: Conditions
+    delays: Delays
+    starts_airborne: bool
+    disturbance: float
+
+
+def draw_variation(seed: int) -> Variation:
+    """The variation of a seed."""
+    random = np.random.Generator(np.random.PCG64((seed, 4)))
+    shares = (NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE)
+    is_nominal, is_airborne, is_undisturbed = random.random(3) < shares
+    return Variation(
+        seed=seed,
+        conditions=NOMINAL if is_nominal else random_conditions(seed),
+        delays=_random_delays(random),
+        starts_airborne=bool(is_airborne),
+        disturbance=0.0 if is_undisturbed else float(random.uniform(0.5, 1.0)),
+    )
+
+
+def _random_delays(random: np.random.Generator) -> Delays:
+    """Delays between those of a fast computer and a busy one, with log-uniform medians."""
+
+    def median_ns(low_ms: float, high_ms: float) -> int:
+        return round(NS_PER_MS * float(np.exp(random.uniform(np.log(low_ms), np.log(high_ms)))))
+
+    camera_ns, vision_ns = median_ns(2, 12), median_ns(6, 35)
+    action_ns, link_ns = median_ns(0.8, 6), median_ns(0.2, 3)
+    return Delays(
+        camera=Delay(p50_ns=camera_ns),
+        vision=Delay(p50_ns=vision_ns, p99_ns=2 * vision_ns),
+        action=Delay(p50_ns=action_ns, p99_ns=2 * action_ns),
+        uplink=Delay(p50_ns=link_ns),
+        downlink=Delay(p50_ns=link_ns),
+    )
 
 
 class Pilot:
@@ -45,7 +97,6 @@ class Pilot:
         self._turns = TurnSchedule(variation.seed)
         self._expert: Expert | None = None
         self.expert_sticks: Sticks | None = None
-        """Sticks that the expert would hold now; None before the first action."""
         self.begin_ns: int | None = None
         """When the demonstration begins; None before the first action."""
         expert = Executable(

@@ -1,46 +1,18 @@
 """The picture of an evaluation: gates passed, outcomes, speed against smoothness."""
 
-from pathlib import Path
-from typing import Any
-
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mavbridge.commands.evaluate.results import Evaluation
 from mavbridge.commands.evaluate.statistics import rate
-
-INK, MUTED, GRID, BLUE, RED = "#1f2933", "#6b7885", "#dfe4ea", "#2b6cb0", "#d1495b"
-SIZE_INCHES = (12.0, 4.2)
-DOTS_PER_INCH = 150
-STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "text.color": INK,
-    "axes.labelcolor": MUTED,
-    "axes.edgecolor": GRID,
-    "axes.titlesize": 12,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": GRID,
-    "xtick.color": MUTED,
-    "ytick.color": INK,
-    "legend.frameon": False,
-}
-
-
-def draw(evaluation: Evaluation, path: Path) -> None:
-    """Write the PNG; the evaluation holds at least one episode."""
-    make_figure(evaluation).savefig(path)
+from mavbridge.commands.output import BLUE, FIGURE_DPI, FIGURE_STYLE, MUTED, RED
 
 
 def make_figure(evaluation: Evaluation) -> Figure:
-    """Plots, left to right: share of flights by gate, outcomes, speed against smoothness."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor="white")
+    """Share of flights by gate, outcomes, and speed against smoothness, of one or more episodes."""
+    with rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(12.0, 4.2), dpi=FIGURE_DPI, facecolor="white")
         axes = figure.subplots(1, 3)
         _draw_gates(axes[0], evaluation)
         _draw_outcomes(axes[1], evaluation)
@@ -57,7 +29,6 @@ def make_figure(evaluation: Evaluation) -> Figure:
 
 
 def _draw_gates(axes: Axes, evaluation: Evaluation) -> None:
-    """Share of the flights that passed each gate, with the interval of the share."""
     episodes = evaluation.episodes
     gates = range(1, episodes[0].gates_total + 1)
     shares = [
@@ -89,7 +60,6 @@ def _draw_outcomes(axes: Axes, evaluation: Evaluation) -> None:
 
 
 def _draw_smoothness(axes: Axes, evaluation: Evaluation) -> None:
-    """Speed against smoothness, a dot for each flight."""
     for has_finished, colour, label in ((True, BLUE, "finished"), (False, RED, "not finished")):
         dots = [
             (one.mean_speed_mps, one.stick_rate_per_s)

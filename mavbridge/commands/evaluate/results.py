@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from mavbridge.commands.evaluate.statistics import Estimate, mean, rate
+from mavbridge.commands.output import make_table
 from mavbridge.config.evaluate import EvaluateConfig
-from mavbridge.simulation.result import EpisodeResult, Outcome
+from mavbridge.simulation.referee import EpisodeResult, Outcome
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +30,6 @@ class Summary:
     course_s: Estimate | None
     """First action to last gate, of the successful flights."""
     outcomes: tuple[tuple[Outcome, int], ...]
-    """Most frequent first."""
 
 
 def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
@@ -106,25 +105,22 @@ def to_json(evaluation: Evaluation) -> str:
 def print_evaluation(evaluation: Evaluation, console: Console) -> None:
     """Print each figure with its 95 % interval, then how the flights ended."""
     summary = evaluation.summary
-    table = Table(title=evaluation.title)
-    for heading in ("", "mean", "95 % interval", "flights"):
-        table.add_column(heading, justify="left" if heading == "" else "right")
-    table.add_row("success rate", *_cells(summary.success_rate, "{:.1%}"))
-    for name, estimate in (
+    figures = (
         (f"gates passed, of {evaluation.episodes[0].gates_total}", summary.gates_passed),
         ("mean speed, m/s", summary.mean_speed_mps),
         ("stick movement, 1/s", summary.stick_rate_per_s),
         ("flown, s", summary.flown_s),
         ("course time, s (successful flights)", summary.course_s),
-    ):
-        table.add_row(name, *_cells(estimate, "{:.2f}"))
-    console.print(table)
+    )
+    rows = [("success rate", *_cells(summary.success_rate, "{:.1%}"))]
+    rows += [(name, *_cells(estimate, "{:.2f}")) for name, estimate in figures]
+    header = ("", "mean", "95 % interval", "flights")
+    console.print(make_table(evaluation.title, header, rows))
     ends = ", ".join(f"{count} {outcome}" for outcome, count in summary.outcomes)
     console.print(Text(f"{len(evaluation.episodes)} flights: {ends}"))
 
 
 def _cells(estimate: Estimate | None, form: str) -> tuple[str, str, str]:
-    """Value, interval and count."""
     if estimate is None:
         return "-", "-", "0"
     interval = "-"

@@ -1,15 +1,18 @@
 """``mavbridge evaluate`` from its config to its exit status: fly, print, write, draw."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode, fly_simulated
+from mavbridge.commands.evaluate.episodes import (
+    EpisodeSpec,
+    FlownEpisode,
+    fly_on_wall_clock,
+    fly_simulated,
+)
 from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
-from mavbridge.commands.evaluate.wall_clock import fly_on_wall_clock
 from mavbridge.commands.output import progress_bar, require_outputs
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.errors import MavbridgeError
@@ -23,7 +26,6 @@ def evaluate(config: EvaluateConfig) -> int:
         MavbridgeError: an episode cannot be flown, or the results cannot be written.
     """
     require_outputs(config.json, config.plot)
-    draw = None if config.plot is None else _drawing(config.plot)
     console = Console(stderr=True, emoji=False)
     if config.realtime is not None:
         names = ("--realtime", "wall") if config.realtime else ("--lockstep", "simulated")
@@ -44,8 +46,10 @@ def evaluate(config: EvaluateConfig) -> int:
     )
     if episodes:
         print_evaluation(evaluation, Console())
-        if draw is not None:
-            draw(evaluation)
+        if config.plot is not None:
+            from mavbridge.commands.evaluate.figure import make_figure
+
+            make_figure(evaluation).savefig(config.plot)
     if config.json is not None and (episodes or failure is None):
         config.json.write_text(to_json(evaluation))
     if failure is not None or was_stopped:
@@ -73,10 +77,3 @@ def _fly(
             flown[index] = episode
             finished = sum(one.result.has_finished for one in flown.values())
             progress.update(bar, advance=1, status=f"{finished} of {len(flown)} finished")
-
-
-def _drawing(path: Path) -> Callable[[Evaluation], None]:
-    """The function that draws to ``path``; imported before the run."""
-    from mavbridge.commands.evaluate.figure import draw
-
-    return lambda evaluation: draw(evaluation, path)

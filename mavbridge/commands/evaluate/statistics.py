@@ -22,7 +22,6 @@ class Estimate:
     low: float | None
     high: float | None
     count: int
-    """Flights behind it."""
 
 
 def rate(successes: int, count: int) -> Estimate:

@@ -24,7 +24,6 @@ class FlightWindow:
     """``K`` = context_frames and ``S`` later steps of one flight, ``frame_dt_s`` apart."""
 
     folder: Path
-    """Folder of the flight."""
     frames: NDArray[np.int64]
     """[K + S] rows of the flight's frames."""
     states: FloatArray
@@ -90,12 +89,7 @@ def choose_windows(
 def with_images(
     windows: Sequence[FlightWindow], steps: Sequence[int], size: int
 ) -> Iterator[tuple[FlightWindow, dict[int, ImageArray]]]:
-    """Each window with the images [size, size, 3] of some of its steps, by step.
-
-    Args:
-        windows: from ``choose_windows``.
-        steps: counted from 0, the first of the context.
-        size: side of the images, px.
+    """Each window with its images [size, size, 3] at ``steps``, which count from the context on.
 
     Raises:
         MavbridgeError: a flight cannot be read, or its video is damaged.

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mavbridge.commands.evaluate.statistics import Estimate
+from mavbridge.commands.output import make_table, number
 
 Method = Literal["imagined", "autoencoder only", "copy last"]
 METHODS: tuple[Method, ...] = ("imagined", "autoencoder only", "copy last")
@@ -29,7 +30,7 @@ class FrameQuality:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickFollowing:
-    """Imagined body rates against those of the vehicle, which obeyed the recorded sticks.
+    """Imagined body rates against those of the vehicle, which flew the recorded sticks.
 
     Slope and rank correlation of 1 are perfect. With the sticks of another window both are near 0
     in a model that follows its sticks, and as high as with its own in one that ignores them.
@@ -47,7 +48,6 @@ class DriftIteration:
     """Frames at the end of one iteration, mean of all chains."""
 
     iteration: int
-    """Counted from 1."""
     chains: int
     imagined_psnr_db: float
     autoencoder_psnr_db: float
@@ -64,12 +64,9 @@ class Given:
     seed: int
     frame_dt_s: float
     exe_steps: int
-    """Frames of a chain's iteration."""
     flights: int
-    """Flights that are long enough for a window."""
     flights_too_short: int
     demonstrations_failed: int
-    """Left out, as in training."""
     asked_windows: int
 
 
@@ -79,7 +76,6 @@ class ImaginationQuality:
 
     given: Given
     windows: int
-    """Number of windows scored."""
     frames: tuple[FrameQuality, ...]
     stick_following: tuple[StickFollowing, ...]
     own_actions_nearer: Estimate | None
@@ -121,43 +117,32 @@ def print_quality(quality: ImaginationQuality, console: Console) -> None:
         console.print(_drift_table(quality))
 
 
-def _table(title: str, texts: int, headings: list[str]) -> Table:
-    """A table whose first columns hold text, and the others numbers."""
-    table = Table(title=title)
-    for column, heading in enumerate(headings):
-        table.add_column(heading, justify="left" if column < texts else "right")
-    return table
-
-
 def _frames_table(quality: ImaginationQuality) -> Table:
     dt_s = quality.given.frame_dt_s
     steps = sorted({one.step for one in quality.frames})
-    headings = ["", *(f"{step} ({step * dt_s:.1f} s)" for step in steps)]
-    table = _table("frames: PSNR in dB, by frames ahead", 1, headings)
-    for method in METHODS:
-        rows = (one for one in quality.frames if one.method == method)
-        table.add_row(method, *(f"{one.psnr_db:.2f}" for one in rows))
-    return table
+    rows = [
+        (method, *(f"{one.psnr_db:.2f}" for one in quality.frames if one.method == method))
+        for method in METHODS
+    ]
+    header = ("", *(f"{step} ({step * dt_s:.1f} s)" for step in steps))
+    return make_table("frames: PSNR in dB, by frames ahead", header, rows)
 
 
 def _following_table(quality: ImaginationQuality) -> Table:
-    headings = ["axis", "of", "slope", "Spearman", "steps"]
-    table = _table("body rates against the vehicle's: are the sticks followed?", 2, headings)
-    for one in quality.stick_following:
-        numbers = ("-" if v is None else f"{v:.2f}" for v in (one.slope, one.spearman))
-        table.add_row(one.axis, one.source, *numbers, str(one.pairs))
-    return table
+    rows = [
+        (one.axis, one.source, number(one.slope, 2), number(one.spearman, 2), str(one.pairs))
+        for one in quality.stick_following
+    ]
+    title = "body rates against the vehicle's: are the sticks followed?"
+    return make_table(title, ("axis", "of", "slope", "Spearman", "steps"), rows, left_columns=2)
 
 
 def _drift_table(quality: ImaginationQuality) -> Table:
-    given = quality.given
-    title = f"drift: chained iterations of {given.exe_steps} frames, PSNR in dB of the last"
-    table = _table(title, 0, ["iteration", *METHODS, "chains"])
+    steps = quality.given.exe_steps
+    rows = []
     for one in quality.drift:
-        values = (one.imagined_psnr_db, one.autoencoder_psnr_db, one.copy_last_psnr_db)
-        table.add_row(
-            f"{one.iteration} ({one.iteration * given.exe_steps * given.frame_dt_s:.1f} s)",
-            *(f"{value:.2f}" for value in values),
-            str(one.chains),
-        )
-    return table
+        values_db = (one.imagined_psnr_db, one.autoencoder_psnr_db, one.copy_last_psnr_db)
+        end = f"{one.iteration} ({one.iteration * steps * quality.given.frame_dt_s:.1f} s)"
+        rows.append((end, *(f"{value:.2f}" for value in values_db), str(one.chains)))
+    title = f"drift: chained iterations of {steps} frames, PSNR in dB of the last"
+    return make_table(title, ("iteration", *METHODS, "chains"), rows)

@@ -1,6 +1,7 @@
 """``mavbridge evaluate-imagination``: from flights to figures."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,7 +25,7 @@ from mavbridge.commands.evaluate_imagination.results import (
 from mavbridge.commands.evaluate_imagination.scores import DriftScorer, WindowScorer
 from mavbridge.commands.imagine.run import SHIPPED, load_model
 from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.commands.output import table_console
+from mavbridge.commands.output import progress_bar, table_console
 from mavbridge.config.imagine import EvaluateImaginationConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
@@ -32,6 +33,7 @@ from mavbridge.core.files import require_writable
 from mavbridge.core.stopping import INTERRUPTED, StopRequest, stop_on_signals
 from policy.data.flight_data import FlightData
 from policy.data.flight_folders import find_flights, is_exemplary
+from policy.world_model.config import WorldModelConfig
 
 ITERATIONS = 10
 """Iterations of a chain, if a flight is long enough."""
@@ -39,22 +41,20 @@ _T = TypeVar("_T")
 
 
 def evaluate_imagination(flights: Sequence[Path], config: EvaluateImaginationConfig) -> int:
-    """Evaluate a world model; the exit status is 130 if interrupted, with what there was by then.
-
-    Args:
-        flights: flight folders, or folders of them.
-        config: the settings.
-
-    Raises:
-        MavbridgeError: every failure that a user can have caused.
-    """
+    """Evaluate a world model on flight folders, or folders of them; 130 if interrupted."""
     require_writable(config.json, "--json")
     cv2.setNumThreads(1)  # images this small are not worth a pool
     model = load_model(config.world_model, ddim_steps=config.ddim_steps, device=config.device)
     sampler = Sampler(model, ddim_steps=config.ddim_steps, decode_all=False, clock=MonotonicClock())
+    exe_steps = config.exe_steps or model.config.frames
+    if exe_steps > model.config.frames:
+        raise UserError(
+            f"--exe-steps {exe_steps} is more than the {model.config.frames} frames that the world "
+            "model imagines: lower it"
+        )
     errors = Console(stderr=True, highlight=False, emoji=False)
-    with stop_on_signals() as stop, Progress(console=errors) as progress:
-        quality = _Evaluation(config, sampler, progress, stop).run(flights)
+    with stop_on_signals() as stop, progress_bar(errors) as progress:
+        quality = _Evaluation(config, sampler, exe_steps, progress, stop).run(flights)
         was_stopped = stop.is_set()
     print_quality(quality, table_console())
     if config.json is not None:
@@ -64,38 +64,28 @@ def evaluate_imagination(flights: Sequence[Path], config: EvaluateImaginationCon
     return INTERRUPTED if was_stopped else 0
 
 
+@dataclass(frozen=True)
 class _Evaluation:
-    """One evaluation, part by part; ends early once a stop is requested."""
+    config: EvaluateImaginationConfig
+    sampler: Sampler
+    exe_steps: int
+    progress: Progress
+    stop: StopRequest
 
-    def __init__(
-        self,
-        config: EvaluateImaginationConfig,
-        sampler: Sampler,
-        progress: Progress,
-        stop: StopRequest,
-    ) -> None:
-        self._config = config
-        self._sampler = sampler
-        self._model = sampler.config
-        self._progress = progress
-        self._stop = stop
-        self._exe_steps = config.exe_steps or self._model.frames
-        if self._exe_steps > self._model.frames:
-            raise UserError(
-                f"--exe-steps {self._exe_steps} is more than the {self._model.frames} frames that "
-                "the world model imagines: lower it"
-            )
+    @property
+    def model(self) -> WorldModelConfig:
+        return self.sampler.config
 
     def run(self, paths: Sequence[Path]) -> ImaginationQuality:
         """Read, imagine and score everything."""
-        config, model = self._config, self._model
+        config, model = self.config, self.model
         folders = find_flights(paths)
         exemplary = [folder for folder in folders if is_exemplary(folder)]
         reading = self._until_stopped(exemplary, "reading", len(exemplary))
         episodes = [read_episode(folder, model) for folder in reading]
         scorer, flights = self._score_windows(episodes)
         too_short, failed = len(episodes) - flights, len(folders) - len(exemplary)
-        if flights == 0 and not self._stop.is_set():
+        if flights == 0 and not self.stop.is_set():
             raise UserError(
                 f"no flight is long enough: {too_short} are too short and {failed} are "
                 f"demonstrations that failed; one of "
@@ -108,7 +98,7 @@ class _Evaluation:
                 ddim_steps=config.ddim_steps,
                 seed=config.seed,
                 frame_dt_s=model.frame_dt_s,
-                exe_steps=self._exe_steps,
+                exe_steps=self.exe_steps,
                 flights=flights,
                 flights_too_short=too_short,
                 demonstrations_failed=failed,
@@ -123,12 +113,12 @@ class _Evaluation:
 
     def _score_windows(self, episodes: list[FlightData]) -> tuple[WindowScorer, int]:
         """The scores, and how many flights have windows."""
-        scorer = WindowScorer(self._sampler, seed=self._config.seed)
+        scorer = WindowScorer(self.sampler, seed=self.config.seed)
         windows, flights = choose_windows(
-            episodes, self._model, steps=self._model.frames, count=self._config.windows
+            episodes, self.model, steps=self.model.frames, count=self.config.windows
         )
         count = len(windows)
-        seen = with_images(windows, scorer.wanted, self._model.image_size)
+        seen = with_images(windows, scorer.image_steps, self.model.image_size)
         imagining = self._until_stopped(seen, "imagining windows", count)
         for index, (window, images) in enumerate(imagining):
             # Half of all windows away: of another flight, or of another time.
@@ -139,28 +129,26 @@ class _Evaluation:
     def _score_chains(self, episodes: list[FlightData]) -> tuple[DriftIteration, ...]:
         """Score the longest chains that any flight has room for: all iterations compare."""
         for iterations in range(ITERATIONS, 0, -1):
-            steps = (iterations - 1) * self._exe_steps + self._model.frames
-            windows, _ = choose_windows(
-                episodes, self._model, steps=steps, count=self._config.chains
-            )
+            steps = (iterations - 1) * self.exe_steps + self.model.frames
+            windows, _ = choose_windows(episodes, self.model, steps=steps, count=self.config.chains)
             if windows:
                 break
         scorer = DriftScorer(
-            self._sampler,
-            seed=self._config.seed,
-            exe_steps=self._exe_steps,
+            self.sampler,
+            seed=self.config.seed,
+            exe_steps=self.exe_steps,
             iterations=iterations,
         )
-        seen = with_images(windows, scorer.wanted, self._model.image_size)
+        seen = with_images(windows, scorer.image_steps, self.model.image_size)
         chains = self._until_stopped(seen, "imagining chains", len(windows))
         for index, (window, images) in enumerate(chains):
             scorer.add(window, images, index=index)
         return scorer.iterations()
 
     def _until_stopped(self, items: Iterable[_T], what: str, total: int) -> Iterator[_T]:
-        task = self._progress.add_task(what, total=total)
+        task = self.progress.add_task(what, total=total)
         for item in items:
-            if self._stop.is_set():
+            if self.stop.is_set():
                 return
             yield item
-            self._progress.advance(task)
+            self.progress.advance(task)

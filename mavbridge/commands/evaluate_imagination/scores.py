@@ -65,7 +65,7 @@ class WindowScorer:
         self._seed = seed
         self._now = sampler.config.context_frames - 1
         self._steps = [step for step in STEPS if step <= sampler.config.frames]
-        self.wanted = [*range(self._now + 1), *(self._now + step for step in self._steps)]
+        self.image_steps = [*range(self._now + 1), *(self._now + step for step in self._steps)]
         """Steps of a window, counted from the first of its context, whose images are used."""
         self.windows = 0
         self._psnr_db = {method: np.zeros(len(self._steps)) for method in METHODS}
@@ -80,13 +80,10 @@ class WindowScorer:
         index: int,
         other_actions: FloatArray | None,
     ) -> None:
-        """Imagine and score one window.
+        """Imagine and score one window with the images of ``image_steps``.
 
-        Args:
-            window: with ``frames`` steps after the context.
-            images: of the steps ``wanted``.
-            index: of the window; with the seed, it determines the noise.
-            other_actions: [frames, 4] of another window; None where there is no other.
+        The seed and ``index`` determine the noise; ``other_actions`` [frames, 4] are those of
+        another window, if there is one.
 
         Raises:
             ImaginationError: the world model imagines NaN or infinity.
@@ -116,7 +113,6 @@ class WindowScorer:
         self.windows += 1
 
     def _note_rates(self, source: RateSource, now: FloatArray, states: FloatArray) -> None:
-        """Keep the mean body rates [3] of each scored step."""
         rates = np.concatenate([now[None], states])[:, RATE].astype(np.float64)
         self._rates[source] += [rates[step - 1 : step + 1].mean(axis=0) for step in self._steps]
 
@@ -162,16 +158,11 @@ class DriftScorer:
         self._psnr_db = np.zeros((iterations, len(METHODS)))
         now = sampler.config.context_frames - 1
         self._ends = [now + exe_steps * (n + 1) for n in range(iterations)]
-        self.wanted = [*range(now + 1), *self._ends]
+        self.image_steps = [*range(now + 1), *self._ends]
         """Steps of a window, counted from the first of its context, whose images are used."""
 
     def add(self, window: FlightWindow, images: dict[int, ImageArray], *, index: int) -> None:
-        """Imagine and score one chain.
-
-        Args:
-            window: with the sticks of all iterations.
-            images: of the steps ``wanted``.
-            index: of the chain; with the seed, it determines the noise.
+        """Imagine and score one chain with the images of ``image_steps``.
 
         Raises:
             ImaginationError: the world model imagines NaN or infinity.

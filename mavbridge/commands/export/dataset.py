@@ -41,7 +41,6 @@ class DatasetWriter:
         self._episodes: list[dict[str, Json]] = []
         self._colours = ImageStats()
         self.rows = 0
-        """Number of rows so far."""
 
     @property
     def episodes(self) -> int:
@@ -51,10 +50,7 @@ class DatasetWriter:
     def add(self, part: Stretch, images: Iterable[ImageArray]) -> int:
         """Append an episode; returns the number of its rows.
 
-        Args:
-            part: its rows.
-            images: of the rows, in their order; the episode ends with them if they end early, and
-                is left out if there are fewer than ``MIN_ROWS``.
+        It ends with its images where they end early, and is left out with fewer than ``MIN_ROWS``.
 
         Raises:
             VideoError: images of another size.
@@ -100,7 +96,6 @@ class DatasetWriter:
             )
 
     def _columns(self, part: Stretch) -> dict[str, NDArray[np.generic]]:
-        """All columns, in the order of the features."""
         count = len(part)
         frame_index = np.arange(count, dtype=np.int64)
         return {
@@ -147,7 +142,15 @@ class DatasetWriter:
         episodes.parent.mkdir(parents=True)
         pq.write_table(_tasks(self._spec.task), self._folder / names.TASKS)
         pq.write_table(pa.Table.from_pylist(self._episodes), episodes)
-        self._write_json(names.STATS, self._stats())
+        # One feature after the other, so that memory holds one.
+        columns = (name for name in _features(self._spec) if name != names.CAMERA_KEY)
+        stats = {name: vector_stats(self._data.column(name)) for name in columns}
+        stats[names.CAMERA_KEY] = self._colours.stats()
+        lists: Json = {
+            feature: {name: values.tolist() for name, values in found.items()}
+            for feature, found in stats.items()
+        }
+        self._write_json(names.STATS, lists)
         self._write_json(names.INFO, self._info())
 
     def close(self) -> None:
@@ -156,16 +159,6 @@ class DatasetWriter:
             self._video.close()
         finally:
             self._data.close()
-
-    def _stats(self) -> dict[str, Json]:
-        """Statistics over all episodes, one feature after the other so that memory holds one."""
-        columns = (name for name in _features(self._spec) if name != names.CAMERA_KEY)
-        found = {name: vector_stats(self._data.column(name)) for name in columns}
-        found[names.CAMERA_KEY] = self._colours.stats()
-        return {
-            feature: {name: values.tolist() for name, values in stats.items()}
-            for feature, stats in found.items()
-        }
 
     def _info(self) -> dict[str, Json]:
         spec = self._spec
@@ -204,17 +197,9 @@ def _arrow(values: NDArray[np.generic]) -> pa.Array:
 def _tasks(task: str) -> pa.Table:
     """``task_index`` under the index ``task``: the reader takes the words from pandas' index."""
     columns: list[Json] = [
-        {
-            "name": name,
-            "field_name": name,
-            "pandas_type": kind,
-            "numpy_type": numpy_type,
-            "metadata": None,
-        }
-        for name, kind, numpy_type in (
-            ("task_index", "int64", "int64"),
-            ("task", "unicode", "object"),
-        )
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": dtype}
+        | {"metadata": None}
+        for name, kind, dtype in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
     ]
     pandas: Json = {"index_columns": ["task"], "column_indexes": [], "columns": columns}
     table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [task]})

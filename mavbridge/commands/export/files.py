@@ -57,7 +57,6 @@ class DatasetSpec:
     width: int
     state_frame: StateFrame
     task: str
-    """In words, for policies that read them."""
     data_file_bytes: int = DATA_FILE_MB * MB
     video_file_bytes: int = VIDEO_FILE_MB * MB
     """Size of a file; one episode alone may be larger."""
@@ -77,9 +76,7 @@ class VideoFiles:
         self._stream: VideoStream | None = None
         self._file = -1
         self._frames = self._bytes = 0
-        """Contents of the file."""
         self._first = 0
-        """Frame of the file with which the episode begins."""
         self._all_frames = self._all_bytes = 0
 
     def begin(self, frames: int) -> None:
@@ -88,7 +85,16 @@ class VideoFiles:
         is_large = expected >= self._spec.video_file_bytes
         is_long = self._frames + frames > MAX_FILE_S * self._spec.fps
         if self._container is None or ((is_large or is_long) and self._frames > 0):
-            self._next_file()
+            self.close()
+            self._file += 1
+            self._frames = self._bytes = 0
+            path = _path(self._folder, names.VIDEO, self._file)
+            self._container = av.open(str(path), "w", options={"movflags": "faststart"})
+            stream = self._container.add_stream("libx264", self._spec.fps)
+            stream.height, stream.width = self._spec.height, self._spec.width
+            stream.pix_fmt, stream.options = "yuv420p", dict(_OPTIONS)
+            stream.codec_context.time_base = Fraction(1, self._spec.fps)
+            self._stream = stream
         self._first = self._frames
 
     def append(self, rgb: ImageArray) -> None:
@@ -115,18 +121,6 @@ class VideoFiles:
             finally:
                 self._container.close()
                 self._container = self._stream = None
-
-    def _next_file(self) -> None:
-        self.close()
-        self._file += 1
-        self._frames = self._bytes = 0
-        path = _path(self._folder, names.VIDEO, self._file)
-        self._container = av.open(str(path), "w", options={"movflags": "faststart"})
-        stream = self._container.add_stream("libx264", self._spec.fps)
-        stream.height, stream.width = self._spec.height, self._spec.width
-        stream.pix_fmt, stream.options = "yuv420p", dict(_OPTIONS)
-        stream.codec_context.time_base = Fraction(1, self._spec.fps)
-        self._stream = stream
 
     def _mux(self, frame: av.VideoFrame | None) -> None:
         if self._container is None or self._stream is None:
@@ -173,7 +167,6 @@ class TableFiles:
 
 
 def _path(folder: Path, pattern: str, number: int) -> Path:
-    """Path of a data or video file by its number; makes its folder."""
     chunk, file = divmod(number, FILES_A_CHUNK)
     path = folder / pattern.format(video_key=names.CAMERA_KEY, chunk_index=chunk, file_index=file)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -36,7 +36,6 @@ class Stretch:
 
     episode: FlightData
     first_frame: int
-    """Counted in the flight's frames."""
     columns: dict[str, NDArray[np.generic]]
     """State [N, 13], action and sent sticks [N, 4], then the stamps [N], under their names in the
     dataset. Sent sticks are zeros where they were released or nothing had been sent yet."""
@@ -56,11 +55,7 @@ class Stretch:
 
 
 def stretches(episode: FlightData) -> list[Stretch]:
-    """Align a flight to its frames, and leave out those without a state or sticks.
-
-    Args:
-        episode: from ``policy.data.flight_folders.read_flight``.
-    """
+    """Align a flight to its frames, and leave out those without a state or sticks."""
     captured_ns = episode.captured_ns
     arrived_ns = np.maximum.accumulate(np.maximum(episode.attitude_ns, episode.velocity_ns))
     tick = _newest(arrived_ns, captured_ns)
@@ -121,7 +116,6 @@ def common_fps(parts: Sequence[Stretch]) -> int:
 
 
 def _rate_hz(periods_ns: Nanoseconds) -> float:
-    """Mean rate, where no frame is missing."""
     whole = periods_ns[periods_ns <= 1.5 * np.median(periods_ns)]
     return NS_PER_S / float(np.maximum(whole.mean(), 1.0))
 

@@ -3,17 +3,18 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from shutil import rmtree
 
 from av.error import FFmpegError
 from rich.console import Console
-from rich.progress import Progress, TaskID
+from rich.progress import TaskID
 
 from mavbridge.commands.export.dataset import DatasetWriter, even_size
 from mavbridge.commands.export.files import DATA_FILE_MB, MB, VIDEO_FILE_MB, DatasetSpec
 from mavbridge.commands.export.rows import Stretch, common_fps, stretches, worst_shift_ns
+from mavbridge.commands.output import progress_bar
 from mavbridge.config.export import ExportConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
@@ -31,17 +32,12 @@ class ExportSummary:
     rows: int
     fps: int
     frames_lost: int
-    """Frames missing at the ends of videos that break off."""
     worst_shift_ns: int
     """Largest distance of an exposure from its place on the even grid."""
 
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
-    """Export flights.
-
-    Raises:
-        MavbridgeError: every failure that a user can have caused.
-    """
+    """Export flights."""
     console = Console(stderr=True, highlight=False, emoji=False)
     folders = find_flights(flights)
     exemplary = [folder for folder in folders if is_exemplary(folder)]
@@ -51,7 +47,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         console.print(f"left out: {failed} of {len(folders)} flights, demonstrations that failed")
     with (
         stop_on_signals() as stop,
-        Progress(console=console) as progress,
+        progress_bar(console) as progress,
         _whole_or_nothing(config.out) as folder,
     ):
 
@@ -81,28 +77,23 @@ def write_dataset(
     data_file_bytes: int = DATA_FILE_MB * MB,
     video_file_bytes: int = VIDEO_FILE_MB * MB,
 ) -> ExportSummary:
-    """Write flights into an empty folder.
-
-    Args:
-        episodes: the flights.
-        folder: there, and empty.
-        config: holds the task.
-        on_frame: called for every frame that was decoded.
-        data_file_bytes: largest size of a table.
-        video_file_bytes: largest size of a video.
+    """Write flights into an empty folder; ``on_frame`` is called for every decoded frame.
 
     Raises:
         UserError, VideoError, DatasetError: flights that cannot be in one dataset, or damaged.
     """
     parts = [stretches(episode) for episode in episodes]
-    every = [part for of_flight in parts for part in of_flight]
+    every = list(chain.from_iterable(parts))
     if not every:
         raise UserError(
             f"nothing to export: in {len(episodes)} flights no frame has a state and sticks at "
             "its exposure: are camera and telemetry of one clock?"
         )
     fps = common_fps(every)
-    height, width = _image_size(every)
+    first = next(chain.from_iterable(part.episode.decode() for part in every), None)
+    if first is None:
+        raise UserError("nothing to export: not one image of these flights can be decoded")
+    height, width = even_size(first)
     spec = DatasetSpec(
         fps=fps,
         height=height,
@@ -126,13 +117,6 @@ def write_dataset(
         frames_lost=sum(map(len, every)) - writer.rows,
         worst_shift_ns=max(worst_shift_ns(part, fps) for part in every),
     )
-
-
-def _image_size(parts: Sequence[Stretch]) -> tuple[int, int]:
-    for part in parts:
-        for image in part.episode.decode():
-            return even_size(image)
-    raise UserError("nothing to export: not one image of these flights can be decoded")
 
 
 def _write_flight(

@@ -34,14 +34,9 @@ class ObservationQueue:
         images: int,
         contract: Contract,
     ) -> None:
-        """Begin with what was really seen.
+        """Begin with the observed past, whose images have ``latents`` [context_frames, C, h, w].
 
-        Args:
-            start: the observed past.
-            latents: [context_frames, C, h, w] of its images.
-            frame_dt_s: time between two steps.
-            images: how many the decider looks at.
-            contract: gives length and spacing of the decider's history.
+        ``images`` and ``contract`` are the decider's.
         """
         self._latents = deque(latents, maxlen=len(latents))
         self._states = deque(start.states, maxlen=len(start.states))
@@ -53,13 +48,7 @@ class ObservationQueue:
             self._history.append(sticks, at_ns)
 
     def push(self, latent: Tensor, state: FloatArray, action: FloatArray) -> None:
-        """Add one executed step: the sticks that were held, and what came of them.
-
-        Args:
-            latent: [C, h, w]
-            state: [13]
-            action: [4]
-        """
+        """Add a step: latent [C, h, w] and state [13] that followed from holding ``action`` [4]."""
         self._history.append(Sticks(*action.tolist()), self._now_ns)
         self._now_ns += self._step_ns
         self._latents.append(latent)
@@ -137,12 +126,7 @@ class WorldModelDecider:
     """The world model itself, with the actions part of what it samples."""
 
     def __init__(self, sampler: Sampler, *, from_pixels: bool) -> None:
-        """Choose what it looks at.
-
-        Args:
-            sampler: calls the world model.
-            from_pixels: its own frames, decoded and encoded again, and not their latents.
-        """
+        """``from_pixels``: it looks at its own frames, decoded and encoded again."""
         self.images = sampler.config.context_frames if from_pixels else 0
         self.contract = sampler.config.contract
         self._sampler = sampler

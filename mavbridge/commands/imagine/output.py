@@ -6,7 +6,7 @@ While it grows, and after a crash, the table is ``NAME.arrows``, as with recorde
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,8 +15,9 @@ import pyarrow as pa
 
 from mavbridge.commands.imagine.loop import RolloutPlan, Segment
 from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.recording.folder import require_extra
 from mavbridge.recording.tables import TableWriter, read_table
@@ -39,6 +40,10 @@ OnFrame: TypeAlias = Callable[[RolloutFrame, ImageArray | None], None]
 """Called for every frame [H, W, 3] in the video's order, by one thread; None: not decoded."""
 
 
+def ignore_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
+    """An ``OnFrame`` that does nothing."""
+
+
 class RolloutError(MavbridgeError):
     """A rollout that could not be written to its end; what was written is readable."""
 
@@ -55,15 +60,7 @@ def prepare_out(out: Path) -> None:
     for path in (out, out.with_suffix(".arrows"), out.with_suffix(".parquet")):
         if path.exists():
             raise UserError(f"{path} is there already: remove it, or name another --out")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.open("xb").close()
-        out.unlink()
-    except OSError as error:
-        raise UserError(
-            f"--out {out} cannot be written ({error.strerror}); name a file in a folder that you "
-            "may write to"
-        ) from error
+    require_writable(out, "--out")
 
 
 def read_rows(out: Path) -> Any:
@@ -111,30 +108,19 @@ class RolloutOutput(ABC):
         sampler: Sampler,
         plan: RolloutPlan,
         *,
-        decode_video: bool,
-        clock: Clock,
-        on_frame: OnFrame,
+        decode_video: bool = True,
+        on_frame: OnFrame = ignore_frame,
     ) -> None:
-        """Open the output.
-
-        Args:
-            out: from ``prepare_out``.
-            sampler: of the rollout.
-            plan: of the rollout.
-            decode_video: whether there is to be a video; the rows are written in any case.
-            clock: for deadlines and stamps.
-            on_frame: observes every frame.
-        """
-        self._out = out
+        """Open the output at ``out``; without ``decode_video`` it is the rows alone."""
+        self.out = out
         self._plan = plan
         self._decode_video = decode_video
-        self._clock = clock
+        self._clock = sampler.clock
         self._sampler = sampler
         self._frame_dt_s = sampler.config.frame_dt_s
         self._on_frame = on_frame
         self._digest = hashlib.sha256()
         self.frames = 0
-        """Frames that have left the decoder."""
         self.frames_decoded = 0
         """Frames decoded beside the loop's thread, whose own are in its meter."""
         self._open()
@@ -176,7 +162,6 @@ class RolloutOutput(ABC):
         """Leave things as they are, after an error; may be called twice."""
 
     def _rows(self, segment: Segment) -> list[RolloutFrame]:
-        """The rows of a segment, without pixels."""
         plan = self._plan
         return [
             RolloutFrame(
@@ -224,27 +209,23 @@ class SerialOutput(RolloutOutput):
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Write everything."""
-        with self._sampler.meter.write, writing(self._out):
-            table = TableWriter(self._out, SCHEMA)
+        with self._sampler.meter.write, writing(self.out):
+            table = TableWriter(self.out, SCHEMA)
             try:
                 table.append(rows_batch([frame for frame, _ in self._collected]))
                 if self._decode_video:
-                    self._write_video(on_wait)
+                    size = self._sampler.config.image_size
+                    with closing(
+                        FragmentedMp4(self.out, height=size, width=size, hz=1 / self._frame_dt_s)
+                    ) as video:
+                        for frame, rgb in self._collected:
+                            video.append(rgb, captured_ns(frame))
+                            self._written += 1
+                            on_wait()
             except BaseException:
                 table.abandon()
                 raise
             table.finish()
-
-    def _write_video(self, on_wait: Callable[[], None]) -> None:
-        size = self._sampler.config.image_size
-        video = FragmentedMp4(self._out, height=size, width=size, hz=1 / self._frame_dt_s)
-        try:
-            for frame, rgb in self._collected:
-                video.append(rgb, captured_ns(frame))
-                self._written += 1
-                on_wait()
-        finally:
-            video.close()
 
     def close(self) -> None:
         """Nothing is open between two calls."""

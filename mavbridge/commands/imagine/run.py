@@ -1,13 +1,11 @@
 """``mavbridge imagine``: from the settings to the files of a rollout."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 from rich.text import Text
 
 import policy
@@ -18,18 +16,19 @@ from mavbridge.commands.imagine.output import (
     RolloutError,
     RolloutOutput,
     SerialOutput,
+    ignore_frame,
     prepare_out,
 )
-from mavbridge.commands.imagine.sampling import Sampler, cores_left_free
+from mavbridge.commands.imagine.sampling import Sampler, torch_threads
 from mavbridge.commands.imagine.start import RealFrames, RolloutStart, read_start
 from mavbridge.commands.imagine.streamed import StreamedOutput
+from mavbridge.commands.output import progress_bar
 from mavbridge.config.imagine import ImagineConfig
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.recording.flight_folder import open_flight
 from policy.checkpoints.world_model_file import load_world_model
 from policy.world_model.model import WorldModel
 
@@ -37,11 +36,7 @@ SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 
 
 def imagine(config: ImagineConfig) -> int:
-    """Imagine a flight; the exit status is 130 if interrupted, with what there was by then.
-
-    Raises:
-        MavbridgeError: every failure that a user can have caused.
-    """
+    """Imagine a flight; the exit status is 130 if interrupted, with what there was by then."""
     console = Console(stderr=True, highlight=False, emoji=False)
     clock = MonotonicClock()
     plan = RolloutPlan(
@@ -62,41 +57,26 @@ def imagine(config: ImagineConfig) -> int:
     start = read_start(flight, model.config, config.start_at)
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=config.serial, clock=clock)
     decider = _make_decider(config, sampler, clock, console)
-    # Serially, too: how a sum is split up decides how it is rounded.
-    with cores_left_free(), _viewer(config, flight, sampler, start) as on_frame:
-        output = make_output(
-            config.out,
-            sampler,
-            plan,
-            serial=config.serial,
-            decode_video=config.decode_video,
-            clock=clock,
-            on_frame=on_frame,
+    # One core is left for the decoder: torch's threads spin at the end of every operation until the
+    # last is done. Serially, too: how a sum is split up decides how it is rounded.
+    free = torch.get_num_threads() - 1
+    with torch_threads(free), ExitStack() as stack:
+        on_frame: OnFrame = ignore_frame
+        if config.rerun != "off":
+            from mavbridge.observe.rerun_rollout import RolloutView
+
+            real = RealFrames(flight, model.config, start.newest_ns)
+            view = stack.enter_context(closing(RolloutView(config.rerun, real=real.at)))
+            on_frame = view.show
+        kind = SerialOutput if config.serial else StreamedOutput
+        output = kind(
+            config.out, sampler, plan, decode_video=config.decode_video, on_frame=on_frame
         )
-        was_stopped = run_rollout(sampler, decider, start, plan, output, config.out, console)
+        was_stopped = run_rollout(sampler, decider, start, plan, output, console)
     _print_summary(config, sampler, output)
     if was_stopped:
         console.print(Text("interrupted: the files hold what was imagined so far", style="yellow"))
     return INTERRUPTED if was_stopped else 0
-
-
-def ignore_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
-    """Do nothing: nobody observes the rollout."""
-
-
-def make_output(
-    out: Path,
-    sampler: Sampler,
-    plan: RolloutPlan,
-    *,
-    serial: bool,
-    decode_video: bool,
-    clock: Clock,
-    on_frame: OnFrame = ignore_frame,
-) -> RolloutOutput:
-    """Make the serial form or the streamed one; the arguments are those of ``RolloutOutput``."""
-    kind = SerialOutput if serial else StreamedOutput
-    return kind(out, sampler, plan, decode_video=decode_video, clock=clock, on_frame=on_frame)
 
 
 def run_rollout(
@@ -105,7 +85,6 @@ def run_rollout(
     start: RolloutStart,
     plan: RolloutPlan,
     output: RolloutOutput,
-    out: Path,
     console: Console,
 ) -> bool:
     """Run the iterations; returns whether a signal ended them early.
@@ -115,7 +94,7 @@ def run_rollout(
     """
     done = 0
     try:
-        with stop_on_signals() as stop, Progress(console=console) as bar:
+        with stop_on_signals() as stop, progress_bar(console) as bar:
             task = bar.add_task("imagining", total=plan.iterations * plan.frames)
 
             def refresh() -> None:
@@ -123,7 +102,7 @@ def run_rollout(
                     f"iteration {done}/{plan.iterations}, to decode {output.decode_queue}, "
                     f"to write {output.writer_queue}"
                 )
-                bar.update(task, completed=output.frames, description=status)
+                bar.update(task, completed=output.frames, status=status)
 
             for segment in rollout(sampler, decider, start, plan):
                 output.put(segment)
@@ -137,8 +116,8 @@ def run_rollout(
     except MavbridgeError as error:
         output.close()
         left = "nothing was written"
-        if out.exists() or out.with_suffix(".arrows").exists():
-            left = f"{out} and its rows hold what was written before, and are readable"
+        if output.out.exists() or output.out.with_suffix(".arrows").exists():
+            left = f"{output.out} and its rows hold what was written before, and are readable"
         raise RolloutError(f"{error}; {left}") from error
     except BaseException:
         output.close()
@@ -182,24 +161,6 @@ def _make_decider(
     for note in loaded.notes:
         console.print(Text(note, style="yellow" if note.startswith("warning") else "dim"))
     return PolicyDecider(loaded.executable, sampler)
-
-
-@contextmanager
-def _viewer(
-    config: ImagineConfig, flight: RecordedFlight, sampler: Sampler, start: RolloutStart
-) -> Iterator[OnFrame]:
-    """Open the Rerun view, if one was requested; yields its callback."""
-    if config.rerun == "off":
-        yield ignore_frame
-        return
-    from mavbridge.observe.rerun_rollout import RolloutView
-
-    real = RealFrames(flight, sampler.config, start.newest_ns)
-    view = RolloutView(config.rerun, real=real.at)
-    try:
-        yield view.show
-    finally:
-        view.close()
 
 
 def _print_summary(config: ImagineConfig, sampler: Sampler, output: RolloutOutput) -> None:

@@ -1,7 +1,7 @@
 """The world model as the loop calls it: numpy at the edge, no gradients, every second counted."""
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,26 +20,9 @@ class ImaginationError(MavbridgeError):
     """A world model that imagines NaN or infinity."""
 
 
-def cores_left_free() -> AbstractContextManager[None]:
-    """Let torch use all of a CPU's cores but one, which is for the decoder.
-
-    Torch's threads spin at the end of every operation until the last is done: with more threads
-    than cores a rollout takes twice the time.
-    """
-    return _torch_threads(torch.get_num_threads() - 1)
-
-
-def one_core() -> AbstractContextManager[None]:
-    """Let torch use the calling thread alone.
-
-    All frames are decoded so, because how a sum is split up decides how it is rounded. One frame
-    gains little from a second core.
-    """
-    return _torch_threads(1)
-
-
 @contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use so many threads, at least one, within the ``with`` block."""
     before = torch.get_num_threads()
     torch.set_num_threads(max(1, count))
     try:
@@ -70,13 +53,11 @@ class Meter:
 
     def __init__(self, clock: Clock) -> None:
         self.sample = Stopwatch(clock)
-        """Time inside the world model."""
         self.decode = Stopwatch(clock)
         """Time for pixels: its own decodes, and waits for room in the decode queue."""
         self.write = Stopwatch(clock)
         """Time for the files: its own writing, or waits for the end of the writer's."""
         self.frames_decoded = 0
-        """Frames decoded by that thread."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +86,7 @@ class Sampler:
         """
         self.model = model
         self.config: WorldModelConfig = model.config
+        self.clock = clock
         self.meter = Meter(clock)
         self._ddim_steps = ddim_steps
         self._decode_all = decode_all
@@ -116,8 +98,11 @@ class Sampler:
             return self.model.encode(torch.from_numpy(images).to(self._device))
 
     def decode(self, latents: Tensor) -> NDArray[np.uint8]:
-        """Latents [N, C, h, w] -> images [N, H, W, 3], now."""
-        with torch.inference_mode(), one_core(), self.meter.decode:
+        """Latents [N, C, h, w] -> images [N, H, W, 3].
+
+        On one thread, as ``FrameDecoder``: how a sum is split up decides how it is rounded.
+        """
+        with torch.inference_mode(), torch_threads(1), self.meter.decode:
             pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
         self.meter.frames_decoded += len(pixels)
         return pixels
@@ -125,13 +110,10 @@ class Sampler:
     def sample(
         self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
     ) -> ImaginedSteps:
-        """Decide (actions None) or simulate.
+        """Simulate the actions [frames, 4], or decide on some where they are None.
 
-        Args:
-            latents: [1, context_frames, C, h, w]
-            states: [1, context_frames, 13]
-            actions: [frames, 4] to simulate, or None.
-            seed: of the noise alone.
+        Latents are [1, context_frames, C, h, w], states [1, context_frames, 13]; ``seed`` is that
+        of the noise.
 
         Raises:
             ImaginationError: what came out is not finite.

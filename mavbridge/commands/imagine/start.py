@@ -35,12 +35,7 @@ class RolloutStart:
 
 
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
-    """Read the context that a world model continues from.
-
-    Args:
-        flight: from ``open_flight``.
-        config: of the world model.
-        start_s: time of the first frame, since the first one that has a state.
+    """Read the context, from ``start_s`` after the first frame that has a state.
 
     Raises:
         UserError: the flight is too short, has no states, or they are in another frame.
@@ -113,7 +108,6 @@ def _images(flight: RecordedFlight, frames: list[int], size: int) -> NDArray[np.
 
 
 def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
-    """Index of the stamp nearest to a time."""
     return int(np.abs(stamps_ns - at_ns).argmin())
 
 
@@ -131,7 +125,6 @@ class RealFrames:
         self._decoded = 0
         self._newest_step = 0
         self._window: deque[ImageArray] = deque(maxlen=config.frames)
-        """Images of consecutive steps, up to the newest."""
 
     def at(self, step: int) -> ImageArray | None:
         """The frame ``step`` times ``frame_dt_s`` after the start; None once the flight is over.
@@ -141,24 +134,17 @@ class RealFrames:
             VideoError: the video is damaged.
         """
         while self._newest_step < step:
-            rgb = self._decode(self._newest_step + 1)
-            if rgb is None:
+            dt_s, size = self._config.frame_dt_s, self._config.image_size
+            at_ns = self._newest_ns + round((self._newest_step + 1) * dt_s * NS_PER_S)
+            if at_ns > self._captured_ns[-1]:
                 return None
+            rgb = None
+            while self._decoded <= _nearest(self._captured_ns, at_ns):
+                rgb = next(self._images)
+                self._decoded += 1
             self._newest_step += 1
-            self._window.append(rgb)
+            # Two steps share a frame only where the camera is slower than the world model.
+            self._window.append(self._window[-1] if rgb is None else resize(rgb, size, size))
         if self._newest_step - step >= len(self._window):
             raise ValueError(f"step {step} has left the window")
         return self._window[step - self._newest_step - 1]
-
-    def _decode(self, step: int) -> ImageArray | None:
-        at_ns = self._newest_ns + round(step * self._config.frame_dt_s * NS_PER_S)
-        if at_ns > self._captured_ns[-1]:
-            return None
-        index = _nearest(self._captured_ns, at_ns)
-        rgb = None
-        while self._decoded <= index:
-            rgb = next(self._images)
-            self._decoded += 1
-        # Two steps share a frame only where the camera is slower than the world model.
-        size = self._config.image_size
-        return self._window[-1] if rgb is None else resize(rgb, size, size)

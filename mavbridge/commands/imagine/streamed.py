@@ -21,7 +21,7 @@ from mavbridge.commands.imagine.output import (
     rows_batch,
     writing,
 )
-from mavbridge.commands.imagine.sampling import one_core
+from mavbridge.commands.imagine.sampling import torch_threads
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.core.workers import HungError, Worker
@@ -96,8 +96,6 @@ class FrameDecoder:
 
 @dataclass(frozen=True, kw_only=True)
 class _DecodeJob:
-    """A segment on its way to the thread."""
-
     frames: list[RolloutFrame]
     decoded: dict[int, ImageArray]
     missing: Tensor | None
@@ -110,16 +108,15 @@ class StreamedOutput(RolloutOutput):
     """Frames and rows go to the disk as they come."""
 
     def _open(self) -> None:
-        """Create the files, start the writer process and the thread."""
         self._decoder = FrameDecoder(self._sampler.model)
         self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
-        self._table_path = self._out.with_suffix(".arrows")
+        self._table_path = self.out.with_suffix(".arrows")
         self._video: VideoWriter | None = None
         with writing(self._table_path):
-            self._table = TableWriter(self._out, SCHEMA)
+            self._table = TableWriter(self.out, SCHEMA)
         if self._decode_video:
             try:
-                self._video = VideoWriter(self._out, pressure="offline", hz=1 / self._frame_dt_s)
+                self._video = VideoWriter(self.out, pressure="offline", hz=1 / self._frame_dt_s)
             except BaseException:
                 self._table.abandon()
                 raise
@@ -201,8 +198,7 @@ class StreamedOutput(RolloutOutput):
         self._table.abandon()
 
     def _serve(self, stop: Event) -> None:
-        """Decode and write jobs, on the thread."""
-        with one_core():
+        with torch_threads(1):
             while not stop.is_set():
                 try:
                     job = self._jobs.get(timeout=_POLL_S)

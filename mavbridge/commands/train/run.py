@@ -3,12 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Self
 
 import torch
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.commands.train.display import Display, print_result
+from mavbridge.commands.output import progress_bar
 from mavbridge.config.checks import check_range
 from mavbridge.config.courses import MAX_EPISODES
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
@@ -20,7 +21,7 @@ from policy.data.flight_folders import find_flights, is_exemplary, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.loading import builtin_config
 from policy.training.policy_run import Check, Network, train_policy
-from policy.training.report import Hooks, TrainResult
+from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import TrainingStoppedError
 from policy.training.settings import TrainSettings, WorldModelSettings
 from policy.training.world_model.run import train_world_model
@@ -30,9 +31,7 @@ from policy.world_model.config import WorldModelConfig
 def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     """Train a policy; 0 when the checkpoint is written, 130 if interrupted.
 
-    Args:
-        paths: flight folders, folders of them, or LeRobot datasets.
-        settings: what to train and how.
+    Paths are flight folders, folders of them, or LeRobot datasets.
 
     Raises:
         UserError: a flag that cannot be used.
@@ -40,7 +39,19 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     """
     _require_device(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
-    check = _check(settings)
+    check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
+    check: Check | None = None
+    if settings.check_flights:
+        try:
+            from mavbridge.commands.train.check_flights import share_of_gates
+        except ImportError as error:
+            raise UserError(
+                f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
+            ) from error
+
+        def check(checkpoint: Path) -> float:
+            return share_of_gates(checkpoint, settings.policy, settings.check_flights)
+
     flights = _read_flights(paths, settings.camera_key)
     network = fit_to_flights(network, flights, settings)
     return _finish(lambda hooks: train_policy(flights, network, settings, hooks, check))
@@ -67,8 +78,38 @@ def fit_to_flights(
     return replace(network, contract=contract)
 
 
+class Display:
+    """A progress bar, whose last words are the losses, and lines for what the run reports."""
+
+    def __init__(self) -> None:
+        self._bar = progress_bar(Console(stderr=True, highlight=False), as_percentage=True)
+        self._task = self._bar.add_task("starting", total=1.0)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, progress: TrainingProgress) -> None:
+        """Show whatever the run reports."""
+        if progress.note is not None:
+            self._bar.print(f"note: {progress.note}")
+            return
+        self._bar.update(self._task, description=progress.stage, completed=progress.fraction)
+        if progress.losses is not None:
+            parts = (f"{name} {value:.3f}" for name, value in progress.losses.items())
+            losses = f"step {progress.step}  {'  '.join(parts).replace('_', ' ')}"
+            self._bar.update(self._task, status=losses)
+        if progress.validation is not None:
+            self._bar.print(
+                f"{progress.fraction:4.0%} {progress.stage}, step {progress.step}: "
+                f"{progress.validation.describe()}"
+            )
+
+
 def _finish(train: Callable[[Hooks], TrainResult]) -> int:
-    """Run to the end, or until Ctrl-C, which keeps the run."""
     clock = MonotonicClock()
     try:
         with stop_on_signals() as stop, Display() as display:
@@ -82,12 +123,16 @@ def _finish(train: Callable[[Hooks], TrainResult]) -> int:
     except TrainingStoppedError as stopped:
         Console(stderr=True, highlight=False).print(Text(str(stopped), style="yellow"))
         return INTERRUPTED
-    print_result(result)
+    console = Console(highlight=False)
+    console.print(f"{result.checkpoint}: {result.steps} steps", soft_wrap=True)
+    if result.validation is not None:
+        console.print(result.validation.describe(), soft_wrap=True)
+    if result.score is not None:
+        console.print(f"closed-loop score {result.score:.3f}")
     return 0
 
 
 def _read_flights(paths: Sequence[Path], camera_key: str | None) -> list[FlightData]:
-    """Read LeRobot datasets (folders with meta/info.json) and flights of ours."""
     datasets = [path for path in paths if is_lerobot(path)]
     if camera_key is not None and not datasets:
         raise UserError("--camera-key is for LeRobot datasets; flights have one camera")
@@ -95,20 +140,6 @@ def _read_flights(paths: Sequence[Path], camera_key: str | None) -> list[FlightD
     folders = find_flights(own) if own else []
     flights = [read_flight(folder) for folder in folders if is_exemplary(folder)]
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]
-
-
-def _check(settings: TrainSettings) -> Check | None:
-    """The closed-loop check, if there is to be one."""
-    check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
-    if settings.check_flights == 0:
-        return None
-    try:
-        from mavbridge.commands.train.check_flights import share_of_gates
-    except ImportError as error:
-        raise UserError(
-            f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
-        ) from error
-    return lambda checkpoint: share_of_gates(checkpoint, settings.policy, settings.check_flights)
 
 
 def _require_device(device: str) -> None:

@@ -83,12 +83,10 @@ def test_the_json_holds_what_follows_from_the_figures(tmp_path: Path) -> None:
 
 
 def test_the_figure_shows_speed_up_by_steps_and_memory_by_iterations() -> None:
-    figure = pytest.importorskip("matplotlib.figure", reason="the figure needs the extra 'bench'")
-    left, right = figure.Figure().subplots(1, 2)
-    rollout.draw_speed_up(left, BY_STEPS)
+    pytest.importorskip("matplotlib", reason="the figure needs the extra 'bench'")
+    left, right = rollout.draw(BY_ITERATIONS, BY_STEPS).axes
     measured, bound = left.lines
     assert list(measured.get_xdata()) == [1, 4]
     assert list(measured.get_ydata()) == [1.25, 1.25]
     assert list(bound.get_ydata()) == pytest.approx([10 / 6, 10 / 6])
-    rollout.draw_memory(right, BY_ITERATIONS)
     assert [list(line.get_ydata()) for line in right.lines] == [[329, 385], [329, 385]]

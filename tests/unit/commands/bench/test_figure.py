@@ -1,6 +1,5 @@
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -39,7 +38,7 @@ def test_rates_are_drawn_beside_what_was_asked(axes) -> None:
 
 def test_latencies_run_from_the_median_to_the_99th_percentile(axes) -> None:
     span = figure.LatencyRow("one, two", 2.0, 30.0, "black")
-    figure.draw_spans(axes, "title", [span])
+    figure.draw_latencies(axes, "title", [span])
     line, dot = axes.lines
     assert list(line.get_xdata()) == [2.0, 30.0]
     assert list(dot.get_xdata()) == [2.0]
@@ -48,16 +47,10 @@ def test_latencies_run_from_the_median_to_the_99th_percentile(axes) -> None:
     assert high > 30.0
 
 
-def test_a_flight_that_sent_nothing_has_no_latency(tmp_path: Path) -> None:
+def test_every_client_has_its_round_trip_and_a_flight_that_sent_nothing_no_latency() -> None:
     flights = tuple(replace(flight, state_to_wire_ms=None) for flight in RESULT.flights)
-    assert figure.flight_spans(flights) == []
-    figure.draw(replace(RESULT, flights=flights), tmp_path / "bench.png")
-    assert (tmp_path / "bench.png").exists()
-
-
-def test_every_client_has_its_round_trip() -> None:
-    spans = figure.link_spans(RESULT.links)
-    assert [(span.label, span.p50) for span in spans] == [
-        ("mavbridge, 100 Hz clock", 5.0),
-        ("bare pymavlink loop", 0.3),
-    ]
+    flying, links = figure.make_figure(replace(RESULT, flights=flights)).axes[2:]
+    assert not flying.lines
+    labels = [label.get_text().replace("\n", ", ") for label in links.get_yticklabels()]
+    assert [label.lstrip(", ") for label in labels] == [link.client for link in RESULT.links]
+    assert [line.get_xdata()[0] for line in links.lines[::2]] == [5.0, 0.3]

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from mavbridge.commands.demonstrate.flight import DemonstrationSpec, fly_demonstration
-from mavbridge.commands.demonstrate.pilot import TurnSchedule
+from mavbridge.commands.demonstrate.pilot import TurnSchedule, draw_variation
 from mavbridge.commands.demonstrate.run import demonstrate
-from mavbridge.commands.demonstrate.variation import draw_variation
 from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError

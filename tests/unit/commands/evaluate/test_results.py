@@ -16,7 +16,7 @@ from mavbridge.commands.evaluate.results import (
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import NEUTRAL, Sticks
-from mavbridge.simulation.result import EpisodeResult, StickMeter
+from mavbridge.simulation.referee import EpisodeResult, StickMeter
 
 
 def evaluation(*episodes: EpisodeResult) -> Evaluation:

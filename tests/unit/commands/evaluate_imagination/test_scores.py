@@ -102,7 +102,7 @@ def score(imagine: Imagine) -> tuple[WindowScorer, OracleSampler]:
         images = dict(enumerate(images_of(window.states)))
         scorer.add(
             window,
-            {step: images[step] for step in scorer.wanted},
+            {step: images[step] for step in scorer.image_steps},
             index=index,
             other_actions=windows[(index + 1) % 4].actions,
         )
@@ -171,10 +171,10 @@ def test_a_chain_continues_from_what_was_imagined() -> None:
 
     sampler = OracleSampler(imagine)
     scorer = DriftScorer(sampler, seed=3, exe_steps=4, iterations=3)  # type: ignore[arg-type]
-    assert scorer.wanted == [0, 1, 5, 9, 13]
+    assert scorer.image_steps == [0, 1, 5, 9, 13]
     assert scorer.iterations() == ()
     images = dict(enumerate(images_of(window.states)))
-    scorer.add(window, {step: images[step] for step in scorer.wanted}, index=0)
+    scorer.add(window, {step: images[step] for step in scorer.image_steps}, index=0)
     found = scorer.iterations()
     assert [(one.iteration, one.chains) for one in found] == [(1, 1), (2, 1), (3, 1)]
     for row, value in enumerate((40, 80, 160)):

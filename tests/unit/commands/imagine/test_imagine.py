@@ -154,14 +154,14 @@ def test_ctrl_c_finishes_what_is_there(
 def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
     imagine: Imagine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, make_output = tmp_path / "a.mp4", run.make_output
+    out, start_output = tmp_path / "a.mp4", run.StreamedOutput
 
-    def make(*arguments: object, **named: object) -> object:
-        made = make_output(*arguments, **named)  # type: ignore[arg-type]
-        os.kill(made.writer_pid, signal.SIGKILL)  # type: ignore[attr-defined, arg-type]
+    def start(*arguments: object, **named: object) -> object:
+        made = start_output(*arguments, **named)  # type: ignore[arg-type]
+        os.kill(made.writer_pid, signal.SIGKILL)  # type: ignore[arg-type]
         return made
 
-    monkeypatch.setattr(run, "make_output", make)
+    monkeypatch.setattr(run, "StreamedOutput", start)
     status, text = imagine("--out", str(out), "--n-iter", "100")
     assert status == 1
     assert "the writer process has died" in text
@@ -192,7 +192,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
         (["--rerun", "a.txt"], ".rrd"),
         (["--out", "taken.mp4"], "taken.mp4 is there already"),
         (["--out", "a.avi"], "must end in .mp4"),
-        (["--out", "taken.mp4/a.mp4"], "cannot be written"),
+        (["--out", "taken.mp4/a.mp4"], "cannot write --out"),
     ],
 )
 def test_bad_input_is_one_message(

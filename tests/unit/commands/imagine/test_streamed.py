@@ -20,9 +20,7 @@ from helpers.recordings import send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler
 from mavbridge.commands.imagine.loop import Segment
 from mavbridge.commands.imagine.output import RolloutError, read_rows
-from mavbridge.commands.imagine.run import ignore_frame
 from mavbridge.commands.imagine.streamed import QUEUED_SEGMENTS, StreamedOutput
-from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
@@ -35,14 +33,7 @@ PLAN = make_plan(iterations=1000)
 
 @contextmanager
 def output(out: Path, model: TinyWorld | None = None) -> Iterator[StreamedOutput]:
-    made = StreamedOutput(
-        out,
-        make_sampler(model),
-        PLAN,
-        decode_video=True,
-        clock=MonotonicClock(),
-        on_frame=ignore_frame,
-    )
+    made = StreamedOutput(out, make_sampler(model), PLAN)
     try:
         yield made
     finally:
@@ -189,14 +180,7 @@ def test_files_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
         put_all(made)
     assert out.read_text() == "precious"
     with pytest.raises(RolloutError, match="exists"):
-        StreamedOutput(  # the rows of the one before
-            out,
-            make_sampler(),
-            PLAN,
-            decode_video=False,
-            clock=MonotonicClock(),
-            on_frame=ignore_frame,
-        )
+        StreamedOutput(out, make_sampler(), PLAN, decode_video=False)  # the rows are there already
 
 
 KILLED = """
@@ -205,7 +189,6 @@ from pathlib import Path
 
 
 def main():  # the writer process imports this script, too: nothing heavy outside
-    from mavbridge.core.clock import MonotonicClock
     from mavbridge.commands.imagine.loop import rollout
     from mavbridge.commands.imagine.streamed import StreamedOutput
     from helpers.rollouts import make_decider, make_plan, make_sampler, make_start
@@ -215,14 +198,7 @@ def main():  # the writer process imports this script, too: nothing heavy outsid
             os.kill(os.getpid(), signal.SIGKILL)
 
     plan, sampler = make_plan(iterations=50), make_sampler()
-    output = StreamedOutput(
-        Path(sys.argv[1]),
-        sampler,
-        plan,
-        decode_video=True,
-        clock=MonotonicClock(),
-        on_frame=on_frame,
-    )
+    output = StreamedOutput(Path(sys.argv[1]), sampler, plan, on_frame=on_frame)
     for segment in rollout(sampler, make_decider("toge", sampler), make_start(), plan):
         output.put(segment)
 

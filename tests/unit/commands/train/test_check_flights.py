@@ -15,7 +15,7 @@ from mavbridge.config.courses import CHECK_COURSE_SEED, HELD_OUT_COURSE_SEED, MA
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import Clock
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.simulation.result import EpisodeResult
+from mavbridge.simulation.referee import EpisodeResult
 from policy.checkpoints.policy_file import save_checkpoint
 from policy.contract import Contract, Executable, FloatArray
 from policy.loading import LoadedPolicy

@@ -11,7 +11,6 @@ import torch
 from helpers.flight_folders import write_meta, write_spot_flight
 from mavbridge.__main__ import main
 from mavbridge.commands.train import run
-from mavbridge.commands.train.display import Display
 from mavbridge.core.stopping import INTERRUPTED
 from policy.checkpoints.world_model_file import load_world_model
 from policy.contract import Contract
@@ -142,12 +141,12 @@ def test_ctrl_c_keeps_the_run_and_says_how_to_resume_it(
     out = tmp_path / "a.safetensors"
     command = ("train", str(tmp_path / "flights"), "--out", str(out), *SMALL, "--steps", "8")
 
-    def interrupt(_: Display, progress: TrainingProgress) -> None:
+    def interrupt(_: run.Display, progress: TrainingProgress) -> None:
         if progress.stage.startswith("encoding"):
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Display, "show", interrupt)
+        patch.setattr(run.Display, "show", interrupt)
         assert status_of(*command) == INTERRUPTED
     assert "--resume" in capsys.readouterr().err
     assert not out.exists()
