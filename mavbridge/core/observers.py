@@ -28,19 +28,15 @@ class Consumer(Protocol):
         Raises:
             MavbridgeError, OSError: it cannot continue; no further batch will come.
         """
-        ...
 
     def close(self) -> None:
         """Finish; called once, after the last batch, also when ``consume`` has raised."""
-        ...
 
 
 class _Lane:
     """A bounded queue with one producer and one consumer, which therefore needs no lock."""
 
     def __init__(self, capacity: int) -> None:
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {capacity}")
         self._capacity = capacity
         self._events: deque[Event] = deque()
         self.refused = 0
@@ -71,13 +67,9 @@ class ObserverThread:
     def __init__(
         self, name: str, consumer: Consumer, *, capacity: int, image_capacity: int = 16
     ) -> None:
-        """Start the thread.
+        """Start the thread, which alone uses the consumer from here on.
 
-        Args:
-            name: of the thread, and of the observer in messages.
-            consumer: used by the thread alone from here on.
-            capacity: most ticks waiting.
-            image_capacity: most vision ticks waiting; each holds an image.
+        ``capacity`` is the most ticks that may wait, ``image_capacity`` the most vision ticks.
         """
         self._name = name
         self._consumer = consumer
@@ -86,7 +78,8 @@ class ObserverThread:
         self._closing = threading.Event()
         self._out_of_time = threading.Event()
         self._open = True
-        self._failure: str | None = None
+        self.failure: str | None = None
+        """Why the observer stopped before it was closed, or None."""
         self._in_flight = 0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -107,11 +100,6 @@ class ObserverThread:
             return refused
         return refused + len(self._ticks) + len(self._visions) + self._in_flight
 
-    @property
-    def failure(self) -> str | None:
-        """Why the observer stopped before it was closed, or None."""
-        return self._failure
-
     def close(self, timeout_s: float) -> None:
         """Let the consumer empty the queue and finish, for at most ``timeout_s``."""
         self._open = False
@@ -123,7 +111,15 @@ class ObserverThread:
 
     def _run(self) -> None:
         try:
-            self._serve()
+            while not self._out_of_time.is_set():
+                is_last_round = self._closing.wait(BATCH_PERIOD_S)
+                batch = self._ticks.take() + self._visions.take()
+                if batch:
+                    self._in_flight = len(batch)
+                    self._consumer.consume(batch)
+                    self._in_flight = 0
+                elif is_last_round:
+                    return
         except (MavbridgeError, OSError) as error:
             self._fail(str(error))
         except Exception as bug:
@@ -136,20 +132,9 @@ class ObserverThread:
             except (MavbridgeError, OSError) as error:
                 self._fail(str(error))
 
-    def _serve(self) -> None:
-        while not self._out_of_time.is_set():
-            last_round = self._closing.wait(BATCH_PERIOD_S)
-            batch = self._ticks.take() + self._visions.take()
-            if batch:
-                self._in_flight = len(batch)
-                self._consumer.consume(batch)
-                self._in_flight = 0
-            elif last_round:
-                return
-
     def _fail(self, reason: str) -> None:
-        if self._failure is None:
-            self._failure = reason
+        if self.failure is None:
+            self.failure = reason
             _log.warning("%s stopped: %s; the flight goes on without it", self._name, reason)
 
 

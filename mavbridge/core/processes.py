@@ -57,11 +57,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 def wait(process: subprocess.Popen[bytes], name: str, log: Path, timeout_s: float) -> None:
-    """Wait for a process that ends by itself.
-
-    Raises:
-        UserError: it failed, or did not end in time; quotes the end of its log.
-    """
+    """Wait for a process to end; raises UserError with the end of its log if it fails to."""
     try:
         status = process.wait(timeout_s)
     except subprocess.TimeoutExpired as error:
