@@ -63,6 +63,8 @@ class GridPacer:
     """
 
     def __init__(self, clock: Clock, *, period_ns: int) -> None:
+        if period_ns <= 0:
+            raise ValueError(f"period_ns must be positive, got {period_ns}")
         self._clock = clock
         self._period_ns = period_ns
         self._tolerance_ns = period_ns // 4

@@ -37,6 +37,8 @@ class _Lane:
     """A bounded queue with one producer and one consumer, which therefore needs no lock."""
 
     def __init__(self, capacity: int) -> None:
+        if capacity < 1:
+            raise ValueError(f"capacity must be at least 1, got {capacity}")
         self._capacity = capacity
         self._events: deque[Event] = deque()
         self.refused = 0

@@ -14,7 +14,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.observers import ObserverThread
 from mavbridge.core.ports import TickSink
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.packet_log import PacketLog
+from mavbridge.mavlink.transport.connection import PacketLog
 from mavbridge.observe.rerun_flight import RerunView
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json

@@ -19,8 +19,7 @@ from mavbridge.mavlink.session.discovery import VehicleDiscovery, VehicleIdentit
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.transport.connection import Arrival, Connection
-from mavbridge.mavlink.transport.packet_log import PacketLog
+from mavbridge.mavlink.transport.connection import Arrival, Connection, PacketLog
 from mavbridge.mavlink.transport.sockets import Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -204,7 +203,7 @@ class MavlinkLink:
             identity, self._config, state_hz=self._state_hz, report=self._report
         )
         self._counters.new_sequence()
-        self._connection.answer_to(identity.address)
+        self._connection.peer = identity.address
 
     def _report(self, text: str) -> None:
         self._connection.texts.append(text)

@@ -1,6 +1,7 @@
 """Transport and codec together: messages in, packets out, reconnecting by itself."""
 
 import threading
+from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -8,13 +9,35 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.records import Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.transport.packet_log import PacketLog
 from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDownError
 
 REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 4 * NS_PER_MS
 """Longest stretch of reading: a flood must not keep the action loop from its next slot. What is
 left stays with the kernel, which drops what it cannot hold."""
+
+
+LOG_CAPACITY = 16384
+"""Packets that may wait for a recorder: ten seconds of a busy link."""
+
+
+class PacketLog:
+    """Implements ``ports.PacketSource``: the link appends, another thread drains."""
+
+    def __init__(self) -> None:
+        self._packets: deque[Packet] = deque()
+        self.dropped = 0
+
+    def append(self, packet: Packet) -> None:
+        """Keep a packet that has arrived or left; drop and count it if nobody drains."""
+        if len(self._packets) < LOG_CAPACITY:
+            self._packets.append(packet)
+        else:
+            self.dropped += 1
+
+    def drain(self) -> list[Packet]:
+        """Packets of both directions since the last call."""
+        return [self._packets.popleft() for _ in range(len(self._packets))]
 
 
 class Arrival(NamedTuple):
@@ -36,7 +59,8 @@ class Connection:
         self._clock = clock
         self._log = log
         self._reopen_ns: int | None = None
-        self._peer: Address | None = None
+        self.peer: Address | None = None
+        """The vehicle's address, to which packets are sent; None until it is found."""
         self._lock = threading.Lock()
         self._is_blocked = False
         self.texts: list[str] = []
@@ -56,7 +80,6 @@ class Connection:
             self._lose(error, now_ns)
             return
         self._codec.forget_partial()
-        self._transport.answer_to(self._peer)
 
     def _lose(self, error: TransportDownError, now_ns: int) -> None:
         self._transport.close()
@@ -90,18 +113,13 @@ class Connection:
         else:
             self._transport.wait(until_ns)
 
-    def answer_to(self, peer: Address | None) -> None:
-        """Send to this peer from now on, also after reconnecting."""
-        self._peer = peer
-        self._transport.answer_to(peer)
-
     def send(self, data: bytes, *, is_forced: bool = False) -> bool:
         """Send one packet; False: it was not sent. ``is_forced`` overrides ``block_sends``."""
         with self._lock:
             if self.is_down or (self._is_blocked and not is_forced):
                 return False
             try:
-                is_sent = self._transport.send(data)
+                is_sent = self._transport.send(data, self.peer)
             except TransportDownError as error:
                 self._lose(error, self._clock.now_ns())
                 return False

@@ -13,7 +13,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.records import IDLE, Command, LinkSnapshot, Release, Sticks
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.packet_log import PacketLog
+from mavbridge.mavlink.transport.connection import PacketLog
 from mavbridge.mavlink.transport.sockets import Address, Chunk, TransportDownError
 
 MS = NS_PER_MS
@@ -61,12 +61,10 @@ class Vehicle:
         if arrival_ns <= until_ns and self.is_alive:
             self.tick(1)
 
-    def answer_to(self, sender: Address | None) -> None:
-        self.answered_to = sender
-
-    def send(self, data: bytes) -> bool:
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
         if self.is_down or self.is_deaf:
             return False
+        self.answered_to = peer
         for message in self.end.read(data):
             self.received.append(message)
             self.answer(message)

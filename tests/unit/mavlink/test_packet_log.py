@@ -10,8 +10,8 @@ from pymavlink.dialects.v10 import ardupilotmega as dialect1
 from helpers.wire import WireEnd
 from mavbridge.core.records import Packet
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.transport import packet_log
-from mavbridge.mavlink.transport.packet_log import PacketLog
+from mavbridge.mavlink.transport import connection
+from mavbridge.mavlink.transport.connection import PacketLog
 from mavbridge.recording.tlog import TlogWriter
 
 
@@ -52,7 +52,7 @@ def test_every_packet_comes_out_of_the_codec_as_it_was_sent(sizes: list[int], co
 
 
 def test_a_full_log_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packet_log, "CAPACITY", 3)
+    monkeypatch.setattr(connection, "LOG_CAPACITY", 3)
     full = PacketLog()
     for k in range(5):
         full.append(Packet(k, b"x"))
