@@ -63,7 +63,11 @@ def open_device(device: int | Path, *, image_size: int, clock: Clock) -> Capture
     else:
         capture = cv2.VideoCapture(device)
     if not capture.isOpened():
-        raise CameraError(f"camera {device} cannot be opened; {_devices()}")
+        names = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*")))
+        present = "there is no /dev/video* on this machine"
+        if names:
+            present = f"present: {names} (in use, or no permission to open it: group video?)"
+        raise CameraError(f"camera {device} cannot be opened; {present}")
     width, height = device_mode(image_size)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
@@ -79,8 +83,7 @@ def open_device(device: int | Path, *, image_size: int, clock: Clock) -> Capture
 def open_stream(url: str, *, clock: Clock) -> CaptureSource:
     """Open a network stream that FFmpeg can read; frames are stamped on arrival.
 
-    Raises:
-        CameraError: no video arrives within OPEN_TIMEOUT_MS.
+    Raises CameraError if no video arrives within OPEN_TIMEOUT_MS.
     """
     timeouts = [
         *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, OPEN_TIMEOUT_MS),
@@ -115,11 +118,7 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
 
 
 def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> ImageArray:
-    """The grabbed frame as [H, W, 3] RGB.
-
-    Raises:
-        CameraError: it cannot be decoded.
-    """
+    """The grabbed frame as [H, W, 3] RGB; raises CameraError if it cannot be decoded."""
     decoded, bgr = capture.retrieve()
     if not decoded:
         raise CameraError(f"{name}: a frame cannot be decoded")
@@ -141,10 +140,3 @@ def device_mode(image_size: int) -> tuple[int, int]:
     """Width and height to request from a camera, so that its short side covers ``image_size``."""
     covering = (mode for mode in DEVICE_MODES if mode[1] >= image_size)
     return next(covering, DEVICE_MODES[-1])
-
-
-def _devices() -> str:
-    names = sorted(str(path) for path in Path("/dev").glob("video*"))
-    if not names:
-        return "there is no /dev/video* on this machine"
-    return f"present: {', '.join(names)} (in use, or no permission to open it: group video?)"

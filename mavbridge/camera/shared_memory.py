@@ -48,7 +48,10 @@ class SharedMemoryCamera:
             UserError: not a valid name.
             CameraError: it did not appear, or is not in the format.
         """
-        self._path = _shm_path(name)
+        if not name or "/" in name or name.startswith("."):
+            raise UserError(f"shm:{name}: use a name such as shm:fpv, without '/' or a leading '.'")
+        folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
+        self._path = (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
         self._clock = clock
         deadline_ns = clock.now_ns() + FIRST_FRAME_NS
         while not self._path.exists():
@@ -195,13 +198,6 @@ def _slot_type(width: int, height: int) -> np.dtype[np.void]:
             "itemsize": -(-header_bytes // 64) * 64,
         }
     )
-
-
-def _shm_path(name: str) -> Path:
-    if not name or "/" in name or name.startswith("."):
-        raise UserError(f"shm:{name}: use a name such as shm:fpv, without '/' or a leading '.'")
-    folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
-    return (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
 
 
 def _checked_size(name: str, header: bytes, file_bytes: int) -> tuple[int, int]:

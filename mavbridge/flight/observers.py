@@ -73,11 +73,7 @@ class FlightObservers:
         stack.callback(self._viewer.close, VIEWER_JOIN_S)
 
     def open_recorder(self, link: MavlinkLink) -> None:
-        """Start the recording, if one is wanted.
-
-        Raises:
-            UserError: the folder cannot be written.
-        """
+        """Start the recording, if one is wanted; raises UserError if it cannot be written."""
         if self._config.record is None or self.packets is None:
             return
         from mavbridge.recording.meta import FlightMeta
@@ -116,20 +112,20 @@ class FlightObservers:
 
     def finish(self, link: MavlinkLink) -> None:
         """Print the report, and write it where --report names a file."""
-        drops = ObserverDrops(
-            rerun=self._viewer.dropped if self._viewer else None,
-            recorder=self._recorder.dropped if self._recorder else None,
-        )
+        viewer, recorder = self._viewer, self._recorder
         report = self._timing.report(
             mode=self._mode,
             engine=self._executable.engine,
             policy=self._executable.name,
             autopilot=link.autopilot,
             link=link.stats(),
-            observer_drops=drops,
+            observer_drops=ObserverDrops(
+                rerun=viewer.dropped if viewer else None,
+                recorder=recorder.dropped if recorder else None,
+            ),
         )
         self.screen.show_report(report)
-        if self._recorder is not None:
-            self._console.print(Text(self._recorder.summary()), soft_wrap=True)
+        if recorder is not None:
+            self._console.print(Text(recorder.summary()), soft_wrap=True)
         if self._config.report is not None:
             self._config.report.write_text(report_json(report))

@@ -35,11 +35,7 @@ class RecordedFlight:
         return read_frames(self.frames)
 
     def images(self) -> Iterator[ImageArray]:
-        """The images, decoded one by one: [H, W, 3] uint8 RGB.
-
-        Raises:
-            VideoError: the video was damaged after it was recorded.
-        """
+        """The images one by one, [H, W, 3] uint8 RGB; raises VideoError if the video is damaged."""
         return read_video(self.folder / VIDEO, self.frames.num_rows)
 
 

@@ -42,11 +42,11 @@ class FlightWriter:
         with_labels: bool = False,
         wall_offset_ns: int | None = None,
     ) -> None:
-        """Create the files and start the writer process.
+        """Create the files in a folder from ``prepare_folder``, and start the writer process.
 
         Args:
-            folder: from ``prepare_folder``.
-            meta: what is known at the start.
+            folder: the flight's folder.
+            meta: the facts known at the start.
             pressure: "offline" drops nothing, and waits; see ``VideoWriter``.
             with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
             wall_offset_ns: wall time minus the clock of the stamps, for a tlog; None = no tlog.
