@@ -98,7 +98,9 @@ class Engagement:
             PeerError: the vehicle did not take the mode or arm in time.
         """
         if self._readonly:
-            return self._observe(facts)
+            return (
+                self._fly(facts) if facts.link_problem is None else self._wait(facts.link_problem)
+            )
         if facts.armed:
             self._may_arm = False  # armed once, by anybody: never arm a second time
         if facts.is_overruled and self.phase is Phase.FLYING:
@@ -115,11 +117,6 @@ class Engagement:
             self.phase = Phase.LATCHED
             return Directive(sticks=Release(f"mode changed from {self._own_mode} to {facts.mode}"))
         return self._in_air(facts)
-
-    def _observe(self, facts: Facts) -> Directive:
-        if facts.link_problem is not None:
-            return self._wait(facts.link_problem)
-        return self._fly(facts)
 
     def _wait(self, reason: str, request: Request | None = None) -> Directive:
         if self.phase is Phase.PREPARING:

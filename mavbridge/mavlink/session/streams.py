@@ -1,16 +1,11 @@
 """Requests telemetry at the rate of the action loop, and again whenever it slows down."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.messages import (
-    CommandAck,
-    CommandRequest,
-    Request,
-    StreamRequest,
-)
+from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Request, StreamRequest
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
 _ATTEMPTS = 4
@@ -20,8 +15,7 @@ _ENOUGH = 0.7
 """Share of the granted rate below which another station is assumed to have changed it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamGroup:
+class StreamGroup(NamedTuple):
     """One quantity: the messages that carry it, best first, and its legacy stream."""
 
     messages: tuple[str, ...]
@@ -31,18 +25,12 @@ class StreamGroup:
 
 def telemetry_streams(*, state_hz: float, rc_hz: float) -> tuple[StreamGroup, ...]:
     """The telemetry that the bridge needs."""
-    return tuple(
-        StreamGroup(messages=messages, stream=stream, rate_hz=rate_hz)
-        for messages, stream, rate_hz in (
-            (("ATTITUDE_QUATERNION", "ATTITUDE"), dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
-            (("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
-            (
-                ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2"),
-                dialect.MAV_DATA_STREAM_RAW_SENSORS,
-                state_hz,
-            ),
-            (("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, rc_hz),
-        )
+    attitude, imu = ("ATTITUDE_QUATERNION", "ATTITUDE"), ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
+    return (
+        StreamGroup(attitude, dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
+        StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
+        StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
+        StreamGroup(("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, rc_hz),
     )
 
 

@@ -293,8 +293,7 @@ _FORMS = "udp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /de
 def make_transport(spec: str, clock: Clock) -> Transport:
     """The transport for a connection string in pymavlink's notation, not opened yet.
 
-    Raises:
-        UserError: the string is malformed, or its host does not exist.
+    Raises UserError if the string is malformed, or its host does not exist.
     """
     kind, _, rest = spec.partition(":")
     if kind in ("udp", "udpin", "udpout"):
