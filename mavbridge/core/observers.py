@@ -4,7 +4,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.ports import TickSink
@@ -17,6 +17,7 @@ BATCH_EVENTS = 256
 """Most events of a kind in one batch, so that a backlog is not handled in one long stretch."""
 
 _log = logging.getLogger(__name__)
+_Item = TypeVar("_Item")
 
 
 class Consumer(Protocol):
@@ -33,29 +34,31 @@ class Consumer(Protocol):
         """Finish; called once, after the last batch, also when ``consume`` has raised."""
 
 
-class _Lane:
-    """A bounded queue with one producer and one consumer, which therefore needs no lock."""
+class BoundedQueue(Generic[_Item]):
+    """A queue with one producer and one consumer, which needs no lock; neither ever waits."""
 
     def __init__(self, capacity: int) -> None:
         if capacity < 1:
             raise ValueError(f"capacity must be at least 1, got {capacity}")
         self._capacity = capacity
-        self._events: deque[Event] = deque()
-        self.refused = 0
+        self._items: deque[_Item] = deque()
+        self.dropped = 0
 
     def __len__(self) -> int:
-        return len(self._events)
+        return len(self._items)
 
-    def put(self, event: Event) -> None:
-        """Add the event, or count it as refused."""
-        if len(self._events) < self._capacity:
-            self._events.append(event)
+    def put(self, item: _Item) -> None:
+        """Add the item; drop and count it if the queue is full."""
+        if len(self._items) < self._capacity:
+            self._items.append(item)
         else:
-            self.refused += 1
+            self.dropped += 1
 
-    def take(self) -> list[Event]:
-        """Remove and return up to ``BATCH_EVENTS`` of the oldest."""
-        return [self._events.popleft() for _ in range(min(len(self._events), BATCH_EVENTS))]
+    def take(self, limit: int | None = None) -> list[_Item]:
+        """Remove and return the oldest items, at most ``limit``."""
+        waiting = len(self._items)
+        count = waiting if limit is None else min(waiting, limit)
+        return [self._items.popleft() for _ in range(count)]
 
 
 class ObserverThread:
@@ -75,8 +78,8 @@ class ObserverThread:
         """
         self._name = name
         self._consumer = consumer
-        self._ticks = _Lane(capacity)
-        self._visions = _Lane(image_capacity)
+        self._ticks: BoundedQueue[Event] = BoundedQueue(capacity)
+        self._visions: BoundedQueue[Event] = BoundedQueue(image_capacity)
         self._closing = threading.Event()
         self._out_of_time = threading.Event()
         self._open = True
@@ -88,19 +91,19 @@ class ObserverThread:
 
     def emit(self, event: Event) -> None:
         """Queue the event, or drop and count it; never blocks, never raises."""
-        lane = self._ticks if type(event) is Tick else self._visions
+        queue = self._ticks if type(event) is Tick else self._visions
         if self._open:
-            lane.put(event)
+            queue.put(event)
         else:
-            lane.refused += 1
+            queue.dropped += 1
 
     @property
     def dropped(self) -> int:
         """Events that the consumer never got, or failed on."""
-        refused = self._ticks.refused + self._visions.refused
+        dropped = self._ticks.dropped + self._visions.dropped
         if self._thread.is_alive() and not self._out_of_time.is_set():
-            return refused
-        return refused + len(self._ticks) + len(self._visions) + self._in_flight
+            return dropped
+        return dropped + len(self._ticks) + len(self._visions) + self._in_flight
 
     def close(self, timeout_s: float) -> None:
         """Let the consumer empty the queue and finish, for at most ``timeout_s``."""
@@ -115,7 +118,7 @@ class ObserverThread:
         try:
             while not self._out_of_time.is_set():
                 is_last_round = self._closing.wait(BATCH_PERIOD_S)
-                batch = self._ticks.take() + self._visions.take()
+                batch = self._ticks.take(BATCH_EVENTS) + self._visions.take(BATCH_EVENTS)
                 if batch:
                     self._in_flight = len(batch)
                     self._consumer.consume(batch)

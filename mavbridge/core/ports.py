@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from mavbridge.core.records import Decision, Event, Frame, LinkSnapshot, Packet, Sticks
+from mavbridge.core.records import Decision, Event, Frame, LinkSnapshot, Sticks
 
 
 class Camera(Protocol):
@@ -44,28 +44,11 @@ class Link(Protocol):
     def hand_back(self) -> None:
         """Repeat the release at the end of a flight, as packets may be lost; takes 0.5 s."""
 
-    def force_release(self) -> None:
-        """From any thread: release the sticks now, and send nothing after that."""
-
     def set_mode(self, mode: str) -> None:
         """Ask for a flight mode (rate-limited; a later heartbeat shows the result)."""
 
     def arm(self) -> None:
         """Ask to arm (rate-limited; a later heartbeat shows the result)."""
-
-    def close(self) -> None:
-        """Free the socket or port."""
-
-
-class PacketSource(Protocol):
-    """Packets that went over the link, for a recorder; drained by one thread."""
-
-    @property
-    def dropped(self) -> int:
-        """Packets that were dropped because they were not drained in time."""
-
-    def drain(self) -> list[Packet]:
-        """Packets of both directions since the last call."""
 
 
 class TickSink(Protocol):

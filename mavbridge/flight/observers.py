@@ -11,10 +11,10 @@ import mavbridge
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
-from mavbridge.core.observers import ObserverThread
+from mavbridge.core.observers import BoundedQueue, ObserverThread
 from mavbridge.core.ports import TickSink
+from mavbridge.core.records import Packet
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.connection import PacketLog
 from mavbridge.observe.rerun_flight import RerunView
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
@@ -25,6 +25,8 @@ if TYPE_CHECKING:  # the extra "record" may not be installed
 
 RERUN_CAPACITY = 1000
 """Ticks that may wait for the viewer: ten seconds at 100 Hz."""
+PACKET_CAPACITY = 16384
+"""Packets that may wait for the recorder: ten seconds of a busy link."""
 VIEWER_JOIN_S = 2.0
 RECORDER_JOIN_S = 60.0
 """The tables of a long flight become Parquet within seconds; the vehicle is released by then."""
@@ -52,7 +54,9 @@ class FlightObservers:
         self.screen = FlightScreen(
             console, action_hz=action_hz, vision_hz=vision_hz, readonly=config.link.readonly
         )
-        self.packets = None if config.record is None else PacketLog()
+        self.packets: BoundedQueue[Packet] | None = None
+        if config.record is not None:
+            self.packets = BoundedQueue(PACKET_CAPACITY)
 
     @property
     def sinks(self) -> tuple[TickSink, ...]:

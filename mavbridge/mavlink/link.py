@@ -6,7 +6,16 @@ from mavbridge.config.flight import LinkConfig
 from mavbridge.config.rates import HEARTBEAT_HZ, period_ns
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import PeerError
-from mavbridge.core.records import Decision, LinkSnapshot, LinkStats, Release, Sticks, Telemetry
+from mavbridge.core.observers import BoundedQueue
+from mavbridge.core.records import (
+    Decision,
+    LinkSnapshot,
+    LinkStats,
+    Packet,
+    Release,
+    Sticks,
+    Telemetry,
+)
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Heartbeat, Timesync
 from mavbridge.mavlink.codec.packets import Codec, manual_control_sticks, pwm_of
@@ -14,7 +23,7 @@ from mavbridge.mavlink.session.discovery import VehicleDiscovery, VehicleIdentit
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.transport.connection import Connection, PacketLog
+from mavbridge.mavlink.transport.connection import Connection
 from mavbridge.mavlink.transport.sockets import Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -39,7 +48,7 @@ class MavlinkLink:
         config: LinkConfig,
         *,
         state_hz: float,
-        packet_log: PacketLog | None = None,
+        packet_log: BoundedQueue[Packet] | None = None,
     ) -> None:
         self._clock = clock
         self._config = config

@@ -8,9 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mavbridge.core.observers import ObserverThread
-from mavbridge.core.ports import PacketSource
-from mavbridge.core.records import Event, Tick, VisionTick
+from mavbridge.core.observers import BoundedQueue, ObserverThread
+from mavbridge.core.records import Event, Packet, Tick, VisionTick
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 
@@ -27,7 +26,7 @@ class Recorder:
         folder: Path,
         meta: FlightMeta,
         *,
-        packets: PacketSource,
+        packets: BoundedQueue[Packet],
         wall_offset_ns: int,
         autopilot: Callable[[], str],
         report: Callable[[str], None],
@@ -82,7 +81,7 @@ class _FlightConsumer:
     """Runs on the recorder's thread; may raise OSError and WriterError."""
 
     writer: FlightWriter
-    packets: PacketSource
+    packets: BoundedQueue[Packet]
     autopilot: Callable[[], str]
     report: Callable[[str], None]
     _seen_frames: int = 0
@@ -97,7 +96,7 @@ class _FlightConsumer:
         """Write one batch, and the packets that came meanwhile."""
         seen_frames = self._seen_frames
         try:
-            self.writer.packets(self.packets.drain())
+            self.writer.packets(self.packets.take())
             for event in batch:
                 if isinstance(event, Tick):
                     self.writer.tick(event)
@@ -121,6 +120,6 @@ class _FlightConsumer:
         if self._has_failed:
             self.writer.close()
             return
-        self.writer.packets(self.packets.drain())
+        self.writer.packets(self.packets.take())
         meta, dropped = self.writer.meta, self.packets.dropped
         self.writer.finish(replace(meta, autopilot=self.autopilot(), packets_dropped=dropped))

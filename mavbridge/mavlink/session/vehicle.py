@@ -181,17 +181,14 @@ class VehicleSession:
     def status(self) -> VehicleStatus | None:
         """The vehicle's own report; None before its first heartbeat."""
         if self._status is None and self._heartbeat is not None:
-            heartbeat_ns, heartbeat = self._heartbeat
+            heartbeat = self._heartbeat[1]
             rc_ns, rc = self._rc or (None, RcChannels(()))
             pwm_us, rc_sticks = self._stick_channels_us(rc), None
             if self.calibration and pwm_us and all(pwm_us):
                 rc_sticks = self.calibration.to_sticks(pwm_us)
             self._status = VehicleStatus(
-                system_id=self.identity.source.system,
-                autopilot=self.identity.autopilot,
                 mode=self.modes.name(heartbeat.custom_mode),
                 armed=bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED),
-                heartbeat_ns=heartbeat_ns,
                 rc_sticks=rc_sticks,
                 rc_channels_us=rc.channels_us,
                 rc_arrived_ns=rc_ns,

@@ -1,11 +1,11 @@
 """Transport and codec together: messages in, packets out, reconnecting by itself."""
 
 import threading
-from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.records import Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
@@ -15,29 +15,6 @@ REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 4 * NS_PER_MS
 """Longest stretch of reading: a flood must not keep the action loop from its next slot. What is
 left stays with the kernel, which drops what it cannot hold."""
-
-
-LOG_CAPACITY = 16384
-"""Packets that may wait for a recorder: ten seconds of a busy link."""
-
-
-class PacketLog:
-    """Implements ``ports.PacketSource``: the link appends, another thread drains."""
-
-    def __init__(self) -> None:
-        self._packets: deque[Packet] = deque()
-        self.dropped = 0
-
-    def append(self, packet: Packet) -> None:
-        """Keep a packet that has arrived or left; drop and count it if nobody drains."""
-        if len(self._packets) < LOG_CAPACITY:
-            self._packets.append(packet)
-        else:
-            self.dropped += 1
-
-    def drain(self) -> list[Packet]:
-        """Packets of both directions since the last call."""
-        return [self._packets.popleft() for _ in range(len(self._packets))]
 
 
 class Arrival(NamedTuple):
@@ -52,7 +29,11 @@ class Connection:
     """Packets in and out; used by one thread, but another one may stop it from sending."""
 
     def __init__(
-        self, transport: Transport, codec: Codec, clock: Clock, log: PacketLog | None = None
+        self,
+        transport: Transport,
+        codec: Codec,
+        clock: Clock,
+        log: BoundedQueue[Packet] | None = None,
     ) -> None:
         self._transport = transport
         self._codec = codec
@@ -99,7 +80,7 @@ class Connection:
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data):
                     if self._log is not None:
-                        self._log.append(Packet(arrived_ns, message.packet))
+                        self._log.put(Packet(arrived_ns, message.packet))
                     yield Arrival(message, arrived_ns, sender)
                 if self._clock.now_ns() - now_ns > DRAIN_BUDGET_NS:
                     return
@@ -124,7 +105,7 @@ class Connection:
                 self._lose(error, self._clock.now_ns())
                 return False
             if is_sent and self._log is not None:
-                self._log.append(Packet(self._clock.now_ns(), data))
+                self._log.put(Packet(self._clock.now_ns(), data))
             return is_sent
 
     def block_sends(self) -> None:
