@@ -5,6 +5,7 @@ import os
 import struct
 import tempfile
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -221,17 +222,13 @@ def _checked_size(name: str, header: bytes, file_bytes: int) -> tuple[int, int]:
 
 
 def _absent(path: Path) -> str:
-    others = [other.name for other in sorted(path.parent.iterdir()) if _is_segment(other)]
+    others = []
+    for other in sorted(path.parent.iterdir()):
+        with suppress(OSError), other.open("rb") as file:
+            if file.read(len(MAGIC)) == MAGIC:
+                others.append(other.name)
     return (
         f"shm:{path.name}: did not appear within {FIRST_FRAME_NS / NS_PER_S:g} s. Start its "
         f"writer, for example: python -m sitl --camera shm:{path.name} "
         f"(frame segments here now: {', '.join(others) or 'none'})"
     )
-
-
-def _is_segment(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False

@@ -123,13 +123,11 @@ class _Flight:
     def run(self, stop: StopRequest) -> None:
         """Fly until the action loop ends, the camera dies, or a signal comes."""
         rates, screen = self._rates, self.observers.screen
-        vision = Worker(
-            "mavbridge-vision", self._scheduled(self._bridge.vision.run, cpu=rates.vision_cpu)
+        see = self._scheduled(self._bridge.vision.run, realtime=False, cpu=rates.vision_cpu)
+        act = self._scheduled(
+            self._bridge.action.run, realtime=rates.realtime, cpu=rates.action_cpu
         )
-        action = Worker(
-            "mavbridge-action",
-            self._scheduled(self._bridge.action.run, realtime=rates.realtime, cpu=rates.action_cpu),
-        )
+        vision, action = Worker("mavbridge-vision", see), Worker("mavbridge-action", act)
         settle_process()
         # Joined in reverse: the sticks are released before anything that feeds them is closed.
         self._stack.callback(vision.join, JOIN_S)
@@ -143,7 +141,7 @@ class _Flight:
                 stop.wait(1 / STATUS_HZ)
 
     def _scheduled(
-        self, run: Callable[[threading.Event], None], *, realtime: bool = False, cpu: int | None
+        self, run: Callable[[threading.Event], None], *, realtime: bool, cpu: int | None
     ) -> Callable[[threading.Event], None]:
         """Wrap a loop so that its thread first asks for its scheduling."""
 

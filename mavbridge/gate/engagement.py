@@ -9,11 +9,9 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.records import FloatArray, Release
 
-PILOTED_MODES = frozenset(
-    {
-        *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
-        *("MANUAL", "STABILIZED", "ALTCTL", "POSCTL"),
-    }
+PILOTED_MODES = (
+    *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
+    *("MANUAL", "STABILIZED", "ALTCTL", "POSCTL"),
 )
 """Modes in which sticks fly the vehicle (ArduPilot, PX4)."""
 
@@ -110,9 +108,8 @@ class Engagement:
         if not facts.armed:
             return self._on_ground(facts)
         if self.phase is Phase.LATCHED:
-            return Directive(
-                sticks=Release(f"somebody else has taken over ({facts.mode}): disarm to reset")
-            )
+            reason = f"somebody else has taken over ({facts.mode}): disarm to reset"
+            return Directive(sticks=Release(reason))
         if self._own_mode is not None and facts.mode != self._own_mode:
             self.phase = Phase.LATCHED
             return Directive(sticks=Release(f"mode changed from {self._own_mode} to {facts.mode}"))
@@ -164,9 +161,8 @@ class Engagement:
                 self._retake_ns = facts.now_ns + RETAKE_NS
             return Directive(sticks=Release(facts.input_problem))
         if self._retake_ns is not None and facts.now_ns < self._retake_ns:
-            return Directive(
-                sticks=Release("inputs are good again: waiting to see that they stay so")
-            )
+            reason = "inputs are good again: waiting to see that they stay so"
+            return Directive(sticks=Release(reason))
         self.phase = Phase.FLYING
         self._own_mode = facts.mode
         self._prepare_until_ns = None

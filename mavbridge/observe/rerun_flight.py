@@ -136,10 +136,7 @@ class RerunView:
     def __init__(self, target: str, *, action_hz: float, vision_hz: float) -> None:
         """Check the target; calls that may block are left to ``consume`` and ``close``.
 
-        Args:
-            target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
-            action_hz: target rate of the action loop; jitter is measured against it.
-            vision_hz: target rate of the vision loop.
+        Jitter is measured against the target rates; ``target`` is that of ``prepare_target``.
         """
         self._recording = RerunRecording("mavbridge", target)
         self._is_open = False

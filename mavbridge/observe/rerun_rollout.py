@@ -54,14 +54,9 @@ class RolloutView:
     """
 
     def __init__(self, target: str, *, real: Callable[[int], ImageArray | None]) -> None:
-        """Open the file or viewer.
+        """Open the file or viewer; raises as ``prepare_target``.
 
-        Args:
-            target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
-            real: gives what the camera really saw at a step, [H, W, 3], or None.
-
-        Raises:
-            MavbridgeError: the target cannot be opened.
+        ``real`` returns the camera's real image at a step, [H, W, 3], or None.
         """
         self._real = real
         self._recording = RerunRecording("mavbridge-rollout", target)

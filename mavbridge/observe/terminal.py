@@ -122,10 +122,7 @@ class FlightScreen:
             yield
 
     def refresh(self) -> None:
-        """Print new messages and redraw the line; to be called at ``STATUS_HZ``.
-
-        Without a terminal, the line is printed every ``PLAIN_PERIOD_S``.
-        """
+        """Print new messages and the line, at ``STATUS_HZ``; without a terminal, less often."""
         self._print_messages()
         line = self.status_line()
         self._refreshes += 1

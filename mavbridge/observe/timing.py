@@ -48,10 +48,9 @@ class VisionReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseEvent:
-    """The sticks were released, or the reason for their release changed."""
+    """A release of the sticks, or a new reason for it, ``t_s`` after the first tick."""
 
     t_s: float
-    """Time since the first tick."""
     reason: str
 
 
@@ -225,9 +224,7 @@ class _Span:
 
     @property
     def rate_hz(self) -> float | None:
-        """Intervals per second; None before there is one."""
-        duration_s = self.duration_s
-        return round((self.count - 1) / duration_s, 3) if duration_s > 0 else None
+        return round((self.count - 1) / self.duration_s, 3) if self.duration_s > 0 else None
 
 
 def report_json(report: TimingReport) -> str:
