@@ -10,7 +10,6 @@ from mavbridge.core.errors import CameraError
 from mavbridge.core.records import Frame, ImageArray
 
 REOPEN_DELAYS_S = (0.5, 1.0, 2.0, 4.0)
-"""Delays before the attempts to reopen a lost source."""
 JOIN_S = 3.0
 
 

@@ -40,11 +40,9 @@ class Facts:
     now_ns: int
     link_problem: str | None
     input_problem: str | None
-    """What state or feature lacks, or None."""
     mode: str | None
     armed: bool
     is_overruled: bool
-    """The vehicle does not act on our sticks."""
     echo_confirmed: bool
 
 
@@ -52,7 +50,6 @@ class Hold(Enum):
     """Use of the sticks while they are not released."""
 
     IDLE = "idle"
-    """Throttle at the bottom, the rest centred: for arming."""
     FLY = "fly"
 
 

@@ -184,12 +184,10 @@ class MavlinkLink:
         if (identity := self._discovery.choose(now_ns)) is not None:
             self._adopt(identity)
             return
-        waited_ns = now_ns - self._started_ns
-        if not self._discovery.is_settling and waited_ns > self._config.connect_timeout * NS_PER_S:
-            raise PeerError(
-                f"no vehicle on {self._config.connect} after {self._config.connect_timeout:g} s: "
-                f"{self._discovery.describe()}"
-            )
+        timeout_s, waited_ns = self._config.connect_timeout, now_ns - self._started_ns
+        if not self._discovery.is_settling and waited_ns > timeout_s * NS_PER_S:
+            waited = f"no vehicle on {self._config.connect} after {timeout_s:g} s"
+            raise PeerError(f"{waited}: {self._discovery.describe()}")
 
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""

@@ -210,15 +210,10 @@ class RerunView:
             self._first_dropped = int(dropped[0])
         self._send(DROPPED, index, dropped - self._first_dropped)
         captured_ns = [vision.captured_ns for vision in visions]
-        self._recording.stream.send_columns(
-            CAMERA,
-            self._index(captured_ns, self._tick_indexes_at(captured_ns, ticks)),
-            rr.EncodedImage.columns(
-                blob=[_jpeg(vision.rgb) for vision in visions],
-                media_type=["image/jpeg"] * len(visions),
-            ),
-            strict=True,
-        )
+        index = self._index(captured_ns, self._tick_indexes_at(captured_ns, ticks))
+        blobs = [_jpeg(vision.rgb) for vision in visions]
+        images = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(visions))
+        self._recording.stream.send_columns(CAMERA, index, images, strict=True)
 
     def _send_events(self, ticks: list[Tick]) -> None:
         before = [self._last_tick, *ticks[:-1]]
@@ -231,16 +226,10 @@ class RerunView:
             return
         changed, texts, levels, colors = zip(*changes, strict=True)
         since_s = [(tick.woke_ns - (self._origin_ns or 0)) / NS_PER_S for tick in changed]
-        self._recording.stream.send_columns(
-            EVENTS,
-            self._index([tick.woke_ns for tick in changed], [tick.index for tick in changed]),
-            rr.TextLog.columns(
-                text=[f"{t_s:6.2f} s  {text}" for t_s, text in zip(since_s, texts, strict=True)],
-                level=levels,
-                color=colors,
-            ),
-            strict=True,
-        )
+        lines = [f"{t_s:6.2f} s  {text}" for t_s, text in zip(since_s, texts, strict=True)]
+        index = self._index([tick.woke_ns for tick in changed], [tick.index for tick in changed])
+        columns = rr.TextLog.columns(text=lines, level=levels, color=colors)
+        self._recording.stream.send_columns(EVENTS, index, columns, strict=True)
 
     def _tick_indexes_at(self, stamps_ns: list[int], ticks: list[Tick]) -> list[int]:
         """Index of the last tick before each stamp, as far as this batch shows."""

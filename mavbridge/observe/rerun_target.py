@@ -15,7 +15,6 @@ from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 
 VIEWER_HOST = "127.0.0.1"
 VIEWER_PORT = 9876
-"""Rerun's own default."""
 VIEWER_URL = f"rerun+http://{VIEWER_HOST}:{VIEWER_PORT}/proxy"
 VIEWER_MEMORY = "2GB"
 """Beyond this the viewer drops its oldest data: it shares the machine with the flight."""

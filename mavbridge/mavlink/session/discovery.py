@@ -115,10 +115,8 @@ class VehicleDiscovery:
         """Everything that was heard instead of the vehicle, with advice."""
         if self._heard_ns:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
-            return (
-                f"system {self._target_system} is silent, but system {heard} was heard: "
-                "correct --target-system"
-            )
+            silent = f"system {self._target_system} is silent"
+            return f"{silent}, but system {heard} was heard: correct --target-system"
         if self._others:
             return (
                 f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "

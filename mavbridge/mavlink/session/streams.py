@@ -11,6 +11,7 @@ _ACK_TIMEOUT_NS = 500 * NS_PER_MS
 _ATTEMPTS = 4
 _LOWEST_HZ = 25.0
 _WATCH_NS = 2 * NS_PER_S
+_UNDECIDED = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_IN_PROGRESS)
 _ENOUGH = 0.7
 """Share of the granted rate below which another station is assumed to have changed it."""
 
@@ -54,8 +55,7 @@ class _Stream:
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
     def accept(self) -> None:
-        self.is_settled = True
-        self.attempts = 0
+        self.is_settled, self.attempts = True, 0
 
     def refuse(self) -> None:
         """Half the rate, then the next message: "denied" may mean too fast or unknown."""
@@ -91,7 +91,6 @@ class StreamRequester:
         self._window_ns: int | None = None
         """Start of the window in which messages are counted; None while requests are open."""
         self.renewals = 0
-        """Number of streams that had to be requested again."""
 
     @property
     def is_settled(self) -> bool:
@@ -109,10 +108,7 @@ class StreamRequester:
             return
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
             self._pending.accept()
-        elif ack.result not in (
-            dialect.MAV_RESULT_TEMPORARILY_REJECTED,
-            dialect.MAV_RESULT_IN_PROGRESS,
-        ):
+        elif ack.result not in _UNDECIDED:
             self._pending.refuse()
         self._pending = None
 

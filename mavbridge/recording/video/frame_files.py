@@ -10,7 +10,6 @@ from mavbridge.recording.tables import READ_ERRORS, TableWriter
 from mavbridge.recording.video.file import WRITE_ERRORS, FragmentedMp4
 
 FILE_ERRORS = (*WRITE_ERRORS, *READ_ERRORS)
-"""Errors that ``FrameFiles`` raises."""
 FLUSH_NS = 500_000_000
 """Longest span of frames whose rows may wait."""
 FLUSH_ROWS = 64
@@ -25,7 +24,6 @@ class VideoJob(NamedTuple):
     rows: Path | None = None
     """Path and stem of the frames table; None: only a video."""
     with_truth: bool = False
-    """The table has the columns of ``FrameTruth``."""
 
 
 class FrameFiles:
