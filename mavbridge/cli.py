@@ -21,6 +21,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
 from mavbridge.config.imagine import EvaluateImaginationConfig, ImagineConfig
 from mavbridge.core.errors import UserError
+from mavbridge.recording.folder import require_extra
 from policy.training.settings import TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
@@ -66,8 +67,6 @@ def bench(config: BenchConfig | None = None) -> int:
 @cli.command
 def imagine(config: ImagineConfig) -> int:
     """Let a policy and a world model imagine a flight, from the start of a recorded one."""
-    from mavbridge.recording.folder import require_extra
-
     require_extra("imagine")
     from mavbridge.commands.imagine.run import imagine as run_rollout
 
@@ -82,8 +81,6 @@ def evaluate_imagination(*flights: Path, config: EvaluateImaginationConfig | Non
         flights: flight folders, or folders of them, that the model was not trained on.
         config: the settings.
     """
-    from mavbridge.recording.folder import require_extra
-
     require_extra("evaluate-imagination")
     if not flights:
         raise UserError("name the flights to imagine: mavbridge evaluate-imagination DIR...")
@@ -116,8 +113,6 @@ def evaluate(config: EvaluateConfig | None = None) -> int:
 @cli.command
 def demonstrate(config: DemonstrateConfig) -> int:
     """Record flights of simulated gate courses by an expert, to learn from."""
-    from mavbridge.recording.folder import require_extra
-
     require_extra("demonstrate")
     with _needs_simulator("demonstrate"):
         from mavbridge.commands.demonstrate.run import demonstrate as run_demonstrations
@@ -162,8 +157,6 @@ def export(*flights: Path, config: ExportConfig) -> int:
         flights: flight folders, or folders of them.
         config: the settings.
     """
-    from mavbridge.recording.folder import require_extra
-
     require_extra("export")
     from mavbridge.commands.export.run import export as run_export
 
@@ -184,9 +177,15 @@ def with_config(
         config: TOML file with flags as keys; flags given on the command line win.
     """
     _check_command(tokens)
+    cli.config = []
     if config is not None:
-        _check_toml(config)
-    cli.config = [] if config is None else [Toml(config, use_commands_as_keys=False)]
+        try:
+            tomllib.loads(config.read_text())
+        except OSError as error:
+            raise UserError(f"--config {config}: {error.strerror}") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise UserError(f"--config {config} is not TOML: {error}") from error
+        cli.config = [Toml(config, use_commands_as_keys=False)]
     status: int | None = cli(_current_spelling(tokens))
     return status or 0
 
@@ -218,12 +217,3 @@ def _current_spelling(tokens: tuple[str, ...]) -> tuple[str, ...]:
 
 def _note(text: str) -> None:
     sys.stderr.write(f"note: {text}\n")
-
-
-def _check_toml(path: Path) -> None:
-    try:
-        tomllib.loads(path.read_text())
-    except OSError as error:
-        raise UserError(f"--config {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"--config {path} is not TOML: {error}") from error

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -24,63 +25,51 @@ DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
 MAX_DRIVER_AGE_NS = NS_PER_S
 
 
+@dataclass(frozen=True, slots=True)
 class CaptureSource:
-    """Implements `ImageSource` over an open OpenCV capture."""
+    """Implements `ImageSource` over an open OpenCV capture; ``failure`` says why it may end."""
 
-    def __init__(
-        self,
-        capture: cv2.VideoCapture,
-        name: str,
-        *,
-        failure: str,
-        clock: Clock,
-        has_driver_stamps: bool = False,
-    ) -> None:
-        self._capture = capture
-        self._name = name
-        self._failure = failure
-        self._clock = clock
-        self._has_driver_stamps = has_driver_stamps
+    capture: cv2.VideoCapture
+    name: str
+    failure: str
+    clock: Clock
+    has_driver_stamps: bool = False
 
     def next_image(self) -> Image:
         """See `ImageSource`."""
-        if not self._capture.grab():
-            raise CameraError(f"{self._name} {self._failure}")
-        captured_ns = self._clock.now_ns()
-        if self._has_driver_stamps:
-            captured_ns = exposure_ns(self._capture.get(cv2.CAP_PROP_POS_MSEC), captured_ns)
-        return Image(captured_ns=captured_ns, rgb=retrieve_rgb(self._capture, self._name))
+        if not self.capture.grab():
+            raise CameraError(f"{self.name} {self.failure}")
+        captured_ns = self.clock.now_ns()
+        if self.has_driver_stamps:
+            captured_ns = exposure_ns(self.capture.get(cv2.CAP_PROP_POS_MSEC), captured_ns)
+        return Image(captured_ns=captured_ns, rgb=retrieve_rgb(self.capture, self.name))
 
     def close(self) -> None:
         """See `ImageSource`."""
-        self._capture.release()
+        self.capture.release()
 
 
 def open_device(device: int | Path, *, image_size: int, clock: Clock) -> CaptureSource:
     """Open a local camera: ``0`` or ``/dev/video0``. Raises CameraError."""
-    if isinstance(device, Path):
-        capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
-    else:
-        capture = cv2.VideoCapture(device)
+    is_path = isinstance(device, Path)
+    capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2) if is_path else cv2.VideoCapture(device)
     if not capture.isOpened():
-        raise CameraError(f"camera {device} cannot be opened; {_devices()}")
+        names = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*")))
+        present = "there is no /dev/video* on this machine"
+        if names:
+            present = f"present: {names} (in use, or no permission to open it: group video?)"
+        raise CameraError(f"camera {device} cannot be opened; {present}")
     width, height = device_mode(image_size)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
-    return CaptureSource(
-        capture,
-        f"camera {device}",
-        failure="has stopped delivering frames: was it unplugged?",
-        clock=clock,
-        has_driver_stamps=True,
-    )
+    failure = "has stopped delivering frames: was it unplugged?"
+    return CaptureSource(capture, f"camera {device}", failure, clock, has_driver_stamps=True)
 
 
 def open_stream(url: str, *, clock: Clock) -> CaptureSource:
     """Open a network stream that FFmpeg can read; frames are stamped on arrival.
 
-    Raises:
-        CameraError: no video arrives within OPEN_TIMEOUT_MS.
+    Raises CameraError if no video arrives within OPEN_TIMEOUT_MS.
     """
     timeouts = [
         *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, OPEN_TIMEOUT_MS),
@@ -94,7 +83,7 @@ def open_stream(url: str, *, clock: Clock) -> CaptureSource:
             "address, that the sender is running, and that it sends video"
         )
     failure = f"ended, or was silent for {READ_TIMEOUT_MS / 1000:g} s"
-    return CaptureSource(capture, f"stream {url}", failure=failure, clock=clock)
+    return CaptureSource(capture, f"stream {url}", failure, clock)
 
 
 @contextmanager
@@ -115,11 +104,7 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
 
 
 def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> ImageArray:
-    """The grabbed frame as [H, W, 3] RGB.
-
-    Raises:
-        CameraError: it cannot be decoded.
-    """
+    """The grabbed frame as [H, W, 3] RGB; raises CameraError if it cannot be decoded."""
     decoded, bgr = capture.retrieve()
     if not decoded:
         raise CameraError(f"{name}: a frame cannot be decoded")
@@ -141,10 +126,3 @@ def device_mode(image_size: int) -> tuple[int, int]:
     """Width and height to request from a camera, so that its short side covers ``image_size``."""
     covering = (mode for mode in DEVICE_MODES if mode[1] >= image_size)
     return next(covering, DEVICE_MODES[-1])
-
-
-def _devices() -> str:
-    names = sorted(str(path) for path in Path("/dev").glob("video*"))
-    if not names:
-        return "there is no /dev/video* on this machine"
-    return f"present: {', '.join(names)} (in use, or no permission to open it: group video?)"

@@ -10,7 +10,6 @@ from mavbridge.core.errors import CameraError
 from mavbridge.core.records import Frame, ImageArray
 
 REOPEN_DELAYS_S = (0.5, 1.0, 2.0, 4.0)
-"""Delays before the attempts to reopen a lost source."""
 JOIN_S = 3.0
 
 
@@ -26,11 +25,7 @@ class ImageSource(Protocol):
     """A blocking source, opened already; used by the grabber's thread alone."""
 
     def next_image(self) -> Image:
-        """Block until the next frame.
-
-        Raises:
-            CameraError: there will be none.
-        """
+        """Block until the next frame; raises CameraError if there will be none."""
 
     def close(self) -> None:
         """Free the device or connection."""
@@ -51,11 +46,7 @@ class Grabber:
         clock: Clock,
         reopen_delays_s: Sequence[float] = REOPEN_DELAYS_S,
     ) -> None:
-        """Open the source and start the thread.
-
-        Raises:
-            CameraError: it cannot be opened.
-        """
+        """Open the source and start the thread; raises CameraError if it cannot be opened."""
         self._open_source = open_source
         self._clock = clock
         self._reopen_delays_s = reopen_delays_s
@@ -124,7 +115,16 @@ class Grabber:
         """Take frame after frame; returns the reason for the end."""
         try:
             while not self._stopping.is_set():
-                self._put(source.next_image())
+                captured_ns, rgb = source.next_image()
+                rgb.flags.writeable = False
+                with self._changed:
+                    self._frame_count += 1
+                    self._dropped_frames += self._newest is not None
+                    self._newest = Frame(
+                        frame_id=self._frame_count, captured_ns=captured_ns, rgb=rgb
+                    )
+                    self._silent_after_ns = self._clock.now_ns() + STALL_NS
+                    self._changed.notify_all()
         except CameraError as error:
             return str(error)
         finally:
@@ -132,14 +132,3 @@ class Grabber:
                 self._silent_after_ns = None
             source.close()
         return "closed"
-
-    def _put(self, image: Image) -> None:
-        image.rgb.flags.writeable = False
-        with self._changed:
-            self._frame_count += 1
-            self._dropped_frames += self._newest is not None
-            self._newest = Frame(
-                frame_id=self._frame_count, captured_ns=image.captured_ns, rgb=image.rgb
-            )
-            self._silent_after_ns = self._clock.now_ns() + STALL_NS
-            self._changed.notify_all()

@@ -41,14 +41,10 @@ def check_camera(spec: str) -> None:
 
 
 def open_camera(spec: str, *, image_size: int, clock: Clock) -> Camera:
-    """Open the source that ``spec`` names.
+    """Open the source that ``spec`` names; raises as ``check_camera``, or CameraError.
 
     ``image_size`` is the side of the policy's square image in pixels: a device is asked for a mode
     that covers it. All other sources deliver their own size.
-
-    Raises:
-        UserError: ``spec`` has no known form, names no file, or needs a package that is missing.
-        CameraError: the source cannot be opened.
     """
     check_camera(spec)
     kind, _, rest = spec.partition(":")

@@ -55,7 +55,15 @@ class ScreenCamera:
         if not wait_until_due(self._clock, self._due_ns, timeout_ns):
             return None
         captured_ns = self._clock.now_ns()
-        region = self._region()
+        if self._windows is None:
+            everything = self._screen.monitors[0]
+            region = Region(**{side: everything[side] for side in Region._fields})
+        elif (found := self._windows.region(self._window.id)) is not None:
+            region = found
+        else:
+            raise CameraError(
+                f"the window {self._title!r} has been closed, hidden or moved off the screen"
+            )
         try:
             bgra = np.asarray(self._screen.grab(region._asdict()))
         except ScreenShotError as error:
@@ -72,26 +80,12 @@ class ScreenCamera:
         if self._windows is not None:
             self._windows.close()
 
-    def _region(self) -> Region:
-        if self._windows is None:
-            everything = self._screen.monitors[0]
-            return Region(**{side: everything[side] for side in Region._fields})
-        region = self._windows.region(self._window.id)
-        if region is None:
-            raise CameraError(
-                f"the window {self._title!r} has been closed, hidden or moved off the screen"
-            )
-        return region
-
 
 def choose_window(windows: Sequence[Window], title: str) -> Window:
     """The window with this title, or else the only one whose title contains it in any case.
 
     Window managers may give a frame the title of the window inside it, so of equal titles the last
-    is chosen: the innermost, topmost one.
-
-    Raises:
-        UserError: there is none, or there are several; lists the windows.
+    is chosen: the innermost, topmost one. Raises UserError if there is none, or are several.
     """
     exact = [window for window in windows if window.title == title]
     similar = [window for window in windows if title.casefold() in window.title.casefold()]

@@ -5,6 +5,7 @@ import os
 import struct
 import tempfile
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,10 @@ class SharedMemoryCamera:
             UserError: not a valid name.
             CameraError: it did not appear, or is not in the format.
         """
-        self._path = _shm_path(name)
+        if not name or "/" in name or name.startswith("."):
+            raise UserError(f"shm:{name}: use a name such as shm:fpv, without '/' or a leading '.'")
+        folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
+        self._path = (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
         self._clock = clock
         deadline_ns = clock.now_ns() + FIRST_FRAME_NS
         while not self._path.exists():
@@ -197,13 +201,6 @@ def _slot_type(width: int, height: int) -> np.dtype[np.void]:
     )
 
 
-def _shm_path(name: str) -> Path:
-    if not name or "/" in name or name.startswith("."):
-        raise UserError(f"shm:{name}: use a name such as shm:fpv, without '/' or a leading '.'")
-    folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
-    return (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
-
-
 def _checked_size(name: str, header: bytes, file_bytes: int) -> tuple[int, int]:
     """Width and height from the header, checked against the length of the file."""
     if len(header) < HEADER.size or not header.startswith(MAGIC):
@@ -225,17 +222,13 @@ def _checked_size(name: str, header: bytes, file_bytes: int) -> tuple[int, int]:
 
 
 def _absent(path: Path) -> str:
-    others = [other.name for other in sorted(path.parent.iterdir()) if _is_segment(other)]
+    others = []
+    for other in sorted(path.parent.iterdir()):
+        with suppress(OSError), other.open("rb") as file:
+            if file.read(len(MAGIC)) == MAGIC:
+                others.append(other.name)
     return (
         f"shm:{path.name}: did not appear within {FIRST_FRAME_NS / NS_PER_S:g} s. Start its "
         f"writer, for example: python -m sitl --camera shm:{path.name} "
         f"(frame segments here now: {', '.join(others) or 'none'})"
     )
-
-
-def _is_segment(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False

@@ -25,11 +25,7 @@ class VideoFileCamera:
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
-        """Open the file and decode its first frame.
-
-        Raises:
-            CameraError: not a video that OpenCV can decode.
-        """
+        """Open the file; raises CameraError if OpenCV cannot decode its first frame."""
         self._path = path
         self._clock = clock
         self._capture = cv2.VideoCapture(str(path))
@@ -60,11 +56,8 @@ class VideoFileCamera:
             self.dropped_frames += 1
             self._frame_count += 1
             self._upcoming = self._decode(previous_ns=newest.captured_ns)
-        return Frame(
-            frame_id=self._frame_count,
-            captured_ns=self._start_ns + newest.captured_ns,
-            rgb=newest.rgb,
-        )
+        captured_ns = self._start_ns + newest.captured_ns
+        return Frame(frame_id=self._frame_count, captured_ns=captured_ns, rgb=newest.rgb)
 
     def close(self) -> None:
         """Close the file."""

@@ -32,11 +32,7 @@ class X11Screen:
     """A connection to the display that DISPLAY names; used by one thread at a time."""
 
     def __init__(self) -> None:
-        """Connect.
-
-        Raises:
-            CameraError: there is no X server.
-        """
+        """Connect; raises CameraError if there is no X server."""
         try:
             self._display = Display()
         except (DisplayError, OSError) as error:
@@ -45,9 +41,7 @@ class X11Screen:
             ) from error
         self._screen = self._display.screen()
         self._root = self._screen.root
-        self._title_atoms = [
-            self._display.intern_atom(name) for name in ("_NET_WM_NAME", "WM_NAME")
-        ]
+        self._title_atoms = [*map(self._display.intern_atom, ("_NET_WM_NAME", "WM_NAME"))]
 
     def windows(self) -> list[Window]:
         """Visible windows with a title, bottom to top, a window before those inside it."""
@@ -69,11 +63,7 @@ class X11Screen:
             yield from self._titled(child)
 
     def region(self, window_id: int) -> Region | None:
-        """The part of the window that is on the screen; None if it is closed or hidden.
-
-        Raises:
-            CameraError: the X server has gone.
-        """
+        """The part of the window that is on the screen; None if it is closed or hidden."""
         window = self._display.create_resource_object("window", window_id)
         try:
             size = window.get_geometry()

@@ -52,7 +52,7 @@ class EvaluateConfig:
     """Draw the results here as PNG; needs matplotlib (the extra "bench")."""
 
     def __post_init__(self) -> None:
-        """Refuse contradictions."""
+        """Refuse values out of range, and contradictions."""
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("max-time", self.max_time, 1, 3600, "s")
         check_range("vision-delay", self.vision_delay, 0, 5000, "ms")

@@ -101,7 +101,6 @@ class Rates:
 
     def loops(self, *, is_dual: bool) -> LoopRates:
         """Rates of both loops; without dual rate each action has an image of its own."""
-        if not is_dual:
-            return LoopRates(action_hz=self.rate, min_vision_hz=self.rate, max_vision_hz=self.rate)
-        min_hz, max_hz = self.visual_limits_hz
-        return LoopRates(action_hz=self.action_rate, min_vision_hz=min_hz, max_vision_hz=max_hz)
+        min_hz, max_hz = self.visual_limits_hz if is_dual else (self.rate, self.rate)
+        action_hz = self.action_rate if is_dual else self.rate
+        return LoopRates(action_hz=action_hz, min_vision_hz=min_hz, max_vision_hz=max_hz)

@@ -18,11 +18,9 @@ class Clock(Protocol):
 
     def now_ns(self) -> int:
         """Nanoseconds on a monotonic clock with an arbitrary origin."""
-        ...
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Return at or after ``deadline_ns``; at once if it has passed."""
-        ...
 
 
 class MonotonicClock:
@@ -54,7 +52,6 @@ class Pacer(Protocol):
 
     def wait(self) -> Slot:
         """Sleep until the next tick."""
-        ...
 
 
 class GridPacer:

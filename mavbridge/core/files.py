@@ -6,14 +6,9 @@ from mavbridge.core.errors import UserError
 
 
 def require_writable(path: Path | None, flag: str) -> None:
-    """Refuse an output file that cannot be written, before a long run; creates its folder.
+    """Raise UserError if the file that a flag names cannot be written; creates its folder.
 
-    Args:
-        path: the file, which is not left behind; None where the flag was not given.
-        flag: its name on the command line, such as ``--json``.
-
-    Raises:
-        UserError: the file cannot be written.
+    ``flag`` is named in the message, such as ``--json``. An empty file is not left behind.
     """
     if path is None:
         return

@@ -40,10 +40,9 @@ class Histogram:
         self.count += 1
 
     def quantile_ns(self, fraction: float) -> float | None:
-        """Nearest-rank quantile: the middle of its bin, never beyond the extremes; None if empty.
+        """Nearest-rank quantile, ``fraction`` in (0, 1]; None if empty.
 
-        Args:
-            fraction: in (0, 1].
+        It is the middle of its bin, but never beyond the extremes.
         """
         if self.min_ns is None or self.max_ns is None:
             return None
@@ -52,24 +51,14 @@ class Histogram:
         for index, count in enumerate(self._counts):
             seen += count
             if count and seen >= rank:
-                return min(max(_bin_middle(index), self.min_ns), self.max_ns)
+                shift = max((index >> _SUB_BITS) - 1, 0)
+                low_ns = (index - (shift << _SUB_BITS)) << shift
+                middle_ns = low_ns + ((1 << shift) - 1) / 2
+                return min(max(middle_ns, self.min_ns), self.max_ns)
         return self.max_ns
 
     def percentiles_ms(self) -> Percentiles | None:
         """p50, p99, p99.9 and the exact maximum in milliseconds; None if empty."""
-        p50, p99, p999 = (self.quantile_ns(fraction) for fraction in (0.5, 0.99, 0.999))
-        if p50 is None or p99 is None or p999 is None or self.max_ns is None:
-            return None
-        return Percentiles(p50=_ms(p50), p99=_ms(p99), p999=_ms(p999), max=_ms(self.max_ns))
-
-
-def _bin_middle(index: int) -> float:
-    octave = index >> _SUB_BITS
-    shift = max(octave - 1, 0)
-    low = (index - (shift << _SUB_BITS)) << shift
-    return low + ((1 << shift) - 1) / 2
-
-
-def _ms(value_ns: float) -> float:
-    """Milliseconds, to the microsecond."""
-    return round(value_ns / NS_PER_MS, 3)
+        quantiles_ns = (*map(self.quantile_ns, (0.5, 0.99, 0.999)), self.max_ns)
+        p50, p99, p999, longest = (round((ns or 0) / NS_PER_MS, 3) for ns in quantiles_ns)
+        return Percentiles(p50=p50, p99=p99, p999=p999, max=longest) if self.count else None

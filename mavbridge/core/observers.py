@@ -4,7 +4,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.ports import TickSink
@@ -17,6 +17,7 @@ BATCH_EVENTS = 256
 """Most events of a kind in one batch, so that a backlog is not handled in one long stretch."""
 
 _log = logging.getLogger(__name__)
+_Item = TypeVar("_Item")
 
 
 class Consumer(Protocol):
@@ -28,36 +29,36 @@ class Consumer(Protocol):
         Raises:
             MavbridgeError, OSError: it cannot continue; no further batch will come.
         """
-        ...
 
     def close(self) -> None:
         """Finish; called once, after the last batch, also when ``consume`` has raised."""
-        ...
 
 
-class _Lane:
-    """A bounded queue with one producer and one consumer, which therefore needs no lock."""
+class BoundedQueue(Generic[_Item]):
+    """A queue with one producer and one consumer, which needs no lock; neither ever waits."""
 
     def __init__(self, capacity: int) -> None:
         if capacity < 1:
             raise ValueError(f"capacity must be at least 1, got {capacity}")
         self._capacity = capacity
-        self._events: deque[Event] = deque()
-        self.refused = 0
+        self._items: deque[_Item] = deque()
+        self.dropped = 0
 
     def __len__(self) -> int:
-        return len(self._events)
+        return len(self._items)
 
-    def put(self, event: Event) -> None:
-        """Add the event, or count it as refused."""
-        if len(self._events) < self._capacity:
-            self._events.append(event)
+    def put(self, item: _Item) -> None:
+        """Add the item; drop and count it if the queue is full."""
+        if len(self._items) < self._capacity:
+            self._items.append(item)
         else:
-            self.refused += 1
+            self.dropped += 1
 
-    def take(self) -> list[Event]:
-        """Remove and return up to ``BATCH_EVENTS`` of the oldest."""
-        return [self._events.popleft() for _ in range(min(len(self._events), BATCH_EVENTS))]
+    def take(self, limit: int | None = None) -> list[_Item]:
+        """Remove and return the oldest items, at most ``limit``."""
+        waiting = len(self._items)
+        count = waiting if limit is None else min(waiting, limit)
+        return [self._items.popleft() for _ in range(count)]
 
 
 class ObserverThread:
@@ -71,46 +72,38 @@ class ObserverThread:
     def __init__(
         self, name: str, consumer: Consumer, *, capacity: int, image_capacity: int = 16
     ) -> None:
-        """Start the thread.
+        """Start the thread, which alone uses the consumer from here on.
 
-        Args:
-            name: of the thread, and of the observer in messages.
-            consumer: used by the thread alone from here on.
-            capacity: most ticks waiting.
-            image_capacity: most vision ticks waiting; each holds an image.
+        ``capacity`` is the most ticks that may wait, ``image_capacity`` the most vision ticks.
         """
         self._name = name
         self._consumer = consumer
-        self._ticks = _Lane(capacity)
-        self._visions = _Lane(image_capacity)
+        self._ticks: BoundedQueue[Event] = BoundedQueue(capacity)
+        self._visions: BoundedQueue[Event] = BoundedQueue(image_capacity)
         self._closing = threading.Event()
         self._out_of_time = threading.Event()
         self._open = True
-        self._failure: str | None = None
+        self.failure: str | None = None
+        """Why the observer stopped before it was closed, or None."""
         self._in_flight = 0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def emit(self, event: Event) -> None:
         """Queue the event, or drop and count it; never blocks, never raises."""
-        lane = self._ticks if type(event) is Tick else self._visions
+        queue = self._ticks if type(event) is Tick else self._visions
         if self._open:
-            lane.put(event)
+            queue.put(event)
         else:
-            lane.refused += 1
+            queue.dropped += 1
 
     @property
     def dropped(self) -> int:
         """Events that the consumer never got, or failed on."""
-        refused = self._ticks.refused + self._visions.refused
+        dropped = self._ticks.dropped + self._visions.dropped
         if self._thread.is_alive() and not self._out_of_time.is_set():
-            return refused
-        return refused + len(self._ticks) + len(self._visions) + self._in_flight
-
-    @property
-    def failure(self) -> str | None:
-        """Why the observer stopped before it was closed, or None."""
-        return self._failure
+            return dropped
+        return dropped + len(self._ticks) + len(self._visions) + self._in_flight
 
     def close(self, timeout_s: float) -> None:
         """Let the consumer empty the queue and finish, for at most ``timeout_s``."""
@@ -123,7 +116,15 @@ class ObserverThread:
 
     def _run(self) -> None:
         try:
-            self._serve()
+            while not self._out_of_time.is_set():
+                is_last_round = self._closing.wait(BATCH_PERIOD_S)
+                batch = self._ticks.take(BATCH_EVENTS) + self._visions.take(BATCH_EVENTS)
+                if batch:
+                    self._in_flight = len(batch)
+                    self._consumer.consume(batch)
+                    self._in_flight = 0
+                elif is_last_round:
+                    return
         except (MavbridgeError, OSError) as error:
             self._fail(str(error))
         except Exception as bug:
@@ -136,20 +137,9 @@ class ObserverThread:
             except (MavbridgeError, OSError) as error:
                 self._fail(str(error))
 
-    def _serve(self) -> None:
-        while not self._out_of_time.is_set():
-            last_round = self._closing.wait(BATCH_PERIOD_S)
-            batch = self._ticks.take() + self._visions.take()
-            if batch:
-                self._in_flight = len(batch)
-                self._consumer.consume(batch)
-                self._in_flight = 0
-            elif last_round:
-                return
-
     def _fail(self, reason: str) -> None:
-        if self._failure is None:
-            self._failure = reason
+        if self.failure is None:
+            self.failure = reason
             _log.warning("%s stopped: %s; the flight goes on without it", self._name, reason)
 
 

@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from mavbridge.core.records import Decision, Event, Frame, LinkSnapshot, Packet, Sticks
+from mavbridge.core.records import Decision, Event, Frame, LinkSnapshot, Sticks
 
 
 class Camera(Protocol):
@@ -11,7 +11,6 @@ class Camera(Protocol):
     @property
     def dropped_frames(self) -> int:
         """Frames that the source delivered and nobody read, since it was opened."""
-        ...
 
     def read(self, timeout_ns: int) -> Frame | None:
         """Newest frame that was not returned before; None if none comes within the timeout.
@@ -19,11 +18,9 @@ class Camera(Protocol):
         Raises:
             CameraError: the source has died and will not come back by itself.
         """
-        ...
 
     def close(self) -> None:
         """Free the source; joins its thread. May be called twice."""
-        ...
 
 
 class Link(Protocol):
@@ -31,55 +28,27 @@ class Link(Protocol):
 
     def poll(self) -> LinkSnapshot:
         """Receive everything that has arrived; never blocks."""
-        ...
 
     def service(self) -> None:
         """Send what is due besides sticks (heartbeat, handshake, requests); called after them."""
-        ...
 
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
         """Receive until an attitude newer than ``newer_than_ns`` arrives, or until ``until_ns``.
 
         Returns the arrival time of the newest attitude, 0 before the first.
         """
-        ...
 
     def send(self, decision: Decision) -> Sticks | None:
         """Send the decision; returns the sticks as rounded and sent, None when released."""
-        ...
 
     def hand_back(self) -> None:
         """Repeat the release at the end of a flight, as packets may be lost; takes 0.5 s."""
-        ...
-
-    def force_release(self) -> None:
-        """From any thread: release the sticks now, and send nothing after that."""
-        ...
 
     def set_mode(self, mode: str) -> None:
         """Ask for a flight mode (rate-limited; a later heartbeat shows the result)."""
-        ...
 
     def arm(self) -> None:
         """Ask to arm (rate-limited; a later heartbeat shows the result)."""
-        ...
-
-    def close(self) -> None:
-        """Free the socket or port."""
-        ...
-
-
-class PacketSource(Protocol):
-    """Packets that went over the link, for a recorder; drained by one thread."""
-
-    @property
-    def dropped(self) -> int:
-        """Packets that were dropped because they were not drained in time."""
-        ...
-
-    def drain(self) -> list[Packet]:
-        """Packets of both directions since the last call."""
-        ...
 
 
 class TickSink(Protocol):
@@ -87,4 +56,3 @@ class TickSink(Protocol):
 
     def emit(self, event: Event) -> None:
         """Take the event, or drop and count it."""
-        ...

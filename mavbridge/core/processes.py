@@ -35,10 +35,8 @@ def running(*command: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
         "PYTHONPATH": os.pathsep.join(filter(None, import_path)),
         "PYTHONSAFEPATH": "1",
     }
-    with log.open("wb") as output:
-        process = subprocess.Popen(
-            command, env=environment, stdout=output, stderr=subprocess.STDOUT
-        )
+    with log.open("wb") as out:
+        process = subprocess.Popen(command, env=environment, stdout=out, stderr=subprocess.STDOUT)
         try:
             yield process
         finally:
@@ -57,11 +55,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 def wait(process: subprocess.Popen[bytes], name: str, log: Path, timeout_s: float) -> None:
-    """Wait for a process that ends by itself.
-
-    Raises:
-        UserError: it failed, or did not end in time; quotes the end of its log.
-    """
+    """Wait for a process to end; raises UserError with the end of its log if it fails to."""
     try:
         status = process.wait(timeout_s)
     except subprocess.TimeoutExpired as error:

@@ -21,11 +21,8 @@ def settle_process() -> None:
 def settle_thread(*, realtime: bool, cpu: int | None) -> str | None:
     """Schedule the calling thread; returns a message about what was refused, or None."""
     if not hasattr(os, "sched_setaffinity"):
-        return (
-            None
-            if cpu is None
-            else "this system cannot pin threads: leave out --action-cpu and --vision-cpu"
-        )
+        refusal = "this system cannot pin threads: leave out --action-cpu and --vision-cpu"
+        return None if cpu is None else refusal
     has_other_cpus = len(os.sched_getaffinity(0)) > 1
     if cpu is not None:
         try:

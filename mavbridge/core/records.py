@@ -70,10 +70,6 @@ class FeatureFrame:
     value: FloatArray
     """Dual rate: feature [1, F]. Single rate: preprocessed image [1, 3, H, W]. Read-only."""
 
-    def age_ns(self, now_ns: int) -> int:
-        """Time since exposure."""
-        return now_ns - self.captured_ns
-
 
 class Reading(NamedTuple):
     """One measurement of the vehicle as it came in."""
@@ -96,12 +92,8 @@ class Telemetry:
 class VehicleStatus:
     """The vehicle's state as its heartbeat and RC_CHANNELS report it."""
 
-    system_id: int
-    autopilot: str
-    """"ardupilot", "px4" or "generic"."""
     mode: str
     armed: bool
-    heartbeat_ns: int
     rc_sticks: Sticks | None = None
     """Sticks that the vehicle acts on (RC_CHANNELS through its calibration)."""
     rc_channels_us: tuple[int, ...] = ()
@@ -157,7 +149,6 @@ class Tick:
     due_ns: int
     woke_ns: int
     missed_slots: int
-    """Slots skipped just before this one."""
     predict_ns: int | None
     """Duration of the policy's part; None when it did not run."""
     sent_ns: int
@@ -174,7 +165,6 @@ class Tick:
     rc_channels_us: tuple[int, ...]
     rc_sticks: Sticks | None
     texts: tuple[str, ...] = ()
-    """Status texts of the vehicle and warnings of the link since the last tick."""
 
     @property
     def activity(self) -> str:
@@ -199,7 +189,7 @@ class VisionTick:
     started_ns: int
     ready_ns: int
     dropped_frames: int
-    """By the source, since it was opened."""
+    """Frames dropped by the source since it was opened."""
     rgb: ImageArray
     """[H, W, 3] uint8, read-only: what the policy saw, before resizing."""
 
@@ -232,7 +222,6 @@ class LinkStats:
     messages_per_s: tuple[tuple[str, float], ...]
     """Mean arrival rate by MAVLink message name."""
     lost_fraction: float | None
-    """Lost over expected messages, by the vehicle's sequence numbers."""
     rtt_ms: Percentiles | None
     """Round trips of our own TIMESYNC requests."""
     sent_overrides: int
@@ -250,16 +239,15 @@ class RolloutFrame:
     """One row of an imagined flight: everything about a frame except its pixels."""
 
     number: int
-    """In the video."""
+    """Frame number in the video."""
     iteration: int
     frame: int
-    """Within its iteration."""
+    """Frame number within its iteration."""
     executed: bool
     """The next decision was made after it; the others were only looked at."""
     step: int
-    """Since the newest frame that was really seen, whose step is 0; iterations may overlap."""
+    """Steps since the newest frame that was really seen; iterations may overlap."""
     frame_dt_s: float
-    """Duration of a step."""
     state: FloatArray
     """[13]"""
     action: FloatArray
@@ -267,5 +255,5 @@ class RolloutFrame:
 
     @property
     def time_s(self) -> float:
-        """Since the newest frame that was really seen."""
+        """Time since the newest frame that was really seen."""
         return self.step * self.frame_dt_s

@@ -48,11 +48,9 @@ def stop_on_signals() -> Iterator[StopRequest]:
         stop.set()
 
     # SIGHUP: the terminal, or the connection to this computer, is gone.
-    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    previous = {
-        number: signal.signal(number, on_signal)
-        for number in (getattr(signal, name) for name in names)
-    }
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    previous = {number: signal.signal(number, on_signal) for number in numbers}
     try:
         yield stop
     finally:

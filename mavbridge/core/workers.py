@@ -40,11 +40,7 @@ class Worker:
         return not self._thread.is_alive()
 
     def join(self, timeout_s: float) -> None:
-        """Request the stop, wait for the thread, and raise what it raised.
-
-        Raises:
-            HungError: it did not stop in time.
-        """
+        """Request the stop, wait for the thread, and raise what it raised, or HungError."""
         self._stop.set()
         self._thread.join(timeout_s)
         if self._thread.is_alive():

@@ -45,7 +45,7 @@ class ActionSettings:
 
     state_frame: StateFrame
     since_exposure: bool
-    """Whether the policy is told the age of the image and the motion since."""
+    """The age of the image and the motion since its exposure are appended to the state."""
     chunk_dt_s: float
     history_len: int
     history_dt_s: float
@@ -56,15 +56,6 @@ class ActionSettings:
     mode: str | None
     duration_ns: int | None
     """Flight time from the first engagement on; None = until stopped."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Flown:
-    """The policy's part of one tick: a command and how it came about, or a refusal."""
-
-    decision: Decision
-    trace: StickTrace | None
-    predict_ns: int
 
 
 class ActionLoop:
@@ -127,23 +118,22 @@ class ActionLoop:
         directive = self._engagement.step(_facts(snapshot, problem, now_ns))
         self._request(directive.request)
 
-        flown: _Flown | None = None
+        trace: StickTrace | None = None
+        predict_ns: int | None = None
         if isinstance(directive.sticks, Release):
             decision: Decision = directive.sticks
         elif directive.sticks is Hold.IDLE:
             decision = Command(sticks=IDLE)
         else:
-            flown = self._fly(snapshot.status, state, feature, now_ns)
-            decision = flown.decision
-        self._is_flying = flown is not None and flown.trace is not None
+            decision, trace, predict_ns = self._fly(snapshot.status, state, feature, now_ns)
+        self._is_flying = trace is not None
 
         sent = self._link.send(decision)
         sent_ns = self._clock.now_ns()
         self._has_commanded = isinstance(decision, Command)
         self._history.append(sent, sent_ns)
-        self._sink.emit(
-            _tick(self._ticks, slot, snapshot, feature, state, flown, decision, sent, sent_ns)
-        )
+        flown = (decision, trace, predict_ns)
+        self._sink.emit(_tick(self._ticks, slot, snapshot, feature, state, flown, sent, sent_ns))
         self._ticks += 1
         self._link.service()
         self.alive_ns = sent_ns
@@ -156,7 +146,7 @@ class ActionLoop:
             return state.reason
         if feature is None:
             return "no image feature yet"
-        if feature.age_ns(now_ns) > self._settings.max_feature_age_ns:
+        if now_ns - feature.captured_ns > self._settings.max_feature_age_ns:
             limit_ms = self._settings.max_feature_age_ns // NS_PER_MS
             return f"the image feature is older than {limit_ms} ms"
         return None
@@ -167,8 +157,12 @@ class ActionLoop:
         state: VehicleState | Release,
         feature: FeatureFrame | None,
         now_ns: int,
-    ) -> _Flown:
-        """Sample the policy, check its chunk, and smooth the action that acts now."""
+    ) -> tuple[Decision, StickTrace | None, int]:
+        """Sample the policy, check its chunk, and smooth the action that acts now.
+
+        Returns the decision, the trace of its sticks (None if the chunk was refused), and the
+        duration in ns.
+        """
         if isinstance(state, Release) or feature is None:
             raise RuntimeError("engaged without inputs: the engagement must not allow this")
         if not self._is_flying:
@@ -176,7 +170,8 @@ class ActionLoop:
             self._chunk_state_ns = None
         started_ns = self._clock.now_ns()
         history = self._history.resample(now_ns)
-        elapsed_s = self._elapsed_s(state)
+        last_ns, self._chunk_state_ns = self._chunk_state_ns, state.attitude_ns
+        elapsed_s = None if last_ns is None else (state.attitude_ns - last_ns) / NS_PER_S
         values = state.values[None]
         if self._ego_motion is not None:
             values = self._ego_motion.append_to(state, feature.captured_ns)
@@ -184,16 +179,11 @@ class ActionLoop:
         done_ns = self._clock.now_ns()
         predict_ns = done_ns - started_ns
         if (refusal := check_chunk(chunk)) is not None:
-            return _Flown(decision=refusal, trace=None, predict_ns=predict_ns)
+            return refusal, None, predict_ns
         at_s = (done_ns - state.attitude_ns) / NS_PER_S + self._settings.lead_s
         raw = sample_chunk(chunk[0], chunk_dt_s=self._settings.chunk_dt_s, at_s=at_s)
         trace = self._smoother.step(raw, done_ns)
-        return _Flown(decision=Command(sticks=trace.smoothed), trace=trace, predict_ns=predict_ns)
-
-    def _elapsed_s(self, state: VehicleState) -> float | None:
-        """Time from the state of the last chunk to this one, which becomes the last."""
-        last_ns, self._chunk_state_ns = self._chunk_state_ns, state.attitude_ns
-        return None if last_ns is None else (state.attitude_ns - last_ns) / NS_PER_S
+        return Command(sticks=trace.smoothed), trace, predict_ns
 
     def _request(self, request: Request | None) -> None:
         if request == "mode" and self._settings.mode is not None:
@@ -246,24 +236,23 @@ def _tick(
     snapshot: LinkSnapshot,
     feature: FeatureFrame | None,
     state: VehicleState | Release,
-    flown: _Flown | None,
-    decision: Decision,
+    flown: tuple[Decision, StickTrace | None, int | None],
     sent: Sticks | None,
     sent_ns: int,
 ) -> Tick:
-    status = snapshot.status
+    status, (decision, trace, predict_ns) = snapshot.status, flown
     return Tick(
         serial=serial,
         index=slot.index,
         due_ns=slot.due_ns,
         woke_ns=slot.woke_ns,
         missed_slots=slot.missed,
-        predict_ns=flown.predict_ns if flown else None,
+        predict_ns=predict_ns,
         sent_ns=sent_ns,
         feature_frame_id=feature.frame_id if feature else None,
         feature_captured_ns=feature.captured_ns if feature else None,
         state=state if isinstance(state, VehicleState) else None,
-        trace=flown.trace if flown else None,
+        trace=trace,
         sent=sent,
         release_reason=decision.reason if isinstance(decision, Release) else None,
         mode=status.mode if status else None,

@@ -39,23 +39,19 @@ def fly(config: FlyConfig) -> int:
         MavbridgeError: anything that the user, the vehicle or the policy got wrong.
     """
     clock = MonotonicClock()
-    _check_quickly(config, clock)
-    console = Console(stderr=True, emoji=False)
-    loaded = load_configured_policy(config.policy, clock)
-    for note in loaded.notes:
-        console.print(Text(note, style="yellow"))
-    fly_executable(config, loaded.executable, clock=clock, console=console)
-    return 0
-
-
-def _check_quickly(config: FlyConfig, clock: Clock) -> None:
-    """Check what takes no time, before weights take seconds to load."""
+    # First what takes no time to check: weights take seconds to load.
     make_transport(config.link.connect, clock)
     check_camera(config.camera.source)
     check_request(policy_request(config.policy))
     require_writable(config.report, "--report")
     if config.record is not None:
         prepare_folder(config.record)
+    console = Console(stderr=True, emoji=False)
+    loaded = load_configured_policy(config.policy, clock)
+    for note in loaded.notes:
+        console.print(Text(note, style="yellow"))
+    fly_executable(config, loaded.executable, clock=clock, console=console)
+    return 0
 
 
 def fly_executable(
@@ -66,11 +62,7 @@ def fly_executable(
     console: Console,
     sinks: tuple[TickSink, ...] = (),
 ) -> None:
-    """Run one flight of a policy that is loaded already; ``sinks`` see every tick.
-
-    Raises:
-        MavbridgeError: anything that the user, the vehicle or the policy got wrong.
-    """
+    """Run one flight of a policy that is loaded already; ``sinks`` see every tick."""
     # OpenCV would print its own complaint about a camera before, and instead of, ours.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)  # both loops may share two cores: no pool of threads under either
@@ -83,7 +75,7 @@ def fly_executable(
             flight.run(stop)
     finally:
         if flight is not None:
-            flight.finish()
+            flight.observers.finish(flight.link)
 
 
 class _Flight:
@@ -103,41 +95,39 @@ class _Flight:
         self._stack = stack
         self._has_hung = False
         loops = config.rates.loops(is_dual=executable.dual_rate)
-        self._observers = FlightObservers(config, executable, clock=clock, console=console)
-        stack.callback(self._observers.close_recorder)  # after the link: it records the release
-        self._link = MavlinkLink(
+        self.observers = FlightObservers(config, executable, clock=clock, console=console)
+        stack.callback(self.observers.close_recorder)  # after the link: it records the release
+        self.link = MavlinkLink(
             make_transport(config.link.connect, clock),
             clock,
             config.link,
             state_hz=loops.state_hz,
-            packet_log=self._observers.packets,
+            packet_log=self.observers.packets,
         )
-        stack.callback(self._link.close)
-        self._observers.open_viewer(stack)
+        stack.callback(self.link.close)
+        self.observers.open_viewer(stack)
         camera = open_camera(
             config.camera.source, image_size=executable.contract.image_height, clock=clock
         )
         stack.callback(camera.close)
-        self._observers.open_recorder(self._link)
+        self.observers.open_recorder(self.link)
         self._bridge = build_bridge(
             config,
             executable,
             clock=clock,
-            link=self._link,
+            link=self.link,
             camera=camera,
-            sinks=(*self._observers.sinks, *sinks),
+            sinks=(*self.observers.sinks, *sinks),
         )
 
     def run(self, stop: StopRequest) -> None:
         """Fly until the action loop ends, the camera dies, or a signal comes."""
-        rates, screen = self._rates, self._observers.screen
-        vision = Worker(
-            "mavbridge-vision", self._scheduled(self._bridge.vision.run, cpu=rates.vision_cpu)
+        rates, screen = self._rates, self.observers.screen
+        see = self._scheduled(self._bridge.vision.run, realtime=False, cpu=rates.vision_cpu)
+        act = self._scheduled(
+            self._bridge.action.run, realtime=rates.realtime, cpu=rates.action_cpu
         )
-        action = Worker(
-            "mavbridge-action",
-            self._scheduled(self._bridge.action.run, realtime=rates.realtime, cpu=rates.action_cpu),
-        )
+        vision, action = Worker("mavbridge-vision", see), Worker("mavbridge-action", act)
         settle_process()
         # Joined in reverse: the sticks are released before anything that feeds them is closed.
         self._stack.callback(vision.join, JOIN_S)
@@ -151,14 +141,14 @@ class _Flight:
                 stop.wait(1 / STATUS_HZ)
 
     def _scheduled(
-        self, run: Callable[[threading.Event], None], *, realtime: bool = False, cpu: int | None
+        self, run: Callable[[threading.Event], None], *, realtime: bool, cpu: int | None
     ) -> Callable[[threading.Event], None]:
         """Wrap a loop so that its thread first asks for its scheduling."""
 
         def run_settled(stop: threading.Event) -> None:
             refusal = settle_thread(realtime=realtime, cpu=cpu)
             if refusal is not None:
-                self._observers.screen.show_message(refusal)
+                self.observers.screen.show_message(refusal)
             run(stop)
 
         return run_settled
@@ -167,7 +157,7 @@ class _Flight:
         """End the flight when the action loop hangs: its last sticks must not stay."""
         idle_ns = self._clock.now_ns() - self._bridge.action.alive_ns
         if action.is_alive and idle_ns > HANG_NS:
-            self._link.force_release()
+            self.link.force_release()
             self._has_hung = True
             raise PeerError(
                 f"the action loop has hung for {idle_ns / NS_PER_S:.1f} s: the policy is too slow "
@@ -178,10 +168,6 @@ class _Flight:
         try:
             action.join(JOIN_S)
         except HungError:
-            self._link.force_release()
+            self.link.force_release()
             if not self._has_hung:  # else that is being reported already
                 raise
-
-    def finish(self) -> None:
-        """Print and write the report."""
-        self._observers.finish(self._link)

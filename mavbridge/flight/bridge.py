@@ -79,30 +79,11 @@ def build_action_loop(
 ) -> ActionLoop:
     """Build the fast path alone; arguments as for ``build_bridge``."""
     action_period_ns = period_ns(config.rates.loops(is_dual=executable.dual_rate).action_hz)
-    pacer: Pacer
+    pacer: Pacer = GridPacer(clock, period_ns=action_period_ns)
     if config.rates.pace == "state":
         pacer = StatePacer(clock, link, period_ns=action_period_ns)
-    else:
-        pacer = GridPacer(clock, period_ns=action_period_ns)
-    limits = config.limits
-    return ActionLoop(
-        clock=clock,
-        pacer=pacer,
-        link=link,
-        cache=cache,
-        act=executable.act,
-        smoother=StickSmoother(Smoothing(max_slew_per_s=limits.max_slew, tau_s=limits.tau)),
-        engagement=Engagement(
-            wanted_mode=config.mode, arm=config.arm, readonly=config.link.readonly
-        ),
-        sink=sink,
-        settings=_action_settings(config, executable),
-    )
-
-
-def _action_settings(config: FlyConfig, executable: Executable) -> ActionSettings:
     contract, limits = executable.contract, config.limits
-    return ActionSettings(
+    settings = ActionSettings(
         state_frame=contract.state_frame,
         since_exposure=contract.since_exposure,
         chunk_dt_s=contract.chunk_dt_s,
@@ -116,4 +97,17 @@ def _action_settings(config: FlyConfig, executable: Executable) -> ActionSetting
         lead_s=limits.tau,
         mode=config.mode,
         duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
+    )
+    return ActionLoop(
+        clock=clock,
+        pacer=pacer,
+        link=link,
+        cache=cache,
+        act=executable.act,
+        smoother=StickSmoother(Smoothing(max_slew_per_s=limits.max_slew, tau_s=limits.tau)),
+        engagement=Engagement(
+            wanted_mode=config.mode, arm=config.arm, readonly=config.link.readonly
+        ),
+        sink=sink,
+        settings=settings,
     )

@@ -16,7 +16,7 @@ from policy.contract import (
     VELOCITY_CHANGE,
 )
 from policy.observation import motion_since_exposure
-from policy.rotation import Quaternion, Vector, slerp
+from policy.rotation import slerp
 
 MAX_READINGS = 1024
 """Readings of each kind: five seconds of the fastest attitude stream that a link carries."""
@@ -44,8 +44,8 @@ class EgoMotion:
 
         Args:
             state: the newest of those that were pushed.
-            exposed_ns: when the image was taken. If that was after the attitude, the motion is
-                zero and the age negative.
+            exposed_ns: exposure of the image. If that was after the attitude, the motion is zero
+                and the age negative.
 
         Raises:
             ValueError: nothing was pushed.
@@ -55,13 +55,14 @@ class EgoMotion:
         out = np.empty((1, STATE_DIM + SINCE_EXPOSURE_DIM), np.float32)
         out[0, :STATE_DIM] = state.values
         a, b, c, d = state.values[QUATERNION].tolist()
-        was = _velocity_at(self._velocities, exposed_ns)
         vx, vy, vz = state.values[VELOCITY].tolist()
-        turn, change = motion_since_exposure(
-            _attitude_at(self._attitudes, exposed_ns),
-            (a, b, c, d),
-            (vx - was[0], vy - was[1], vz - was[2]),
-        )
+        before, after, share = _around(self._attitudes, exposed_ns)
+        (pw, px, py, pz), (qw, qx, qy, qz) = before.values, after.values
+        attitude_then = slerp((pw, px, py, pz), (qw, qx, qy, qz), share)
+        before, after, share = _around(self._velocities, exposed_ns)
+        ux, uy, uz = (p + share * (q - p) for p, q in zip(before.values, after.values, strict=True))
+        velocity_change = (vx - ux, vy - uy, vz - uz)
+        turn, change = motion_since_exposure(attitude_then, (a, b, c, d), velocity_change)
         out[0, AGE] = (state.attitude_ns - exposed_ns) / NS_PER_S
         out[0, ROTATION], out[0, VELOCITY_CHANGE] = turn, change
         return out
@@ -84,15 +85,3 @@ def _around(readings: deque[Reading], at_ns: int) -> tuple[Reading, Reading, flo
             return before, after, (at_ns - before.arrived_ns) / between_ns if between_ns else 0.0
         after = before
     return after, after, 0.0
-
-
-def _attitude_at(readings: deque[Reading], at_ns: int) -> Quaternion:
-    before, after, share = _around(readings, at_ns)
-    (w, x, y, z), (a, b, c, d) = before.values, after.values
-    return slerp((w, x, y, z), (a, b, c, d), share)
-
-
-def _velocity_at(readings: deque[Reading], at_ns: int) -> Vector:
-    before, after, share = _around(readings, at_ns)
-    (px, py, pz), (qx, qy, qz) = before.values, after.values
-    return px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)

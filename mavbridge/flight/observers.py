@@ -11,10 +11,10 @@ import mavbridge
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
-from mavbridge.core.observers import ObserverThread
+from mavbridge.core.observers import BoundedQueue, ObserverThread
 from mavbridge.core.ports import TickSink
+from mavbridge.core.records import Packet
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.packet_log import PacketLog
 from mavbridge.observe.rerun_flight import RerunView
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
@@ -25,6 +25,8 @@ if TYPE_CHECKING:  # the extra "record" may not be installed
 
 RERUN_CAPACITY = 1000
 """Ticks that may wait for the viewer: ten seconds at 100 Hz."""
+PACKET_CAPACITY = 16384
+"""Packets that may wait for the recorder: ten seconds of a busy link."""
 VIEWER_JOIN_S = 2.0
 RECORDER_JOIN_S = 60.0
 """The tables of a long flight become Parquet within seconds; the vehicle is released by then."""
@@ -52,7 +54,9 @@ class FlightObservers:
         self.screen = FlightScreen(
             console, action_hz=action_hz, vision_hz=vision_hz, readonly=config.link.readonly
         )
-        self.packets = None if config.record is None else PacketLog()
+        self.packets: BoundedQueue[Packet] | None = None
+        if config.record is not None:
+            self.packets = BoundedQueue(PACKET_CAPACITY)
 
     @property
     def sinks(self) -> tuple[TickSink, ...]:
@@ -73,11 +77,7 @@ class FlightObservers:
         stack.callback(self._viewer.close, VIEWER_JOIN_S)
 
     def open_recorder(self, link: MavlinkLink) -> None:
-        """Start the recording, if one is wanted.
-
-        Raises:
-            UserError: the folder cannot be written.
-        """
+        """Start the recording, if one is wanted; raises UserError if it cannot be written."""
         if self._config.record is None or self.packets is None:
             return
         from mavbridge.recording.meta import FlightMeta
@@ -116,20 +116,20 @@ class FlightObservers:
 
     def finish(self, link: MavlinkLink) -> None:
         """Print the report, and write it where --report names a file."""
-        drops = ObserverDrops(
-            rerun=self._viewer.dropped if self._viewer else None,
-            recorder=self._recorder.dropped if self._recorder else None,
-        )
+        viewer, recorder = self._viewer, self._recorder
         report = self._timing.report(
             mode=self._mode,
             engine=self._executable.engine,
             policy=self._executable.name,
             autopilot=link.autopilot,
             link=link.stats(),
-            observer_drops=drops,
+            observer_drops=ObserverDrops(
+                rerun=viewer.dropped if viewer else None,
+                recorder=recorder.dropped if recorder else None,
+            ),
         )
         self.screen.show_report(report)
-        if self._recorder is not None:
-            self._console.print(Text(self._recorder.summary()), soft_wrap=True)
+        if recorder is not None:
+            self._console.print(Text(recorder.summary()), soft_wrap=True)
         if self._config.report is not None:
             self._config.report.write_text(report_json(report))

@@ -12,11 +12,7 @@ BUILT_IN = ("toge", "resnet-unet")
 
 
 def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
-    """Load the policy that the flags ask for; scripted ones follow ``clock``.
-
-    Raises:
-        PolicyError: with what was wrong, what was available and what to do.
-    """
+    """Load the policy that the flags name, or raise PolicyError; scripted ones follow ``clock``."""
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)  # a user's module:Class lies in the working directory
@@ -52,11 +48,7 @@ def _loaded_once(policy: PolicyConfig) -> LoadedPolicy:
 
 
 def load_for_episodes(policy: PolicyConfig, clock: Clock) -> LoadedPolicy:
-    """Load a policy for one of many flights; nets, which keep nothing between them, only once.
-
-    Raises:
-        PolicyError: it cannot be loaded.
-    """
+    """Load a policy for one of many flights; nets, which keep nothing between them, only once."""
     if is_stateless(policy):
         return _loaded_once(policy)
     return load_configured_policy(policy, clock)

@@ -29,11 +29,7 @@ def build_state(
 ) -> VehicleState | Release:
     """Join the newest readings; a part that is missing or too old is a release, never a zero.
 
-    Args:
-        telemetry: newest reading of each quantity, NED world and FRD body.
-        now_ns: time of the tick.
-        frame: frame of the contract, in which the state is returned.
-        freshness: oldest acceptable readings.
+    The state is returned in ``frame``, that of the contract.
     """
     attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
     velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2

@@ -41,20 +41,12 @@ class VisionLoop:
         self._frames = 0
 
     def run(self, stop: threading.Event) -> None:
-        """Encode until told to stop.
-
-        Raises:
-            CameraError: the camera has died.
-        """
+        """Encode until told to stop; raises CameraError if the camera has died."""
         while not stop.is_set():
             self.step()
 
     def step(self) -> None:
-        """Wait up to ``READ_TIMEOUT_NS`` for one frame, encode and publish it.
-
-        Raises:
-            CameraError: the camera has died.
-        """
+        """Wait up to ``READ_TIMEOUT_NS`` for one frame, encode and publish it, or CameraError."""
         frame = self._camera.read(READ_TIMEOUT_NS)
         started_ns = self._clock.now_ns()
         if frame is None:
@@ -66,14 +58,10 @@ class VisionLoop:
         value = self._encode(frame.rgb)
         value.setflags(write=False)
         ready_ns = self._clock.now_ns()
-        self._cache.publish(
-            FeatureFrame(
-                frame_id=frame.frame_id,
-                captured_ns=captured_ns,
-                ready_ns=ready_ns,
-                value=value,
-            )
+        feature = FeatureFrame(
+            frame_id=frame.frame_id, captured_ns=captured_ns, ready_ns=ready_ns, value=value
         )
+        self._cache.publish(feature)
         self._sink.emit(
             VisionTick(
                 serial=self._frames,

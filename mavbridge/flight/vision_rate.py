@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import Event, ImageArray, Tick, VisionTick
+from mavbridge.core.records import Event, ImageArray, Tick
 from policy.contract import RATE
 
 FULL_TURN_RADPS = 1.5
@@ -45,24 +45,20 @@ class AdaptiveRate:
         if isinstance(event, Tick):
             if event.state is not None:
                 self._turn_radps = math.hypot(*event.state.values[RATE].tolist())
-        else:
-            self._see(event)
-
-    def _see(self, vision: VisionTick) -> None:
-        encode_s = (vision.ready_ns - vision.started_ns) / NS_PER_S
+            return
+        encode_s = (event.ready_ns - event.started_ns) / NS_PER_S
         # Slower at once, faster slowly: the budget must hold for the next frame, too.
         self._encode_s = max(encode_s, self._encode_s + 0.1 * (encode_s - self._encode_s))
-        small = _thin(vision.rgb)
-        last, self._last = self._last, (vision.captured_ns, small)
+        height, width = event.rgb.shape[:2]
+        small = event.rgb[:: max(1, height // _GRID), :: max(1, width // _GRID)]
+        last, self._last = self._last, (event.captured_ns, small)
         if last is None or last[1].shape != small.shape:
             return
-        gap_s = max((vision.captured_ns - last[0]) / NS_PER_S, 1e-3)
-        change = np.abs(small.astype(np.int16) - last[1]).mean() / 255 / gap_s
-        wanted = min(
-            1.0, max(self._turn_radps / FULL_TURN_RADPS, float(change) / FULL_CHANGE_PER_S)
-        )
+        gap_s = max((event.captured_ns - last[0]) / NS_PER_S, 1e-3)
+        change_per_s = float(np.abs(small.astype(np.int16) - last[1]).mean() / 255 / gap_s)
+        wanted = max(self._turn_radps / FULL_TURN_RADPS, change_per_s / FULL_CHANGE_PER_S)
         calmed = self._demand * math.exp(-gap_s / CALM_TAU_S)
-        self._demand = max(wanted, calmed)
+        self._demand = max(min(1.0, wanted), calmed)
 
     @property
     def rate_hz(self) -> float:
@@ -75,8 +71,3 @@ class AdaptiveRate:
     def period_ns(self) -> int:
         """Time to the next frame to encode."""
         return round(NS_PER_S / self.rate_hz)
-
-
-def _thin(rgb: ImageArray) -> ImageArray:
-    height, width = rgb.shape[:2]
-    return rgb[:: max(1, height // _GRID), :: max(1, width // _GRID)]

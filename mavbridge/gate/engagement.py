@@ -9,11 +9,9 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.records import FloatArray, Release
 
-PILOTED_MODES = frozenset(
-    {
-        *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
-        *("MANUAL", "STABILIZED", "ALTCTL", "POSCTL"),
-    }
+PILOTED_MODES = (
+    *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
+    *("MANUAL", "STABILIZED", "ALTCTL", "POSCTL"),
 )
 """Modes in which sticks fly the vehicle (ArduPilot, PX4)."""
 
@@ -42,11 +40,9 @@ class Facts:
     now_ns: int
     link_problem: str | None
     input_problem: str | None
-    """What state or feature lacks, or None."""
     mode: str | None
     armed: bool
     is_overruled: bool
-    """The vehicle does not act on our sticks."""
     echo_confirmed: bool
 
 
@@ -54,7 +50,6 @@ class Hold(Enum):
     """Use of the sticks while they are not released."""
 
     IDLE = "idle"
-    """Throttle at the bottom, the rest centred: for arming."""
     FLY = "fly"
 
 
@@ -98,7 +93,9 @@ class Engagement:
             PeerError: the vehicle did not take the mode or arm in time.
         """
         if self._readonly:
-            return self._observe(facts)
+            return (
+                self._fly(facts) if facts.link_problem is None else self._wait(facts.link_problem)
+            )
         if facts.armed:
             self._may_arm = False  # armed once, by anybody: never arm a second time
         if facts.is_overruled and self.phase is Phase.FLYING:
@@ -108,18 +105,12 @@ class Engagement:
         if not facts.armed:
             return self._on_ground(facts)
         if self.phase is Phase.LATCHED:
-            return Directive(
-                sticks=Release(f"somebody else has taken over ({facts.mode}): disarm to reset")
-            )
+            reason = f"somebody else has taken over ({facts.mode}): disarm to reset"
+            return Directive(sticks=Release(reason))
         if self._own_mode is not None and facts.mode != self._own_mode:
             self.phase = Phase.LATCHED
             return Directive(sticks=Release(f"mode changed from {self._own_mode} to {facts.mode}"))
         return self._in_air(facts)
-
-    def _observe(self, facts: Facts) -> Directive:
-        if facts.link_problem is not None:
-            return self._wait(facts.link_problem)
-        return self._fly(facts)
 
     def _wait(self, reason: str, request: Request | None = None) -> Directive:
         if self.phase is Phase.PREPARING:
@@ -167,9 +158,8 @@ class Engagement:
                 self._retake_ns = facts.now_ns + RETAKE_NS
             return Directive(sticks=Release(facts.input_problem))
         if self._retake_ns is not None and facts.now_ns < self._retake_ns:
-            return Directive(
-                sticks=Release("inputs are good again: waiting to see that they stay so")
-            )
+            reason = "inputs are good again: waiting to see that they stay so"
+            return Directive(sticks=Release(reason))
         self.phase = Phase.FLYING
         self._own_mode = facts.mode
         self._prepare_until_ns = None

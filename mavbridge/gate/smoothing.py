@@ -44,12 +44,7 @@ class StickSmoother:
         self._smoothed = start
 
     def step(self, raw: Sticks, now_ns: int) -> StickTrace:
-        """Filter one action.
-
-        Args:
-            raw: the policy's action; must be finite (``check_chunk`` saw to that).
-            now_ns: time at which it acts; the first step after a reset spans no time.
-        """
+        """Filter one action, which must be finite; the first after a reset spans no time."""
         dt_s = 0.0
         if self._last_ns is not None:
             dt_s = min(max(now_ns - self._last_ns, 0) / NS_PER_S, self._settings.max_dt_s)
@@ -66,12 +61,8 @@ class StickSmoother:
         if limit == 0:
             return target
         reach = limit * dt_s
-        return Sticks(
-            *[
-                now + min(max(goal - now, -reach), reach)
-                for now, goal in zip(self._slewed, target, strict=True)
-            ]
-        )
+        pairs = zip(self._slewed, target, strict=True)
+        return Sticks(*[now + min(max(goal - now, -reach), reach) for now, goal in pairs])
 
     def _low_pass(self, u0: Sticks, u1: Sticks, dt_s: float) -> Sticks:
         tau_s = self._settings.tau_s

@@ -6,21 +6,24 @@ from mavbridge.config.flight import LinkConfig
 from mavbridge.config.rates import HEARTBEAT_HZ, period_ns
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import PeerError
-from mavbridge.core.records import Decision, LinkSnapshot, LinkStats, Release, Sticks, Telemetry
-from mavbridge.mavlink.codec.calibration import RcCalibration
-from mavbridge.mavlink.codec.messages import (
-    CommandAck,
-    CommandRequest,
-    Heartbeat,
-    Timesync,
+from mavbridge.core.observers import BoundedQueue
+from mavbridge.core.records import (
+    Decision,
+    LinkSnapshot,
+    LinkStats,
+    Packet,
+    Release,
+    Sticks,
+    Telemetry,
 )
+from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Heartbeat, Timesync
 from mavbridge.mavlink.codec.packets import Codec, manual_control_sticks, pwm_of
 from mavbridge.mavlink.session.discovery import VehicleDiscovery, VehicleIdentity
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.transport.connection import Arrival, Connection
-from mavbridge.mavlink.transport.packet_log import PacketLog
+from mavbridge.mavlink.transport.connection import Connection
 from mavbridge.mavlink.transport.sockets import Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -45,7 +48,7 @@ class MavlinkLink:
         config: LinkConfig,
         *,
         state_hz: float,
-        packet_log: PacketLog | None = None,
+        packet_log: BoundedQueue[Packet] | None = None,
     ) -> None:
         self._clock = clock
         self._config = config
@@ -97,28 +100,23 @@ class MavlinkLink:
         return 0 if self._vehicle is None else self._vehicle.telemetry.attitude_ns
 
     def _receive_all(self) -> None:
-        for arrival in self._connection.receive():
-            self._receive(arrival)
-
-    def _receive(self, arrival: Arrival) -> None:
-        message, arrived_ns, sender = arrival
-        if isinstance(message.body, Heartbeat):
-            self._discovery.receive(message.source, message.body, sender, arrived_ns)
         vehicle = self._vehicle
-        if vehicle is None or (message.source, sender) != (
-            vehicle.identity.source,
-            vehicle.identity.address,
-        ):
-            return
-        self._counters.receive(message.name, message.sequence, arrived_ns)
-        match message.body:
-            case Timesync() as reply:
-                self._timesync.receive(reply, arrived_ns)
-            case CommandAck() as ack if ack.target not in ((0, 0), self._codec.source):
-                return  # an answer to another station
-            case CommandAck() as ack:
-                self._report_refusal(ack)
-        vehicle.receive(message, arrived_ns)
+        for message, arrived_ns, sender in self._connection.receive():
+            if isinstance(message.body, Heartbeat):
+                self._discovery.receive(message.source, message.body, sender, arrived_ns)
+            if vehicle is None or message.source != vehicle.identity.source:
+                continue
+            if sender != vehicle.identity.address:
+                continue
+            self._counters.receive(message.name, message.sequence, arrived_ns)
+            match message.body:
+                case Timesync() as reply:
+                    self._timesync.receive(reply, arrived_ns)
+                case CommandAck() as ack if ack.target not in ((0, 0), self._codec.source):
+                    continue  # an answer to another station
+                case CommandAck() as ack:
+                    self._report_refusal(ack)
+            vehicle.receive(message, arrived_ns)
 
     def _report_refusal(self, ack: CommandAck) -> None:
         if ack.command not in self._requested_ns or ack.result == dialect.MAV_RESULT_ACCEPTED:
@@ -133,13 +131,8 @@ class MavlinkLink:
         self._connection.texts.clear()
         is_down, vehicle = self._connection.is_down, self._vehicle
         if vehicle is None:
-            problem = "waiting for the vehicle's heartbeat"
-            return LinkSnapshot(
-                telemetry=Telemetry(),
-                status=None,
-                problem=_DOWN if is_down else problem,
-                texts=texts,
-            )
+            problem = _DOWN if is_down else "waiting for the vehicle's heartbeat"
+            return LinkSnapshot(telemetry=Telemetry(), status=None, problem=problem, texts=texts)
         overruled = vehicle.overruled(now_ns)
         return LinkSnapshot(
             telemetry=vehicle.telemetry.snapshot(),
@@ -191,12 +184,10 @@ class MavlinkLink:
         if (identity := self._discovery.choose(now_ns)) is not None:
             self._adopt(identity)
             return
-        waited_ns = now_ns - self._started_ns
-        if not self._discovery.is_settling and waited_ns > self._config.connect_timeout * NS_PER_S:
-            raise PeerError(
-                f"no vehicle on {self._config.connect} after {self._config.connect_timeout:g} s: "
-                f"{self._discovery.describe()}"
-            )
+        timeout_s, waited_ns = self._config.connect_timeout, now_ns - self._started_ns
+        if not self._discovery.is_settling and waited_ns > timeout_s * NS_PER_S:
+            waited = f"no vehicle on {self._config.connect} after {timeout_s:g} s"
+            raise PeerError(f"{waited}: {self._discovery.describe()}")
 
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""
@@ -204,7 +195,7 @@ class MavlinkLink:
             identity, self._config, state_hz=self._state_hz, report=self._report
         )
         self._counters.new_sequence()
-        self._connection.answer_to(identity.address)
+        self._connection.peer = identity.address
 
     def _report(self, text: str) -> None:
         self._connection.texts.append(text)
@@ -237,16 +228,13 @@ class MavlinkLink:
         if isinstance(decision, Release):
             self._send_release()
             return None
-        if self._config.output == "manual-control":
-            return self._send_manual_control(decision.sticks, self._vehicle)
-        return self._send_override(decision.sticks, self._vehicle)
-
-    def _send_manual_control(self, sticks: Sticks, vehicle: VehicleSession) -> Sticks | None:
-        system = vehicle.identity.source.system
-        if not self._connection.send(self._codec.encode_manual_control(system, sticks)):
+        if self._config.output == "rc-override":
+            return self._send_override(decision.sticks, self._vehicle)
+        system = self._vehicle.identity.source.system
+        if not self._connection.send(self._codec.encode_manual_control(system, decision.sticks)):
             return None
         self._counters.sent += 1
-        return manual_control_sticks(sticks)
+        return manual_control_sticks(decision.sticks)
 
     def _send_override(self, sticks: Sticks, vehicle: VehicleSession) -> Sticks | None:
         calibration = vehicle.calibration

@@ -9,7 +9,6 @@ costs a tenth of one ``log`` per value.
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
-from uuid import uuid4
 
 import cv2
 import numpy as np
@@ -18,9 +17,8 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import Event, ImageArray, Sticks, Tick, VisionTick
-from mavbridge.observe.rerun_target import RrdFile, prepare_target
+from mavbridge.observe.rerun_target import RerunRecording
 
 JPEG_QUALITY = 85
 MAX_IMAGE_WIDTH = 640
@@ -33,13 +31,8 @@ FloatColumn: TypeAlias = NDArray[np.float64]
 _STICKS_GAP = Sticks(math.nan, math.nan, math.nan, math.nan)
 
 _Rgb: TypeAlias = tuple[int, int, int]
-_BLUE: _Rgb = (86, 180, 233)
-_ORANGE: _Rgb = (240, 160, 40)
-_GREEN: _Rgb = (60, 200, 140)
-_PINK: _Rgb = (225, 120, 180)
-_YELLOW: _Rgb = (240, 228, 66)
-_WHITE: _Rgb = (235, 235, 235)
-_GREY: _Rgb = (135, 135, 135)
+_BLUE, _ORANGE, _GREEN = (86, 180, 233), (240, 160, 40), (60, 200, 140)
+_PINK, _YELLOW, _WHITE, _GREY = (225, 120, 180), (240, 228, 66), (235, 235, 235), (135, 135, 135)
 
 
 class _Series(NamedTuple):
@@ -73,13 +66,8 @@ _STICK_SERIES = (
     _Series("sent", _WHITE),
 )
 STICKS = tuple(_Plot(f"sticks/{axis}", _STICK_SERIES) for axis in Sticks._fields)
-RC = _Plot(
-    "rc",
-    tuple(
-        _Series(f"channel {number + 1}", color)
-        for number, color in enumerate((_BLUE, _ORANGE, _GREEN, _PINK))
-    ),
-)
+_RC_COLORS = enumerate((_BLUE, _ORANGE, _GREEN, _PINK), start=1)
+RC = _Plot("rc", tuple(_Series(f"channel {number}", color) for number, color in _RC_COLORS))
 """Channels 1 to 4 hold the sticks, unless RCMAP_* says otherwise; the stick plots are mapped."""
 PLOTS = (
     *(AGE, ACTION_PERIOD, VISION_PERIOD, ACTION_JITTER, VISION_JITTER),
@@ -137,16 +125,6 @@ def _time_series(
     )
 
 
-def _style(plot: _Plot) -> rr.SeriesLines:
-    """Names and colours; zoomed out, lines show their extremes, since averages hide stalls."""
-    return rr.SeriesLines(
-        names=[series.name for series in plot.series],
-        colors=[series.color for series in plot.series],
-        widths=[series.width for series in plot.series],
-        aggregation_policy="MinMax",
-    )
-
-
 class RerunView:
     """Shows ticks and vision ticks on the timelines ``time`` and ``tick``.
 
@@ -158,17 +136,9 @@ class RerunView:
     def __init__(self, target: str, *, action_hz: float, vision_hz: float) -> None:
         """Check the target; calls that may block are left to ``consume`` and ``close``.
 
-        Args:
-            target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
-            action_hz: target rate of the action loop; jitter is measured against it.
-            vision_hz: target rate of the vision loop.
-
-        Raises:
-            MavbridgeError: see ``rerun_target.prepare_target``.
+        Jitter is measured against the target rates; ``target`` is that of ``prepare_target``.
         """
-        self._target = prepare_target(target)
-        rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
-        self._recording = rr.RecordingStream("mavbridge", recording_id=uuid4())
+        self._recording = RerunRecording("mavbridge", target)
         self._is_open = False
         self._action_periods = _Periods(action_hz)
         self._vision_periods = _Periods(vision_hz)
@@ -192,29 +162,23 @@ class RerunView:
             self._last_tick = ticks[-1]
 
     def close(self) -> None:
-        """Deliver the rest and close the file or connection; blocks until all is taken.
-
-        Raises:
-            MavbridgeError: the viewer is gone.
-        """
+        """Deliver the rest; blocks until it is taken. Raises MavbridgeError: the viewer is gone."""
         self._open()
-        try:
-            self._recording.flush()
-        except RuntimeError as error:
-            raise MavbridgeError(f"the viewer did not take the whole flight: {error}") from error
-        self._recording.disconnect()
+        self._recording.close()
 
     def _open(self) -> None:
         if self._is_open:
             return
         self._is_open = True
-        blueprint = flight_blueprint()
-        if isinstance(self._target, RrdFile):
-            self._recording.save(self._target.path, default_blueprint=blueprint)
-        else:
-            self._recording.connect_grpc(self._target.url, default_blueprint=blueprint)
+        self._recording.open(flight_blueprint())
         for plot in PLOTS:
-            self._recording.log(plot.path, _style(plot), static=True, strict=True)
+            style = rr.SeriesLines(
+                names=[series.name for series in plot.series],
+                colors=[series.color for series in plot.series],
+                widths=[series.width for series in plot.series],
+                aggregation_policy="MinMax",  # zoomed out: averages would hide stalls
+            )
+            self._recording.stream.log(plot.path, style, static=True, strict=True)
 
     def _send_ticks(self, ticks: list[Tick]) -> None:
         woke_ns = [tick.woke_ns for tick in ticks]
@@ -230,7 +194,9 @@ class RerunView:
         stages = np.array([_stick_stages(tick) for tick in ticks])
         for axis, plot in enumerate(STICKS):
             self._send(plot, index, stages[:, :, axis])
-        self._send(RC, index, np.array([_rc_channels(tick) for tick in ticks]))
+        shown_us = [tick.rc_channels_us[: len(RC.series)] for tick in ticks]
+        gaps = (math.nan,) * len(RC.series)
+        self._send(RC, index, np.array([us + gaps[len(us) :] for us in shown_us]))
 
     def _send_visions(self, visions: list[VisionTick], ticks: list[Tick]) -> None:
         ready_ns = [vision.ready_ns for vision in visions]
@@ -244,15 +210,10 @@ class RerunView:
             self._first_dropped = int(dropped[0])
         self._send(DROPPED, index, dropped - self._first_dropped)
         captured_ns = [vision.captured_ns for vision in visions]
-        self._recording.send_columns(
-            CAMERA,
-            self._index(captured_ns, self._tick_indexes_at(captured_ns, ticks)),
-            rr.EncodedImage.columns(
-                blob=[_jpeg(vision.rgb) for vision in visions],
-                media_type=["image/jpeg"] * len(visions),
-            ),
-            strict=True,
-        )
+        index = self._index(captured_ns, self._tick_indexes_at(captured_ns, ticks))
+        blobs = [_jpeg(vision.rgb) for vision in visions]
+        images = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(visions))
+        self._recording.stream.send_columns(CAMERA, index, images, strict=True)
 
     def _send_events(self, ticks: list[Tick]) -> None:
         before = [self._last_tick, *ticks[:-1]]
@@ -265,16 +226,10 @@ class RerunView:
             return
         changed, texts, levels, colors = zip(*changes, strict=True)
         since_s = [(tick.woke_ns - (self._origin_ns or 0)) / NS_PER_S for tick in changed]
-        self._recording.send_columns(
-            EVENTS,
-            self._index([tick.woke_ns for tick in changed], [tick.index for tick in changed]),
-            rr.TextLog.columns(
-                text=[f"{t_s:6.2f} s  {text}" for t_s, text in zip(since_s, texts, strict=True)],
-                level=levels,
-                color=colors,
-            ),
-            strict=True,
-        )
+        lines = [f"{t_s:6.2f} s  {text}" for t_s, text in zip(since_s, texts, strict=True)]
+        index = self._index([tick.woke_ns for tick in changed], [tick.index for tick in changed])
+        columns = rr.TextLog.columns(text=lines, level=levels, color=colors)
+        self._recording.stream.send_columns(EVENTS, index, columns, strict=True)
 
     def _tick_indexes_at(self, stamps_ns: list[int], ticks: list[Tick]) -> list[int]:
         """Index of the last tick before each stamp, as far as this batch shows."""
@@ -293,7 +248,7 @@ class RerunView:
 
     def _send(self, plot: _Plot, index: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         columns = rr.Scalars.columns(scalars=values.reshape(-1, len(plot.series)))
-        self._recording.send_columns(plot.path, index, columns, strict=True)
+        self._recording.stream.send_columns(plot.path, index, columns, strict=True)
 
 
 class _Periods:
@@ -332,11 +287,6 @@ def _stick_stages(tick: Tick) -> tuple[Sticks, ...]:
     return echo, trace.raw, trace.clipped, trace.slewed, trace.smoothed, sent
 
 
-def _rc_channels(tick: Tick) -> tuple[float, ...]:
-    shown = tick.rc_channels_us[: len(RC.series)]
-    return shown + (math.nan,) * (len(RC.series) - len(shown))
-
-
 def _changes(before: Tick | None, now: Tick) -> Iterator[tuple[str, str, _Rgb]]:
     """Text, level and colour of everything in this tick that is new to the user."""
     if before is None or before.activity != now.activity:
@@ -354,11 +304,9 @@ def _changes(before: Tick | None, now: Tick) -> Iterator[tuple[str, str, _Rgb]]:
 
 def _jpeg(rgb: ImageArray) -> bytes:
     height, width = rgb.shape[:2]
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     if width > MAX_IMAGE_WIDTH:
         size = (MAX_IMAGE_WIDTH, max(1, round(height * MAX_IMAGE_WIDTH / width)))
-        shown = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    else:
-        shown = rgb
-    bgr = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
+        bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
     _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return encoded.tobytes()

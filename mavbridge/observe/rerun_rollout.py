@@ -5,16 +5,14 @@ it.
 """
 
 from collections.abc import Callable
-from uuid import uuid4
 
 import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import ImageArray, RolloutFrame
-from mavbridge.observe.rerun_target import RrdFile, prepare_target
+from mavbridge.observe.rerun_target import RerunRecording
 from policy.contract import ACTION_NAMES, QUATERNION, RATE, SPECIFIC_FORCE, STATE_NAMES, VELOCITY
 
 IMAGINED, REAL, STICKS = "imagined", "real", "sticks"
@@ -56,35 +54,20 @@ class RolloutView:
     """
 
     def __init__(self, target: str, *, real: Callable[[int], ImageArray | None]) -> None:
-        """Open the file or viewer.
+        """Open the file or viewer; raises as ``prepare_target``.
 
-        Args:
-            target: ``spawn``, ``connect``, ``connect=URL``, or a path that ends in ``.rrd``.
-            real: gives what the camera really saw at a step, [H, W, 3], or None.
-
-        Raises:
-            MavbridgeError: the target cannot be opened.
+        ``real`` returns the camera's real image at a step, [H, W, 3], or None.
         """
         self._real = real
-        where = prepare_target(target)
-        rr.unregister_shutdown()  # its exit hook waits forever for a viewer that stalls
-        self._recording = rr.RecordingStream("mavbridge-rollout", recording_id=uuid4())
-        blueprint = rollout_blueprint()
-        if isinstance(where, RrdFile):
-            self._recording.save(where.path, default_blueprint=blueprint)
-        else:
-            self._recording.connect_grpc(where.url, default_blueprint=blueprint)
+        self._recording = RerunRecording("mavbridge-rollout", target)
+        self._recording.open(rollout_blueprint())
         names = {path: list(STATE_NAMES[columns]) for path, (_, columns) in STATES.items()}
         for path, lines in {STICKS: list(ACTION_NAMES), **names}.items():
-            self._recording.log(path, rr.SeriesLines(names=lines), static=True, strict=True)
+            self._recording.stream.log(path, rr.SeriesLines(names=lines), static=True, strict=True)
 
     def show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
-        """Send one frame; blocks while the viewer does not keep up. For one thread.
-
-        Raises:
-            VideoError: the real flight's video is damaged.
-        """
-        recording = self._recording
+        """Send one frame; blocks while the viewer does not keep up. For one thread."""
+        recording = self._recording.stream
         recording.set_time("frame", sequence=frame.number)
         recording.set_time("time", duration=frame.time_s)
         if rgb is not None:
@@ -97,16 +80,8 @@ class RolloutView:
             recording.log(path, rr.Scalars(frame.state[columns]), strict=True)
 
     def close(self) -> None:
-        """Deliver what is left; blocks until it is taken.
-
-        Raises:
-            MavbridgeError: the viewer is gone.
-        """
-        try:
-            self._recording.flush()
-        except RuntimeError as error:
-            raise MavbridgeError(f"the viewer did not take the whole rollout: {error}") from error
-        self._recording.disconnect()
+        """Deliver the rest; blocks until it is taken. Raises MavbridgeError: the viewer is gone."""
+        self._recording.close()
 
 
 def _png(rgb: ImageArray) -> rr.EncodedImage:

@@ -1,19 +1,20 @@
-"""Checks the target of a Rerun recording (``--rerun``) and starts the viewer before the flight."""
+"""A Rerun recording, and its target (``--rerun``), which is ready before the flight begins."""
 
 import socket
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 from urllib.parse import urlsplit
+from uuid import uuid4
+
+import rerun as rr
+import rerun.blueprint as rrb
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 
 VIEWER_HOST = "127.0.0.1"
 VIEWER_PORT = 9876
-"""Rerun's own default."""
 VIEWER_URL = f"rerun+http://{VIEWER_HOST}:{VIEWER_PORT}/proxy"
 VIEWER_MEMORY = "2GB"
 """Beyond this the viewer drops its oldest data: it shares the machine with the flight."""
@@ -25,27 +26,33 @@ _POLL_S = 0.1
 _SCHEMES = ("rerun", "rerun+http", "rerun+https")
 
 
-@dataclass(frozen=True, slots=True)
-class RrdFile:
-    """A recording on disk; replaced if it exists."""
+class RerunRecording:
+    """One recording and its target; every call may block while the viewer does not keep up."""
 
-    path: Path
+    def __init__(self, application: str, target: str) -> None:
+        """Check the target, and start the viewer if wanted; see ``prepare_target`` for errors."""
+        self._target = prepare_target(target)
+        rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
+        self.stream = rr.RecordingStream(application, recording_id=uuid4())
+
+    def open(self, blueprint: rrb.Blueprint) -> None:
+        """Open the file or the connection, with this initial layout of the viewer."""
+        if isinstance(self._target, Path):
+            self.stream.save(self._target, default_blueprint=blueprint)
+        else:
+            self.stream.connect_grpc(self._target, default_blueprint=blueprint)
+
+    def close(self) -> None:
+        """Deliver the rest and close; raises MavbridgeError if the viewer is gone."""
+        try:
+            self.stream.flush()
+        except RuntimeError as error:
+            raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
+        self.stream.disconnect()
 
 
-@dataclass(frozen=True, slots=True)
-class Viewer:
-    """A viewer that listens at a URL."""
-
-    url: str
-    process: "subprocess.Popen[bytes] | None" = None
-    """Set if we started it; it stays open after the flight."""
-
-
-Target: TypeAlias = RrdFile | Viewer
-
-
-def prepare_target(text: str) -> Target:
-    """Make sure that a recording can be written to the target of ``--rerun``.
+def prepare_target(text: str) -> Path | str:
+    """Return the file that a recording is written to, or the URL of a viewer that listens.
 
     Args:
         text: ``spawn``, ``connect``, ``connect=URL`` or a path that ends in ``.rrd``.
@@ -56,17 +63,14 @@ def prepare_target(text: str) -> Target:
         MavbridgeError: the viewer does not start.
     """
     if text == "spawn":
-        if _listens(VIEWER_HOST, VIEWER_PORT, timeout_s=_POLL_S):
-            return Viewer(VIEWER_URL)
-        return spawn_viewer([sys.executable, "-m", "rerun_cli"], port=VIEWER_PORT)
+        if not _listens(VIEWER_HOST, VIEWER_PORT, timeout_s=_POLL_S):
+            spawn_viewer([sys.executable, "-m", "rerun_cli"], port=VIEWER_PORT)
+        return VIEWER_URL
     if text == "connect" or text.startswith("connect="):
         return _reachable(text.removeprefix("connect").removeprefix("=") or VIEWER_URL)
-    if text.endswith(".rrd"):
-        return _writable(Path(text))
-    raise UserError(f"--rerun {text!r} is none of: spawn, connect, connect=URL, FILE.rrd, off")
-
-
-def _writable(path: Path) -> RrdFile:
+    if not text.endswith(".rrd"):
+        raise UserError(f"--rerun {text!r} is none of: spawn, connect, connect=URL, FILE.rrd, off")
+    path = Path(text)
     try:
         path.open("wb").close()
     except OSError as error:
@@ -74,10 +78,10 @@ def _writable(path: Path) -> RrdFile:
             f"--rerun: {path} cannot be written ({error.strerror}); name a file in an existing "
             "folder that you may write to"
         ) from error
-    return RrdFile(path)
+    return path
 
 
-def _reachable(url: str) -> Viewer:
+def _reachable(url: str) -> str:
     problem = f"--rerun: {url!r} is not a viewer's address; it should look like {VIEWER_URL}"
     try:
         parts = urlsplit(url)
@@ -91,7 +95,7 @@ def _reachable(url: str) -> Viewer:
             f"no Rerun viewer listens at {url}: start one with `rerun`, let the bridge start one "
             "(--rerun spawn), or record to a file (--rerun flight.rrd)"
         )
-    return Viewer(url)
+    return url
 
 
 def _listens(host: str, port: int, *, timeout_s: float) -> bool:
@@ -102,10 +106,10 @@ def _listens(host: str, port: int, *, timeout_s: float) -> bool:
     return True
 
 
-def spawn_viewer(command: list[str], *, port: int) -> Viewer:
+def spawn_viewer(command: list[str], *, port: int) -> "subprocess.Popen[bytes]":
     """Start a viewer and wait until it listens and has not exited for SETTLE_S.
 
-    It gets a session of its own, out of reach of Ctrl-C, and its output is not shown.
+    It gets a session of its own, out of reach of Ctrl-C, and stays open after the flight.
 
     Raises:
         MavbridgeError: it exited, or did not listen in time.
@@ -125,7 +129,7 @@ def spawn_viewer(command: list[str], *, port: int) -> Viewer:
                 process.wait(SETTLE_S if is_listening else _POLL_S)
             except subprocess.TimeoutExpired:
                 if is_listening:
-                    return Viewer(f"rerun+http://{VIEWER_HOST}:{port}/proxy", process)
+                    return process
                 continue
             errors.seek(0)
             lines = errors.read().decode(errors="replace").strip().splitlines()

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import Event, LinkStats, Percentiles, Tick
+from mavbridge.core.records import Event, LinkStats, Tick
 from mavbridge.observe.timing import TimingReport
 
 RATE_WINDOW_S = 1.0
@@ -122,10 +122,7 @@ class FlightScreen:
             yield
 
     def refresh(self) -> None:
-        """Print new messages and redraw the line; to be called at ``STATUS_HZ``.
-
-        Without a terminal, the line is printed every ``PLAIN_PERIOD_S``.
-        """
+        """Print new messages and the line, at ``STATUS_HZ``; without a terminal, less often."""
         self._print_messages()
         line = self.status_line()
         self._refreshes += 1
@@ -139,15 +136,28 @@ class FlightScreen:
             self._console.print(Text(self._messages.popleft()), soft_wrap=True)
 
     def show_report(self, report: TimingReport) -> None:
-        """Print the last messages, the table and the verdicts."""
+        """Print the last messages, the table of what was measured, and the verdicts."""
         self._print_messages()
-        self._console.print(timing_table(report))
+        if (table := timing_table(report)) is not None:
+            self._console.print(table)
         for verdict in verdicts(report):
             self._console.print(verdict, soft_wrap=not self._console.is_terminal)
 
 
-def timing_table(report: TimingReport) -> Table:
-    """Percentiles of a flight in milliseconds."""
+def timing_table(report: TimingReport) -> Table | None:
+    """Percentiles in milliseconds of what was measured in a flight; None if nothing was."""
+    rows = {
+        "action period": report.action.period_ms,
+        "action jitter |period - target|": report.action.jitter_ms,
+        "predict": report.action.predict_ms,
+        "vision encode": report.vision.encode_ms,
+        "feature age at send": report.feature_age_ms,
+        "attitude age at send": report.state_age_ms,
+        "new attitude to wire": report.state_to_wire_ms,
+        "link round trip": report.link.rtt_ms if report.link else None,
+    }
+    if not any(rows.values()):
+        return None
     table = Table(
         title=f"{report.duration_s:.1f} s, {report.mode} rate: {report.policy} on {report.engine}, "
         f"{report.autopilot or 'no vehicle'}",
@@ -159,18 +169,10 @@ def timing_table(report: TimingReport) -> Table:
     table.add_column("ms")
     for name in ("p50", "p99", "p99.9", "max"):
         table.add_column(name, justify="right")
-    rows = {
-        "action period": report.action.period_ms,
-        "action jitter |period - target|": report.action.jitter_ms,
-        "predict": report.action.predict_ms,
-        "vision encode": report.vision.encode_ms,
-        "feature age at send": report.feature_age_ms,
-        "attitude age at send": report.state_age_ms,
-        "new attitude to wire": report.state_to_wire_ms,
-        "link round trip": report.link.rtt_ms if report.link else None,
-    }
     for label, measured in rows.items():
-        table.add_row(label, *_cells(measured))
+        if measured is not None:
+            values = (measured.p50, measured.p99, measured.p999, measured.max)
+            table.add_row(label, *(f"{v:.2f}" if v < 1000 else f"{v:.0f}" for v in values))
     return table
 
 
@@ -179,14 +181,10 @@ def verdicts(report: TimingReport) -> list[Text]:
     action, vision = report.action, report.vision
     missed = f"{_counted(action.missed_slots, 'missed slot')} in {_counted(action.ticks, 'tick')}"
     dropped = f"{_counted(vision.dropped_frames, 'frame')} dropped by the camera"
-    lines = [
-        _line(
-            name,
-            f"{_rate(loop.rate_hz)} Hz of {loop.target_hz:g} Hz, {rest}",
-            _rate_style(loop.rate_hz, loop.target_hz),
-        )
-        for name, loop, rest in (("action", action, missed), ("vision", vision, dropped))
-    ]
+    lines = []
+    for name, loop, rest in (("action", action, missed), ("vision", vision, dropped)):
+        text = f"{_rate(loop.rate_hz)} Hz of {loop.target_hz:g} Hz, {rest}"
+        lines.append(_line(name, text, _rate_style(loop.rate_hz, loop.target_hz)))
     if report.link is not None:
         lines.append(_line("link", _link_verdict(report.link)))
     lines.append(_line("sticks", _release_verdict(report)))
@@ -221,13 +219,6 @@ def _release_verdict(report: TimingReport) -> str:
 
 def _line(name: str, text: str, style: str = "") -> Text:
     return Text.assemble((f"{name:9}", "bold"), (text, style))
-
-
-def _cells(measured: Percentiles | None) -> tuple[str, ...]:
-    if measured is None:
-        return (_NOT_MEASURED,) * 4
-    values = (measured.p50, measured.p99, measured.p999, measured.max)
-    return tuple(f"{value:.2f}" if value < 1000 else f"{value:.0f}" for value in values)
 
 
 def _counted(count: int, noun: str) -> str:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.records import Event, LinkStats, Percentiles, Tick, VisionTick
+from mavbridge.core.records import Event, LinkStats, Percentiles, Tick
 
 MAX_RELEASES = 1000
 """Releases listed in a report; the rest are only counted."""
@@ -29,7 +29,6 @@ class ActionReport:
     ticks: int
     missed_slots: int
     period_ms: Percentiles | None
-    """Wake to wake."""
     jitter_ms: Percentiles | None
     """|period - target period|; a stall of n slots shows as one jitter of n periods."""
     predict_ms: Percentiles | None
@@ -49,10 +48,9 @@ class VisionReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseEvent:
-    """The sticks were released, or the reason for their release changed."""
+    """A release of the sticks, or a new reason for it, ``t_s`` after the first tick."""
 
     t_s: float
-    """Time since the first tick."""
     reason: str
 
 
@@ -115,15 +113,12 @@ class FlightTiming:
         """Count the event."""
         if isinstance(event, Tick):
             self._add_tick(event)
-        else:
-            self._add_frame(event)
-
-    def _add_frame(self, vision: VisionTick) -> None:
-        self._frames.add(vision.started_ns)
-        self._encode.add(vision.ready_ns - vision.started_ns)
+            return
+        self._frames.add(event.started_ns)
+        self._encode.add(event.ready_ns - event.started_ns)
         if self._first_dropped is None:
-            self._first_dropped = vision.dropped_frames
-        self._dropped_frames = vision.dropped_frames - self._first_dropped
+            self._first_dropped = event.dropped_frames
+        self._dropped_frames = event.dropped_frames - self._first_dropped
 
     def _add_tick(self, tick: Tick) -> None:
         self._ticks.add(tick.woke_ns)
@@ -136,8 +131,12 @@ class FlightTiming:
             self._add_ages(tick)
         if tick.release_reason != self._last_reason:
             self._last_reason = tick.release_reason
-            if tick.release_reason is not None:
-                self._add_release(tick.woke_ns, tick.release_reason)
+            if tick.release_reason is None:
+                return
+            self._release_count += 1
+            if len(self._releases) < MAX_RELEASES:
+                t_s = round((tick.woke_ns - self._ticks.first_ns) / NS_PER_S, 3)
+                self._releases.append(ReleaseEvent(t_s=t_s, reason=tick.release_reason))
 
     def _add_period(self, tick: Tick) -> None:
         """Only between two ticks of flight: a released loop has nothing to compute."""
@@ -161,12 +160,6 @@ class FlightTiming:
         if tick.sent is not None and tick.state.attitude_ns != self._last_attitude_ns:
             self._last_attitude_ns = tick.state.attitude_ns
             self._state_to_wire.add(age_ns)
-
-    def _add_release(self, woke_ns: int, reason: str) -> None:
-        self._release_count += 1
-        if len(self._releases) < MAX_RELEASES:
-            t_s = (woke_ns - self._ticks.first_ns) / NS_PER_S
-            self._releases.append(ReleaseEvent(t_s=round(t_s, 3), reason=reason))
 
     def report(
         self,
@@ -231,9 +224,7 @@ class _Span:
 
     @property
     def rate_hz(self) -> float | None:
-        """Intervals per second; None before there is one."""
-        duration_s = self.duration_s
-        return round((self.count - 1) / duration_s, 3) if duration_s > 0 else None
+        return round((self.count - 1) / self.duration_s, 3) if self.duration_s > 0 else None
 
 
 def report_json(report: TimingReport) -> str:

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from mavbridge.core.records import ImageArray
+from mavbridge.recording import rows
 from mavbridge.recording.folder import FRAMES, TICKS, VIDEO
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
-from mavbridge.recording.rows import FRAMES as FRAMES_SCHEMA
-from mavbridge.recording.rows import TICKS as TICKS_SCHEMA
 from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
 from mavbridge.recording.tables import read_table
 from mavbridge.recording.video.file import count_frames, read_video
@@ -35,11 +34,7 @@ class RecordedFlight:
         return read_frames(self.frames)
 
     def images(self) -> Iterator[ImageArray]:
-        """The images, decoded one by one: [H, W, 3] uint8 RGB.
-
-        Raises:
-            VideoError: the video was damaged after it was recorded.
-        """
+        """The images one by one, [H, W, 3] uint8 RGB; raises VideoError if the video is damaged."""
         return read_video(self.folder / VIDEO, self.frames.num_rows)
 
 
@@ -53,7 +48,7 @@ def open_flight(folder: Path) -> RecordedFlight:
         MavbridgeError: it is no recorded flight, or a damaged one; the message says what to do.
     """
     meta = read_meta(folder)
-    ticks = read_table(folder / TICKS, TICKS_SCHEMA)
+    ticks = read_table(folder / TICKS, rows.TICKS)
     return RecordedFlight(folder=folder, meta=meta, ticks=ticks, frames=_frames(folder, meta))
 
 
@@ -67,8 +62,8 @@ def _frames(folder: Path, meta: FlightMeta) -> Any:
                 f"{folder} lacks {missing}, though {meta.frames} frames were recorded: copy the "
                 "folder again, whole"
             )
-        return FRAMES_SCHEMA.empty_table()  # the flight ended before its first frame
-    table = read_table(folder / FRAMES, FRAMES_SCHEMA)
+        return rows.FRAMES.empty_table()  # the flight ended before its first frame
+    table = read_table(folder / FRAMES, rows.FRAMES)
     whole = count_frames(folder / VIDEO)
     if meta.finished and whole != table.num_rows:
         raise FlightError(

@@ -6,17 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from mavbridge.core.records import Packet, Tick, VisionTick
+from mavbridge.recording import rows
 from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
 from mavbridge.recording.meta import FlightMeta, write_meta
-from mavbridge.recording.rows import (
-    DEMONSTRATION_TICKS,
-    FrameRow,
-    FrameTruth,
-    TickLabels,
-    TickRow,
-    ticks_batch,
-)
-from mavbridge.recording.rows import TICKS as TICKS_SCHEMA
+from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow, ticks_batch
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.tlog import TlogWriter
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError
@@ -42,11 +35,11 @@ class FlightWriter:
         with_labels: bool = False,
         wall_offset_ns: int | None = None,
     ) -> None:
-        """Create the files and start the writer process.
+        """Create the files in a folder from ``prepare_folder``, and start the writer process.
 
         Args:
-            folder: from ``prepare_folder``.
-            meta: what is known at the start.
+            folder: the flight's folder.
+            meta: the facts known at the start.
             pressure: "offline" drops nothing, and waits; see ``VideoWriter``.
             with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
             wall_offset_ns: wall time minus the clock of the stamps, for a tlog; None = no tlog.
@@ -55,7 +48,7 @@ class FlightWriter:
         self.meta = meta
         self.video_failure: WriterDiedError | None = None
         """Reason why no more frames are recorded, while the rest is."""
-        self._schema = DEMONSTRATION_TICKS if with_labels else TICKS_SCHEMA
+        self._schema = rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS
         self._rows: list[TickRow] = []
         self._flushed_ns = meta.start_ns
         self._tick_serial = self._frame_serial = -1
@@ -127,8 +120,8 @@ class FlightWriter:
     def _flush(self) -> None:
         if self._rows:
             # Cleared first: rows that could not be written are not tried again.
-            rows, self._rows = self._rows, []
-            self._table.append(ticks_batch(rows, self._schema))
+            waiting, self._rows = self._rows, []
+            self._table.append(ticks_batch(waiting, self._schema))
 
     @property
     def frames_written(self) -> int:
@@ -158,14 +151,10 @@ class FlightWriter:
             raise
         if self._tlog is not None:
             self._tlog.close()
-        self.meta = self._completed(meta)
-        write_meta(self._folder, self.meta)
-
-    def _completed(self, meta: FlightMeta) -> FlightMeta:
         is_whole = self.video_failure is None
         height, width = self._video.size or (None, None)
         source_height, source_width = self._source_size or (None, None)
-        return replace(
+        self.meta = replace(
             meta,
             image_height=height,
             image_width=width,
@@ -177,6 +166,7 @@ class FlightWriter:
             ticks_dropped=self._ticks_dropped,
             frames_dropped=self._frame_serial + 1 - self._video.written,
         )
+        write_meta(self._folder, self.meta)
 
     def close(self) -> None:
         """Leave everything as it is, after an error; may be called twice."""

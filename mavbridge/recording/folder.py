@@ -17,11 +17,7 @@ EXTRA = ("av", "pyarrow")
 
 
 def require_extra(what: str) -> None:
-    """Refuse to begin what cannot be recorded.
-
-    Raises:
-        UserError: the extra is not installed.
-    """
+    """Raise UserError if the extra is not installed; ``what`` needs it."""
     missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
     if missing:
         raise UserError(f"{what} needs {' and '.join(missing)}: pip install 'mavbridge[record]'")

@@ -61,11 +61,7 @@ class FlightMeta:
 
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:
-    """Write or replace ``meta.json``, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write or replace ``meta.json``, whole or not at all; raises OSError."""
     document = {"format": FORMAT, "version": VERSION} | asdict(meta)
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
     part = folder / f"{META}.part"
@@ -78,11 +74,7 @@ def write_meta(folder: Path, meta: FlightMeta) -> None:
 
 
 def read_meta(folder: Path) -> FlightMeta:
-    """Read ``meta.json``.
-
-    Raises:
-        FlightError: there is none, or it is not one of ours; the message says what to do.
-    """
+    """Read ``meta.json``; raises FlightError if there is none, or it is not one of ours."""
     try:
         document: Any = json.loads((folder / META).read_text())
     except OSError as error:

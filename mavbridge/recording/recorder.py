@@ -8,9 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mavbridge.core.observers import ObserverThread
-from mavbridge.core.ports import PacketSource
-from mavbridge.core.records import Event, Tick
+from mavbridge.core.observers import BoundedQueue, ObserverThread
+from mavbridge.core.records import Event, Packet, Tick, VisionTick
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 
@@ -27,7 +26,7 @@ class Recorder:
         folder: Path,
         meta: FlightMeta,
         *,
-        packets: PacketSource,
+        packets: BoundedQueue[Packet],
         wall_offset_ns: int,
         autopilot: Callable[[], str],
         report: Callable[[str], None],
@@ -36,15 +35,14 @@ class Recorder:
 
         Args:
             folder: from ``prepare_folder``.
-            meta: what is known at the start.
-            packets: what the link sends and receives; drained by the recorder's thread.
+            meta: the facts known at the start.
+            packets: sent and received by the link; drained by the recorder's thread.
             wall_offset_ns: wall time minus the clock of the stamps.
-            autopilot: name of the autopilot, called at the end.
-            report: shows a person a line; called from the recorder's thread.
+            autopilot: returns the autopilot's name at the end.
+            report: shows a line to the user; called from the recorder's thread.
 
         Raises:
-            OSError: the folder cannot be written.
-            WriterError: the writer process does not start.
+            OSError, WriterError: the folder cannot be written, the writer process does not start.
         """
         self._folder = folder
         writer = FlightWriter(folder, meta, pressure="online", wall_offset_ns=wall_offset_ns)
@@ -83,7 +81,7 @@ class _FlightConsumer:
     """Runs on the recorder's thread; may raise OSError and WriterError."""
 
     writer: FlightWriter
-    packets: PacketSource
+    packets: BoundedQueue[Packet]
     autopilot: Callable[[], str]
     report: Callable[[str], None]
     _seen_frames: int = 0
@@ -98,21 +96,21 @@ class _FlightConsumer:
         """Write one batch, and the packets that came meanwhile."""
         seen_frames = self._seen_frames
         try:
-            self.writer.packets(self.packets.drain())
+            self.writer.packets(self.packets.take())
             for event in batch:
-                self._write(event)
+                if isinstance(event, Tick):
+                    self.writer.tick(event)
+                else:
+                    self._write_frame(event)
         except BaseException:
             self._has_failed = True
             self._seen_frames = seen_frames  # the observer counts this whole batch as lost
             raise
 
-    def _write(self, event: Event) -> None:
-        if isinstance(event, Tick):
-            self.writer.tick(event)
-            return
+    def _write_frame(self, vision: VisionTick) -> None:
         self._seen_frames += 1
         had_failed = self.writer.video_failure is not None
-        self.writer.frame(event)
+        self.writer.frame(vision)
         failure = self.writer.video_failure
         if failure is not None and not had_failed:
             self.report(f"recording no more images: {failure}; the rest is still recorded")
@@ -122,11 +120,6 @@ class _FlightConsumer:
         if self._has_failed:
             self.writer.close()
             return
-        self.writer.packets(self.packets.drain())
-        self.writer.finish(
-            replace(
-                self.writer.meta,
-                autopilot=self.autopilot(),
-                packets_dropped=self.packets.dropped,
-            )
-        )
+        self.writer.packets(self.packets.take())
+        meta, dropped = self.writer.meta, self.packets.dropped
+        self.writer.finish(replace(meta, autopilot=self.autopilot(), packets_dropped=dropped))

@@ -60,7 +60,6 @@ class TickRow(NamedTuple):
 
     tick: Tick
     dropped_before: int
-    """Ticks lost on the way to the recording, just before this one."""
     labels: TickLabels | None = None
 
 
@@ -92,12 +91,8 @@ TICKS = pa.schema(
 )
 DEMONSTRATION_TICKS = TICKS.append(pa.field("expert", _STICKS))
 
-FRAMES = pa.schema(
-    [
-        *_fields(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False),
-        pa.field("dropped_before", pa.int32(), nullable=False),
-    ]
-)
+_FRAME_STAMPS = _fields(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False)
+FRAMES = pa.schema([*_FRAME_STAMPS, pa.field("dropped_before", pa.int32(), nullable=False)])
 DEMONSTRATION_FRAMES = pa.schema(
     [
         *FRAMES,
@@ -118,22 +113,12 @@ _ROWS_AT_ONCE = 4096
 
 
 def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
-    """Rows of the ticks table, in their order.
-
-    Args:
-        rows: of consecutive ticks.
-        schema: ``TICKS``, or ``DEMONSTRATION_TICKS`` to keep the labels.
-    """
+    """Rows of consecutive ticks; with the schema ``DEMONSTRATION_TICKS``, their labels as well."""
     return pa.RecordBatch.from_pylist([_tick_columns(row) for row in rows], schema=schema)
 
 
 def frames_batch(rows: Sequence[FrameRow], schema: pa.Schema) -> pa.RecordBatch:
-    """Rows of the frames table, in their order.
-
-    Args:
-        rows: of consecutive frames.
-        schema: ``FRAMES``, or ``DEMONSTRATION_FRAMES`` to keep the truth.
-    """
+    """Rows of consecutive frames; with ``DEMONSTRATION_FRAMES``, the truth as well."""
     return pa.RecordBatch.from_pylist(
         [_attributes(row, tuple(FRAMES.names)) | _attributes(row.truth, _TRUTH) for row in rows],
         schema=schema,
@@ -186,19 +171,14 @@ def _tick(row: dict[str, Any], serial: int) -> Tick:
     values = {name: row[name] for name in _TICK}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
     values |= {name: _sticks(row[name]) for name in ("sent", "rc_sticks")}
-    values["state"] = _state(row)
-    trace = None
+    state, trace = None, None
+    if row["state"] is not None:
+        array = np.array(row["state"], np.float32)
+        array.setflags(write=False)
+        state = VehicleState(values=array, **{name: row[name] for name in _STAMPS})
     if row["raw"] is not None:
         trace = StickTrace(**{name: Sticks(*row[name]) for name in _TRACE})
-    return Tick(serial=serial, trace=trace, **values)
-
-
-def _state(row: dict[str, Any]) -> VehicleState | None:
-    if row["state"] is None:
-        return None
-    values = np.array(row["state"], np.float32)
-    values.setflags(write=False)
-    return VehicleState(values=values, **{name: row[name] for name in _STAMPS})
+    return Tick(**values | {"serial": serial, "state": state, "trace": trace})
 
 
 def _sticks(values: list[float] | None) -> Sticks | None:

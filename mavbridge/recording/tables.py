@@ -52,8 +52,7 @@ class TableWriter:
 def to_parquet(stream: Path, parquet: Path) -> None:
     """Replace an Arrow stream by the Parquet file of its whole batches, in constant memory.
 
-    Raises:
-        OSError: it cannot be written; the stream stays.
+    If it cannot be written, OSError is raised, and the stream stays.
     """
     part = parquet.with_suffix(".parquet.part")
     try:
@@ -86,12 +85,8 @@ def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa
 def read_table(stem: Path, schema: pa.Schema) -> pa.Table:
     """The table under this stem, whichever form it has; of a cut-off stream the whole batches.
 
-    Args:
-        stem: path without a suffix.
-        schema: the columns that must be there; others may follow.
-
     Raises:
-        TableError: there is none, it is damaged, or it is another table.
+        TableError: there is none, it is damaged, or it lacks a column of ``schema``.
     """
     parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
     path = parquet if parquet.exists() else stream

@@ -18,10 +18,7 @@ class TlogWriter:
     """One ``.tlog`` file; every method may raise OSError where it cannot be written."""
 
     def __init__(self, path: Path, *, wall_offset_ns: int) -> None:
-        """Create the file, which must not exist.
-
-        ``wall_offset_ns`` is wall time minus the clock of the stamps, taken once: wall time steps.
-        """
+        """Create the file, which must not exist; the offset leads from stamps to wall time."""
         self._file = path.open("xb")
         self._offset_ns = wall_offset_ns
 

@@ -66,10 +66,7 @@ class MemoryTransport:
             stops = [stop for stop in (arrival_ns, event_ns) if stop is not None]
             self._clock.sleep_until_ns(min([until_ns, *stops]))
 
-    def answer_to(self, sender: Address | None) -> None:
-        """Nothing to choose: there is one vehicle."""
-
-    def send(self, data: bytes) -> bool:
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Send one packet; always succeeds."""
         self._to_vehicle.send(data)
         return True

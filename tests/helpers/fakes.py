@@ -122,11 +122,8 @@ class FakeLink:
         now_ns = self.clock.now_ns()
         telemetry = self.telemetry or level_telemetry(now_ns - self.telemetry_age_ns)
         status = VehicleStatus(
-            system_id=1,
-            autopilot="ardupilot",
             mode=self.mode,
             armed=self.armed,
-            heartbeat_ns=now_ns,
             rc_sticks=self.rc_sticks,
             rc_arrived_ns=now_ns if self.rc_sticks else None,
         )

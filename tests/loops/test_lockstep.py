@@ -139,7 +139,9 @@ def test_the_same_seed_sends_the_same_bytes_and_another_one_others(
     sent: list[bytes] = []
     send = MemoryTransport.send
     monkeypatch.setattr(
-        MemoryTransport, "send", lambda self, data: (sent.append(data), send(self, data))[1]
+        MemoryTransport,
+        "send",
+        lambda self, data, peer: (sent.append(data), send(self, data, peer))[1],
     )
 
     def stick_bytes(seed: int) -> list[bytes]:

@@ -97,11 +97,5 @@ class RcCalibration:
 
     def to_sticks(self, pwm_us: Pwm) -> Sticks:
         """Sticks that correspond to these PWM values."""
-        return Sticks(
-            *(
-                channel.to_stick(value_us, centre_us=centre_us) * sign
-                for value_us, (channel, sign, centre_us) in zip(
-                    pwm_us, self._mapping(), strict=True
-                )
-            )
-        )
+        pairs = zip(pwm_us, self._mapping(), strict=True)
+        return Sticks(*(c.to_stick(us, centre_us=centre) * sign for us, (c, sign, centre) in pairs))

@@ -92,23 +92,12 @@ class Codec:
 
     def encode_heartbeat(self) -> bytes:
         """HEARTBEAT of an onboard controller, which no vehicle mistakes for a ground station."""
-        return self._pack(
-            self._mav.heartbeat_encode(
-                dialect.MAV_TYPE_ONBOARD_CONTROLLER,
-                dialect.MAV_AUTOPILOT_INVALID,
-                0,
-                0,
-                dialect.MAV_STATE_ACTIVE,
-            )
-        )
+        kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
+        state = dialect.MAV_STATE_ACTIVE
+        return self._pack(self._mav.heartbeat_encode(kind, autopilot, 0, 0, state))
 
     def encode_override(self, target: Endpoint, pwm_us: Pwm, calibration: RcCalibration) -> bytes:
         """RC_CHANNELS_OVERRIDE of the four stick channels; the others are left alone.
-
-        Args:
-            target: the vehicle.
-            pwm_us: throttle, yaw, pitch, roll, from ``pwm_of``.
-            calibration: assigns the sticks to channels.
 
         Raises:
             CommandRefusedError: a value that no radio sends, or a throttle that is a failsafe.
@@ -161,11 +150,7 @@ class Codec:
 
 
 def pwm_of(sticks: Sticks, calibration: RcCalibration) -> Pwm:
-    """PWM of throttle, yaw, pitch, roll in us.
-
-    Raises:
-        CommandRefusedError: a stick that is not finite or not in [-1, 1].
-    """
+    """PWM of throttle, yaw, pitch, roll in us; refuses sticks as ``encode_manual_control`` does."""
     _refuse_bad_sticks(sticks)
     return calibration.to_pwm_us(sticks)
 

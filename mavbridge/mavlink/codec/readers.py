@@ -37,12 +37,7 @@ def _require_finite(*values: float) -> None:
 
 
 def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
-    return Heartbeat(
-        vehicle_type=m.type,
-        autopilot=m.autopilot,
-        base_mode=m.base_mode,
-        custom_mode=m.custom_mode,
-    )
+    return Heartbeat(m.type, m.autopilot, m.base_mode, m.custom_mode)
 
 
 def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body:
@@ -51,23 +46,14 @@ def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body
     _require_finite(*quaternion, *rate)
     if not 0.9 < math.hypot(*quaternion) < 1.1:
         raise UnusableError
-    return Attitude(
-        is_quaternion=True,
-        boot_ms=m.time_boot_ms,
-        ned_from_body_wxyz=quaternion,
-        rate_body_radps=rate,
-    )
+    return Attitude(True, m.time_boot_ms, quaternion, rate)
 
 
 def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
     rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
     _require_finite(m.roll, m.pitch, m.yaw, *rate)
-    return Attitude(
-        is_quaternion=False,
-        boot_ms=m.time_boot_ms,
-        ned_from_body_wxyz=_quaternion_from_euler(m.roll, m.pitch, m.yaw),
-        rate_body_radps=rate,
-    )
+    quaternion = _quaternion_from_euler(m.roll, m.pitch, m.yaw)
+    return Attitude(False, m.time_boot_ms, quaternion, rate)
 
 
 def _quaternion_from_euler(
@@ -94,14 +80,12 @@ def _highres_imu(m: dialect.MAVLink_highres_imu_message) -> Body:
     _require_finite(m.xacc, m.yacc, m.zacc)
     if m.fields_updated & _HIGHRES_ACCEL_FIELDS != _HIGHRES_ACCEL_FIELDS:
         raise UnusableError
-    return SpecificForce(
-        message_name="HIGHRES_IMU", specific_force_body_mps2=(m.xacc, m.yacc, m.zacc)
-    )
+    return SpecificForce("HIGHRES_IMU", (m.xacc, m.yacc, m.zacc))
 
 
 def _milli_g_imu(m: dialect.MAVLink_scaled_imu_message) -> Body:
     x, y, z = (value * MG_TO_MPS2 for value in (m.xacc, m.yacc, m.zacc))
-    return SpecificForce(message_name=m.get_type(), specific_force_body_mps2=(x, y, z))
+    return SpecificForce(m.get_type(), (x, y, z))
 
 
 def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:

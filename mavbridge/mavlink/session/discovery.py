@@ -15,15 +15,9 @@ SETTLE_NS = 3 * NS_PER_S // 2
 MOVED_NS = 3 * NS_PER_S
 """Silence after which a vehicle that sends from a new address has moved there."""
 
-_NOT_VEHICLES = frozenset(
-    {
-        dialect.MAV_TYPE_GCS,
-        dialect.MAV_TYPE_ONBOARD_CONTROLLER,
-        dialect.MAV_TYPE_GIMBAL,
-        dialect.MAV_TYPE_ADSB,
-        dialect.MAV_TYPE_CAMERA,
-        dialect.MAV_TYPE_ANTENNA_TRACKER,
-    }
+_NOT_VEHICLES = (
+    *(dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_TYPE_GIMBAL),
+    *(dialect.MAV_TYPE_ADSB, dialect.MAV_TYPE_CAMERA, dialect.MAV_TYPE_ANTENNA_TRACKER),
 )
 _AUTOPILOTS = {
     dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
@@ -101,10 +95,10 @@ class VehicleDiscovery:
                 "choose one with --target-system"
             )
         if len(wanted) > 1:
+            addresses = " and ".join(str(vehicle.address) for vehicle in wanted)
             raise PeerError(
-                f"two vehicles use system id {systems[0]} "
-                f"(from {' and '.join(str(vehicle.address) for vehicle in wanted)}): give one of "
-                "them another id (MAV_SYSID, SYSID_THISMAV) or another port"
+                f"two vehicles use system id {systems[0]} (from {addresses}): give one of them "
+                "another id (MAV_SYSID, SYSID_THISMAV) or another port"
             )
         return wanted[0]
 
@@ -121,10 +115,8 @@ class VehicleDiscovery:
         """Everything that was heard instead of the vehicle, with advice."""
         if self._heard_ns:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
-            return (
-                f"system {self._target_system} is silent, but system {heard} was heard: "
-                "correct --target-system"
-            )
+            silent = f"system {self._target_system} is silent"
+            return f"{silent}, but system {heard} was heard: correct --target-system"
         if self._others:
             return (
                 f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "

@@ -24,12 +24,12 @@ class EchoCheck:
         self._baseline: Pwm | None = None
         self._since_ns: int | None = None
         self._failed_ns: int | None = None
-        self.confirmed_ns: int | None = None
+        self._confirmed_ns: int | None = None
 
     @property
     def confirmed(self) -> bool:
         """The vehicle acts on our sticks."""
-        return self.confirmed_ns is not None
+        return self._confirmed_ns is not None
 
     def with_nudge(self, pwm_us: Pwm) -> Pwm:
         """The values to send: until confirmed, they differ from what the vehicle reported before.
@@ -54,7 +54,7 @@ class EchoCheck:
         """Overriding has ended: the next one starts a new check."""
         self._sent.clear()
         self._since_ns = None
-        self.confirmed_ns = None
+        self._confirmed_ns = None
 
     def received(self, pwm_us: Pwm, now_ns: int) -> None:
         """Compare one RC_CHANNELS."""
@@ -63,13 +63,13 @@ class EchoCheck:
             return
         is_conclusive = self.confirmed or pwm_us != self._baseline
         if is_conclusive and any(pwm_us == past for _, past in self._sent):
-            self.confirmed_ns = now_ns
+            self._confirmed_ns = now_ns
             self._failed_ns = None
 
     def failed(self, now_ns: int) -> bool:
         """No echo within the deadline; stays true for 3 s after sending has stopped."""
         if self._since_ns is not None:
-            newest_ns = max(self._since_ns, self.confirmed_ns or 0)
+            newest_ns = max(self._since_ns, self._confirmed_ns or 0)
             if now_ns - newest_ns > ECHO_DEADLINE_NS:
                 self._failed_ns = now_ns
         return self._failed_ns is not None and now_ns - self._failed_ns < _RETRY_NS

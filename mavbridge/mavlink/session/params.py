@@ -75,11 +75,7 @@ FIRST_NAMES = (
 
 
 def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """RCn_* of the four stick channels.
-
-    Raises:
-        PeerError: RCMAP_* is missing.
-    """
+    """RCn_* of the four stick channels; raises PeerError if RCMAP_* is missing."""
     numbers = [int(_require(values, f"RCMAP_{stick}")) for stick in STICKS]
     return tuple(
         f"RC{number}_{part}" for number in numbers for part in ("MIN", "TRIM", "MAX", "REVERSED")
@@ -87,21 +83,14 @@ def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def calibration(values: Mapping[str, float]) -> RcCalibration:
-    """The radio calibration that these parameters describe.
-
-    Raises:
-        PeerError: a parameter is missing, or they contradict each other.
-    """
+    """The radio calibration, or PeerError if a parameter is missing or contradicts another."""
     try:
         throttle, yaw, pitch, roll = (
             _channel(values, int(_require(values, f"RCMAP_{stick}"))) for stick in STICKS
         )
+        floor_us = int(values.get("FS_THR_VALUE", 0)) + FS_THR_MARGIN_US
         return RcCalibration(
-            throttle=throttle,
-            yaw=yaw,
-            pitch=pitch,
-            roll=roll,
-            throttle_floor_us=int(values.get("FS_THR_VALUE", 0)) + FS_THR_MARGIN_US,
+            throttle=throttle, yaw=yaw, pitch=pitch, roll=roll, throttle_floor_us=floor_us
         )
     except ValueError as error:
         raise PeerError(
@@ -130,10 +119,8 @@ def _require(values: Mapping[str, float], name: str) -> float:
 
 def override_switch(values: Mapping[str, float]) -> int | None:
     """Number of the channel that enables overrides, or None."""
-    for number in OPTION_CHANNELS:
-        if values.get(f"RC{number}_OPTION") == OVERRIDE_SWITCH_OPTION:
-            return number
-    return None
+    options = {number: values.get(f"RC{number}_OPTION") for number in OPTION_CHANNELS}
+    return next((n for n, option in options.items() if option == OVERRIDE_SWITCH_OPTION), None)
 
 
 def override_obstacles(values: Mapping[str, float], source_system: int) -> Iterator[str]:

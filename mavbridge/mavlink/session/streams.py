@@ -1,27 +1,22 @@
 """Requests telemetry at the rate of the action loop, and again whenever it slows down."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.messages import (
-    CommandAck,
-    CommandRequest,
-    Request,
-    StreamRequest,
-)
+from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Request, StreamRequest
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
 _ATTEMPTS = 4
 _LOWEST_HZ = 25.0
 _WATCH_NS = 2 * NS_PER_S
+_UNDECIDED = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_IN_PROGRESS)
 _ENOUGH = 0.7
 """Share of the granted rate below which another station is assumed to have changed it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamGroup:
+class StreamGroup(NamedTuple):
     """One quantity: the messages that carry it, best first, and its legacy stream."""
 
     messages: tuple[str, ...]
@@ -31,18 +26,12 @@ class StreamGroup:
 
 def telemetry_streams(*, state_hz: float, rc_hz: float) -> tuple[StreamGroup, ...]:
     """The telemetry that the bridge needs."""
-    return tuple(
-        StreamGroup(messages=messages, stream=stream, rate_hz=rate_hz)
-        for messages, stream, rate_hz in (
-            (("ATTITUDE_QUATERNION", "ATTITUDE"), dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
-            (("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
-            (
-                ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2"),
-                dialect.MAV_DATA_STREAM_RAW_SENSORS,
-                state_hz,
-            ),
-            (("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, rc_hz),
-        )
+    attitude, imu = ("ATTITUDE_QUATERNION", "ATTITUDE"), ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
+    return (
+        StreamGroup(attitude, dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
+        StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
+        StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
+        StreamGroup(("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, rc_hz),
     )
 
 
@@ -66,8 +55,7 @@ class _Stream:
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
     def accept(self) -> None:
-        self.is_settled = True
-        self.attempts = 0
+        self.is_settled, self.attempts = True, 0
 
     def refuse(self) -> None:
         """Half the rate, then the next message: "denied" may mean too fast or unknown."""
@@ -103,7 +91,6 @@ class StreamRequester:
         self._window_ns: int | None = None
         """Start of the window in which messages are counted; None while requests are open."""
         self.renewals = 0
-        """Number of streams that had to be requested again."""
 
     @property
     def is_settled(self) -> bool:
@@ -121,10 +108,7 @@ class StreamRequester:
             return
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
             self._pending.accept()
-        elif ack.result not in (
-            dialect.MAV_RESULT_TEMPORARILY_REJECTED,
-            dialect.MAV_RESULT_IN_PROGRESS,
-        ):
+        elif ack.result not in _UNDECIDED:
             self._pending.refuse()
         self._pending = None
 

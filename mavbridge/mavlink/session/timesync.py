@@ -25,7 +25,7 @@ class TimesyncFilter:
         self.round_trips = Histogram()
 
     def request(self, now_ns: int) -> int | None:
-        """ts1 of the request that is due, if any."""
+        """The ts1 of the request that is due, if any."""
         if now_ns < self._next_ns:
             return None
         self._next_ns = now_ns + period_ns(TIMESYNC_HZ)

@@ -51,13 +51,7 @@ class VehicleSession:
     """One vehicle from its first heartbeat to its next reboot.
 
     Reads its version, then its parameters (if the output needs them), then requests its streams and
-    keeps them coming.
-
-    Args:
-        identity: the vehicle.
-        config: output and source system.
-        state_hz: rate of the telemetry that the action loop needs.
-        report: shows a text to the user.
+    keeps them coming. ``report`` shows a text to the user.
 
     Raises:
         PeerError: the vehicle cannot be flown with the configured output.
@@ -135,8 +129,7 @@ class VehicleSession:
         if boot_ms + _REBOOT_STEP_MS < self._boot_ms:
             self._old_stamps += 1
         else:
-            self._old_stamps = 0
-            self._boot_ms = boot_ms
+            self._old_stamps, self._boot_ms = 0, boot_ms
 
     def _stick_channels_us(self, rc: RcChannels) -> Pwm | None:
         calibration = self.calibration
@@ -188,17 +181,14 @@ class VehicleSession:
     def status(self) -> VehicleStatus | None:
         """The vehicle's own report; None before its first heartbeat."""
         if self._status is None and self._heartbeat is not None:
-            heartbeat_ns, heartbeat = self._heartbeat
+            heartbeat = self._heartbeat[1]
             rc_ns, rc = self._rc or (None, RcChannels(()))
             pwm_us, rc_sticks = self._stick_channels_us(rc), None
-            if self.calibration is not None and pwm_us is not None and all(pwm_us):
+            if self.calibration and pwm_us and all(pwm_us):
                 rc_sticks = self.calibration.to_sticks(pwm_us)
             self._status = VehicleStatus(
-                system_id=self.identity.source.system,
-                autopilot=self.identity.autopilot,
                 mode=self.modes.name(heartbeat.custom_mode),
                 armed=bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED),
-                heartbeat_ns=heartbeat_ns,
                 rc_sticks=rc_sticks,
                 rc_channels_us=rc.channels_us,
                 rc_arrived_ns=rc_ns,

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.records import Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.transport.packet_log import PacketLog
 from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDownError
 
 REOPEN_NS = NS_PER_S
@@ -29,14 +29,19 @@ class Connection:
     """Packets in and out; used by one thread, but another one may stop it from sending."""
 
     def __init__(
-        self, transport: Transport, codec: Codec, clock: Clock, log: PacketLog | None = None
+        self,
+        transport: Transport,
+        codec: Codec,
+        clock: Clock,
+        log: BoundedQueue[Packet] | None = None,
     ) -> None:
         self._transport = transport
         self._codec = codec
         self._clock = clock
         self._log = log
         self._reopen_ns: int | None = None
-        self._peer: Address | None = None
+        self.peer: Address | None = None
+        """The vehicle's address, to which packets are sent; None until it is found."""
         self._lock = threading.Lock()
         self._is_blocked = False
         self.texts: list[str] = []
@@ -56,7 +61,6 @@ class Connection:
             self._lose(error, now_ns)
             return
         self._codec.forget_partial()
-        self._transport.answer_to(self._peer)
 
     def _lose(self, error: TransportDownError, now_ns: int) -> None:
         self._transport.close()
@@ -76,7 +80,7 @@ class Connection:
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data):
                     if self._log is not None:
-                        self._log.append(Packet(arrived_ns, message.packet))
+                        self._log.put(Packet(arrived_ns, message.packet))
                     yield Arrival(message, arrived_ns, sender)
                 if self._clock.now_ns() - now_ns > DRAIN_BUDGET_NS:
                     return
@@ -90,23 +94,18 @@ class Connection:
         else:
             self._transport.wait(until_ns)
 
-    def answer_to(self, peer: Address | None) -> None:
-        """Send to this peer from now on, also after reconnecting."""
-        self._peer = peer
-        self._transport.answer_to(peer)
-
     def send(self, data: bytes, *, is_forced: bool = False) -> bool:
         """Send one packet; False: it was not sent. ``is_forced`` overrides ``block_sends``."""
         with self._lock:
             if self.is_down or (self._is_blocked and not is_forced):
                 return False
             try:
-                is_sent = self._transport.send(data)
+                is_sent = self._transport.send(data, self.peer)
             except TransportDownError as error:
                 self._lose(error, self._clock.now_ns())
                 return False
             if is_sent and self._log is not None:
-                self._log.append(Packet(self._clock.now_ns(), data))
+                self._log.put(Packet(self._clock.now_ns(), data))
             return is_sent
 
     def block_sends(self) -> None:

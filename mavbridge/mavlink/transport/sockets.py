@@ -55,14 +55,11 @@ class Transport(Protocol):
     def wait(self, until_ns: int) -> None:
         """Return when ``drain`` has something to yield, or at the given time."""
 
-    def answer_to(self, sender: Address | None) -> None:
-        """From now on send to this peer; no effect on a stream."""
-
-    def send(self, data: bytes) -> bool:
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Hand one whole packet to the kernel; False: dropped, because it cannot be sent now.
 
-        Raises:
-            TransportDownError: the connection is lost.
+        ``peer`` is the receiver of a datagram where we listen; nothing else heeds it. Raises
+        TransportDownError when the connection is lost.
         """
 
     def close(self) -> None:
@@ -110,7 +107,6 @@ class UdpTransport(_Base[socket.socket]):
         super().__init__(clock)
         self._address = _resolve(address)
         self._listen = listen
-        self._peer: Address | None = None if listen else self._address
 
     def open(self) -> None:
         """See `Transport`."""
@@ -118,13 +114,9 @@ class UdpTransport(_Base[socket.socket]):
         udp.setblocking(False)
         if sys.platform == "linux":
             udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        if self._listen:
-            self._bind(udp)
-        self._handle = udp
-
-    def _bind(self, udp: socket.socket) -> None:
         try:
-            udp.bind(self._address)
+            if self._listen:
+                udp.bind(self._address)
         except OSError as error:
             udp.close()
             host, port = self._address
@@ -134,6 +126,7 @@ class UdpTransport(_Base[socket.socket]):
                 else "check the address"
             )
             raise UserError(f"cannot use udp {host}:{port}: {error.strerror}; {hint}") from error
+        self._handle = udp
 
     def drain(self) -> Iterator[Chunk]:
         """Datagrams, with the kernel's arrival stamp where there is one."""
@@ -157,17 +150,13 @@ class UdpTransport(_Base[socket.socket]):
                 return now_ns - min(max(queued_ns, 0), NS_PER_S)
         return now_ns
 
-    def answer_to(self, sender: Address | None) -> None:
-        """Send to this peer from now on, if we listen."""
-        if self._listen:
-            self._peer = sender
-
-    def send(self, data: bytes) -> bool:
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Send one datagram to the peer, if there is one and it can be reached now."""
-        if self._handle is None or self._peer is None:
+        receiver = peer if self._listen else self._address
+        if self._handle is None or receiver is None:
             return False
         try:
-            self._handle.sendto(data, self._peer)
+            self._handle.sendto(data, receiver)
         except OSError:
             return False  # full buffer, no route, nobody listens: this datagram is lost, no more
         return True
@@ -177,9 +166,6 @@ class _StreamTransport(_Base[_Handle]):
     """A stream that may take a part of a packet: the rest goes out before the next packet."""
 
     _unsent = b""
-
-    def answer_to(self, sender: Address | None) -> None:
-        """See `Transport`."""
 
     def _put(self, data: bytes, write: Callable[[bytes], int]) -> bool:
         """Write the packet, or drop it whole; raises OSError as ``write`` does."""
@@ -241,7 +227,7 @@ class TcpTransport(_StreamTransport[socket.socket]):
         if self._handle is not None and self._clock.now_ns() - self._heard_ns > TCP_SILENCE_NS:
             raise TransportDownError(f"tcp: silent for {TCP_SILENCE_NS // NS_PER_S} s")
 
-    def send(self, data: bytes) -> bool:
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
         """See `Transport`."""
         if self._handle is None:
             return False
@@ -290,7 +276,7 @@ class SerialTransport(_StreamTransport[serial.Serial]):
         if data:
             yield Chunk(data, self._clock.now_ns(), None)
 
-    def send(self, data: bytes) -> bool:
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
         """See `Transport`. Bypasses pyserial, whose write loops forever on a full buffer."""
         if self._handle is None:
             return False
@@ -307,8 +293,7 @@ _FORMS = "udp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /de
 def make_transport(spec: str, clock: Clock) -> Transport:
     """The transport for a connection string in pymavlink's notation, not opened yet.
 
-    Raises:
-        UserError: the string is malformed, or its host does not exist.
+    Raises UserError if the string is malformed, or its host does not exist.
     """
     kind, _, rest = spec.partition(":")
     if kind in ("udp", "udpin", "udpout"):

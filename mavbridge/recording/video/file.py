@@ -48,13 +48,9 @@ class FragmentedMp4:
     """A video file that grows by a frame at a time; methods may raise ``WRITE_ERRORS``."""
 
     def __init__(self, path: Path, *, height: int, width: int, hz: float) -> None:
-        """Create the file.
+        """Create the file, which must not exist, for frames with even sides.
 
-        Args:
-            path: must not exist.
-            height: of every frame; even.
-            width: of every frame; even.
-            hz: nominal frame rate; the frames' own stamps decide.
+        ``hz`` is the nominal frame rate; the frames' own stamps decide.
         """
         self._file: BinaryIO = path.open("xb", buffering=_BUFFER_BYTES)
         self._container: OutputContainer = av.open(
@@ -69,11 +65,9 @@ class FragmentedMp4:
         self._last_pts = -1
 
     def append(self, rgb: ImageArray, captured_ns: int) -> None:
-        """Encode one frame and hand it to the kernel.
+        """Encode one frame, [H, W, 3] uint8, and hand it to the kernel.
 
-        Args:
-            rgb: [H, W, 3] uint8.
-            captured_ns: its time; one that is not after the last frame's is moved behind it.
+        A stamp that is not after the last frame's is moved behind it.
         """
         if self._first_ns is None:
             self._first_ns = captured_ns
@@ -94,11 +88,7 @@ class FragmentedMp4:
 
 
 def count_frames(path: Path) -> int:
-    """Whole frames of a file of ``FragmentedMp4``, however it ended.
-
-    Raises:
-        VideoError: it cannot be read.
-    """
+    """Whole frames of a file of ``FragmentedMp4``, however it ended; raises VideoError."""
     try:
         return len(_frame_ends(path))
     except OSError as error:
@@ -122,14 +112,10 @@ def _frame_ends(path: Path) -> list[int]:
 
 
 def read_video(path: Path, frames: int | None = None) -> Iterator[ImageArray]:
-    """Frames of a file of ``FragmentedMp4`` in their order, [H, W, 3] uint8 RGB.
+    """Frames of a file of ``FragmentedMp4``, whole or cut off: [H, W, 3] uint8 RGB.
 
-    Args:
-        path: the file, whole or cut off.
-        frames: how many to read; by default all whole ones.
-
-    Raises:
-        VideoError: it cannot be read, or ends before that.
+    ``frames`` is the number to read, by default all whole ones. Raises VideoError if the file
+    cannot be read, or ends before that.
     """
     wanted = count_frames(path) if frames is None else frames
     if wanted == 0:

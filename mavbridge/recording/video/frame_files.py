@@ -10,7 +10,6 @@ from mavbridge.recording.tables import READ_ERRORS, TableWriter
 from mavbridge.recording.video.file import WRITE_ERRORS, FragmentedMp4
 
 FILE_ERRORS = (*WRITE_ERRORS, *READ_ERRORS)
-"""Errors that ``FrameFiles`` raises."""
 FLUSH_NS = 500_000_000
 """Longest span of frames whose rows may wait."""
 FLUSH_ROWS = 64
@@ -22,11 +21,9 @@ class VideoJob(NamedTuple):
     video: Path
     """Fragmented MP4; must not exist."""
     hz: float
-    """Nominal frame rate."""
     rows: Path | None = None
     """Path and stem of the frames table; None: only a video."""
     with_truth: bool = False
-    """The table has the columns of ``FrameTruth``."""
 
 
 class FrameFiles:
@@ -45,9 +42,8 @@ class FrameFiles:
         """Write a frame [H, W, 3] with even sides; its row follows within half a second."""
         if self._video is None:
             height, width = rgb.shape[:2]
-            self._video = FragmentedMp4(
-                self._job.video, height=height, width=width, hz=self._job.hz
-            )
+            job = self._job
+            self._video = FragmentedMp4(job.video, height=height, width=width, hz=job.hz)
         self._video.append(rgb, row.captured_ns)
         if self._job.rows is not None:
             self._rows.append(row)

@@ -46,8 +46,12 @@ class FrameRing:
         frame_bytes = height * width * 3
         slots = max(MIN_SLOTS, min(MAX_SLOTS, MAX_BYTES // frame_bytes))
         memory = SharedMemory(create=True, size=slots * frame_bytes)
+        # Take the pages now: a page that is not there when it is first written ends the process.
+        path = Path("/dev/shm") / memory.name.lstrip("/")  # noqa: S108 - where Linux keeps them
         try:
-            _reserve(memory)
+            if path.exists():
+                with path.open("r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, memory.size)
         except OSError:
             memory.close()
             memory.unlink()
@@ -79,11 +83,3 @@ class FrameRing:
         self._frames = None
         self._memory.close()
         self.unlink()
-
-
-def _reserve(memory: SharedMemory) -> None:
-    """Take the pages now: a page that is not there when it is first written ends the process."""
-    path = Path("/dev/shm") / memory.name.lstrip("/")  # noqa: S108 - where Linux keeps them
-    if path.exists():
-        with path.open("r+b") as file:
-            os.posix_fallocate(file.fileno(), 0, memory.size)

@@ -84,10 +84,10 @@ class FrameSender:
 
         Args:
             rgb: [H, W, 3] uint8; an odd last row or column is cut off, which H.264 cannot have.
-            row: what else is known of it; drops of the ring are added to ``dropped_before``.
+            row: its other facts; drops of the ring are added to ``dropped_before``.
 
         Returns:
-            Whether it was taken.
+            True if it was taken.
         """
         self._offered += 1
         self.receive()
@@ -151,23 +151,20 @@ class FrameSender:
         """Take in the messages that have come."""
         try:
             while not self._failure and Notice.DONE not in self._notices and self._pipe.poll():
-                self._handle(self._pipe.recv())
+                match self._pipe.recv():
+                    case Written(slot=slot):
+                        self._free.append(slot)
+                        self.written += 1
+                    case Failed(reason=reason):
+                        self._failure = WriterError(f"the video cannot be written: {reason}")
+                    case Notice() as notice:
+                        self._notices.add(notice)
+                        if notice is Notice.MAPPED and self._ring is not None:
+                            self._ring.unlink()
         except (EOFError, OSError):
             raise self._died() from None
         if self._failure is not None:
             raise self._failure
-
-    def _handle(self, message: FromWriter) -> None:
-        match message:
-            case Written(slot=slot):
-                self._free.append(slot)
-                self.written += 1
-            case Failed(reason=reason):
-                self._failure = WriterError(f"the video cannot be written: {reason}")
-            case Notice():
-                self._notices.add(message)
-                if message is Notice.MAPPED and self._ring is not None:
-                    self._ring.unlink()
 
     def _died(self) -> WriterError:
         if self._failure is None:

@@ -93,18 +93,15 @@ class WriterService:
             if not self._pipe.poll(timeout_s):
                 self._files.flush()
                 return
-            self._handle(self._receive())
+            try:
+                message = self._pipe.recv()
+            except (EOFError, ConnectionResetError):  # the producer is gone
+                message = Notice.FINISH
+            self._handle(message)
         except FILE_ERRORS as error:
             self._files.abandon()
             self._close()
             self.send(Failed(f"{self._folder}: {getattr(error, 'strerror', None) or error}"))
-
-    def _receive(self) -> ToWriter:
-        try:
-            message: ToWriter = self._pipe.recv()
-        except (EOFError, ConnectionResetError):  # the producer is gone
-            return Notice.FINISH
-        return message
 
     def _handle(self, message: ToWriter) -> None:
         match message:

@@ -5,7 +5,7 @@ import pytest
 
 from helpers.factories import make_tick, make_vision_tick
 from mavbridge.core.errors import PeerError
-from mavbridge.core.observers import FanOut, ObserverThread
+from mavbridge.core.observers import BoundedQueue, FanOut, ObserverThread
 from mavbridge.core.records import Event, Tick, VisionTick
 
 DEADLINE_S = 10.0
@@ -141,6 +141,16 @@ def test_events_after_close_are_counted() -> None:
     observer.emit(make_tick())
     observer.emit(make_vision_tick())
     assert observer.dropped == 2
+
+
+def test_a_full_queue_drops_and_counts() -> None:
+    queue: BoundedQueue[int] = BoundedQueue(3)
+    for item in range(5):
+        queue.put(item)
+    assert queue.dropped == 2
+    assert queue.take(2) == [0, 1]
+    assert queue.take() == [2]
+    assert queue.take() == []
 
 
 @pytest.mark.parametrize("capacities", [(0, 1), (1, 0), (-3, 1)])

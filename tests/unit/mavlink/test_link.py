@@ -11,9 +11,9 @@ from helpers.wire import CALIBRATION, WireEnd
 from mavbridge.config.flight import LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
-from mavbridge.core.records import IDLE, Command, LinkSnapshot, Release, Sticks
+from mavbridge.core.observers import BoundedQueue
+from mavbridge.core.records import IDLE, Command, LinkSnapshot, Packet, Release, Sticks
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.packet_log import PacketLog
 from mavbridge.mavlink.transport.sockets import Address, Chunk, TransportDownError
 
 MS = NS_PER_MS
@@ -61,12 +61,10 @@ class Vehicle:
         if arrival_ns <= until_ns and self.is_alive:
             self.tick(1)
 
-    def answer_to(self, sender: Address | None) -> None:
-        self.answered_to = sender
-
-    def send(self, data: bytes) -> bool:
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
         if self.is_down or self.is_deaf:
             return False
+        self.answered_to = peer
         for message in self.end.read(data):
             self.received.append(message)
             self.answer(message)
@@ -119,7 +117,7 @@ class Rig:
     def __init__(self, **config: Any) -> None:
         self.clock = FakeClock()
         self.vehicle = Vehicle(self.clock)
-        self.packet_log = PacketLog()
+        self.packet_log: BoundedQueue[Packet] = BoundedQueue(20_000)
         self.link = MavlinkLink(
             self.vehicle,
             self.clock,
@@ -179,7 +177,7 @@ def test_the_packet_log_has_both_directions_and_only_what_left() -> None:
     rig.vehicle.is_deaf = True
     rig.run(1.0)
     rig.vehicle.is_deaf = False
-    packets = rig.packet_log.drain()
+    packets = rig.packet_log.take()
     assert rig.packet_log.dropped == 0
     end = WireEnd()
     read = [message for packet in packets for message in end.read(packet.data)]

@@ -10,8 +10,6 @@ from pymavlink.dialects.v10 import ardupilotmega as dialect1
 from helpers.wire import WireEnd
 from mavbridge.core.records import Packet
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.transport import packet_log
-from mavbridge.mavlink.transport.packet_log import PacketLog
 from mavbridge.recording.tlog import TlogWriter
 
 
@@ -51,29 +49,16 @@ def test_every_packet_comes_out_of_the_codec_as_it_was_sent(sizes: list[int], co
     assert decoded(Codec(source_system=255, source_component=191), pieces) == wanted
 
 
-def test_a_full_log_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packet_log, "CAPACITY", 3)
-    full = PacketLog()
-    for k in range(5):
-        full.append(Packet(k, b"x"))
-    assert full.dropped == 2
-    assert full.drain() == [Packet(k, b"x") for k in range(3)]
-    assert full.drain() == []
-
-
 def test_pymavlink_reads_the_log(tmp_path: Path) -> None:
     path = tmp_path / "link.tlog"
     unix_ns = 1_700_000_000_123_456_789
-    link = PacketLog()
+    log = TlogWriter(path, wall_offset_ns=unix_ns - 5_000_000_000)
     end = WireEnd()
     for k in range(5):
         stamp_ns = 5_000_000_000 + k * 10_000_000
-        link.append(Packet(stamp_ns, end.heartbeat()))
-        link.append(Packet(stamp_ns, packets(1)[0]))
         sent = end.pack(end.mav.manual_control_encode(1, k, 0, 0, 0, 0))
-        link.append(Packet(stamp_ns + 2_000_000, sent))
-    log = TlogWriter(path, wall_offset_ns=unix_ns - 5_000_000_000)
-    log.append(link.drain())
+        arrived = [Packet(stamp_ns, end.heartbeat()), Packet(stamp_ns, packets(1)[0])]
+        log.append([*arrived, Packet(stamp_ns + 2_000_000, sent)])
     log.close()
     reader = mavutil.mavlogfile(str(path))
     read = []

@@ -76,9 +76,8 @@ def test_udp_listens_answers_whom_it_is_told_and_stamps_arrival() -> None:
         assert before_ns - slack_ns <= first.arrived_ns <= after_ns + slack_ns
         assert before_ns - slack_ns <= second.arrived_ns <= after_ns + slack_ns
         assert list(ours.drain()) == []
-        ours.send(b"to nobody yet")
-        ours.answer_to(first.sender)
-        ours.send(b"hello")
+        assert not ours.send(b"to nobody yet")
+        assert ours.send(b"hello", first.sender)
         assert vehicle.recv(100) == b"hello"
     ours.close()
     ours.close()

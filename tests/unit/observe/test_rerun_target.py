@@ -9,7 +9,7 @@ import pytest
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import free_port
 from mavbridge.observe import rerun_target
-from mavbridge.observe.rerun_target import RrdFile, Viewer, prepare_target, spawn_viewer
+from mavbridge.observe.rerun_target import prepare_target, spawn_viewer
 
 LISTENS_UNTIL_KILLED = """
 import socket, sys
@@ -29,7 +29,7 @@ def bound_port() -> Iterator[int]:
 
 def test_a_file_is_created_at_once(tmp_path: Path) -> None:
     path = tmp_path / "flight.rrd"
-    assert prepare_target(str(path)) == RrdFile(path)
+    assert prepare_target(str(path)) == path
     assert path.exists()
 
 
@@ -70,7 +70,7 @@ def test_a_malformed_url_is_refused_with_an_example(url: str) -> None:
 def test_a_viewer_that_listens_is_accepted() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         url = f"rerun+http://127.0.0.1:{server.getsockname()[1]}/proxy"
-        assert prepare_target(f"connect={url}") == Viewer(url)
+        assert prepare_target(f"connect={url}") == url
 
 
 def test_a_viewer_that_does_not_listen_is_named(bound_port: int) -> None:
@@ -82,10 +82,10 @@ def test_a_spawned_viewer_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None
     port = free_port(socket.SOCK_STREAM)
     monkeypatch.setattr(rerun_target, "SETTLE_S", 0.05)
     viewer = spawn_viewer([sys.executable, "-c", LISTENS_UNTIL_KILLED], port=port)
-    assert viewer.url == f"rerun+http://127.0.0.1:{port}/proxy"
-    assert viewer.process is not None
-    viewer.process.kill()
-    viewer.process.wait(10)
+    assert viewer.poll() is None
+    socket.create_connection(("127.0.0.1", port), 10).close()
+    viewer.kill()
+    viewer.wait(10)
 
 
 def test_a_spawned_viewer_that_ends_is_reported_with_its_last_words(bound_port: int) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, send_signal
+from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.records import Packet
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.recorder import Recorder
@@ -18,21 +19,11 @@ DEADLINE_S = 30.0
 
 
 @dataclass
-class Packets:
-    waiting: list[Packet] = field(default_factory=list)
-    dropped: int = 0
-
-    def drain(self) -> list[Packet]:
-        taken, self.waiting = self.waiting, []
-        return taken
-
-
-@dataclass
 class RecorderStand:
     """A recorder and what it told a person."""
 
     folder: Path
-    packets: Packets = field(default_factory=Packets)
+    packets: BoundedQueue[Packet] = field(default_factory=lambda: BoundedQueue(100))
     told: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -72,7 +63,8 @@ def until(stood: RecorderStand, ticks: int) -> None:
 
 def test_ticks_frames_and_packets_end_in_the_folder(tmp_path: Path) -> None:
     with stand(tmp_path) as stood:
-        stood.packets.waiting += [Packet(k, b"packet") for k in range(3)]
+        for k in range(3):
+            stood.packets.put(Packet(k, b"packet"))
         for k in range(300):
             stood.recorder.emit(make_tick(k))
         for k in range(20):

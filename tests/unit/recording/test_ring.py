@@ -1,11 +1,10 @@
 import errno
-from multiprocessing.shared_memory import SharedMemory
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mavbridge.recording.video import ring as ring_module
 from mavbridge.recording.video.ring import MAX_BYTES, MAX_SLOTS, MIN_SLOTS, FrameRing
 
 
@@ -47,16 +46,17 @@ def test_memory_is_bounded(side: int, slots: int) -> None:
 def test_too_little_memory_is_an_error_now_and_not_a_crash_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    reserved: list[str] = []
+    reserved: list[Path] = []
 
-    def refuse(memory: SharedMemory) -> None:
-        reserved.append(memory.name)
+    def refuse(fd: int, _offset: int, _size: int) -> None:
+        reserved.append(Path(f"/proc/self/fd/{fd}").readlink())
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(ring_module, "_reserve", refuse)
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
     with pytest.raises(OSError, match="No space"):
         FrameRing.create(20, 20)
-    assert not (Path("/dev/shm") / reserved[0]).exists()
+    assert reserved[0].parent == Path("/dev/shm")
+    assert not reserved[0].exists()
 
 
 def test_more_than_there_can_be_is_refused() -> None:
