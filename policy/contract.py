@@ -6,7 +6,7 @@ carries its ``Contract`` in the header, and the bridge refuses one that it canno
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from policy.errors import ContractError
 
 CONTRACT_VERSION = 1
+NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
     *("vx_mps", "vy_mps", "vz_mps"),
@@ -163,6 +164,16 @@ def _rgb(name: str, value: object) -> tuple[float, float, float]:
         if len(numbers) == 3:
             return numbers[0], numbers[1], numbers[2]
     raise ContractError(f"{name} must be three numbers, got {value!r}")
+
+
+def history_ages_ns(length: int, dt_s: float) -> Sequence[int]:
+    """Ages of the sticks in a history, oldest first; the newest is ``dt_s`` before the tick.
+
+    A stick holds until the next one is sent, so the one at a time is the newest sent by then.
+    Released sticks, and those before the first was sent, are neutral.
+    """
+    dt_ns = round(dt_s * NS_PER_S)
+    return range(length * dt_ns, 0, -dt_ns)
 
 
 @runtime_checkable

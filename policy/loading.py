@@ -20,10 +20,9 @@ from typing import TYPE_CHECKING, Any
 from policy.checkpoints.header import read_contract
 from policy.contract import Contract, DualRatePolicy, Executable, SingleRatePolicy, WarmStartPolicy
 from policy.engines.executable import EngineName, ExecutionSettings
-from policy.errors import PolicyError
+from policy.errors import PolicyError, user_code
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 from policy.scripted import ScriptedPolicy
-from policy.user_code import user_code
 
 if TYPE_CHECKING:
     from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy

@@ -13,11 +13,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from policy.contract import ACTION_NAMES, SPECIFIC_FORCE, STATE_NAMES, FloatArray, StateFrame
+from policy.contract import (
+    ACTION_NAMES,
+    NS_PER_S,
+    SPECIFIC_FORCE,
+    STATE_NAMES,
+    FloatArray,
+    StateFrame,
+)
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
 from policy.data.tables import file_digest, numbers, parse_state_frame, read_json, stamps, vectors
-from policy.observation import NS_PER_S
 
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 

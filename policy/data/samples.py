@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from policy.contract import (
     ACTION_DIM,
     AGE,
+    NS_PER_S,
     QUATERNION,
     RATE,
     ROTATION,
@@ -22,10 +23,11 @@ from policy.contract import (
     VELOCITY_CHANGE,
     Contract,
     FloatArray,
+    history_ages_ns,
 )
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, Nanoseconds
 from policy.data.interpolation import Indices, Interpolator, covered, nearest
-from policy.observation import NS_PER_S, history_ages_ns, motion_since_exposure
+from policy.rotation import motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
 """Largest distance of a tick from the moment that was drawn: two ticks at 100 Hz."""

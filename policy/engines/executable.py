@@ -17,9 +17,8 @@ from policy.contract import (
     WarmStartPolicy,
 )
 from policy.engines.warm_start import Segment, WarmStart, make_solve
-from policy.errors import PolicyError
+from policy.errors import PolicyError, user_code
 from policy.preprocess import image_to_input
-from policy.user_code import user_code
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]

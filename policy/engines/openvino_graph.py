@@ -19,13 +19,13 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, FloatArray
 from policy.engines.executable import Shape
+from policy.errors import user_code
 from policy.nets.action_head import DiffusionHead, size_dims
 from policy.nets.diffusion import DdimStep, NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.nets.unet1d import Conv, Norm, ResidualBlock, UNet1d
 from policy.preprocess import egocentric_scale
-from policy.user_code import user_code
 
 
 class _Traceable(nn.Module):

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl import UsageError
 from sitl.camera import scenery
 from sitl.camera.imager import Image, Imager
 from sitl.camera.scenery import FloatArray
 from sitl.course.layout import Course
-from sitl.errors import UsageError
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
 

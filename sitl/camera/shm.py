@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.errors import UsageError
+from sitl import UsageError
 
 MAGIC = b"MBSHM\0\0\1"
 HEADER_BYTES = 64

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from sitl.errors import UsageError
+from sitl import UsageError
 from sitl.rotation import Quat, Vec3, wrap_pi
 
 GATE_COUNT = 8

@@ -14,9 +14,9 @@ import cmath
 import math
 from dataclasses import dataclass, replace
 
+from sitl import UsageError
 from sitl.course.layout import Course, Gate
 from sitl.course.referee import GateCounter, crossing
-from sitl.errors import UsageError
 from sitl.expert.guidance import Plan, Waypoint, least_acceleration
 from sitl.expert.stick_response import DRAG_PER_S, Demand, StickPositions, StickResponse
 from sitl.rotation import Vec3, rotate, to_euler, wrap_pi

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import NamedTuple, TypeAlias
 
+from sitl import UsageError
 from sitl.clock import NS_PER_S, Clock, monotonic_from_wall_ns
-from sitl.errors import UsageError
 
 Address: TypeAlias = tuple[str, int]
 

@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sitl.errors import UsageError
+from sitl import UsageError
 from sitl.rotation import Vec3
 
 Rgb: TypeAlias = tuple[int, int, int]

@@ -6,8 +6,7 @@ import pytest
 from policy.contract import Contract
 from policy.engines.executable import ExecutionSettings
 from policy.engines.numpy_eager import make_numpy_executable
-from policy.errors import PolicyError
-from policy.user_code import user_code
+from policy.errors import PolicyError, user_code
 
 
 @pytest.mark.parametrize("error", [AssertionError("no"), ZeroDivisionError("no"), OSError("no")])
