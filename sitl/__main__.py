@@ -8,9 +8,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from sitl import UsageError
-from sitl.app import print_status, run_vehicle, stop_on_signal
+from sitl.app import print_status, run_vehicle
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
+from sitl.clock import stop_on_signal
 from sitl.course.layout import course_to_json, make_course
 from sitl.vehicle.autopilot import VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions

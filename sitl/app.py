@@ -1,6 +1,5 @@
 """Flies the vehicle in real time: sockets, the 400 Hz loop, the camera thread, the final report."""
 
-import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
@@ -10,7 +9,7 @@ from pathlib import Path
 from sitl import UsageError
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
-from sitl.clock import NS_PER_S, Clock
+from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
 from sitl.course.layout import Course
 from sitl.link.transport import Transport, open_transport
 from sitl.report import write_report
@@ -18,38 +17,6 @@ from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
-
-
-class StopRequest:
-    """A flag that a signal handler may set.
-
-    Not a ``threading.Event``: a second signal would wait for the lock that the first one's handler
-    holds.
-    """
-
-    def __init__(self) -> None:
-        self._is_set = False
-
-    def set(self) -> None:
-        """Request the stop."""
-        self._is_set = True
-
-    def is_set(self) -> bool:
-        """True once a stop was requested."""
-        return self._is_set
-
-
-@contextmanager
-def stop_on_signal() -> Iterator[StopRequest]:
-    """Let SIGINT and SIGTERM request the stop; the old handlers come back afterwards."""
-    stop = StopRequest()
-    signals = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(number, lambda *_: stop.set()) for number in signals]
-    try:
-        yield stop
-    finally:
-        for number, handler in zip(signals, previous, strict=True):
-            signal.signal(number, handler)
 
 
 def run_vehicle(

@@ -8,9 +8,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from sitl.app import StopRequest
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions, FpvRenderer
+from sitl.clock import StopRequest
 from sitl.course.layout import make_course
 from sitl.rotation import IDENTITY
 
