@@ -9,7 +9,7 @@ from policy.contract import ACTION_DIM, Contract
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule, ddim_solve
 from policy.nets.names import SIZE_NAMES, Size
-from policy.nets.unet1d import UNet1d, UNet1dConfig
+from policy.nets.unet1d import UNet1d
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,12 +59,7 @@ class DiffusionHead(nn.Module):
         dims = size_dims(size)
         self.schedule = schedule
         self.unet = UNet1d(
-            UNet1dConfig(
-                horizon=contract.horizon,
-                action_dim=ACTION_DIM,
-                condition_dim=dims.base_dim,
-                widths=dims.widths,
-            )
+            horizon=contract.horizon, condition_dim=dims.base_dim, widths=dims.widths
         )
         self.direct = nn.Linear(dims.base_dim, contract.horizon * ACTION_DIM)
         self._timesteps: Tensor

@@ -32,14 +32,13 @@ TRAIN_TIMESTEPS = 100
 class DdimStep:
     """One reverse step: where it starts, and the coefficients of the state before and after it.
 
-    Plain floats, so that a tracer folds them to constants and float64 stays float64.
+    ``signal`` is sqrt(a_t), ``noise`` sqrt(1 - a_t). They are plain floats, so that a tracer folds
+    them to constants and float64 stays float64.
     """
 
     timestep: int
     signal: float
-    """sqrt(a_t)"""
     noise: float
-    """sqrt(1 - a_t)"""
     next_signal: float
     next_noise: float
 

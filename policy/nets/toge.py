@@ -109,10 +109,6 @@ class Toge(nn.Module):
         condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
         return condition
 
-    def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
-        """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
-        return self.head.denoise(noisy, timestep, condition)
-
     def predict_fast(
         self,
         feature: Tensor,
