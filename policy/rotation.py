@@ -78,12 +78,6 @@ def slerp(p: Q, q: Q, share: Any) -> Q:
     return multiply(p, _like(p, library.cos(half), scale * x, scale * y, scale * z))
 
 
-def about_z(angle_rad: Array) -> Array:
-    """Rotations [B, 4] by angles [B] about the third axis."""
-    zero = np.zeros_like(angle_rad)
-    return np.stack([np.cos(angle_rad / 2), zero, zero, np.sin(angle_rad / 2)], axis=-1)
-
-
 def motion_since_exposure(
     attitude_then: Q, attitude_now: Q, velocity_change_world: V
 ) -> tuple[V, V]:
