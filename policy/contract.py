@@ -72,7 +72,6 @@ class Contract:
     feature_dim: int = 0
     """F of encode_visual's [B, F]; 0 where there is no fast path."""
     horizon: int = 16
-    """Actions in a chunk."""
     chunk_dt_s: float = 0.05
     """Time between the actions of a chunk; action 0 acts at the time of the state."""
     history_len: int = 4
@@ -80,7 +79,6 @@ class Contract:
     history_dt_s: float = 0.05
     """Time between them; the newest is history_dt_s before the state."""
     arrays: Arrays = "torch"
-    """Kind of arrays that the policy takes and returns."""
     since_exposure: bool = False
     """The state is followed by ``SINCE_EXPOSURE_NAMES``."""
     version: int = CONTRACT_VERSION
@@ -189,7 +187,6 @@ class SingleRatePolicy(Protocol):
 
     def predict(self, image: Any, state: Any, action_history: Any, num_diffusion_steps: int) -> Any:
         """Encode the image and sample one chunk."""
-        ...
 
 
 @runtime_checkable
@@ -198,13 +195,11 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
 
     def encode_visual(self, image: Any) -> Any:
         """Image [B, 3, H, W] -> feature [B, F]."""
-        ...
 
     def predict_fast(
         self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
     ) -> Any:
         """Cached feature [B, F], newest state and history -> chunk [B, horizon, 4]."""
-        ...
 
 
 class NoiseModel(Protocol):
@@ -213,11 +208,9 @@ class NoiseModel(Protocol):
     @property
     def initial_noise(self) -> Any:
         """[1, horizon, 4]; the same for a whole flight."""
-        ...
 
     def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
         """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-        ...
 
 
 @runtime_checkable
@@ -239,7 +232,6 @@ class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
     ) -> Any:
         """``count`` steps of a solve: ``noisy`` [B, horizon, 4] as step ``first`` starts with it
         -> as the next step would; after the last step, the chunk."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

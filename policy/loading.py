@@ -70,7 +70,6 @@ class LoadedPolicy:
 
     executable: Executable
     notes: tuple[str, ...]
-    """Lines to show before take-off."""
 
 
 def check_request(request: PolicyRequest) -> None:
@@ -103,11 +102,7 @@ def check_request(request: PolicyRequest) -> None:
 
 
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
-    """Find, build, load and try a policy.
-
-    Args:
-        request: which one.
-        now_s: monotonic seconds, for scripted programs.
+    """Find, build, load and try a policy; ``now_s``, monotonic seconds, is for scripted programs.
 
     Raises:
         PolicyError: with what was wrong, what was available and what to do.
@@ -247,19 +242,15 @@ def _trained(
     policy.reset(seed)
     notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
     if checkpoint.suffix != ".safetensors":
-        notes.append(_assumptions(checkpoint, policy))
+        contract, schedule = policy.contract, policy.config.schedule
+        notes.append(
+            f"warning: {checkpoint} may hold no contract; it is flown with frame "
+            f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
+            f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
+            f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
+            f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
+        )
     return policy, notes
-
-
-def _assumptions(checkpoint: Path, policy: "BuiltinPolicy") -> str:
-    contract, schedule = policy.contract, policy.config.schedule
-    return (
-        f"warning: {checkpoint} may hold no contract; it is flown with frame "
-        f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
-        f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
-        f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
-        f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
-    )
 
 
 def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:

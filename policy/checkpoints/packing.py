@@ -16,12 +16,7 @@ _LARGEST = 127.0
 
 
 def pack(state: Mapping[str, Tensor], *, coarse: str) -> dict[str, Tensor]:
-    """Weights for a file.
-
-    Args:
-        state: float32 weights by name.
-        coarse: weights whose names begin so are stored in int8.
-    """
+    """Weights for a file, from float32 weights; those whose names begin with ``coarse`` in int8."""
     packed: dict[str, Tensor] = {}
     for name, value in state.items():
         if value.ndim < 2 or value.dtype != torch.float32:

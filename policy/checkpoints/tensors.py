@@ -1,4 +1,4 @@
-"""Files of weights, whatever the network: read, written, and refused in the same words."""
+"""Files of weights, whatever the network: read, written, and refused by a ``CheckpointError``."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,11 +13,7 @@ from policy.errors import CheckpointError
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
-    """Write a ``.safetensors`` file; replaces ``path`` at once or not at all.
-
-    Raises:
-        CheckpointError: of another suffix, or a path that cannot be written.
-    """
+    """Write a ``.safetensors`` file; replaces ``path`` at once or not at all."""
     if path.suffix != ".safetensors":
         raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
     partial = path.with_name(path.name + ".partial")
@@ -30,22 +26,14 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
 
 
 def read_tensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Header and tensors of a ``.safetensors`` file.
-
-    Raises:
-        CheckpointError: damaged, or of another format.
-    """
+    """Header and tensors of a ``.safetensors`` file."""
     with open_safetensors(path, "pt") as file:
         header = file.metadata() or {}
         return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
 
 
 def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
-    """Refuse weights that no run could use.
-
-    Raises:
-        CheckpointError: NaN or infinity among them.
-    """
+    """Refuse weights with NaN or infinity among them."""
     bad = [name for name, value in state.items() if not torch.isfinite(value).all()]
     if bad:
         raise CheckpointError(
@@ -55,11 +43,7 @@ def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
 
 
 def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor]) -> None:
-    """Name the first few weights that do not fit; torch's own message lists hundreds.
-
-    Raises:
-        CheckpointError: other names or shapes than the network's.
-    """
+    """Name the first few weights that do not fit; torch's own message lists hundreds."""
     wanted = {name: list(value.shape) for name, value in policy.state_dict().items()}
     problems = [f"missing {name!r}" for name in wanted if name not in state]
     problems += [f"unexpected {name!r}" for name in state if name not in wanted]

@@ -38,11 +38,8 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
 
     Stamps are those that ``mavbridge export`` adds; without them, image, state and action of a row
     are of its ``timestamp``. A LeRobot dataset does not say how old an image was when a policy
-    acted on it: ``age_ns`` is empty.
-
-    Args:
-        folder: the dataset, with ``meta/info.json``.
-        camera_key: the feature with the images; by default the only one.
+    acted on it: ``age_ns`` is empty. ``camera_key`` is the feature with the images, by default the
+    only one.
 
     Raises:
         DatasetError: another version, other features, or damaged; the message says what to do.

@@ -33,11 +33,8 @@ class ExecutionSettings:
     name: str
     """The policy's name in messages."""
     vision_device: str = "cpu"
-    """torch's name of where images are encoded."""
     action_device: str = "cpu"
-    """torch's name of where chunks are sampled."""
     num_diffusion_steps: int = 10
-    """Denoising steps of a full solve."""
     head_steps: int | None = None
     """Denoising steps of a solve from the last chunk; None = always a full solve."""
     dual_rate: bool = True
@@ -62,13 +59,7 @@ def make_executable(
 ) -> Executable:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
-    Args:
-        vision: the policy where images are encoded.
-        action: the same policy where chunks are sampled.
-        compile_vision: how ``vision``'s methods are run.
-        compile_action: how ``action``'s methods are run.
-        engine: its name.
-        settings: what was asked for.
+    ``vision`` encodes images and ``action`` samples chunks: one policy, perhaps on two devices.
 
     Raises:
         PolicyError: no fast path where one was asked for, or the policy failed on the sample.
@@ -129,12 +120,7 @@ def assemble(
 ) -> Executable:
     """An executable of an engine's two functions, tried on a dummy sample, which warms it up.
 
-    Args:
-        contract: of the policy.
-        encode: normalised image [1, 3, H, W] -> what ``act`` takes.
-        act: see ``Executable``.
-        engine: its name.
-        settings: what was asked for.
+    ``encode`` takes a normalised image [1, 3, H, W], ``act`` is that of ``Executable``.
 
     Raises:
         PolicyError: a function failed on the sample, or returned the wrong shape or no numbers.

@@ -95,11 +95,9 @@ def step_inputs(
 ) -> tuple[FloatArray, FloatArray]:
     """Inputs that make a graph of ``unrolled`` steps run ``first`` to ``first + count`` of a solve.
 
-    Where those are fewer, steps that change nothing come before them.
-
-    Returns:
-        The timesteps' shares of FiLM [unrolled, film_dim], 1 added to the scales, and the
-        coefficients of ``_updated`` [unrolled, 4].
+    Where those are fewer, steps that change nothing come before them. Returns the timesteps' shares
+    of FiLM [unrolled, film_dim], 1 added to the scales, and the coefficients of ``_updated``
+    [unrolled, 4].
     """
     steps = head.schedule.ddim_steps(num_diffusion_steps)[first : first + count]
     timesteps = torch.tensor([step.timestep for step in steps])

@@ -62,12 +62,7 @@ def train_policy(
 ) -> TrainResult:
     """Train, and write the best weights on held-out flights to ``settings.out``.
 
-    Args:
-        flights: what to learn from.
-        network: what to train; its contract's ``state_frame`` must be that of the flights.
-        settings: how, and how long.
-        hooks: clock, progress, and a request to stop.
-        check: scores a checkpoint, in place of the validation loss.
+    The best are those with the least validation loss, or the highest score by ``check``.
 
     Raises:
         DatasetError: flights that cannot be learned from.
@@ -236,11 +231,7 @@ def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds
 
 
 def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
-    """The policy to start from and a new gate head; torch's global random state is kept.
-
-    Raises:
-        PolicyError: weights that do not fit.
-    """
+    """The policy to start from and a new gate head; torch's global random state is kept."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:

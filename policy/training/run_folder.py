@@ -65,11 +65,7 @@ class RunFolder:
         return self._state.is_file()
 
     def save(self, position: Position, tensors: Mapping[str, Any]) -> None:
-        """Write the state in one piece or not at all.
-
-        Raises:
-            TrainingError: no room.
-        """
+        """Write the state in one piece, or raise a ``TrainingError``."""
         target, partial = self._state, self.path / "state.pt.partial"
         contents = {"identity": self._identity, "position": asdict(position), **tensors}
         try:

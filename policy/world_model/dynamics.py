@@ -24,14 +24,14 @@ _INITIAL_STD = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class Future:
-    """The unknown that is denoised, or an estimate of it; every part has about unit scale."""
+    """The unknown that is denoised, or an estimate of it; every part has about unit scale.
+
+    Latents are [B, T, C, h, w], motion is [B, T, MOTION_DIM], actions are [B, T, 4].
+    """
 
     latents: Tensor
-    """[B, T, C, h, w]"""
     motion: Tensor
-    """[B, T, MOTION_DIM]"""
     actions: Tensor
-    """[B, T, 4]"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,12 +25,9 @@ class MotionPredictor(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, features: Tensor, actions: Tensor, knows_actions: Tensor) -> Tensor:
-        """Predict motions [B, T, MOTION_DIM] of about unit scale.
+        """``relative_state.context_features`` [B, D], actions [B, T, 4] -> motions [B, T, 15].
 
-        Args:
-            features: [B, D], see ``relative_state.context_features``.
-            actions: [B, T, 4] of about unit scale; ignored where they are not known.
-            knows_actions: [B] bool.
+        Both have about unit scale. Actions are ignored where ``knows_actions`` [B] is False.
         """
         known = knows_actions.view(-1, 1, 1)
         sticks = torch.where(known, actions, 0.0)

@@ -46,12 +46,6 @@ def train_world_model(
 ) -> TrainResult:
     """Train, and write the best weights on held-out flights to ``settings.out``.
 
-    Args:
-        flights: what to learn from.
-        config: what to train; its contract's ``state_frame`` must be that of the flights.
-        settings: how, and how long.
-        hooks: clock, progress, and a request to stop.
-
     Raises:
         DatasetError: flights that cannot be learned from.
         TrainingError: a run that cannot be resumed or kept, or that diverged.
