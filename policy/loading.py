@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from policy.checkpoints.header import read_contract
 from policy.contract import Contract, DualRatePolicy, Executable, SingleRatePolicy, WarmStartPolicy
-from policy.engines.executable import EngineName, ExecutionSettings
+from policy.engines.executable import EngineName, ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError, user_code
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 from policy.scripted import ScriptedPolicy
@@ -178,8 +178,6 @@ def _executable(
 ) -> tuple[Executable, tuple[str, ...]]:
     """An engine that takes the policy's kind of arrays, and notes about the choice."""
     if policy.contract.arrays == "numpy":
-        from policy.engines.numpy_eager import make_numpy_executable
-
         if request.engine != "auto":
             raise PolicyError(
                 f"{request.spec} computes in numpy, which --engine {request.engine} cannot run: "

@@ -28,8 +28,14 @@ from policy.checkpoints.header import (
     require_file,
     require_header,
 )
-from policy.checkpoints.packing import pack, unpack
-from policy.checkpoints.tensors import read_tensors, require_finite, require_fit, write_tensors
+from policy.checkpoints.tensors import (
+    pack,
+    read_tensors,
+    require_finite,
+    require_fit,
+    unpack,
+    write_tensors,
+)
 from policy.contract import Contract, FloatArray
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.errors import CheckpointError, PolicyError
@@ -75,7 +81,7 @@ def save_checkpoint(
     """Write weights, contract, architecture and a test vector; replaces ``path`` at once or not.
 
     ``training`` is JSON that says how it was trained, for people and reports. ``packed`` makes a
-    third of the size, rounded as ``packing`` says; the test vector is then of rounded weights.
+    third of the size, rounded as ``pack`` says; the test vector is then of rounded weights.
 
     Raises:
         CheckpointError: weights that are not finite, or a path that cannot be written.

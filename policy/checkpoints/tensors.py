@@ -11,6 +11,10 @@ from torch import Tensor, nn
 from policy.checkpoints.header import open_safetensors
 from policy.errors import CheckpointError
 
+SCALE = ".int8_scale"
+"""After a weight's name: its scales, one an output channel."""
+_LARGEST = 127.0
+
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
     """Write a ``.safetensors`` file; replaces ``path`` at once or not at all."""
@@ -57,3 +61,36 @@ def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor]) -> N
             f"{path}: does not fit this policy in {len(problems)} places: "
             f"{'; '.join(problems[:4])}. Choose the size and backbone that it was trained with"
         )
+
+
+def pack(state: Mapping[str, Tensor], *, coarse: str) -> dict[str, Tensor]:
+    """Weights small enough to ship, from float32: half precision, but int8 for ``coarse`` prefixes.
+
+    Those are the encoder's: most of the weights, and the least sensitive. Each output channel has a
+    scale of its own, so a weight is off by at most 1/254 of its channel's largest. What has one
+    dimension (norms, biases) stays in float32.
+    """
+    packed: dict[str, Tensor] = {}
+    for name, value in state.items():
+        if value.ndim < 2 or value.dtype != torch.float32:
+            packed[name] = value
+        elif name.startswith(coarse):
+            scale = value.flatten(1).abs().amax(dim=1).clamp_min(torch.finfo().tiny) / _LARGEST
+            per_channel = scale.view(-1, *[1] * (value.ndim - 1))
+            packed[name] = (value / per_channel).round().to(torch.int8)
+            packed[name + SCALE] = scale
+        else:
+            packed[name] = value.to(torch.float16)
+    return packed
+
+
+def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights of a file as float32; those that are not packed come back as they are."""
+    state: dict[str, Tensor] = {}
+    for name, value in packed.items():
+        scale = packed.get(name + SCALE)
+        if scale is not None:
+            state[name] = value.float() * scale.view(-1, *[1] * (value.ndim - 1))
+        elif not name.endswith(SCALE):
+            state[name] = value.float() if value.dtype == torch.float16 else value
+    return state

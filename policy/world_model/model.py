@@ -21,9 +21,8 @@ from policy.errors import PolicyError
 from policy.nets.diffusion import DdimStep
 from policy.world_model.autoencoder import FrameAutoencoder, to_bytes, to_unit
 from policy.world_model.config import FACTOR, WorldModelConfig
-from policy.world_model.dynamics import Conditioning, Future, LatentDynamics
+from policy.world_model.dynamics import Conditioning, Future, LatentDynamics, MotionPredictor
 from policy.world_model.frame_warp import FrameWarp, Poses, SourceFrame
-from policy.world_model.motion_predictor import MotionPredictor
 from policy.world_model.relative_state import (
     MOTION_DIM,
     MOTION_SCALE,

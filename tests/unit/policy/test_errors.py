@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings
-from policy.engines.numpy_eager import make_numpy_executable
+from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError, user_code
 
 
