@@ -6,7 +6,7 @@ carries its ``Contract`` in the header, and the bridge refuses one that it canno
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from policy.errors import ContractError
 
 CONTRACT_VERSION = 1
+NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
     *("vx_mps", "vy_mps", "vz_mps"),
@@ -71,7 +72,6 @@ class Contract:
     feature_dim: int = 0
     """F of encode_visual's [B, F]; 0 where there is no fast path."""
     horizon: int = 16
-    """Actions in a chunk."""
     chunk_dt_s: float = 0.05
     """Time between the actions of a chunk; action 0 acts at the time of the state."""
     history_len: int = 4
@@ -79,7 +79,6 @@ class Contract:
     history_dt_s: float = 0.05
     """Time between them; the newest is history_dt_s before the state."""
     arrays: Arrays = "torch"
-    """Kind of arrays that the policy takes and returns."""
     since_exposure: bool = False
     """The state is followed by ``SINCE_EXPOSURE_NAMES``."""
     version: int = CONTRACT_VERSION
@@ -165,6 +164,16 @@ def _rgb(name: str, value: object) -> tuple[float, float, float]:
     raise ContractError(f"{name} must be three numbers, got {value!r}")
 
 
+def history_ages_ns(length: int, dt_s: float) -> Sequence[int]:
+    """Ages of the sticks in a history, oldest first; the newest is ``dt_s`` before the tick.
+
+    A stick holds until the next one is sent, so the one at a time is the newest sent by then.
+    Released sticks, and those before the first was sent, are neutral.
+    """
+    dt_ns = round(dt_s * NS_PER_S)
+    return range(length * dt_ns, 0, -dt_ns)
+
+
 @runtime_checkable
 class SingleRatePolicy(Protocol):
     """The minimum that flies: image, state and history in, a chunk out.
@@ -178,7 +187,6 @@ class SingleRatePolicy(Protocol):
 
     def predict(self, image: Any, state: Any, action_history: Any, num_diffusion_steps: int) -> Any:
         """Encode the image and sample one chunk."""
-        ...
 
 
 @runtime_checkable
@@ -187,13 +195,11 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
 
     def encode_visual(self, image: Any) -> Any:
         """Image [B, 3, H, W] -> feature [B, F]."""
-        ...
 
     def predict_fast(
         self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
     ) -> Any:
         """Cached feature [B, F], newest state and history -> chunk [B, horizon, 4]."""
-        ...
 
 
 class NoiseModel(Protocol):
@@ -202,11 +208,9 @@ class NoiseModel(Protocol):
     @property
     def initial_noise(self) -> Any:
         """[1, horizon, 4]; the same for a whole flight."""
-        ...
 
     def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
         """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-        ...
 
 
 @runtime_checkable
@@ -228,7 +232,6 @@ class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
     ) -> Any:
         """``count`` steps of a solve: ``noisy`` [B, horizon, 4] as step ``first`` starts with it
         -> as the next step would; after the last step, the chunk."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

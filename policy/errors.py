@@ -1,7 +1,14 @@
 """The root of every expected error, and those of policies; ``mavbridge.core.errors`` has the rest.
 
-It lies here because ``policy`` imports nothing of ``mavbridge``.
+They lie here because ``policy`` imports nothing of ``mavbridge``.
 """
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+_OURS = Path(__file__).parent
 
 
 class MavbridgeError(Exception):
@@ -18,3 +25,23 @@ class ContractError(PolicyError):
 
 class CheckpointError(PolicyError):
     """A checkpoint that cannot be read, or does not fit; the message says what to do."""
+
+
+@contextmanager
+def user_code(doing: str) -> Iterator[None]:
+    """Turn any exception of a user's policy into a ``PolicyError`` with its file and line.
+
+    The message begins with ``doing``; an exception that is a ``PolicyError`` already passes.
+    """
+    try:
+        yield
+    except PolicyError:
+        raise
+    except Exception as error:
+        theirs = [
+            frame
+            for frame in traceback.extract_tb(error.__traceback__)
+            if not frame.filename.startswith("<") and _OURS not in Path(frame.filename).parents
+        ]
+        where = f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""
+        raise PolicyError(f"{doing}: {type(error).__name__}: {error}{where}") from error

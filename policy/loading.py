@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING, Any
 
 from policy.checkpoints.header import read_contract
 from policy.contract import Contract, DualRatePolicy, Executable, SingleRatePolicy, WarmStartPolicy
-from policy.engines.executable import EngineName, ExecutionSettings
-from policy.errors import PolicyError
+from policy.engines.executable import EngineName, ExecutionSettings, make_numpy_executable
+from policy.errors import PolicyError, user_code
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 from policy.scripted import ScriptedPolicy
-from policy.user_code import user_code
 
 if TYPE_CHECKING:
     from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
@@ -71,7 +70,6 @@ class LoadedPolicy:
 
     executable: Executable
     notes: tuple[str, ...]
-    """Lines to show before take-off."""
 
 
 def check_request(request: PolicyRequest) -> None:
@@ -104,11 +102,7 @@ def check_request(request: PolicyRequest) -> None:
 
 
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
-    """Find, build, load and try a policy.
-
-    Args:
-        request: which one.
-        now_s: monotonic seconds, for scripted programs.
+    """Find, build, load and try a policy; ``now_s``, monotonic seconds, is for scripted programs.
 
     Raises:
         PolicyError: with what was wrong, what was available and what to do.
@@ -184,8 +178,6 @@ def _executable(
 ) -> tuple[Executable, tuple[str, ...]]:
     """An engine that takes the policy's kind of arrays, and notes about the choice."""
     if policy.contract.arrays == "numpy":
-        from policy.engines.numpy_eager import make_numpy_executable
-
         if request.engine != "auto":
             raise PolicyError(
                 f"{request.spec} computes in numpy, which --engine {request.engine} cannot run: "
@@ -248,19 +240,15 @@ def _trained(
     policy.reset(seed)
     notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
     if checkpoint.suffix != ".safetensors":
-        notes.append(_assumptions(checkpoint, policy))
+        contract, schedule = policy.contract, policy.config.schedule
+        notes.append(
+            f"warning: {checkpoint} may hold no contract; it is flown with frame "
+            f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
+            f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
+            f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
+            f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
+        )
     return policy, notes
-
-
-def _assumptions(checkpoint: Path, policy: "BuiltinPolicy") -> str:
-    contract, schedule = policy.contract, policy.config.schedule
-    return (
-        f"warning: {checkpoint} may hold no contract; it is flown with frame "
-        f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
-        f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
-        f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
-        f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
-    )
 
 
 def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:

@@ -28,14 +28,12 @@ STATE_SCALE = (
 Fixed, not taken from data: every checkpoint shares it, and a sensor that is off by a unit shows.
 """
 
-
 SINCE_EXPOSURE_SCALE = (
     0.1,  # s: about the age of an image that is too old to be of use
     *(0.5, 0.5, 0.5),  # rad: an image turned by half its width
     *(2.0, 2.0, 2.0),  # m/s: two tenths of a second of hard acceleration
 )
 """As ``STATE_SCALE``, for what a contract may append to the state."""
-
 
 EGOCENTRIC_SCALE = (
     *(5.0, 5.0, 5.0),  # m/s
@@ -55,13 +53,8 @@ def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
 
     Velocity in body axes, the world's vertical axis in body axes, then rates, specific force and
     whatever the contract appends, unchanged. No net has to learn rotations, and none can recognise
-    a course by its heading.
-
-    Args:
-        columns: of the state, in the contract's order; floats, or arrays of any kind.
-
-    Returns:
-        12 columns, or 19: one fewer than came in.
+    a course by its heading. Columns are floats or arrays of any kind, in the contract's order; 12
+    or 19 come out, one fewer than came in.
     """
     vx, vy, vz, w, x, y, z, *rest = columns
     forward, side, up = matrix_columns(w, x, y, z)
@@ -80,14 +73,9 @@ def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
 
 
 def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:
-    """Resize and normalise one image.
+    """RGB image [H, W, 3] uint8 of any size -> [1, 3, image_height, image_width] float32.
 
-    Args:
-        rgb: [H, W, 3] uint8, RGB, any size.
-        contract: gives the size that the net takes, and its mean and standard deviation.
-
-    Returns:
-        [1, 3, image_height, image_width] float32, ``(rgb / 255 - mean) / std``.
+    It is resized, then normalised as ``(rgb / 255 - mean) / std`` by the contract.
 
     Raises:
         PolicyError: the array is not an RGB uint8 image.

@@ -78,10 +78,17 @@ def slerp(p: Q, q: Q, share: Any) -> Q:
     return multiply(p, _like(p, library.cos(half), scale * x, scale * y, scale * z))
 
 
-def about_z(angle_rad: Array) -> Array:
-    """Rotations [B, 4] by angles [B] about the third axis."""
-    zero = np.zeros_like(angle_rad)
-    return np.stack([np.cos(angle_rad / 2), zero, zero, np.sin(angle_rad / 2)], axis=-1)
+def motion_since_exposure(
+    attitude_then: Q, attitude_now: Q, velocity_change_world: V
+) -> tuple[V, V]:
+    """Rotation vector (rad) and change of velocity (m/s) in the body axes at the exposure.
+
+    Between two readings, the body turns at a constant rate and accelerates evenly; outside of all
+    readings it does neither.
+    """
+    body_from_world = conjugate(attitude_then)
+    turn: V = rotation_vector(multiply(body_from_world, attitude_now))
+    return turn, rotate(body_from_world, velocity_change_world)
 
 
 def _parts(values: Any) -> Any:

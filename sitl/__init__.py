@@ -2,3 +2,7 @@
 
 Nothing here comes from the bridge, so an agreement between the two is an agreement over the wire.
 """
+
+
+class UsageError(Exception):
+    """A flag, address or port that cannot be used; the message says why and what would work."""

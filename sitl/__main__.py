@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from sitl import UsageError
 from sitl.app import print_status, run_vehicle
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
+from sitl.clock import stop_on_signal
 from sitl.course.layout import course_to_json, make_course
-from sitl.errors import UsageError
-from sitl.stopping import stop_on_signal
 from sitl.vehicle.autopilot import VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions
 
@@ -92,7 +92,7 @@ def _film(args: argparse.Namespace) -> None:
             "camera --follow needs --camera shm:NAME, the name to publish frames under"
         )
     with stop_on_signal() as stop:
-        film_vehicle(args.follow, make_course(args.course), _camera(args), stop)
+        film_vehicle(args.follow, make_course(args.course), _camera(args), stop.is_set)
 
 
 def _camera(args: argparse.Namespace) -> CameraOptions:

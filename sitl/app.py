@@ -6,15 +6,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
+from sitl import UsageError
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
-from sitl.clock import NS_PER_S, Clock
+from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
 from sitl.course.layout import Course
-from sitl.errors import UsageError
 from sitl.link.transport import Transport, open_transport
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.stopping import StopRequest, stop_on_signal
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0

@@ -1,6 +1,9 @@
-"""The simulator's time source: CLOCK_MONOTONIC as integer nanoseconds, shared by all processes."""
+"""The host's clock, as integer nanoseconds shared by all processes, and its signals to stop."""
 
+import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
@@ -22,3 +25,35 @@ class Clock:
 def monotonic_from_wall_ns(wall_ns: int) -> int:
     """Convert a recent CLOCK_REALTIME stamp, such as the kernel's of a datagram."""
     return time.monotonic_ns() - (time.time_ns() - wall_ns)
+
+
+class StopRequest:
+    """A flag that a signal handler may set.
+
+    Not a ``threading.Event``: a second signal would wait for the lock that the first one's handler
+    holds.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+
+    def set(self) -> None:
+        """Request the stop."""
+        self._is_set = True
+
+    def is_set(self) -> bool:
+        """True once a stop was requested."""
+        return self._is_set
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[StopRequest]:
+    """Let SIGINT and SIGTERM request the stop; the old handlers come back afterwards."""
+    stop = StopRequest()
+    signals = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, lambda *_: stop.set()) for number in signals]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(signals, previous, strict=True):
+            signal.signal(number, handler)

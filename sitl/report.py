@@ -33,13 +33,9 @@ class FlightLog:
     def __init__(self, start_ns: int, course: Course | None) -> None:
         self.refused_messages = 0
         self.manual_controls = 0
-        """Accepted MANUAL_CONTROL messages."""
         self.texts: list[LogEntry] = []
-        """The vehicle's STATUSTEXTs: ``t_s`` and ``text``."""
         self.crash: Crash | None = None
-        """The first hard impact."""
         self.distance_m = 0.0
-        """Length of the path so far."""
         self._start_ns = start_ns
         self._course = course or Course(seed=0, gates=())
         self._has_course = course is not None

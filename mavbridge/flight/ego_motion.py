@@ -15,8 +15,7 @@ from policy.contract import (
     VELOCITY,
     VELOCITY_CHANGE,
 )
-from policy.observation import motion_since_exposure
-from policy.rotation import slerp
+from policy.rotation import motion_since_exposure, slerp
 
 MAX_READINGS = 1024
 """Readings of each kind: five seconds of the fastest attitude stream that a link carries."""

@@ -5,7 +5,7 @@ from bisect import bisect_right
 import numpy as np
 
 from mavbridge.core.records import NEUTRAL, FloatArray, Sticks
-from policy.observation import history_ages_ns
+from policy.contract import history_ages_ns
 
 
 def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks:
@@ -43,6 +43,6 @@ class SentHistory:
             del self._sent_ns[: old - 1], self._sent[: old - 1]
 
     def resample(self, now_ns: int) -> FloatArray:
-        """[1, K, 4], see ``policy.observation.history_ages_ns``."""
+        """[1, K, 4], see ``policy.contract.history_ages_ns``."""
         rows = [self._sent[bisect_right(self._sent_ns, now_ns - age)] for age in self._ages_ns]
         return np.array([rows], dtype=np.float32)

@@ -1,4 +1,7 @@
-"""The header of a checkpoint, read without torch and without the weights."""
+"""The header of a checkpoint, read without torch and without the weights.
+
+What is wrong with a file is raised as a ``CheckpointError``.
+"""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,11 +22,7 @@ SUFFIXES = (".safetensors", ".pt", ".pth")
 
 @contextmanager
 def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
-    """An open file of safetensors.
-
-    Raises:
-        CheckpointError: damaged, or of another format; also while it is read.
-    """
+    """An open file of safetensors; also errors while it is read are refused."""
     try:
         with safe_open(path, framework=framework) as file:
             yield file
@@ -34,11 +33,7 @@ def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
 
 
 def require_file(path: Path, suffixes: Sequence[str]) -> None:
-    """Refuse a path that is not a file of one of these suffixes, and say what is there.
-
-    Raises:
-        CheckpointError: another suffix, or no such file.
-    """
+    """Refuse a path that is not a file of one of these suffixes, and say what is there."""
     if path.suffix not in suffixes:
         raise CheckpointError(f"{path}: not a checkpoint; use one of {', '.join(suffixes)}")
     if not path.is_file():
@@ -48,11 +43,7 @@ def require_file(path: Path, suffixes: Sequence[str]) -> None:
 
 
 def require_header(path: Path, header: dict[str, str]) -> None:
-    """Refuse a file that does not say what it is.
-
-    Raises:
-        CheckpointError: a key is missing.
-    """
+    """Refuse a file that does not say what it is."""
     for key in HEADER_KEYS:
         if key not in header:
             raise CheckpointError(
@@ -66,8 +57,7 @@ def read_contract(path: Path) -> Contract | None:
     """The contract in a policy's file; None where it is a ``.pt``, which only torch can read.
 
     Raises:
-        CheckpointError: missing, damaged, or not a policy's file.
-        ContractError: its contract is malformed or of another version.
+        ContractError: the contract is malformed or of another version.
     """
     require_file(path, SUFFIXES)
     if path.suffix != ".safetensors":

@@ -28,8 +28,14 @@ from policy.checkpoints.header import (
     require_file,
     require_header,
 )
-from policy.checkpoints.packing import pack, unpack
-from policy.checkpoints.tensors import read_tensors, require_finite, require_fit, write_tensors
+from policy.checkpoints.tensors import (
+    pack,
+    read_tensors,
+    require_finite,
+    require_fit,
+    unpack,
+    write_tensors,
+)
 from policy.contract import Contract, FloatArray
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.errors import CheckpointError, PolicyError
@@ -56,11 +62,10 @@ _DAMAGED = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Contents:
-    """Contents of a file; None where it does not say."""
+    """Contents of a file; texts are None and ``vector`` is empty where it does not say."""
 
     state: dict[str, Tensor]
     vector: dict[str, Tensor]
-    """Empty, or the test vector by ``VECTOR_NAMES``."""
     contract: str | None
     architecture: str | None
 
@@ -75,11 +80,8 @@ def save_checkpoint(
 ) -> None:
     """Write weights, contract, architecture and a test vector; replaces ``path`` at once or not.
 
-    Args:
-        path: a ``.safetensors`` file.
-        policy: whose weights.
-        training: JSON that says how it was trained, for people and reports; no runtime reads it.
-        packed: a third of the size, rounded as ``packing`` says; the test vector is of the rounded.
+    ``training`` is JSON that says how it was trained, for people and reports. ``packed`` makes a
+    third of the size, rounded as ``pack`` says; the test vector is then of rounded weights.
 
     Raises:
         CheckpointError: weights that are not finite, or a path that cannot be written.
@@ -92,10 +94,9 @@ def save_checkpoint(
         policy.load_state_dict(unpack(state))
     for name, value in _make_vector(policy).items():
         state[VECTOR_PREFIX + name] = value
-    header = {
-        CONTRACT_KEY: policy.contract.to_json(),
-        ARCHITECTURE_KEY: _architecture_to_json(policy.config),
-    }
+    config = {name: value for name, value in asdict(policy.config).items() if name != "contract"}
+    architecture = json.dumps({"policy": _kind(policy.config), **config}, sort_keys=True)
+    header = {CONTRACT_KEY: policy.contract.to_json(), ARCHITECTURE_KEY: architecture}
     if training is not None:
         header[TRAINING_KEY] = training
     write_tensors(path, state, header)
@@ -104,16 +105,16 @@ def save_checkpoint(
 def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
     """Read a checkpoint into the network that it was made for, on the CPU, in eval mode.
 
-    Args:
-        path: a ``.safetensors``, ``.pt`` or ``.pth`` file.
-        fallback: the policy asked for; its kind must be the file's, and its values serve for what
-            a ``.pt`` does not say.
+    ``fallback`` is the policy that was asked for: its kind must be the file's, and its values serve
+    for what a ``.pt`` does not say.
 
     Raises:
         CheckpointError: missing, corrupt, of another policy or contract version, not finite, or
             it no longer makes the chunks of its test vector.
     """
-    contents = _read(path)
+    require_file(path, SUFFIXES)
+    is_safetensors = path.suffix == ".safetensors"
+    contents = _read_safetensors(path) if is_safetensors else _read_torch(path)
     require_finite(path, contents.state)
     try:
         policy = build_policy(_config_of(contents, fallback))
@@ -186,11 +187,6 @@ def _kind(config: BuiltinConfig) -> str:
     return "toge" if isinstance(config, TogeConfig) else "resnet-unet"
 
 
-def _architecture_to_json(config: BuiltinConfig) -> str:
-    data = {name: value for name, value in asdict(config).items() if name != "contract"}
-    return json.dumps({"policy": _kind(config), **data}, sort_keys=True)
-
-
 def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
     try:
         data: Any = json.loads(text)
@@ -205,11 +201,6 @@ def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
             f"malformed architecture {text[:200]!r} ({error}): export the checkpoint again"
         ) from error
     raise CheckpointError(f"policy {kind!r} is unknown; this build knows 'toge', 'resnet-unet'")
-
-
-def _read(path: Path) -> _Contents:
-    require_file(path, SUFFIXES)
-    return _read_safetensors(path) if path.suffix == ".safetensors" else _read_torch(path)
 
 
 def _read_safetensors(path: Path) -> _Contents:

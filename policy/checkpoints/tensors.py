@@ -1,4 +1,4 @@
-"""Files of weights, whatever the network: read, written, and refused in the same words."""
+"""Files of weights, whatever the network: read, written, and refused by a ``CheckpointError``."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from policy.checkpoints.header import open_safetensors
 from policy.errors import CheckpointError
 
+SCALE = ".int8_scale"
+"""After a weight's name: its scales, one an output channel."""
+_LARGEST = 127.0
+
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
-    """Write a ``.safetensors`` file; replaces ``path`` at once or not at all.
-
-    Raises:
-        CheckpointError: of another suffix, or a path that cannot be written.
-    """
+    """Write a ``.safetensors`` file; replaces ``path`` at once or not at all."""
     if path.suffix != ".safetensors":
         raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
     partial = path.with_name(path.name + ".partial")
@@ -30,22 +30,14 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
 
 
 def read_tensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Header and tensors of a ``.safetensors`` file.
-
-    Raises:
-        CheckpointError: damaged, or of another format.
-    """
+    """Header and tensors of a ``.safetensors`` file."""
     with open_safetensors(path, "pt") as file:
         header = file.metadata() or {}
         return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
 
 
 def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
-    """Refuse weights that no run could use.
-
-    Raises:
-        CheckpointError: NaN or infinity among them.
-    """
+    """Refuse weights with NaN or infinity among them."""
     bad = [name for name, value in state.items() if not torch.isfinite(value).all()]
     if bad:
         raise CheckpointError(
@@ -55,11 +47,7 @@ def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
 
 
 def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor]) -> None:
-    """Name the first few weights that do not fit; torch's own message lists hundreds.
-
-    Raises:
-        CheckpointError: other names or shapes than the network's.
-    """
+    """Name the first few weights that do not fit; torch's own message lists hundreds."""
     wanted = {name: list(value.shape) for name, value in policy.state_dict().items()}
     problems = [f"missing {name!r}" for name in wanted if name not in state]
     problems += [f"unexpected {name!r}" for name in state if name not in wanted]
@@ -73,3 +61,36 @@ def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor]) -> N
             f"{path}: does not fit this policy in {len(problems)} places: "
             f"{'; '.join(problems[:4])}. Choose the size and backbone that it was trained with"
         )
+
+
+def pack(state: Mapping[str, Tensor], *, coarse: str) -> dict[str, Tensor]:
+    """Weights small enough to ship, from float32: half precision, but int8 for ``coarse`` prefixes.
+
+    Those are the encoder's: most of the weights, and the least sensitive. Each output channel has a
+    scale of its own, so a weight is off by at most 1/254 of its channel's largest. What has one
+    dimension (norms, biases) stays in float32.
+    """
+    packed: dict[str, Tensor] = {}
+    for name, value in state.items():
+        if value.ndim < 2 or value.dtype != torch.float32:
+            packed[name] = value
+        elif name.startswith(coarse):
+            scale = value.flatten(1).abs().amax(dim=1).clamp_min(torch.finfo().tiny) / _LARGEST
+            per_channel = scale.view(-1, *[1] * (value.ndim - 1))
+            packed[name] = (value / per_channel).round().to(torch.int8)
+            packed[name + SCALE] = scale
+        else:
+            packed[name] = value.to(torch.float16)
+    return packed
+
+
+def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights of a file as float32; those that are not packed come back as they are."""
+    state: dict[str, Tensor] = {}
+    for name, value in packed.items():
+        scale = packed.get(name + SCALE)
+        if scale is not None:
+            state[name] = value.float() * scale.view(-1, *[1] * (value.ndim - 1))
+        elif not name.endswith(SCALE):
+            state[name] = value.float() if value.dtype == torch.float16 else value
+    return state

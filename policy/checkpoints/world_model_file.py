@@ -13,7 +13,6 @@ from policy.world_model.model import WorldModel
 
 WORLD_MODEL_KEY = "world_model"
 """Key in the header; a policy's file has ``architecture`` instead."""
-_SUFFIX = ".safetensors"
 _RENAMED = {
     "foresight.begin.": "motion_predictor.initial_hidden.",
     "foresight.read.": "motion_predictor.gru.",
@@ -29,15 +28,11 @@ def save_world_model(
 ) -> None:
     """Write weights and configuration; replaces ``path`` at once or not at all.
 
-    Args:
-        path: a ``.safetensors`` file.
-        model: whose weights.
-        training: JSON that says how it was trained, for people and reports.
-        half: whether to store float16, at half the size and some thousandth of rounding.
+    ``training`` is JSON that says how it was trained, for people and reports. ``half`` stores
+    float16, at half the size and some thousandth of rounding.
 
     Raises:
-        CheckpointError: weights that are not finite, also in float16, or a path that cannot be
-            written.
+        CheckpointError: weights that are not finite as stored, or a path that cannot be written.
     """
     dtype = torch.float16 if half else torch.float32
     state = {
@@ -58,9 +53,9 @@ def load_world_model(path: Path) -> WorldModel:
     Raises:
         CheckpointError: missing, damaged, of another kind or version, or not finite.
     """
-    if path.suffix != _SUFFIX:
-        raise CheckpointError(f"{path}: world models are stored as {_SUFFIX}")
-    require_file(path, (_SUFFIX,))
+    if path.suffix != ".safetensors":
+        raise CheckpointError(f"{path}: world models are stored as .safetensors")
+    require_file(path, (".safetensors",))
     header, tensors = read_tensors(path)
     state = {_current_name(name): value for name, value in tensors.items()}
     if WORLD_MODEL_KEY not in header or CONTRACT_KEY not in header:

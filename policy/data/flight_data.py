@@ -48,11 +48,9 @@ class FlightData:
     velocity_ns: Nanoseconds
     """[T] arrival of its velocity."""
     target_ns: Nanoseconds
-    """[M]"""
     target: FloatArray
-    """[M, 4] sticks to imitate."""
+    """[M, 4] sticks to imitate, at ``target_ns`` [M]."""
     sent_ns: Nanoseconds
-    """[S]"""
     sent: FloatArray
     """[S, 4] sticks that flew, each until the next one; zeros where they were released."""
     age_ns: Nanoseconds

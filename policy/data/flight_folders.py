@@ -48,11 +48,7 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_exemplary(folder: Path) -> bool:
-    """False for a demonstration that failed: flying into a gate's frame is not to be imitated.
-
-    Raises:
-        DatasetError: not a flight of ours.
-    """
+    """False for a demonstration that failed: flying into a gate's frame is not to be imitated."""
     meta = _read_meta(folder)
     return meta.get("source") != "demonstration" or meta.get("success") is not False
 

@@ -73,11 +73,8 @@ def store_frames(
 ) -> FrameStore:
     """Decode and resize, as in flight, the images that ``folder`` does not hold yet.
 
-    Args:
-        flights: whose images.
-        folder: one file a flight, named by the content of its video and the size.
-        size: pixels along a side of the stored images.
-        progress: called with the fraction done.
+    It has a file of images of ``size`` pixels a side for each flight, named by the content of its
+    video and the size. ``progress`` is called with the fraction done.
 
     Raises:
         DatasetError: no image in a flight, or no room on the disk.

@@ -13,11 +13,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from policy.contract import ACTION_NAMES, SPECIFIC_FORCE, STATE_NAMES, FloatArray, StateFrame
+from policy.contract import (
+    ACTION_NAMES,
+    NS_PER_S,
+    SPECIFIC_FORCE,
+    STATE_NAMES,
+    FloatArray,
+    StateFrame,
+)
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
 from policy.data.tables import file_digest, numbers, parse_state_frame, read_json, stamps, vectors
-from policy.observation import NS_PER_S
 
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
@@ -32,11 +38,8 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
 
     Stamps are those that ``mavbridge export`` adds; without them, image, state and action of a row
     are of its ``timestamp``. A LeRobot dataset does not say how old an image was when a policy
-    acted on it: ``age_ns`` is empty.
-
-    Args:
-        folder: the dataset, with ``meta/info.json``.
-        camera_key: the feature with the images; by default the only one.
+    acted on it: ``age_ns`` is empty. ``camera_key`` is the feature with the images, by default the
+    only one.
 
     Raises:
         DatasetError: another version, other features, or damaged; the message says what to do.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from policy.contract import (
     ACTION_DIM,
     AGE,
+    NS_PER_S,
     QUATERNION,
     RATE,
     ROTATION,
@@ -22,10 +23,11 @@ from policy.contract import (
     VELOCITY_CHANGE,
     Contract,
     FloatArray,
+    history_ages_ns,
 )
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, Nanoseconds
 from policy.data.interpolation import Indices, Interpolator, covered, nearest
-from policy.observation import NS_PER_S, history_ages_ns, motion_since_exposure
+from policy.rotation import motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
 """Largest distance of a tick from the moment that was drawn: two ticks at 100 Hz."""
@@ -85,12 +87,9 @@ class Timeline:
     def __init__(
         self, flights: Sequence[FlightData], contract: Contract, ages_ns: Nanoseconds
     ) -> None:
-        """Lay out the flights.
+        """Lay out the flights in the order in which their images are counted.
 
-        Args:
-            flights: in the order in which their images are counted.
-            contract: says what a sample holds.
-            ages_ns: sorted; an image's age in a sample is drawn from these.
+        An image's age in a sample is drawn from ``ages_ns``, which are sorted.
 
         Raises:
             DatasetError: not one image has a tick at any such age.
@@ -201,7 +200,16 @@ class Timeline:
         # Flights are seconds apart, so a time before the first stick finds the neutral row.
         row = np.maximum(np.searchsorted(self._sent_ns, at_ns, side="right") - 1, 0)
         history: FloatArray = self._sent[row]
-        return history if random is None else _forgetful(history, random)
+        if random is None:
+            return history
+        samples = len(ticks)
+        offset = random.normal(0.0, HISTORY_NOISE, (samples, 1, ACTION_DIM))
+        history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
+        chance = random.random(samples)
+        neutral = np.where(chance < FRESH_START_SHARE, random.integers(1, count + 1, samples), 0)
+        neutral = np.where(chance > 1 - BLIND_SHARE, count, neutral)
+        is_neutral = (np.arange(count) < neutral[:, None])[..., None]
+        return np.where(is_neutral, np.float32(0), history)
 
     def chunks(self, ticks: Indices) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Sticks [B, horizon, 4] to imitate, and which of them [B, horizon] are known."""
@@ -216,17 +224,6 @@ class Timeline:
         held = np.minimum(np.arange(horizon), last[:, None])
         filled = np.take_along_axis(chunk, held[..., None], axis=1)
         return filled.astype(np.float32), known
-
-
-def _forgetful(history: FloatArray, random: np.random.Generator) -> FloatArray:
-    """Histories [B, K, 4] with offset sticks, some of them partly or wholly neutral."""
-    samples, count, _ = history.shape
-    offset = random.normal(0.0, HISTORY_NOISE, (samples, 1, ACTION_DIM))
-    history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
-    chance = random.random(samples)
-    neutral = np.where(chance < FRESH_START_SHARE, random.integers(1, count + 1, samples), 0)
-    neutral = np.where(chance > 1 - BLIND_SHARE, count, neutral)
-    return np.where((np.arange(count) < neutral[:, None])[..., None], np.float32(0), history)
 
 
 def _starts_and_offsets(flights: Sequence[FlightData]) -> tuple[list[int], list[int]]:

@@ -1,4 +1,4 @@
-"""Read JSON and columns of Arrow tables, with one message for each way in which they are wrong."""
+"""Read JSON and columns of Arrow tables; what is wrong is raised as a ``DatasetError``."""
 
 import hashlib
 import json
@@ -13,11 +13,7 @@ from policy.data.flight_data import DatasetError, Nanoseconds
 
 
 def read_json(path: Path, kind: str) -> Any:
-    """The contents of a JSON file.
-
-    Raises:
-        DatasetError: not there, or not JSON.
-    """
+    """The contents of a JSON file; ``kind`` names what its folder should be."""
     try:
         return json.loads(path.read_text())
     except OSError as error:
@@ -27,11 +23,7 @@ def read_json(path: Path, kind: str) -> Any:
 
 
 def parse_state_frame(name: str, value: object) -> StateFrame:
-    """A state frame by its name in a file.
-
-    Raises:
-        DatasetError: an unknown one.
-    """
+    """A state frame by its name in a file."""
     if value not in get_args(StateFrame):
         raise DatasetError(
             f"{name}: its state frame is {value!r}; known are {list(get_args(StateFrame))}"
@@ -40,20 +32,12 @@ def parse_state_frame(name: str, value: object) -> StateFrame:
 
 
 def stamps(name: str, table: pa.Table, column: str) -> Nanoseconds:
-    """A column of integers.
-
-    Raises:
-        DatasetError: not numbers, or some are missing.
-    """
+    """A column of integers, none of them missing."""
     return numbers(name, table, column).astype(np.int64)
 
 
 def numbers(name: str, table: pa.Table, column: str) -> np.ndarray:
-    """A column of numbers, of its own type.
-
-    Raises:
-        DatasetError: not numbers, or some are missing.
-    """
+    """A column of numbers of its own type, none of them missing."""
     values = table[column]
     if values.null_count:
         raise DatasetError(f"{name}: {column} is missing in {values.null_count} rows")
@@ -64,11 +48,7 @@ def numbers(name: str, table: pa.Table, column: str) -> np.ndarray:
 
 
 def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
-    """A column of lists as [rows, width] float32, NaN where null.
-
-    Raises:
-        DatasetError: lists of another width, or numbers that are not finite.
-    """
+    """A column of lists of ``width`` finite numbers as [rows, width] float32, NaN where null."""
     values = table[column].combine_chunks()
     valid = values.is_valid().to_numpy(zero_copy_only=False).astype(bool)
     try:

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, VELOCITY, FloatArray
+from policy.contract import ACTION_DIM, NS_PER_S, QUATERNION, STATE_DIM, VELOCITY, FloatArray
 from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
 from policy.data.interpolation import Indices, Interpolator, nearest
-from policy.observation import NS_PER_S
 
 TOLERANCE = 0.25
 """Largest distance of a frame from its time in a window, over the time between two frames: no

@@ -7,7 +7,6 @@ checksum, because an engine that reads half a file may crash.
 import contextlib
 import hashlib
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 MAX_ENTRIES = 12
@@ -57,11 +56,9 @@ class CompileCache:
         return self._folder / f"{hashlib.sha256(key.encode()).hexdigest()}.graph"
 
     def _make_room(self) -> None:
-        newest_first = sorted(self._entries(), reverse=True)
-        for _, path in newest_first[MAX_ENTRIES:]:
-            path.unlink(missing_ok=True)
-
-    def _entries(self) -> Iterator[tuple[int, Path]]:
+        entries = []
         for path in self._folder.glob("*.graph*"):  # leftovers of a killed process count too
             with contextlib.suppress(FileNotFoundError):  # another process made room
-                yield path.stat().st_mtime_ns, path
+                entries.append((path.stat().st_mtime_ns, path))
+        for _, path in sorted(entries, reverse=True)[MAX_ENTRIES:]:
+            path.unlink(missing_ok=True)

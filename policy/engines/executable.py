@@ -17,9 +17,8 @@ from policy.contract import (
     WarmStartPolicy,
 )
 from policy.engines.warm_start import Segment, WarmStart, make_solve
-from policy.errors import PolicyError
+from policy.errors import PolicyError, user_code
 from policy.preprocess import image_to_input
-from policy.user_code import user_code
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
@@ -34,11 +33,8 @@ class ExecutionSettings:
     name: str
     """The policy's name in messages."""
     vision_device: str = "cpu"
-    """torch's name of where images are encoded."""
     action_device: str = "cpu"
-    """torch's name of where chunks are sampled."""
     num_diffusion_steps: int = 10
-    """Denoising steps of a full solve."""
     head_steps: int | None = None
     """Denoising steps of a solve from the last chunk; None = always a full solve."""
     dual_rate: bool = True
@@ -63,13 +59,7 @@ def make_executable(
 ) -> Executable:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
-    Args:
-        vision: the policy where images are encoded.
-        action: the same policy where chunks are sampled.
-        compile_vision: how ``vision``'s methods are run.
-        compile_action: how ``action``'s methods are run.
-        engine: its name.
-        settings: what was asked for.
+    ``vision`` encodes images and ``action`` samples chunks: one policy, perhaps on two devices.
 
     Raises:
         PolicyError: no fast path where one was asked for, or the policy failed on the sample.
@@ -93,6 +83,30 @@ def make_executable(
         sample = compile_action(lambda e, s, h: sampler.predict_fast(e, s, h, steps), fast)
         act = always_full(sample)
     return assemble(contract, encode, act, engine, settings)
+
+
+def make_numpy_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
+    """Wrap a numpy policy for the loops; tried once.
+
+    Raises:
+        PolicyError: no fast path where one was asked for, or it failed on a dummy sample.
+    """
+
+    def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
+        def run(*arrays: FloatArray) -> FloatArray:
+            # Copies in and out: what is published is read-only, and what is returned may be a
+            # buffer that the policy writes to again.
+            result = method(*(array.copy() for array in arrays))
+            if not isinstance(result, np.ndarray):
+                raise PolicyError(
+                    f"{settings.name} returned {type(result).__name__}; its contract says numpy "
+                    "arrays"
+                )
+            return np.array(result, np.float32)
+
+        return run
+
+    return make_executable(policy, policy, compile_, compile_, engine="numpy", settings=settings)
 
 
 def _warm_started(
@@ -130,12 +144,7 @@ def assemble(
 ) -> Executable:
     """An executable of an engine's two functions, tried on a dummy sample, which warms it up.
 
-    Args:
-        contract: of the policy.
-        encode: normalised image [1, 3, H, W] -> what ``act`` takes.
-        act: see ``Executable``.
-        engine: its name.
-        settings: what was asked for.
+    ``encode`` takes a normalised image [1, 3, H, W], ``act`` is that of ``Executable``.
 
     Raises:
         PolicyError: a function failed on the sample, or returned the wrong shape or no numbers.

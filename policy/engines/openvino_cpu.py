@@ -58,13 +58,8 @@ def make_openvino_executable(
     """Compile a policy for the loops, or take it from the user's cache; tried once.
 
     A module of a user is traced, so what it decides by a tensor's values, or keeps between calls,
-    is frozen. It is not cached: its code may change where its weights do not.
-
-    Args:
-        policy: a torch module on the CPU; its initial noise is taken as it is now.
-        settings: what was asked for.
-        vision: precision of the image path.
-        action: precision of the action path.
+    is frozen. It is not cached: its code may change where its weights do not. The initial noise of
+    the policy is taken as it is now; ``vision`` and ``action`` are the precisions of both paths.
 
     Raises:
         PolicyError: it is no torch module, cannot be converted, has no fast path where one was

@@ -19,13 +19,13 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, FloatArray
 from policy.engines.executable import Shape
+from policy.errors import user_code
 from policy.nets.action_head import DiffusionHead, size_dims
 from policy.nets.diffusion import DdimStep, NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.nets.unet1d import Conv, Norm, ResidualBlock, UNet1d
 from policy.preprocess import egocentric_scale
-from policy.user_code import user_code
 
 
 class _Traceable(nn.Module):
@@ -95,11 +95,9 @@ def step_inputs(
 ) -> tuple[FloatArray, FloatArray]:
     """Inputs that make a graph of ``unrolled`` steps run ``first`` to ``first + count`` of a solve.
 
-    Where those are fewer, steps that change nothing come before them.
-
-    Returns:
-        The timesteps' shares of FiLM [unrolled, film_dim], 1 added to the scales, and the
-        coefficients of ``_updated`` [unrolled, 4].
+    Where those are fewer, steps that change nothing come before them. Returns the timesteps' shares
+    of FiLM [unrolled, film_dim], 1 added to the scales, and the coefficients of ``_updated``
+    [unrolled, 4].
     """
     steps = head.schedule.ddim_steps(num_diffusion_steps)[first : first + count]
     timesteps = torch.tensor([step.timestep for step in steps])

@@ -58,11 +58,8 @@ def make_solve(
 ) -> Solve:
     """A solve of ``num_diffusion_steps`` in segments; only the first may have fewer steps.
 
-    Args:
-        start: its initial noise is taken as it is now.
-        segment: (first step, number of steps) -> what runs them.
-        num_diffusion_steps: in all.
-        segment_steps: in each segment.
+    ``segment`` makes the function that runs so many steps from a first one on. The initial noise of
+    ``start`` is taken as it is now.
 
     Raises:
         PolicyError: the solve does not have ``segment_steps``.
@@ -85,11 +82,9 @@ def make_solve(
 
 
 def shift_chunk(chunk: FloatArray, periods: float) -> FloatArray:
-    """The chunk as it is ``periods`` of its actions later, its last action held.
+    """The chunk [1, horizon, 4] ``periods`` >= 0 of its actions later, its last action held.
 
-    Args:
-        chunk: [1, horizon, 4].
-        periods: 0 or more; linear between two actions.
+    It is linear between two actions.
     """
     last = chunk.shape[1] - 1
     at = np.minimum(np.arange(last + 1) + periods, last)
@@ -106,24 +101,14 @@ class _Guess:
     """From the state that it was made from to that of the last call."""
 
 
+@dataclass(slots=True)
 class _SpreadSolve:
     """A full solve on the inputs of the tick where it began, a segment at a time."""
 
-    def __init__(
-        self, solve: Solve, encoded: FloatArray, state: FloatArray, history: FloatArray
-    ) -> None:
-        # Copies: the caller may write to its arrays before the last segment reads them.
-        self._inputs = encoded.copy(), state.copy(), history.copy()
-        self._noisy = solve.noise
-        self._segments = solve.segments
-        self._done = 0
-        self.age_s = 0.0
-
-    def run_segment(self) -> FloatArray | None:
-        """The chunk, if that was the last segment."""
-        self._noisy = self._segments[self._done](*self._inputs, self._noisy)
-        self._done += 1
-        return self._noisy if self._done == len(self._segments) else None
+    inputs: tuple[FloatArray, FloatArray, FloatArray]
+    noisy: FloatArray
+    segments_done: int = 0
+    age_s: float = 0.0
 
 
 class WarmStart:
@@ -160,7 +145,9 @@ class WarmStart:
             spread.age_s += elapsed_s
         elif self._since_full_s >= FULL_EVERY_S:
             self._since_full_s = 0.0
-            spread = _SpreadSolve(self._solve, encoded, state, history)
+            # Copies: the caller may write to its arrays before the last segment reads them.
+            inputs = encoded.copy(), state.copy(), history.copy()
+            spread = _SpreadSolve(inputs, self._solve.noise)
         if spread is not None:
             self._run_segment(spread)
         return chunk
@@ -174,8 +161,9 @@ class WarmStart:
         return chunk
 
     def _run_segment(self, spread: _SpreadSolve) -> None:
-        chunk = spread.run_segment()
-        if chunk is None:
+        spread.noisy = self._solve.segments[spread.segments_done](*spread.inputs, spread.noisy)
+        spread.segments_done += 1
+        if spread.segments_done < len(self._solve.segments):
             self._spread = spread
         else:
-            self._guess = _Guess(chunk, spread.age_s)
+            self._guess = _Guess(spread.noisy, spread.age_s)

@@ -9,7 +9,7 @@ from policy.contract import ACTION_DIM, Contract
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule, ddim_solve
 from policy.nets.names import SIZE_NAMES, Size
-from policy.nets.unet1d import UNet1d, UNet1dConfig
+from policy.nets.unet1d import UNet1d
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +52,8 @@ class DiffusionHead(nn.Module):
 
     The initial noise is fixed for a flight: the same inputs then give the same sticks, and chunks
     do not jitter from sample to sample. It is not part of a checkpoint.
+
+    Steps that the schedule does not have raise a ``PolicyError``.
     """
 
     def __init__(self, size: Size, contract: Contract, schedule: NoiseSchedule) -> None:
@@ -59,12 +61,7 @@ class DiffusionHead(nn.Module):
         dims = size_dims(size)
         self.schedule = schedule
         self.unet = UNet1d(
-            UNet1dConfig(
-                horizon=contract.horizon,
-                action_dim=ACTION_DIM,
-                condition_dim=dims.base_dim,
-                widths=dims.widths,
-            )
+            horizon=contract.horizon, condition_dim=dims.base_dim, widths=dims.widths
         )
         self.direct = nn.Linear(dims.base_dim, contract.horizon * ACTION_DIM)
         self._timesteps: Tensor
@@ -81,11 +78,7 @@ class DiffusionHead(nn.Module):
         self.initial_noise.copy_(torch.randn(self.initial_noise.shape, generator=generator))
 
     def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with.
-
-        Raises:
-            PolicyError: the schedule has no such number of steps.
-        """
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
         step = self.schedule.ddim_steps(num_diffusion_steps)[first]
         return step.signal, step.noise
 
@@ -106,11 +99,7 @@ class DiffusionHead(nn.Module):
         return chunk.reshape(condition.shape[0], -1, ACTION_DIM)
 
     def sample(self, condition: Tensor, num_diffusion_steps: int) -> Tensor:
-        """Condition [B, C] -> chunk [B, horizon, 4] in [-1, 1].
-
-        Raises:
-            PolicyError: the number of steps is not one that the schedule has.
-        """
+        """Condition [B, C] -> chunk [B, horizon, 4] in [-1, 1]."""
         noise = self.initial_noise.expand(condition.shape[0], -1, -1)
         return self.denoise_steps(condition, noise, num_diffusion_steps, 0, num_diffusion_steps)
 
@@ -119,15 +108,8 @@ class DiffusionHead(nn.Module):
     ) -> Tensor:
         """``count`` steps of a solve from step ``first`` on, bit for bit as within the whole one.
 
-        Args:
-            condition: [B, C].
-            noisy: [B, horizon, 4], as step ``first`` starts with it.
-            num_diffusion_steps: of the whole solve.
-            first: counted from 0, the noisiest step.
-            count: how many steps.
-
-        Raises:
-            PolicyError: the schedule or the solve has no such steps.
+        ``noisy`` [B, horizon, 4] is what step ``first``, counted from 0, starts with; the condition
+        is [B, C].
         """
         steps = self.schedule.ddim_steps(num_diffusion_steps)
         if not 0 <= first < first + count <= num_diffusion_steps:

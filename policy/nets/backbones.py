@@ -33,20 +33,14 @@ def build_backbone(name: BackboneName) -> Backbone:
             backbone = ResNet(BasicBlock, (2, 2, 2, 2))
         case "resnet50":
             backbone = ResNet(Bottleneck, (3, 4, 6, 3))
-    _initialise(backbone)
-    return backbone
-
-
-def _initialise(backbone: Backbone) -> None:
-    """He et al. 2015, fan-in: the signal survives the depth before any batch norm has statistics.
-
-    With torch's own default an untrained EfficientNet-B3 maps every image to about 1e-13.
-    """
+    # He et al. 2015, fan-in: the signal survives the depth before any batch norm has statistics.
+    # With torch's own default an untrained EfficientNet-B3 maps every image to about 1e-13.
     for module in backbone.modules():
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, mode="fan_in", nonlinearity="relu")
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
+    return backbone
 
 
 def load_imagenet_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:

@@ -4,7 +4,6 @@ Stochastic depth is left out: it holds no parameters and does nothing in flight.
 """
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.nets.pooling import MOMENTS, moments
@@ -19,11 +18,7 @@ class ChannelNorm(nn.LayerNorm):
 
     def forward(self, x: Tensor) -> Tensor:
         """[B, C, H, W] -> the same."""
-        channels_last = x.permute(0, 2, 3, 1)
-        normed = F.layer_norm(
-            channels_last, self.normalized_shape, self.weight, self.bias, self.eps
-        )
-        return normed.permute(0, 3, 1, 2)
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 class Permute(nn.Module):
@@ -71,20 +66,13 @@ class ConvNextTiny(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        layers: list[nn.Module] = [
-            nn.Sequential(
-                nn.Conv2d(3, WIDTHS[0], 4, stride=4), ChannelNorm(WIDTHS[0], eps=NORM_EPS)
-            )
-        ]
+        stem = nn.Conv2d(3, WIDTHS[0], 4, stride=4)
+        layers: list[nn.Module] = [nn.Sequential(stem, ChannelNorm(WIDTHS[0], eps=NORM_EPS))]
         for index, (width, depth) in enumerate(zip(WIDTHS, DEPTHS, strict=True)):
             layers.append(nn.Sequential(*[ConvNextBlock(width) for _ in range(depth)]))
             if index + 1 < len(WIDTHS):
-                layers.append(
-                    nn.Sequential(
-                        ChannelNorm(width, eps=NORM_EPS),
-                        nn.Conv2d(width, WIDTHS[index + 1], 2, stride=2),
-                    )
-                )
+                halve = nn.Conv2d(width, WIDTHS[index + 1], 2, stride=2)
+                layers.append(nn.Sequential(ChannelNorm(width, eps=NORM_EPS), halve))
         self.features = nn.Sequential(*layers)
         self.classifier = nn.Sequential(ChannelNorm(WIDTHS[-1], eps=NORM_EPS), nn.Flatten())
         self.out_dim = MOMENTS * WIDTHS[-1]

@@ -32,14 +32,13 @@ TRAIN_TIMESTEPS = 100
 class DdimStep:
     """One reverse step: where it starts, and the coefficients of the state before and after it.
 
-    Plain floats, so that a tracer folds them to constants and float64 stays float64.
+    ``signal`` is sqrt(a_t), ``noise`` sqrt(1 - a_t). They are plain floats, so that a tracer folds
+    them to constants and float64 stays float64.
     """
 
     timestep: int
     signal: float
-    """sqrt(a_t)"""
     noise: float
-    """sqrt(1 - a_t)"""
     next_signal: float
     next_noise: float
 
@@ -95,15 +94,10 @@ class NoiseSchedule:
         return _ddim_steps(total, self.betas, count)
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
-        """Forward process, for training.
-
-        Args:
-            clean: [B, horizon, 4] actions in [-1, 1].
-            noise: standard normal, same shape.
-            timestep: [B] int64 in 0..num_train_timesteps-1.
+        """Forward process, for training: clean [B, ...] and standard normal noise -> noisy.
 
         Raises:
-            PolicyError: shapes or timesteps do not fit.
+            PolicyError: shapes do not fit, or a timestep [B] is not in 0..num_train_timesteps-1.
         """
         if clean.shape != noise.shape or timestep.shape != clean.shape[:1]:
             raise PolicyError(

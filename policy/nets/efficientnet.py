@@ -72,18 +72,10 @@ class EfficientNetB3(nn.Module):
         layers: list[nn.Module] = [_conv_norm(3, STEM_CHANNELS, 3, stride=2)]
         channels = STEM_CHANNELS
         for expand, kernel, stride, channels_out, depth in STAGES:
-            blocks = []
-            for index in range(depth):
-                blocks.append(
-                    MBConv(
-                        channels,
-                        channels_out,
-                        expand=expand,
-                        kernel=kernel,
-                        stride=stride if index == 0 else 1,
-                    )
-                )
-                channels = channels_out
+            blocks = [MBConv(channels, channels_out, expand=expand, kernel=kernel, stride=stride)]
+            channels = channels_out
+            for _ in range(depth - 1):
+                blocks.append(MBConv(channels, channels, expand=expand, kernel=kernel, stride=1))
             layers.append(nn.Sequential(*blocks))
         layers.append(_conv_norm(channels, OUT_CHANNELS, 1))
         self.features = nn.Sequential(*layers)
@@ -104,18 +96,9 @@ def _conv_norm(
     groups: int = 1,
     activation: bool = True,
 ) -> nn.Sequential:
-    layers: list[nn.Module] = [
-        nn.Conv2d(
-            channels_in,
-            channels_out,
-            kernel,
-            stride=stride,
-            padding=kernel // 2,
-            groups=groups,
-            bias=False,
-        ),
-        nn.BatchNorm2d(channels_out),
-    ]
+    pad = kernel // 2
+    conv = nn.Conv2d(channels_in, channels_out, kernel, stride, pad, groups=groups, bias=False)
+    layers: list[nn.Module] = [conv, nn.BatchNorm2d(channels_out)]
     if activation:
         layers.append(nn.SiLU(inplace=True))
     return nn.Sequential(*layers)

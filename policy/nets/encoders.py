@@ -12,11 +12,7 @@ HEADS = 4
 
 
 def require_shape(name: str, array: Tensor, *shape: int) -> None:
-    """Refuse ``array`` unless it is [B, *shape].
-
-    Raises:
-        PolicyError: it is not.
-    """
+    """Raise a ``PolicyError`` unless ``array`` is [B, *shape]."""
     if array.ndim != len(shape) + 1 or tuple(array.shape[1:]) != shape:
         wanted = ", ".join(["B", *map(str, shape)])
         raise PolicyError(f"{name} must be [{wanted}], got {list(array.shape)}")

@@ -60,19 +60,11 @@ class ResnetUnet(nn.Module):
         """Start a flight: fixes the initial noise of all samples to come."""
         self.head.reset(seed)
 
-    def fuse_visual(self, visual: Tensor, state: Tensor, action_history: Tensor) -> Tensor:
-        """Projected image [B, C], state, history [B, K, 4] -> condition [B, C]."""
-        return self.condition(visual, self.state_encoder(state), action_history)
-
     def condition(self, visual: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
         """Projected image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C]."""
         parts = [visual, state_token, action_history.flatten(1)]
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition
-
-    def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
-        """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
-        return self.head.denoise(noisy, timestep, condition)
 
     def predict(
         self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int = 10
@@ -87,5 +79,5 @@ class ResnetUnet(nn.Module):
         require_shape("state", state, contract.state_dim)
         require_shape("action_history", action_history, contract.history_len, ACTION_DIM)
         visual = self.visual_projection(self.backbone(image))
-        condition = self.fuse_visual(visual, state, action_history)
+        condition = self.condition(visual, self.state_encoder(state), action_history)
         return self.head.sample(condition, num_diffusion_steps)

@@ -55,7 +55,8 @@ class TogeConfig:
 class Toge(nn.Module):
     """The policy protocol of ``contract.DualRatePolicy``, on torch tensors.
 
-    Images are normalised by ``preprocess.image_to_input``, states are in SI units.
+    Images are normalised by ``preprocess.image_to_input``, states are in SI units. A shape that is
+    not the contract's, or steps that the schedule does not have, raise a ``PolicyError``.
     """
 
     def __init__(self, config: TogeConfig) -> None:
@@ -78,11 +79,7 @@ class Toge(nn.Module):
         self.head.reset(seed)
 
     def encode_visual(self, image: Tensor) -> Tensor:
-        """Image [B, 3, H, W] -> feature [B, F]: the slow path.
-
-        Raises:
-            PolicyError: the image is not of the contract's size.
-        """
+        """Image [B, 3, H, W] -> feature [B, F]: the slow path."""
         require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
         feature: Tensor = self.visual_projection(self.backbone(image))
         return feature
@@ -93,9 +90,6 @@ class Toge(nn.Module):
         """Feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
 
         No history is the same as sticks that were centred all the time: training shows both so.
-
-        Raises:
-            PolicyError: a shape is not the contract's.
         """
         require_shape("feature", feature, self.contract.feature_dim)
         require_shape("state", state, self.contract.state_dim)
@@ -109,10 +103,6 @@ class Toge(nn.Module):
         condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
         return condition
 
-    def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
-        """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
-        return self.head.denoise(noisy, timestep, condition)
-
     def predict_fast(
         self,
         feature: Tensor,
@@ -120,11 +110,7 @@ class Toge(nn.Module):
         action_history: Tensor | None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
-        """Cached feature, newest state and history -> chunk [B, horizon, 4] in [-1, 1].
-
-        Raises:
-            PolicyError: a shape is not the contract's, or the steps are not 1..100.
-        """
+        """Cached feature, newest state and history -> chunk [B, horizon, 4] in [-1, 1]."""
         condition = self.encode_and_fuse(feature, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)
 
@@ -134,11 +120,7 @@ class Toge(nn.Module):
         return self.head.initial_noise
 
     def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with.
-
-        Raises:
-            PolicyError: the steps are not 1..100.
-        """
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
         return self.head.noise_shares(num_diffusion_steps, first)
 
     def denoise_fast(
@@ -151,11 +133,7 @@ class Toge(nn.Module):
         first: int,
         count: int,
     ) -> Tensor:
-        """Steps ``first`` to ``first + count`` of ``predict_fast``: [B, horizon, 4] -> the same.
-
-        Raises:
-            PolicyError: a shape is not the contract's, or the solve has no such steps.
-        """
+        """Steps ``first`` to ``first + count`` of ``predict_fast``: [B, horizon, 4] -> the same."""
         require_shape("noisy", noisy, self.contract.horizon, ACTION_DIM)
         condition = self.encode_and_fuse(feature, state, action_history)
         return self.head.denoise_steps(condition, noisy, num_diffusion_steps, first, count)

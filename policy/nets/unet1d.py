@@ -10,42 +10,17 @@ weights and the number of steps, and an engine can fold it and fuse the rest int
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from policy.contract import ACTION_DIM
 from policy.errors import PolicyError
 
 GROUPS = 8
+TAPS = 5
 TIME_DIM = 128
-
-
-@dataclass(frozen=True, kw_only=True)
-class UNet1dConfig:
-    """Shape of the denoiser.
-
-    Raises:
-        PolicyError: the horizon cannot be halved once per level.
-    """
-
-    horizon: int
-    action_dim: int
-    condition_dim: int
-    widths: tuple[int, ...]
-    """Channels of each level, a multiple of 8; the length halves from one level to the next."""
-    taps: int = 5
-    """Length of the convolutions' kernels, odd."""
-
-    def __post_init__(self) -> None:
-        """Refuse a horizon that would come back with another length."""
-        factor = 2 ** (len(self.widths) - 1)
-        if self.horizon % factor:
-            raise PolicyError(
-                f"a horizon of {self.horizon} does not suit {len(self.widths)} U-Net levels; "
-                f"use a multiple of {factor}"
-            )
 
 
 class Conv(nn.Module):
@@ -81,11 +56,11 @@ class Norm(nn.GroupNorm):
 class ResidualBlock(nn.Module):
     """Two convolutions with FiLM between them, around a shortcut; [B, L, C_in] -> [B, L, C_out]."""
 
-    def __init__(self, channels_in: int, channels_out: int, taps: int) -> None:
+    def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
-        self.conv1 = Conv(channels_in, channels_out, taps)
+        self.conv1 = Conv(channels_in, channels_out, TAPS)
         self.norm1 = Norm(GROUPS, channels_out)
-        self.conv2 = Conv(channels_out, channels_out, taps)
+        self.conv2 = Conv(channels_out, channels_out, TAPS)
         self.norm2 = Norm(GROUPS, channels_out)
         self.shortcut: nn.Module = nn.Identity()
         if channels_in != channels_out:
@@ -102,29 +77,39 @@ class ResidualBlock(nn.Module):
 
 
 class UNet1d(nn.Module):
-    """Denoiser over [B, horizon, action_dim]."""
+    """Denoiser over [B, horizon, 4].
 
-    def __init__(self, config: UNet1dConfig) -> None:
+    ``widths`` are the channels of each level, multiples of 8; the length halves from one level to
+    the next.
+
+    Raises:
+        PolicyError: the horizon cannot be halved so often.
+    """
+
+    def __init__(self, *, horizon: int, condition_dim: int, widths: tuple[int, ...]) -> None:
         super().__init__()
-        self.config = config
-        widths, taps = config.widths, config.taps
+        factor = 2 ** (len(widths) - 1)
+        if horizon % factor:
+            raise PolicyError(
+                f"a horizon of {horizon} does not suit {len(widths)} U-Net levels; "
+                f"use a multiple of {factor}"
+            )
         self.down, self.downsample = nn.ModuleList(), nn.ModuleList()
         self.up, self.upsample = nn.ModuleList(), nn.ModuleList()
-        channels = config.action_dim
+        channels = ACTION_DIM
         for width in widths[:-1]:
-            self.down.append(ResidualBlock(channels, width, taps))
+            self.down.append(ResidualBlock(channels, width))
             self.downsample.append(Conv(width, width, 3, stride=2))
             channels = width
         self.mid = nn.ModuleList(
-            [ResidualBlock(channels, widths[-1], taps), ResidualBlock(widths[-1], widths[-1], taps)]
+            [ResidualBlock(channels, widths[-1]), ResidualBlock(widths[-1], widths[-1])]
         )
         channels = widths[-1]
         for width in reversed(widths[:-1]):
             self.upsample.append(Conv(channels, width, 3))
-            self.up.append(ResidualBlock(2 * width, width, taps))
+            self.up.append(ResidualBlock(2 * width, width))
             channels = width
-        self.out = nn.Linear(channels, config.action_dim)
-
+        self.out = nn.Linear(channels, ACTION_DIM)
         widths_of_blocks = (*widths[:-1], widths[-1], widths[-1], *reversed(widths[:-1]))
         self.film_sizes = [2 * width for width in widths_of_blocks]
         self.film_dim = sum(self.film_sizes)
@@ -136,7 +121,7 @@ class UNet1d(nn.Module):
         )
         self.film_time = nn.Linear(TIME_DIM, self.film_dim)
         self.film_condition = nn.Sequential(
-            nn.SiLU(), nn.Linear(config.condition_dim, self.film_dim, bias=False)
+            nn.SiLU(), nn.Linear(condition_dim, self.film_dim, bias=False)
         )
         self._frequencies: Tensor
         self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
@@ -153,7 +138,7 @@ class UNet1d(nn.Module):
         return film
 
     def forward(self, noisy: Tensor, film: Tensor) -> Tensor:
-        """Noisy actions [B, horizon, action_dim] and FiLM [B, film_dim] -> the net's prediction."""
+        """Noisy actions [B, horizon, 4] and FiLM [B, film_dim] -> the net's prediction."""
         films = iter(torch.split(film, self.film_sizes, dim=-1))
         x = noisy
         skips = []

@@ -40,7 +40,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, kw_only=True)
 class Batch(TensorBatch):
-    """``B`` images and ``S`` = R times as many samples of a policy; image i serves R samples."""
+    """``B`` images and ``S`` = R times as many samples of a policy; image i serves R samples.
+
+    The samples are state [S, state_dim], history [S, K, 4], chunk and noise [S, horizon, 4], known
+    [S, horizon] bool, and timestep [S] int64.
+    """
 
     images: Tensor | None
     """[B, height, width, 3] uint8, or None where ``features`` are given."""
@@ -51,19 +55,13 @@ class Batch(TensorBatch):
     features: Tensor | None
     """[B, D] outputs of the backbone."""
     state: Tensor
-    """[S, state_dim]"""
     history: Tensor
-    """[S, K, 4]"""
     chunk: Tensor
-    """[S, horizon, 4]"""
     known: Tensor
-    """[S, horizon] bool"""
     gate: Tensor
     """[B, 7], NaN where unknown."""
     noise: Tensor
-    """[S, horizon, 4]"""
     timestep: Tensor
-    """[S] int64"""
 
     def split(self, count: int) -> list[Self]:
         """At most ``count`` parts of about the same size, each of two images or more."""
@@ -84,12 +82,9 @@ class FeatureStore:
     """Features or latents on disk, of plain and of mirrored images."""
 
     def __init__(self, path: Path, dim: int, row_of: Indices) -> None:
-        """Open it.
+        """Open a file of float16 rows, each ``dim`` wide.
 
-        Args:
-            path: float16 rows of ``dim``.
-            dim: width of a row.
-            row_of: [2, images] row of each image, plain and mirrored; -1 = was not encoded.
+        ``row_of`` [2, images] is the row of each image, plain and mirrored; -1 = was not encoded.
         """
         self._rows = np.memmap(path, np.float16, mode="r").reshape(-1, dim)
         self._row_of = row_of

@@ -50,14 +50,9 @@ def encode_rows(
     dim: int,
     should_continue: Callable[[float], bool],
 ) -> FeatureStore:
-    """Encode images to ``path``, in float16 to save half the disk, while there is time.
+    """Encode images to ``path``, as rows of ``dim`` float16, in the order of the jobs.
 
-    Args:
-        path: the file.
-        jobs: which images, in this order.
-        encode: makes rows of ``dim`` numbers.
-        dim: width of a row.
-        should_continue: takes the share that is done; False ends the encoding.
+    ``should_continue`` takes the share that is done; False ends the encoding.
 
     Raises:
         DatasetError: no room on the disk.

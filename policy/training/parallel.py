@@ -61,7 +61,8 @@ class Gradients(Generic[M]):
         threads = torch.get_num_threads() if device.type == "cpu" else 1
         shared = {id(weight): weight for weight in trainee.parameters()}
         others = [copy.deepcopy(trainee, dict(shared)) for _ in range(threads - 1)]
-        self._replicas = [trainee, *others]
+        self.replicas = [trainee, *others]
+        """The trainee, and copies that share its weights."""
         self._pool = ThreadPoolExecutor(
             threads,
             thread_name_prefix="train",
@@ -80,7 +81,7 @@ class Gradients(Generic[M]):
 
         The same numbers for the same batch and count of threads: parts are added in order.
         """
-        weights = [p for p in self._replicas[0].parameters() if p.requires_grad]
+        weights = [p for p in self.replicas[0].parameters() if p.requires_grad]
 
         def one(replica: M, part: B) -> tuple[Mapping[str, Tensor], Sequence[Tensor]]:
             with computing_in(self._device, self._bf16):
@@ -88,7 +89,7 @@ class Gradients(Generic[M]):
             made = torch.autograd.grad(loss.total, weights, materialize_grads=True)
             return {name: value.detach() for name, value in loss.metrics.items()}, made
 
-        results = list(self._pool.map(one, self._replicas, batch.split(len(self._replicas))))
+        results = list(self._pool.map(one, self.replicas, batch.split(len(self.replicas))))
         share = 1.0 / len(results)
         metrics = {name: value * share for name, value in results[0][0].items()}
         sums = [gradient * share for gradient in results[0][1]]
@@ -98,11 +99,6 @@ class Gradients(Generic[M]):
         for weight, gradient in zip(weights, sums, strict=True):
             weight.grad = gradient
         return metrics
-
-    def each(self, change: Callable[[M], object]) -> None:
-        """Do the same to the trainee and its replicas, such as to choose their mode."""
-        for replica in self._replicas:
-            change(replica)
 
 
 def row_parts(count: int, parts: int) -> list[slice]:

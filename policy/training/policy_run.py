@@ -2,7 +2,7 @@
 
 import copy
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -18,7 +18,7 @@ from policy.checkpoints.policy_file import (
     save_checkpoint,
 )
 from policy.contract import STATE_NAMES
-from policy.data.flight_data import DatasetError, FlightData, Nanoseconds, common_frame
+from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
@@ -33,7 +33,7 @@ from policy.training.encode import ENCODE_BATCH, Encode, encode_rows, one_way_fi
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, PolicyValidation, TrainResult, Validation
 from policy.training.run import TrainingRun, open_run
-from policy.training.run_folder import RunFolder
+from policy.training.run_folder import Position, RunFolder
 from policy.training.settings import MAX_AGE_MS, TrainSettings
 from policy.training.stages import TrainingStage, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
@@ -62,12 +62,7 @@ def train_policy(
 ) -> TrainResult:
     """Train, and write the best weights on held-out flights to ``settings.out``.
 
-    Args:
-        flights: what to learn from.
-        network: what to train; its contract's ``state_frame`` must be that of the flights.
-        settings: how, and how long.
-        hooks: clock, progress, and a request to stop.
-        check: scores a checkpoint, in place of the validation loss.
+    The best are those with the least validation loss, or the highest score by ``check``.
 
     Raises:
         DatasetError: flights that cannot be learned from.
@@ -76,10 +71,6 @@ def train_policy(
         PolicyError: weights to start from that do not fit.
     """
     folder = open_run(settings, network, flights)
-    if (frame := common_frame(flights)) != network.contract.state_frame:
-        raise DatasetError(
-            f"the flights hold {frame} states, the policy takes {network.contract.state_frame}"
-        )
     return _PolicyRun(flights, network, settings, folder, hooks, check).finish()
 
 
@@ -181,7 +172,13 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         if self._held is None:
             return None
         with computing_in(self.device, self.bf16):
-            return validate(self.average, self._held_batches(self._held, stage))
+            held: Iterable[Batch] | None = self._held_features
+            if held is None:
+                batches = self._held.validation(VALIDATION_SAMPLES, stage.image_size)
+                held = (batch.to(self.device) for batch in batches)
+                if not stage.trains_encoder:  # it stays as it is: encode once
+                    held = self._held_features = [self.average.encoded(batch) for batch in held]
+            return validate(self.average, held)
 
     def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
         if self._check is None:
@@ -210,24 +207,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
             settings=self.settings,
         )
 
-    def _held_batches(self, held: Batches, stage: TrainingStage) -> Iterable[Batch]:
-        """Always the same samples; once the encoder is frozen, encoded once."""
-        if self._held_features is not None:
-            return self._held_features
-        batches = held.validation(VALIDATION_SAMPLES, stage.image_size)
-        moved: Iterable[Batch] = (batch.to(self.device) for batch in batches)
-        if not stage.trains_encoder:
-            moved = self._held_features = [self.average.encoded(batch) for batch in moved]
-        return moved
-
     def _write(self, path: Path) -> None:
-        card = _training_card(
-            self.settings,
-            self._flights,
-            self._ages_ns,
-            steps=self.position.step,
-            validation=self.position.kept,
-        )
+        card = _training_card(self.settings, self._flights, self._ages_ns, self.position)
         policy = copy.deepcopy(self.average.policy)
         save_checkpoint(path, policy, training=card, packed=self.settings.pack)
 
@@ -250,11 +231,7 @@ def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds
 
 
 def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
-    """The policy to start from and a new gate head; torch's global random state is kept.
-
-    Raises:
-        PolicyError: weights that do not fit.
-    """
+    """The policy to start from and a new gate head; torch's global random state is kept."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:
@@ -296,9 +273,7 @@ def _training_card(
     settings: TrainSettings,
     flights: Sequence[FlightData],
     ages_ns: Nanoseconds,
-    *,
-    steps: int,
-    validation: Mapping[str, float] | None,
+    position: Position,
 ) -> str:
     """Facts about the training of a checkpoint, as JSON."""
     state = np.concatenate([flight.state for flight in flights])
@@ -309,7 +284,7 @@ def _training_card(
         "flights": len(flights),
         "images": sum(len(flight.captured_ns) for flight in flights),
         "ticks": len(state),
-        "steps": steps,
+        "steps": position.step,
         "batch_size": settings.batch_size,
         "seed": settings.seed,
         "mirror": settings.mirror,
@@ -324,7 +299,7 @@ def _training_card(
         "state_std": _by_name(np.nanstd(state, axis=0)),
         "stick_mean": target.mean(axis=0).round(4).tolist(),
         "stick_std": target.std(axis=0).round(4).tolist(),
-        "validation": validation,
+        "validation": position.kept,
     }
     return json.dumps(card, sort_keys=True)
 

@@ -18,8 +18,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.data.flight_data import FlightData, hold_out
+from policy.data.flight_data import DatasetError, FlightData, common_frame, hold_out
 from policy.data.frames import FrameStore, store_frames
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import TogeConfig
 from policy.training.batches import ahead
 from policy.training.parallel import B, Gradients, M, StepLoss
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
@@ -32,6 +34,7 @@ from policy.training.run_folder import (
 )
 from policy.training.settings import Precision, RunSettings
 from policy.training.stages import TrainingStage, learning_rate_factor
+from policy.world_model.config import WorldModelConfig
 
 LOG_STEPS = 20
 """Steps between two lines of the log."""
@@ -40,10 +43,15 @@ ENCODING_SHARE = 0.4
 """Share of a stage's time after which images are no longer encoded for it."""
 
 
-def open_run(settings: RunSettings, network: object, flights: Sequence[FlightData]) -> RunFolder:
+def open_run(
+    settings: RunSettings,
+    network: TogeConfig | ResnetUnetConfig | WorldModelConfig,
+    flights: Sequence[FlightData],
+) -> RunFolder:
     """Open the folder of a run, to begin it or to resume it.
 
     Raises:
+        DatasetError: the flights hold states in another frame than the network takes.
         TrainingError: no folder for the checkpoint, or an unfinished run that is not to be resumed.
     """
     if not settings.out.parent.is_dir():
@@ -52,6 +60,10 @@ def open_run(settings: RunSettings, network: object, flights: Sequence[FlightDat
     if folder.has_state and not settings.resume:
         raise TrainingError(
             f"{folder.path} holds an unfinished run: continue it with --resume, or remove it"
+        )
+    if (frame := common_frame(flights)) != network.contract.state_frame:
+        raise DatasetError(
+            f"the flights hold {frame} states, the network takes {network.contract.state_frame}"
         )
     return folder
 
@@ -76,7 +88,8 @@ class TrainingRun(ABC, Generic[M, B]):
         self.device = torch.device(settings.device)
         self.bf16 = uses_bf16(settings.precision, self.device)
         self._begun_s = hooks.now_s()
-        self._ema = Ema(trainee, settings.ema_decay)
+        self.average: M = copy.deepcopy(trainee).eval().requires_grad_(False)
+        """The average of the weights, in eval mode."""
         self._optimiser = self._new_optimiser(stages[0])
 
     # ---- for subclasses ----
@@ -112,11 +125,6 @@ class TrainingRun(ABC, Generic[M, B]):
     def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
         """Score of the average weights, more is better; None if they are not to be exported."""
         return None if validation is None else -validation.loss
-
-    @property
-    def average(self) -> M:
-        """The average of the weights, in eval mode."""
-        return self._ema.average
 
     def store_flights(
         self, flights: Sequence[FlightData]
@@ -196,7 +204,9 @@ class TrainingRun(ABC, Generic[M, B]):
             Gradients(self.trainee, device=self.device, bf16=self.bf16) as gradients,
             closing(ahead(self.batch_maker(stage), position.step)) as batches,
         ):
-            gradients.each(lambda replica: self._set_mode(replica, stage))
+            for replica in gradients.replicas:
+                replica.train()
+                self.encoder(replica).train(stage.trains_encoder)
             since = 0
             while self._fraction < stage.end:
                 metrics = gradients.compute(next(batches).to(self.device), self.losses)
@@ -214,10 +224,6 @@ class TrainingRun(ABC, Generic[M, B]):
                     self._save()
                     self._stop()
 
-    def _set_mode(self, trainee: M, stage: TrainingStage) -> None:
-        trainee.train()
-        self.encoder(trainee).train(stage.trains_encoder)
-
     def _step(self, stage: TrainingStage) -> None:
         position = self.position
         start = position.phase_start
@@ -228,7 +234,8 @@ class TrainingRun(ABC, Generic[M, B]):
         torch.nn.utils.clip_grad_norm_(self.trainee.parameters(), GRADIENT_LIMIT)
         self._optimiser.step()
         position.step += 1
-        self._ema.update(self.trainee, position.step - position.phase_step)
+        updates = position.step - position.phase_step
+        update_average(self.average, self.trainee, self.settings.ema_decay, updates)
 
     def _validate(self, stage: TrainingStage, *, is_last: bool) -> None:
         """Validate, export if the score is the best so far, and save the state of the run."""
@@ -257,7 +264,15 @@ class TrainingRun(ABC, Generic[M, B]):
     def _new_optimiser(self, stage: TrainingStage) -> torch.optim.AdamW:
         self.trainee.requires_grad_(not (stage.trains_encoder and self.encoder_learns_alone))
         self.encoder(self.trainee).requires_grad_(stage.trains_encoder)
-        return make_optimiser(self.trainee, self.learning_rate(stage), self.settings.weight_decay)
+        trainable = [p for p in self.trainee.parameters() if p.requires_grad]
+        # Biases, norms and other vectors are not decayed.
+        matrices, decay = [p for p in trainable if p.ndim >= 2], self.settings.weight_decay
+        groups = [
+            {"params": matrices, "weight_decay": decay},
+            {"params": [p for p in trainable if p.ndim < 2], "weight_decay": 0.0},
+        ]
+        rate = self.learning_rate(stage)
+        return torch.optim.AdamW(groups, lr=rate, betas=(0.9, 0.98), fused=True)
 
     def _restore(self) -> None:
         self.position, state = self.folder.load()
@@ -311,51 +326,28 @@ class TrainingRun(ABC, Generic[M, B]):
                 "flights with wrong numbers, or start from other weights"
             )
         self._report(stage.name, losses=losses)
-        self.folder.log(
-            {
-                "step": step,
-                "stage": stage.name,
-                "fraction": self._fraction,
-                "spent_s": self._spent_s,
-                **losses,
-                "learning_rate": self._optimiser.param_groups[0]["lr"],
-            }
-        )
+        used = {"fraction": self._fraction, "spent_s": self._spent_s}
+        rate = self._optimiser.param_groups[0]["lr"]
+        record = {"step": step, "stage": stage.name, **used, **losses, "learning_rate": rate}
+        self.folder.log(record)
 
 
-class Ema(Generic[M]):
-    """An exponential moving average of a module's weights, itself such a module in eval mode."""
+@torch.no_grad()
+def update_average(average: nn.Module, trainee: nn.Module, decay: float, updates: int) -> None:
+    """Move an exponential moving average of weights, faster in the first of ``updates``.
 
-    def __init__(self, trainee: M, decay: float) -> None:
-        self.average = copy.deepcopy(trainee).eval().requires_grad_(False)
-        self._decay = decay
-
-    @torch.no_grad()
-    def update(self, trainee: M, updates: int) -> None:
-        """Move towards ``trainee``, faster in the first of ``updates``; counters are copied.
-
-        Frozen weights are the same in both, and are left alone.
-        """
-        weight = 1.0 - min(self._decay, (1 + updates) / (10 + updates))
-        frozen = {name for name, one in trainee.named_parameters() if not one.requires_grad}
-        new = {name: one for name, one in trainee.state_dict().items() if name not in frozen}
-        old = self.average.state_dict()
-        names = [name for name, value in new.items() if value.is_floating_point()]
-        torch._foreach_lerp_(  # one call for some thousand tensors
-            [old[name] for name in names], [new[name] for name in names], weight
-        )
-        for name in new.keys() - set(names):
-            old[name].copy_(new[name])
-
-
-def make_optimiser(trainee: nn.Module, learning_rate: float, decay: float) -> torch.optim.AdamW:
-    """AdamW over the trainable weights; biases, norms and other vectors are not decayed."""
-    trainable = [p for p in trainee.parameters() if p.requires_grad]
-    groups = [
-        {"params": [p for p in trainable if p.ndim >= 2], "weight_decay": decay},
-        {"params": [p for p in trainable if p.ndim < 2], "weight_decay": 0.0},
-    ]
-    return torch.optim.AdamW(groups, lr=learning_rate, betas=(0.9, 0.98), fused=True)
+    Frozen weights are the same in both, and are left alone; counters are copied.
+    """
+    weight = 1.0 - min(decay, (1 + updates) / (10 + updates))
+    frozen = {name for name, one in trainee.named_parameters() if not one.requires_grad}
+    new = {name: one for name, one in trainee.state_dict().items() if name not in frozen}
+    old = average.state_dict()
+    names = [name for name, value in new.items() if value.is_floating_point()]
+    torch._foreach_lerp_(  # one call for some thousand tensors
+        [old[name] for name in names], [new[name] for name in names], weight
+    )
+    for name in new.keys() - set(names):
+        old[name].copy_(new[name])
 
 
 def uses_bf16(precision: Precision, device: torch.device) -> bool:

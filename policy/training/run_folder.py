@@ -65,11 +65,7 @@ class RunFolder:
         return self._state.is_file()
 
     def save(self, position: Position, tensors: Mapping[str, Any]) -> None:
-        """Write the state in one piece or not at all.
-
-        Raises:
-            TrainingError: no room.
-        """
+        """Write the state in one piece, or raise a ``TrainingError``."""
         target, partial = self._state, self.path / "state.pt.partial"
         contents = {"identity": self._identity, "position": asdict(position), **tensors}
         try:
@@ -101,7 +97,10 @@ class RunFolder:
                 f"{path} is of a run with other flights or settings: give the same ones, or remove "
                 f"{self.path} to start again"
             )
-        self._cut_log(position.step)
+        if self._log.is_file():  # the steps after the saved one are about to be repeated
+            lines = self._log.read_text().splitlines(keepends=True)
+            kept = [line for line in lines if _step_of(line) <= position.step]
+            self._log.write_text("".join(kept))
         return position, contents
 
     def log(self, record: Mapping[str, object]) -> None:
@@ -121,12 +120,6 @@ class RunFolder:
     def start_log(self) -> None:
         """Remove the log of an earlier run."""
         self._log.unlink(missing_ok=True)
-
-    def _cut_log(self, step: int) -> None:
-        """Remove the lines after a step: those steps are about to be repeated."""
-        if self._log.is_file():
-            lines = self._log.read_text().splitlines(keepends=True)
-            self._log.write_text("".join(line for line in lines if _step_of(line) <= step))
 
 
 def _step_of(line: str) -> float:

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from policy.checkpoints.policy_file import BuiltinPolicy
 from policy.contract import ACTION_DIM, FloatArray
 from policy.nets.action_head import size_dims
-from policy.nets.toge import Toge
 from policy.training.batches import Batch, normalised
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import PolicyValidation
@@ -70,9 +69,8 @@ class Trainee(nn.Module):
     def condition(self, visual: Tensor, batch: Batch) -> Tensor:
         """Projected images [B, C], each for its samples -> conditions [S, C]."""
         visual = visual.repeat_interleave(len(batch.state) // len(visual), dim=0)
-        if isinstance(self.policy, Toge):
-            return self.policy.encode_and_fuse(visual, batch.state, batch.history)
-        return self.policy.fuse_visual(visual, batch.state, batch.history)
+        state_token = self.policy.state_encoder(batch.state)
+        return self.policy.condition(visual, state_token, batch.history)
 
     def forward(self, batch: Batch) -> StepLoss:
         """Losses of a batch.
@@ -98,7 +96,7 @@ class Trainee(nn.Module):
         chunk, timestep = batch.chunk[::every], batch.timestep[::every]
         noise, schedule = batch.noise[::every], self.policy.config.schedule
         noisy = schedule.add_noise(chunk, noise, timestep)
-        made = self.policy.denoise(noisy, timestep, condition[::every]).float()
+        made = self.policy.head.denoise(noisy, timestep, condition[::every]).float()
         is_sample = schedule.prediction == "sample"
         error = (made - chunk) / self.stick_std if is_sample else made - noise
         return _squared(error, batch.known[::every])

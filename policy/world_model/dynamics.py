@@ -20,18 +20,19 @@ from policy.world_model.relative_state import MOTION_DIM, features_dim
 MODULATIONS = 6
 """Scale and shift of each of a layer's three norms."""
 _INITIAL_STD = 0.02
+PREDICTOR_WIDTH = 192
 
 
 @dataclass(frozen=True, kw_only=True)
 class Future:
-    """The unknown that is denoised, or an estimate of it; every part has about unit scale."""
+    """The unknown that is denoised, or an estimate of it; every part has about unit scale.
+
+    Latents are [B, T, C, h, w], motion is [B, T, MOTION_DIM], actions are [B, T, 4].
+    """
 
     latents: Tensor
-    """[B, T, C, h, w]"""
     motion: Tensor
-    """[B, T, MOTION_DIM]"""
     actions: Tensor
-    """[B, T, 4]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,3 +164,35 @@ class _Attention(nn.Module):
         attended = F.scaled_dot_product_attention(query, key, value, is_causal=is_causal)
         out: Tensor = self.project(attended.transpose(1, 2).reshape(tokens.shape))
         return out
+
+
+class MotionPredictor(nn.Module):
+    """Predicts the motion that sticks lead to, once, before anything is denoised.
+
+    It is a GRU over the sticks in the order in which they act: none changes what was before it.
+    """
+
+    def __init__(self, config: WorldModelConfig) -> None:
+        super().__init__()
+        features = features_dim(config.context_frames)
+        self.initial_hidden = nn.Linear(features, PREDICTOR_WIDTH)
+        self.gru = nn.GRU(2 * ACTION_DIM + 1 + features, PREDICTOR_WIDTH, batch_first=True)
+        self.output = nn.Linear(PREDICTOR_WIDTH, MOTION_DIM)
+        self.mean_motion = nn.Parameter(torch.zeros(config.frames, MOTION_DIM))
+        nn.init.normal_(self.output.weight, std=_INITIAL_STD)  # a new net predicts the mean motion
+        nn.init.zeros_(self.output.bias)
+
+    def forward(self, features: Tensor, actions: Tensor, knows_actions: Tensor) -> Tensor:
+        """``relative_state.context_features`` [B, D], actions [B, T, 4] -> motions [B, T, 15].
+
+        Both have about unit scale. Actions are ignored where ``knows_actions`` [B] is False.
+        """
+        known = knows_actions.view(-1, 1, 1)
+        sticks = torch.where(known, actions, 0.0)
+        so_far = sticks.cumsum(dim=1) / sticks.shape[1] ** 0.5
+        start = torch.cat([known[:, 0].to(sticks.dtype), features], dim=-1)
+        each = start.unsqueeze(1).expand(-1, sticks.shape[1], -1)
+        hidden = torch.tanh(self.initial_hidden(features)).unsqueeze(0)
+        read, _ = self.gru(torch.cat([sticks, so_far, each], dim=-1), hidden)
+        motion: Tensor = self.output(read) + self.mean_motion
+        return motion

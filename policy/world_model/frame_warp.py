@@ -88,12 +88,9 @@ class FrameWarp(nn.Module):
         self.register_buffer("_body_from_camera", axes, persistent=False)
 
     def source(self, pixels: Tensor, latents: Tensor, vertical_body: Tensor) -> SourceFrame:
-        """Estimate the inverse depth of a frame.
+        """Estimate the inverse depth of a frame: its pixels and its latents [B, C, h, w].
 
-        Args:
-            pixels: [B, 3, H, W] about [-1, 1].
-            latents: [B, C, h, w] of the same frame.
-            vertical_body: [B, 3] third axis of the world, in body axes.
+        ``vertical_body`` [B, 3] is the third axis of the world, in body axes.
         """
         # The steeper a ray points down, the nearer is level ground; only its scale is unknown.
         below = (self._cell_rays_body @ (self._down_sign * vertical_body)[:, None, :, None])[..., 0]

@@ -21,9 +21,8 @@ from policy.errors import PolicyError
 from policy.nets.diffusion import DdimStep
 from policy.world_model.autoencoder import FrameAutoencoder, to_bytes, to_unit
 from policy.world_model.config import FACTOR, WorldModelConfig
-from policy.world_model.dynamics import Conditioning, Future, LatentDynamics
+from policy.world_model.dynamics import Conditioning, Future, LatentDynamics, MotionPredictor
 from policy.world_model.frame_warp import FrameWarp, Poses, SourceFrame
-from policy.world_model.motion_predictor import MotionPredictor
 from policy.world_model.relative_state import (
     MOTION_DIM,
     MOTION_SCALE,
@@ -52,7 +51,10 @@ class Imagined:
 
 
 class WorldModel(nn.Module):
-    """Autoencoder and dynamics; all scales are stored with the weights."""
+    """Autoencoder and dynamics; all scales are stored with the weights.
+
+    A shape or type that is not the model's raises a ``PolicyError``.
+    """
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
@@ -75,11 +77,7 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
-        """Frames [N, H, W, 3] uint8 -> latents [N, C, h, w] of about unit scale.
-
-        Raises:
-            PolicyError: not uint8 frames of the model's size.
-        """
+        """Frames [N, H, W, 3] uint8 -> latents [N, C, h, w] of about unit scale."""
         size = self.config.image_size
         if images.dtype != torch.uint8 or tuple(images.shape[1:]) != (size, size, 3):
             raise PolicyError(
@@ -93,11 +91,7 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
-        """Latents [N, C, h, w] -> frames [N, H, W, 3] uint8.
-
-        Raises:
-            PolicyError: not latents of the model's shape.
-        """
+        """Latents [N, C, h, w] -> frames [N, H, W, 3] uint8."""
         shape = self.config.latent_shape
         if tuple(latents.shape[1:]) != shape:
             raise PolicyError(
@@ -129,9 +123,6 @@ class WorldModel(nn.Module):
                 advanced.
             sim_mode: True to simulate given actions, False to decide.
             decode_video: whether to decode all frames.
-
-        Raises:
-            PolicyError: shapes or steps that do not fit, or actions in the wrong role.
         """
         self._require_context(latents, states, actions, sim_mode=sim_mode)
         steps = self.config.schedule.ddim_steps(ddim_steps)
@@ -173,14 +164,9 @@ class WorldModel(nn.Module):
     ) -> Conditioning:
         """Predict the motion and warp the newest frame by it, once for all steps of a sample.
 
-        Takes about as long as two denoising steps, because each warped frame is encoded.
-
-        Args:
-            source: the newest frame.
-            latents: [B, context_frames, C, h, w] of the last frames, oldest first.
-            states: [B, context_frames, 13] at their exposures, SI units, the contract's frame.
-            actions: [B, frames, 4] of about unit scale; ignored where they are not known.
-            knows_actions: [B] bool.
+        Latents and states are those of ``sample``. Actions [B, frames, 4] are of about unit scale,
+        and ignored where ``knows_actions`` [B] is False. It takes about as long as two denoising
+        steps, because each warped frame is encoded.
         """
         with torch.autocast(latents.device.type, enabled=False):  # angles need all their digits
             features = context_features(states, self.config.contract)
@@ -219,11 +205,7 @@ class WorldModel(nn.Module):
         The net gives latents as a change of the warped frame, in units of how much they change in
         so many steps, and the motion as a change of the predicted one. Given the actions, little of
         a future is random: predicting x_0 works at every noise level, and few steps lose little.
-
-        Args:
-            noisy: the future as ``Future`` has it; known actions in it are clean.
-            timestep: [B] int64.
-            known: the context.
+        Known actions in ``noisy`` are clean; ``timestep`` is [B] int64.
         """
         output = self.dynamics(noisy, timestep, known)
         return Future(

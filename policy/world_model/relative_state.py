@@ -30,9 +30,7 @@ MOTION_SCALE = (
 def motion_since(now: Tensor, then: Tensor) -> Tensor:
     """Motions [..., 15] from ``now`` to other states, earlier or later.
 
-    Args:
-        now: [..., 13] in SI units, broadcast against ``then``.
-        then: [..., 13] in the same frame.
+    Both are [..., 13] in SI units and of one frame, and are broadcast.
     """
     to_body = _matrix(now[..., QUATERNION]).transpose(-1, -2)
     change = then - now

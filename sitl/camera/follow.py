@@ -5,6 +5,7 @@ heading north.
 """
 
 import sys
+from collections.abc import Callable
 from contextlib import closing
 
 from sitl.camera.fpv import CameraOptions, FpvRenderer
@@ -13,15 +14,16 @@ from sitl.clock import NS_PER_S, Clock
 from sitl.course.layout import Course
 from sitl.link.pose_listener import PoseListener
 from sitl.link.transport import FOLLOWER_KINDS, open_transport
-from sitl.stopping import StopRequest
 
 MESSAGES_PER_FRAME = 2
 MAX_MESSAGE_HZ = 200.0  # within what ArduPilot can send at its default loop rate
 NO_POSE = "no pose from the vehicle in the last second, so no frames"
 
 
-def film_vehicle(url: str, course: Course, camera: CameraOptions, stop: StopRequest) -> None:
-    """Publish the view from the vehicle on ``url`` until ``stop`` is set.
+def film_vehicle(
+    url: str, course: Course, camera: CameraOptions, should_stop: Callable[[], bool]
+) -> None:
+    """Publish the view from the vehicle on ``url`` until ``should_stop``.
 
     ``url``: ``udp:HOST:PORT`` or ``udpin:`` listens, ``udpout:`` and ``tcp:`` connect to it. While
     the pose is unknown or older than 1 s no frames are published; changes are printed on stderr.
@@ -39,7 +41,7 @@ def film_vehicle(url: str, course: Course, camera: CameraOptions, stop: StopRequ
         closing(open_transport(url, clock, FOLLOWER_KINDS)) as transport,
         closing(FramePublisher(camera.shm_name, camera.image_size, camera.image_size)) as publisher,
     ):
-        while not stop.is_set():
+        while not should_stop():
             clock.sleep_until_ns(due_ns)
             for received in transport.drain():
                 listener.receive(received.data, received.arrived_ns)

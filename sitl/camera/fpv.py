@@ -12,11 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl import UsageError
 from sitl.camera import scenery
-from sitl.camera.imager import Image, Imager
-from sitl.camera.scenery import FloatArray
+from sitl.camera.scenery import FloatArray, Image
 from sitl.course.layout import Course
-from sitl.errors import UsageError
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
@@ -27,6 +26,9 @@ GATE_HAZE_M = 90.0  # distance at which a gate has lost 63 % of its contrast
 GROUND_FADE_M = 14.0
 """Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
 SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
+REFERENCE_WIDTH_PX = 224  # image width for which the conditions give the blur
+NOISE_MARGIN_PX = 61
+"""Noise is drawn once, this much larger than the image, and cropped anew for every frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +66,7 @@ class FpvRenderer:
         self._ground = scenery.ground_tile(conditions)
         self._ridge = scenery.ridge_directions(course.seed)
         self._faces = scenery.gate_faces(course, conditions)
-        self._imager = Imager(conditions, width, height)
+        self._sensor = _ImageSensor(conditions, width, height)
         self._centers_ned_m = np.array([gate.center_ned_m for gate in course.gates])
 
     def render(self, position_ned_m: Vec3, ned_from_body_wxyz: Quat) -> Image:
@@ -78,7 +80,7 @@ class FpvRenderer:
         ridge = self._ridge @ ned_from_camera
         self._fill(image, ridge, np.tile(self._ridge_rgb, (len(ridge), 1)), cv2.LINE_8)
         self._draw_gates(image, eye_ned_m, ned_from_camera)
-        return self._imager.expose(image)
+        return self._sensor.expose(image)
 
     def _draw_backdrop(self, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> Image:
         """Draw sky and ground; a ray of unit depth falls by a linear function of the pixel."""
@@ -158,6 +160,37 @@ class FpvRenderer:
         is_above, is_below = y < -half_height * z, y > half_height * z
         outside = np.stack([z < NEAR_M, is_left, is_right, is_above, is_below])
         return np.asarray(~outside.all(axis=2).any(axis=0))
+
+
+class _ImageSensor:
+    """Exposure, colour cast, blur and noise of a sensor; noise is the same in each n-th frame."""
+
+    def __init__(self, conditions: Conditions, width: int, height: int) -> None:
+        self._random = np.random.Generator(np.random.PCG64((conditions.seed, 3)))
+        gains = conditions.exposure * np.array(conditions.white_balance)
+        self._lut: Image | None = None
+        if (gains != 1.0).any():
+            levels = np.arange(256)[:, None] * gains
+            self._lut = np.clip(levels.round(), 0, 255).astype(np.uint8).reshape(1, 256, 3)
+        self._blur_px = conditions.blur_px * width / REFERENCE_WIDTH_PX
+        self._noise: NDArray[np.int16] | None = None
+        if conditions.image_noise > 0.0:
+            shape = (height + NOISE_MARGIN_PX, width + NOISE_MARGIN_PX, 3)
+            noise = conditions.image_noise * self._random.standard_normal(shape)
+            self._noise = noise.round().astype(np.int16)
+
+    def expose(self, image: Image) -> Image:
+        """Image [H, W, 3] RGB as the sensor would record it; may be the argument itself."""
+        if self._lut is not None:
+            image = np.asarray(cv2.LUT(image, self._lut), dtype=np.uint8)
+        if self._blur_px > 0.0:
+            image = np.asarray(cv2.GaussianBlur(image, (0, 0), self._blur_px), dtype=np.uint8)
+        if self._noise is not None:
+            top, left = self._random.integers(NOISE_MARGIN_PX + 1, size=2)
+            height, width, _ = image.shape
+            noise = self._noise[top : top + height, left : left + width]
+            image = np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+        return image
 
 
 def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:

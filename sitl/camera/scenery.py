@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.camera.imager import Image
 from sitl.course.layout import BAR_M, DEPTH_M, Course, Gate
 from sitl.rotation import Vec3
 from sitl.vehicle.conditions import NOMINAL, Conditions, Rgb
 
 FloatArray: TypeAlias = NDArray[np.float64]
+Image: TypeAlias = NDArray[np.uint8]
 
 LEG_M = 0.09  # width of the two posts that reach down to the ground
 PIP_M = 0.16

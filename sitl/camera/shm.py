@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.errors import UsageError
+from sitl import UsageError
 
 MAGIC = b"MBSHM\0\0\1"
 HEADER_BYTES = 64
@@ -28,7 +28,10 @@ class FramePublisher:
     def __init__(self, name: str, width: int, height: int) -> None:
         if min(width, height) < 1:
             raise UsageError(f"a frame needs at least one pixel, got {width}x{height}")
-        self._path = _shm_path(name)
+        if not name or "/" in name or name.startswith("."):
+            raise UsageError(f"shm:{name}: want a name such as fpv, without '/' or a leading '.'")
+        folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
+        self._path = (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
         self._shape = (height, width, CHANNELS)
         size = height * width * CHANNELS
         stride = -(-(SLOT_HEADER_BYTES + size) // 64) * 64
@@ -82,13 +85,6 @@ class FramePublisher:
         """
         with self._lock:
             pass
-
-
-def _shm_path(name: str) -> Path:
-    if not name or "/" in name or name.startswith("."):
-        raise UsageError(f"shm:{name}: want a name such as fpv, without '/' or a leading '.'")
-    folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
-    return (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
 
 
 def _create(path: Path, width: int, height: int, size: int) -> tuple[mmap.mmap, int]:

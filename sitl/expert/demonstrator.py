@@ -14,9 +14,9 @@ import cmath
 import math
 from dataclasses import dataclass, replace
 
+from sitl import UsageError
 from sitl.course.layout import Course, Gate
 from sitl.course.referee import GateCounter, crossing
-from sitl.errors import UsageError
 from sitl.expert.guidance import Plan, Waypoint, least_acceleration
 from sitl.expert.stick_response import DRAG_PER_S, Demand, StickPositions, StickResponse
 from sitl.rotation import Vec3, rotate, to_euler, wrap_pi
@@ -72,7 +72,14 @@ class Expert:
                 f"the expert flies at {MIN_SPEED_MPS} to {MAX_SPEED_MPS} m/s, got {speed_mps}"
             )
         self._last = course.gates[-1]
-        self._beyond = _extension(self._last)
+        # Points straight on from the last gate, so that it is flown like any other.
+        north_m, east_m, down_m = self._last.center_ned_m
+        step_m = cmath.rect(BEYOND_LEG_M, self._last.yaw_rad)
+        beyond_ned_m = [
+            (north_m + k * step_m.real, east_m + k * step_m.imag, down_m)
+            for k in range(1, GATES_AHEAD + 1)
+        ]
+        self._beyond = tuple(replace(self._last, center_ned_m=point) for point in beyond_ned_m)
         self._gates = course.gates + self._beyond
         self._speed_mps = speed_mps
         self._referee = GateCounter(course, first=next_gate)
@@ -262,16 +269,6 @@ def _brake(state: _State) -> Demand:
     most_mps = -ALONG_ACCEL_MPS2[0] / BRAKING_GAIN_PER_S
     gain = BRAKING_GAIN_PER_S * min(1.0, most_mps / max(1e-6, _length(state.velocity_mps)))
     return Demand(-gain * state.velocity_mps, 0.0, 0.0)
-
-
-def _extension(last: Gate) -> tuple[Gate, ...]:
-    """Points straight on from the last gate, so that it is flown like any other."""
-    north_m, east_m, down_m = last.center_ned_m
-    step_m = cmath.rect(BEYOND_LEG_M, last.yaw_rad)
-    return tuple(
-        replace(last, center_ned_m=(north_m + k * step_m.real, east_m + k * step_m.imag, down_m))
-        for k in range(1, GATES_AHEAD + 1)
-    )
 
 
 def _yaw_rate(error_rad: float, lead_radps: float) -> float:

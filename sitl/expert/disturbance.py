@@ -63,7 +63,10 @@ class StickDisturbance:
         dt_s, self._last_s = t_s - self._last_s, t_s
         while t_s >= self._stretch.end_s:
             self._stretch = self._next(self._stretch)
-        self._update_noise(dt_s)
+        # An Ornstein-Uhlenbeck process, exact for any step.
+        kept = math.exp(-max(dt_s, 0.0) / NOISE_TIME_S)
+        fresh = math.sqrt(1.0 - kept * kept) * self._random.standard_normal(4)
+        self._noise = kept * self._noise + fresh * np.array(NOISE_RMS)
         if not self.active:
             return wanted
         if self._stretch.kind == "late":
@@ -86,12 +89,6 @@ class StickDisturbance:
         held *= self._random.permutation([1.0, 1.0, 0.0, 0.0])
         length_s = float(self._random.uniform(*PULSE_S))
         return _Stretch("pulse", ended.end_s + length_s, StickPositions(*held.tolist()))
-
-    def _update_noise(self, dt_s: float) -> None:
-        """An Ornstein-Uhlenbeck process, exact for any step."""
-        kept = math.exp(-max(dt_s, 0.0) / NOISE_TIME_S)
-        fresh = math.sqrt(1.0 - kept * kept) * self._random.standard_normal(4)
-        self._noise = kept * self._noise + fresh * np.array(NOISE_RMS)
 
 
 def random_start(

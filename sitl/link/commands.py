@@ -17,7 +17,6 @@ FAILED: int = mav.MAV_RESULT_FAILED
 FORCE = 21196.0  # param 2 of ARM_DISARM that overrules every check (MAVLink common.xml)
 UINT16_MAX = 65535
 
-
 Params7: TypeAlias = tuple[float, ...]  # param1..7 of a command, the first at index 0
 Handler: TypeAlias = Callable[[Params7, Autopilot, MavlinkEndpoint], int]
 

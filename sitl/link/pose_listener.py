@@ -82,15 +82,15 @@ class PoseListener:
         if self._due_ns is not None and now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + REQUEST_PERIOD_NS
-        heartbeat = mav.MAVLink_heartbeat_message(
-            mav.MAV_TYPE_ONBOARD_CONTROLLER,
-            mav.MAV_AUTOPILOT_INVALID,
-            base_mode=0,
-            custom_mode=0,
-            system_status=mav.MAV_STATE_ACTIVE,
-            mavlink_version=3,
-        )
-        messages = [heartbeat, *(self._request(kind) for kind in self._missing())]
+        own_type, no_autopilot = mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID
+        messages = [
+            mav.MAVLink_heartbeat_message(own_type, no_autopilot, 0, 0, mav.MAV_STATE_ACTIVE, 3)
+        ]
+        number, interval_us = mav.MAV_CMD_SET_MESSAGE_INTERVAL, 1e6 / self._rate_hz
+        for kind in self._missing():
+            to, params = (self._vehicle, mav.MAV_COMP_ID_AUTOPILOT1), (kind, interval_us)
+            request = mav.MAVLink_command_long_message(*to, number, 0, *params, *[0.0] * 5)
+            messages.append(request)
         self._received.clear()
         return [message.pack(self._mav) for message in messages]
 
@@ -139,10 +139,3 @@ class PoseListener:
         if self._rounds_without_quaternion > ROUNDS_BEFORE_EULER:
             wanted.append(mav.MAVLINK_MSG_ID_ATTITUDE)
         return [kind for kind in wanted if self._received[kind] < self._rate_hz / 2]
-
-    def _request(self, kind: int) -> Message:
-        number, interval_us = mav.MAV_CMD_SET_MESSAGE_INTERVAL, 1e6 / self._rate_hz
-        autopilot = mav.MAV_COMP_ID_AUTOPILOT1
-        return mav.MAVLink_command_long_message(
-            self._vehicle, autopilot, number, 0, kind, interval_us, *[0.0] * 5
-        )

@@ -67,7 +67,9 @@ class MavlinkServer:
             if handler is None or not self._is_accepted(message):
                 continue
             # Commands mark unused parameters with NaN; each checks those that it reads.
-            if handler != self._command and _has_nan(message):
+            values = [getattr(message, name) for name in message.fieldnames]
+            numbers = [value for value in values if isinstance(value, float)]
+            if handler != self._command and not all(map(math.isfinite, numbers)):
                 self._log.refused_messages += 1
                 continue
             handler(link, message, arrived_ns)
@@ -175,8 +177,3 @@ def _sender(message: Message) -> tuple[int, int]:
 
 def _send_ack(link: MavlinkEndpoint, message: Message, number: int, result: int) -> None:
     link.send(mav.MAVLink_command_ack_message(number, result, 0, 0, *_sender(message)))
-
-
-def _has_nan(message: Message) -> bool:
-    values = (getattr(message, name) for name in message.fieldnames)
-    return any(isinstance(value, float) and not math.isfinite(value) for value in values)

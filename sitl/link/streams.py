@@ -113,17 +113,13 @@ class Streams:
     def _start(self, message_id: int, interval_ms: int, now_ns: int) -> None:
         self._streams.pop(message_id, None)
         if interval_ms > 0:
-            interval_ms = self._bucket(interval_ms)
+            # The firmware keeps ten distinct intervals per link; an eleventh joins the nearest.
+            taken = {stream.interval_ms for stream in self._streams.values()}
+            if interval_ms not in taken and len(taken) >= MAX_DISTINCT_INTERVALS:
+                interval_ms = min(taken, key=lambda other: abs(other - interval_ms))
             period_ns = (interval_ms + self._slowdown_ms) * NS_PER_MS
             due_ns = now_ns + period_ns - self._random_ns(self._phase_spread * period_ns)
             self._streams[message_id] = _Stream(interval_ms=interval_ms, due_ns=due_ns)
-
-    def _bucket(self, interval_ms: int) -> int:
-        """The firmware keeps ten distinct intervals per link; an eleventh joins the nearest."""
-        taken = {stream.interval_ms for stream in self._streams.values()}
-        if interval_ms in taken or len(taken) < MAX_DISTINCT_INTERVALS:
-            return interval_ms
-        return min(taken, key=lambda other: abs(other - interval_ms))
 
 
 def shortest_ms(loop_hz: float) -> int:

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import NamedTuple, TypeAlias
 
+from sitl import UsageError
 from sitl.clock import NS_PER_S, Clock, monotonic_from_wall_ns
-from sitl.errors import UsageError
 
 Address: TypeAlias = tuple[str, int]
 
@@ -192,18 +192,15 @@ def split_frames(data: bytes, limit: int) -> Iterator[bytes]:
     """Cut whole MAVLink frames into pieces of at most ``limit`` bytes (or one frame, if longer)."""
     start = end = 0
     while end < len(data):
-        length = _frame_length(data, end)
+        length = data[end + 1]  # of the payload
+        if data[end] == _V1_MAGIC:
+            length += _V1_OVERHEAD
+        else:
+            is_signed = data[end + 2] & _SIGNED_FLAG
+            length += _V2_OVERHEAD + (_SIGNATURE if is_signed else 0)
         if end > start and end + length - start > limit:
             yield data[start:end]
             start = end
         end += length
     if start < len(data):
         yield data[start:]
-
-
-def _frame_length(data: bytes, at: int) -> int:
-    payload = data[at + 1]
-    if data[at] == _V1_MAGIC:
-        return payload + _V1_OVERHEAD
-    is_signed = data[at + 2] & _SIGNED_FLAG
-    return payload + _V2_OVERHEAD + (_SIGNATURE if is_signed else 0)

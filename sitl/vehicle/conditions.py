@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sitl.errors import UsageError
+from sitl import UsageError
 from sitl.rotation import Vec3
 
 Rgb: TypeAlias = tuple[int, int, int]
@@ -139,10 +139,6 @@ class _Draw:
         """Any direction; the strength does not matter."""
         return float(self.random.uniform(-math.pi, math.pi))
 
-    def dead_zone_us(self) -> float:
-        """Within 0 .. 30, which covers what is usual for RCn_DZ."""
-        return float(round(self.amount(30.0)))
-
     def shade(self, rgb: Rgb) -> Rgb:
         """A similar colour: hue within 20 degrees, paler or darker."""
         hue, saturation, value = colorsys.rgb_to_hsv(*(part / 255 for part in rgb))
@@ -221,7 +217,8 @@ def _vary_firmware(nominal: Conditions, draw: _Draw) -> Conditions:
         pilot_speed_down_cmps=round(nominal.pilot_speed_up_cmps * draw.factor(1.4)),
         pilot_accel_z_cmps2=round(nominal.pilot_accel_z_cmps2 * draw.factor(1.4)),
         throttle_dead_zone_permille=round(nominal.throttle_dead_zone_permille * draw.factor(1.4)),
-        rc_dead_zones_us=tuple(draw.dead_zone_us() for _ in nominal.rc_dead_zones_us),
+        # 0..30 us covers what is usual for RCn_DZ.
+        rc_dead_zones_us=tuple(float(round(draw.amount(30.0))) for _ in nominal.rc_dead_zones_us),
         input_time_s=round(nominal.input_time_s * draw.factor(1.6), 3),
         angle_gains_per_s=(
             round(roll_gain * lean_gain_factor, 3),

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import NEUTRAL, Sticks, StickTrace, Tick, VehicleState, VisionTick
@@ -88,3 +89,9 @@ def make_vision_tick(frame_id: int = 1, **changes: Any) -> VisionTick:
         rgb=rgb,
     )
     return replace(vision, **changes)
+
+
+def about_z(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotations [B, 4] by angles [B] about the third axis."""
+    zero = np.zeros_like(angle_rad)
+    return np.stack([np.cos(angle_rad / 2), zero, zero, np.sin(angle_rad / 2)], axis=-1)

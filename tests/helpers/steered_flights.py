@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from helpers.factories import about_z
 from helpers.flight_folders import spot
-from policy import rotation
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY
 from policy.data.flight_data import FlightData
 
@@ -33,7 +33,7 @@ def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> Flight
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     change_mps = before[:, 2:3] * 0.01 * ACCELERATION_MPS2 * ahead
     state[:, VELOCITY.start : VELOCITY.start + 2] = np.cumsum(change_mps, axis=0)
-    state[:, QUATERNION] = rotation.about_z(heading)
+    state[:, QUATERNION] = about_z(heading)
     state[:, QUATERNION] *= np.where(state[:, 3:4] < 0, -1, 1)
     state[:, RATE.stop - 1] = before[:, 1] * YAW_RATE_RADPS
     state[:, SPECIFIC_FORCE.stop - 1] = -9.8

@@ -20,7 +20,7 @@ from mavbridge.recording.rows import FrameTruth, TickLabels
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import NOMINAL_VEHICLE, Exposure
 from policy.contract import Contract, Executable
-from sitl.course.truth import gate_truth
+from sitl.course.layout import gate_truth
 
 TRUTHS_KEPT = 64
 """Exposures whose frames may still be on their way."""

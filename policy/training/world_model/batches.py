@@ -40,7 +40,10 @@ class FrameBatch(TensorBatch):
 
 @dataclass(frozen=True, kw_only=True)
 class WindowBatch(TensorBatch):
-    """Windows of K + T frames, and everything random about a step."""
+    """Windows of K + T frames, and everything random about a step.
+
+    Noise is [B, T, ...] of the shape of what it is added to.
+    """
 
     latents: Tensor
     """[B, K + T, C, h, w], not normalised."""
@@ -51,11 +54,8 @@ class WindowBatch(TensorBatch):
     context_noise: Tensor
     """[B, K, C, h, w], of unit scale as normalised latents are."""
     latent_noise: Tensor
-    """[B, T, C, h, w]"""
     motion_noise: Tensor
-    """[B, T, MOTION_DIM]"""
     action_noise: Tensor
-    """[B, T, 4]"""
     timestep: Tensor
     """[B] int64"""
     knows_actions: Tensor

@@ -193,12 +193,9 @@ def validate_autoencoder(model: WorldModel, images: Tensor) -> WorldModelValidat
 def validate_world_model(
     model: WorldModel, batches: Sequence[WindowBatch], frames: Tensor
 ) -> WorldModelValidation:
-    """Losses of all ``batches``, and errors of imagining the first of them.
+    """Losses of all held-out ``batches``, and errors of imagining the first of them.
 
-    Args:
-        model: in eval mode.
-        batches: held-out windows.
-        frames: [B, K + T, H, W, 3] uint8, true frames of the first batch.
+    ``frames`` [B, K + T, H, W, 3] uint8 are the true ones of that batch.
     """
     losses = [float(dynamics_loss(model, batch).metrics["loss"]) for batch in batches]
     context, first = model.config.context_frames, batches[0]

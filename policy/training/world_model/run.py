@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.checkpoints.world_model_file import load_world_model, save_world_model
-from policy.data.flight_data import DatasetError, FlightData, common_frame
+from policy.data.flight_data import DatasetError, FlightData
 from policy.data.interpolation import Indices
 from policy.data.windows import find_windows
 from policy.errors import PolicyError
@@ -46,12 +46,6 @@ def train_world_model(
 ) -> TrainResult:
     """Train, and write the best weights on held-out flights to ``settings.out``.
 
-    Args:
-        flights: what to learn from.
-        config: what to train; its contract's ``state_frame`` must be that of the flights.
-        settings: how, and how long.
-        hooks: clock, progress, and a request to stop.
-
     Raises:
         DatasetError: flights that cannot be learned from.
         TrainingError: a run that cannot be resumed or kept, or that diverged.
@@ -59,10 +53,6 @@ def train_world_model(
         PolicyError: an autoencoder to keep that does not fit.
     """
     folder = open_run(settings, config, flights)
-    if (frame := common_frame(flights)) != config.contract.state_frame:
-        raise DatasetError(
-            f"the flights hold {frame} states, the world model takes {config.contract.state_frame}"
-        )
     return _WorldModelRun(flights, config, settings, folder, hooks).finish()
 
 

@@ -26,7 +26,7 @@ print("ended")
     ("module", "context", "asked"),
     [
         ("mavbridge.core.stopping", "stop_on_signals", "stop.wait(0.001)"),
-        ("sitl.stopping", "stop_on_signal", "stop.is_set()"),
+        ("sitl.clock", "stop_on_signal", "stop.is_set()"),
     ],
 )
 def test_any_number_of_signals_at_once_is_one_stop(module: str, context: str, asked: str) -> None:

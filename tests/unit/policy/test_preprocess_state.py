@@ -4,6 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers.factories import about_z
 from policy import rotation
 from policy.contract import QUATERNION, VELOCITY, Contract
 from policy.nets.encoders import StateEncoder
@@ -30,7 +31,7 @@ def test_it_is_the_same_on_every_heading(
 ) -> None:
     here = state(q, velocity)
     there = here.copy()
-    about = rotation.about_z(np.array([turn]))
+    about = about_z(np.array([turn]))
     there[:, QUATERNION] = rotation.multiply(about, here[:, QUATERNION].astype(np.float64))
     there[:, VELOCITY] = rotation.rotate(about, here[:, VELOCITY].astype(np.float64))
     contract = Contract()

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers.factories import about_z
 from policy import rotation
 
 ANGLE = st.floats(-3.0, 3.0)
@@ -15,7 +16,7 @@ def about(axis: int, angle: float) -> np.ndarray:
 
 
 def test_a_quarter_turn_about_the_third_axis_takes_x_to_y() -> None:
-    turned = rotation.rotate(rotation.about_z(np.array([np.pi / 2])), np.array([[1.0, 0.0, 0.5]]))
+    turned = rotation.rotate(about_z(np.array([np.pi / 2])), np.array([[1.0, 0.0, 0.5]]))
     np.testing.assert_allclose(turned, [[0.0, 1.0, 0.5]], atol=1e-12)
 
 

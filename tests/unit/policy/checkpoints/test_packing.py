@@ -2,7 +2,7 @@
 
 import torch
 
-from policy.checkpoints.packing import pack, unpack
+from policy.checkpoints.tensors import pack, unpack
 
 STATE = {
     "backbone.conv.weight": torch.randn(8, 3, 3, 3, generator=torch.Generator().manual_seed(0)),

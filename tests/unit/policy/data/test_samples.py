@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from helpers.factories import about_z
 from mavbridge.core.records import Sticks, VehicleState
 from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.history import SentHistory, sample_chunk
@@ -36,7 +37,7 @@ def flown(start_ns: int = 10**12, ticks: int = 200, seed: int = 0, **changes: ob
     angle = np.cumsum(random.normal(0, 0.02, ticks))
     state = random.normal(0, 1, (ticks, 13)).astype(np.float32)
     state[:, VELOCITY] = np.cumsum(random.normal(0, 0.05, (ticks, 3)), axis=0)
-    state[:, QUATERNION] = rotation.about_z(angle)
+    state[:, QUATERNION] = about_z(angle)
     attitude_ns = tick_ns - random.integers(1, 5, ticks) * MS
     captured_ns = start_ns + np.arange(ticks // 3) * 33 * MS
     episode = FlightData(
@@ -123,7 +124,7 @@ def test_since_exposure_by_hand() -> None:
     """A quarter turn to the right in 100 ms, gathering 1 m/s northwards, nose east at exposure."""
     tick_ns = np.arange(5) * 100 * MS
     state = np.zeros((5, 13), np.float32)
-    state[:, QUATERNION] = rotation.about_z(np.array([0.0, 90, 180, 180, 180]) * np.pi / 180)
+    state[:, QUATERNION] = about_z(np.array([0.0, 90, 180, 180, 180]) * np.pi / 180)
     state[:, 0] = [0.0, 1.0, 2.0, 3.0, 4.0]
     episode = flown(
         tick_ns=tick_ns,

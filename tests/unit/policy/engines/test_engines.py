@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from policy.contract import Contract, Executable, SingleRatePolicy
-from policy.engines.executable import ExecutionSettings
-from policy.engines.numpy_eager import make_numpy_executable
+from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.toge import Toge

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from policy.contract import Contract, Executable, FloatArray
-from policy.engines.executable import ExecutionSettings
-from policy.engines.numpy_eager import make_numpy_executable
+from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.engines.torch_eager import make_torch_executable
 from policy.engines.warm_start import FULL_EVERY_S, Solve, WarmStart, shift_chunk
 from policy.errors import PolicyError

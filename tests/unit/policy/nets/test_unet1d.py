@@ -7,14 +7,13 @@ from policy.errors import PolicyError
 from policy.nets.action_head import DiffusionHead
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.names import Size
-from policy.nets.unet1d import Conv, UNet1d, UNet1dConfig
+from policy.nets.unet1d import Conv, UNet1d
 
 
 @pytest.fixture(scope="module")
 def unet() -> UNet1d:
     torch.manual_seed(0)
-    config = UNet1dConfig(horizon=16, action_dim=4, condition_dim=32, widths=(16, 24, 32))
-    return UNet1d(config).eval()
+    return UNet1d(horizon=16, condition_dim=32, widths=(16, 24, 32)).eval()
 
 
 @pytest.mark.parametrize(("taps", "stride", "length"), [(1, 1, 4), (3, 1, 5), (3, 2, 8), (5, 1, 4)])
@@ -78,7 +77,7 @@ def test_every_parameter_learns(unet: UNet1d) -> None:
 
 def test_refuses_a_horizon_that_cannot_be_halved() -> None:
     with pytest.raises(PolicyError, match="multiple of 4"):
-        UNet1dConfig(horizon=10, action_dim=4, condition_dim=32, widths=(16, 24, 32))
+        UNet1d(horizon=10, condition_dim=32, widths=(16, 24, 32))
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,8 @@ def frozen(model: Trainee) -> None:
 
 def gradients_of(batch: Batch, model: Trainee) -> dict[str, torch.Tensor]:
     with Gradients(model, device=CPU, bf16=False) as gradients:
-        gradients.each(frozen)
+        for replica in gradients.replicas:
+            frozen(replica)
         told = gradients.compute(batch, losses)
     assert told["loss"].isfinite()
     return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
@@ -94,7 +95,8 @@ def test_statistics_of_norms_are_those_of_the_first_part(batch: Batch, threads: 
     model = trainee()
     before = model.policy.backbone.bn1.running_mean.clone()  # type: ignore[union-attr, operator]
     with Gradients(model, device=CPU, bf16=False) as gradients:
-        gradients.each(Trainee.train)
+        for replica in gradients.replicas:
+            replica.train()
         gradients.compute(batch, losses)
     alone = trainee().train()
     alone(batch.split(threads)[0])

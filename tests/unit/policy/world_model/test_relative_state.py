@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers.factories import about_z
 from policy import rotation
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract, StateFrame
 from policy.world_model.relative_state import (
@@ -78,7 +79,7 @@ def test_what_a_net_makes_up_becomes_a_unit_quaternion_with_positive_w() -> None
 def test_what_is_told_is_the_same_on_every_heading(
     frame: StateFrame, up: tuple[float, float, float]
 ) -> None:
-    by = rotation.about_z(np.array([1.1]))[0]
+    by = about_z(np.array([1.1]))[0]
     past, then = random_states(2), random_states(7, seed=1)
     past_turned, then_turned = turned(past, by), turned(then, by)
     contract = Contract(state_frame=frame)

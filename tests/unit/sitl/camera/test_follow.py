@@ -10,9 +10,9 @@ from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions, FpvRenderer
+from sitl.clock import StopRequest
 from sitl.course.layout import make_course
 from sitl.rotation import IDENTITY
-from sitl.stopping import StopRequest
 
 SHM = "mb-test-follow"
 POSITION_M = (2.0, 0.5, -2.5)
@@ -30,7 +30,7 @@ def test_a_vehicle_over_udp_is_seen_through_shared_memory(capfd):
         vehicle.settimeout(10)
         url = f"udpout:127.0.0.1:{vehicle.getsockname()[1]}"
         follower = threading.Thread(
-            target=film_vehicle, args=(url, course, options, stop), name="test-follow"
+            target=film_vehicle, args=(url, course, options, stop.is_set), name="test-follow"
         )
         follower.start()
         camera = SharedMemoryCamera(SHM, clock=MonotonicClock())

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sitl import UsageError
 from sitl.camera import scenery
 from sitl.camera.fpv import NEAR_M, FpvRenderer, clip_near
 from sitl.course.layout import Course, Gate, make_course
-from sitl.errors import UsageError
 from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import NOMINAL
 

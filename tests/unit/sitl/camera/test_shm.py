@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sitl import UsageError
 from sitl.camera.shm import FramePublisher
-from sitl.errors import UsageError
 
 WIDTH, HEIGHT = 10, 6
 STRIDE = 256

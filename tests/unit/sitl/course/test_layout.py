@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sitl import UsageError
 from sitl.course.layout import (
     ALTITUDE_M,
     CLIMB_M,
@@ -17,7 +18,6 @@ from sitl.course.layout import (
     course_to_json,
     make_course,
 )
-from sitl.errors import UsageError
 
 
 @given(st.integers(0, 2**32))

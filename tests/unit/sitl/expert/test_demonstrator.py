@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.course_flights import fly_course
+from sitl import UsageError
 from sitl.camera.fpv import body_from_camera
-from sitl.course.layout import AirborneStart, make_course
-from sitl.course.truth import gate_truth
-from sitl.errors import UsageError
+from sitl.course.layout import AirborneStart, gate_truth, make_course
 from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance, random_start
 from sitl.expert.guidance import Waypoint, least_acceleration

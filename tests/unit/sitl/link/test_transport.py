@@ -7,8 +7,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from mavbridge.core.processes import free_port
+from sitl import UsageError
 from sitl.clock import NS_PER_S, Clock
-from sitl.errors import UsageError
 from sitl.link.transport import FOLLOWER_KINDS, MAX_PEERS, open_transport, split_frames
 
 DEADLINE_S = 5.0

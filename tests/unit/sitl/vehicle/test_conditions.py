@@ -6,9 +6,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from sitl import UsageError
 from sitl.camera.fpv import FpvRenderer
 from sitl.course.layout import make_course
-from sitl.errors import UsageError
 from sitl.rotation import from_euler, multiply
 from sitl.vehicle.autopilot import Autopilot, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions

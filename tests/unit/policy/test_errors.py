@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings
-from policy.engines.numpy_eager import make_numpy_executable
-from policy.errors import PolicyError
-from policy.user_code import user_code
+from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.errors import PolicyError, user_code
 
 
 @pytest.mark.parametrize("error", [AssertionError("no"), ZeroDivisionError("no"), OSError("no")])
