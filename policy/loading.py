@@ -143,7 +143,7 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
             f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
-            "resnet-unet[:SIZE] or world-model"
+            "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
         )
     return _config(kind, options, image_size)
 
