@@ -159,10 +159,8 @@ class _Flight:
         if action.is_alive and idle_ns > HANG_NS:
             self.link.force_release()
             self._has_hung = True
-            raise PeerError(
-                f"the action loop has hung for {idle_ns / NS_PER_S:.1f} s: the policy is too slow "
-                "for this machine, or stuck"
-            )
+            hung = f"the action loop has hung for {idle_ns / NS_PER_S:.1f} s"
+            raise PeerError(f"{hung}: the policy is too slow for this machine, or stuck")
 
     def _end(self, action: Worker) -> None:
         try:

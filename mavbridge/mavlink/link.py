@@ -81,7 +81,21 @@ class MavlinkLink:
         if self._vehicle is not None and self._vehicle.has_rebooted:
             self._report("the vehicle has rebooted: starting over")
             self._adopt(self._vehicle.identity)
-        return self._snapshot(self._clock.now_ns())
+        now_ns, texts = self._clock.now_ns(), tuple(self._connection.texts)
+        self._connection.texts.clear()
+        is_down, vehicle = self._connection.is_down, self._vehicle
+        if vehicle is None:
+            problem = _DOWN if is_down else "waiting for the vehicle's heartbeat"
+            return LinkSnapshot(telemetry=Telemetry(), status=None, problem=problem, texts=texts)
+        overruled = vehicle.overruled(now_ns)
+        return LinkSnapshot(
+            telemetry=vehicle.telemetry.snapshot(),
+            status=vehicle.status(),
+            problem=(_DOWN if is_down else vehicle.problem(now_ns)) or overruled,
+            is_overruled=overruled is not None,
+            echo_confirmed=vehicle.echo_confirmed,
+            texts=texts,
+        )
 
     def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
         """Receive until an attitude newer than ``newer_than_ns`` has come, or until the deadline.
@@ -125,23 +139,6 @@ class MavlinkLink:
         result = dialect.enums["MAV_RESULT"].get(ack.result)
         reason = result.name.removeprefix("MAV_RESULT_") if result else ack.result
         self._report(f"the vehicle answered {command} with {reason}")
-
-    def _snapshot(self, now_ns: int) -> LinkSnapshot:
-        texts = tuple(self._connection.texts)
-        self._connection.texts.clear()
-        is_down, vehicle = self._connection.is_down, self._vehicle
-        if vehicle is None:
-            problem = _DOWN if is_down else "waiting for the vehicle's heartbeat"
-            return LinkSnapshot(telemetry=Telemetry(), status=None, problem=problem, texts=texts)
-        overruled = vehicle.overruled(now_ns)
-        return LinkSnapshot(
-            telemetry=vehicle.telemetry.snapshot(),
-            status=vehicle.status(),
-            problem=(_DOWN if is_down else vehicle.problem(now_ns)) or overruled,
-            is_overruled=overruled is not None,
-            echo_confirmed=vehicle.echo_confirmed,
-            texts=texts,
-        )
 
     def stats(self) -> LinkStats:
         """Counters for the report."""

@@ -272,11 +272,9 @@ def _ms(values_ns: Sequence[float | None] | Sequence[tuple[float | None, ...]]) 
 
 
 def _ages_ns(tick: Tick) -> tuple[int | None, int | None]:
-    feature_ns = tick.feature_captured_ns
-    return (
-        None if feature_ns is None else tick.sent_ns - feature_ns,
-        None if tick.state is None else tick.sent_ns - tick.state.attitude_ns,
-    )
+    feature_ns, state = tick.feature_captured_ns, tick.state
+    feature_age_ns = None if feature_ns is None else tick.sent_ns - feature_ns
+    return feature_age_ns, None if state is None else tick.sent_ns - state.attitude_ns
 
 
 def _stick_stages(tick: Tick) -> tuple[Sticks, ...]:

@@ -1,8 +1,7 @@
 """The terminal during a flight: one status line while flying, a table afterwards."""
 
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 
 from rich.console import Console
 from rich.live import Live
@@ -112,14 +111,9 @@ class FlightScreen:
             return "READ-ONLY", "bold cyan"
         return "FLYING" if tick.trace else "PREPARING", "bold green"
 
-    @contextmanager
-    def live(self) -> Iterator[None]:
+    def live(self) -> AbstractContextManager[object]:
         """Show the status line, if there is a terminal, until the end of the block."""
-        if not self._console.is_terminal:
-            yield
-            return
-        with self._live:
-            yield
+        return self._live if self._console.is_terminal else nullcontext()
 
     def refresh(self) -> None:
         """Print new messages and the line, at ``STATUS_HZ``; without a terminal, less often."""

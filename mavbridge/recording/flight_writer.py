@@ -1,5 +1,6 @@
 """One flight into its folder, by one thread: ticks, frames, packets, and meta around them."""
 
+import struct
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
@@ -11,12 +12,39 @@ from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
 from mavbridge.recording.meta import FlightMeta, write_meta
 from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow, ticks_batch
 from mavbridge.recording.tables import TableWriter
-from mavbridge.recording.tlog import TlogWriter
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError
 
 FLUSH_NS = 500_000_000
 """Longest span of events that a crash may take with it."""
 FLUSH_ROWS = 256
+
+
+_TLOG_STAMP = struct.Struct(">Q")
+_TLOG_LINK_MASK = 0b11
+
+
+class TlogWriter:
+    """A telemetry log as MAVProxy and the ground stations read it; methods may raise OSError.
+
+    Eight bytes precede every packet: Unix time in microseconds, big-endian. Its lowest two bits are
+    the number of the link (pymavlink's mavlogfile reads them so), here always 0.
+    """
+
+    def __init__(self, path: Path, *, wall_offset_ns: int) -> None:
+        """Create the file, which must not exist; the offset leads from stamps to wall time."""
+        self._file = path.open("xb")
+        self._offset_ns = wall_offset_ns
+
+    def append(self, packets: Iterable[Packet]) -> None:
+        """Hand packets to the kernel."""
+        for packet in sorted(packets, key=lambda packet: packet.stamp_ns):
+            stamp_us = (packet.stamp_ns + self._offset_ns) // 1000 & ~_TLOG_LINK_MASK
+            self._file.write(_TLOG_STAMP.pack(stamp_us) + packet.data)
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
 class FlightWriter:

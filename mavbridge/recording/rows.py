@@ -114,7 +114,18 @@ _ROWS_AT_ONCE = 4096
 
 def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
     """Rows of consecutive ticks; with the schema ``DEMONSTRATION_TICKS``, their labels as well."""
-    return pa.RecordBatch.from_pylist([_tick_columns(row) for row in rows], schema=schema)
+    columns = [
+        {
+            **_attributes(row.tick, _TICK),
+            **_attributes(row.tick.state, _STAMPS),
+            **_attributes(row.tick.trace, _TRACE),
+            **_attributes(row.labels, ("expert",)),
+            "state": row.tick.state and row.tick.state.values.tolist(),
+            "dropped_before": row.dropped_before,
+        }
+        for row in rows
+    ]
+    return pa.RecordBatch.from_pylist(columns, schema=schema)
 
 
 def frames_batch(rows: Sequence[FrameRow], schema: pa.Schema) -> pa.RecordBatch:
@@ -123,18 +134,6 @@ def frames_batch(rows: Sequence[FrameRow], schema: pa.Schema) -> pa.RecordBatch:
         [_attributes(row, tuple(FRAMES.names)) | _attributes(row.truth, _TRUTH) for row in rows],
         schema=schema,
     )
-
-
-def _tick_columns(row: TickRow) -> dict[str, object]:
-    tick = row.tick
-    return {
-        **_attributes(tick, _TICK),
-        **_attributes(tick.state, _STAMPS),
-        **_attributes(tick.trace, _TRACE),
-        **_attributes(row.labels, ("expert",)),
-        "state": None if tick.state is None else tick.state.values.tolist(),
-        "dropped_before": row.dropped_before,
-    }
 
 
 def _attributes(source: object | None, names: Iterable[str]) -> dict[str, object]:

@@ -66,15 +66,6 @@ class Transport(Protocol):
         """Free the socket or port; may be called twice."""
 
 
-def _resolve(address: Address) -> Address:
-    """IP address of a host; once, at the start, because a resolver may block."""
-    host, port = address
-    try:
-        return socket.gethostbyname(host), port
-    except OSError as error:
-        raise UserError(f"cannot find host {host!r}: {error.strerror}") from error
-
-
 _Handle = TypeVar("_Handle", socket.socket, serial.Serial)
 
 
@@ -105,7 +96,7 @@ class UdpTransport(_Base[socket.socket]):
 
     def __init__(self, address: Address, clock: Clock, *, listen: bool) -> None:
         super().__init__(clock)
-        self._address = _resolve(address)
+        self._address = address
         self._listen = listen
 
     def open(self) -> None:
@@ -185,7 +176,7 @@ class TcpTransport(_StreamTransport[socket.socket]):
 
     def __init__(self, address: Address, clock: Clock) -> None:
         super().__init__(clock)
-        self._address = _resolve(address)
+        self._address = address
         self._is_connected = False
         self._heard_ns = 0
 
@@ -314,4 +305,7 @@ def _address(spec: str, text: str) -> Address:
     host, _, port = text.rpartition(":")
     if not (host and port.isdigit() and 0 < int(port) < 65536):
         raise UserError(f"--connect {spec!r}: {text!r} is not HOST:PORT; use {_FORMS}")
-    return host, int(port)
+    try:
+        return socket.gethostbyname(host), int(port)  # now: a resolver may block
+    except OSError as error:
+        raise UserError(f"cannot find host {host!r}: {error.strerror}") from error

@@ -10,7 +10,7 @@ from pymavlink.dialects.v10 import ardupilotmega as dialect1
 from helpers.wire import WireEnd
 from mavbridge.core.records import Packet
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.recording.tlog import TlogWriter
+from mavbridge.recording.flight_writer import TlogWriter
 
 
 def packets(count: int) -> list[bytes]:
