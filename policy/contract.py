@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,12 +90,10 @@ class Contract:
                 f"contract version {self.version} is not supported; this build reads version "
                 f"{CONTRACT_VERSION}: export the checkpoint again"
             )
-        if self.state_frame not in ("ned_frd", "enu_flu"):
-            raise ContractError(
-                f"state_frame {self.state_frame!r} is unknown; use 'ned_frd' or 'enu_flu'"
-            )
-        if self.arrays not in ("numpy", "torch"):
-            raise ContractError(f"arrays {self.arrays!r} is unknown; use 'numpy' or 'torch'")
+        for name, known in (("state_frame", StateFrame), ("arrays", Arrays)):
+            if (value := getattr(self, name)) not in get_args(known):
+                one, other = get_args(known)
+                raise ContractError(f"{name} {value!r} is unknown; use {one!r} or {other!r}")
         if not isinstance(self.since_exposure, bool):
             raise ContractError(
                 f"since_exposure must be true or false, got {self.since_exposure!r}"

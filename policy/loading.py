@@ -55,7 +55,6 @@ class PolicyRequest:
     dual_rate: bool = True
     """A policy without a fast path is made single-rate, with a note."""
     num_diffusion_steps: int = 10
-    """Denoising steps of a full solve."""
     head_steps: int | None = None
     """Denoising steps of a solve from the last chunk; None = all solves are full."""
     image_size: int | None = None

@@ -57,7 +57,10 @@ def load_world_model(path: Path) -> WorldModel:
         raise CheckpointError(f"{path}: world models are stored as .safetensors")
     require_file(path, (".safetensors",))
     header, tensors = read_tensors(path)
-    state = {_current_name(name): value for name, value in tensors.items()}
+    state = {}
+    for name, value in tensors.items():
+        old = next((prefix for prefix in _RENAMED if name.startswith(prefix)), "")
+        state[_RENAMED.get(old, "") + name.removeprefix(old)] = value
     if WORLD_MODEL_KEY not in header or CONTRACT_KEY not in header:
         held = "a policy" if ARCHITECTURE_KEY in header else f"no world model ({sorted(header)})"
         raise CheckpointError(f"{path} holds {held}: name a file of mavbridge train-world-model")
@@ -70,10 +73,3 @@ def load_world_model(path: Path) -> WorldModel:
     require_fit(path, model, state)
     model.load_state_dict(state)
     return model.eval()
-
-
-def _current_name(name: str) -> str:
-    for old, new in _RENAMED.items():
-        if name.startswith(old):
-            return new + name.removeprefix(old)
-    return name

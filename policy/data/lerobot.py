@@ -79,7 +79,6 @@ class _Info:
     video_path: str
     camera: str
     is_video: bool
-    """The images are in videos, not in the table."""
 
 
 @dataclass(frozen=True, kw_only=True)

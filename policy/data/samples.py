@@ -57,12 +57,10 @@ GATE_SIGNS = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """``B`` pairs of an image and a later tick."""
+    """``B`` pairs of an image and a later tick: state [B, state_dim], history [B, K, 4], labels."""
 
     state: FloatArray
-    """[B, state_dim]"""
     history: FloatArray
-    """[B, K, 4]"""
     chunk: FloatArray
     """[B, horizon, 4]; where the flight ends inside, its last stick is held."""
     known: NDArray[np.bool_]

@@ -24,7 +24,6 @@ from policy.nets.toge import Toge
 SAMPLE_ELAPSED_S = 0.02
 """Time between the two chunks of a sample: with a warm start, the second is a refinement."""
 
-
 Candidate = tuple[str, Callable[[], Executable]]
 """The name of an engine to try, and what makes it."""
 

@@ -25,7 +25,6 @@ NAME = "cuda-graph"
 WARM_UP_CALLS = 3
 """Before a capture, so that libraries have their choices and handles (PyTorch's CUDA notes)."""
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
-"""Priorities of CUDA streams."""
 
 
 def make_cuda_graph_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
@@ -84,11 +83,7 @@ class _Graph:
         self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
 
     def __call__(self, *arrays: FloatArray) -> FloatArray:
-        """Run the graph; the result is the caller's.
-
-        Raises:
-            PolicyError: an array is not of the input's shape.
-        """
+        """Run the graph; the result is the caller's. An array of another shape is refused."""
         for host, array in zip(self._pinned, arrays, strict=True):
             if array.shape != tuple(host.shape):
                 raise PolicyError(f"an input must be {list(host.shape)}, got {list(array.shape)}")

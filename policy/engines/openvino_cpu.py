@@ -185,11 +185,7 @@ class _Graph:
         self._request.set_output_tensor(ov.Tensor(self._output, shared_memory=True))
 
     def __call__(self, *arrays: FloatArray) -> FloatArray:
-        """Run the graph; the result is the caller's.
-
-        Raises:
-            PolicyError: an array is not of the input's shape.
-        """
+        """Run the graph; the result is the caller's. An array of another shape is refused."""
         for index, (own, array) in enumerate(zip(self._inputs, arrays, strict=True)):
             if own.shape != array.shape:
                 raise PolicyError(

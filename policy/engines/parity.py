@@ -24,14 +24,14 @@ SAMPLES = 4
 
 @dataclass(frozen=True, kw_only=True)
 class ParitySamples:
-    """Synthetic inputs that exercise every input of a policy; the same for the same contract."""
+    """Synthetic inputs that exercise every input of a policy; the same for the same contract.
+
+    They are rgb [samples, H, W, 3], state [samples, state_dim] and history [samples, K, 4].
+    """
 
     rgb: NDArray[np.uint8]
-    """[samples, image_height, image_width, 3]"""
     state: FloatArray
-    """[samples, state_dim] in the ranges of flight"""
     history: FloatArray
-    """[samples, K, 4]"""
 
 
 def make_parity_samples(contract: Contract) -> ParitySamples:

@@ -130,7 +130,6 @@ class Batches:
         self._timeline, self._store = timeline, store
         self._timesteps, self._settings, self._seed = timesteps, settings, settings.seed
         self.frames = timeline.frames
-        """Images that can be used."""
 
     def with_images(self, step: int, size: int) -> Batch:
         """A batch to train encoder and head."""

@@ -5,9 +5,8 @@ cores that something else uses too, that left half of the time unused.
 """
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Generic, Self, TypeVar
@@ -107,8 +106,6 @@ def row_parts(count: int, parts: int) -> list[slice]:
     return [slice(start, stop) for start, stop in pairwise(bounds) if stop > start]
 
 
-@contextmanager
-def computing_in(device: torch.device, bf16: bool) -> Iterator[None]:
+def computing_in(device: torch.device, bf16: bool) -> torch.autocast:
     """Autocast to bfloat16, or nothing."""
-    with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
-        yield
+    return torch.autocast(device.type, torch.bfloat16, enabled=bf16)

@@ -106,7 +106,7 @@ class MavlinkEndpoint:
 
     def send_all_params(self) -> None:
         """Send every parameter from the first, a few hundred a second."""
-        self._queued_params = deque(range(len(self._ap.params)))
+        self._queued_params = deque(range(len(self._ap.params.names)))
 
     def send_param(self, index: int) -> None:
         """Send PARAM_VALUE; ``index`` must exist."""
@@ -114,6 +114,6 @@ class MavlinkEndpoint:
         name = params.names[index]
         self.send(
             mav.MAVLink_param_value_message(
-                name.encode(), params[name], mav.MAV_PARAM_TYPE_REAL32, len(params), index
+                name.encode(), params[name], mav.MAV_PARAM_TYPE_REAL32, len(params.names), index
             )
         )

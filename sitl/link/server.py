@@ -141,10 +141,10 @@ class MavlinkServer:
         link.send_all_params()
 
     def _param_read(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:
-        index = message.param_index
-        if index < 0 and message.param_id in self._ap.params:
-            index = self._ap.params.names.index(message.param_id)
-        if 0 <= index < len(self._ap.params):
+        index, names = message.param_index, self._ap.params.names
+        if index < 0 and message.param_id in names:
+            index = names.index(message.param_id)
+        if 0 <= index < len(names):
             link.send_param(index)
 
     def _param_set(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:

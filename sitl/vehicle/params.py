@@ -82,12 +82,6 @@ class Params:
     def __getitem__(self, name: str) -> float:
         return self._values[name]
 
-    def __contains__(self, name: object) -> bool:
-        return name in self._values
-
-    def __len__(self) -> int:
-        return len(self._values)
-
     def integer(self, name: str) -> int:
         """The value of an enumeration or bit mask."""
         return int(self._values[name])

@@ -141,19 +141,15 @@ class _OverrideSwitch:
         if now_ns < self._due_ns:
             return False
         self._due_ns = now_ns + self._PERIOD_NS
-        position = self._position(pwm_us)
+        position = "neither"
+        if 900 < pwm_us < 1200:
+            position = "low"
+        elif 1800 < pwm_us < 2200:
+            position = "high"
         if position != self._candidate:
             self._candidate, self._since_ns = position, now_ns
             return False
-        if position in ("middle", "invalid") or now_ns - self._since_ns < self._DEBOUNCE_NS:
+        if position == "neither" or now_ns - self._since_ns < self._DEBOUNCE_NS:
             return False
         was_enabled, self.enabled = self.enabled, position == "high"
         return was_enabled and not self.enabled
-
-    @staticmethod
-    def _position(pwm_us: int) -> str:
-        if not 900 < pwm_us < 2200:
-            return "invalid"
-        if pwm_us < 1200:
-            return "low"
-        return "high" if pwm_us > 1800 else "middle"
