@@ -1,7 +1,7 @@
 """``mavbridge export``: flights in, a LeRobot dataset out, whole or not at all."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -103,13 +103,10 @@ def write_dataset(
         data_file_bytes=data_file_bytes,
         video_file_bytes=video_file_bytes,
     )
-    writer = DatasetWriter(folder, spec)
-    try:
+    with closing(DatasetWriter(folder, spec)) as writer:
         for episode, of_flight in zip(episodes, parts, strict=True):
             _write_flight(writer, episode, of_flight, on_frame)
         writer.finish()
-    finally:
-        writer.close()
     return ExportSummary(
         episodes=writer.episodes,
         rows=writer.rows,
