@@ -7,6 +7,7 @@ graph, and one copy of the weights, serves every step. The parity gate compares 
 torch.
 """
 
+import logging
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -48,13 +49,17 @@ def convert(policy: nn.Module, function: Callable[..., Any], shapes: Sequence[Sh
     Raises:
         PolicyError: the tracer or the converter does not know an operation.
     """
-    with user_code("converting it for OpenVINO failed"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # each shape check of ours is one, and rightly constant
-        return ov.convert_model(
-            _Traceable(policy, function).eval(),
-            example_input=tuple(torch.zeros(shape) for shape in shapes),
-            input=[list(shape) for shape in shapes],
-        )
+    log_level = logging.root.level
+    try:
+        with user_code("converting it for OpenVINO failed"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # each shape check of ours is one, and rightly constant
+            return ov.convert_model(
+                _Traceable(policy, function).eval(),
+                example_input=tuple(torch.zeros(shape) for shape in shapes),
+                input=[list(shape) for shape in shapes],
+            )
+    finally:
+        logging.root.setLevel(log_level)  # a failed conversion silences the warnings of everybody
 
 
 def vision_graph(policy: Toge | ResnetUnet) -> ov.Model:

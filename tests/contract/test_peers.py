@@ -126,7 +126,7 @@ def test_mavsdk_gets_parameters_telemetry_and_arms():
     found = json.loads(console.seen.partition("RESULT ")[2].splitlines()[0])
     assert found == {
         "param": 0.5,
-        "params": len(Params()),
+        "params": len(Params().names),
         "attitude": True,
         "position": True,
         "version": 4,

@@ -1,5 +1,6 @@
 """The OpenVINO engine against plain torch, on a CPU; every graph is compiled once per test run."""
 
+import logging
 import subprocess
 import sys
 from collections.abc import Callable
@@ -207,9 +208,11 @@ def test_a_users_module_is_converted_where_it_is_asked_for(changes: dict[str, An
 def test_a_users_module_that_cannot_be_traced_flies_on_torch() -> None:
     policy = UserModule()
     policy.encode_visual = lambda image: torch.linalg.qr(image)[0].mean(dim=(2, 3))  # type: ignore[method-assign]
+    level = logging.root.level
     executable, notes = choose_executable(policy, "openvino", ExecutionSettings(name="mine"))
     assert executable.engine == "torch"
     assert all("is passed over" in note for note in notes)
+    assert logging.root.level == level  # the converter raises it
 
 
 def cached(folder: Path) -> list[Path]:
