@@ -6,6 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.records import Sticks
 from mavbridge.mavlink.codec.calibration import Pwm, RcCalibration
+from mavbridge.mavlink.codec.fast_path import decode_state_packet, pack_override
 from mavbridge.mavlink.codec.messages import (
     CommandRequest,
     Endpoint,
@@ -54,6 +55,9 @@ class Codec:
         """
         if data[:1] in _PACKET_STARTS:
             self.forget_partial()
+            if (state := decode_state_packet(data)) is not None:
+                yield state
+                return
             try:
                 message = self._mav.decode(bytearray(data))  # in half the time of the parser
             except dialect.MAVError:
@@ -119,7 +123,9 @@ class Codec:
         channels_us = [IGNORE_US] * 8
         for channel, value_us in zip(calibration.channels, values_us, strict=True):
             channels_us[channel.number - 1] = value_us
-        return self._pack(self._mav.rc_channels_override_encode(*target, *channels_us))
+        data = pack_override(self.source, self._mav.seq, target, channels_us)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return data
 
     def encode_manual_control(self, target_system: int, sticks: Sticks) -> bytes:
         """MANUAL_CONTROL: x forward, y right, r nose right in -1000..1000, z up in 0..1000.
