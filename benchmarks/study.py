@@ -1,4 +1,4 @@
-"""What makes a checkpoint fly well or badly: one setting changed at a time, the same courses.
+"""A study of what a checkpoint needs: one setting changed at a time, on the same courses.
 
 python -m benchmarks.study --episodes 10 --json docs/study.json --plot docs/study.png
 --checkpoint fast.safetensors --without-age fast_without_age.safetensors

@@ -18,7 +18,7 @@ Output = Literal["rc-override", "manual-control"]
 @Parameter(name="*", group=LIMITS)
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How old an input may be, and how fast a stick may move."""
+    """Oldest inputs to act on, and the fastest stick movement."""
 
     max_attitude_age: float = 0.1
     """Oldest attitude and body rates to act on, in seconds."""
