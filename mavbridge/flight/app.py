@@ -20,12 +20,11 @@ from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import build_bridge
 from mavbridge.flight.observers import FlightObservers
-from mavbridge.flight.policies import load_configured_policy, policy_request
+from mavbridge.flight.policies import check_configured_policy, load_configured_policy
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.recording.folder import prepare_folder
 from policy.contract import Executable
-from policy.loading import check_request
 
 JOIN_S = 2.0
 HANG_NS = NS_PER_S
@@ -42,7 +41,7 @@ def fly(config: FlyConfig) -> int:
     # First what takes no time to check: weights take seconds to load.
     make_transport(config.link.connect, clock)
     check_camera(config.camera.source)
-    check_request(policy_request(config.policy))
+    check_configured_policy(config.policy)
     require_writable(config.report, "--report")
     if config.record is not None:
         prepare_folder(config.record)

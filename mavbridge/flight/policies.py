@@ -6,21 +6,25 @@ from pathlib import Path
 
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
-from policy.loading import LoadedPolicy, PolicyRequest, load_policy
+from policy.loading import LoadedPolicy, PolicyRequest, check_request, load_policy
 
 BUILT_IN = ("toge", "resnet-unet")
 
 
 def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
     """Load the policy that the flags name, or raise PolicyError; scripted ones follow ``clock``."""
+    return load_policy(_request(wanted), now_s=lambda: clock.now_ns() / NS_PER_S)
+
+
+def check_configured_policy(wanted: PolicyConfig) -> None:
+    """Refuse in milliseconds, by PolicyError, what ``load_configured_policy`` cannot load."""
+    check_request(_request(wanted))
+
+
+def _request(wanted: PolicyConfig) -> PolicyRequest:
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)  # a user's module:Class lies in the working directory
-    return load_policy(policy_request(wanted), now_s=lambda: clock.now_ns() / NS_PER_S)
-
-
-def policy_request(wanted: PolicyConfig) -> PolicyRequest:
-    """Translate the flags into the request that ``policy.loading`` takes."""
     return PolicyRequest(
         spec=wanted.policy,
         checkpoint=wanted.checkpoint,

@@ -1,0 +1,32 @@
+import sys
+from pathlib import Path
+
+import pytest
+
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import MonotonicClock
+from mavbridge.flight.policies import check_configured_policy, load_configured_policy
+
+MINE = """
+import numpy as np
+from policy.contract import Contract
+
+
+class Still:
+    contract = Contract(arrays="numpy")
+
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        return np.zeros((1, self.contract.horizon, 4), np.float32)
+"""
+
+
+def test_a_users_class_is_found_in_the_working_directory_by_check_and_loading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An installed command does not have the working directory on its path, ``python -m`` does."""
+    (tmp_path / "still_module.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    wanted = PolicyConfig(policy="still_module:Still")
+    check_configured_policy(wanted)
+    assert load_configured_policy(wanted, MonotonicClock()).executable.name == wanted.policy
