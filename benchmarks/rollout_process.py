@@ -23,7 +23,8 @@ from mavbridge.commands.imagine.sampling import Sampler, torch_threads
 from mavbridge.commands.imagine.start import RolloutStart
 from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.core.records import NEUTRAL, ImageArray, RolloutFrame
+from mavbridge.core.records import ImageArray, RolloutFrame
+from mavbridge.core.vehicle import NEUTRAL
 from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM
 from policy.world_model.config import WorldModelConfig
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -11,8 +11,7 @@ from mavbridge.config.groups import CAMERA, LIMITS, OUTPUT, RARE, VEHICLE
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
-
-Output = Literal["rc-override", "manual-control"]
+from mavbridge.core.vehicle import Output
 
 
 @Parameter(name="*", group=LIMITS)

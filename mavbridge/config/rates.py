@@ -8,15 +8,8 @@ from cyclopts import Parameter
 
 from mavbridge.config.checks import check_range
 from mavbridge.config.groups import RARE, RATES
-from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 
-HEARTBEAT_HZ = 1.0
-"""MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
-RC_CHANNELS_HZ = 20.0
-"""RC_CHANNELS for the echo check and the pilot's sticks; the check needs 10 Hz or more."""
-TIMESYNC_HZ = 2.0
-"""TIMESYNC requests; the minimum-delay filter wants a few a second."""
 AUTO_VISUAL_HZ = (10.0, 60.0)
 """Limits of --visual-rate auto where none are given."""
 STATE_HZ = 50.0
@@ -31,11 +24,6 @@ STATUS_HZ = 5.0
 
 
 Pace = Literal["clock", "state"]
-
-
-def period_ns(rate_hz: float) -> int:
-    """Period of a rate in integer nanoseconds."""
-    return round(NS_PER_S / rate_hz)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

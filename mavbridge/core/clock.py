@@ -8,6 +8,11 @@ NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
 
 
+def period_ns(rate_hz: float) -> int:
+    """Period of a rate in integer nanoseconds."""
+    return round(NS_PER_S / rate_hz)
+
+
 def wall_offset_ns(clock: "Clock") -> int:
     """Return Unix time minus the clock, to label moments; take it once, because wall time steps."""
     return time.time_ns() - clock.now_ns()

@@ -1,7 +1,7 @@
 """Durations counted into percentiles, in constant memory."""
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import Percentiles
+from mavbridge.core.vehicle import Percentiles
 
 _SUB_BITS = 7
 """128 bins an octave: a bin is at most 1/128 = 0.8 % wide."""

@@ -47,7 +47,7 @@ class BoundedQueue(Generic[_Item]):
     def __len__(self) -> int:
         return len(self._items)
 
-    def put(self, item: _Item) -> None:
+    def put(self, item: _Item, /) -> None:
         """Add the item; drop and count it if the queue is full."""
         if len(self._items) < self._capacity:
             self._items.append(item)

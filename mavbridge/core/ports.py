@@ -2,7 +2,8 @@
 
 from typing import Protocol
 
-from mavbridge.core.records import Decision, Event, Frame, LinkSnapshot, Sticks
+from mavbridge.core.records import Event, Frame
+from mavbridge.core.vehicle import Decision, LinkSnapshot, Sticks
 
 
 class Camera(Protocol):

@@ -5,48 +5,15 @@ arrival). Arrays are read-only once they are published here.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mavbridge.core.vehicle import Sticks, StickTrace
+
 FloatArray: TypeAlias = NDArray[np.float32]
 ImageArray: TypeAlias = NDArray[np.uint8]
-
-
-class Sticks(NamedTuple):
-    """Stick positions in [-1, 1], in the order of the action vector.
-
-    +throttle = up (0 is mid-stick), +yaw = nose right, +pitch = stick forward = nose down,
-    +roll = right.
-    """
-
-    throttle: float
-    yaw: float
-    pitch: float
-    roll: float
-
-
-NEUTRAL = Sticks(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
-IDLE = Sticks(throttle=-1.0, yaw=0.0, pitch=0.0, roll=0.0)
-"""Throttle at the bottom, the rest centred: what arming demands."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
-    """Hold the vehicle's sticks here."""
-
-    sticks: Sticks
-
-
-@dataclass(frozen=True, slots=True)
-class Release:
-    """Do not touch the sticks: they belong to the pilot. ``reason`` is shown to the user."""
-
-    reason: str
-
-
-Decision: TypeAlias = Command | Release
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,51 +38,6 @@ class FeatureFrame:
     """Dual rate: feature [1, F]. Single rate: preprocessed image [1, 3, H, W]. Read-only."""
 
 
-class Reading(NamedTuple):
-    """One measurement of the vehicle as it came in."""
-
-    arrived_ns: int
-    values: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Telemetry:
-    """Newest reading of each quantity, in MAVLink's frames (NED world, FRD body); None = never."""
-
-    ned_from_body_wxyz: Reading | None = None
-    rate_body_radps: Reading | None = None
-    velocity_ned_mps: Reading | None = None
-    specific_force_body_mps2: Reading | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VehicleStatus:
-    """The vehicle's state as its heartbeat and RC_CHANNELS report it."""
-
-    mode: str
-    armed: bool
-    rc_sticks: Sticks | None = None
-    """Sticks that the vehicle acts on (RC_CHANNELS through its calibration)."""
-    rc_channels_us: tuple[int, ...] = ()
-    rc_arrived_ns: int | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkSnapshot:
-    """Everything that the link knows at one tick."""
-
-    telemetry: Telemetry
-    status: VehicleStatus | None
-    problem: str | None
-    """Why sticks may not be sent (no heartbeat, handshake, override switch, no echo), or None."""
-    is_overruled: bool = False
-    """The vehicle does not act on the sticks that we send: somebody else holds them."""
-    echo_confirmed: bool = False
-    """The vehicle was seen to act on our sticks, or its output has no echo to check."""
-    texts: tuple[str, ...] = ()
-    """Status texts of the vehicle and warnings of the link since the last snapshot."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
     """The 13-D state of the contract and the arrival of each of its parts."""
@@ -127,16 +49,6 @@ class VehicleState:
     rate_ns: int
     velocity_ns: int
     specific_force_ns: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StickTrace:
-    """One action on its way from the policy to the wire."""
-
-    raw: Sticks
-    clipped: Sticks
-    slewed: Sticks
-    smoothed: Sticks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,6 +77,12 @@ class Tick:
     rc_channels_us: tuple[int, ...]
     rc_sticks: Sticks | None
     texts: tuple[str, ...] = ()
+    is_slot: bool = True
+    """A slot of the stick grid; False: sent between two slots, at once for a new chunk."""
+    chunk_serial: int | None = None
+    """Number of the chunk that was flown; None when none was."""
+    is_coasting: bool = False
+    """The chunk was too old to be flown as fresh, and was flown for the grace alone."""
 
     @property
     def activity(self) -> str:
@@ -195,43 +113,6 @@ class VisionTick:
 
 
 Event: TypeAlias = Tick | VisionTick
-
-
-class Packet(NamedTuple):
-    """One MAVLink packet as it came or left."""
-
-    stamp_ns: int
-    """Arrival, or handed to the kernel."""
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Percentiles:
-    """Distribution of a measured quantity; the unit is in the name of what holds it."""
-
-    p50: float
-    p99: float
-    p999: float
-    max: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkStats:
-    """Counters of the link over one flight; None = not measured."""
-
-    messages_per_s: tuple[tuple[str, float], ...]
-    """Mean arrival rate by MAVLink message name."""
-    lost_fraction: float | None
-    rtt_ms: Percentiles | None
-    """Round trips of our own TIMESYNC requests."""
-    sent_overrides: int
-    """Stick messages handed to the kernel; releases not counted."""
-    echo_confirmed: bool | None
-    """The vehicle showed our sticks in RC_CHANNELS; None = no stick was sent."""
-    unusable_packets: int = 0
-    """Corrupt, cut off, or holding NaN."""
-    vehicle_clock_offset_ns: int | None = None
-    """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,19 +6,16 @@ from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, Pacer, Slot
 from mavbridge.core.ports import Link, TickSink
-from mavbridge.core.records import (
+from mavbridge.core.records import FeatureFrame, FloatArray, Tick, VehicleState
+from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
     Command,
     Decision,
-    FeatureFrame,
-    FloatArray,
     LinkSnapshot,
     Release,
     Sticks,
     StickTrace,
-    Tick,
-    VehicleState,
     VehicleStatus,
 )
 from mavbridge.flight.ego_motion import EgoMotion

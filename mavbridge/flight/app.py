@@ -19,6 +19,7 @@ from mavbridge.core.realtime import settle_process, settle_thread
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import build_bridge
+from mavbridge.flight.link_settings import link_settings
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy
 from mavbridge.mavlink.link import MavlinkLink
@@ -99,8 +100,7 @@ class _Flight:
         self.link = MavlinkLink(
             make_transport(config.link.connect, clock),
             clock,
-            config.link,
-            state_hz=loops.state_hz,
+            link_settings(config.link, state_hz=loops.state_hz),
             packet_log=self.observers.packets,
         )
         stack.callback(self.link.close)

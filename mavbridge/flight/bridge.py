@@ -4,8 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.rates import period_ns
-from mavbridge.core.clock import NS_PER_S, Clock, GridPacer, Pacer
+from mavbridge.core.clock import NS_PER_S, Clock, GridPacer, Pacer, period_ns
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, Link, TickSink
 from mavbridge.flight.action_loop import ActionLoop, ActionSettings

@@ -5,7 +5,8 @@ from collections import deque
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import FloatArray, Reading, VehicleState
+from mavbridge.core.records import FloatArray, VehicleState
+from mavbridge.core.vehicle import Reading
 from policy.contract import (
     AGE,
     QUATERNION,

@@ -4,7 +4,8 @@ from bisect import bisect_right
 
 import numpy as np
 
-from mavbridge.core.records import NEUTRAL, FloatArray, Sticks
+from mavbridge.core.records import FloatArray
+from mavbridge.core.vehicle import NEUTRAL, Sticks
 from policy.contract import history_ages_ns
 
 

@@ -13,7 +13,7 @@ from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import BoundedQueue, ObserverThread
 from mavbridge.core.ports import TickSink
-from mavbridge.core.records import Packet
+from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.observe.rerun_flight import RerunView
 from mavbridge.observe.terminal import FlightScreen

@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import Reading, Release, Telemetry, VehicleState
+from mavbridge.core.records import VehicleState
+from mavbridge.core.vehicle import Reading, Release, Telemetry
 
 StateFrame = Literal["ned_frd", "enu_flu"]
 

@@ -7,7 +7,8 @@ from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PeerError
-from mavbridge.core.records import FloatArray, Release
+from mavbridge.core.records import FloatArray
+from mavbridge.core.vehicle import Release
 
 PILOTED_MODES = (
     *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import NEUTRAL, Sticks, StickTrace
+from mavbridge.core.vehicle import NEUTRAL, Sticks, StickTrace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,16 +2,12 @@
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.config.flight import LinkConfig
-from mavbridge.config.rates import HEARTBEAT_HZ, period_ns
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
-from mavbridge.core.observers import BoundedQueue
-from mavbridge.core.records import (
+from mavbridge.core.vehicle import (
     Decision,
     LinkSnapshot,
     LinkStats,
-    Packet,
     Release,
     Sticks,
     Telemetry,
@@ -23,7 +19,8 @@ from mavbridge.mavlink.session.discovery import VehicleDiscovery, VehicleIdentit
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.transport.connection import Connection
+from mavbridge.mavlink.settings import LinkSettings
+from mavbridge.mavlink.transport.connection import Connection, PacketLog
 from mavbridge.mavlink.transport.sockets import Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -31,6 +28,8 @@ RELEASE_REPEATS = 10
 RELEASE_SPACING_NS = 50 * NS_PER_MS
 """A release is sent ten times over half a second, since any one packet may be lost."""
 _COMMAND_SPACING_NS = NS_PER_S
+_HEARTBEAT_HZ = 1.0
+"""MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
 _DOWN = "the connection to the vehicle is lost: reconnecting"
 
 
@@ -45,14 +44,12 @@ class MavlinkLink:
         self,
         transport: Transport,
         clock: Clock,
-        config: LinkConfig,
+        config: LinkSettings,
         *,
-        state_hz: float,
-        packet_log: BoundedQueue[Packet] | None = None,
+        packet_log: PacketLog | None = None,
     ) -> None:
         self._clock = clock
         self._config = config
-        self._state_hz = state_hz
         self._codec = Codec(source_system=config.source_system, source_component=SOURCE_COMPONENT)
         self._connection = Connection(transport, self._codec, clock, packet_log)
         self._discovery = VehicleDiscovery(target_system=config.target_system)
@@ -168,7 +165,7 @@ class MavlinkLink:
             self._report(f"the vehicle now sends from {moved.address}: starting over")
             self._adopt(moved)
         if now_ns >= self._heartbeat_due_ns:
-            self._heartbeat_due_ns = now_ns + period_ns(HEARTBEAT_HZ)
+            self._heartbeat_due_ns = now_ns + period_ns(_HEARTBEAT_HZ)
             self._connection.send(self._codec.encode_heartbeat())
         if (vehicle := self._vehicle) is None:
             return
@@ -181,16 +178,14 @@ class MavlinkLink:
         if (identity := self._discovery.choose(now_ns)) is not None:
             self._adopt(identity)
             return
-        timeout_s, waited_ns = self._config.connect_timeout, now_ns - self._started_ns
+        timeout_s, waited_ns = self._config.connect_timeout_s, now_ns - self._started_ns
         if not self._discovery.is_settling and waited_ns > timeout_s * NS_PER_S:
             waited = f"no vehicle on {self._config.connect} after {timeout_s:g} s"
             raise PeerError(f"{waited}: {self._discovery.describe()}")
 
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""
-        self._vehicle = VehicleSession(
-            identity, self._config, state_hz=self._state_hz, report=self._report
-        )
+        self._vehicle = VehicleSession(identity, self._config, report=self._report)
         self._counters.new_sequence()
         self._connection.peer = identity.address
 

@@ -17,7 +17,8 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import Event, ImageArray, Sticks, Tick, VisionTick
+from mavbridge.core.records import Event, ImageArray, Tick, VisionTick
+from mavbridge.core.vehicle import Sticks
 from mavbridge.observe.rerun_target import RerunRecording
 
 JPEG_QUALITY = 85

@@ -10,7 +10,8 @@ from rich.text import Text
 
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import Event, LinkStats, Tick
+from mavbridge.core.records import Event, Tick
+from mavbridge.core.vehicle import LinkStats
 from mavbridge.observe.timing import TimingReport
 
 RATE_WINDOW_S = 1.0

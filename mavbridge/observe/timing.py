@@ -6,7 +6,8 @@ from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.records import Event, LinkStats, Percentiles, Tick
+from mavbridge.core.records import Event, Tick
+from mavbridge.core.vehicle import LinkStats, Percentiles
 
 MAX_RELEASES = 1000
 """Releases listed in a report; the rest are only counted."""

@@ -6,7 +6,8 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from mavbridge.core.records import Packet, Tick, VisionTick
+from mavbridge.core.records import Tick, VisionTick
+from mavbridge.core.vehicle import Packet
 from mavbridge.recording import rows
 from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
 from mavbridge.recording.meta import FlightMeta, write_meta

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mavbridge.core.observers import BoundedQueue, ObserverThread
-from mavbridge.core.records import Event, Packet, Tick, VisionTick
+from mavbridge.core.records import Event, Tick, VisionTick
+from mavbridge.core.vehicle import Packet
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 

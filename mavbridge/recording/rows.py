@@ -11,7 +11,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import pyarrow as pa
 
-from mavbridge.core.records import Sticks, StickTrace, Tick, VehicleState
+from mavbridge.core.records import Tick, VehicleState
+from mavbridge.core.vehicle import Sticks, StickTrace
 from policy.contract import ACTION_DIM, STATE_DIM
 
 Vector: TypeAlias = tuple[float, float, float]

@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
-from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, Rates, period_ns
+from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, Rates
+from mavbridge.core.clock import period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.ports import TickSink
 from mavbridge.core.records import ImageArray
 from mavbridge.flight.action_loop import ActionLoop
 from mavbridge.flight.bridge import build_bridge
+from mavbridge.flight.link_settings import link_settings
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.delays import Delays
@@ -154,7 +156,11 @@ class SimulatedFlight:
             config,
             self._take_time(executable, vision_clock),
             clock=self.clock,
-            link=MavlinkLink(self._transport, self.clock, config.link, state_hz=loops.state_hz),
+            link=MavlinkLink(
+                self._transport,
+                self.clock,
+                link_settings(config.link, state_hz=loops.state_hz),
+            ),
             camera=camera,
             sinks=sinks,
             cache=DelayedFeatureCache(self.clock),

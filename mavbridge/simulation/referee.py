@@ -8,7 +8,8 @@ from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, PeerError
-from mavbridge.core.records import Event, Sticks, Tick
+from mavbridge.core.records import Event, Tick
+from mavbridge.core.vehicle import Sticks
 from sitl.simulated_vehicle import SimulatedVehicle
 
 READY_NS = 30 * NS_PER_S

@@ -8,7 +8,7 @@ from mavbridge.commands.bench.results import (
     LinkLatency,
     Machine,
 )
-from mavbridge.core.records import Percentiles
+from mavbridge.core.vehicle import Percentiles
 
 
 def all_equal(value: float) -> Percentiles:

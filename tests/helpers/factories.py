@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import NEUTRAL, Sticks, StickTrace, Tick, VehicleState, VisionTick
+from mavbridge.core.records import Tick, VehicleState, VisionTick
+from mavbridge.core.vehicle import NEUTRAL, Sticks, StickTrace
 
 START_NS = 1_000 * NS_PER_S
 TICK_NS = 10 * NS_PER_MS

@@ -6,18 +6,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import (
+from mavbridge.core.records import Event, Frame, Tick, VisionTick
+from mavbridge.core.vehicle import (
     Decision,
-    Event,
-    Frame,
     LinkSnapshot,
     Reading,
     Release,
     Sticks,
     Telemetry,
-    Tick,
     VehicleStatus,
-    VisionTick,
 )
 
 START_NS = 1_000 * NS_PER_S

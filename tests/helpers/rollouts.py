@@ -18,7 +18,8 @@ from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.commands.imagine.start import RolloutStart, read_start
 from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.core.records import FloatArray, ImageArray, Sticks
+from mavbridge.core.records import FloatArray, ImageArray
+from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta

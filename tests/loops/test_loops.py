@@ -10,18 +10,8 @@ import pytest
 
 from helpers.fakes import START_NS, FakeClock, FakeLink, ListSink, ScriptedCamera, level_telemetry
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, GridPacer
-from mavbridge.core.records import (
-    IDLE,
-    NEUTRAL,
-    Command,
-    FeatureFrame,
-    FloatArray,
-    Frame,
-    ImageArray,
-    Reading,
-    Release,
-    Sticks,
-)
+from mavbridge.core.records import FeatureFrame, FloatArray, Frame, ImageArray
+from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Reading, Release, Sticks
 from mavbridge.flight.action_loop import NEUTRAL_NS, NEUTRAL_SPACING_NS, ActionLoop, ActionSettings
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.state import Freshness

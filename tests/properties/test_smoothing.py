@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import NEUTRAL, Sticks
+from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.gate.smoothing import Smoothing, StickSmoother
 
 SETTINGS = Smoothing(max_slew_per_s=8.0, tau_s=0.05)

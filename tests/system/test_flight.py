@@ -12,7 +12,7 @@ import pytest
 from pymavlink import mavutil
 
 from helpers.stand import Override, flight
-from mavbridge.core.records import Sticks
+from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 
 pytestmark = pytest.mark.system

@@ -21,8 +21,7 @@ from mavbridge.commands.bench.missed_slots import (
 from mavbridge.commands.bench.results import OURS, Flight, name_of, solves_of, to_json
 from mavbridge.config.flight import CameraConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.rates import period_ns
-from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.clock import NS_PER_S, MonotonicClock, period_ns
 from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_executable
 from mavbridge.flight.policies import load_configured_policy

@@ -20,6 +20,7 @@ from mavbridge.core.realtime import settle_process, settle_thread
 from mavbridge.core.records import Event, FeatureFrame, FloatArray, Tick
 from mavbridge.flight.bridge import build_action_loop
 from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.link_settings import link_settings
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import make_transport
 from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract, Executable
@@ -60,7 +61,8 @@ def main(*, port: int, out: Path, pace: Pace = "clock") -> None:
         act=repeat_roll_rate,
     )
     transport = make_transport(config.link.connect, clock)
-    link = MavlinkLink(transport, clock, config.link, state_hz=config.rates.action_rate)
+    settings = link_settings(config.link, state_hz=config.rates.action_rate)
+    link = MavlinkLink(transport, clock, settings)
     loop = build_action_loop(config, executable, clock=clock, link=link, cache=cache, sink=meter)
     try:
         loop.run(stop)

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from mavbridge.commands.bench.results import to_json
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.records import Percentiles
+from mavbridge.core.vehicle import Percentiles
 from mavbridge.mavlink.transport.sockets import UdpTransport
 
 ATTITUDE_HZ = 97.0

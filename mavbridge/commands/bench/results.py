@@ -16,7 +16,7 @@ from rich.text import Text
 
 from mavbridge.commands.output import make_table, number
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.records import Percentiles
+from mavbridge.core.vehicle import Percentiles
 
 OURS, BASELINE = "mavbridge", "baseline"
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import Sticks
+from mavbridge.core.vehicle import Sticks
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight
 from policy.contract import Contract, Executable, FloatArray

@@ -11,7 +11,8 @@ from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.commands.imagine.start import RolloutStart
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import FloatArray, ImageArray, Sticks
+from mavbridge.core.records import FloatArray, ImageArray
+from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy.contract import SINCE_EXPOSURE_DIM, Contract, Executable
 

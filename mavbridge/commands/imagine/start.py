@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import FloatArray, ImageArray, Sticks
+from mavbridge.core.records import FloatArray, ImageArray
+from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight
 from policy.preprocess import resize
 from policy.world_model.config import WorldModelConfig

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from mavbridge.core.records import Sticks
+from mavbridge.core.vehicle import Sticks
 
 Pwm: TypeAlias = tuple[int, int, int, int]
 """Throttle, yaw, pitch, roll in us."""

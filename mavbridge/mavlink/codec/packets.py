@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.records import Sticks
+from mavbridge.core.vehicle import Sticks
 from mavbridge.mavlink.codec.calibration import Pwm, RcCalibration
 from mavbridge.mavlink.codec.fast_path import decode_state_packet, pack_override
 from mavbridge.mavlink.codec.messages import (

@@ -3,7 +3,7 @@
 from collections import Counter
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import LinkStats
+from mavbridge.core.vehicle import LinkStats
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 
 

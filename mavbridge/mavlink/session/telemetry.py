@@ -1,7 +1,7 @@
 """Newest reading of each quantity, from the best message that carries it."""
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import Reading, Telemetry
+from mavbridge.core.vehicle import Reading, Telemetry
 from mavbridge.mavlink.codec.messages import Attitude, LocalVelocity, SpecificForce
 
 _YIELD_NS = 300 * NS_PER_MS

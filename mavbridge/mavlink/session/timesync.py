@@ -2,11 +2,12 @@
 
 from collections import deque
 
-from mavbridge.config.rates import TIMESYNC_HZ, period_ns
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.histogram import Histogram
 from mavbridge.mavlink.codec.messages import Timesync
 
+TIMESYNC_HZ = 2.0
+"""TIMESYNC requests; the minimum-delay filter wants a few a second."""
 _WINDOW = 20
 _OUTSTANDING = 8
 

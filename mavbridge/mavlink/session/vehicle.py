@@ -9,11 +9,9 @@ from functools import cached_property
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.config.flight import LinkConfig
-from mavbridge.config.rates import RC_CHANNELS_HZ
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
-from mavbridge.core.records import VehicleStatus
+from mavbridge.core.vehicle import VehicleStatus
 from mavbridge.mavlink.codec.calibration import Pwm, RcCalibration
 from mavbridge.mavlink.codec.messages import (
     Attitude,
@@ -35,7 +33,10 @@ from mavbridge.mavlink.session.echo import EchoCheck
 from mavbridge.mavlink.session.modes import ModeTable
 from mavbridge.mavlink.session.streams import StreamRequester, message_id, telemetry_streams
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
+from mavbridge.mavlink.settings import LinkSettings
 
+RC_CHANNELS_HZ = 20.0
+"""RC_CHANNELS for the echo check and the pilot's sticks; the check needs 10 Hz or more."""
 HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
 """Heartbeats come at 1 Hz: a vehicle that loses three in a row is lost."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
@@ -60,9 +61,8 @@ class VehicleSession:
     def __init__(
         self,
         identity: VehicleIdentity,
-        config: LinkConfig,
+        config: LinkSettings,
         *,
-        state_hz: float,
         report: Callable[[str], None],
     ) -> None:
         self._source_system = config.source_system
@@ -84,7 +84,9 @@ class VehicleSession:
         self._version_due_ns = 0
         self._params = params.ParamReader(params.FIRST_NAMES if self._is_override else ())
         self._is_reading_channels = False
-        self._streams = StreamRequester(telemetry_streams(state_hz=state_hz, rc_hz=RC_CHANNELS_HZ))
+        self._streams = StreamRequester(
+            telemetry_streams(state_hz=config.state_hz, rc_hz=RC_CHANNELS_HZ)
+        )
         self._has_advised = False
         self._status: VehicleStatus | None = None
         """None after a message that may have changed it."""

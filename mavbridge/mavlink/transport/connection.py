@@ -2,11 +2,10 @@
 
 import threading
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
-from mavbridge.core.observers import BoundedQueue
-from mavbridge.core.records import Packet
+from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDownError
@@ -15,6 +14,13 @@ REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 4 * NS_PER_MS
 """Longest stretch of reading: a flood must not keep the action loop from its next slot. What is
 left stays with the kernel, which drops what it cannot hold."""
+
+
+class PacketLog(Protocol):
+    """Takes every packet that is received or sent; must neither wait nor raise."""
+
+    def put(self, packet: Packet, /) -> None:
+        """Take the packet, or drop and count it."""
 
 
 class Arrival(NamedTuple):
@@ -33,7 +39,7 @@ class Connection:
         transport: Transport,
         codec: Codec,
         clock: Clock,
-        log: BoundedQueue[Packet] | None = None,
+        log: PacketLog | None = None,
     ) -> None:
         self._transport = transport
         self._codec = codec

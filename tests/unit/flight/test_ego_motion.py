@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from helpers.factories import make_state
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import Reading, Telemetry, VehicleState
+from mavbridge.core.records import VehicleState
+from mavbridge.core.vehicle import Reading, Telemetry
 from mavbridge.flight.ego_motion import MAX_READINGS, EgoMotion
 from mavbridge.flight.state import Freshness, StateFrame, build_state
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import NEUTRAL, Sticks
+from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
 
 CHUNK = np.array([[0, 0, 0, 0], [1, -1, 0.5, 0], [0, 0, 0, 1]], dtype=np.float32)

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from helpers.fakes import level_telemetry, without
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import Reading, Release, Telemetry, VehicleState
+from mavbridge.core.records import VehicleState
+from mavbridge.core.vehicle import Reading, Release, Telemetry
 from mavbridge.flight.state import Freshness, StateFrame, build_state
 
 NOW_NS = 5_000_000_000

@@ -6,7 +6,7 @@ import pytest
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PeerError
-from mavbridge.core.records import Release
+from mavbridge.core.vehicle import Release
 from mavbridge.gate.engagement import (
     PREPARE_TIMEOUT_NS,
     RETAKE_NS,

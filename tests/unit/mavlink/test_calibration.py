@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.wire import ARDUPILOT
-from mavbridge.core.records import IDLE, NEUTRAL, Sticks
+from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks
 from mavbridge.mavlink.codec.calibration import RcCalibration, RcChannel
 
 

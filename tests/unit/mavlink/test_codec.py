@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.wire import ARDUPILOT, WireEnd
-from mavbridge.core.records import IDLE, NEUTRAL, Sticks
+from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks
 from mavbridge.mavlink.codec.messages import (
     Attitude,
     AutopilotVersion,

@@ -8,12 +8,12 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.fakes import FakeClock
 from helpers.wire import CALIBRATION, WireEnd
-from mavbridge.config.flight import LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.observers import BoundedQueue
-from mavbridge.core.records import IDLE, Command, LinkSnapshot, Packet, Release, Sticks
+from mavbridge.core.vehicle import IDLE, Command, LinkSnapshot, Packet, Release, Sticks
 from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.settings import LinkSettings
 from mavbridge.mavlink.transport.sockets import Address, Chunk, TransportDownError
 
 MS = NS_PER_MS
@@ -121,8 +121,7 @@ class Rig:
         self.link = MavlinkLink(
             self.vehicle,
             self.clock,
-            LinkConfig(connect="memory", **config),
-            state_hz=100.0,
+            LinkSettings(connect="memory", **config),
             packet_log=self.packet_log,
         )
         self.ticks = 0
@@ -410,14 +409,14 @@ def test_mode_and_arm_are_requested_once_a_second_and_refusals_are_reported() ->
 
 
 def test_no_vehicle_is_an_error_with_advice() -> None:
-    rig = Rig(connect_timeout=2.0)
+    rig = Rig(connect_timeout_s=2.0)
     rig.vehicle.is_alive = False
     with pytest.raises(PeerError, match="no vehicle on memory after 2 s: heard nothing"):
         rig.run(3.0)
 
 
 def test_a_vehicle_heard_in_time_is_not_given_up_while_it_settles() -> None:
-    assert Rig(connect_timeout=0.1).run(8.0).problem is None
+    assert Rig(connect_timeout_s=0.1).run(8.0).problem is None
 
 
 def test_it_waits_for_the_attitude_and_no_longer() -> None:

@@ -8,7 +8,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v10 import ardupilotmega as dialect1
 
 from helpers.wire import WireEnd
-from mavbridge.core.records import Packet
+from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.recording.flight_writer import TlogWriter
 

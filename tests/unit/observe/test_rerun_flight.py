@@ -17,7 +17,8 @@ from rerun.chunk import RrdReader
 from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import Event, Sticks, StickTrace
+from mavbridge.core.records import Event
+from mavbridge.core.vehicle import Sticks, StickTrace
 from mavbridge.observe.rerun_flight import MAX_IMAGE_WIDTH, PLOTS, RerunView, flight_blueprint
 
 

@@ -13,7 +13,8 @@ from helpers.factories import (
 )
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import LinkStats, Percentiles, Tick
+from mavbridge.core.records import Tick
+from mavbridge.core.vehicle import LinkStats, Percentiles
 from mavbridge.observe.terminal import (
     PLAIN_PERIOD_S,
     FlightScreen,

@@ -11,7 +11,8 @@ from helpers.factories import (
     make_vision_tick,
 )
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import LinkStats, Percentiles, Tick
+from mavbridge.core.records import Tick
+from mavbridge.core.vehicle import LinkStats, Percentiles
 from mavbridge.observe.timing import (
     MAX_RELEASES,
     FlightTiming,

@@ -8,7 +8,7 @@ import pytest
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, without_writer_process
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.records import Sticks
+from mavbridge.core.vehicle import Sticks
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter

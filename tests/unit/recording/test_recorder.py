@@ -11,7 +11,7 @@ import pytest
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, send_signal
 from mavbridge.core.observers import BoundedQueue
-from mavbridge.core.records import Packet
+from mavbridge.core.vehicle import Packet
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.recorder import Recorder
 

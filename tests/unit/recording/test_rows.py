@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from helpers.factories import make_released_tick, make_state, make_tick, make_trace
 from helpers.recordings import make_row
-from mavbridge.core.records import Sticks, Tick, VehicleState
+from mavbridge.core.records import Tick, VehicleState
+from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.rows import (
     DEMONSTRATION_FRAMES,
     DEMONSTRATION_TICKS,

@@ -10,7 +10,7 @@ from mavbridge.commands.bench.link_vehicle import (
     stick_of,
 )
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import Sticks
+from mavbridge.core.vehicle import Sticks
 from mavbridge.mavlink.session.params import calibration
 
 

@@ -16,7 +16,7 @@ from mavbridge.commands.bench.results import (
     to_json,
 )
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.records import Percentiles
+from mavbridge.core.vehicle import Percentiles
 
 
 @pytest.mark.parametrize("flight", RESULT.flights)

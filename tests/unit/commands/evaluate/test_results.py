@@ -15,7 +15,7 @@ from mavbridge.commands.evaluate.results import (
 )
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.records import NEUTRAL, Sticks
+from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.simulation.referee import EpisodeResult, StickMeter
 
 

@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from helpers.factories import about_z
-from mavbridge.core.records import Sticks, VehicleState
+from mavbridge.core.records import VehicleState
+from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy import rotation

@@ -1,0 +1,160 @@
+"""Values that describe the vehicle, its sticks and the link to it; no arrays, so no numpy to load.
+
+Stamps are nanoseconds of the injected clock, taken where the thing happened (datagram arrival,
+handed to the kernel).
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, TypeAlias
+
+Output: TypeAlias = Literal["rc-override", "manual-control"]
+"""RC_CHANNELS_OVERRIDE (ArduPilot) or MANUAL_CONTROL (PX4)."""
+
+
+class Sticks(NamedTuple):
+    """Stick positions in [-1, 1], in the order of the action vector.
+
+    +throttle = up (0 is mid-stick), +yaw = nose right, +pitch = stick forward = nose down,
+    +roll = right.
+    """
+
+    throttle: float
+    yaw: float
+    pitch: float
+    roll: float
+
+
+NEUTRAL = Sticks(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
+IDLE = Sticks(throttle=-1.0, yaw=0.0, pitch=0.0, roll=0.0)
+"""Throttle at the bottom, the rest centred: what arming demands."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """Hold the vehicle's sticks here."""
+
+    sticks: Sticks
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Do not touch the sticks: they belong to the pilot. ``reason`` is shown to the user."""
+
+    reason: str
+
+
+Decision: TypeAlias = Command | Release
+
+
+class Reading(NamedTuple):
+    """One measurement of the vehicle as it came in."""
+
+    arrived_ns: int
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Telemetry:
+    """Newest reading of each quantity, in MAVLink's frames (NED world, FRD body); None = never."""
+
+    ned_from_body_wxyz: Reading | None = None
+    rate_body_radps: Reading | None = None
+    velocity_ned_mps: Reading | None = None
+    specific_force_body_mps2: Reading | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleStatus:
+    """The vehicle's state as its heartbeat and RC_CHANNELS report it."""
+
+    mode: str
+    armed: bool
+    rc_sticks: Sticks | None = None
+    """Sticks that the vehicle acts on (RC_CHANNELS through its calibration)."""
+    rc_channels_us: tuple[int, ...] = ()
+    rc_arrived_ns: int | None = None
+    is_failsafe: bool = False
+    """HEARTBEAT.system_status is critical or worse: a failsafe of the vehicle is active."""
+    is_landed: bool | None = None
+    """None = the vehicle does not say."""
+    has_receiver: bool | None = None
+    """A radio receiver delivers the pilot's sticks, as seen before our first override; None = not
+    known, or we sent sticks before it could be seen."""
+    pilot_sticks: Sticks | None = None
+    """The receiver's sticks as last seen while we sent none."""
+    position_ned_m: tuple[float, float, float] | None = None
+    """From the estimator's origin; None without a valid, fresh position."""
+    is_position_valid: bool | None = None
+    """The estimator's own verdict on its horizontal position; None = it does not say."""
+    battery_problem: str | None = None
+    """The vehicle reports its battery as low or failed, in words for the user."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSnapshot:
+    """Everything that the link knows at one tick."""
+
+    telemetry: Telemetry
+    status: VehicleStatus | None
+    problem: str | None
+    """Why sticks may not be sent (no heartbeat, handshake, override switch, no echo), or None."""
+    is_overruled: bool = False
+    """The vehicle does not act on the sticks that we send: somebody else holds them."""
+    echo_confirmed: bool = False
+    """The vehicle was seen to act on our sticks, or its output has no echo to check."""
+    is_released: bool = True
+    """The vehicle was seen to act on other sticks than ours since the release, or none was sent."""
+    interruption: str | None = None
+    """Why every engagement so far is over, or None: the vehicle has rebooted, or now sends from
+    another address. Stays as it is once it has happened; a later one has another text."""
+    refused_mode: str | None = None
+    """Mode that the vehicle has just refused to enter, or None."""
+    texts: tuple[str, ...] = ()
+    """Status texts of the vehicle and warnings of the link since the last snapshot."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StickTrace:
+    """One action on its way from the policy to the wire."""
+
+    raw: Sticks
+    clipped: Sticks
+    slewed: Sticks
+    smoothed: Sticks
+
+
+class Packet(NamedTuple):
+    """One MAVLink packet as it came or left."""
+
+    stamp_ns: int
+    """Arrival, or handed to the kernel."""
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Percentiles:
+    """Distribution of a measured quantity; the unit is in the name of what holds it."""
+
+    p50: float
+    p99: float
+    p999: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkStats:
+    """Counters of the link over one flight; None = not measured."""
+
+    messages_per_s: tuple[tuple[str, float], ...]
+    """Mean arrival rate by MAVLink message name."""
+    lost_fraction: float | None
+    rtt_ms: Percentiles | None
+    """Round trips of our own TIMESYNC requests."""
+    sent_overrides: int
+    """Stick messages handed to the kernel; releases not counted."""
+    echo_confirmed: bool | None
+    """The vehicle showed our sticks in RC_CHANNELS; None = no stick was sent."""
+    unusable_packets: int = 0
+    """Corrupt, cut off, or holding NaN."""
+    vehicle_clock_offset_ns: int | None = None
+    """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
