@@ -15,6 +15,7 @@ from sitl.clock import stop_on_signal
 from sitl.course.layout import course_to_json, make_course
 from sitl.vehicle.autopilot import VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.rc import IDLE_RECEIVER_US, MID_RECEIVER_US
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -43,8 +44,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
     end_help = "stop one second after the last gate, or at a crash"
     add("--end-with-course", action="store_true", help=end_help)
-    receiver_help = "RC receiver: with idle sticks (default), or none"
-    add("--receiver", choices=("idle", "none"), default="idle", help=receiver_help)
+    receiver_help = "RC receiver: throttle down (default), every stick centred, or none"
+    add("--receiver", choices=("idle", "mid", "none"), default="idle", help=receiver_help)
+    rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/rc_input.py)"
+    add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
+    type_help = "MAV_TYPE of its heartbeats (default: 2, quadrotor)"
+    add("--vehicle-type", type=_MAV_TYPE, default=2, metavar="N", help=type_help)
     conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
     add("--conditions", type=_SEED, metavar="SEED", help=conditions_help)
     _add_camera_flags(parser)
@@ -77,9 +82,15 @@ def _fly(args: argparse.Namespace) -> None:
     conditions = NOMINAL if args.conditions is None else random_conditions(args.conditions)
     run_vehicle(
         args.connect,
-        VehicleConfig(receiver=args.receiver == "idle", conditions=conditions),
+        VehicleConfig(
+            receiver=args.receiver != "none",
+            receiver_us=MID_RECEIVER_US if args.receiver == "mid" else IDLE_RECEIVER_US,
+            vehicle_type=args.vehicle_type,
+            conditions=conditions,
+        ),
         make_course(args.course),
         camera=None if args.camera is None else _camera(args),
+        rc_port=args.rc_in,
         report=args.report,
         duration_s=args.duration,
         end_with_course=args.end_with_course,
@@ -129,6 +140,8 @@ def _number(
 
 _POSITIVE = _number(float, sys.float_info.min, sys.float_info.max, "a positive number")
 _SEED = _number(int, 0, math.inf, "a whole number, 0 or more")
+_PORT = _number(int, 1, 65535, "a port, 1 to 65535")
+_MAV_TYPE = _number(int, 0, 255, "a number of MAV_TYPE, 0 to 255")
 _IMAGE_SIZE = _number(int, 16, 4096, "16 to 4096 pixels")
 
 

@@ -11,6 +11,7 @@ from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
 from sitl.course.layout import Course
+from sitl.link.rc_input import RcInput
 from sitl.link.transport import Transport, open_transport
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
@@ -25,6 +26,7 @@ def run_vehicle(
     course: Course,
     *,
     camera: CameraOptions | None,
+    rc_port: int | None,
     report: Path | None,
     duration_s: float | None,
     end_with_course: bool,
@@ -32,7 +34,7 @@ def run_vehicle(
     """Fly until the duration is over (None: endless), the course ends, or a signal comes.
 
     Raises:
-        UsageError: a link, the camera's name or the report's folder cannot be used.
+        UsageError: a link, the RC input, the camera's name or the report's folder cannot be used.
     """
     if report is not None and not report.parent.is_dir():
         raise UsageError(f"--report {report}: there is no folder {report.parent}")
@@ -42,15 +44,26 @@ def run_vehicle(
         vehicle = SimulatedVehicle(
             links=len(transports), boot_ns=clock.now_ns(), config=config, course=course
         )
+        rc_input = None
+        if rc_port is not None:
+            rc_input = stack.enter_context(closing(RcInput(rc_port)))
         stop = stack.enter_context(stop_on_signal())
         if camera is not None:
             stack.enter_context(filming(vehicle, course, camera, clock))
         print_status("ready on " + ", ".join(links))
         end_ns = None if duration_s is None else clock.now_ns() + round(duration_s * NS_PER_S)
-        fly(vehicle, transports, clock, stop, end_ns, end_with_course=end_with_course)
-    if report is not None:
-        write_report(report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
-        print_status(f"report written to {report}")
+        fly(
+            vehicle,
+            transports,
+            clock,
+            stop,
+            end_ns,
+            rc_input=rc_input,
+            end_with_course=end_with_course,
+        )
+        if report is not None:
+            write_report(report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
+            print_status(f"report written to {report}")
 
 
 def fly(
@@ -60,6 +73,7 @@ def fly(
     stop: StopRequest,
     end_ns: int | None,
     *,
+    rc_input: RcInput | None = None,
     end_with_course: bool = False,
 ) -> None:
     """Run the loop on a 2.5 ms grid: receive, advance the vehicle to now, send what is due.
@@ -74,6 +88,8 @@ def fly(
             for received in transport.drain():
                 status.on_received(link_id)
                 vehicle.receive(link_id, received.data, received.arrived_ns)
+        if rc_input is not None and (values_us := rc_input.latest()) is not None:
+            vehicle.set_receiver(values_us)
         vehicle.step(clock.now_ns())
         for link_id, transport in enumerate(transports):
             transport.send(vehicle.take_outgoing(link_id))

@@ -20,6 +20,8 @@ class LinkFaults:
     reorder: float = 0.0  # the packet is held back by ``reorder_ms``, so later ones overtake it
     reorder_ms: float = 20.0
     delay_ms: float = 0.0
+    silence_ns: tuple[int, int] | None = None
+    """From and until (not included) on the caller's clock: what is sent meanwhile is lost."""
 
 
 class FaultyLink:
@@ -33,6 +35,9 @@ class FaultyLink:
 
     def send(self, packet: bytes, now_ns: int) -> None:
         """Put a packet on the link."""
+        silence_ns = self._faults.silence_ns
+        if silence_ns is not None and silence_ns[0] <= now_ns < silence_ns[1]:
+            return
         if self._happens(self._faults.loss):
             return
         for _ in range(2 if self._happens(self._faults.duplicate) else 1):
@@ -42,6 +47,11 @@ class FaultyLink:
             due_ns = now_ns + round(delay_ms * NS_PER_MS)
             heapq.heappush(self._in_flight, (due_ns, self._sent, self._maybe_corrupt(packet)))
             self._sent += 1
+
+    @property
+    def due_ns(self) -> int | None:
+        """When the next packet arrives; None while none is on its way."""
+        return self._in_flight[0][0] if self._in_flight else None
 
     def receive(self, now_ns: int) -> list[bytes]:
         """Packets that have arrived by now, in order of arrival."""

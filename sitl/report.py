@@ -3,9 +3,10 @@
 import json
 import math
 from array import array
+from collections import deque
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from sitl.course.layout import Course
 from sitl.course.referee import Crash, GateCounter, GatePass, struck_gate
 from sitl.rotation import Vec3, cos_tilt, to_euler
 from sitl.vehicle.autopilot import Autopilot
+from sitl.vehicle.flight_modes import Mode
 
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
@@ -23,6 +25,10 @@ END_AFTER_NS = NS_PER_S
 """From the last gate to the end of a flown course: a crash just behind the gate still counts."""
 PATH_PERIOD_NS = NS_PER_S // 20
 """Path length is summed at 20 Hz: fine enough for turns, coarse enough not to add up vibration."""
+
+MAX_STICK_ENTRIES = 20_000
+STICK_PERIOD_NS = NS_PER_S // 20
+"""While armed an entry is made at least this often, so that the motion under held sticks shows."""
 
 LogEntry: TypeAlias = dict[str, float | str]  # a time ``t_s`` and what happened then
 
@@ -43,6 +49,8 @@ class FlightLog:
         self._overrides = _OverrideStats()
         self._release_times_s: list[float] = []
         self._releases = 0
+        self._sticks = _StickRecord()
+        self._arrived_ns = start_ns
         self._modes: list[LogEntry] = []
         self._armed_ns = 0
         self._last_ns = self._path_due_ns = start_ns
@@ -93,6 +101,13 @@ class FlightLog:
         over_ns = now_ns - self._start_ns - END_AFTER_NS
         return "finished" if self._gates.passed[-1].t_s * NS_PER_S <= over_ns else None
 
+    def on_received(self, arrived_ns: int) -> None:
+        """Note that bytes came: after a stall the steps that act on them lie before their arrival.
+
+        What they change in ``sticks`` is stamped with the arrival then, never with less.
+        """
+        self._arrived_ns = max(self._arrived_ns, arrived_ns)
+
     def on_override(self, arrived_ns: int) -> None:
         """Count an RC_CHANNELS_OVERRIDE that drives at least one stick."""
         self._overrides.add(arrived_ns)
@@ -113,6 +128,7 @@ class FlightLog:
         """Measure the vehicle after a control step."""
         if not self._modes or self._modes[-1]["mode"] != ap.mode.name:
             self._modes.append({"t_s": self._t_s(ap.now_ns), "mode": ap.mode.name})
+        self._sticks.update(ap, max(ap.now_ns, self._arrived_ns))
         if ap.armed:
             self._armed_ns += ap.now_ns - self._last_ns
         self._last_ns = ap.now_ns
@@ -176,10 +192,65 @@ class FlightLog:
                 "velocity_ned_mps": body.velocity_ned_mps,
                 "roll_pitch_yaw_deg": [math.degrees(angle) for angle in angles],
             },
+            "sticks": self._sticks.summary(self._start_ns),
         }
 
     def _t_s(self, now_ns: int) -> float:
         return (now_ns - self._start_ns) / NS_PER_S
+
+
+class _StickEntry(NamedTuple):
+    stamp_ns: int
+    us: tuple[int, int, int, int]  # roll, pitch, throttle, yaw
+    mode: Mode
+    armed: bool
+    failsafe: bool
+    lean_deg: float  # between the vehicle's axis and the vertical
+    climb_mps: float
+
+
+class _StickRecord:
+    """The sticks that the vehicle acted on and its motion, at every change and between them."""
+
+    def __init__(self) -> None:
+        self._entries: deque[_StickEntry] = deque(maxlen=MAX_STICK_ENTRIES)
+        self._channels_us: list[int] = []
+        self._due_ns = 0
+
+    def update(self, ap: Autopilot, stamp_ns: int) -> None:
+        """Look at the vehicle after a control step; ``stamp_ns`` is the time of an entry."""
+        last = self._entries[-1] if self._entries else None
+        failsafe = ap.radio_failsafe.active
+        is_same = last is not None and (ap.mode, ap.armed, failsafe) == last[2:5]
+        is_due = ap.armed and ap.now_ns >= self._due_ns
+        if is_same and not is_due and ap.rc.channels_us == self._channels_us:
+            return
+        self._channels_us = ap.rc.channels_us.copy()
+        us = ap.rc.sticks_us()
+        if is_same and not is_due and last is not None and us == last.us:
+            return
+        body = ap.truth
+        lean_deg = math.degrees(math.acos(max(-1.0, min(1.0, cos_tilt(body.ned_from_body_wxyz)))))
+        climb_mps = -body.velocity_ned_mps[2]
+        self._due_ns = ap.now_ns + STICK_PERIOD_NS
+        self._entries.append(
+            _StickEntry(stamp_ns, us, ap.mode, ap.armed, failsafe, lean_deg, climb_mps)
+        )
+
+    def summary(self, start_ns: int) -> list[dict[str, Any]]:
+        """The ``sticks`` list of the report."""
+        return [
+            {
+                "t_s": (entry.stamp_ns - start_ns) / NS_PER_S,
+                "us": entry.us,
+                "mode": entry.mode.name,
+                "armed": entry.armed,
+                "failsafe": entry.failsafe,
+                "lean_deg": round(entry.lean_deg, 2),
+                "climb_mps": round(entry.climb_mps, 3),
+            }
+            for entry in self._entries
+        ]
 
 
 class _OverrideStats:
@@ -223,5 +294,8 @@ class _OverrideStats:
 
 
 def write_report(path: Path, summary: dict[str, Any]) -> None:
-    """Write the report as JSON."""
-    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    """Write the report as JSON, each entry of ``sticks`` on a line of its own."""
+    sticks = ",\n    ".join(json.dumps(entry) for entry in summary["sticks"])
+    rest = {key: value for key, value in summary.items() if key != "sticks"}
+    head = json.dumps(rest, indent=2).removesuffix("\n}")
+    path.write_text(f'{head},\n  "sticks": [\n    {sticks}\n  ]\n}}\n', encoding="utf-8")

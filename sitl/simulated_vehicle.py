@@ -1,5 +1,6 @@
 """A whole vehicle without I/O: bytes in and out per link, and a clock that the caller steps."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sitl.course.layout import AirborneStart, Course
@@ -36,6 +37,7 @@ class SimulatedVehicle:
         self.params = Params(self._config.conditions)
         self.log = FlightLog(boot_ns, course)
         self.ap = Autopilot(self.params, self._config, boot_ns)
+        self._transmitter_us: Sequence[int] | None = None
         self.server = MavlinkServer(self.ap, links, self.log)
         self.pose = Pose(stamp_ns=boot_ns, body=self.ap.truth)
 
@@ -46,7 +48,13 @@ class SimulatedVehicle:
 
     def receive(self, link_id: int, data: bytes, now_ns: int) -> None:
         """Act on bytes that arrived on a link at ``now_ns``."""
+        self.log.on_received(now_ns)
         self.server.receive(link_id, data, now_ns)
+
+    def set_receiver(self, values_us: Sequence[int]) -> None:
+        """Move the pilot's sticks and switches (`RcEngine.set_receiver`); a reboot leaves them."""
+        self._transmitter_us = values_us
+        self.ap.rc.set_receiver(values_us)
 
     def step(self, now_ns: int) -> None:
         """Advance the simulation to ``now_ns`` in whole control steps, then queue what is due.
@@ -75,5 +83,7 @@ class SimulatedVehicle:
     def reboot(self) -> None:
         """Restart on the ground at the origin: time_boot_ms is 0, parameters stay."""
         self.ap = Autopilot(self.params, self._config, self.ap.now_ns)
+        if self._transmitter_us is not None:
+            self.ap.rc.set_receiver(self._transmitter_us)
         self.server.restart(self.ap)
         self.log.on_reboot()

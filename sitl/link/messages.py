@@ -14,7 +14,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.rotation import Vec3, conjugate, rotate, to_euler
 from sitl.vehicle.autopilot import Autopilot
 from sitl.vehicle.dynamics import GRAVITY_MPS2
-from sitl.vehicle.flight_modes import Mode
 
 Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 
@@ -26,7 +25,6 @@ GYRO_BIAS_RADPS: Vec3 = (0.003, -0.002, 0.001)
 """Subtracted by the estimator; raw IMU messages still carry it."""
 GROUND_PRESSURE_HPA = 945.0
 TEMPERATURE_CDEG = 3500
-BATTERY_MV, BATTERY_CA = 12_600, 0
 
 _SENSORS = (
     mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -98,7 +96,7 @@ def _lat_lon_e7(north_m: float, east_m: float) -> tuple[int, int]:
 
 
 def _heartbeat(ap: Autopilot) -> Message:
-    """A quadrotor; CRITICAL while a failsafe is active."""
+    """CRITICAL while a failsafe is active."""
     base_mode = (
         mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         | mav.MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -108,11 +106,11 @@ def _heartbeat(ap: Autopilot) -> Message:
     if ap.armed:
         base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED
         status = mav.MAV_STATE_ACTIVE
-    if ap.radio_failsafe.active or ap.gcs_failsafe.active:
+    if ap.radio_failsafe.active or ap.gcs_failsafe.active or ap.battery.is_low:
         status = mav.MAV_STATE_CRITICAL
     autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     return mav.MAVLink_heartbeat_message(
-        mav.MAV_TYPE_QUADROTOR, autopilot, base_mode, int(ap.mode), status, 3
+        ap.config.vehicle_type, autopilot, base_mode, int(ap.mode), status, 3
     )
 
 
@@ -174,10 +172,22 @@ def _vfr_hud(ap: Autopilot) -> Message:
 def _sys_status(ap: Autopilot) -> Message:
     """PREARM_CHECK is healthy when mode and sticks alone decide on arming."""
     present = _SENSORS | mav.MAV_SYS_STATUS_PREARM_CHECK
-    health = present if ap.armed or ap.prearm_refusal() is None else _SENSORS
+    present |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.rc.found else 0
+    faults = 0
+    if not ap.armed and ap.prearm_refusal() is not None:
+        faults |= mav.MAV_SYS_STATUS_PREARM_CHECK
+    if ap.radio_failsafe.active:
+        faults |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+    if ap.battery.is_low:
+        faults |= mav.MAV_SYS_STATUS_SENSOR_BATTERY
+    battery = (*_battery_mv_ca(ap), ap.battery.remaining_percent)
     return mav.MAVLink_sys_status_message(
-        present, present, health, 100, BATTERY_MV, BATTERY_CA, 100, 0, 0, 0, 0, 0, 0
+        present, present, present & ~faults, 100, *battery, 0, 0, 0, 0, 0, 0
     )
+
+
+def _battery_mv_ca(ap: Autopilot) -> tuple[int, int]:
+    return round(1000.0 * ap.battery.voltage_v), round(100.0 * ap.battery.current_a)
 
 
 def _ekf_status_report(ap: Autopilot) -> Message:
@@ -207,19 +217,30 @@ def _gps_raw_int(ap: Autopilot) -> Message:
     )
 
 
-def _battery_status(_ap: Autopilot) -> Message:
-    """A full pack that never empties."""
+def _battery_status(ap: Autopilot) -> Message:
+    """One pack, its voltage as that of a single cell."""
     function, chemistry = mav.MAV_BATTERY_FUNCTION_ALL, mav.MAV_BATTERY_TYPE_LIPO
-    cells_mv = [BATTERY_MV] + [65535] * 9
+    pack_mv, current_ca = _battery_mv_ca(ap)
+    is_low = ap.battery.is_low
     return mav.MAVLink_battery_status_message(
-        0, function, chemistry, _INT16, cells_mv, BATTERY_CA, 0, 0, 100
+        0,
+        function,
+        chemistry,
+        _INT16,
+        [pack_mv] + [65535] * 9,
+        current_ca,
+        0,
+        0,
+        ap.battery.remaining_percent,
+        0,
+        mav.MAV_BATTERY_CHARGE_STATE_LOW if is_low else mav.MAV_BATTERY_CHARGE_STATE_OK,
     )
 
 
 def _extended_sys_state(ap: Autopilot) -> Message:
     if ap.landed:
         state = mav.MAV_LANDED_STATE_ON_GROUND
-    elif ap.mode in (Mode.LAND, Mode.RTL):
+    elif ap.mode.lands:
         state = mav.MAV_LANDED_STATE_LANDING
     else:
         state = mav.MAV_LANDED_STATE_IN_AIR
@@ -274,7 +295,7 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: _servo_output_raw,
     # The values after overrides.
     mav.MAVLINK_MSG_ID_RC_CHANNELS: lambda ap: mav.MAVLink_rc_channels_message(
-        _ms(ap), 8, *ap.rc.channels_us, 0, 0, 255
+        _ms(ap), ap.rc.channel_count, *ap.rc.channels_us, 0, 0, 255
     ),
     mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
     mav.MAVLINK_MSG_ID_OPTICAL_FLOW: lambda _: None,  # accepted by the firmware, never sent

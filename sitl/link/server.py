@@ -29,6 +29,7 @@ class MavlinkServer:
     def __init__(self, ap: Autopilot, link_count: int, log: FlightLog) -> None:
         self.links = tuple(MavlinkEndpoint(ap) for _ in range(link_count))
         self._ap = ap
+        self._mode = ap.mode
         self._log = log
         self._handlers = {
             "HEARTBEAT": self._heartbeat,
@@ -56,6 +57,7 @@ class MavlinkServer:
     def restart(self, ap: Autopilot) -> None:
         """Serve a vehicle that has just booted."""
         self._ap = ap
+        self._mode = ap.mode
         for link in self.links:
             link.restart(ap)
 
@@ -75,7 +77,11 @@ class MavlinkServer:
             handler(link, message, arrived_ns)
 
     def step(self) -> None:
-        """Queue what is due on every link; texts go to all."""
+        """Queue what is due on every link; texts go to all, and at a change of mode a heartbeat."""
+        if self._ap.mode is not self._mode:
+            self._mode = self._ap.mode
+            for link in self.links:
+                link.send_now(mav.MAVLINK_MSG_ID_HEARTBEAT)
         for text in self._ap.texts:
             self._log.on_text(self._ap.now_ns, text.text)
             for link in self.links:

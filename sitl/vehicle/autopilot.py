@@ -4,6 +4,7 @@ It behaves as a pilot and a companion computer see ArduCopter: modes, arming, fa
 status texts, word for word. Nothing here knows about MAVLink, sockets or the host's time.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from sitl.vehicle.environment import SensorNoise, Wind
 from sitl.vehicle.failsafe import GcsFailsafe, RadioFailsafe
 from sitl.vehicle.flight_modes import STOPPED, FlightControl, Mode
 from sitl.vehicle.params import Params
-from sitl.vehicle.rc import IDLE_RECEIVER_US, RcEngine
+from sitl.vehicle.rc import IDLE_RECEIVER_US, ModeSwitch, RcEngine
 from sitl.vehicle.sticks import climb_rate_mps, read_sticks
 
 SUBSTEPS = 2
@@ -29,8 +30,12 @@ CRASH_TILT_COS = 0.7
 CRASH_AFTER_NS = NS_PER_S
 SEVERITY_CRITICAL, SEVERITY_WARNING, SEVERITY_INFO = 2, 4, 6
 
-FAILSAFE_LAND = {"FS_THR_ENABLE": 3, "FS_GCS_ENABLE": 5}
-"""The value of each parameter that selects LAND; any other value but 0 means RTL."""
+FAILSAFE_MODES = {
+    "FS_THR_ENABLE": {3: Mode.LAND, 7: Mode.BRAKE},
+    "FS_GCS_ENABLE": {5: Mode.LAND, 7: Mode.BRAKE},
+}
+"""The mode that each value of the parameter selects; any other value but 0 means RTL."""
+FS_OPTION_LANDING_CONTINUES = 8
 FS_OPTION_PILOT_CONTINUES = 16
 RC_OPTION_SKIP_NEUTRAL_CHECK = 64
 
@@ -42,12 +47,26 @@ class StatusText(NamedTuple):
     text: str
 
 
+class Battery(NamedTuple):
+    """The vehicle's word about its battery; it never empties by itself."""
+
+    voltage_v: float = 12.6
+    current_a: float = 0.0
+    remaining_percent: int = 100
+    is_low: bool = False
+    """ArduCopter's battery failsafe has fired; this vehicle reports it and flies on."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleConfig:
     """Differences between one simulated vehicle and another."""
 
     receiver: bool = True
-    """An RC receiver with an idle transmitter; without one the sticks latch and the radio fails."""
+    """An RC receiver is there; without one the sticks latch and the radio fails."""
+    receiver_us: tuple[int, ...] = IDLE_RECEIVER_US
+    """The receiver's channels at boot, in microseconds."""
+    vehicle_type: int = 2
+    """HEARTBEAT.type, a MAV_TYPE: 2 is a quadrotor, and flies as one whatever it says."""
     estimator_ready_s: float = 3.0
     """From boot until arming is possible (about 23 s on the real firmware)."""
     position_ready_s: float = 5.0
@@ -67,7 +86,9 @@ class Autopilot:
         self.mode = Mode.STABILIZE
         self.armed = False
         self.landed = True
-        self.rc = RcEngine(params, IDLE_RECEIVER_US if config.receiver else None)
+        self.rc = RcEngine(params, config.receiver_us if config.receiver else None)
+        self.battery = Battery()
+        """Replaced as a whole by whoever wants another one."""
         self.radio_failsafe = RadioFailsafe(params, boot_ns)
         self.gcs_failsafe = GcsFailsafe(params)
         self.texts: list[StatusText] = []
@@ -75,7 +96,10 @@ class Autopilot:
         self.motor_commands: tuple[float, ...] = STOPPED
         self.sensors_frozen = False
         """Fault: telemetry and control keep the last state, the physics goes on."""
+        self.position_lost = False
+        """Fault: the estimator has no position any more, as long as this is set."""
         self._control = FlightControl(params)
+        self._mode_switch = ModeSwitch()
         self._quad = Quadrotor(config.conditions)
         self._wind = Wind(config.conditions, STEP_S)
         self._noise = SensorNoise(config.conditions)
@@ -106,7 +130,8 @@ class Autopilot:
     @property
     def position_ready(self) -> bool:
         """True once there is a position: LOCAL_POSITION_NED flows, RTL is possible."""
-        return self.uptime_ns >= self.config.position_ready_s * NS_PER_S
+        is_settled = self.uptime_ns >= self.config.position_ready_s * NS_PER_S
+        return is_settled and not self.position_lost
 
     def prearm_refusal(self) -> str | None:
         """ArduCopter's reason why the vehicle is not ready to arm in any mode (PREARM_CHECK)."""
@@ -125,6 +150,8 @@ class Autopilot:
         """ArduCopter's reason why mode or sticks forbid arming, or None."""
         if not self.mode.piloted:
             return f"{self.mode.name} mode not armable"
+        if self.mode.needs_position and not self.position_ready:
+            return "Need Position Estimate"
         sticks = read_sticks(self.rc, self.params)
         is_thrust = self.mode.manual_throttle and sticks.throttle > 0
         if is_thrust or climb_rate_mps(sticks, self.params) > 0.0:
@@ -160,13 +187,16 @@ class Autopilot:
         return True
 
     def set_mode(self, mode: Mode) -> bool:
-        """Change the flight mode; a refusal becomes a status text. True if in that mode then."""
+        """Change the flight mode; a refusal becomes a status text. True if in that mode then.
+
+        A mode that needs a position is refused in the air only: on the ground arming is.
+        """
         if mode is self.mode:
             return True
         refusal = None
         if mode.manual_throttle and self.radio_failsafe.active:
             refusal = "in RC failsafe"
-        elif mode is Mode.RTL and not self.position_ready:
+        elif mode.needs_position and self.armed and not self.position_ready:
             refusal = "requires position"
         if refusal is not None:
             self._send_text(SEVERITY_WARNING, f"Mode change to {mode.name} failed: {refusal}")
@@ -214,10 +244,10 @@ class Autopilot:
         sticks = read_sticks(self.rc, self.params)
         if self.landed:
             if not self._control.wants_takeoff(self.mode, sticks):
-                # LAND and RTL stop the motors on touchdown, the pilot's modes after DISARM_DELAY.
+                # LAND and RTL stop the motors on touchdown, the other modes after DISARM_DELAY.
                 delay_s = self.params["DISARM_DELAY"]
                 is_idle = delay_s > 0.0 and self._has_held(self._idle_since_ns, delay_s * NS_PER_S)
-                if is_idle or not self.mode.piloted:
+                if is_idle or self.mode.lands:
                     self.disarm(force=False)
                 return self._control.idle(self.sensed)
             self.landed = False
@@ -256,10 +286,11 @@ class Autopilot:
 
     def _read_radio(self) -> None:
         new_input = self.rc.update(self.now_ns)
+        self._read_mode_switch()
         changed = self.radio_failsafe.update(
             new_input=new_input,
             throttle_us=self.rc.channels_us[self.rc.index_of("THROTTLE")],
-            can_fail=self.config.receiver or self.armed,
+            can_fail=self.rc.has_receiver or self.armed,
             now_ns=self.now_ns,
         )
         if not changed:
@@ -268,6 +299,15 @@ class Autopilot:
             self._fail_over("Radio", "FS_THR_ENABLE")
         else:
             self._send_text(SEVERITY_WARNING, "Radio Failsafe Cleared")
+
+    def _read_mode_switch(self) -> None:
+        channel = self.params.integer("FLTMODE_CH")
+        if not 1 <= channel <= len(self.rc.channels_us):
+            return
+        position = self._mode_switch.update(self.rc.channels_us[channel - 1], self.now_ns)
+        if position is not None:
+            with suppress(ValueError):  # a mode that this vehicle does not have
+                self.set_mode(Mode(self.params.integer(f"FLTMODE{position}")))
 
     def _on_gcs_change(self) -> None:
         if not self.gcs_failsafe.active:
@@ -286,13 +326,15 @@ class Autopilot:
             self._send_text(SEVERITY_WARNING, f"{who} Failsafe - Disarming")
             self.disarm(force=True)
             return
+        options = self.params.integer("FS_OPTIONS")
+        if self.armed and self.mode is Mode.LAND and options & FS_OPTION_LANDING_CONTINUES:
+            self._send_text(SEVERITY_WARNING, f"{who} Failsafe - Continuing Landing")
+            return
         self._send_text(SEVERITY_WARNING, f"{who} Failsafe")
         if not self.armed:
             return
-        if self.params.integer(parameter) == FAILSAFE_LAND[parameter] or not self.position_ready:
-            self.set_mode(Mode.LAND)
-        elif self.mode is not Mode.LAND:
-            self.set_mode(Mode.RTL)
+        mode = FAILSAFE_MODES[parameter].get(self.params.integer(parameter), Mode.RTL)
+        self.set_mode(mode if self.position_ready else Mode.LAND)
 
     def _send_text(self, severity: int, text: str) -> None:
         self.texts.append(StatusText(severity, text))

@@ -20,6 +20,8 @@ RTL_ARRIVED_M = 1.0
 POSITION_GAIN_PER_S = 0.8
 VELOCITY_GAIN_PER_S = 2.0
 TRAINER_GAIN_PER_S = 5.0
+HOLD_ACCEL_MPS2 = 2.5  # braking and holding lean by at most 14 degrees, as LOITER was measured to
+HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the position of that moment is held
 
 
 class Mode(IntEnum):
@@ -28,8 +30,11 @@ class Mode(IntEnum):
     STABILIZE = 0
     ACRO = 1
     ALT_HOLD = 2
+    LOITER = 5
     RTL = 6
     LAND = 9
+    POSHOLD = 16
+    BRAKE = 17
 
     @property
     def manual_throttle(self) -> bool:
@@ -39,7 +44,27 @@ class Mode(IntEnum):
     @property
     def piloted(self) -> bool:
         """The sticks fly it; also the modes in which it can be armed."""
-        return self in (Mode.STABILIZE, Mode.ACRO, Mode.ALT_HOLD)
+        return self.manual_throttle or self.throttle_is_climb_rate
+
+    @property
+    def throttle_is_climb_rate(self) -> bool:
+        """The throttle stick is a climb rate; the height is held where it is centred."""
+        return self in (Mode.ALT_HOLD, Mode.LOITER, Mode.POSHOLD)
+
+    @property
+    def holds_position(self) -> bool:
+        """It stops and stays at its place: LOITER and POSHOLD at centred sticks, BRAKE always."""
+        return self in (Mode.LOITER, Mode.POSHOLD, Mode.BRAKE)
+
+    @property
+    def needs_position(self) -> bool:
+        """Refused to a vehicle that is armed and has no position."""
+        return self is Mode.RTL or self.holds_position
+
+    @property
+    def lands(self) -> bool:
+        """It ends on the ground: touching down stops the motors at once."""
+        return self in (Mode.RTL, Mode.LAND)
 
 
 class FlightControl:
@@ -50,6 +75,7 @@ class FlightControl:
         self._attitude = AttitudeController(params)
         self._height = HeightController()
         self._home_reached = False
+        self._hold_ned_m: Vec3 | None = None
         self.collective = 0.0
         """Commanded mean thrust, as a fraction of full."""
 
@@ -58,6 +84,7 @@ class FlightControl:
         self._attitude.reset(body)
         self._height.reset(body)
         self._home_reached = False
+        self._hold_ned_m = None
         self.collective = 0.0
 
     def idle(self, body: BodyState) -> tuple[float, ...]:
@@ -69,7 +96,8 @@ class FlightControl:
         """True if the sticks command a landed vehicle to take off."""
         if mode.manual_throttle:
             return sticks.throttle > 0.0
-        return mode is Mode.ALT_HOLD and pilot.climb_rate_mps(sticks, self._params) > 0.0
+        is_climb = pilot.climb_rate_mps(sticks, self._params) > 0.0
+        return mode.throttle_is_climb_rate and is_climb
 
     def fly(
         self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool, dt_s: float
@@ -79,10 +107,13 @@ class FlightControl:
             turn = self._attitude.rates(body, self._acro_rates(sticks, body), dt_s)
             self.collective = pilot.manual_thrust(sticks, self._params)
             return mix(self.collective, turn)
-        if mode in (Mode.STABILIZE, Mode.ALT_HOLD):
-            roll, pitch = pilot.lean_angles(sticks, self._params)
-        else:
-            roll, pitch = self._lean_home(mode, body) if has_position else (0.0, 0.0)
+        roll, pitch = pilot.lean_angles(sticks, self._params) if mode.piloted else (0.0, 0.0)
+        if roll or pitch or not has_position:
+            self._hold_ned_m = None
+        elif mode.holds_position:
+            roll, pitch = self._lean_to_hold(body)
+        elif mode.lands:
+            roll, pitch = self._lean_home(mode, body)
         yaw_rate = pilot.yaw_rate_radps(sticks, self._params) if mode.piloted else 0.0
         turn = self._attitude.lean(body, roll, pitch, yaw_rate, dt_s)
         if mode is Mode.STABILIZE:
@@ -95,8 +126,10 @@ class FlightControl:
         return mix(self.collective, turn)
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
-        if mode is Mode.ALT_HOLD:
+        if mode.throttle_is_climb_rate:
             return pilot.climb_rate_mps(sticks, self._params)
+        if mode is Mode.BRAKE:
+            return 0.0
         height = -body.position_ned_m[2]
         if mode is Mode.RTL and not self._home_reached:
             return max(0.0, min(2.5, self._params["RTL_ALT"] / 100.0 - height))
@@ -115,14 +148,19 @@ class FlightControl:
             elif -down > self._params["RTL_ALT"] / 100.0 - RTL_ARRIVED_M:
                 speed = min(RTL_SPEED_MPS, POSITION_GAIN_PER_S * distance)
                 wanted_n, wanted_e = -north / distance * speed, -east / distance * speed
-        accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n - body.velocity_ned_mps[0])
-        accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e - body.velocity_ned_mps[1])
         limit = GRAVITY_MPS2 * math.tan(math.radians(self._params["ANGLE_MAX"] / 100.0))
-        scale = limit / max(limit, math.hypot(accel_n_mps2, accel_e_mps2))
-        _, _, yaw = to_euler(body.ned_from_body_wxyz)
-        forward = scale * (accel_n_mps2 * math.cos(yaw) + accel_e_mps2 * math.sin(yaw))
-        right = scale * (accel_e_mps2 * math.cos(yaw) - accel_n_mps2 * math.sin(yaw))
-        return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)
+        return _lean_towards(wanted_n, wanted_e, body, limit)
+
+    def _lean_to_hold(self, body: BodyState) -> tuple[float, float]:
+        """Lean that stops the vehicle, and then keeps it where it came to rest."""
+        wanted_n = wanted_e = 0.0
+        if self._hold_ned_m is not None:
+            north, east, _ = self._hold_ned_m
+            wanted_n = POSITION_GAIN_PER_S * (north - body.position_ned_m[0])
+            wanted_e = POSITION_GAIN_PER_S * (east - body.position_ned_m[1])
+        elif math.hypot(*body.velocity_ned_mps[:2]) < HOLD_BELOW_MPS:
+            self._hold_ned_m = body.position_ned_m
+        return _lean_towards(wanted_n, wanted_e, body, HOLD_ACCEL_MPS2)
 
     def _acro_rates(self, sticks: Sticks, body: BodyState) -> Vec3:
         """Stick rates, bent back towards level by ACRO_TRAINER."""
@@ -144,3 +182,16 @@ def _stay_within(angle: float, limit: float, rate: float) -> float:
     """The rate, braked so that the angle comes to rest at the limit."""
     lowest, highest = -limit - angle, limit - angle
     return max(TRAINER_GAIN_PER_S * lowest, min(TRAINER_GAIN_PER_S * highest, rate))
+
+
+def _lean_towards(
+    wanted_n_mps: float, wanted_e_mps: float, body: BodyState, limit_mps2: float
+) -> tuple[float, float]:
+    """Roll and pitch (rad) that change the velocity to this one, at no more than the limit."""
+    accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n_mps - body.velocity_ned_mps[0])
+    accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e_mps - body.velocity_ned_mps[1])
+    scale = limit_mps2 / max(limit_mps2, math.hypot(accel_n_mps2, accel_e_mps2))
+    _, _, yaw = to_euler(body.ned_from_body_wxyz)
+    forward = scale * (accel_n_mps2 * math.cos(yaw) + accel_e_mps2 * math.sin(yaw))
+    right = scale * (accel_e_mps2 * math.cos(yaw) - accel_n_mps2 * math.sin(yaw))
+    return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)

@@ -20,10 +20,17 @@ _FIXED = {
     "ACRO_TRAINER": 2.0,  # 0 none, 1 levels itself, 2 also limits the lean
     "ACRO_Y_RATE": 202.5,  # deg/s
     "DISARM_DELAY": 10.0,  # s
-    "FS_GCS_ENABLE": 0.0,
+    "FLTMODE1": 0.0,  # STABILIZE; the modes of the switch's six positions, this vehicle's own
+    "FLTMODE2": 9.0,  # LAND
+    "FLTMODE3": 6.0,  # RTL
+    "FLTMODE4": 2.0,  # ALT_HOLD, at 1500 us
+    "FLTMODE5": 5.0,  # LOITER
+    "FLTMODE6": 17.0,  # BRAKE
+    "FLTMODE_CH": 5.0,  # channel of the switch; 0: none
+    "FS_GCS_ENABLE": 0.0,  # 0 off, 1 RTL, 5 LAND, 7 BRAKE
     "FS_GCS_TIMEOUT": 5.0,  # s
-    "FS_OPTIONS": 16.0,  # bit 4: carry on under pilot control when the GCS is lost
-    "FS_THR_ENABLE": 1.0,  # 0 off, 1 RTL, 3 LAND
+    "FS_OPTIONS": 16.0,  # bit 3: a landing goes on; 4: so does the pilot when the GCS is lost
+    "FS_THR_ENABLE": 1.0,  # 0 off, 1 RTL, 3 LAND, 7 BRAKE
     "FS_THR_VALUE": 975.0,  # us
     "LAND_SPEED": 50.0,  # cm/s
     "MAV_GCS_SYSID": 255.0,

@@ -4,7 +4,9 @@ Channel rules, timers and their quirks are ArduCopter 4.7's as measured on the f
 expiry after RC_OVERRIDE_TIME, no range check, sticks that stay latched where no receiver exists.
 """
 
+from bisect import bisect_left
 from collections.abc import Sequence
+from itertools import zip_longest
 
 from sitl.clock import NS_PER_S
 from sitl.vehicle.params import RC_CHANNELS_WITH_PARAMS, Params
@@ -17,6 +19,8 @@ RELEASE = 0  # releases channels 1-8; on 9-16 it means "ignore"
 AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
 IDLE_RECEIVER_US = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
 """An untouched transmitter: throttle down, the rest centred."""
+MID_RECEIVER_US = (1500,) * 8
+"""Every stick centred, the throttle too: what a pilot holds who stands by."""
 
 _RECEIVER_PERIOD_NS = NS_PER_S // 50
 _OPTION_OVERRIDE_SWITCH = 46
@@ -30,6 +34,7 @@ class RcEngine:
     def __init__(self, params: Params, receiver_us: Sequence[int] | None) -> None:
         self._params = params
         self._receiver_us = receiver_us
+        self._has_frames = receiver_us is not None
         self._override_us = [RELEASE] * CHANNELS
         self._override_ns = [0] * CHANNELS
         self._fresh_override = False
@@ -39,6 +44,29 @@ class RcEngine:
         """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
         self.found = receiver_us is not None
         """True with a receiver, or once an override has come."""
+
+    @property
+    def has_receiver(self) -> bool:
+        """A receiver has sent values, now or earlier."""
+        return self._receiver_us is not None
+
+    @property
+    def channel_count(self) -> int:
+        """Channels of the receiver, at least eight."""
+        return max(PRIMARY_CHANNELS, len(self._receiver_us or ()))
+
+    def set_receiver(self, values_us: Sequence[int]) -> None:
+        """Move sticks and switches of the transmitter, in microseconds; the next frame has them.
+
+        Up to 16 channels at 50 Hz; a 0 leaves its channel as it is. All zeros switch it off: no
+        more frames come, and the last values stay. A vehicle without a receiver has one from its
+        first values on.
+        """
+        self._has_frames = any(values_us)
+        if self._has_frames:
+            pairs = zip_longest(values_us[:CHANNELS], self._receiver_us or (), fillvalue=0)
+            self._receiver_us = tuple(new or old for new, old in pairs)
+            self.found = True
 
     def override(self, raw_us: Sequence[int], now_ns: int) -> None:
         """Apply the 18 fields of one RC_CHANNELS_OVERRIDE."""
@@ -77,9 +105,15 @@ class RcEngine:
         mapped = self._params.integer(f"RCMAP_{axis}")
         return min(max(mapped, 1), RC_CHANNELS_WITH_PARAMS) - 1
 
+    def sticks_us(self) -> tuple[int, int, int, int]:
+        """Roll, pitch, throttle and yaw that the modes use, in microseconds by RCMAP_*."""
+        roll, pitch, throttle, yaw = map(self.index_of, ("ROLL", "PITCH", "THROTTLE", "YAW"))
+        channels_us = self.channels_us
+        return channels_us[roll], channels_us[pitch], channels_us[throttle], channels_us[yaw]
+
     def update(self, now_ns: int) -> bool:
         """Refresh ``channels_us``; True if receiver or overrides supplied a value."""
-        frame = self._receiver_us is not None and now_ns >= self._next_receiver_ns
+        frame = self._has_frames and now_ns >= self._next_receiver_ns
         if not (frame or self._fresh_override):
             self._watch_switch(now_ns)
             return False
@@ -119,6 +153,30 @@ class RcEngine:
                 if self._switch.update(self.channels_us[channel - 1], now_ns):
                     self.clear_overrides()
                 return
+
+
+class ModeSwitch:
+    """FLTMODE_CH: acts when its position has changed and has stayed for 0.2 s."""
+
+    _HIGHEST_US = (1230, 1360, 1490, 1620, 1749)  # of the first five positions
+    _DEBOUNCE_NS = NS_PER_S // 5
+
+    def __init__(self) -> None:
+        self._position: int | None = None
+        self._candidate: int | None = None
+        self._since_ns = 0
+
+    def update(self, pwm_us: int, now_ns: int) -> int | None:
+        """The new position, 1..6, at the moment it is taken; None otherwise and for the first."""
+        if not 900 < pwm_us < 2200:
+            return None
+        position = 1 + bisect_left(self._HIGHEST_US, pwm_us)
+        if position != self._candidate:
+            self._candidate, self._since_ns = position, now_ns
+        if position == self._position or now_ns - self._since_ns < self._DEBOUNCE_NS:
+            return None
+        before, self._position = self._position, position
+        return None if before is None else position
 
 
 class _OverrideSwitch:

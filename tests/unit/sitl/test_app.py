@@ -4,6 +4,8 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 from itertools import pairwise
 from pathlib import Path
@@ -121,6 +123,50 @@ def test_a_signal_ends_the_loop_and_handlers_come_back(number):
     assert signal.getsignal(number) is before
 
 
+class ScriptedTransmitter:
+    """Receiver values that come at a time."""
+
+    def __init__(self, clock, values_us, at_ns):
+        self._clock, self._values_us, self._at_ns = clock, values_us, at_ns
+
+    def latest(self):
+        if self._at_ns is None or self._clock.now_ns() < self._at_ns:
+            return None
+        self._at_ns = None
+        return self._values_us
+
+
+def test_the_rc_input_moves_the_receiver_while_the_vehicle_flies():
+    clock = FakeClock()
+    vehicle = SimulatedVehicle(links=0, boot_ns=0)
+    rc_input = ScriptedTransmitter(
+        clock, (1700, 1500, 1000, 1500, 1400, 1500, 1500, 1900), NS_PER_S
+    )
+
+    fly(vehicle, [], clock, StopRequest(), end_ns=2 * NS_PER_S, rc_input=rc_input)
+
+    (before, after, switched) = vehicle.log.summary(vehicle.ap, 0)["sticks"]
+    assert before["us"] == (1500, 1500, 1000, 1500)
+    assert after["us"] == (1700, 1500, 1000, 1500)
+    assert after["t_s"] == pytest.approx(1.0, abs=0.025)
+    assert switched["mode"] == "RTL"
+
+
+def test_terminating_the_process_writes_the_report(tmp_path):
+    path = tmp_path / "fc.json"
+    command = [sys.executable, "-m", "sitl", "--connect", "udpout:127.0.0.1:9"]
+    with subprocess.Popen(
+        [*command, "--receiver", "mid", "--report", str(path)], stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr.readline().startswith("sitl: ready")
+        process.terminate()
+        process.communicate(timeout=20.0)
+
+    assert process.returncode == 0
+    assert path.stat().st_size > 0
+    assert json.loads(path.read_text())["final"]["mode"] == "STABILIZE"
+
+
 def test_a_short_run_writes_its_report(tmp_path):
     path = tmp_path / "fc.json"
 
@@ -139,6 +185,8 @@ def test_a_short_run_writes_its_report(tmp_path):
         ["--connect", "udpout:127.0.0.1:9", "--fps", "nan"],
         ["--connect", "udpout:127.0.0.1:9", "--camera", "fpv"],
         ["--connect", "udpout:127.0.0.1:9", "--course", "x"],
+        ["--connect", "udpout:127.0.0.1:9", "--rc-in", "70000"],
+        ["--connect", "udpout:127.0.0.1:9", "--receiver", "broken"],
         ["--connect", "udpout:127.0.0.1:9", "--image-size", "5"],
         ["camera"],
         ["teleport"],
@@ -162,6 +210,7 @@ def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
             ["--connect", url],
             ["--connect", "udpout:127.0.0.1:9", "--report", str(tmp_path / "no" / "fc.json")],
             ["camera", "--follow", "udp:127.0.0.1:9"],
+            ["--connect", "udpout:127.0.0.1:9", "--rc-in", url.rpartition(":")[2]],
         ]
         for argv in requests:
             assert main(argv) == 2

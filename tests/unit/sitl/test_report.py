@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import pairwise
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -10,6 +11,7 @@ from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import Course, make_course
 from sitl.report import FlightLog, write_report
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.autopilot import STEP_NS
 from sitl.vehicle.flight_modes import Mode
 
 
@@ -62,6 +64,59 @@ def test_releases_and_foreign_overrides_on_the_link_are_distinguished():
     summary = vehicle.log.summary(vehicle.ap, 0)
     assert summary["overrides"]["count"] == 2
     assert summary["releases"]["count"] == 2
+
+
+def test_sticks_are_recorded_when_they_change_with_how_the_vehicle_moved(pilot):
+    log, watch = flown(pilot)
+    pilot.take_off()
+    start_ns = pilot.ap.now_ns
+    pilot.hold(0.5, roll=1700, watch=watch)
+    pilot.hold(0.5, watch=watch)
+    pilot.ap.set_mode(Mode.LAND)
+    pilot.hold(0.5, watch=watch)
+
+    entries = log.summary(pilot.ap, 0)["sticks"]
+    changes = [
+        after
+        for before, after in pairwise(entries)
+        if (before["us"], before["mode"]) != (after["us"], after["mode"])
+    ]
+    stamps_s = [entry["t_s"] for entry in entries]
+    neutral, landing = changes
+    assert entries[0] == {
+        "t_s": (start_ns + STEP_NS) / NS_PER_S,
+        "us": (1700, 1500, 1500, 1500),
+        "mode": "ALT_HOLD",
+        "armed": True,
+        "failsafe": False,
+        "lean_deg": pytest.approx(0.0, abs=0.1),
+        "climb_mps": pytest.approx(0.0, abs=0.1),
+    }
+    assert (neutral["us"], neutral["mode"]) == ((1500,) * 4, "ALT_HOLD")
+    assert neutral["t_s"] == pytest.approx(start_ns / NS_PER_S + 0.5, abs=0.003)
+    assert neutral["lean_deg"] == pytest.approx(11.25, abs=0.3)
+    assert landing["mode"] == "LAND"
+    assert entries[-1]["climb_mps"] == pytest.approx(-0.5, abs=0.1)
+    assert max(b - a for a, b in pairwise(stamps_s)) <= 0.051
+
+
+def test_after_a_stall_a_stick_is_not_recorded_before_it_came():
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
+    vehicle.step(STEP_NS)
+    override = mav.MAVLink_rc_channels_override_message(1, 1, 1700, *[65535] * 7)
+
+    vehicle.receive(0, override.pack(mav.MAVLink(None, srcSystem=255)), 300 * NS_PER_MS)
+    vehicle.step(301 * NS_PER_MS)
+
+    changed = vehicle.log.summary(vehicle.ap, 0)["sticks"][1]
+    assert (changed["us"][0], changed["t_s"]) == (1700, 0.3)
+
+
+def test_a_vehicle_at_rest_adds_nothing_to_the_record(pilot):
+    log, watch = flown(pilot)
+    pilot.hold(3.0, thr=1000, watch=watch)
+
+    assert len(log.summary(pilot.ap, 0)["sticks"]) == 1
 
 
 def flown(pilot, course=None):
@@ -122,4 +177,5 @@ def test_the_report_is_json(tmp_path, pilot):
 
     written = json.loads(path.read_text())
     assert written["bad_frames"] == 3
+    assert written["sticks"] == []
     assert written["statustexts"] == [{"t_s": 5e-9, "text": "hello"}]

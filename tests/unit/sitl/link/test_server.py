@@ -14,50 +14,9 @@ from sitl.link.messages import BUILDERS
 from sitl.link.streams import Streams
 from sitl.simulated_vehicle import SimulatedVehicle
 
-STEP_NS = 2_500_000
-
-
-class Station:
-    """The far ends of a vehicle's links."""
-
-    def __init__(self, links=1):
-        self.vehicle = SimulatedVehicle(links=links, boot_ns=0)
-        self.now_ns = 0
-        self._parsers = [mav.MAVLink(None) for _ in range(links)]
-        self._sender = mav.MAVLink(None, srcSystem=255, srcComponent=190)
-
-    def pack(self, message, system_id=255):
-        self._sender.srcSystem = system_id
-        return message.pack(self._sender)
-
-    def send(self, message, link=0, system_id=255):
-        self.vehicle.receive(link, self.pack(message, system_id), self.now_ns)
-
-    def run(self, seconds, link=0):
-        received = []
-        for _ in range(round(seconds * NS_PER_S / STEP_NS)):
-            self.now_ns += STEP_NS
-            self.vehicle.step(self.now_ns)
-            received += self._parsers[link].parse_buffer(self.vehicle.take_outgoing(link)) or []
-        return received
-
-    def interval(self, message_id, rate_hz, link=0):
-        self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz, link=link)
-
-    def command(self, number, *params, link=0):
-        padded = (*params, *[0.0] * (7 - len(params)))
-        self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *padded), link=link)
-        acks = named(self.run(0.01, link), "COMMAND_ACK")
-        return acks[-1].result if acks else None
-
 
 def named(messages, name):
     return [message for message in messages if message.get_type() == name]
-
-
-@pytest.fixture
-def station():
-    return Station()
 
 
 def test_only_heartbeats_and_timesync_come_unasked(station):
@@ -77,16 +36,16 @@ def test_sequence_numbers_have_no_gaps(station):
     assert all((b - a) % 256 == 1 for a, b in pairwise(sequence))
 
 
-def test_intervals_belong_to_the_link_they_came_on():
-    station = Station(links=2)
+def test_intervals_belong_to_the_link_they_came_on(station_of):
+    station = station_of(links=2)
     station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100, link=1)
 
     assert not named(station.run(0.5, link=0), "ATTITUDE")
     assert len(named(station.run(0.5, link=1), "ATTITUDE")) >= 49
 
 
-def test_texts_go_to_all_links():
-    station = Station(links=2)
+def test_texts_go_to_all_links(station_of):
+    station = station_of(links=2)
     station.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196, link=0)
 
     (text,) = named(station.run(0.1, link=1), "STATUSTEXT")
@@ -294,8 +253,8 @@ def test_garbage_never_raises_and_a_good_frame_still_gets_through(chunks):
     st.sampled_from(sorted(mav.mavlink_map)),
     st.binary(min_size=0, max_size=255),
 )
-def test_any_payload_of_any_known_message_is_survived(message_id, payload):
-    station = Station()
+def test_any_payload_of_any_known_message_is_survived(station_of, message_id, payload):
+    station = station_of()
     message = mav.MAVLink_message(message_id, mav.mavlink_map[message_id].msgname)
     message._crc_extra = mav.mavlink_map[message_id].crc_extra
     frame = message._pack(
@@ -383,6 +342,14 @@ def test_link_faults_delay_and_reorder():
     order = [packet[0] for packet in late.receive(NS_PER_S)]
     assert sorted(order) == list(range(50))
     assert order != sorted(order)
+
+
+def test_a_silent_link_loses_what_is_sent_meanwhile_and_nothing_else():
+    link = FaultyLink(LinkFaults(silence_ns=(3 * NS_PER_MS, 5 * NS_PER_MS), delay_ms=1.0), seed=0)
+    for ms in range(8):
+        link.send(bytes([ms]), ms * NS_PER_MS)
+
+    assert link.receive(NS_PER_S) == [bytes([ms]) for ms in (0, 1, 2, 5, 6, 7)]
 
 
 def test_corrupted_frames_are_counted_and_the_rest_gets_through(station):

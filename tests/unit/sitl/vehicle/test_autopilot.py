@@ -158,20 +158,13 @@ def test_forced_arming_skips_the_checks(pilot):
     assert pilot.ap.arm(force=True)
 
 
-@pytest.mark.parametrize("mode", [Mode.LAND, Mode.RTL])
+@pytest.mark.parametrize("mode", [Mode.LAND, Mode.RTL, Mode.BRAKE])
 def test_automatic_modes_cannot_be_armed(pilot, mode):
     pilot.hold(6.0, thr=1000)
     pilot.ap.set_mode(mode)
 
     assert not pilot.ap.arm(force=False)
     assert pilot.texts() == [f"Arm: {mode.name} mode not armable"]
-
-
-def test_rtl_needs_a_position(pilot):
-    pilot.hold(4.0, thr=1000)
-
-    assert not pilot.ap.set_mode(Mode.RTL)
-    assert pilot.texts() == ["Mode change to RTL failed: requires position"]
 
 
 def test_radio_failsafe_without_position_lands(pilot_without_receiver):
@@ -185,7 +178,9 @@ def test_radio_failsafe_without_position_lands(pilot_without_receiver):
     assert pilot.ap.mode is Mode.LAND
 
 
-@pytest.mark.parametrize(("choice", "mode"), [(0, Mode.ALT_HOLD), (1, Mode.RTL), (3, Mode.LAND)])
+@pytest.mark.parametrize(
+    ("choice", "mode"), [(0, Mode.ALT_HOLD), (1, Mode.RTL), (3, Mode.LAND), (7, Mode.BRAKE)]
+)
 def test_fs_thr_enable_chooses_the_action(pilot_without_receiver, choice, mode):
     pilot = pilot_without_receiver
     pilot.ap.params.set("FS_THR_ENABLE", float(choice))
@@ -194,6 +189,111 @@ def test_fs_thr_enable_chooses_the_action(pilot_without_receiver, choice, mode):
     pilot.silence(1.5)
 
     assert pilot.ap.mode is mode
+
+
+FLOWN = (Mode.STABILIZE, Mode.ALT_HOLD, Mode.LOITER, Mode.POSHOLD, Mode.BRAKE, Mode.LAND)
+
+
+@pytest.mark.parametrize("mode", FLOWN)
+def test_without_a_receiver_silence_becomes_rtl_out_of_every_mode(pilot_without_receiver, mode):
+    pilot = pilot_without_receiver
+    pilot.take_off(height_m=8.0, mode=mode)
+    pilot.hold(0.5)
+
+    pilot.silence(0.95)
+    assert pilot.ap.mode is mode
+    pilot.silence(0.1)
+
+    assert pilot.ap.mode is Mode.RTL
+    assert pilot.texts() == ["Radio Failsafe"]
+
+
+def test_a_mode_set_after_the_radio_failsafe_fired_stays(pilot_without_receiver):
+    pilot = pilot_without_receiver
+    pilot.take_off()
+    pilot.silence(1.5)
+    assert pilot.ap.set_mode(Mode.BRAKE)
+
+    pilot.silence(5.0)
+
+    assert pilot.ap.mode is Mode.BRAKE
+
+
+@pytest.mark.parametrize(
+    ("mode", "after", "text"),
+    [
+        (Mode.LAND, Mode.LAND, "Radio Failsafe - Continuing Landing"),
+        (Mode.BRAKE, Mode.RTL, "Radio Failsafe"),
+    ],
+)
+def test_fs_options_bit_3_lets_a_landing_go_on(pilot_without_receiver, mode, after, text):
+    pilot = pilot_without_receiver
+    pilot.ap.params.set("FS_OPTIONS", 24.0)
+    pilot.take_off(mode=mode)
+
+    pilot.silence(1.1)
+
+    assert pilot.ap.mode is after
+    assert pilot.texts() == [text]
+
+
+@pytest.mark.parametrize(("choice", "is_level_after_3_s"), [(1.0, True), (0.0, False)])
+def test_zeros_without_a_receiver_leave_the_lean(
+    pilot_without_receiver, choice, is_level_after_3_s
+):
+    """For a second, until the failsafe; with that switched off for good, whatever the timeout."""
+    pilot = pilot_without_receiver
+    pilot.ap.params.set("FS_THR_ENABLE", choice)
+    pilot.take_off(height_m=8.0)
+    pilot.hold(1.0, roll=1700)
+    pilot.ap.rc.override([0] * 8, pilot.ap.now_ns)
+    pilot.silence(0.95)
+    held_deg = pilot.angles_deg()[0]
+    pilot.silence(3.05)
+
+    assert held_deg == pytest.approx(11.25, abs=0.1)
+    assert (pilot.angles_deg()[0] < 2.0) == is_level_after_3_s
+
+
+def test_the_transmitter_switched_off_is_a_radio_failsafe(pilot):
+    pilot.take_off()
+    pilot.ap.rc.override([0] * 8, pilot.ap.now_ns)
+    pilot.ap.rc.set_receiver([1500] * 8)
+    pilot.silence(1.0)
+    assert pilot.ap.mode is Mode.ALT_HOLD
+
+    pilot.ap.rc.set_receiver([0] * 8)
+    pilot.silence(1.1)
+    assert pilot.ap.mode is Mode.RTL
+
+    pilot.ap.rc.set_receiver([1500] * 8)
+    pilot.silence(0.1)
+    assert pilot.texts() == ["Radio Failsafe", "Radio Failsafe Cleared"]
+    assert pilot.ap.mode is Mode.RTL
+
+
+def test_the_mode_switch_acts_after_its_debounce_and_only_when_it_moves(pilot):
+    pilot.take_off(mode=Mode.ACRO)
+    pilot.ap.rc.set_receiver([1500, 1500, 1500, 1500, 1400])
+    pilot.hold(0.19)
+    assert pilot.ap.mode is Mode.ACRO
+    pilot.hold(0.05)
+    assert pilot.ap.mode is Mode.RTL
+
+    assert pilot.ap.set_mode(Mode.ALT_HOLD)
+    pilot.ap.rc.set_receiver([1500, 1500, 1500, 1500, 1450])
+    pilot.hold(0.5)
+
+    assert pilot.ap.mode is Mode.ALT_HOLD
+
+
+def test_a_position_of_the_mode_switch_without_a_mode_changes_nothing(pilot):
+    pilot.ap.params.set("FLTMODE6", 99.0)
+    pilot.hold(0.5)
+    pilot.ap.rc.set_receiver([1500, 1500, 1000, 1500, 1900])
+    pilot.hold(0.5)
+
+    assert pilot.ap.mode is Mode.STABILIZE
 
 
 def test_radio_failsafe_on_the_ground_disarms(pilot_without_receiver):

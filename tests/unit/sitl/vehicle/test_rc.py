@@ -119,6 +119,55 @@ def test_manual_control_axes_can_be_absent_and_negative_thrust_is_refused():
     assert rc.channels_us[:4] == [2000, 1500, 1000, 1000]
 
 
+def test_the_receiver_moves_at_its_next_frame():
+    rc, _ = engine()
+    rc.update(0)
+    rc.set_receiver([1600, 1500, 1400, 1500])
+    run(rc, 1, 20)
+    assert rc.channels_us[:4] == list(IDLE_RECEIVER_US[:4])
+
+    run(rc, 20, 21)
+
+    assert rc.channels_us[:8] == [1600, 1500, 1400, 1500, 1500, 1500, 1500, 1500]
+
+
+def test_a_receiver_may_have_16_channels_and_zeros_leave_theirs():
+    rc, _ = engine()
+    rc.set_receiver([1500] * 15 + [1900])
+    rc.set_receiver([1700] + [0] * 15)
+    rc.update(0)
+
+    assert rc.channels_us == [1700] + [1500] * 14 + [1900]
+    assert rc.channel_count == 16
+
+
+def test_a_receiver_may_turn_up_later():
+    rc, _ = engine(receiver=False)
+    rc.set_receiver([0] * 8)
+    assert not rc.update(0)
+    assert not rc.found
+
+    rc.set_receiver([1500] * 8)
+
+    assert rc.update(NS_PER_MS)
+    assert rc.found
+    assert rc.channels_us[:8] == [1500] * 8
+
+
+def test_the_sticks_hide_behind_overrides_and_come_back():
+    rc, params = engine(RCMAP_ROLL=2.0, RCMAP_PITCH=1.0)
+    rc.set_receiver([1510, 1520, 1530, 1540])
+    rc.override([1600, 1700] + [KEEP] * 6, 0)
+    run(rc, 0, 30)
+    assert rc.sticks_us() == (1700, 1600, 1530, 1540)
+
+    rc.override([0, 0] + [KEEP] * 6, 30 * NS_PER_MS)
+    run(rc, 30, 31)
+
+    assert rc.sticks_us() == (1520, 1510, 1530, 1540)
+    assert params["RCMAP_ROLL"] == 2.0
+
+
 def sticks_at(**params_and_pwm):
     pwm = params_and_pwm.pop("pwm")
     rc, params = engine(**params_and_pwm)

@@ -1,0 +1,164 @@
+"""What the vehicle says about itself: heartbeats, SYS_STATUS, battery, landed state; two pilots."""
+
+from itertools import pairwise
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.vehicle.autopilot import Battery, VehicleConfig
+from sitl.vehicle.flight_modes import Mode
+
+WITHOUT_RECEIVER = VehicleConfig(receiver=False, estimator_ready_s=0.0, position_ready_s=0.0)
+RECEIVER = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+BATTERY = mav.MAV_SYS_STATUS_SENSOR_BATTERY
+
+
+def latest(messages, name):
+    return [message for message in messages if message.get_type() == name][-1]
+
+
+def override(station, *values_us, link=0, seconds=0.02):
+    padded = (*values_us, *[65535] * (8 - len(values_us)))
+    station.send(mav.MAVLink_rc_channels_override_message(1, 1, *padded), link=link)
+    return station.run(seconds, link)
+
+
+def fly(station):
+    """Up to some metres and neutral, without a receiver."""
+    override(station, 1500, 1500, 1000, 1500, seconds=0.2)
+    assert station.vehicle.ap.set_mode(Mode.ALT_HOLD)
+    assert station.vehicle.ap.arm(force=False)
+    for _ in range(200):
+        override(station, 1500, 1500, 1900, 1500)
+    for _ in range(50):
+        override(station, 1500, 1500, 1500, 1500)
+
+
+@pytest.mark.parametrize(("asked_hz", "sent_hz"), [(10, 10.0), (15, 1000.0 / 66.0)])
+def test_heartbeats_come_as_often_as_asked_in_whole_milliseconds(station, asked_hz, sent_hz):
+    station.interval(mav.MAVLINK_MSG_ID_HEARTBEAT, asked_hz)
+
+    heartbeats = [m for m in station.run(6.6) if m.get_type() == "HEARTBEAT"]
+
+    assert len(heartbeats) == pytest.approx(6.6 * sent_hz, abs=1)
+    assert station.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, 0) == mav.MAV_RESULT_ACCEPTED
+    assert len([m for m in station.run(5.0) if m.get_type() == "HEARTBEAT"]) == 5
+
+
+@pytest.mark.parametrize("link", [0, 1])
+def test_a_change_of_mode_sends_a_heartbeat_on_every_link_at_once(station_of, link):
+    station = station_of(links=2)
+    station.run(0.5, link)
+    set_mode = mav.MAV_CMD_DO_SET_MODE
+    command = mav.MAVLink_command_long_message(1, 1, set_mode, 0, 1, Mode.ALT_HOLD, *[0] * 5)
+    station.send(command)
+
+    (heartbeat,) = [m for m in station.run(0.0025, link) if m.get_type() == "HEARTBEAT"]
+
+    assert heartbeat.custom_mode == Mode.ALT_HOLD
+
+
+def test_the_vehicle_may_call_itself_something_else(station_of):
+    plane = VehicleConfig(vehicle_type=mav.MAV_TYPE_FIXED_WING)
+
+    heartbeat = latest(station_of(config=plane).run(1.1), "HEARTBEAT")
+
+    assert heartbeat.type == mav.MAV_TYPE_FIXED_WING
+
+
+def test_a_radio_failsafe_shows_in_heartbeat_and_receiver_health(station_of):
+    station = station_of(config=WITHOUT_RECEIVER)
+    station.interval(mav.MAVLINK_MSG_ID_SYS_STATUS, 10)
+    station.interval(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
+    station.interval(mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 10)
+    messages = station.run(0.2)
+    assert not latest(messages, "SYS_STATUS").onboard_control_sensors_present & RECEIVER
+    assert latest(messages, "EXTENDED_SYS_STATE").landed_state == mav.MAV_LANDED_STATE_ON_GROUND
+
+    fly(station)
+    messages = station.run(0.2)
+    status = latest(messages, "SYS_STATUS")
+    assert status.onboard_control_sensors_present & RECEIVER
+    assert status.onboard_control_sensors_health & RECEIVER
+    assert latest(messages, "HEARTBEAT").system_status == mav.MAV_STATE_ACTIVE
+    assert latest(messages, "EXTENDED_SYS_STATE").landed_state == mav.MAV_LANDED_STATE_IN_AIR
+
+    messages = station.run(1.2)
+    assert not latest(messages, "SYS_STATUS").onboard_control_sensors_health & RECEIVER
+    assert latest(messages, "HEARTBEAT").system_status == mav.MAV_STATE_CRITICAL
+    assert latest(messages, "HEARTBEAT").custom_mode == Mode.RTL
+
+    messages = override(station, 1500, 1500, 1500, 1500, seconds=0.2)
+    assert latest(messages, "SYS_STATUS").onboard_control_sensors_health & RECEIVER
+    assert latest(messages, "HEARTBEAT").system_status == mav.MAV_STATE_ACTIVE
+    assert latest(messages, "HEARTBEAT").custom_mode == Mode.RTL
+
+
+def test_without_a_receiver_channels_are_zero_and_then_the_last_ones_stay(station_of):
+    station = station_of(config=WITHOUT_RECEIVER)
+    station.interval(mav.MAVLINK_MSG_ID_RC_CHANNELS, 50)
+
+    def channels_us(messages):
+        message = latest(messages, "RC_CHANNELS")
+        return [getattr(message, f"chan{n}_raw") for n in range(1, 9)]
+
+    assert channels_us(station.run(0.1)) == [0] * 8
+    override(station, 1510, 1490, 1100, 1505)
+
+    assert channels_us(station.run(5.0)) == [1510, 1490, 1100, 1505, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("is_low", [False, True])
+def test_the_battery_is_reported_as_set(station, is_low):
+    station.vehicle.ap.battery = Battery(
+        voltage_v=10.9, current_a=12.5, remaining_percent=14, is_low=is_low
+    )
+    station.interval(mav.MAVLINK_MSG_ID_SYS_STATUS, 10)
+    station.interval(mav.MAVLINK_MSG_ID_BATTERY_STATUS, 10)
+
+    messages = station.run(1.1)
+
+    status, battery = latest(messages, "SYS_STATUS"), latest(messages, "BATTERY_STATUS")
+    heartbeat = latest(messages, "HEARTBEAT")
+    assert (status.voltage_battery, status.current_battery) == (10_900, 1_250)
+    assert (status.battery_remaining, battery.battery_remaining) == (14, 14)
+    assert bool(status.onboard_control_sensors_health & BATTERY) != is_low
+    assert (battery.charge_state == mav.MAV_BATTERY_CHARGE_STATE_LOW) == is_low
+    assert (heartbeat.system_status == mav.MAV_STATE_CRITICAL) == is_low
+
+
+def test_two_senders_of_one_system_id_flip_the_sticks(station_of):
+    """The last writer wins; the vehicle arbitrates nothing."""
+    station = station_of(links=2)
+    station.interval(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
+    rolls_us = []
+    for _ in range(50):
+        override(station, 1600, link=0, seconds=0.01)
+        override(station, 1400, link=1, seconds=0.01)
+        rolls_us.append(station.vehicle.ap.rc.channels_us[0])
+        override(station, 1600, link=0, seconds=0.01)
+        rolls_us.append(station.vehicle.ap.rc.channels_us[0])
+
+    assert set(rolls_us) == {1400, 1600}
+    assert all(before != after for before, after in pairwise(rolls_us))
+
+
+def test_the_override_timeout_changes_while_an_override_is_held(station):
+    override(station, 1700, seconds=0.4)
+    assert station.vehicle.ap.rc.channels_us[0] == 1700
+
+    message = mav.MAVLink_param_set_message(1, 1, b"RC_OVERRIDE_TIME", 0.5, 9)
+    station.send(message)
+    station.run(0.15)
+
+    assert station.vehicle.ap.rc.channels_us[0] == 1500
+
+
+def test_a_reboot_leaves_the_transmitter_as_it_was(station):
+    station.vehicle.set_receiver([1500, 1500, 1500, 1500, 1500, 1900, 1500, 1500])
+    station.run(0.1)
+
+    station.vehicle.reboot()
+    station.run(0.1)
+
+    assert station.vehicle.ap.rc.channels_us[5] == 1900

@@ -1,0 +1,103 @@
+"""BRAKE, LOITER and POSHOLD: stopping, staying, what the sticks do, and the position they need."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from sitl.vehicle.autopilot import VehicleConfig
+from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.flight_modes import Mode
+
+HOLDING = (Mode.BRAKE, Mode.LOITER, Mode.POSHOLD)
+PILOTED = (Mode.LOITER, Mode.POSHOLD)
+
+
+@pytest.mark.parametrize("mode", HOLDING)
+def test_it_stops_and_stays_there_in_the_wind(pilot, mode):
+    windy = replace(NOMINAL, wind_ned_mps=(4.0, 0.0, 0.0), gust_rms_mps=0.5)
+    pilot = type(pilot)(VehicleConfig(conditions=windy))
+    pilot.take_off()
+    pilot.hold(1.5, roll=1750)
+    start_m = pilot.height_m
+    assert math.hypot(*pilot.ap.truth.velocity_ned_mps) > 2.0
+    assert pilot.ap.set_mode(mode)
+
+    pilot.hold(5.0)
+    stopped_ned_m = pilot.ap.truth.position_ned_m
+    pilot.hold(20.0)
+
+    assert math.dist(pilot.ap.truth.position_ned_m, stopped_ned_m) < 0.3
+    assert pilot.height_m == pytest.approx(start_m, abs=0.3)
+
+
+def test_brake_ignores_every_stick(pilot):
+    pilot.take_off(mode=Mode.BRAKE)
+    start_ned_m, start_yaw_deg = pilot.ap.truth.position_ned_m, pilot.angles_deg()[2]
+
+    pilot.hold(5.0, roll=1900, pitch=1100, thr=1000, yaw=1900)
+
+    assert math.dist(pilot.ap.truth.position_ned_m, start_ned_m) < 0.1
+    assert pilot.angles_deg()[2] == pytest.approx(start_yaw_deg, abs=0.5)
+
+
+@pytest.mark.parametrize("mode", PILOTED)
+def test_sticks_lean_turn_and_climb_as_in_alt_hold(pilot, mode):
+    in_alt_hold = type(pilot)(pilot.ap.config)
+    for one in (pilot, in_alt_hold):
+        one.take_off()
+    assert pilot.ap.set_mode(mode)
+    for one in (pilot, in_alt_hold):
+        one.hold(2.5, roll=1700, thr=1700, yaw=1700)
+
+    flown, wanted = pilot.ap.truth, in_alt_hold.ap.truth
+    assert abs(pilot.angles_deg()[0]) > 9.0
+    assert pilot.angles_deg() == pytest.approx(in_alt_hold.angles_deg(), abs=0.3)
+    assert flown.velocity_ned_mps == pytest.approx(wanted.velocity_ned_mps, abs=0.05)
+    assert flown.rate_body_radps == pytest.approx(wanted.rate_body_radps, abs=0.02)
+
+
+@pytest.mark.parametrize("mode", PILOTED)
+def test_it_arms_takes_off_and_sinks_under_an_idle_throttle(pilot, mode):
+    pilot.hold(6.0, thr=1000)
+    assert pilot.ap.set_mode(mode)
+    assert pilot.ap.arm(force=False), pilot.texts()
+    pilot.hold(4.0, thr=1900)
+    assert pilot.height_m > 2.0
+
+    pilot.hold(2.0, thr=1000)
+
+    assert pilot.ap.truth.velocity_ned_mps[2] > 2.0
+
+
+def test_without_a_position_it_is_refused_in_the_air(pilot):
+    pilot = type(pilot)(VehicleConfig(position_ready_s=math.inf))
+    pilot.take_off()
+
+    for mode in (*HOLDING, Mode.RTL):
+        assert not pilot.ap.set_mode(mode)
+        assert pilot.texts() == [f"Mode change to {mode.name} failed: requires position"]
+    assert pilot.ap.mode is Mode.ALT_HOLD
+
+
+def test_a_position_that_is_lost_in_flight_leaves_the_vehicle_level(pilot):
+    pilot.take_off()
+    pilot.hold(1.0, roll=1700)
+    assert pilot.ap.set_mode(Mode.BRAKE)
+    pilot.ap.position_lost = True
+
+    pilot.hold(1.0)
+
+    assert pilot.angles_deg()[:2] == pytest.approx([0.0, 0.0], abs=0.5)
+    assert math.hypot(*pilot.ap.truth.velocity_ned_mps[:2]) > 1.0
+    assert pilot.ap.set_mode(Mode.ALT_HOLD)
+    assert not pilot.ap.set_mode(Mode.BRAKE)
+
+
+@pytest.mark.parametrize("mode", PILOTED)
+def test_without_a_position_it_is_taken_on_the_ground_but_does_not_arm(pilot, mode):
+    pilot.hold(4.0, thr=1000)
+    assert pilot.ap.set_mode(mode)
+
+    assert not pilot.ap.arm(force=False)
+    assert pilot.texts() == ["Arm: Need Position Estimate"]
