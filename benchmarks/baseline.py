@@ -58,7 +58,7 @@ def eager_toge(policy: PolicyConfig) -> Toge:
     if not isinstance(net, Toge):
         raise TypeError(f"not a Toge: {type(net).__name__}")
     net.eval()
-    net.reset(policy.seed)
+    net.seed_noise(policy.seed)
     return net
 
 
@@ -231,18 +231,26 @@ class Baseline:
             policy=self._job.policy.policy,
             solves="full solves",
             engine=EAGER,
+            asked_stick_hz=action_hz,
             asked_action_hz=action_hz,
             asked_vision_hz=self._vision_hz,
             duration_s=round(duration_s, 3),
+            stick_hz=_rate_hz(self._stamps_ns),
             action_hz=_rate_hz(self._stamps_ns),
             vision_hz=_rate_hz(self._frames_ns),
             missed_slots=max(0, round(action_hz * duration_s) + 1 - len(self._stamps_ns)),
+            lateness_ms=None,
+            coasting_sends=None,
+            chunks=len(self._stamps_ns),
+            late_chunks=None,
             period_ms=self._period.percentiles_ms(),
             predict_ms=self._predict.percentiles_ms(),
             encode_ms=self._encode.percentiles_ms(),
             feature_age_ms=self._feature_age.percentiles_ms(),
+            state_age_ms=None,
             state_to_wire_ms=self._state_to_wire.percentiles_ms(),
             cpu_cores=round(cpu_ns / NS_PER_S / duration_s, 3),
+            gate_cpu_cores=None,
             stolen_ms=stolen_ms,
             missed_by_cause=None,
         )

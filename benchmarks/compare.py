@@ -3,24 +3,20 @@
 python -m benchmarks.compare --json bench.json --plot bench.png --check benchmarks/budget.json
 
 Engines and flights with the shipped policy (ResNet-8, 96 pixels) and with an untrained one
-(EfficientNet-B3, 224 pixels); MAVSDK where .venv-peers has it. The last line names the highest
-action rate that is kept beside 30 Hz vision.
+(EfficientNet-B3, 224 pixels); MAVSDK where .venv-peers has it.
 """
 
 import sys
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import takewhile
 
 from cyclopts import App
 
 from benchmarks.roofline import time_rooflines
 from mavbridge.commands.bench.engines import EAGER, time_engines
 from mavbridge.commands.bench.flight import FLIGHT_PROCESS, fly
-from mavbridge.commands.bench.link import OUR_CLIENTS, LinkClient, time_link
+from mavbridge.commands.bench.link import OUR_CLIENT, LinkClient, time_link
 from mavbridge.commands.bench.results import BenchResult, this_machine
 from mavbridge.commands.bench.run import BARE_CLIENT, QUICK, Effort, run_and_report
-from mavbridge.commands.output import print_status
 from mavbridge.config.bench import BenchOutputs
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
@@ -38,10 +34,6 @@ FLIGHTS = (
     (replace(LARGE, head_steps=None, engine=EAGER), FLIGHT_PROCESS),
     (replace(LARGE, head_steps=None, engine=EAGER), BASELINE_PROCESS),
 )
-RATES_HZ = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0, 400.0, 500.0)
-MAX_MISSED_FRACTION = 0.001
-NEARLY_KEPT_FRACTION = 0.05
-"""Half a second of ten: what a stall of the host can do."""
 app = App(help=__doc__)
 
 
@@ -65,8 +57,8 @@ def measure(effort: Effort) -> BenchResult:
         flights=tuple(
             fly(policy, Rates(), effort.flight_s, module=module) for policy, module in FLIGHTS
         ),
-        links=tuple(time_link(client, effort.attitudes) for client in (*OUR_CLIENTS, *peers)),
-        notes=(*notes, *peer_notes, _highest_rate_note(effort.flight_s / 6)),
+        links=tuple(time_link(client, effort.attitudes) for client in (OUR_CLIENT, *peers)),
+        notes=(*notes, *peer_notes),
     )
 
 
@@ -79,35 +71,6 @@ def peer_clients() -> tuple[tuple[LinkClient, ...], tuple[str, ...]]:
         return (bare,), (f"{name}: not measured, there is no {PEERS_PYTHON} (make bench)",)
     command = (str(PEERS_PYTHON), "-m", "benchmarks.link_mavsdk")
     return (bare, LinkClient(name=name, command=command)), ()
-
-
-def _highest_rate_note(duration_s: float) -> str:
-    def missed_fraction(action_hz: float) -> float:
-        flight = fly(SHIPPED, Rates(action_rate=action_hz), duration_s)
-        print_status(f"{action_hz:g} Hz: {flight.missed_fraction:.2%} missed")
-        return flight.missed_fraction
-
-    best_hz = highest_rate(RATES_HZ, missed_fraction)
-    reached = f"under {RATES_HZ[0]:g}" if best_hz is None else f"{best_hz:g}"
-    return f"highest action rate with under 0.1 % missed slots, shipped policy: {reached} Hz"
-
-
-def highest_rate(
-    rates_hz: Sequence[float], missed_fraction: Callable[[float], float]
-) -> float | None:
-    """The last of rising rates before the first that is not kept; None if the first is not.
-
-    A rate that is nearly kept is tried once more: a single stall of a shared host in ten seconds
-    is more missed slots than are allowed.
-    """
-
-    def is_kept(rate_hz: float) -> bool:
-        missed = missed_fraction(rate_hz)
-        if MAX_MISSED_FRACTION <= missed < NEARLY_KEPT_FRACTION:
-            missed = missed_fraction(rate_hz)
-        return missed < MAX_MISSED_FRACTION
-
-    return max(takewhile(is_kept, rates_hz), default=None)
 
 
 if __name__ == "__main__":

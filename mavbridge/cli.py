@@ -21,6 +21,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
 from mavbridge.config.imagine import EvaluateImaginationConfig, ImagineConfig
 from mavbridge.core.errors import UserError
+from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
 from policy.training.settings import TrainSettings, WorldModelSettings
 
@@ -48,9 +49,10 @@ cli = App(
 @cli.command(name="fly")
 @cli.default
 def fly(config: FlyConfig | None = None) -> int:
-    """Fly; the default command. Nothing is armed and no mode is changed unless asked."""
+    """Fly; the default command. The policy gets the sticks by an explicit act, such as --arm."""
     if config is None or not config.link.connect:
         raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
+    require_supported_system()
     from mavbridge.flight.app import fly as run_flight
 
     return run_flight(config)

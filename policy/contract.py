@@ -7,7 +7,7 @@ carries its ``Contract`` in the header, and the bridge refuses one that it canno
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from policy.errors import ContractError
 
-CONTRACT_VERSION = 1
+CONTRACT_VERSION = 2
+READABLE_VERSIONS = (1, 2)
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -51,13 +52,30 @@ IMAGENET_STD_RGB = (0.229, 0.224, 0.225)
 FloatArray = NDArray[np.float32]
 StateFrame = Literal["ned_frd", "enu_flu"]
 Arrays = Literal["numpy", "torch"]
+ActionKind = Literal["sticks"]
+
+STICK_MODES = (
+    *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
+    *("MANUAL", "STABILIZED", "ALTCTL", "POSCTL"),
+)
+"""Autopilot modes that are flown with sticks: ArduPilot copter, then PX4; PX4 has ACRO as well."""
+MAX_AGE_LIMIT_S = 60.0
+FLIGHT_TERMS = (
+    *("action", "modes"),
+    *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
+    *("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m"),
+)
+"""Fields that came with version 2. They say when a policy may fly, and change no array of it; a
+contract of version 1 is read with their defaults."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contract:
-    """The interface of one policy.
+    """The interface of one policy, and the terms under which it may fly.
 
-    Times are seconds, never ticks: one checkpoint behaves the same at 50, 100 or 250 Hz.
+    Times are seconds, never ticks: one checkpoint behaves the same at 50, 100 or 250 Hz. Ages are
+    judged when a stick leaves for the autopilot, not when a computation starts; the configuration
+    of a flight may tighten their limits, never loosen them.
 
     Raises:
         ContractError: a field is out of its range.
@@ -81,15 +99,31 @@ class Contract:
     arrays: Arrays = "torch"
     since_exposure: bool = False
     """The state is followed by ``SINCE_EXPOSURE_NAMES``."""
-    version: int = CONTRACT_VERSION
+    action: ActionKind = "sticks"
+    """Meaning of the four numbers of an action: stick positions, ``ACTION_NAMES``."""
+    modes: tuple[str, ...] = ("ALT_HOLD", "ALTCTL")
+    """Autopilot modes in which the policy may fly, of ``STICK_MODES``: the same sticks mean a lean
+    angle in one and a body rate in another."""
+    max_state_age_s: float = 0.1
+    """Oldest attitude and body rates that a stick may come from."""
+    max_velocity_age_s: float = 0.25
+    """Oldest velocity and acceleration."""
+    max_feature_age_s: float = 0.3
+    """Oldest image, since its exposure."""
+    max_chunk_age_s: float = 0.3
+    """Longest time since the chunk was computed."""
+    max_tilt_deg: float | None = None
+    """Largest lean, in degrees, before the policy loses the sticks. For this and the next three,
+    None leaves the limit to the flight's configuration; a number may widen it."""
+    max_speed_mps: float | None = None
+    max_height_m: float | None = None
+    """Above the estimator's origin, where the vehicle was switched on."""
+    max_distance_m: float | None = None
+    """From the estimator's origin, horizontally."""
+    version: int = field(default=CONTRACT_VERSION, init=False)
 
     def __post_init__(self) -> None:
         """Refuse values that no runtime could serve."""
-        if self.version != CONTRACT_VERSION:
-            raise ContractError(
-                f"contract version {self.version} is not supported; this build reads version "
-                f"{CONTRACT_VERSION}: export the checkpoint again"
-            )
         for name, known in (("state_frame", StateFrame), ("arrays", Arrays)):
             if (value := getattr(self, name)) not in get_args(known):
                 one, other = get_args(known)
@@ -113,12 +147,41 @@ class Contract:
             if not (math.isfinite(value) and 0 < value <= 1):
                 raise ContractError(f"{name} must be in (0, 1] seconds, got {value!r}")
         self._require_image_statistics()
+        self._require_flight_terms()
 
     def _require_image_statistics(self) -> None:
         if not all(map(math.isfinite, (*self.image_mean_rgb, *self.image_std_rgb))):
             raise ContractError("image_mean_rgb and image_std_rgb must be finite numbers")
         if min(self.image_std_rgb) <= 0:
             raise ContractError(f"image_std_rgb must be positive, got {self.image_std_rgb}")
+
+    def _require_flight_terms(self) -> None:
+        if self.action not in get_args(ActionKind):
+            raise ContractError(
+                f"action {self.action!r} is not flown by this build, which flies 'sticks' "
+                f"({', '.join(ACTION_NAMES)} in [-1, 1])"
+            )
+        if not isinstance(self.modes, tuple) or not self.modes:
+            raise ContractError(f"modes must be a tuple of at least one mode, got {self.modes!r}")
+        if unknown := [mode for mode in self.modes if mode not in STICK_MODES]:
+            raise ContractError(
+                f"modes {unknown} are not flown with sticks; known are {', '.join(STICK_MODES)}"
+            )
+        for name, value, high, unit in (
+            ("max_state_age_s", self.max_state_age_s, MAX_AGE_LIMIT_S, "seconds"),
+            ("max_velocity_age_s", self.max_velocity_age_s, MAX_AGE_LIMIT_S, "seconds"),
+            ("max_feature_age_s", self.max_feature_age_s, MAX_AGE_LIMIT_S, "seconds"),
+            ("max_chunk_age_s", self.max_chunk_age_s, MAX_AGE_LIMIT_S, "seconds"),
+            ("max_tilt_deg", self.max_tilt_deg, 180.0, "degrees"),
+            ("max_speed_mps", self.max_speed_mps, 1e3, "m/s"),
+            ("max_height_m", self.max_height_m, 1e5, "m"),
+            ("max_distance_m", self.max_distance_m, 1e6, "m"),
+        ):
+            if value is None and not name.endswith("_age_s"):
+                continue
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            if value is None or not is_number or not 0 < value <= high:
+                raise ContractError(f"{name} must be in (0, {high:g}] {unit}, got {value!r}")
 
     @property
     def state_dim(self) -> int:
@@ -131,10 +194,10 @@ class Contract:
 
     @classmethod
     def from_json(cls, text: str) -> "Contract":
-        """Read the header form; an unknown or missing-type key is refused.
+        """Read the header form; one of version 1 gets the default ``FLIGHT_TERMS``.
 
         Raises:
-            ContractError: not JSON, unknown keys, or values out of range.
+            ContractError: not JSON, another version, unknown keys, or values out of range.
         """
         try:
             data: Any = json.loads(text)
@@ -142,9 +205,20 @@ class Contract:
             raise ContractError(f"the contract in the checkpoint is not JSON: {error}") from error
         if not isinstance(data, dict):
             raise ContractError("the contract in the checkpoint is not a JSON object")
-        known = {field.name for field in fields(cls)}
+        version = data.pop("version", CONTRACT_VERSION)
+        if version not in READABLE_VERSIONS:
+            raise ContractError(
+                f"contract version {version!r} is not supported; this build reads versions "
+                f"{' and '.join(map(str, READABLE_VERSIONS))}: export the checkpoint again"
+            )
+        known = {each.name for each in fields(cls) if each.init}
+        known -= set(FLIGHT_TERMS) if version == 1 else set()
         if unknown := sorted(set(data) - known):
-            raise ContractError(f"unknown contract keys {unknown}; known are {sorted(known)}")
+            raise ContractError(
+                f"unknown contract keys {unknown}; those of version {version} are {sorted(known)}"
+            )
+        if isinstance(data.get("modes"), list):
+            data["modes"] = tuple(data["modes"])
         for name in ("image_mean_rgb", "image_std_rgb"):
             if name in data:
                 data[name] = _rgb(name, data[name])
@@ -179,6 +253,11 @@ class SingleRatePolicy(Protocol):
     Shapes, float32: image [B, 3, H, W] normalised by the contract, state [B, state_dim] in SI
     units, action_history [B, K, 4]; returns [B, horizon, 4] sticks in [-1, 1]. Arrays are numpy or
     torch, as ``contract.arrays`` says. Any class with these members will do; nothing is inherited.
+
+    A policy that keeps something from one chunk to the next may also have ``reset()``, without
+    arguments: it is called once after loading, and whenever a flight begins. The vision thread
+    calls ``encode_visual``; the policy thread calls the other methods and ``reset``, so what
+    ``encode_visual`` keeps is not for ``reset`` to change without a lock.
     """
 
     contract: Contract
@@ -232,12 +311,16 @@ class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
         -> as the next step would; after the last step, the chunk."""
 
 
+def keep_nothing() -> None:
+    """Reset a policy that keeps nothing between chunks."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Executable:
     """A policy ready to run on one engine, numpy in and numpy out, as the loops call it.
 
-    ``encode`` runs in the vision thread, ``act`` in the action thread. Without a fast path
-    ``encode`` only preprocesses and ``act`` does the rest.
+    ``encode`` runs in the vision thread, ``act`` and ``reset`` in the policy thread. Without a fast
+    path ``encode`` only preprocesses and ``act`` does the rest.
     """
 
     contract: Contract
@@ -250,3 +333,6 @@ class Executable:
     act: Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
     """(encode's value, state [1, state_dim], history [1, K, 4], seconds from the state of the last
     chunk to this one or None to start afresh) -> chunk [1, horizon, 4]."""
+    reset: Callable[[], None] = keep_nothing
+    """Forgets earlier flights; called when a flight begins. A warm start needs no reset: ``act``
+    starts it afresh where no time is given."""

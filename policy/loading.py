@@ -12,13 +12,21 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from policy.checkpoints.header import read_contract
-from policy.contract import Contract, DualRatePolicy, Executable, SingleRatePolicy, WarmStartPolicy
+from policy.contract import (
+    Contract,
+    DualRatePolicy,
+    Executable,
+    SingleRatePolicy,
+    WarmStartPolicy,
+    keep_nothing,
+)
 from policy.engines.executable import EngineName, ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError, user_code
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
@@ -108,6 +116,7 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     """
     check_request(request)
     policy, notes = _find(request, now_s)
+    reset = _reset(policy, request.spec)
     _require_image_size(policy.contract, request.image_size)
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
     if request.dual_rate and not dual_rate:
@@ -129,7 +138,8 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
         dual_rate=dual_rate,
     )
     executable, engine_notes = _executable(policy, request, settings)
-    return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes))
+    reset()  # of what the trial on dummy samples left behind
+    return LoadedPolicy(executable=replace(executable, reset=reset), notes=(*notes, *engine_notes))
 
 
 def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
@@ -236,7 +246,7 @@ def _trained(
         raise PolicyError(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
         )
-    policy.reset(seed)
+    policy.seed_noise(seed)
     notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
@@ -258,7 +268,7 @@ def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", lis
     with torch.random.fork_rng(devices=[]):  # the process's own random stream stays as it was
         torch.manual_seed(seed)
         policy = build_policy(config).eval()
-    policy.reset(seed)
+    policy.seed_noise(seed)
     note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
     return policy, [note]
 
@@ -310,6 +320,38 @@ def _instance(spec: str, found: type, checkpoint: Path | None) -> SingleRatePoli
     if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
         raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")
     return policy
+
+
+def _reset(policy: SingleRatePolicy, spec: str) -> Callable[[], None]:
+    """The policy's own ``reset``, ready for the loops; one that does nothing where it has none."""
+    method: object = getattr(policy, "reset", None)
+    if method is None:
+        return keep_nothing
+    if not callable(method):
+        raise PolicyError(
+            f"--policy {spec}: reset must be a method without arguments, which is called when a "
+            f"flight begins; it is {method!r}"
+        )
+    try:
+        inspect.signature(method).bind()
+    except (TypeError, ValueError) as error:
+        raise PolicyError(
+            f"--policy {spec}: reset is called without arguments when a flight begins, and cannot "
+            f"be: {error}; give its parameters defaults, or give it another name"
+        ) from error
+    with_torch = policy.contract.arrays == "torch"
+
+    def reset() -> None:
+        with ExitStack() as stack:
+            stack.enter_context(user_code(f"{spec} failed to reset"))
+            if with_torch:
+                import torch
+
+                # As chunks are computed: torch refuses to change their tensors in place elsewhere.
+                stack.enter_context(torch.inference_mode())
+            method()
+
+    return reset
 
 
 def _contract(image_size: int | None) -> Contract:

@@ -71,7 +71,7 @@ PROGRAM_NAMES = tuple(_PROGRAMS)
 
 
 class ScriptedPolicy:
-    """Takes off to 3 m from where it is first asked, then flies ``program`` for ever.
+    """Takes off to 3 m from where it is first asked, or was reset, then flies ``program`` for ever.
 
     The state has no position: altitude is the integral of the measured climb rate, so a ground that
     is left late costs nothing, and it drifts as the vehicle's own velocity estimate does. Used by
@@ -94,6 +94,11 @@ class ScriptedPolicy:
         self._last_s: float | None = None
         self._altitude_m = 0.0
         self._program_start_s: float | None = None
+
+    def reset(self) -> None:
+        """Begin again: the altitude of now is the ground."""
+        self._last_s = self._program_start_s = None
+        self._altitude_m = 0.0
 
     def encode_visual(self, image: FloatArray) -> FloatArray:
         """Image [1, 3, H, W] -> mean and deviation of each channel, zeros: [1, 8]."""

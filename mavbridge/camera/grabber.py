@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from mavbridge.camera.deadlines import FIRST_FRAME_NS, STALL_NS
+from mavbridge.camera.deadlines import REOPENED_NS, STALL_NS
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.records import Frame, ImageArray
@@ -32,11 +32,13 @@ class ImageSource(Protocol):
 
 
 class Grabber:
-    """`Camera` over a blocking source.
+    """`LiveCamera` over a blocking source, which its thread opens, reads and closes.
 
-    A source that fails is reopened, up to ``len(reopen_delays_s)`` times in a row; meanwhile
-    ``read`` returns None. ``read`` raises once all these attempts have delivered no frame, or when
-    the source is open but silent for STALL_NS (FIRST_FRAME_NS before its first frame).
+    Before the first frame the source is opened again and again until ``close``. Later a source that
+    fails is reopened, up to ``len(reopen_delays_s)`` times in a row; meanwhile ``read`` returns
+    None. ``read`` raises once all these attempts have delivered no frame, when the source is open
+    but silent for STALL_NS (REOPENED_NS after it was reopened), or when the thread has failed by
+    anything but a CameraError.
     """
 
     def __init__(
@@ -46,7 +48,7 @@ class Grabber:
         clock: Clock,
         reopen_delays_s: Sequence[float] = REOPEN_DELAYS_S,
     ) -> None:
-        """Open the source and start the thread; raises CameraError if it cannot be opened."""
+        """Start the thread, which opens the source."""
         self._open_source = open_source
         self._clock = clock
         self._reopen_delays_s = reopen_delays_s
@@ -55,11 +57,10 @@ class Grabber:
         self._newest: Frame | None = None
         self._frame_count = 0
         self._dropped_frames = 0
-        self._failure: str | None = None
+        self._failure: CameraError | None = None
+        self._waiting_reason = "it is being opened"
         self._silent_after_ns: int | None = None
-        self._thread = threading.Thread(
-            target=self._run, args=(self._open(),), name="mavbridge-camera", daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, name="mavbridge-camera", daemon=True)
         self._thread.start()
 
     @property
@@ -67,6 +68,12 @@ class Grabber:
         """Frames that were replaced by a newer one before they were read."""
         with self._changed:
             return self._dropped_frames
+
+    @property
+    def waiting_reason(self) -> str:
+        """See `LiveCamera`."""
+        with self._changed:
+            return self._waiting_reason
 
     def read(self, timeout_ns: int) -> Frame | None:
         """See `mavbridge.core.ports.Camera`."""
@@ -78,7 +85,7 @@ class Grabber:
             if frame is not None:
                 return frame
             if self._failure is not None:
-                raise CameraError(self._failure)
+                raise CameraError(str(self._failure)) from self._failure.__cause__
             if self._silent_after_ns is not None and self._clock.now_ns() > self._silent_after_ns:
                 raise CameraError("the camera is open but has stopped delivering frames")
             return None
@@ -88,28 +95,43 @@ class Grabber:
         self._stopping.set()
         self._thread.join(JOIN_S)
 
-    def _open(self) -> ImageSource:
-        source = self._open_source()
+    def _run(self) -> None:
+        try:
+            failure = self._serve()
+        except Exception as error:  # noqa: BLE001 - a driver's or ours: raised again by read
+            failure = CameraError(f"the camera's thread has failed: {error!r}")
+            failure.__cause__ = error
         with self._changed:
-            self._silent_after_ns = self._clock.now_ns() + FIRST_FRAME_NS
-        return source
+            self._failure = failure
+            self._changed.notify_all()
 
-    def _run(self, source: ImageSource) -> None:
-        reason, delays_s = self._drain(source), iter(self._reopen_delays_s)
-        while (delay_s := next(delays_s, None)) is not None:
-            if self._stopping.wait(delay_s):
-                return
+    def _serve(self) -> CameraError:
+        """Open and drain until told to stop, or until the attempts are used up."""
+        delays_s = iter(self._reopen_delays_s)
+        while True:
             frames_before = self._frame_count
             try:
                 reason = self._drain(self._open())
             except CameraError as error:
                 reason = str(error)
-            if self._frame_count > frames_before:
+            if self._frame_count == 0 or self._frame_count > frames_before:
                 delays_s = iter(self._reopen_delays_s)
+            with self._changed:
+                self._waiting_reason = reason
+            delay_s = next(delays_s, None)
+            if delay_s is None:
+                attempts = len(self._reopen_delays_s)
+                return CameraError(f"{reason}; {attempts} attempts to reopen it have failed")
+            if self._stopping.wait(delay_s):
+                return CameraError("the camera has been closed")
+
+    def _open(self) -> ImageSource:
+        source = self._open_source()
         with self._changed:
-            attempts = len(self._reopen_delays_s)
-            self._failure = f"{reason}; {attempts} attempts to reopen it have failed"
-            self._changed.notify_all()
+            self._waiting_reason = "it is open, and has delivered no frame yet"
+            if self._frame_count > 0:
+                self._silent_after_ns = self._clock.now_ns() + REOPENED_NS
+        return source
 
     def _drain(self, source: ImageSource) -> str:
         """Take frame after frame; returns the reason for the end."""

@@ -1,14 +1,17 @@
 """Opens the camera that ``--camera`` describes."""
 
+from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 from mavbridge.camera.capture import open_device, open_stream
+from mavbridge.camera.deadlines import LiveCamera, wait_for_first_frame
 from mavbridge.camera.grabber import Grabber
+from mavbridge.camera.latency import LatencyCompensatedCamera
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
-from mavbridge.core.clock import Clock
+from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.ports import Camera
 
@@ -21,13 +24,19 @@ FORMS = (
 )
 
 
-def check_camera(spec: str) -> None:
+def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
     """Refuse a source that cannot be opened, as far as that can be told without opening it.
 
     Raises:
-        UserError: ``spec`` has no known form, names no file, or needs a package that is missing.
+        UserError: ``spec`` has no known form, names no file, needs a package that is missing, or
+            stamps its frames itself and ``latency_ms`` is not 0.
     """
     kind = spec.partition(":")[0]
+    if kind == "shm" and latency_ms != 0.0:
+        raise UserError(
+            f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps each "
+            "frame with its exposure; mend the stamps there, or leave the flag out"
+        )
     if kind == "screen":
         missing = [name for name in SCREEN_PACKAGES if find_spec(name) is None]
         if missing:
@@ -40,13 +49,48 @@ def check_camera(spec: str) -> None:
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
 
 
-def open_camera(spec: str, *, image_size: int, clock: Clock) -> Camera:
-    """Open the source that ``spec`` names; raises as ``check_camera``, or CameraError.
+def open_camera(
+    spec: str,
+    *,
+    image_size: int,
+    clock: Clock,
+    timeout_s: float = 10.0,
+    latency_ms: float = 0.0,
+    report: Callable[[str], None] = lambda _: None,
+) -> Camera:
+    """Open the source that ``spec`` names, and wait for its first frame, which is dropped.
 
-    ``image_size`` is the side of the policy's square image in pixels: a device is asked for a mode
-    that covers it. All other sources deliver their own size.
+    A file has no wait: it plays from the first ``read`` on. Nor has a screen.
+
+    Args:
+        spec: one of FORMS.
+        image_size: side of the policy's square image in pixels: a device is asked for a mode that
+            covers it. All other sources deliver their own size.
+        clock: time of the waits, and of the stamps made here.
+        timeout_s: longest wait for the first frame; meanwhile a device or stream that cannot be
+            opened is tried again, and shared memory may appear.
+        latency_ms: time from exposure to arrival, subtracted from the stamps.
+        report: gets a line of a countdown for every second of the wait.
+
+    Raises:
+        UserError: as ``check_camera``.
+        CameraError: no frame came in time, or the source cannot be used.
     """
-    check_camera(spec)
+    check_camera(spec, latency_ms=latency_ms)
+    camera = _open(spec, image_size=image_size, clock=clock)
+    if isinstance(camera, Grabber | SharedMemoryCamera):
+        live: LiveCamera = camera
+        try:
+            wait_for_first_frame(live, clock=clock, timeout_s=timeout_s, report=report)
+        except BaseException:
+            camera.close()
+            raise
+    if latency_ms == 0.0:
+        return camera
+    return LatencyCompensatedCamera(camera, latency_ns=round(latency_ms * NS_PER_MS))
+
+
+def _open(spec: str, *, image_size: int, clock: Clock) -> Camera:
     kind, _, rest = spec.partition(":")
     if kind == "shm":
         return SharedMemoryCamera(rest, clock=clock)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mavbridge.camera.deadlines import FIRST_FRAME_NS, STALL_NS
+from mavbridge.camera.deadlines import STALL_NS
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.records import Frame, ImageArray
@@ -37,38 +37,40 @@ MAX_RETRIES = 8
 class SharedMemoryCamera:
     """Newest frame of a segment. It polls, because the writer has no way to wake a reader.
 
-    When another writer takes over the name, the reader follows. The file is mapped directly and
-    read-only: `multiprocessing.shared_memory` would map it writable, and before Python 3.13 it has
-    a resource tracker that removes the file when the reader ends.
+    The segment may appear later. When another writer takes over the name, the reader follows; once
+    there was a frame, ``read`` raises when none has come for STALL_NS.
+
+    The file is mapped directly and read-only: `multiprocessing.shared_memory` would map it
+    writable, and before Python 3.13 it has a resource tracker that removes the file when the reader
+    ends.
     """
 
     def __init__(self, name: str, *, clock: Clock) -> None:
-        """Wait up to FIRST_FRAME_NS for the segment to appear.
+        """Map the segment, if it is there already.
 
         Raises:
             UserError: not a valid name.
-            CameraError: it did not appear, or is not in the format.
+            CameraError: it is not in the format.
         """
         if not name or "/" in name or name.startswith("."):
             raise UserError(f"shm:{name}: use a name such as shm:fpv, without '/' or a leading '.'")
         folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
         self._path = (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
         self._clock = clock
-        deadline_ns = clock.now_ns() + FIRST_FRAME_NS
-        while not self._path.exists():
-            if clock.now_ns() >= deadline_ns:
-                raise CameraError(_absent(self._path))
-            clock.sleep_until_ns(clock.now_ns() + REOPEN_NS)
         self.dropped_frames = 0
         self._first_id = 0
+        self._seen_id = 0
         self._stamp_age_ns = 0
-        self._segment = _Segment(self._path)
-        self._seen_id = max(0, self._segment.newest_id() - 1)
-        self._expect_frame_within(FIRST_FRAME_NS)
+        self._reopen_ns = clock.now_ns() + REOPEN_NS
+        self._dead_ns: int | None = None
+        """When to give the writer up; None before the first frame."""
+        self._segment: _Segment | None = None
+        self._follow_name()
 
-    def _expect_frame_within(self, limit_ns: int) -> None:
-        now_ns = self._clock.now_ns()
-        self._reopen_ns, self._dead_ns = now_ns + REOPEN_NS, now_ns + limit_ns
+    @property
+    def waiting_reason(self) -> str:
+        """See `LiveCamera`."""
+        return _absent(self._path) if self._segment is None else self._failure(self._segment)
 
     def read(self, timeout_ns: int) -> Frame | None:
         """See `mavbridge.core.ports.Camera`."""
@@ -78,25 +80,30 @@ class SharedMemoryCamera:
             if now_ns >= self._reopen_ns:
                 self._reopen_ns = now_ns + REOPEN_NS
                 self._follow_name()
-            if now_ns >= self._dead_ns:
-                raise CameraError(f"shm:{self._path.name}: {self._failure()}")
+            if self._dead_ns is not None and now_ns >= self._dead_ns:
+                raise CameraError(self.waiting_reason)
             if now_ns >= deadline_ns:
                 return None
             self._clock.sleep_until_ns(min(now_ns + POLL_NS, deadline_ns))
-        self._expect_frame_within(STALL_NS)
+        now_ns = self._clock.now_ns()
+        self._reopen_ns, self._dead_ns = now_ns + REOPEN_NS, now_ns + STALL_NS
         return frame
 
     def close(self) -> None:
         """Unmap the file; it belongs to the writer and stays."""
-        self._segment.close()
+        if self._segment is not None:
+            self._segment.close()
 
     def _take(self) -> Frame | None:
         """The newest frame, if it is new, complete and recent."""
+        segment = self._segment
+        if segment is None:
+            return None
         for _ in range(MAX_RETRIES):
-            newest_id = self._segment.newest_id()
+            newest_id = segment.newest_id()
             if newest_id <= self._seen_id:
                 return None
-            if (copied := self._segment.copy(newest_id)) is not None:
+            if (copied := segment.copy(newest_id)) is not None:
                 break
         else:
             return None
@@ -112,24 +119,30 @@ class SharedMemoryCamera:
     def _follow_name(self) -> None:
         """Map the file that has the name now, if it is another one. Frame ids keep increasing."""
         try:
-            is_same = os.path.samestat(self._path.stat(), self._segment.status)
+            status = self._path.stat()
         except FileNotFoundError:
             return
-        if not is_same:
-            replaced, self._segment = self._segment, _Segment(self._path)
+        replaced = self._segment
+        if replaced is not None and os.path.samestat(status, replaced.status):
+            return
+        self._segment = _Segment(self._path)
+        if replaced is not None:
             replaced.close()
-            self._first_id += self._seen_id
-            self._seen_id = max(0, self._segment.newest_id() - 1)
+        self._first_id += self._seen_id
+        self._seen_id = max(0, self._segment.newest_id() - 1)
 
-    def _failure(self) -> str:
-        if self._segment.is_closed():
-            return "the writer has closed it and no other has replaced it: start it again"
+    def _failure(self, segment: "_Segment") -> str:
+        name = f"shm:{self._path.name}"
+        if segment.is_closed():
+            return f"{name}: the writer has closed it and no other has replaced it: start it again"
         if abs(self._stamp_age_ns) > STALL_NS:
             return (
-                f"the newest frame is stamped {self._stamp_age_ns / NS_PER_S:.1f} s ago: its "
-                "writer has died, or does not stamp on CLOCK_MONOTONIC"
+                f"{name}: the newest frame is stamped {self._stamp_age_ns / NS_PER_S:.1f} s ago: "
+                "its writer has died, or does not stamp on CLOCK_MONOTONIC"
             )
-        return f"no new frame for {STALL_NS / NS_PER_S:g} s: is its writer still running?"
+        if self._dead_ns is None:
+            return f"{name}: no frame in it yet"
+        return f"{name}: no new frame for {STALL_NS / NS_PER_S:g} s: is its writer still running?"
 
 
 class _Segment:
@@ -228,7 +241,7 @@ def _absent(path: Path) -> str:
             if file.read(len(MAGIC)) == MAGIC:
                 others.append(other.name)
     return (
-        f"shm:{path.name}: did not appear within {FIRST_FRAME_NS / NS_PER_S:g} s. Start its "
+        f"shm:{path.name}: there is none. Start its "
         f"writer, for example: python -m sitl --camera shm:{path.name} "
         f"(frame segments here now: {', '.join(others) or 'none'})"
     )

@@ -28,9 +28,9 @@ class EvaluateConfig:
     visual_rate: float | str = 30.0
     """Most frames a second through the image encoder (dual rate), or auto[:MIN:MAX]."""
     action_rate: float = 100.0
-    """Commands a second (dual rate)."""
+    """Most chunks of actions a second (dual rate)."""
     rate: float = 30.0
-    """Commands a second in single-rate mode."""
+    """The same in single-rate mode."""
     episodes: int = 20
     """Courses to fly."""
     max_time: float = 60.0
@@ -44,7 +44,7 @@ class EvaluateConfig:
     """The old names of --clock wall and --clock simulated."""
     vision_delay: float = 0.0
     """Milliseconds added to the encoding of each image (simulated clock); an image older than
-    --max-feature-age is not flown by."""
+    --max-feature-age is not flown by. Here such limits may also be looser than the policy's."""
     workers: WorkersConfig = field(default_factory=WorkersConfig)
     json: Path | None = None
     """Write all results here as JSON."""

@@ -1,5 +1,7 @@
 """Settings of ``mavbridge fly``: the vehicle, the camera, the limits."""
 
+import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -7,11 +9,14 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mavbridge.config.checks import check_range
-from mavbridge.config.groups import CAMERA, LIMITS, OUTPUT, RARE, VEHICLE
+from mavbridge.config.groups import CAMERA, ENGAGING, ENVELOPE, LIMITS, OUTPUT, RARE, VEHICLE
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import Output
+from mavbridge.core.vehicle import OnFault, Output, Risk
+
+_FLOAT32_MAX = 3.4e38
+"""Largest value of a MAVLink parameter."""
 
 
 @Parameter(name="*", group=LIMITS)
@@ -19,12 +24,18 @@ from mavbridge.core.vehicle import Output
 class Limits:
     """Oldest inputs to act on, and the fastest stick movement."""
 
-    max_attitude_age: float = 0.1
-    """Oldest attitude and body rates to act on, in seconds."""
-    max_velocity_age: float = 0.25
+    max_attitude_age: float | None = None
+    """Oldest attitude and body rates to act on, in seconds; this and the next three are judged as a
+    stick leaves, come from the policy's contract, and can only be tightened."""
+    max_velocity_age: float | None = None
     """Oldest velocity and acceleration to act on, in seconds."""
-    max_feature_age: float = 0.3
+    max_feature_age: float | None = None
     """Oldest image feature to act on, in seconds since exposure."""
+    max_chunk_age: float | None = None
+    """Longest time to act on one chunk of actions, in seconds since it was computed."""
+    max_frozen_state: Annotated[float, Parameter(group=RARE)] = 0.5
+    """Longest time in seconds for which the attitude may stay exactly the same while the vehicle
+    turns; 0 = no limit."""
     tau: float = 0.05
     """Time constant of the stick low-pass, in seconds; 0 = off."""
     max_slew: float = 8.0
@@ -32,10 +43,46 @@ class Limits:
 
     def __post_init__(self) -> None:
         """Refuse values that would switch a limit off by accident."""
-        for name in ("max_attitude_age", "max_velocity_age", "max_feature_age"):
-            check_range(name.replace("_", "-"), getattr(self, name), 0.01, 5, "s")
+        for name, age in (
+            ("max-attitude-age", self.max_attitude_age),
+            ("max-velocity-age", self.max_velocity_age),
+            ("max-feature-age", self.max_feature_age),
+            ("max-chunk-age", self.max_chunk_age),
+        ):
+            if age is not None:
+                check_range(name, age, 0.01, 60, "s")
+        check_range("max-frozen-state", self.max_frozen_state, 0, 60, "s")
         check_range("tau", self.tau, 0, 2, "s")
         check_range("max-slew", self.max_slew, 0, 1000, "1/s")
+
+
+@Parameter(name="*", group=ENVELOPE)
+@dataclass(frozen=True, kw_only=True)
+class EnvelopeConfig:
+    """Where the vehicle may fly; without a flag the wider of the default and the policy's own."""
+
+    max_tilt: float | None = None
+    """Largest tilt, in degrees; by default 60 or what the policy needs; 0 = not watched."""
+    max_height: float | None = None
+    """Largest height above the estimator's origin, in metres; by default 120; 0 = not watched."""
+    max_speed: float | None = None
+    """Fastest speed, in m/s; by default 20; 0 = not watched."""
+    max_distance: float | None = None
+    """Farthest from the estimator's origin, in metres; by default 300; 0 = not watched."""
+    min_battery: float = 10.0
+    """Lowest charge, in percent; 0 = only what the vehicle itself calls low."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean something else than a limit."""
+        for name, unit, largest in (
+            ("max_tilt", "deg", 180),
+            ("max_height", "m", 100_000),
+            ("max_speed", "m/s", 1000),
+            ("max_distance", "m", 100_000),
+            ("min_battery", "%", 100),
+        ):
+            if (value := getattr(self, name)) is not None:
+                check_range(name.replace("_", "-"), value, 0, largest, unit)
 
 
 @Parameter(name="*", group=VEHICLE)
@@ -55,12 +102,43 @@ class LinkConfig:
     """RC_CHANNELS_OVERRIDE (ArduPilot) or MANUAL_CONTROL (PX4)."""
     readonly: bool = False
     """Run everything, send no stick, mode or arm command."""
+    set: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    """NAME=VALUE: set a parameter of ArduPilot before arming, put the old value back at the end;
+    may be given more than once."""
+    restore_params: Annotated[bool, Parameter(negative="", group=RARE)] = False
+    """Put back the parameters that a flight which did not end in order has left set."""
+    accept_risk: Annotated[
+        tuple[Risk, ...], Parameter(negative="", show_default=False, group=RARE)
+    ] = ()
+    """Fly in spite of a setting that a flight was refused for; may be given more than once."""
 
     def __post_init__(self) -> None:
-        """Refuse ids that MAVLink has no room for."""
+        """Refuse ids that MAVLink has no room for, and parameters that cannot be set."""
+        if (self.set_params or self.restore_params) and self.readonly:
+            raise UserError("--readonly sets no parameter: leave out --set and --restore-params")
         check_range("source-system", self.source_system, 1, 255, "")
         check_range("target-system", self.target_system, 0, 254, "")
         check_range("connect-timeout", self.connect_timeout, 0.1, 3600, "s")
+
+    @property
+    def set_params(self) -> tuple[tuple[str, float], ...]:
+        """Names and values of ``--set``; UserError if one cannot be read or comes twice."""
+        read: dict[str, float] = {}
+        for text in self.set:
+            match = re.fullmatch(r"([A-Za-z0-9_]{1,16})=(.+)", text)
+            try:
+                name, value = (match[1].upper(), float(match[2])) if match else ("", math.nan)
+            except ValueError:
+                value = math.nan
+            if not abs(value) < _FLOAT32_MAX:  # also true of NaN
+                raise UserError(
+                    f"--set {text} is not understood: use NAME=VALUE with a number, such as "
+                    "RC_OVERRIDE_TIME=0.5"
+                )
+            if name in read:
+                raise UserError(f"--set names {name} twice: leave one out")
+            read[name] = value
+        return tuple(read.items())
 
 
 @Parameter(name="*", group=CAMERA)
@@ -73,6 +151,22 @@ class CameraConfig:
     screen:WINDOW TITLE."""
     window_name: Annotated[str | None, Parameter(group=RARE)] = None
     """Same as --camera "screen:WINDOW TITLE"."""
+    camera_timeout: Annotated[float, Parameter(group=RARE)] = 10.0
+    """Seconds to wait for the camera's first frame."""
+    camera_latency: float = 0.0
+    """Milliseconds from exposure to arrival here; not for shm:, whose frames carry their own
+    stamps."""
+    max_frozen_image: Annotated[float, Parameter(group=LIMITS)] = 0.5
+    """Longest time in seconds for which the image may stay the same in flight; 0 = no limit."""
+    max_black_image: Annotated[float, Parameter(group=LIMITS)] = 0.5
+    """Longest time in seconds for which the image may be black or of one colour; 0 = no limit."""
+
+    def __post_init__(self) -> None:
+        """Refuse times that no camera has."""
+        check_range("camera-timeout", self.camera_timeout, 0.1, 3600, "s")
+        check_range("camera-latency", self.camera_latency, 0, 2000, "ms")
+        check_range("max-frozen-image", self.max_frozen_image, 0, 60, "s")
+        check_range("max-black-image", self.max_black_image, 0, 60, "s")
 
     @property
     def source(self) -> str:
@@ -90,11 +184,22 @@ class FlyConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
-    mode: Annotated[str | None, Parameter(group=VEHICLE)] = None
-    """Flight mode to ask for before flying, e.g. ALT_HOLD; by default the mode is left alone."""
-    arm: Annotated[bool, Parameter(group=VEHICLE)] = False
-    """Arm the vehicle when everything is ready; by default arming is left to the pilot."""
-    duration: Annotated[float | None, Parameter(group=VEHICLE)] = None
+    envelope: EnvelopeConfig = field(default_factory=EnvelopeConfig)
+    arm: Annotated[bool, Parameter(group=ENGAGING)] = False
+    """Arm and engage once, as soon as everything is ready."""
+    mode: Annotated[str | None, Parameter(group=ENGAGING)] = None
+    """Flight mode to ask for when engaging; one of those that the policy flies in."""
+    engage_channel: Annotated[int | None, Parameter(group=ENGAGING)] = None
+    """Radio channel, from 5, whose switch engages when it goes high while armed, and releases when
+    it goes low."""
+    engage_on_arm: Annotated[bool, Parameter(group=ENGAGING)] = False
+    """Engage when the vehicle is armed for the first time."""
+    on_fault: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
+    """After a fault of ours, first neutral sticks, then: release, hold (BRAKE, AUTO.LOITER), land
+    or rtl. auto: release to a receiver whose throttle is near the middle, else hold."""
+    then: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
+    """The same at a normal end. auto: release to a receiver, land without one."""
+    duration: Annotated[float | None, Parameter(group=ENGAGING)] = None
     """Seconds to fly, from the first action of the policy; by default until Ctrl-C."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
     """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
@@ -108,5 +213,11 @@ class FlyConfig:
         """Refuse contradictions."""
         if self.duration is not None:
             check_range("duration", self.duration, 0.1, 86400, "s")
-        if self.link.readonly and (self.arm or self.mode is not None):
-            raise UserError("--readonly sends nothing, so it cannot be used with --arm or --mode")
+        if self.engage_channel is not None:
+            check_range("engage-channel", self.engage_channel, 5, 18, "")
+        engages = self.arm or self.engage_on_arm or self.engage_channel is not None
+        if self.link.readonly and (engages or self.mode is not None):
+            raise UserError(
+                "--readonly sends nothing, so it cannot be used with --arm, --mode, "
+                "--engage-channel or --engage-on-arm"
+            )

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -21,9 +21,6 @@ SIM_CAMERA_PX = 224
 the policy takes, as it does with a real camera."""
 STATUS_HZ = 5.0
 """Terminal refresh."""
-
-
-Pace = Literal["clock", "state"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,26 +47,29 @@ class Rates:
     """Most frames a second through the image encoder (dual rate); auto[:MIN:MAX] encodes more often
     when the vehicle turns or the image changes."""
     action_rate: float = 100.0
-    """Commands a second (dual rate)."""
+    """Most chunks of actions a second, each from the newest attitude (dual rate)."""
     rate: float = 30.0
-    """Commands a second in single-rate mode, each with the newest image."""
+    """The same in single-rate mode, each with the newest image."""
+    stick_rate: float = 100.0
+    """Stick commands a second that leave for the autopilot, whatever the policy's rate."""
     realtime: Annotated[bool, Parameter(group=RARE)] = True
-    """Real-time scheduling (SCHED_FIFO) of the action loop, where the system permits it."""
+    """Real-time scheduling (SCHED_FIFO) of the gate and of the policy, where the system permits
+    it."""
+    gate_cpu: Annotated[int | None, Parameter(group=RARE)] = None
+    """Run the gate on this CPU alone."""
     action_cpu: Annotated[int | None, Parameter(group=RARE)] = None
-    """Run the action loop on this CPU alone."""
+    """Run the policy on this CPU alone."""
     vision_cpu: Annotated[int | None, Parameter(group=RARE)] = None
     """Run the vision loop on this CPU alone."""
-    pace: Pace = "clock"
-    """clock: commands on a fixed grid. state: one on each new attitude message, or by the clock
-    when none comes."""
 
     def __post_init__(self) -> None:
         """Refuse rates that no autopilot serves."""
         low_hz, high_hz = self.visual_limits_hz
         check_range("visual-rate", low_hz, 0.5, high_hz, "Hz")
         check_range("visual-rate", high_hz, low_hz, 240, "Hz")
-        check_range("action-rate", self.action_rate, 10, 500, "Hz")
-        check_range("rate", self.rate, 10, 500, "Hz")
+        check_range("action-rate", self.action_rate, 0.5, 500, "Hz")
+        check_range("rate", self.rate, 0.5, 500, "Hz")
+        check_range("stick-rate", self.stick_rate, 20, 400, "Hz")
 
     @property
     def visual_limits_hz(self) -> tuple[float, float]:

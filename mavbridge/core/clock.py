@@ -1,7 +1,6 @@
-"""The one clock, monotonic integer nanoseconds and injected everywhere, and the pacers' slots."""
+"""The one clock: monotonic integer nanoseconds, injected everywhere."""
 
 import time
-from dataclasses import dataclass
 from typing import Protocol
 
 NS_PER_S = 1_000_000_000
@@ -39,56 +38,3 @@ class MonotonicClock:
         """Sleep to the deadline; a sleep that the kernel ends early is continued."""
         while (left_ns := deadline_ns - time.monotonic_ns()) > 0:
             time.sleep(left_ns / NS_PER_S)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Slot:
-    """One slot: a point of the pacer's grid at which one command is due, and when it was met."""
-
-    index: int
-    due_ns: int
-    woke_ns: int
-    missed: int
-    """Slots skipped since the previous one: their commands were never sent."""
-
-
-class Pacer(Protocol):
-    """Says when the next tick is."""
-
-    def wait(self) -> Slot:
-        """Sleep until the next tick."""
-
-
-class GridPacer:
-    """An absolute grid of slots, ``origin + index * period``.
-
-    A slot missed by more than a quarter of the period is skipped and counted, never made up for:
-    two commands are never closer than 3/4 of a period, and the phase survives any stall. A slot
-    missed by less fires at once, since a command 1 ms late beats one 10 ms late.
-    """
-
-    def __init__(self, clock: Clock, *, period_ns: int) -> None:
-        if period_ns <= 0:
-            raise ValueError(f"period_ns must be positive, got {period_ns}")
-        self._clock = clock
-        self._period_ns = period_ns
-        self._tolerance_ns = period_ns // 4
-        self._origin_ns: int | None = None
-        self._index = -1
-
-    def wait(self) -> Slot:
-        """Sleep until the next slot that can still be met."""
-        now_ns = self._clock.now_ns()
-        if self._origin_ns is None:
-            self._origin_ns = now_ns
-        first = self._index + 1
-        earliest_ns = now_ns - self._tolerance_ns - self._origin_ns
-        self._index = max(first, -(-earliest_ns // self._period_ns))
-        due_ns = self._origin_ns + self._index * self._period_ns
-        self._clock.sleep_until_ns(due_ns)
-        return Slot(
-            index=self._index,
-            due_ns=due_ns,
-            woke_ns=self._clock.now_ns(),
-            missed=self._index - first,
-        )

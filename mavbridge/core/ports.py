@@ -3,7 +3,6 @@
 from typing import Protocol
 
 from mavbridge.core.records import Event, Frame
-from mavbridge.core.vehicle import Decision, LinkSnapshot, Sticks
 
 
 class Camera(Protocol):
@@ -22,34 +21,6 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Free the source; joins its thread. May be called twice."""
-
-
-class Link(Protocol):
-    """The connection to one vehicle; used by the action loop's thread alone."""
-
-    def poll(self) -> LinkSnapshot:
-        """Receive everything that has arrived; never blocks."""
-
-    def service(self) -> None:
-        """Send what is due besides sticks (heartbeat, handshake, requests); called after them."""
-
-    def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
-        """Receive until an attitude newer than ``newer_than_ns`` arrives, or until ``until_ns``.
-
-        Returns the arrival time of the newest attitude, 0 before the first.
-        """
-
-    def send(self, decision: Decision) -> Sticks | None:
-        """Send the decision; returns the sticks as rounded and sent, None when released."""
-
-    def hand_back(self) -> None:
-        """Repeat the release at the end of a flight, as packets may be lost; takes 0.5 s."""
-
-    def set_mode(self, mode: str) -> None:
-        """Ask for a flight mode (rate-limited; a later heartbeat shows the result)."""
-
-    def arm(self) -> None:
-        """Ask to arm (rate-limited; a later heartbeat shows the result)."""
 
 
 class TickSink(Protocol):

@@ -1,41 +1,140 @@
-"""Scheduling of this process and its threads, as far as the system permits."""
+"""Scheduling and memory of this process and its threads, as far as the system permits."""
 
+import ctypes
 import gc
 import os
+import platform
 import sys
+from contextlib import suppress
+from pathlib import Path
+
+from mavbridge.core.errors import UserError
 
 SWITCH_INTERVAL_S = 0.0005
 """Longest time that another Python thread may hold the interpreter while the action loop waits.
 Python's default, 5 ms, is half a period at 100 Hz."""
-FIFO_PRIORITY = 10
+GATE_FIFO_PRIORITY = 10
 """Above every ordinary thread, below the kernel's own."""
+ACTION_FIFO_PRIORITY = 5
+"""Below the gate: however long an inference takes, the gate sends on time."""
+OOM_SCORE = 500
+"""As if this process held half of the machine's memory more than it does (oom_score_adj in proc(5),
+of 1000): it is killed before the gate, whose own score stays 0."""
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+"""From <sys/mman.h>, the same on Linux for x86 and ARM, and on macOS."""
+
+
+def require_supported_system() -> None:
+    """Raise UserError where a gate cannot outlive the flight process; call before other imports."""
+    if platform.system() not in ("Linux", "Darwin"):
+        raise UserError(
+            f"mavbridge does not fly from {platform.system() or 'this system'}: use Linux (with "
+            "real-time scheduling) or macOS, or on Windows a Linux virtual machine"
+        )
 
 
 def settle_process() -> None:
-    """Prepare the interpreter for deadlines; call once everything is built, before the flight."""
+    """Prepare the interpreter for deadlines; call once everything is built, before the flight.
+
+    Collection stays enabled: it no longer walks through what was built, so its cost is bounded by
+    what a flight itself makes, and a cycle that somebody leaves behind does not grow for hours.
+    """
     gc.collect()
-    gc.freeze()  # what was built stays: no collection walks through it in flight
+    gc.freeze()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
 
 
+def prepare_to_die_first() -> None:
+    """Have the kernel kill this process before the gate, and quickly: without a core dump.
+
+    The gate learns of the death when the kernel closes the channel, which is after any dump.
+    Children inherit both settings, so the gate is started before. What is refused stays as it was.
+    """
+    with suppress(OSError):  # no such file on macOS
+        Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE))
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def settle_gate(*, realtime: bool, cpu: int | None) -> str | None:
+    """Prepare the gate process, which has one thread; call once it is built.
+
+    Its memory stays in RAM, and ``realtime`` puts it before all ordinary threads; what it starts
+    is ordinary again. Collection stays enabled, as in ``settle_process``.
+
+    Returns:
+        What the system refused and how to allow it, or None.
+    """
+    gc.collect()
+    gc.freeze()
+    refusals = [
+        _pin("the gate", cpu),
+        _use_fifo(GATE_FIFO_PRIORITY, "the gate", resets_on_fork=True) if realtime else None,
+        _lock_memory(),
+    ]
+    return "; ".join(filter(None, refusals)) or None
+
+
 def settle_thread(*, realtime: bool, cpu: int | None) -> str | None:
-    """Schedule the calling thread; returns a message about what was refused, or None."""
-    if not hasattr(os, "sched_setaffinity"):
-        refusal = "this system cannot pin threads: leave out --action-cpu and --vision-cpu"
-        return None if cpu is None else refusal
-    has_other_cpus = len(os.sched_getaffinity(0)) > 1
-    if cpu is not None:
-        try:
-            os.sched_setaffinity(0, {cpu})
-        except OSError as error:
-            return f"cannot run on CPU {cpu} ({error.strerror}); it runs where the system puts it"
+    """Schedule the calling thread of the flight process; returns what was refused, or None."""
+    if (refusal := _pin("a loop", cpu)) is not None:
+        return refusal
     # On a single CPU a slow policy would leave nothing to the thread that watches over it.
-    if realtime and has_other_cpus:
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
-        except PermissionError:
-            return (
-                "the action loop has no real-time scheduling, so others may delay it: allow it "
-                "with ulimit -r 10 or CAP_SYS_NICE, or use --no-realtime"
-            )
+    if not realtime or _cpu_count() == 1:
+        return None
+    # Threads that the policy starts are ordinary again, or several could hold every CPU.
+    return _use_fifo(ACTION_FIFO_PRIORITY, "the policy", resets_on_fork=True)
+
+
+def _cpu_count() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _pin(who: str, cpu: int | None) -> str | None:
+    if cpu is None:
+        return None
+    if not hasattr(os, "sched_setaffinity"):
+        return f"{who} cannot be kept on CPU {cpu}: {platform.system()} has no such setting"
+    try:
+        os.sched_setaffinity(0, {cpu})
+    except OSError as error:
+        return f"{who} cannot run on CPU {cpu} ({error.strerror}): it runs where the system puts it"
     return None
+
+
+def _use_fifo(priority: int, who: str, *, resets_on_fork: bool) -> str | None:
+    lacking = f"{who} has no real-time scheduling, so others may delay it"
+    if not hasattr(os, "SCHED_RESET_ON_FORK"):
+        return f"{lacking}: {platform.system()} has no SCHED_FIFO for a process, use Linux"
+    policy = os.SCHED_FIFO | (os.SCHED_RESET_ON_FORK if resets_on_fork else 0)
+    try:
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+    except OSError:
+        return f"{lacking}: allow it with ulimit -r 10 or CAP_SYS_NICE, or use --no-realtime"
+    return None
+
+
+def _lock_memory() -> str | None:
+    """Keep all memory, now and later, in RAM.
+
+    Only where no limit holds for this process: under one, an allocation in flight could fail that
+    succeeds unlocked. Without a limit of its own Linux grants it to CAP_IPC_LOCK alone (mlock(2)).
+    """
+    lacking = "the gate's memory is not locked, so it may wait for the disk"
+    if platform.system() != "Linux":
+        return f"{lacking}: {platform.system()} cannot lock it, use Linux"
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    is_unlimited = hard == resource.RLIM_INFINITY
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (hard if is_unlimited else 0, hard))
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0:
+        return None
+    problem = os.strerror(ctypes.get_errno())
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (soft, hard))
+    return f"{lacking} ({problem}): allow it with ulimit -l unlimited or CAP_IPC_LOCK"

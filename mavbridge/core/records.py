@@ -36,11 +36,13 @@ class FeatureFrame:
     ready_ns: int
     value: FloatArray
     """Dual rate: feature [1, F]. Single rate: preprocessed image [1, 3, H, W]. Read-only."""
+    fault: str | None = None
+    """Why it must not be acted on, such as a frozen image; None where nothing is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
-    """The 13-D state of the contract and the arrival of each of its parts."""
+    """The 13-D state of the contract, and when each of its parts was measured."""
 
     values: FloatArray
     """[13] float32: velocity m/s, attitude quaternion wxyz, body rates rad/s, specific force m/s^2,
@@ -81,19 +83,30 @@ class Tick:
     """A slot of the stick grid; False: sent between two slots, at once for a new chunk."""
     chunk_serial: int | None = None
     """Number of the chunk that was flown; None when none was."""
+    chunk_computed_ns: int | None = None
+    """When the policy had finished that chunk."""
     is_coasting: bool = False
     """The chunk was too old to be flown as fresh, and was flown for the grace alone."""
+    phase: str | None = None
+    """State of the gate's engagement: a value of ``gate.engagement.Phase``; None in old records."""
 
     @property
     def activity(self) -> str:
         """Who has the sticks, as a line for the user."""
         if self.release_reason is not None:
-            return f"RELEASED: {self.release_reason}"
+            return f"{self.holder}: {self.release_reason}"
         if self.trace is None:
             return "PREPARING: sticks idle"
         if self.sent is None:
             return "READ-ONLY: the policy runs, nothing is sent"
         return "FLYING: the policy has the sticks"
+
+    @property
+    def holder(self) -> str:
+        """WAITING for an act, NEUTRAL sticks of ours, or RELEASED; only where nobody flies."""
+        if self.phase == "waiting":
+            return "WAITING"
+        return "NEUTRAL" if self.phase in ("leaving", "holding") else "RELEASED"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,6 +9,11 @@ from typing import Literal, NamedTuple, TypeAlias
 
 Output: TypeAlias = Literal["rc-override", "manual-control"]
 """RC_CHANNELS_OVERRIDE (ArduPilot) or MANUAL_CONTROL (PX4)."""
+OnFault: TypeAlias = Literal["auto", "release", "hold", "land", "rtl"]
+"""Action that follows the neutral sticks when a flight ends by our own doing."""
+
+Risk: TypeAlias = Literal["endless-override", "no-throttle-failsafe", "slow-serial"]
+"""A setting of the vehicle or of the link with which a flight is begun only if it is accepted."""
 
 
 class Sticks(NamedTuple):
@@ -51,6 +56,13 @@ class Reading(NamedTuple):
 
     arrived_ns: int
     values: tuple[float, ...]
+    delay_ns: int = 0
+    """From the measured moment to the arrival, by the vehicle's own stamp; 0 = not known."""
+
+    @property
+    def happened_ns(self) -> int:
+        """The measured moment, from which its age counts."""
+        return self.arrived_ns - self.delay_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,6 +112,8 @@ class LinkSnapshot:
     """Why sticks may not be sent (no heartbeat, handshake, override switch, no echo), or None."""
     is_overruled: bool = False
     """The vehicle does not act on the sticks that we send: somebody else holds them."""
+    is_switched_off: bool = False
+    """The pilot holds the switch that forbids overrides (RCn_OPTION 46) low."""
     echo_confirmed: bool = False
     """The vehicle was seen to act on our sticks, or its output has no echo to check."""
     is_released: bool = True
@@ -107,6 +121,8 @@ class LinkSnapshot:
     interruption: str | None = None
     """Why every engagement so far is over, or None: the vehicle has rebooted, or now sends from
     another address. Stays as it is once it has happened; a later one has another text."""
+    known_modes: tuple[str, ...] = ()
+    """Flight modes of this vehicle by name."""
     refused_mode: str | None = None
     """Mode that the vehicle has just refused to enter, or None."""
     texts: tuple[str, ...] = ()
@@ -128,6 +144,15 @@ class Packet(NamedTuple):
 
     stamp_ns: int
     """Arrival, or handed to the kernel."""
+    data: bytes
+
+
+class ForwardedPacket(NamedTuple):
+    """One packet of the vehicle, with all that a later reader needs to tell its age."""
+
+    arrived_ns: int
+    happened_ns: int
+    """The moment that it tells about, by the vehicle's own stamp; else its arrival."""
     data: bytes
 
 
@@ -158,3 +183,7 @@ class LinkStats:
     """Corrupt, cut off, or holding NaN."""
     vehicle_clock_offset_ns: int | None = None
     """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
+    is_timesync_good: bool = False
+    """Ages count from the vehicle's own stamps; False = from arrival, which hides delay."""
+    timesync_error_ms: float | None = None
+    """The most by which the offset of the clocks, and so every age, may be wrong."""

@@ -1,8 +1,10 @@
-"""One real flight: opens what the flags name, runs both loops, and stops them in reverse order."""
+"""One real flight: starts the gate, opens what the flags name, stops all in reverse order."""
 
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
+from typing import NamedTuple
 
 import cv2
 from rich.console import Console
@@ -11,25 +13,52 @@ from rich.text import Text
 from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import STATUS_HZ
-from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.files import require_writable
 from mavbridge.core.ports import TickSink
-from mavbridge.core.realtime import settle_process, settle_thread
+from mavbridge.core.realtime import (
+    prepare_to_die_first,
+    settle_process,
+    settle_thread,
+)
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import HungError, Worker
-from mavbridge.flight.bridge import build_bridge
-from mavbridge.flight.link_settings import link_settings
+from mavbridge.flight.bridge import Bridge, build_bridge
+from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.observers import FlightObservers
-from mavbridge.flight.policies import check_configured_policy, load_configured_policy
-from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.flight.policies import (
+    check_configured_policy,
+    is_scripted,
+    load_configured_policy,
+)
+from mavbridge.flight.settings import effective_freshness, flight_settings, gate_settings
+from mavbridge.gate.departure import Ending
+from mavbridge.gate.engagement import Phase
 from mavbridge.mavlink.transport.sockets import make_transport
+from mavbridge.observe.keyboard import Keyboard
+from mavbridge.observe.output import flight_console
 from mavbridge.recording.folder import prepare_folder
+from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 from policy.contract import Executable
 
 JOIN_S = 2.0
-HANG_NS = NS_PER_S
-"""Silence of the action loop after which the flight is ended for it."""
+LEAST_HANG_NS = NS_PER_S
+"""Silence of the policy, or of the encoder, after which the flight ends; the gate has released it
+long before."""
+HANG_PERIODS = 5
+STOPPED_NS = LEAST_HANG_NS // 2
+"""The main thread looks STATUS_HZ times a second; after a longer pause the whole process had been
+stopped, which is no hang of the policy."""
+END_S = 10.0
+"""Longest wait for a gate that neither holds sticks nor ends."""
+
+
+class StartedGate(NamedTuple):
+    """A gate that looks for the vehicle already, and the pipe of its telemetry log."""
+
+    process: GateProcess
+    tlog_pipe: TlogPipe | None
 
 
 def fly(config: FlyConfig) -> int:
@@ -41,17 +70,40 @@ def fly(config: FlyConfig) -> int:
     clock = MonotonicClock()
     # First what takes no time to check: weights take seconds to load.
     make_transport(config.link.connect, clock)
-    check_camera(config.camera.source)
+    check_camera(config.camera.source, latency_ms=config.camera.camera_latency)
     check_configured_policy(config.policy)
     require_writable(config.report, "--report")
     if config.record is not None:
         prepare_folder(config.record)
-    console = Console(stderr=True, emoji=False)
-    loaded = load_configured_policy(config.policy, clock)
-    for note in loaded.notes:
-        console.print(Text(note, style="yellow"))
-    fly_executable(config, loaded.executable, clock=clock, console=console)
+    console = flight_console()
+    with ExitStack() as stack:
+        gate = start_gate(config, clock, stack)  # finds the vehicle while the weights load
+        loaded = load_configured_policy(config.policy, clock)
+        for note in loaded.notes:
+            console.print(Text(note, style="yellow"))
+        fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
     return 0
+
+
+def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate:
+    """Start the gate process; with ``stack`` its channel is closed, which ends it."""
+    tlog_pipe: TlogPipe | None = None
+    tlog_fd: int | None = None
+    if config.record is not None:
+        tlog_pipe = open_tlog_pipe()
+        stack.callback(tlog_pipe.close)
+        tlog_fd = tlog_pipe.writer.fileno()
+    settings = gate_settings(
+        config,
+        is_dual=config.policy.dual_rate,
+        tlog_fd=tlog_fd,
+        wall_offset_ns=wall_offset_ns(clock),
+    )
+    process = GateProcess(settings)
+    stack.callback(process.close)
+    if tlog_pipe is not None:
+        tlog_pipe.writer.close()
+    return StartedGate(process, tlog_pipe)
 
 
 def fly_executable(
@@ -61,21 +113,26 @@ def fly_executable(
     clock: Clock,
     console: Console,
     sinks: tuple[TickSink, ...] = (),
+    gate: StartedGate | None = None,
 ) -> None:
     """Run one flight of a policy that is loaded already; ``sinks`` see every tick."""
     # OpenCV would print its own complaint about a camera before, and instead of, ours.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)  # both loops may share two cores: no pool of threads under either
+    settings = flight_settings(config, executable)
     flight: _Flight | None = None
     try:
         with ExitStack() as stack:
-            flight = _Flight(config, clock, console, executable, sinks, stack)
+            gate = gate or start_gate(config, clock, stack)
+            prepare_to_die_first()
+            flight = _Flight(config, clock, console, executable, gate, sinks, stack)
             # Only now: until a stick can have been taken, a signal may simply end the process.
             stop = stack.enter_context(stop_on_signals())
+            gate.process.send(settings)
             flight.run(stop)
     finally:
         if flight is not None:
-            flight.observers.finish(flight.link)
+            flight.finish()
 
 
 class _Flight:
@@ -87,57 +144,77 @@ class _Flight:
         clock: Clock,
         console: Console,
         executable: Executable,
+        gate: StartedGate,
         sinks: tuple[TickSink, ...],
         stack: ExitStack,
     ) -> None:
-        self._rates = config.rates
+        self._config = config
         self._clock = clock
         self._stack = stack
+        self._gate = gate.process
         self._has_hung = False
         loops = config.rates.loops(is_dual=executable.dual_rate)
-        self.observers = FlightObservers(config, executable, clock=clock, console=console)
-        stack.callback(self.observers.close_recorder)  # after the link: it records the release
-        self.link = MavlinkLink(
-            make_transport(config.link.connect, clock),
-            clock,
-            link_settings(config.link, state_hz=loops.state_hz),
-            packet_log=self.observers.packets,
-        )
-        stack.callback(self.link.close)
-        self.observers.open_viewer(stack)
+        self._hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * period_ns(loops.action_hz))
+        feature_ns = effective_freshness(executable.contract, config.limits).feature_ns
+        self._encoder_hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * feature_ns)
+        self._looked_ns = self._resumed_ns = clock.now_ns()
+        self._observers = FlightObservers(config, executable, clock=clock, console=console)
+        stack.callback(self._observers.close_recorder)  # after the gate: it records the release
+        self._observers.open_viewer(stack)
         camera = open_camera(
-            config.camera.source, image_size=executable.contract.image_height, clock=clock
+            config.camera.source,
+            image_size=executable.contract.image_height,
+            clock=clock,
+            timeout_s=config.camera.camera_timeout,
+            latency_ms=config.camera.camera_latency,
+            report=lambda line: console.print(Text(line)),
         )
         stack.callback(camera.close)
-        self.observers.open_recorder(self.link)
-        self._bridge = build_bridge(
+        self._observers.open_recorder(
+            gate.tlog_pipe, self._gate, lambda: self._bridge.view.status.autopilot
+        )
+        self._bridge: Bridge = build_bridge(
             config,
             executable,
             clock=clock,
-            link=self.link,
+            send=self._gate.send,
             camera=camera,
-            sinks=(*self.observers.sinks, *sinks),
+            sinks=(*self._observers.sinks, *sinks),
+            watches_images=not is_scripted(config.policy),
         )
 
     def run(self, stop: StopRequest) -> None:
-        """Fly until the action loop ends, the camera dies, or a signal comes."""
-        rates, screen = self._rates, self.observers.screen
-        see = self._scheduled(self._bridge.vision.run, realtime=False, cpu=rates.vision_cpu)
-        act = self._scheduled(
-            self._bridge.action.run, realtime=rates.realtime, cpu=rates.action_cpu
+        """Fly until the gate ends, a loop ends, or a signal comes."""
+        rates, bridge, screen = self._config.rates, self._bridge, self._observers.screen
+        see = self._scheduled(bridge.vision.run, realtime=False, cpu=rates.vision_cpu)
+        act = self._scheduled(bridge.policy.run, realtime=rates.realtime, cpu=rates.action_cpu)
+        vision, policy = Worker("mavbridge-vision", see), Worker("mavbridge-policy", act)
+        # On the way of every attitude to the policy, so it must not wait for ordinary threads.
+        listen = self._scheduled(
+            partial(self._gate.listen, view=bridge.view),
+            realtime=rates.realtime,
+            cpu=rates.action_cpu,
         )
-        vision, action = Worker("mavbridge-vision", see), Worker("mavbridge-action", act)
+        listener = Worker("mavbridge-gate", listen)
         settle_process()
-        # Joined in reverse: the sticks are released before anything that feeds them is closed.
-        self._stack.callback(vision.join, JOIN_S)
-        self._stack.callback(self._end, action)
-        vision.start()
-        action.start()
-        with screen.live():
-            while action.is_alive and vision.is_alive and not stop.is_set():
-                screen.refresh()
-                self._watch(action)
-                stop.wait(1 / STATUS_HZ)
+        # Joined in reverse: the gate has ended before anything that feeds it is closed.
+        for worker in (vision, policy, listener):
+            self._stack.callback(self._join, worker)
+            worker.start()
+        keyboard = Keyboard(self._on_key)
+        self._stack.callback(keyboard.stop, JOIN_S)
+        has_keys = not self._config.link.readonly and keyboard.start()
+        screen.start(hint="e engages, q releases" if has_keys else None)
+        ending = Ending(reason="the flight was ended by a signal")
+        while listener.is_alive and not stop.is_set():
+            if (fault := self._fault(vision, policy)) is not None:
+                ending = Ending(reason=fault, is_fault=True)
+                break
+            stop.wait(1 / STATUS_HZ)
+        self._end(ending, listener, stop)
+
+    def _on_key(self, key: str) -> None:
+        self._gate.send("engage" if key == "e" else "release")
 
     def _scheduled(
         self, run: Callable[[threading.Event], None], *, realtime: bool, cpu: int | None
@@ -147,24 +224,76 @@ class _Flight:
         def run_settled(stop: threading.Event) -> None:
             refusal = settle_thread(realtime=realtime, cpu=cpu)
             if refusal is not None:
-                self.observers.screen.show_message(refusal)
+                self._observers.screen.show_message(refusal)
             run(stop)
 
         return run_settled
 
-    def _watch(self, action: Worker) -> None:
-        """End the flight when the action loop hangs: its last sticks must not stay."""
-        idle_ns = self._clock.now_ns() - self._bridge.action.alive_ns
-        if action.is_alive and idle_ns > HANG_NS:
-            self.link.force_release()
-            self._has_hung = True
-            hung = f"the action loop has hung for {idle_ns / NS_PER_S:.1f} s"
-            raise PeerError(f"{hung}: the policy is too slow for this machine, or stuck")
+    def _fault(self, vision: Worker, policy: Worker) -> str | None:
+        """Why no more chunks will come, or None."""
+        if not vision.is_alive:
+            return "the camera or its encoder has failed"
+        if not policy.is_alive:
+            return "the policy has failed"
+        now_ns = self._clock.now_ns()
+        if now_ns - self._looked_ns > STOPPED_NS:
+            self._resumed_ns = now_ns
+        self._looked_ns = now_ns
+        for name, alive_ns, limit_ns in (
+            ("policy", self._bridge.policy.alive_ns, self._hang_ns),
+            ("encoder", self._bridge.vision.alive_ns, self._encoder_hang_ns),
+        ):
+            idle_ns = now_ns - max(alive_ns, self._resumed_ns)
+            if idle_ns > limit_ns:
+                self._has_hung = True
+                return f"the {name} has hung for {idle_ns / NS_PER_S:.1f} s"
+        return None
 
-    def _end(self, action: Worker) -> None:
+    def _end(self, ending: Ending, listener: Worker, stop: StopRequest) -> None:
+        """Have the gate give the sticks back, and wait for it while it holds any."""
+        self._gate.send(ending)
+        screen, view = self._observers.screen, self._bridge.view
+        asked = stop.requests
+        until_ns = self._clock.now_ns() + round(END_S * NS_PER_S)
+        is_told = False
+        while not listener.ends_within(1 / STATUS_HZ):
+            is_holding = view.phase is Phase.HOLDING
+            if is_holding and not is_told:
+                is_told = True
+                screen.show_message(
+                    "without a receiver silence is a failsafe, so neutral sticks go on until the "
+                    "vehicle is disarmed or its mode is changed; Ctrl-C leaves that to the gate "
+                    f"(process {self._gate.pid})"
+                )
+            if stop.requests > asked or (not is_holding and self._clock.now_ns() > until_ns):
+                break
+        if self._has_hung:
+            raise PeerError(f"{ending.reason}: it is too slow for this machine, or stuck")
+
+    def _join(self, worker: Worker) -> None:
         try:
-            action.join(JOIN_S)
+            worker.join(JOIN_S)
         except HungError:
-            self.link.force_release()
             if not self._has_hung:  # else that is being reported already
                 raise
+
+    def finish(self) -> None:
+        """Print the report of a flight with a vehicle, and write it where --report names a file."""
+        view, screen, summary = self._bridge.view, self._observers.screen, self._gate.summary
+        for text in view.take_texts():  # said after the last tick
+            screen.show_message(text)
+        if view.status.armed and not view.status.is_landed and view.flights:
+            height = "" if view.height_m is None else f" at {view.height_m:.0f} m"
+            left = f"still armed in {view.status.mode}{height}"
+            if summary is not None:
+                screen.show_message(f"sticks given back, {left}")
+            elif view.phase is Phase.HOLDING:
+                holder = f"the gate (process {self._gate.pid})"
+                screen.show_message(f"{left}: {holder} goes on sending neutral sticks")
+        if summary is not None and summary.dropped_messages:
+            screen.show_message(
+                f"{summary.dropped_messages} messages of the gate did not fit into its queue: this "
+                "process was too busy to take them"
+            )
+        is_found = view.status.mode is not None
+        self._observers.finish(self._gate.summary, view.status.autopilot if is_found else None)

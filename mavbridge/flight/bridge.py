@@ -1,29 +1,33 @@
-"""Both loops of a flight, composed once for a real vehicle and for the simulation."""
+"""The loops of the flight process, composed once for a real vehicle and for the simulation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from mavbridge.config.flight import FlyConfig
-from mavbridge.core.clock import NS_PER_S, Clock, GridPacer, Pacer, period_ns
+from mavbridge.camera.image_watch import ImageWatch
+from mavbridge.config.flight import CameraConfig, FlyConfig
+from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.observers import FanOut
-from mavbridge.core.ports import Camera, Link, TickSink
-from mavbridge.flight.action_loop import ActionLoop, ActionSettings
+from mavbridge.core.ports import Camera, TickSink
 from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.history import SentHistory
+from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
+from mavbridge.flight.settings import effective_freshness
 from mavbridge.flight.state import Freshness
-from mavbridge.flight.state_pacer import StatePacer
+from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.flight.vision_rate import AdaptiveRate
-from mavbridge.gate.engagement import Engagement
-from mavbridge.gate.smoothing import Smoothing, StickSmoother
+from mavbridge.gate.chunks import Chunk
+from mavbridge.gate.wire import Absence
 from policy.contract import Executable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bridge:
-    """The two loops, joined by a feature cache; each is run by one thread, or stepped."""
+    """Camera to feature cache, state and feature to chunks, and what the gate says of both."""
 
     vision: VisionLoop
-    action: ActionLoop
+    policy: PolicyLoop
+    view: VehicleView
 
 
 def build_bridge(
@@ -31,30 +35,52 @@ def build_bridge(
     executable: Executable,
     *,
     clock: Clock,
-    link: Link,
+    send: Callable[[Chunk | Absence], object],
     camera: Camera,
     sinks: Sequence[TickSink],
+    watches_images: bool,
     cache: FeatureCache | None = None,
+    policy_clock: Clock | None = None,
     vision_clock: Clock | None = None,
     delay_vision: Callable[[TickSink], TickSink] | None = None,
 ) -> Bridge:
-    """Join a policy, a camera and a link.
+    """Join a policy, a camera and the gate.
 
     Args:
-        config: rates, limits, mode and arming; its camera and address are not used.
+        config: rates and limits; its camera and address are not used.
         executable: the policy on its engine.
-        clock: time of the action loop, and of the vision loop if it has none of its own.
-        link: the vehicle; used by the action loop alone.
+        clock: time of everything that has no clock of its own.
+        send: hands a chunk to the gate, or the reason why there is none.
         camera: used by the vision loop alone.
         sinks: see every tick and every encoded frame.
+        watches_images: a frozen or a black image is a fault; False where nobody looks at it.
         cache: holds the newest feature; simulation passes one that publishes late.
-        vision_clock: time of the vision loop, where simulated encoding takes simulated time.
+        policy_clock: time of the policy loop, where simulated solving takes simulated time.
+        vision_clock: time of the vision loop, likewise.
         delay_vision: wraps the sink of the vision loop, for the same reason.
     """
     cache = cache or FeatureCache()
+    contract = executable.contract
     loops = config.rates.loops(is_dual=executable.dual_rate)
     rate = AdaptiveRate(min_hz=loops.min_vision_hz, max_hz=loops.max_vision_hz)
     sink = FanOut([rate, *sinks] if rate.is_adaptive else sinks)
+    limits = effective_freshness(contract, config.limits)
+    settings = PolicySettings(
+        state_frame=contract.state_frame,
+        since_exposure=contract.since_exposure,
+        chunk_dt_s=contract.chunk_dt_s,
+        freshness=Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns),
+        max_feature_age_ns=limits.feature_ns,
+        max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
+        period_ns=period_ns(loops.action_hz),
+    )
+    history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s)
+    view = VehicleView(
+        history=history,
+        sink=sink,
+        state_frame=settings.state_frame,
+        freshness=settings.freshness,
+    )
     vision = VisionLoop(
         camera=camera,
         encode=executable.encode,
@@ -62,51 +88,21 @@ def build_bridge(
         sink=delay_vision(sink) if delay_vision else sink,
         clock=vision_clock or clock,
         period_ns=rate.period_ns,
+        image_watch=_image_watch(config.camera) if watches_images else None,
+        is_airborne=lambda: view.is_airborne,
     )
-    action = build_action_loop(config, executable, clock=clock, link=link, cache=cache, sink=sink)
-    return Bridge(vision=vision, action=action)
-
-
-def build_action_loop(
-    config: FlyConfig,
-    executable: Executable,
-    *,
-    clock: Clock,
-    link: Link,
-    cache: FeatureCache,
-    sink: TickSink,
-) -> ActionLoop:
-    """Build the fast path alone; arguments as for ``build_bridge``."""
-    action_period_ns = period_ns(config.rates.loops(is_dual=executable.dual_rate).action_hz)
-    pacer: Pacer = GridPacer(clock, period_ns=action_period_ns)
-    if config.rates.pace == "state":
-        pacer = StatePacer(clock, link, period_ns=action_period_ns)
-    contract, limits = executable.contract, config.limits
-    settings = ActionSettings(
-        state_frame=contract.state_frame,
-        since_exposure=contract.since_exposure,
-        chunk_dt_s=contract.chunk_dt_s,
-        history_len=contract.history_len,
-        history_dt_s=contract.history_dt_s,
-        freshness=Freshness(
-            attitude_ns=round(limits.max_attitude_age * NS_PER_S),
-            velocity_ns=round(limits.max_velocity_age * NS_PER_S),
-        ),
-        max_feature_age_ns=round(limits.max_feature_age * NS_PER_S),
-        lead_s=limits.tau,
-        mode=config.mode,
-        duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
-    )
-    return ActionLoop(
-        clock=clock,
-        pacer=pacer,
-        link=link,
+    policy = PolicyLoop(
+        clock=policy_clock or clock,
+        view=view,
         cache=cache,
+        history=history,
         act=executable.act,
-        smoother=StickSmoother(Smoothing(max_slew_per_s=limits.max_slew, tau_s=limits.tau)),
-        engagement=Engagement(
-            wanted_mode=config.mode, arm=config.arm, readonly=config.link.readonly
-        ),
-        sink=sink,
+        reset=executable.reset,
+        send=send,
         settings=settings,
     )
+    return Bridge(vision=vision, policy=policy, view=view)
+
+
+def _image_watch(config: CameraConfig) -> ImageWatch:
+    return ImageWatch(max_frozen_s=config.max_frozen_image, max_black_s=config.max_black_image)

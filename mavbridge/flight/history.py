@@ -1,5 +1,6 @@
 """Chunks and history in seconds: which action acts now, and which sticks were sent before."""
 
+import threading
 from bisect import bisect_right
 
 import numpy as np
@@ -27,23 +28,29 @@ def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks
 
 
 class SentHistory:
-    """Sticks as they were sent, resampled to the policy's history grid."""
+    """Sticks as they were sent, resampled to the policy's history grid.
+
+    One thread appends, another one may resample.
+    """
 
     def __init__(self, *, length: int, dt_s: float) -> None:
         self._ages_ns = history_ages_ns(length, dt_s)
         self._span_ns = self._ages_ns[0] + self._ages_ns[-1]
+        self._lock = threading.Lock()
         self._sent_ns: list[int] = []
         self._sent: list[Sticks] = [NEUTRAL]
         """One more than stamps: what was held before the first of them."""
 
     def append(self, sent: Sticks | None, now_ns: int) -> None:
         """Remember what left at ``now_ns`` (None = released); forget what is too old to matter."""
-        self._sent_ns.append(now_ns)
-        self._sent.append(NEUTRAL if sent is None else sent)
-        if (old := bisect_right(self._sent_ns, now_ns - self._span_ns)) > 1:
-            del self._sent_ns[: old - 1], self._sent[: old - 1]
+        with self._lock:
+            self._sent_ns.append(now_ns)
+            self._sent.append(NEUTRAL if sent is None else sent)
+            if (old := bisect_right(self._sent_ns, now_ns - self._span_ns)) > 1:
+                del self._sent_ns[: old - 1], self._sent[: old - 1]
 
     def resample(self, now_ns: int) -> FloatArray:
         """[1, K, 4], see ``policy.contract.history_ages_ns``."""
-        rows = [self._sent[bisect_right(self._sent_ns, now_ns - age)] for age in self._ages_ns]
+        with self._lock:
+            rows = [self._sent[bisect_right(self._sent_ns, now_ns - age)] for age in self._ages_ns]
         return np.array([rows], dtype=np.float32)

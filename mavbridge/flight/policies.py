@@ -41,6 +41,11 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
     )
 
 
+def is_scripted(policy: PolicyConfig) -> bool:
+    """Return whether the policy flies by no image."""
+    return policy.policy.partition(":")[0] == "scripted"
+
+
 def is_stateless(policy: PolicyConfig) -> bool:
     """Return whether the policy keeps nothing between flights: the built-in nets."""
     return policy.policy.partition(":")[0] in BUILT_IN

@@ -13,6 +13,9 @@ from mavbridge.core.vehicle import Reading, Release, Telemetry
 StateFrame = Literal["ned_frd", "enu_flu"]
 
 _HALF_SQRT2 = math.sqrt(0.5)
+LEAST_RATE_RADPS = 1e-4
+"""A body that turns at this rate cannot keep its attitude: a hundredth of a gyroscope's noise, and
+more than what is left of a turn where a simulator without noise hovers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,13 +37,13 @@ def build_state(
     """
     attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
     velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
-    if attitude is None or now_ns - attitude.arrived_ns > freshness.attitude_ns:
+    if attitude is None or now_ns - attitude.happened_ns > freshness.attitude_ns:
         return _stale(attitude, "attitude", freshness.attitude_ns)
-    if rate is None or now_ns - rate.arrived_ns > freshness.attitude_ns:
+    if rate is None or now_ns - rate.happened_ns > freshness.attitude_ns:
         return _stale(rate, "body rates", freshness.attitude_ns)
-    if velocity is None or now_ns - velocity.arrived_ns > freshness.velocity_ns:
+    if velocity is None or now_ns - velocity.happened_ns > freshness.velocity_ns:
         return _stale(velocity, "velocity", freshness.velocity_ns)
-    if force is None or now_ns - force.arrived_ns > freshness.velocity_ns:
+    if force is None or now_ns - force.happened_ns > freshness.velocity_ns:
         return _stale(force, "acceleration", freshness.velocity_ns)
     v, q, w, a = velocity.values, attitude.values, rate.values, force.values
     if frame == "enu_flu":
@@ -49,11 +52,36 @@ def build_state(
     values.setflags(write=False)
     return VehicleState(
         values=values,
-        attitude_ns=attitude.arrived_ns,
-        rate_ns=rate.arrived_ns,
-        velocity_ns=velocity.arrived_ns,
-        specific_force_ns=force.arrived_ns,
+        attitude_ns=attitude.happened_ns,
+        rate_ns=rate.happened_ns,
+        velocity_ns=velocity.happened_ns,
+        specific_force_ns=force.happened_ns,
     )
+
+
+class FrozenStateCheck:
+    """Notices a state that goes on arriving and stays the same.
+
+    Its attitude has not changed in any bit for longer than the limit, although the body rates say
+    that it turns. A limit of 0 turns the check off.
+    """
+
+    def __init__(self, *, max_frozen_ns: int) -> None:
+        self._max_frozen_ns = max_frozen_ns
+        self._attitude: bytes = b""
+        self._changed_ns = 0
+
+    def problem(self, state: VehicleState) -> str | None:
+        """Reason not to fly by this state, or None; call it with each state, in order."""
+        attitude = state.values[3:7].tobytes()
+        if attitude != self._attitude:
+            self._attitude, self._changed_ns = attitude, state.attitude_ns
+        frozen_ns = state.attitude_ns - self._changed_ns
+        is_turning = bool(np.abs(state.values[7:10]).max() > LEAST_RATE_RADPS)
+        if not self._max_frozen_ns or frozen_ns <= self._max_frozen_ns or not is_turning:
+            return None
+        limit_ms = self._max_frozen_ns // NS_PER_MS
+        return f"the vehicle's attitude has been frozen for more than {limit_ms} ms"
 
 
 def _stale(reading: Reading | None, what: str, limit_ns: int) -> Release:

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 
+from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.records import FeatureFrame, FloatArray, ImageArray, VisionTick
@@ -29,21 +30,42 @@ class VisionLoop:
         sink: TickSink,
         clock: Clock,
         period_ns: Callable[[], int],
+        image_watch: ImageWatch | None = None,
+        is_airborne: Callable[[], bool] = lambda: False,
     ) -> None:
+        """Join a camera, an encoder and a cache; nothing runs yet.
+
+        Args:
+            camera: read by this loop alone.
+            encode: image [H, W, 3] to feature.
+            cache: gets every feature; one whose image is at fault says so.
+            sink: gets a tick for every feature.
+            clock: time of the start and end of the encoding.
+            period_ns: shortest time between two encoded frames, asked for each of them.
+            image_watch: judges each encoded frame; None where the policy looks at no image, or the
+                renderer draws none.
+            is_airborne: whether the policy flies and the vehicle is known not to be landed; a
+                frozen image is a fault only then. Called from this loop's thread.
+        """
         self._camera = camera
         self._encode = encode
         self._cache = cache
         self._sink = sink
         self._clock = clock
         self._period_ns = period_ns
+        self._image_watch = image_watch
+        self._is_airborne = is_airborne
         self._used_ns: int | None = None
         """Slot of the last frame that was used."""
         self._frames = 0
+        self.alive_ns = clock.now_ns()
+        """When the last step ended; read by another thread."""
 
     def run(self, stop: threading.Event) -> None:
         """Encode until told to stop; raises CameraError if the camera has died."""
         while not stop.is_set():
             self.step()
+            self.alive_ns = self._clock.now_ns()
 
     def step(self) -> None:
         """Wait up to ``READ_TIMEOUT_NS`` for one frame, encode and publish it, or CameraError."""
@@ -55,11 +77,19 @@ class VisionLoop:
         captured_ns = min(frame.captured_ns, started_ns)
         if not self._is_due(captured_ns):
             return
+        fault: str | None = None
+        if self._image_watch is not None:
+            is_airborne = self._is_airborne()
+            fault = self._image_watch.check(frame.rgb, captured_ns, is_airborne=is_airborne)
         value = self._encode(frame.rgb)
         value.setflags(write=False)
         ready_ns = self._clock.now_ns()
         feature = FeatureFrame(
-            frame_id=frame.frame_id, captured_ns=captured_ns, ready_ns=ready_ns, value=value
+            frame_id=frame.frame_id,
+            captured_ns=captured_ns,
+            ready_ns=ready_ns,
+            value=value,
+            fault=fault,
         )
         self._cache.publish(feature)
         self._sink.emit(

@@ -1,189 +1,391 @@
-"""Who holds the sticks: a pure state machine, and the check of every chunk a policy returns."""
+"""Who holds the sticks: one pure state machine. docs/SAFETY.md has its table.
 
-import math
+Taking the sticks needs an explicit act; losing them is final until the next one.
+"""
+
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.errors import PeerError
-from mavbridge.core.records import FloatArray
-from mavbridge.core.vehicle import Release
-
-PILOTED_MODES = (
-    *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
-    *("MANUAL", "STABILIZED", "ALTCTL", "POSCTL"),
-)
-"""Modes in which sticks fly the vehicle (ArduPilot, PX4)."""
-
-RETAKE_NS = NS_PER_S // 2
-"""How long inputs must be good again before the policy takes the sticks back, so that control does
-not pass between pilot and policy several times a second."""
+from mavbridge.gate.departure import Departure, DepartureSettings, Ending
+from mavbridge.gate.facts import Facts, Hand, Move
 
 PREPARE_TIMEOUT_NS = 90 * NS_PER_S
 """For mode change and arming; a cold autopilot needs some 40 s for its estimator."""
+ACT_TIMEOUT_NS = 3 * NS_PER_S
+"""For the change of mode that an act asks for while armed: no act comes true much later."""
+REQUEST_SPACING_NS = NS_PER_S
+"""Between two requests to arm or for a mode: each refused one prints the vehicle's reason."""
+RELEASE_TIMEOUT_NS = NS_PER_S
+"""Longest wait for the vehicle to show other sticks than ours. Without a receiver it never does."""
+LOST_NS = 30 * NS_PER_S
+"""A vehicle that was held for so long without a word from it is gone: nothing can be held."""
+OPERATOR = "released by the operator"
+ON_US, OFF_US = 1800, 1200
+"""ArduPilot's thresholds of a high and of a low switch."""
 
 
 class Phase(Enum):
     """State of the engagement."""
 
     WAITING = "waiting"
+    """Nobody has asked us to fly."""
     PREPARING = "preparing"
+    """Asked to; the vehicle is brought into its mode and armed, the sticks idle on the ground."""
     FLYING = "flying"
-    LATCHED = "latched"
-    """The pilot took over; only disarming ends this."""
+    LEAVING = "leaving"
+    """The flight ends by our own doing: neutral sticks, and a safe mode until it is confirmed."""
+    HOLDING = "holding"
+    """Neutral goes on, since without a receiver silence is a failsafe: until disarmed or taken."""
+    RELEASING = "releasing"
+    """The sticks are given back, until the vehicle confirms it."""
+    RELEASED = "released"
+    """Given back, with a reason; only an explicit act ends this."""
+    ENDED = "ended"
+    """The gate may exit."""
+
+
+Act: TypeAlias = Literal["engage", "release"]
+"""Explicit acts of the operator at the terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Facts:
-    """Inputs of the state machine at one tick."""
+class EngagementSettings:
+    """The acts that may engage, and the modes in which they may."""
 
-    now_ns: int
-    link_problem: str | None
-    input_problem: str | None
-    mode: str | None
-    armed: bool
-    is_overruled: bool
-    echo_confirmed: bool
-
-
-class Hold(Enum):
-    """Use of the sticks while they are not released."""
-
-    IDLE = "idle"
-    FLY = "fly"
-
-
-Request: TypeAlias = Literal["mode", "arm"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Directive:
-    """Output of the state machine at one tick."""
-
-    sticks: Hold | Release
-    request: Request | None = None
+    modes: tuple[str, ...]
+    """Modes in which the policy may fly."""
+    mode: str | None = None
+    """Mode to ask for when engaging; None = the present one, or with ``arm`` the first of modes."""
+    arm: bool = False
+    """Arm once and engage once, as soon as everything is ready."""
+    engage_channel: int | None = None
+    """Receiver channel, from 1, that engages when it goes from low to high."""
+    engage_on_arm: bool = False
+    """Engage when the vehicle is armed for the first time."""
+    readonly: bool = False
+    """Fly without sending anything."""
+    duration_ns: int | None = None
+    """Flight time from the first engagement on; None = until told otherwise."""
+    departure: DepartureSettings
 
 
 class Engagement:
-    """Decides whether the policy flies. Every path that does not is a ``Release`` with its reason.
+    """Decides who holds the sticks; ``step`` is called at every wake of the gate."""
 
-    WAITING -> PREPARING (asked to arm or to change mode) -> FLYING. A takeover by
-    somebody else ends it: a mode change in the air, or a vehicle that no longer acts on our sticks,
-    leads to LATCHED, which only disarming ends. A problem of link or inputs releases the sticks for
-    as long as it lasts.
-    """
-
-    def __init__(self, *, wanted_mode: str | None, arm: bool, readonly: bool) -> None:
-        self._wanted_mode = wanted_mode.upper() if wanted_mode else None
-        self._may_arm = arm
-        self._readonly = readonly
+    def __init__(self, settings: EngagementSettings) -> None:
+        self._settings = settings
+        self._departure = Departure(settings.departure)
+        self._wants_arm = settings.arm
         self._own_mode: str | None = None
         """The mode that we fly in, or asked for and got; any change of it is a takeover."""
-        self._prepare_until_ns: int | None = None
-        self._retake_ns: int | None = None
-        """Not before this time, after an input failed in flight."""
+        self._asked_mode: str | None = None
+        """Mode that was asked for while preparing."""
+        self._prepare_timeout_ns = self._prepare_until_ns = 0
+        self._request_due_ns = 0
+        self._release_until_ns = 0
+        self._heard_ns = 0
+        """While holding: the link was last without a problem."""
+        self._was_armed: bool | None = None
+        """As last seen; None before the vehicle was found."""
+        self._has_been_armed = False
+        self._arms = False
+        """It was disarmed when preparing began: the sticks idle on the ground, and we arm it."""
+        self._was_ready = False
+        """The vehicle was armed at the last step of preparing."""
+        self._switch_is_low = False
+        self._seen_interruption: str | None = None
+        self._stop_reason: Ending | None = None
+        self._must_end = False
+        """The stop has not been acted upon."""
         self.phase = Phase.WAITING
+        self.reason = "not engaged"
+        """Why the policy does not fly; shown to the user."""
+        self.refusal: str | None = None
+        """Why the last explicit act had no effect, or what the vehicle has not confirmed; the
+        reader resets it."""
+        self.failure: str | None = None
+        """Why there was no flight: the vehicle did not take the mode or arm in time."""
         self.engaged_ns: int | None = None
-        """First tick of flight."""
+        """First moment of flight."""
 
-    def step(self, facts: Facts) -> Directive:
-        """Advance by one tick.
+    def stop(self, ending: Ending) -> None:
+        """End: give the sticks back as ``ending`` says, and then be ``ENDED``."""
+        if self._stop_reason is None:
+            self._stop_reason = ending
+            self._must_end = True
+            self._wants_arm = False
 
-        Raises:
-            PeerError: the vehicle did not take the mode or arm in time.
-        """
-        if self._readonly:
-            return (
-                self._fly(facts) if facts.link_problem is None else self._wait(facts.link_problem)
-            )
-        if facts.armed:
-            self._may_arm = False  # armed once, by anybody: never arm a second time
-        if facts.is_overruled and self.phase is Phase.FLYING:
-            self.phase = Phase.LATCHED
+    def step(self, facts: Facts, act: Act | None) -> Move:
+        """Advance to the facts of this moment."""
+        if self._settings.readonly:
+            return self._watch(facts)
+        act = self._explicit_act(facts, act)
+        if act == "engage" and self.phase in (Phase.LEAVING, Phase.HOLDING, Phase.RELEASING):
+            self.refusal = f"not engaged: the last flight is still ending ({self.phase.value})"
+        match self.phase:
+            case Phase.WAITING | Phase.RELEASED | Phase.ENDED:
+                return self._rest(facts, act)
+            case Phase.PREPARING:
+                return self._prepare(facts, act)
+            case Phase.FLYING:
+                return self._fly(facts, act)
+            case Phase.LEAVING | Phase.HOLDING:
+                return self._leave(facts, act)
+            case Phase.RELEASING:
+                return self._release(facts)
+
+    # --- explicit acts
+
+    def _explicit_act(self, facts: Facts, act: Act | None) -> Act | None:
+        """The operator's act, or that of the switch, or of the first arming."""
+        channel = self._settings.engage_channel
+        if channel is not None and len(facts.rc_channels_us) >= channel:
+            value_us = facts.rc_channels_us[channel - 1]
+            if value_us > ON_US and self._switch_is_low:
+                self._switch_is_low, act = False, act or "engage"
+            elif 0 < value_us < OFF_US:
+                self._switch_is_low = True
+        is_first_arming = facts.armed and self._was_armed is False and not self._has_been_armed
+        if is_first_arming and self._settings.engage_on_arm:
+            act = act or "engage"
+        if facts.is_connected:
+            self._was_armed = facts.armed
+            self._has_been_armed = self._has_been_armed or facts.armed
+        return act
+
+    def _objection(self, facts: Facts) -> str | None:
+        """Why the policy may not take the sticks of an armed vehicle now, or None."""
         if facts.link_problem is not None:
-            return self._wait(facts.link_problem)
+            return facts.link_problem
+        if facts.is_failsafe:
+            return "a failsafe of the vehicle is active"
+        if self._switch_is_low:
+            return f"the engage switch (channel {self._settings.engage_channel}) is off"
+        return facts.chunk_problem or facts.envelope_problem
+
+    def _mode_objection(self, facts: Facts) -> str | None:
+        if facts.mode in self._settings.modes:
+            return None
+        allowed = " or ".join(self._settings.modes)
+        return f"the policy may not fly in {facts.mode}, only in {allowed}: change the mode"
+
+    # --- phases
+
+    def _rest(self, facts: Facts, act: Act | None) -> Move:
+        """The sticks are the pilot's, and nothing is sent."""
+        if self._is_over(facts):
+            self.stop(Ending(reason="the flight is over"))
+        if self._stop_reason is not None:
+            self.phase = Phase.ENDED
+            return Move()
+        if self.phase is Phase.WAITING:
+            self.reason = self._waiting_reason(facts)
+        if self._wants_arm and facts.link_problem is None:
+            self._wants_arm = False
+            return self._begin_preparing(facts, PREPARE_TIMEOUT_NS)
+        if act != "engage":
+            return Move()
         if not facts.armed:
-            return self._on_ground(facts)
-        if self.phase is Phase.LATCHED:
-            reason = f"somebody else has taken over ({facts.mode}): disarm to reset"
-            return Directive(sticks=Release(reason))
-        if self._own_mode is not None and facts.mode != self._own_mode:
-            self.phase = Phase.LATCHED
-            return Directive(sticks=Release(f"mode changed from {self._own_mode} to {facts.mode}"))
-        return self._in_air(facts)
+            self.refusal = "not engaged: the vehicle is disarmed; arm it first, or use --arm"
+        elif (objection := self._objection(facts)) is not None:
+            self.refusal = f"not engaged: {objection}"
+        elif self._settings.mode is not None and facts.mode != self._settings.mode:
+            return self._begin_preparing(facts, ACT_TIMEOUT_NS)
+        elif (objection := self._mode_objection(facts)) is not None:
+            self.refusal = f"not engaged: {objection}"
+        else:
+            return self._take_off(facts)
+        return Move()
 
-    def _wait(self, reason: str, request: Request | None = None) -> Directive:
-        if self.phase is Phase.PREPARING:
-            self.phase = Phase.WAITING
-        return Directive(sticks=Release(reason), request=request)
+    def _waiting_reason(self, facts: Facts) -> str:
+        if facts.link_problem is not None:
+            return facts.link_problem
+        return facts.chunk_problem or "not engaged: press e, use the engage switch, or --arm"
 
-    def _on_ground(self, facts: Facts) -> Directive:
-        self.phase = Phase.WAITING
-        wants_mode = self._wanted_mode is not None and not self._has_wanted_mode(facts)
-        if self.engaged_ns is not None:
-            self._own_mode = None
-            return self._wait("disarmed: the flight is over, or arm it yourself")
-        if not self._may_arm:
-            self._own_mode = None
-            request: Request | None = "mode" if wants_mode else None
-            return self._wait("disarmed: arm the vehicle, or start with --arm", request)
-        if self._wanted_mode is None and facts.mode not in PILOTED_MODES:
-            return self._wait(f"{facts.mode} is not flown with sticks: name one with --mode")
-        self._prepare(facts)
-        if facts.input_problem is not None or not facts.echo_confirmed:
-            return Directive(sticks=Hold.IDLE)
-        return Directive(sticks=Hold.IDLE, request="mode" if wants_mode else "arm")
+    def _begin_preparing(self, facts: Facts, timeout_ns: int) -> Move:
+        self.phase = Phase.PREPARING
+        self._own_mode = facts.mode if facts.armed else None
+        self._asked_mode = None
+        self._arms, self._was_ready = not facts.armed, False
+        self._prepare_timeout_ns, self._prepare_until_ns = timeout_ns, facts.now_ns + timeout_ns
+        self._seen_interruption = facts.interruption
+        return self._prepare(facts, None)
 
-    def _has_wanted_mode(self, facts: Facts) -> bool:
-        """Return whether the wanted mode is active; from then on a change of it is a takeover."""
-        if facts.mode == self._wanted_mode:
+    def _wanted_mode(self, facts: Facts) -> str | None:
+        """Mode to ask for; None if the present one will do."""
+        wanted = self._settings.mode
+        if wanted is None and facts.mode not in self._settings.modes:
+            known = [mode for mode in self._settings.modes if mode in facts.known_modes]
+            wanted = known[0] if known else self._settings.modes[0]
+        return None if wanted == facts.mode else wanted
+
+    def _prepare(self, facts: Facts, act: Act | None) -> Move:
+        if self._stop_reason is not None or act == "release":
+            return self._depart(facts, self._stop_reason or Ending(reason=OPERATOR))
+        wanted = self._wanted_mode(facts)
+        if facts.mode == self._asked_mode or (wanted is None and self._own_mode is None):
             self._own_mode = facts.mode
-        return facts.mode == self._wanted_mode
+        taken = self._takeover(facts)
+        if taken is None and self._was_ready and not facts.armed:
+            taken = "the vehicle has been disarmed"
+        if taken is not None:
+            return self._give_back(facts, taken)
+        self._was_ready = facts.armed
+        is_late = facts.now_ns > self._prepare_until_ns
+        if is_late or self._impossibility(facts) is not None:
+            return self._give_up_preparing(facts)
+        objection = self._objection(facts)
+        if facts.armed and wanted is None and objection is None:
+            return self._take_off(facts)
+        # Somebody who has armed it keeps the sticks until the policy takes them.
+        hand = Hand.IDLE if self._arms and facts.link_problem is None else None
+        self.reason = objection or f"waiting for {wanted or 'the vehicle to arm'}"
+        is_ready = facts.armed or facts.echo_confirmed
+        if objection is not None or not is_ready or facts.now_ns < self._request_due_ns:
+            return Move(hand=hand)
+        self._request_due_ns = facts.now_ns + REQUEST_SPACING_NS
+        self._asked_mode = wanted
+        return Move(hand=hand, mode=wanted, arm=wanted is None)
 
-    def _in_air(self, facts: Facts) -> Directive:
-        if self._wanted_mode is None:
-            if facts.mode in PILOTED_MODES:
-                return self._fly(facts)
-            return self._wait(f"{facts.mode} is not flown with sticks")
-        if self._has_wanted_mode(facts):
-            return self._fly(facts)
-        if facts.input_problem is not None:
-            return self._wait(facts.input_problem)
-        self._prepare(facts)
-        return Directive(sticks=Release(f"waiting for mode {self._wanted_mode}"), request="mode")
+    def _impossibility(self, facts: Facts) -> str | None:
+        """Why waiting will not help, or None."""
+        wanted = self._wanted_mode(facts)
+        if wanted is None or not facts.known_modes or wanted in facts.known_modes:
+            return facts.slowness
+        return f"this vehicle has no mode {wanted}, it has {', '.join(facts.known_modes)}"
 
-    def _fly(self, facts: Facts) -> Directive:
-        if facts.input_problem is not None:
-            if self.engaged_ns is not None:
-                self._retake_ns = facts.now_ns + RETAKE_NS
-            return Directive(sticks=Release(facts.input_problem))
-        if self._retake_ns is not None and facts.now_ns < self._retake_ns:
-            reason = "inputs are good again: waiting to see that they stay so"
-            return Directive(sticks=Release(reason))
+    def _give_up_preparing(self, facts: Facts) -> Move:
+        """The vehicle, or an input, was not ready in time."""
+        problem = self._impossibility(facts) or (
+            f"the vehicle is not ready after {self._prepare_timeout_ns // NS_PER_S} s "
+            f"(mode {facts.mode}, armed {facts.armed}, overrides seen {facts.echo_confirmed}, "
+            f"inputs {facts.chunk_problem or 'fine'}): see its messages above"
+        )
+        if self._prepare_timeout_ns == ACT_TIMEOUT_NS:  # the act may be repeated
+            self.refusal = f"not engaged: {problem}"
+            return self._give_back(facts, self.refusal)
+        self.failure = problem
+        ending = Ending(reason=problem, is_fault=True)
+        self.stop(ending)
+        return self._depart(facts, ending)
+
+    def _take_off(self, facts: Facts) -> Move:
+        """The policy takes the sticks."""
         self.phase = Phase.FLYING
+        self.reason = ""
         self._own_mode = facts.mode
-        self._prepare_until_ns = None
+        self._seen_interruption = facts.interruption
         if self.engaged_ns is None:
             self.engaged_ns = facts.now_ns
-        return Directive(sticks=Hold.FLY)
+        return Move(hand=Hand.POLICY)
 
-    def _prepare(self, facts: Facts) -> None:
-        self.phase = Phase.PREPARING
-        if self._prepare_until_ns is None:
-            self._prepare_until_ns = facts.now_ns + PREPARE_TIMEOUT_NS
-        elif facts.now_ns > self._prepare_until_ns:
-            raise PeerError(
-                f"the vehicle is not ready after {PREPARE_TIMEOUT_NS // NS_PER_S} s "
-                f"(mode {facts.mode}, armed {facts.armed}, overrides seen {facts.echo_confirmed}, "
-                f"inputs {facts.input_problem or 'fine'}): see its messages above"
-            )
+    def _fly(self, facts: Facts, act: Act | None) -> Move:
+        if (taken := self._takeover(facts)) is not None:
+            return self._give_back(facts, taken)
+        if self._stop_reason is not None:
+            return self._depart(facts, self._stop_reason)
+        if act == "release":
+            return self._depart(facts, Ending(reason=OPERATOR))
+        if self._is_over(facts):
+            over = Ending(reason="the flight is over")
+            self.stop(over)
+            return self._depart(facts, over)
+        if facts.landing is not None:
+            return self._depart(facts, Ending(reason=facts.landing))
+        fault = facts.link_problem or facts.chunk_fault or facts.envelope_problem
+        if fault is not None:
+            return self._depart(facts, Ending(reason=fault, is_fault=True))
+        return Move(hand=Hand.POLICY)
 
+    def _is_over(self, facts: Facts) -> bool:
+        duration_ns = self._settings.duration_ns
+        if self.engaged_ns is None or duration_ns is None:
+            return False
+        return facts.now_ns - self.engaged_ns >= duration_ns
 
-def check_chunk(chunk: FloatArray) -> Release | None:
-    """Refuse a chunk that is not [1, horizon, 4], or holds a value that is not finite."""
-    if chunk.ndim != 3 or chunk.shape[0] != 1 or not chunk.shape[1] or chunk.shape[2] != 4:
-        return Release(f"the policy returned {list(chunk.shape)} instead of [1, horizon, 4]")
-    if not math.isfinite(chunk.sum()):  # one pass; NaN and infinity survive every sum
-        return Release("the policy returned a value that is not finite")
-    return None
+    def _takeover(self, facts: Facts) -> str | None:
+        """Why the sticks are somebody else's now, or None."""
+        if facts.interruption != self._seen_interruption:
+            return facts.interruption
+        if facts.overruled is not None:
+            return facts.overruled
+        if facts.is_switched_off:
+            return "the pilot's override switch is off"
+        if self._switch_is_low and self.phase is Phase.FLYING:
+            return "the pilot's engage switch is off"
+        if not facts.armed and self.phase is not Phase.PREPARING:
+            return "the vehicle has been disarmed"
+        if facts.is_failsafe and facts.armed:
+            return f"a failsafe of the vehicle is active (mode {facts.mode})"
+        if self._own_mode is not None and facts.mode not in (self._own_mode, self._departure.mode):
+            return f"mode changed from {self._own_mode} to {facts.mode}"
+        return None
+
+    def _give_back(self, facts: Facts, reason: str) -> Move:
+        """Somebody took over: release in this same step, and no mode command."""
+        had_sticks = self.phase is not Phase.PREPARING or self._arms
+        self.phase = Phase.RELEASING
+        self.reason = reason
+        self._release_until_ns = facts.now_ns + RELEASE_TIMEOUT_NS
+        # At least once, also where nothing seems to be held: a reboot may be but a wrong stamp.
+        return Move(hand=Hand.RELEASE) if had_sticks else self._release(facts)
+
+    def _depart(self, facts: Facts, ending: Ending) -> Move:
+        """Our own fault or end: neutral, a safe mode, then the release."""
+        if self.phase is Phase.PREPARING and not (self._arms and facts.armed):
+            return self._give_back(facts, ending.reason)  # we never had the sticks in the air
+        self.phase = Phase.LEAVING
+        self.reason = ending.reason
+        self._must_end = self._must_end and ending is not self._stop_reason
+        self._departure.begin(facts, ending)
+        return self._leave(facts, None)
+
+    def _leave(self, facts: Facts, act: Act | None) -> Move:
+        if self.phase is Phase.HOLDING and (act == "release" or self._must_end):
+            # What held after a fault now ends as a flight without a fault does.
+            return self._depart(facts, self._stop_reason or Ending(reason=OPERATOR))
+        if self.phase is Phase.LEAVING or facts.link_problem is None:
+            self._heard_ns = facts.now_ns
+        taken = self._takeover(facts)
+        if facts.now_ns - self._heard_ns >= LOST_NS:
+            taken = taken or f"the vehicle was lost for {LOST_NS // NS_PER_S} s"
+        if taken is not None:
+            return self._give_back(facts, f"{self.reason}; then {taken}")
+        if facts.mode == self._departure.mode:
+            self._own_mode = facts.mode
+        move = self._departure.step(facts)
+        if self._departure.is_done:
+            if self.phase is Phase.LEAVING and self._departure.mode not in (None, facts.mode):
+                self.refusal = f"the vehicle has not confirmed {self._departure.mode} in time"
+            if not self._departure.must_hold:
+                return self._give_back(facts, self.reason)
+            self.phase = Phase.HOLDING
+        return move
+
+    def _release(self, facts: Facts) -> Move:
+        if facts.is_released or facts.now_ns >= self._release_until_ns:
+            if not facts.is_released:
+                self.refusal = (
+                    "the vehicle still shows our last sticks, as it does without a receiver: "
+                    "whether it took the release is not known"
+                )
+            self.phase = Phase.RELEASED
+            self._own_mode = None
+            self._departure.forget()
+            return Move()
+        return Move(hand=Hand.RELEASE)
+
+    def _watch(self, facts: Facts) -> Move:
+        """Read-only: the policy runs whenever it could fly, and the link sends nothing."""
+        if self._stop_reason is not None or self._is_over(facts):
+            self.phase = Phase.ENDED
+            return Move()
+        objection = self._objection(facts)
+        if objection is not None:
+            self.phase, self.reason = Phase.WAITING, objection
+            return Move()
+        if self.phase is not Phase.FLYING:
+            return self._take_off(facts)
+        return Move(hand=Hand.POLICY)

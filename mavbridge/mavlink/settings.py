@@ -1,8 +1,9 @@
 """Settings of the link, without the command line that they come from."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from mavbridge.core.vehicle import Output
+from mavbridge.core.vehicle import Output, Risk
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,3 +23,19 @@ class LinkSettings:
     """Receive and set up streams; send no stick, mode or arm command."""
     state_hz: float = 100.0
     """Rate of attitude, velocity and acceleration to ask the vehicle for."""
+    min_battery_percent: float = 0.0
+    """Charge below which the battery is reported as low; 0 = only what the vehicle itself says."""
+    stick_hz: float = 100.0
+    """Rate at which sticks will be sent."""
+    set_params: tuple[tuple[str, float], ...] = ()
+    """Parameters to set for the flight, by name; needs a state folder."""
+    restore_params: bool = False
+    """Put back what an earlier flight that did not end in order has left set."""
+    accepted_risks: tuple[Risk, ...] = ()
+    state_folder: Path | None = None
+    """Where the old values of parameters are remembered; None: nowhere, and nothing is set."""
+
+    def __post_init__(self) -> None:
+        """Refuse to set what could not be remembered."""
+        if self.state_folder is None and (self.set_params or self.restore_params):
+            raise ValueError("parameters are set and put back only with a state_folder")

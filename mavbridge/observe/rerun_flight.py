@@ -52,8 +52,8 @@ class _Plot(NamedTuple):
 AGE = _Plot("age", (_Series("feature age", _BLUE), _Series("state age", _ORANGE)))
 ACTION_PERIOD = _Plot("period/action", (_Series("action", _BLUE),))
 VISION_PERIOD = _Plot("period/vision", (_Series("vision", _ORANGE),))
-ACTION_JITTER = _Plot("jitter/action", (_Series("action", _BLUE),))
-VISION_JITTER = _Plot("jitter/vision", (_Series("vision", _ORANGE),))
+LATENESS = _Plot("lateness/sticks", (_Series("sticks after their slot", _BLUE),))
+VISION_JITTER = _Plot("jitter/vision", (_Series("vision: |period - target|", _ORANGE),))
 PREDICT = _Plot("compute/action", (_Series("predict", _BLUE),))
 ENCODE = _Plot("compute/vision", (_Series("encode", _ORANGE),))
 MISSED = _Plot("missed/action", (_Series("missed slots", _BLUE),))
@@ -71,7 +71,7 @@ _RC_COLORS = enumerate((_BLUE, _ORANGE, _GREEN, _PINK), start=1)
 RC = _Plot("rc", tuple(_Series(f"channel {number}", color) for number, color in _RC_COLORS))
 """Channels 1 to 4 hold the sticks, unless RCMAP_* says otherwise; the stick plots are mapped."""
 PLOTS = (
-    *(AGE, ACTION_PERIOD, VISION_PERIOD, ACTION_JITTER, VISION_JITTER),
+    *(AGE, ACTION_PERIOD, VISION_PERIOD, LATENESS, VISION_JITTER),
     *(PREDICT, ENCODE, MISSED, DROPPED, *STICKS, RC),
 )
 _EVENT_COLUMNS = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
@@ -92,7 +92,7 @@ def flight_blueprint() -> rrb.Blueprint:
     )
     loops = rrb.Vertical(
         _time_series("Period of the loops [ms]", ACTION_PERIOD, VISION_PERIOD),
-        _time_series("Jitter: |period - target| [ms]", ACTION_JITTER, VISION_JITTER),
+        _time_series("Jitter [ms]", LATENESS, VISION_JITTER),
         _time_series("Missed slots, dropped frames [since the start]", MISSED, DROPPED),
     )
     sticks = rrb.Vertical(
@@ -134,15 +134,16 @@ class RerunView:
     is a gap in its line.
     """
 
-    def __init__(self, target: str, *, action_hz: float, vision_hz: float) -> None:
+    def __init__(self, target: str, *, vision_hz: float) -> None:
         """Check the target; calls that may block are left to ``consume`` and ``close``.
 
-        Jitter is measured against the target rates; ``target`` is that of ``prepare_target``.
+        Jitter of vision is measured against ``vision_hz``; ``target`` is that of
+        ``prepare_target``.
         """
         self._recording = RerunRecording("mavbridge", target)
         self._is_open = False
-        self._action_periods = _Periods(action_hz)
-        self._vision_periods = _Periods(vision_hz)
+        self._action_periods, self._vision_periods = _Periods(), _Periods()
+        self._vision_period_ms = 1e3 / vision_hz
         self._origin_ns: int | None = None
         self._last_tick: Tick | None = None
         self._missed_slots = 0
@@ -184,12 +185,11 @@ class RerunView:
     def _send_ticks(self, ticks: list[Tick]) -> None:
         woke_ns = [tick.woke_ns for tick in ticks]
         index = self._index(woke_ns, [tick.index for tick in ticks])
-        period_ms, jitter_ms = self._action_periods.extend(woke_ns)
         missed = self._missed_slots + np.cumsum([tick.missed_slots for tick in ticks])
         self._missed_slots = int(missed[-1])
         self._send(AGE, index, _ms([_ages_ns(tick) for tick in ticks]))
-        self._send(ACTION_PERIOD, index, period_ms)
-        self._send(ACTION_JITTER, index, jitter_ms)
+        self._send(ACTION_PERIOD, index, self._action_periods.extend(woke_ns))
+        self._send(LATENESS, index, _ms([_lateness_ns(tick) for tick in ticks]))
         self._send(PREDICT, index, _ms([tick.predict_ns for tick in ticks]))
         self._send(MISSED, index, missed)
         stages = np.array([_stick_stages(tick) for tick in ticks])
@@ -202,9 +202,9 @@ class RerunView:
     def _send_visions(self, visions: list[VisionTick], ticks: list[Tick]) -> None:
         ready_ns = [vision.ready_ns for vision in visions]
         index = self._index(ready_ns, self._tick_indexes_at(ready_ns, ticks))
-        period_ms, jitter_ms = self._vision_periods.extend([v.started_ns for v in visions])
+        period_ms = self._vision_periods.extend([v.started_ns for v in visions])
         self._send(VISION_PERIOD, index, period_ms)
-        self._send(VISION_JITTER, index, jitter_ms)
+        self._send(VISION_JITTER, index, np.abs(period_ms - self._vision_period_ms))
         self._send(ENCODE, index, _ms([vision.ready_ns - vision.started_ns for vision in visions]))
         dropped = np.array([vision.dropped_frames for vision in visions])
         if self._first_dropped is None:
@@ -255,16 +255,15 @@ class RerunView:
 class _Periods:
     """Differences of a series of stamps that comes in batches."""
 
-    def __init__(self, target_hz: float) -> None:
-        self._target_ms = 1e3 / target_hz
+    def __init__(self) -> None:
         self._last_ns: int | None = None
 
-    def extend(self, stamps_ns: list[int]) -> tuple[FloatColumn, FloatColumn]:
-        """Period and |period - target| in ms; a gap for the very first stamp."""
+    def extend(self, stamps_ns: list[int]) -> FloatColumn:
+        """Periods in ms; a gap for the very first stamp."""
         first_ns = math.nan if self._last_ns is None else stamps_ns[0] - self._last_ns
         period_ms = _ms([first_ns, *np.diff(stamps_ns)])
         self._last_ns = stamps_ns[-1]
-        return period_ms, np.abs(period_ms - self._target_ms)
+        return period_ms
 
 
 def _ms(values_ns: Sequence[float | None] | Sequence[tuple[float | None, ...]]) -> FloatColumn:
@@ -276,6 +275,11 @@ def _ages_ns(tick: Tick) -> tuple[int | None, int | None]:
     feature_ns, state = tick.feature_captured_ns, tick.state
     feature_age_ns = None if feature_ns is None else tick.sent_ns - feature_ns
     return feature_age_ns, None if state is None else tick.sent_ns - state.attitude_ns
+
+
+def _lateness_ns(tick: Tick) -> int | None:
+    """Time from the slot to its send; None for sticks sent between two slots, or not at all."""
+    return None if tick.trace is None or not tick.is_slot else max(0, tick.sent_ns - tick.due_ns)
 
 
 def _stick_stages(tick: Tick) -> tuple[Sticks, ...]:

@@ -1,31 +1,29 @@
 """The terminal during a flight: one status line while flying, a table afterwards."""
 
+import threading
 from collections import deque
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from typing import NamedTuple
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Event, Tick
-from mavbridge.core.vehicle import LinkStats
+from mavbridge.core.workers import HungError, Worker
+from mavbridge.observe.keyboard import ignore_job_control
+from mavbridge.observe.output import PatientOutput, stray_lines_shown
+from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
 from mavbridge.observe.timing import TimingReport
 
 RATE_WINDOW_S = 1.0
+ACTIVITY_SPACING_NS = NS_PER_S
 PLAIN_PERIOD_S = 5.0
 """Interval between lines if the output is not a terminal."""
-RELEASES_SHOWN = 3
 MAX_MESSAGES = 100
-"""Messages that may wait for the next refresh; the oldest are dropped first."""
-_NOT_MEASURED = "-"
-_STYLE_GOOD, _STYLE_POOR, _STYLE_BAD = "green", "yellow", "red"
-_LEGEND = (
-    "new attitude to wire: from the arrival of a new attitude until the first sticks based on it "
-    "are sent. A slot is one period of the action loop; it is missed when the loop is too late."
-)
+"""Messages that may wait for the reader; the oldest are dropped first, and counted."""
 
 
 class _RateMeter:
@@ -48,45 +46,129 @@ class _RateMeter:
         return (last - first) * NS_PER_S / (last_ns - first_ns) if last_ns > first_ns else None
 
 
+class _Message(NamedTuple):
+    what: RenderableType
+    soft_wrap: bool
+
+
 class FlightScreen:
     """Status line and final table on one console; a ``TickSink``.
 
-    ``emit`` is for the loops' threads, ``show_message`` for any thread, the rest for the main one.
+    Between ``start`` and ``close`` its own thread alone writes to the console. A reader that stalls
+    (Ctrl-S, a pipe that nobody empties) holds up that thread and nothing else: everything here
+    returns at once, but ``close``, which has a deadline. All of it is for any thread, except that
+    ticks, like vision ticks, come from one thread.
     """
 
     def __init__(
         self, console: Console, *, action_hz: float, vision_hz: float, readonly: bool
     ) -> None:
+        """Show a flight on ``console``, which comes from ``flight_console`` in a real one."""
         self._console = console
         self._target_hz = (action_hz, vision_hz)
         self._readonly = readonly
+        self._hint: str | None = None
+        self._final_status: str | None = None
         self._action, self._vision = _RateMeter(), _RateMeter()
         self._tick: Tick | None = None
         self._missed_slots = 0
-        self._messages: deque[str] = deque(maxlen=MAX_MESSAGES)
-        self._live = Live(console=console, auto_refresh=False, transient=True)
+        self._activity, self._activity_ns = "", 0
+        self._messages: deque[_Message] = deque(maxlen=MAX_MESSAGES)
+        self._dropped_messages = 0
         self._refreshes = 0
+        # Not Live's own redirection: whoever prints would wait for the console's lock.
+        self._live = Live(
+            console=console,
+            auto_refresh=False,
+            transient=True,
+            redirect_stdout=False,
+            redirect_stderr=False,
+        )
+        self._worker: Worker | None = None
+        self._redirection = ExitStack()
+
+    def start(self, *, hint: str | None = None) -> None:
+        """Start to show; ``hint`` says which keys do what, if any do."""
+        self._hint = hint
+        if hint is not None and not self._console.is_terminal:
+            self.show_message(hint)
+        if isinstance(self._console.file, PatientOutput):
+            self._redirection.enter_context(stray_lines_shown(self.show_message))
+        self._worker = Worker("mavbridge-terminal", self._run)
+        self._worker.start()
+
+    def close(self, timeout_s: float) -> bool:
+        """Print what is waiting, report included, and end; may be called twice, or never started.
+
+        Returns False if the reader did not take it within the timeout: the rest is dropped, and
+        standard error, which would not take more either, is best left alone (``end_process``).
+        """
+        worker, self._worker = self._worker, None
+        self._redirection.close()
+        if worker is None:
+            if not self._messages:
+                return True
+            worker = Worker("mavbridge-terminal", self._run)
+            worker.start()
+        try:
+            worker.join(timeout_s)
+        except HungError:
+            if isinstance(self._console.file, PatientOutput):
+                self._console.file.give_up()
+                worker.ends_within(timeout_s)
+            return False
+        return True
 
     def emit(self, event: Event) -> None:
         """Remember the event and the messages in it."""
         if not isinstance(event, Tick):
             self._vision.count(event.ready_ns)
             return
-        self._action.count(event.woke_ns)
+        if self._tick is None or event.chunk_serial != self._tick.chunk_serial:
+            self._action.count(event.woke_ns)
         self._missed_slots += event.missed_slots
-        self._messages.extend(event.texts)
-        if self._tick is None or event.activity != self._tick.activity:
-            self._messages.append(event.activity)
+        for text in event.texts:
+            self.show_message(text)
+        self._show_activity(event)
         self._tick = event
+
+    def _show_activity(self, tick: Tick) -> None:
+        """Show who has the sticks when that changes; a reason that keeps changing once a second."""
+        before = self._tick
+        if before is not None:
+            is_other = before.phase != tick.phase or before.holder != tick.holder
+            is_due = tick.woke_ns - self._activity_ns >= ACTIVITY_SPACING_NS
+            if tick.activity == self._activity or not (is_other or is_due):
+                return
+        self._activity, self._activity_ns = tick.activity, tick.woke_ns
+        self.show_message(tick.activity)
 
     def show_message(self, text: str) -> None:
         """Show a message with the next refresh."""
-        self._messages.append(text)
+        self._show(Text(text), soft_wrap=True)
+
+    def show_status(self, text: str) -> None:
+        """Show this as the status line from now on: the flight is over, and something goes on."""
+        self._final_status = text
+
+    def show_report(self, report: TimingReport) -> None:
+        """Show the table of what was measured, and the verdicts, with the next refresh."""
+        if (table := timing_table(report)) is not None:
+            self._show(table, soft_wrap=False)
+        for verdict in verdicts(report):
+            self._show(verdict, soft_wrap=not self._console.is_terminal)
+
+    def _show(self, what: RenderableType, *, soft_wrap: bool) -> None:
+        if len(self._messages) == MAX_MESSAGES:
+            self._dropped_messages += 1  # by two threads at once it may count one too few
+        self._messages.append(_Message(what, soft_wrap))
 
     def status_line(self) -> Text:
         """The status now; to be called at ``STATUS_HZ``, since rates are averages over calls."""
         rates_hz = (self._action.sample_hz(), self._vision.sample_hz())
         tick = self._tick
+        if self._final_status is not None:
+            return Text(self._final_status)
         if tick is None:
             return Text("waiting for the first tick", style="dim")
         line = Text(no_wrap=True, overflow="ellipsis")
@@ -95,8 +177,10 @@ class FlightScreen:
         for name, rate_hz, target_hz in zip(
             ("action", "vision"), rates_hz, self._target_hz, strict=True
         ):
+            if name == "action" and tick.chunk_serial is None:
+                continue  # the policy may well compute, but nobody flies by it
             line.append(f"  {name} ")
-            line.append(f"{_rate(rate_hz)} Hz", style=_rate_style(rate_hz, target_hz))
+            line.append(f"{shown_rate(rate_hz)} Hz", style=rate_style(rate_hz, target_hz))
         attitude_ns = None if tick.state is None else tick.state.attitude_ns
         line.append(f"  feature {_age(tick.sent_ns, tick.feature_captured_ns)}")
         line.append(f"  state {_age(tick.sent_ns, attitude_ns)}")
@@ -107,130 +191,48 @@ class FlightScreen:
 
     def _state(self, tick: Tick) -> tuple[str, str]:
         if tick.release_reason is not None:
-            return "RELEASED", "bold yellow"
+            return tick.holder, "bold yellow"
         if self._readonly:
             return "READ-ONLY", "bold cyan"
+        if tick.is_coasting:
+            return "COASTING", "bold yellow"
         return "FLYING" if tick.trace else "PREPARING", "bold green"
+
+    def _run(self, stop: threading.Event) -> None:
+        ignore_job_control()
+        with self.live():
+            while not stop.wait(1 / STATUS_HZ):
+                self.refresh()
+        self._print_messages()
 
     def live(self) -> AbstractContextManager[object]:
         """Show the status line, if there is a terminal, until the end of the block."""
         return self._live if self._console.is_terminal else nullcontext()
 
     def refresh(self) -> None:
-        """Print new messages and the line, at ``STATUS_HZ``; without a terminal, less often."""
+        """Print new messages and the line; without a terminal, the line less often.
+
+        The screen's own thread calls it at ``STATUS_HZ``; nobody else does during a flight.
+        """
         self._print_messages()
         line = self.status_line()
         self._refreshes += 1
         if self._console.is_terminal:
-            self._live.update(line, refresh=True)
+            shown = line if self._hint is None else Group(line, Text(self._hint, style="dim"))
+            self._live.update(shown, refresh=True)
         elif self._refreshes % round(PLAIN_PERIOD_S * STATUS_HZ) == 0:
             self._console.print(line, soft_wrap=True)
 
     def _print_messages(self) -> None:
+        dropped, self._dropped_messages = self._dropped_messages, 0
+        if dropped:
+            self._console.print(Text(f"({dropped} older messages were dropped)"), soft_wrap=True)
         while self._messages:
-            self._console.print(Text(self._messages.popleft()), soft_wrap=True)
-
-    def show_report(self, report: TimingReport) -> None:
-        """Print the last messages, the table of what was measured, and the verdicts."""
-        self._print_messages()
-        if (table := timing_table(report)) is not None:
-            self._console.print(table)
-        for verdict in verdicts(report):
-            self._console.print(verdict, soft_wrap=not self._console.is_terminal)
-
-
-def timing_table(report: TimingReport) -> Table | None:
-    """Percentiles in milliseconds of what was measured in a flight; None if nothing was."""
-    rows = {
-        "action period": report.action.period_ms,
-        "action jitter |period - target|": report.action.jitter_ms,
-        "predict": report.action.predict_ms,
-        "vision encode": report.vision.encode_ms,
-        "feature age at send": report.feature_age_ms,
-        "attitude age at send": report.state_age_ms,
-        "new attitude to wire": report.state_to_wire_ms,
-        "link round trip": report.link.rtt_ms if report.link else None,
-    }
-    if not any(rows.values()):
-        return None
-    table = Table(
-        title=f"{report.duration_s:.1f} s, {report.mode} rate: {report.policy} on {report.engine}, "
-        f"{report.autopilot or 'no vehicle'}",
-        title_justify="left",
-        title_style="bold",
-        caption=_LEGEND,
-        caption_justify="left",
-    )
-    table.add_column("ms")
-    for name in ("p50", "p99", "p99.9", "max"):
-        table.add_column(name, justify="right")
-    for label, measured in rows.items():
-        if measured is not None:
-            values = (measured.p50, measured.p99, measured.p999, measured.max)
-            table.add_row(label, *(f"{v:.2f}" if v < 1000 else f"{v:.0f}" for v in values))
-    return table
-
-
-def verdicts(report: TimingReport) -> list[Text]:
-    """One line for each part of a flight: its target and its result."""
-    action, vision = report.action, report.vision
-    missed = f"{_counted(action.missed_slots, 'missed slot')} in {_counted(action.ticks, 'tick')}"
-    dropped = f"{_counted(vision.dropped_frames, 'frame')} dropped by the camera"
-    lines = []
-    for name, loop, rest in (("action", action, missed), ("vision", vision, dropped)):
-        text = f"{_rate(loop.rate_hz)} Hz of {loop.target_hz:g} Hz, {rest}"
-        lines.append(_line(name, text, _rate_style(loop.rate_hz, loop.target_hz)))
-    if report.link is not None:
-        lines.append(_line("link", _link_verdict(report.link)))
-    lines.append(_line("sticks", _release_verdict(report)))
-    drops = {"rerun": report.observer_drops.rerun, "recorder": report.observer_drops.recorder}
-    lines += [
-        _line(name, f"missed {_counted(count, 'event')}", _STYLE_POOR)
-        for name, count in drops.items()
-        if count
-    ]
-    return lines
-
-
-def _link_verdict(link: LinkStats) -> str:
-    echo = {True: "echo confirmed", False: "NO ECHO from the vehicle", None: "echo not checked"}
-    lost = (
-        "loss not measured"
-        if link.lost_fraction is None
-        else f"{link.lost_fraction:.2%} of the vehicle's messages lost"
-    )
-    sent = f"{_counted(link.sent_overrides, 'stick message')} sent"
-    return f"{sent}, {echo[link.echo_confirmed]}, {lost}"
-
-
-def _release_verdict(report: TimingReport) -> str:
-    if not report.releases:
-        return "never released"
-    last = report.releases[-RELEASES_SHOWN:]
-    shown = "; ".join(f"{release.reason} ({release.t_s:.1f} s)" for release in last)
-    more = "last " if report.release_count > len(last) else ""
-    return f"released {_counted(report.release_count, 'time')}, {more}for: {shown}"
-
-
-def _line(name: str, text: str, style: str = "") -> Text:
-    return Text.assemble((f"{name:9}", "bold"), (text, style))
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def _rate(rate_hz: float | None) -> str:
-    return _NOT_MEASURED if rate_hz is None else f"{rate_hz:.1f}"
-
-
-def _rate_style(rate_hz: float | None, target_hz: float) -> str:
-    if rate_hz is None or rate_hz < 0.9 * target_hz:
-        return _STYLE_BAD
-    return _STYLE_GOOD if rate_hz >= 0.99 * target_hz else _STYLE_POOR
+            message = self._messages.popleft()
+            self._console.print(message.what, soft_wrap=message.soft_wrap)
 
 
 def _age(now_ns: int, stamp_ns: int | None) -> str:
     if stamp_ns is None:
-        return f"{_NOT_MEASURED} ms"
+        return f"{shown_rate(None)} ms"
     return f"{(now_ns - stamp_ns) / NS_PER_MS:.0f} ms"

@@ -11,27 +11,45 @@ from mavbridge.core.vehicle import LinkStats, Percentiles
 
 MAX_RELEASES = 1000
 """Releases listed in a report; the rest are only counted."""
+LATE_PERIODS = 1.5
+"""A chunk is late beyond this many periods of the policy."""
 
 Mode = Literal["dual", "single"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ActionReport:
-    """The action loop while the policy flew; None = not measured.
+class SticksReport:
+    """Sends of sticks while the policy flew; None = not measured.
 
-    A slot is one period of the loop's fixed time grid. The loop runs once in each slot; a slot that
-    it was too late for is missed.
+    A slot is one period of a fixed time grid; it is missed when nothing was sent within one period.
     """
 
     target_hz: float
     rate_hz: float | None
+    """All sends, those between two slots as well."""
     flying_s: float
     """Duration of this part; the rest of the flight is waiting, preparing and releases."""
-    ticks: int
+    sends: int
+    coasting_sends: int
+    """Sends of a chunk that was too old, within the grace."""
+    slots: int
+    """Slots with a send of their own, and missed ones."""
     missed_slots: int
+    lateness_ms: Percentiles | None
+    """Time from a slot to its send."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionReport:
+    """Chunks of actions that were flown; None = not measured."""
+
+    target_hz: float
+    rate_hz: float | None
+    chunks: int
+    late_chunks: int
+    """Chunks that were finished more than ``LATE_PERIODS`` after the one before them."""
     period_ms: Percentiles | None
-    jitter_ms: Percentiles | None
-    """|period - target period|; a stall of n slots shows as one jitter of n periods."""
+    """Time between the ends of two computations."""
     predict_ms: Percentiles | None
 
 
@@ -72,6 +90,7 @@ class TimingReport:
     engine: str
     policy: str
     autopilot: str | None
+    sticks: SticksReport
     action: ActionReport
     vision: VisionReport
     feature_age_ms: Percentiles | None
@@ -95,16 +114,14 @@ class FlightTiming:
     and they share nothing.
     """
 
-    def __init__(self, *, action_hz: float, vision_hz: float) -> None:
-        self._action_hz, self._vision_hz = action_hz, vision_hz
+    def __init__(self, *, stick_hz: float, action_hz: float, vision_hz: float) -> None:
+        self._vision_hz = vision_hz
         self._ticks, self._frames = _Span(), _Span()
-        self._flown_ticks = self._missed_slots = self._flying_ns = 0
-        self._last_flown_ns: int | None = None
+        self._sticks, self._chunks = _Sticks(stick_hz), _Chunks(action_hz)
         self._last_attitude_ns: int | None = None
         self._last_reason: str | None = None
         self._releases: list[ReleaseEvent] = []
         self._release_count = 0
-        self._period, self._jitter, self._predict = Histogram(), Histogram(), Histogram()
         self._feature_age, self._state_age = Histogram(), Histogram()
         self._state_to_wire, self._encode = Histogram(), Histogram()
         self._first_dropped: int | None = None
@@ -123,33 +140,19 @@ class FlightTiming:
 
     def _add_tick(self, tick: Tick) -> None:
         self._ticks.add(tick.woke_ns)
-        if tick.predict_ns is not None:
-            self._predict.add(tick.predict_ns)
-        if tick.trace is None:
-            self._last_flown_ns = None
-        else:
-            self._add_period(tick)
+        self._sticks.add(tick)
+        self._chunks.add(tick)
+        if tick.trace is not None:
             self._add_ages(tick)
-        if tick.release_reason != self._last_reason:
-            self._last_reason = tick.release_reason
-            if tick.release_reason is None:
+        reason = None if tick.phase == "waiting" else tick.release_reason
+        if reason != self._last_reason:
+            self._last_reason = reason
+            if reason is None:
                 return
             self._release_count += 1
             if len(self._releases) < MAX_RELEASES:
                 t_s = round((tick.woke_ns - self._ticks.first_ns) / NS_PER_S, 3)
-                self._releases.append(ReleaseEvent(t_s=t_s, reason=tick.release_reason))
-
-    def _add_period(self, tick: Tick) -> None:
-        """Only between two ticks of flight: a released loop has nothing to compute."""
-        self._flown_ticks += 1
-        last_ns, self._last_flown_ns = self._last_flown_ns, tick.woke_ns
-        if last_ns is None:
-            return
-        period_ns = tick.woke_ns - last_ns
-        self._period.add(period_ns)
-        self._jitter.add(abs(period_ns - round(NS_PER_S / self._action_hz)))
-        self._missed_slots += tick.missed_slots
-        self._flying_ns += period_ns
+                self._releases.append(ReleaseEvent(t_s=t_s, reason=reason))
 
     def _add_ages(self, tick: Tick) -> None:
         if tick.feature_captured_ns is not None:
@@ -173,23 +176,14 @@ class FlightTiming:
         observer_drops: ObserverDrops,
     ) -> TimingReport:
         """The figures so far; exact once the loops have stopped."""
-        intervals = self._period.count
         return TimingReport(
             duration_s=round(self._ticks.duration_s, 3),
             mode=mode,
             engine=engine,
             policy=policy,
             autopilot=autopilot,
-            action=ActionReport(
-                target_hz=self._action_hz,
-                rate_hz=round(intervals * NS_PER_S / self._flying_ns, 3) if intervals else None,
-                flying_s=round(self._flying_ns / NS_PER_S, 3),
-                ticks=self._flown_ticks,
-                missed_slots=self._missed_slots,
-                period_ms=self._period.percentiles_ms(),
-                jitter_ms=self._jitter.percentiles_ms(),
-                predict_ms=self._predict.percentiles_ms(),
-            ),
+            sticks=self._sticks.report(),
+            action=self._chunks.report(),
             vision=VisionReport(
                 target_hz=self._vision_hz,
                 rate_hz=self._frames.rate_hz,
@@ -205,6 +199,90 @@ class FlightTiming:
             release_count=self._release_count,
             observer_drops=observer_drops,
         )
+
+
+class _Sticks:
+    """Sends between two ticks of flight: a released loop has nothing to send."""
+
+    def __init__(self, target_hz: float) -> None:
+        self._target_hz = target_hz
+        self._last_ns: int | None = None
+        self._sends = self._coasting = self._slots = self._missed = 0
+        self._intervals = self._flying_ns = 0
+        self._lateness = Histogram()
+
+    def add(self, tick: Tick) -> None:
+        if tick.trace is None:
+            self._last_ns = None
+            return
+        self._sends += 1
+        self._coasting += tick.is_coasting
+        if tick.is_slot:
+            self._slots += 1
+            self._lateness.add(max(0, tick.sent_ns - tick.due_ns))
+        if self._last_ns is not None:
+            self._missed += tick.missed_slots
+            self._intervals += 1
+            self._flying_ns += tick.woke_ns - self._last_ns
+        self._last_ns = tick.woke_ns
+
+    def report(self) -> SticksReport:
+        intervals = self._intervals
+        return SticksReport(
+            target_hz=self._target_hz,
+            rate_hz=_rate_hz(intervals, self._flying_ns),
+            flying_s=round(self._flying_ns / NS_PER_S, 3),
+            sends=self._sends,
+            coasting_sends=self._coasting,
+            slots=self._slots + self._missed,
+            missed_slots=self._missed,
+            lateness_ms=self._lateness.percentiles_ms(),
+        )
+
+
+class _Chunks:
+    """Chunks by the tick that flew them first; the time between two is of one stretch of flight."""
+
+    def __init__(self, target_hz: float) -> None:
+        self._target_hz = target_hz
+        self._late_ns = round(LATE_PERIODS * NS_PER_S / target_hz)
+        self._last: tuple[int, int] | None = None
+        self._chunks = self._late = self._intervals = self._span_ns = 0
+        self._period, self._predict = Histogram(), Histogram()
+
+    def add(self, tick: Tick) -> None:
+        if tick.trace is None or tick.chunk_serial is None or tick.chunk_computed_ns is None:
+            self._last = None
+            return
+        newest, last = (tick.chunk_serial, tick.chunk_computed_ns), self._last
+        if last is not None and last[0] == newest[0]:
+            return
+        self._last = newest
+        self._chunks += 1
+        if tick.predict_ns is not None:
+            self._predict.add(tick.predict_ns)
+        if last is None or newest[0] < last[0]:
+            return
+        # A chunk that a newer one overtook before any send was computed in time all the same.
+        count, span_ns = newest[0] - last[0], newest[1] - last[1]
+        self._intervals += count
+        self._span_ns += span_ns
+        self._period.add(span_ns // count)
+        self._late += span_ns // count > self._late_ns
+
+    def report(self) -> ActionReport:
+        return ActionReport(
+            target_hz=self._target_hz,
+            rate_hz=_rate_hz(self._intervals, self._span_ns),
+            chunks=self._chunks,
+            late_chunks=self._late,
+            period_ms=self._period.percentiles_ms(),
+            predict_ms=self._predict.percentiles_ms(),
+        )
+
+
+def _rate_hz(count: int, span_ns: int) -> float | None:
+    return round(count * NS_PER_S / span_ns, 3) if span_ns > 0 else None
 
 
 class _Span:

@@ -1,10 +1,11 @@
 """A flight on disk: docs/flight_folder.md is the format.
 
-    vision loop, action loop --emit--> Recorder (its own thread) --> FlightWriter --> ticks, tlog
+    vision loop, action loop --emit--> Recorder (its own thread) --> FlightWriter --> ticks
                                                                          |
                                       VideoWriter: frames through shared memory, rows by pipe
                                                                          v
                                    writer process: FrameFiles --> camera.mp4, frames
+    process of the link --open_tlog_pipe--> writer process: TlogThread --> link.tlog
 
 ``FlightWriter`` alone, in the offline mode, records what need not fly in real time
 (demonstrations); ``VideoWriter`` alone makes one video of frames from anywhere (rollouts).

@@ -48,7 +48,7 @@ def open_flight(folder: Path) -> RecordedFlight:
         MavbridgeError: it is no recorded flight, or a damaged one; the message says what to do.
     """
     meta = read_meta(folder)
-    ticks = read_table(folder / TICKS, rows.TICKS)
+    ticks = read_table(folder / TICKS, rows.TICKS, later=rows.LATER)
     return RecordedFlight(folder=folder, meta=meta, ticks=ticks, frames=_frames(folder, meta))
 
 

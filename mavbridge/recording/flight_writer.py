@@ -1,51 +1,20 @@
-"""One flight into its folder, by one thread: ticks, frames, packets, and meta around them."""
+"""One flight into its folder, by one thread: ticks, frames, and meta around them."""
 
-import struct
-from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from mavbridge.core.records import Tick, VisionTick
-from mavbridge.core.vehicle import Packet
 from mavbridge.recording import rows
 from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
 from mavbridge.recording.meta import FlightMeta, write_meta
 from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow, ticks_batch
 from mavbridge.recording.tables import TableWriter
+from mavbridge.recording.tlog import TlogJob, TlogPipe
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError
 
 FLUSH_NS = 500_000_000
 """Longest span of events that a crash may take with it."""
 FLUSH_ROWS = 256
-
-
-_TLOG_STAMP = struct.Struct(">Q")
-_TLOG_LINK_MASK = 0b11
-
-
-class TlogWriter:
-    """A telemetry log as MAVProxy and the ground stations read it; methods may raise OSError.
-
-    Eight bytes precede every packet: Unix time in microseconds, big-endian. Its lowest two bits are
-    the number of the link (pymavlink's mavlogfile reads them so), here always 0.
-    """
-
-    def __init__(self, path: Path, *, wall_offset_ns: int) -> None:
-        """Create the file, which must not exist; the offset leads from stamps to wall time."""
-        self._file = path.open("xb")
-        self._offset_ns = wall_offset_ns
-
-    def append(self, packets: Iterable[Packet]) -> None:
-        """Hand packets to the kernel."""
-        for packet in sorted(packets, key=lambda packet: packet.stamp_ns):
-            stamp_us = (packet.stamp_ns + self._offset_ns) // 1000 & ~_TLOG_LINK_MASK
-            self._file.write(_TLOG_STAMP.pack(stamp_us) + packet.data)
-        self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
 
 class FlightWriter:
@@ -62,7 +31,7 @@ class FlightWriter:
         *,
         pressure: Pressure,
         with_labels: bool = False,
-        wall_offset_ns: int | None = None,
+        tlog_pipe: TlogPipe | None = None,
     ) -> None:
         """Create the files in a folder from ``prepare_folder``, and start the writer process.
 
@@ -71,7 +40,7 @@ class FlightWriter:
             meta: the facts known at the start.
             pressure: "offline" drops nothing, and waits; see ``VideoWriter``.
             with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
-            wall_offset_ns: wall time minus the clock of the stamps, for a tlog; None = no tlog.
+            tlog_pipe: its reader becomes ``link.tlog``, and is closed here; None = no such file.
         """
         self._folder = folder
         self.meta = meta
@@ -83,21 +52,19 @@ class FlightWriter:
         self._tick_serial = self._frame_serial = -1
         self._ticks_dropped = 0
         self._source_size: tuple[int, int] | None = None
-        self._tlog: TlogWriter | None = None
         self._video = VideoWriter(
             folder / VIDEO,
             pressure=pressure,
             hz=meta.visual_hz,
             rows=folder / FRAMES,
             with_truth=with_labels,
+            tlog=None if tlog_pipe is None else TlogJob(folder / TLOG, tlog_pipe.reader),
         )
         try:
             write_meta(folder, meta)
             self._table = TableWriter(folder / TICKS, self._schema)
             # The first conversion imports modules: now, and not in flight.
             self._table.append(ticks_batch([], self._schema))
-            if wall_offset_ns is not None:
-                self._tlog = TlogWriter(folder / TLOG, wall_offset_ns=wall_offset_ns)
         except OSError:
             self._video.close()
             raise
@@ -136,11 +103,6 @@ class FlightWriter:
         except WriterDiedError as error:
             self.video_failure = error
 
-    def packets(self, packets: Iterable[Packet]) -> None:
-        """Append to the tlog, if there is one."""
-        if self._tlog is not None:
-            self._tlog.append(packets)
-
     def _flush_if_due(self, now_ns: int) -> None:
         if now_ns - self._flushed_ns >= FLUSH_NS:
             self._flushed_ns = now_ns
@@ -178,8 +140,6 @@ class FlightWriter:
         except BaseException:
             self.close()
             raise
-        if self._tlog is not None:
-            self._tlog.close()
         is_whole = self.video_failure is None
         height, width = self._video.size or (None, None)
         source_height, source_width = self._source_size or (None, None)
@@ -201,6 +161,3 @@ class FlightWriter:
         """Leave everything as it is, after an error; may be called twice."""
         self._video.close()
         self._table.abandon()
-        if self._tlog is not None:
-            with suppress(OSError):  # the error that led here, again
-                self._tlog.close()

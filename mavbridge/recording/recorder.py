@@ -1,18 +1,18 @@
 """Records a flight while it flies: a ``TickSink`` that does its work on a thread of its own.
 
-Cannot hurt the flight: events and packets wait in bounded queues, are dropped and counted when
-these are full, and an error ends the recording alone, with one warning.
+Cannot hurt the flight: events wait in bounded queues, are dropped and counted when these are full,
+and an error ends the recording alone, with one warning.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mavbridge.core.observers import BoundedQueue, ObserverThread
+from mavbridge.core.observers import ObserverThread
 from mavbridge.core.records import Event, Tick, VisionTick
-from mavbridge.core.vehicle import Packet
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.tlog import TlogPipe
 
 CAPACITY = 6000
 """Ticks that may wait: a minute at 100 Hz."""
@@ -27,8 +27,8 @@ class Recorder:
         folder: Path,
         meta: FlightMeta,
         *,
-        packets: BoundedQueue[Packet],
-        wall_offset_ns: int,
+        tlog_pipe: TlogPipe,
+        packets_dropped: Callable[[], int],
         autopilot: Callable[[], str],
         report: Callable[[str], None],
     ) -> None:
@@ -37,8 +37,8 @@ class Recorder:
         Args:
             folder: from ``prepare_folder``.
             meta: the facts known at the start.
-            packets: sent and received by the link; drained by the recorder's thread.
-            wall_offset_ns: wall time minus the clock of the stamps.
+            tlog_pipe: fed by the process of the link; its reader is closed here.
+            packets_dropped: returns how many packets that process has dropped; exact at the end.
             autopilot: returns the autopilot's name at the end.
             report: shows a line to the user; called from the recorder's thread.
 
@@ -46,9 +46,9 @@ class Recorder:
             OSError, WriterError: the folder cannot be written, the writer process does not start.
         """
         self._folder = folder
-        writer = FlightWriter(folder, meta, pressure="online", wall_offset_ns=wall_offset_ns)
-        self._consumer = _FlightConsumer(writer, packets, autopilot, report)
-        self._packets = packets
+        writer = FlightWriter(folder, meta, pressure="online", tlog_pipe=tlog_pipe)
+        self._consumer = _FlightConsumer(writer, packets_dropped, autopilot, report)
+        self._packets_dropped = packets_dropped
         self._observer = ObserverThread(
             "mavbridge-recorder", self._consumer, capacity=CAPACITY, image_capacity=IMAGE_CAPACITY
         )
@@ -58,13 +58,16 @@ class Recorder:
         self._observer.emit(event)
 
     def close(self, timeout_s: float) -> None:
-        """Finish the recording within ``timeout_s``; call it once the link is closed."""
+        """Finish the recording within ``timeout_s``; call it once the link is closed.
+
+        If the process of the link still runs then, the writer process keeps its log to the end.
+        """
         self._observer.close(timeout_s)
 
     @property
     def dropped(self) -> int:
         """Ticks, frames and packets that are not in the recording; exact after ``close``."""
-        return self._observer.dropped + self._consumer.frames_lost + self._packets.dropped
+        return self._observer.dropped + self._consumer.frames_lost + self._packets_dropped()
 
     def summary(self) -> str:
         """One line for a person: the folder, what it holds and what it lacks."""
@@ -82,7 +85,7 @@ class _FlightConsumer:
     """Runs on the recorder's thread; may raise OSError and WriterError."""
 
     writer: FlightWriter
-    packets: BoundedQueue[Packet]
+    packets_dropped: Callable[[], int]
     autopilot: Callable[[], str]
     report: Callable[[str], None]
     _seen_frames: int = 0
@@ -94,10 +97,9 @@ class _FlightConsumer:
         return max(0, self._seen_frames - self.writer.frames_written)
 
     def consume(self, batch: Sequence[Event]) -> None:
-        """Write one batch, and the packets that came meanwhile."""
+        """Write one batch."""
         seen_frames = self._seen_frames
         try:
-            self.writer.packets(self.packets.take())
             for event in batch:
                 if isinstance(event, Tick):
                     self.writer.tick(event)
@@ -121,6 +123,5 @@ class _FlightConsumer:
         if self._has_failed:
             self.writer.close()
             return
-        self.writer.packets(self.packets.take())
-        meta, dropped = self.writer.meta, self.packets.dropped
+        meta, dropped = self.writer.meta, self.packets_dropped()
         self.writer.finish(replace(meta, autopilot=self.autopilot(), packets_dropped=dropped))

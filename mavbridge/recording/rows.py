@@ -88,8 +88,13 @@ TICKS = pa.schema(
         pa.field("armed", pa.bool_(), nullable=False),
         pa.field("texts", pa.list_(pa.string()), nullable=False),
         pa.field("dropped_before", pa.int32(), nullable=False),
+        *_fields(pa.bool_(), "is_slot", "is_coasting"),
+        *_fields(pa.int64(), "chunk_serial", "chunk_computed_ns"),
+        pa.field("phase", pa.string()),
     ]
 )
+LATER = frozenset({"is_slot", "is_coasting", "chunk_serial", "chunk_computed_ns", "phase"})
+"""Columns of ticks that the first flights lack: there, every tick was a slot with a new chunk."""
 DEMONSTRATION_TICKS = TICKS.append(pa.field("expert", _STICKS))
 
 _FRAME_STAMPS = _fields(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False)
@@ -168,7 +173,8 @@ def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _tick(row: dict[str, Any], serial: int) -> Tick:
-    values = {name: row[name] for name in _TICK}
+    values = {name: row[name] for name in _TICK if name not in LATER}
+    values |= {name: row[name] for name in LATER if row[name] is not None}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
     values |= {name: _sticks(row[name]) for name in ("sent", "rc_sticks")}
     state, trace = None, None

@@ -1,6 +1,6 @@
 """Tables that survive a crash: an Arrow IPC stream while they grow, Parquet once they are whole."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -82,8 +82,10 @@ def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa
         yield pa.Table.from_batches(group, schema).combine_chunks()
 
 
-def read_table(stem: Path, schema: pa.Schema) -> pa.Table:
+def read_table(stem: Path, schema: pa.Schema, *, later: Collection[str] = ()) -> pa.Table:
     """The table under this stem, whichever form it has; of a cut-off stream the whole batches.
+
+    Columns named in ``later`` may be missing, since the first files lack them: they are null then.
 
     Raises:
         TableError: there is none, it is damaged, or it lacks a column of ``schema``.
@@ -105,6 +107,9 @@ def read_table(stem: Path, schema: pa.Schema) -> pa.Table:
         ) from error
     except READ_ERRORS as error:
         raise TableError(f"{path} is damaged: {error}") from error
+    for field in schema:
+        if field.name in later and field.name not in table.column_names:
+            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
     missing = [
         field.name
         for field in schema

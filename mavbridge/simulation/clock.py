@@ -13,13 +13,13 @@ START_NS = 1_000 * NS_PER_S
 class SteppedClock:
     """A ``Clock`` with a queue of events, for one thread.
 
-    Only the action loop waits. Everything else in the simulated world is an event: it runs at its
-    time, takes no time itself, and events of equal time run in the order of scheduling.
+    Whoever flies waits; all of the simulated world is events: each runs at its time, takes no time
+    itself, and events of equal time run in the order of scheduling.
     """
 
     def __init__(self, start_ns: int = START_NS) -> None:
         self._now_ns = start_ns
-        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._events: list[tuple[int, int, Callable[[], object]]] = []
         self._order = count()
         self._is_in_event = False
 
@@ -32,7 +32,7 @@ class SteppedClock:
         """When the next event is due; None = no event is scheduled."""
         return self._events[0][0] if self._events else None
 
-    def schedule(self, at_ns: int, event: Callable[[], None]) -> None:
+    def schedule(self, at_ns: int, event: Callable[[], object]) -> None:
         """Run ``event`` at ``at_ns``, or as soon as time passes if that is already over."""
         heapq.heappush(self._events, (at_ns, next(self._order), event))
 
@@ -40,8 +40,10 @@ class SteppedClock:
         """Let time pass to ``deadline_ns``, and run the events due by then.
 
         Raises:
-            RuntimeError: called from within an event.
+            RuntimeError: called from within an event, with a deadline that has not passed.
         """
+        if self._is_in_event and deadline_ns <= self._now_ns:
+            return
         if self._is_in_event:
             raise RuntimeError("an event must not wait: later events would run before its end")
         self._is_in_event = True

@@ -8,16 +8,18 @@ import numpy as np
 
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, Rates
-from mavbridge.core.clock import period_ns
+from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.ports import TickSink
 from mavbridge.core.records import ImageArray
-from mavbridge.flight.action_loop import ActionLoop
 from mavbridge.flight.bridge import build_bridge
-from mavbridge.flight.link_settings import link_settings
+from mavbridge.flight.settings import flight_settings, link_settings
+from mavbridge.gate.departure import Ending
+from mavbridge.gate.loop import GateLoop
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.delays import Delays
+from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper, sender
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.referee import EpisodeResult, Referee
 from mavbridge.simulation.world import (
@@ -39,6 +41,8 @@ from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 MAX_TIME_S = 60.0
 """Default limit: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
 MODE = "ALT_HOLD"
+END_NS = 3 * NS_PER_S
+"""Longest that the gate may take to give the sticks back."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +99,7 @@ class SimulatedFlight:
         uplink = DelayedChannel(self.clock, delays.uplink.samples_ns(self._random(0)))
         downlink = DelayedChannel(self.clock, delays.downlink.samples_ns(self._random(1)))
         self._transport = MemoryTransport(self.clock, to_vehicle=uplink, from_vehicle=downlink)
+        self._downlink = downlink
         self._stepper = VehicleStepper(
             self.clock, self.vehicle, boot_ns, to_vehicle=uplink, from_vehicle=downlink
         )
@@ -138,10 +143,18 @@ class SimulatedFlight:
         cv2.setNumThreads(1)  # the same images on any machine, and no pool to wake for them
         referee = Referee(self.clock, self.vehicle, max_time_s=max_time_s, should_stop=should_stop)
         self.watch_steps(referee.watch)
-        self._compose(executable, (referee, *sinks)).run(referee.stop)
+        gate = self._compose(executable, (referee, *sinks))
+        while not referee.stop.is_set():
+            self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
+        gate.stop(Ending(reason="the flight is over"))
+        end_ns = self.clock.now_ns() + END_NS
+        while not gate.is_done and self.clock.now_ns() < end_ns:
+            self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
         return referee.result(course_seed=self._course_seed, seed=self._seed)
 
-    def _compose(self, executable: Executable, sinks: tuple[TickSink, ...]) -> ActionLoop:
+    def _compose(self, executable: Executable, sinks: tuple[TickSink, ...]) -> GateLoop:
+        """Build the bridge on the stepped clock; its parts run as events from now on."""
+        world, hop = self.clock, self._settings.delays.hop
         config = FlyConfig(
             link=LinkConfig(connect="lockstep"),
             rates=self._settings.rates,
@@ -150,25 +163,44 @@ class SimulatedFlight:
             arm=True,
         )
         loops = config.rates.loops(is_dual=executable.dual_rate)
-        vision_clock = AheadClock(self.clock)
+        to_gate = DelayedChannel(world, hop.samples_ns(self._random(7)))
+        to_flight = DelayedChannel(world, hop.samples_ns(self._random(8)))
+        flight_port = MemoryPort(outgoing=to_gate, incoming=to_flight)
+        link = MavlinkLink(
+            self._transport,
+            world,
+            link_settings(
+                config.link,
+                state_hz=loops.state_hz,
+                stick_hz=config.rates.stick_rate,
+                min_battery_percent=0.0,
+            ),
+            forward=lambda packet: gate.forward(packet),
+        )
+        gate = GateLoop(world, link, MemoryPort(outgoing=to_flight, incoming=to_gate))
+        policy_clock, vision_clock = AheadClock(world), AheadClock(world)
         camera = self._make_camera(executable, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
+        send = sender(world, policy_clock, flight_port)
+        send(flight_settings(config, executable))
         bridge = build_bridge(
             config,
-            self._take_time(executable, vision_clock),
-            clock=self.clock,
-            link=MavlinkLink(
-                self._transport,
-                self.clock,
-                link_settings(config.link, state_hz=loops.state_hz),
-            ),
+            self._take_time(executable, vision_clock, policy_clock),
+            clock=world,
+            send=send,
             camera=camera,
             sinks=sinks,
-            cache=DelayedFeatureCache(self.clock),
+            watches_images=self._settings.draw_images,
+            cache=DelayedFeatureCache(world),
+            policy_clock=policy_clock,
             vision_clock=vision_clock,
-            delay_vision=lambda sink: DelayedSink(self.clock, sink),
+            delay_vision=lambda sink: DelayedSink(world, sink),
         )
-        VisionStepper(self.clock, vision_clock, camera, bridge.vision)
-        return bridge.action
+        VisionStepper(world, vision_clock, camera, bridge.vision)
+        policy = PolicyStepper(world, policy_clock, flight_port, bridge.policy, bridge.view)
+        gate_stepper = GateStepper(world, gate)
+        to_flight.on_arrival = policy.receive
+        to_gate.on_arrival = self._downlink.on_arrival = gate_stepper.step
+        return gate
 
     def _make_camera(self, executable: Executable, *, camera_hz: float) -> SimulatedCamera:
         camera_period_ns = period_ns(camera_hz)
@@ -188,7 +220,9 @@ class SimulatedFlight:
         camera.exposure_watchers += self._exposure_watchers
         return camera
 
-    def _take_time(self, executable: Executable, vision_clock: AheadClock) -> Executable:
+    def _take_time(
+        self, executable: Executable, vision_clock: AheadClock, policy_clock: AheadClock
+    ) -> Executable:
         """The same executable, whose calls take simulated time.
 
         Without a fast path the whole network runs for every action, which then takes both times.
@@ -204,9 +238,7 @@ class SimulatedFlight:
         def act(
             encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
         ) -> FloatArray:
-            chunk = executable.act(encoded, state, history, elapsed_s)
-            took_ns = next(action_ns) + (0 if is_dual else next(vision_ns))
-            self.clock.sleep_until_ns(self.clock.now_ns() + took_ns)
-            return chunk
+            policy_clock.ahead_ns += next(action_ns) + (0 if is_dual else next(vision_ns))
+            return executable.act(encoded, state, history, elapsed_s)
 
         return replace(executable, encode=encode, act=act)

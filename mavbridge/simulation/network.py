@@ -1,28 +1,32 @@
 """A network in memory between two ends: datagrams arrive whole and in order, after their delay."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
-from mavbridge.mavlink.transport.sockets import Address, Chunk
+from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.clock import SteppedClock
 
 VEHICLE: Address = ("sitl", 1)
 
 
 class DelayedChannel:
-    """One direction of the network."""
+    """One direction of the network, or of the channel between two processes."""
 
     def __init__(self, clock: SteppedClock, delays_ns: Iterator[int]) -> None:
         self._clock = clock
         self._delays_ns = delays_ns
         self._in_flight: deque[tuple[int, bytes]] = deque()
         self._last_arrival_ns = 0
+        self.on_arrival: Callable[[], None] | None = None
+        """Called at each arrival."""
 
     def send(self, data: bytes) -> None:
         """Send a datagram; it arrives after its delay, and never before an earlier one."""
         arrival_ns = self._clock.now_ns() + next(self._delays_ns)
         self._last_arrival_ns = max(self._last_arrival_ns, arrival_ns)
         self._in_flight.append((self._last_arrival_ns, data))
+        if self.on_arrival is not None:
+            self._clock.schedule(self._last_arrival_ns, self.on_arrival)
 
     def receive(self) -> Iterator[tuple[int, bytes]]:
         """Arrival stamp in ns and bytes of every datagram that has arrived."""
@@ -49,10 +53,14 @@ class MemoryTransport:
     def open(self) -> None:
         """Nothing to acquire."""
 
-    def drain(self) -> Iterator[Chunk]:
+    def drain(self) -> Iterator[Received]:
         """Every datagram that has arrived."""
         for arrived_ns, data in self._from_vehicle.receive():
-            yield Chunk(data, arrived_ns, VEHICLE)
+            yield Received(data, arrived_ns, VEHICLE)
+
+    def fileno(self) -> int | None:
+        """Nothing that ``select`` could wait for."""
+        return None
 
     def wait(self, until_ns: int) -> None:
         """Let time pass until a datagram has arrived, or until ``until_ns``.

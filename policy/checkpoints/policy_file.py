@@ -51,7 +51,7 @@ VECTOR_PREFIX = "test_vector."
 BACKBONE_PREFIX = "backbone."
 VECTOR_NAMES = ("rgb", "state", "history", "chunks")
 VECTOR_STEPS = 10
-"""Denoising steps of a test vector, or all if the schedule has fewer; its noise is reset(0)'s."""
+"""Denoising steps of a test vector, or all if the schedule has fewer; its noise has seed 0."""
 
 _DAMAGED = (
     *(OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError),
@@ -141,7 +141,7 @@ def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
 
 @torch.inference_mode()
 def _chunks(policy: BuiltinPolicy, samples: ParitySamples) -> FloatArray:
-    policy.reset(0)
+    policy.seed_noise(0)
     images = np.concatenate([image_to_input(rgb, policy.contract) for rgb in samples.rgb])
     steps = min(VECTOR_STEPS, policy.config.schedule.num_train_timesteps)
     image, state, history = map(torch.from_numpy, (images, samples.state, samples.history))

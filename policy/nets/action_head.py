@@ -70,9 +70,9 @@ class DiffusionHead(nn.Module):
         self.initial_noise: Tensor
         noise = torch.empty(1, contract.horizon, ACTION_DIM)
         self.register_buffer("initial_noise", noise, persistent=False)
-        self.reset(0)
+        self.seed_noise(0)
 
-    def reset(self, seed: int) -> None:
+    def seed_noise(self, seed: int) -> None:
         """Draw the initial noise of a flight, the same for the same seed on every device."""
         generator = torch.Generator().manual_seed(seed)
         self.initial_noise.copy_(torch.randn(self.initial_noise.shape, generator=generator))

@@ -56,9 +56,9 @@ class ResnetUnet(nn.Module):
         )
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
-    def reset(self, seed: int) -> None:
+    def seed_noise(self, seed: int) -> None:
         """Start a flight: fixes the initial noise of all samples to come."""
-        self.head.reset(seed)
+        self.head.seed_noise(seed)
 
     def condition(self, visual: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
         """Projected image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C]."""

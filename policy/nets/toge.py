@@ -74,9 +74,9 @@ class Toge(nn.Module):
         self.fusion = Fusion(dim, self.history_encoder.out_dim)
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
-    def reset(self, seed: int) -> None:
+    def seed_noise(self, seed: int) -> None:
         """Start a flight: fixes the initial noise of all samples to come."""
-        self.head.reset(seed)
+        self.head.seed_noise(seed)
 
     def encode_visual(self, image: Tensor) -> Tensor:
         """Image [B, 3, H, W] -> feature [B, F]: the slow path."""

@@ -17,7 +17,7 @@ from policy.checkpoints.policy_file import (
     load_checkpoint,
     save_checkpoint,
 )
-from policy.contract import STATE_NAMES
+from policy.contract import FLIGHT_TERMS, STATE_NAMES
 from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
@@ -244,7 +244,9 @@ def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
 
 def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
     policy = load_checkpoint(path, fallback=network)
-    wanted = replace(network.contract, feature_dim=policy.contract.feature_dim)
+    # What flags of this command do not name is taken over from the checkpoint.
+    kept = {name: getattr(policy.contract, name) for name in ("feature_dim", *FLIGHT_TERMS)}
+    wanted = replace(network.contract, **kept)
     asked, held = (
         {**asdict(config), "contract": None, **asdict(contract)}
         for config, contract in ((network, wanted), (policy.config, policy.contract))

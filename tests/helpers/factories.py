@@ -40,7 +40,10 @@ def make_trace(sticks: Sticks = NEUTRAL) -> StickTrace:
 
 
 def make_tick(index: int = 0, **changes: Any) -> Tick:
-    """Tick ``index``: on time, 2 ms of prediction, 3 ms old attitude, 40 ms old feature, flying."""
+    """Tick ``index``: on time, 2 ms of prediction, 3 ms old attitude, 40 ms old feature, flying.
+
+    Each tick flies a new chunk.
+    """
     due_ns = START_NS + index * TICK_NS
     tick = Tick(
         serial=index,
@@ -60,6 +63,8 @@ def make_tick(index: int = 0, **changes: Any) -> Tick:
         armed=True,
         rc_channels_us=(1500,) * 8,
         rc_sticks=NEUTRAL,
+        chunk_serial=index,
+        chunk_computed_ns=changes.get("woke_ns", due_ns) + 2 * NS_PER_MS,
     )
     return replace(tick, **changes)
 
@@ -71,6 +76,8 @@ def make_released_tick(index: int = 0, reason: str = "no feature yet", **changes
         "trace": None,
         "sent": None,
         "release_reason": reason,
+        "chunk_serial": None,
+        "chunk_computed_ns": None,
     }
     return make_tick(index, **(released | changes))
 

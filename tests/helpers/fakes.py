@@ -1,15 +1,22 @@
-"""Test doubles: a virtual clock, a scripted camera, a recording sink, a vehicle in memory."""
+"""Test doubles: a virtual clock, a recording sink, a vehicle in memory."""
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
-import numpy as np
-
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import Event, Frame, Tick, VisionTick
+from helpers.gate_facts import COPTER_MODES
+from helpers.wire import WireEnd
+from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.records import Event, Tick, VisionTick
 from mavbridge.core.vehicle import (
+    NEUTRAL,
+    Command,
     Decision,
+    ForwardedPacket,
     LinkSnapshot,
+    LinkStats,
     Reading,
     Release,
     Sticks,
@@ -56,32 +63,17 @@ class ListSink:
         return [event for event in self.events if isinstance(event, VisionTick)]
 
 
-class ScriptedCamera:
-    """A camera on a virtual clock: frames at given times, newest wins, the passed-over counted."""
-
-    def __init__(self, clock: FakeClock, captured_ns: list[int]) -> None:
-        self._clock = clock
-        self._pending = list(enumerate(captured_ns, start=1))
-        self.dropped_frames = 0
-        self.is_closed = False
-
-    def read(self, timeout_ns: int) -> Frame | None:
-        deadline_ns = self._clock.now_ns() + timeout_ns
-        ready = [item for item in self._pending if item[1] <= self._clock.now_ns()]
-        if not ready:
-            if not self._pending or self._pending[0][1] > deadline_ns:
-                self._clock.sleep_until_ns(deadline_ns)
-                return None
-            self._clock.sleep_until_ns(self._pending[0][1])
-            ready = self._pending[:1]
-        self._pending = self._pending[len(ready) :]
-        self.dropped_frames += len(ready) - 1
-        frame_id, captured_ns = ready[-1]
-        rgb = np.zeros((4, 4, 3), dtype=np.uint8)
-        return Frame(frame_id=frame_id, captured_ns=captured_ns, rgb=rgb)
-
-    def close(self) -> None:
-        self.is_closed = True
+AIRBORNE_STATUS = VehicleStatus(
+    mode="ALT_HOLD",
+    armed=True,
+    is_landed=False,
+    has_receiver=True,
+    pilot_sticks=NEUTRAL,
+    rc_arrived_ns=START_NS,
+    is_position_valid=True,
+    position_ned_m=(0.0, 0.0, -3.0),
+)
+"""Armed in ALT_HOLD, 3 m up, with a receiver whose sticks are in the middle."""
 
 
 def level_telemetry(arrived_ns: int) -> Telemetry:
@@ -94,66 +86,125 @@ def level_telemetry(arrived_ns: int) -> Telemetry:
     )
 
 
-@dataclass
 class FakeLink:
-    """A vehicle that obeys at once; fields may be changed between ticks."""
+    """The gate's link to a vehicle in memory, which obeys at once; ``vehicle`` may be replaced."""
 
-    clock: FakeClock
-    armed: bool = True
-    mode: str = "ALT_HOLD"
-    problem: str | None = None
-    echo_confirmed: bool = True
-    rc_sticks: Sticks | None = None
-    telemetry_age_ns: int = 2 * NS_PER_MS
-    telemetry: Telemetry | None = None
-    decisions: list[tuple[int, Decision]] = field(default_factory=list)
-    asked: list[str] = field(default_factory=list)
-    on_poll: Callable[["FakeLink"], None] | None = None
-    hand_backs: int = 0
-    attitudes_ns: list[int] = field(default_factory=list)
-    """Arrivals, for a loop that is paced by them."""
+    def __init__(self, clock: Clock, **status: Any) -> None:
+        self._clock = clock
+        self._wire = WireEnd()
+        self._arrived: list[ForwardedPacket] = []
+        self._telemetry = Telemetry()
+        self.forward: Callable[[ForwardedPacket], None] = lambda packet: None
+        self.status: VehicleStatus | None = replace(AIRBORNE_STATUS, **status)
+        self.problem: str | None = None
+        self.overruled: str | None = None
+        self.interruption: str | None = None
+        self.is_release_owed = False
+        self.echo_confirmed = True
+        self.obeys = True
+        """Follows requests for a mode and to arm."""
+        self.lacks: str | None = None
+        """Field of ``Telemetry`` that the vehicle no longer sends."""
+        self.texts: list[str] = []
+        self.is_engaged = False
+        self.is_restored = True
+        self.autopilot = "fake 1.0"
+        self.decisions: list[tuple[int, Decision]] = []
+        self.requests: list[str] = []
+        self.announced: list[str] = []
+        self.services = 0
+        self.restores = 0
+        self.on_send: Callable[[], None] = lambda: None
+
+    def measure(self, *, age_ns: int = 0, yaw_rad: float = 0.0, down_mps: float = 0.0) -> None:
+        """The vehicle sends its state, which arrives now and happened ``age_ns`` ago."""
+        now_ns, mav = self._clock.now_ns(), self._wire.mav
+        quaternion = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
+        velocity, force = (0.0, 0.0, down_mps), (0.0, 0.0, -9.80665)
+        none = (0.0,) * 3
+        reading = partial(Reading, now_ns, delay_ns=age_ns)
+        sent = {
+            "velocity_ned_mps": mav.local_position_ned_encode(0, *none, *velocity),
+            "specific_force_body_mps2": mav.highres_imu_encode(
+                0, *force, *none, *none, 0, 0, 0, 0, 7
+            ),
+            "ned_from_body_wxyz": mav.attitude_quaternion_encode(0, *quaternion, *none),
+        }
+        for name, message in sent.items():
+            if name != self.lacks:
+                data = self._wire.pack(message)
+                self._arrived.append(ForwardedPacket(now_ns, now_ns - age_ns, data))
+        self._telemetry = Telemetry(
+            ned_from_body_wxyz=reading(quaternion),
+            rate_body_radps=reading(none),
+            velocity_ned_mps=reading(velocity),
+            specific_force_body_mps2=reading(force),
+        )
+
+    def change(self, **status: Any) -> None:
+        """Replace fields of the vehicle's status."""
+        assert self.status is not None
+        self.status = replace(self.status, **status)
+
+    @property
+    def hands(self) -> list[Decision]:
+        """What was sent, without repeats."""
+        sent = [decision for _, decision in self.decisions]
+        return [one for k, one in enumerate(sent) if k == 0 or one != sent[k - 1]]
 
     def poll(self) -> LinkSnapshot:
-        if self.on_poll is not None:
-            self.on_poll(self)
-        now_ns = self.clock.now_ns()
-        telemetry = self.telemetry or level_telemetry(now_ns - self.telemetry_age_ns)
-        status = VehicleStatus(
-            mode=self.mode,
-            armed=self.armed,
-            rc_sticks=self.rc_sticks,
-            rc_arrived_ns=now_ns if self.rc_sticks else None,
-        )
+        arrived, self._arrived = self._arrived, []
+        for packet in arrived:
+            self.forward(packet)
+        texts, self.texts = tuple(self.texts), []
+        status = self.status
+        if status is not None and status.rc_arrived_ns is not None:
+            status = replace(status, rc_arrived_ns=self._clock.now_ns())
+        holds = bool(self.decisions) and isinstance(self.decisions[-1][1], Command)
         return LinkSnapshot(
-            telemetry=telemetry,
+            telemetry=self._telemetry,
             status=status,
-            problem=self.problem,
+            problem=self.problem or self.overruled,
+            is_overruled=self.overruled is not None,
+            interruption=self.interruption,
             echo_confirmed=self.echo_confirmed,
+            is_released=not holds,
+            known_modes=COPTER_MODES,
+            texts=texts,
         )
-
-    def service(self) -> None:
-        pass
-
-    def wait_for_attitude(self, *, newer_than_ns: int, until_ns: int) -> int:
-        arrivals = (t for t in self.attitudes_ns if t > newer_than_ns)
-        self.clock.sleep_until_ns(min(next(arrivals, until_ns), until_ns))
-        return max((t for t in self.attitudes_ns if t <= self.clock.now_ns()), default=0)
 
     def send(self, decision: Decision) -> Sticks | None:
-        self.decisions.append((self.clock.now_ns(), decision))
+        self.on_send()
+        self.decisions.append((self._clock.now_ns(), decision))
         return None if isinstance(decision, Release) else decision.sticks
 
-    def hand_back(self) -> None:
-        self.hand_backs += 1
+    def service(self) -> None:
+        self.services += 1
 
     def set_mode(self, mode: str) -> None:
-        self.asked.append(f"mode {mode}")
+        self.requests.append(f"mode {mode}")
+        if self.obeys:
+            self.change(mode=mode)
 
     def arm(self) -> None:
-        self.asked.append("arm")
+        self.requests.append("arm")
+        if self.obeys:
+            self.change(armed=True)
 
-    def close(self) -> None:
-        self.problem = "closed"
+    def announce(self, text: str) -> None:
+        self.announced.append(text)
+
+    def begin_restore(self) -> None:
+        self.restores += 1
+
+    def stats(self) -> LinkStats:
+        return LinkStats(
+            messages_per_s=(),
+            lost_fraction=None,
+            rtt_ms=None,
+            sent_overrides=len(self.decisions),
+            echo_confirmed=self.echo_confirmed,
+        )
 
 
 def without(telemetry: Telemetry, field_name: str) -> Telemetry:

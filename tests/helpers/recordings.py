@@ -16,6 +16,7 @@ from mavbridge.core.records import ImageArray, VisionTick
 from mavbridge.recording import flight_writer
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.tlog import TlogJob
 from mavbridge.recording.video.frame_files import FrameFiles, VideoJob
 from policy.contract import Contract
 
@@ -86,7 +87,10 @@ class InProcessWriter:
         hz: float,
         rows: Path | None = None,
         with_truth: bool = False,
+        tlog: TlogJob | None = None,
     ) -> None:
+        if tlog is not None:
+            tlog.records.close()
         self._files = FrameFiles(VideoJob(video, hz, rows, with_truth))
         self._is_open = True
         self.size: tuple[int, int] | None = None

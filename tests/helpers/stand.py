@@ -2,106 +2,115 @@
 
 import json
 import os
+import select
+import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as dialect
-
+from helpers.frame_feed import FrameFeed
+from helpers.relay import Relay
 from mavbridge.core.processes import free_port
 
 TIMEOUT_S = 90.0
+STARTS = 3
+LEAN_US = 1650
+LEANING = 30
+"""Sticks beyond that, in a row: the policy holds its lean."""
+MARK = "MAVBRIDGE_TEST_MARK"
+"""Environment variable: the file into which ``helpers.user_policies`` writes when its fault
+begins."""
 
 
-class Override(NamedTuple):
-    """The first four channels of one RC_CHANNELS_OVERRIDE, in us."""
+class Process:
+    """A process of which nobody here is the parent, such as the gate of a killed bridge."""
 
-    roll: int
-    pitch: int
-    throttle: int
-    yaw: int
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self._fd = os.pidfd_open(pid)
 
+    def has_ended(self, timeout_s: float) -> bool:
+        """Wait for its end; a zombie has ended."""
+        return bool(select.select([self._fd], [], [], timeout_s)[0])
 
-class Relay:
-    """Passes datagrams between the vehicle and the bridge, and keeps the bridge's sticks."""
+    def kill(self, number: signal.Signals) -> int:
+        """Send a signal; returns the moment."""
+        at_ns = time.monotonic_ns()
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._fd, number)
+        return at_ns
 
-    def __init__(self, bridge_port: int) -> None:
-        self._bridge = ("127.0.0.1", bridge_port)
-        self._vehicle: tuple[str, int] | None = None
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", 0))
-        self._socket.settimeout(0.2)
-        self._mav = dialect.MAVLink(None)
-        self._mav.robust_parsing = True
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="relay")
-        self.overrides: list[Override] = []
-        self.has_flown = threading.Event()
-        self.port: int = self._socket.getsockname()[1]
+    def peak_memory_mb(self) -> float:
+        status = Path(f"/proc/{self.pid}/status").read_text()
+        (line,) = [line for line in status.splitlines() if line.startswith("VmHWM:")]
+        return int(line.split()[1]) / 1024
 
-    def __enter__(self) -> "Relay":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join(5)
-        self._socket.close()
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            try:
-                data, sender = self._socket.recvfrom(65536)
-            except (TimeoutError, ConnectionError):
-                continue
-            if sender == self._bridge:
-                self._record(data)
-                target = self._vehicle
-            else:
-                self._vehicle, target = sender, self._bridge
-            if target is not None:
-                self._socket.sendto(data, target)
-
-    def _record(self, data: bytes) -> None:
-        for message in self._mav.parse_buffer(data) or ():
-            if message.get_type() != "RC_CHANNELS_OVERRIDE":
-                continue
-            sticks = Override(*(getattr(message, f"chan{k}_raw") for k in range(1, 5)))
-            self.overrides.append(sticks)
-            if sticks.throttle > 1500:  # the policy climbs
-                self.has_flown.set()
+    def close(self) -> None:
+        """End it if it still runs."""
+        self.kill(signal.SIGKILL)
+        os.close(self._fd)
 
 
 class Flight:
     """One bridge against one simulated vehicle."""
 
-    def __init__(self, folder: Path, relay: Relay, bridge_port: int, shm: str) -> None:
+    def __init__(self, folder: Path, relay: Relay, shm: str, vehicle: tuple[str, ...]) -> None:
+        """``vehicle`` are the flags of the simulated vehicle, which starts at once."""
         self.folder = folder
         self.relay = relay
-        self._connect = f"udp:127.0.0.1:{bridge_port}"
         self._shm = shm
+        self._vehicle_flags = vehicle
+        self._vehicle = self._start_vehicle()
+        self._flags: tuple[str, ...] = ()
+        self._is_read = True
         self._bridge: subprocess.Popen[str] | None = None
         self._lines: list[str] = []
         self._news = threading.Condition()
-        self._reader = threading.Thread(target=self._read, name="reader")
+        self._reader: threading.Thread | None = None
+        self._gate: Process | None = None
+        self.camera: FrameFeed | None = None
+        """The camera, where the vehicle has none of its own."""
 
-    def start(self, *flags: str) -> None:
-        command = [sys.executable, "-m", "mavbridge", "--connect", self._connect]
-        command += ["--camera", f"shm:{self._shm}", "--report", str(self.folder / "report.json")]
+    def _start_vehicle(self) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "sitl", "--report", str(self.folder / "fc.json")]
+        command += ["--connect", f"udpout:127.0.0.1:{self.relay.port}"]
+        return subprocess.Popen([*command, *self._vehicle_flags], stderr=subprocess.DEVNULL)
+
+    def start(self, *flags: str, is_read: bool = True) -> None:
+        """Start the bridge in a process group of its own; its output is read, or never."""
+        self._flags, self._is_read = flags, is_read
         self._bridge = subprocess.Popen(
-            [*command, *flags],
+            [*self.command(self.folder / "report.json"), *flags],
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "COLUMNS": "200"},
+            env=self.environment() | ({} if is_read else {"PYTHONUNBUFFERED": ""}),
+            process_group=0,
         )
-        self._reader.start()
+        if is_read:
+            self._reader = threading.Thread(target=self._read, name="reader")
+            self._reader.start()
+
+    def command(self, report: Path) -> list[str]:
+        """A bridge for this vehicle, without any flag of its flight."""
+        address = f"udp:127.0.0.1:{self.relay.bridge_port}"
+        command = [sys.executable, "-m", "mavbridge", "--connect", address]
+        return [*command, "--camera", f"shm:{self._shm}", "--report", str(report)]
+
+    def environment(self) -> dict[str, str]:
+        folder = str(Path(__file__).parents[1])
+        return os.environ | {"PYTHONPATH": folder, "COLUMNS": "200", MARK: str(self._mark)}
+
+    @property
+    def _mark(self) -> Path:
+        return self.folder / "mark"
 
     def _read(self) -> None:
         assert self._bridge is not None
@@ -118,14 +127,88 @@ class Flight:
                 lambda: any(text in line for line in self._lines), timeout=TIMEOUT_S
             )
 
+    def wait_for_lean(self) -> None:
+        """The policy holds its lean; remembers the gate, for after the death of its parent.
+
+        Where a busy machine made the gate end the flight before, both start anew.
+        """
+        rows = self.relay.overrides
+
+        def is_leaning() -> bool:
+            return len(rows) > LEANING and min(row.roll for row in rows[-LEANING:]) > LEAN_US
+
+        def is_over() -> bool:
+            return self.relay.has_flown.is_set() and rows[-1].throttle <= 1500
+
+        for _ in range(STARTS):
+            assert self.relay.wait_until(lambda: is_leaning() or is_over(), TIMEOUT_S), self._text
+            assert self.gate.pid
+            if is_leaning():
+                return
+            self._start_over()
+        raise AssertionError(self._text)
+
+    def _start_over(self) -> None:
+        self.close()
+        self._vehicle.kill()
+        self._vehicle.wait(TIMEOUT_S)
+        self.relay.forget()
+        if "--record" in self._flags:
+            shutil.rmtree(self._flags[self._flags.index("--record") + 1])
+        self._lines.append("--- starting over: the machine was too busy to fly\n")
+        self._vehicle = self._start_vehicle()
+        self.start(*self._flags, is_read=self._is_read)
+
+    @property
+    def _text(self) -> str:
+        return "".join(self._lines)
+
+    def fill_output(self) -> None:
+        """Fill the pipe that nobody reads, so that the bridge's next write to it would wait."""
+        assert self._bridge is not None
+        pipe = f"/proc/{self.bridge_pid}/fd/1"
+        fd = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+        with suppress(BlockingIOError):
+            while True:
+                os.write(fd, b"." * 4096)
+        with suppress(BlockingIOError):
+            while True:
+                os.write(fd, b".")
+        os.close(fd)
+
+    def observe(self, seconds: float) -> None:
+        """Let time pass in which something must not happen."""
+        threading.Event().wait(seconds)
+
+    def fault_ns(self) -> int:
+        """When the policy's own fault began; waits for it."""
+        assert self.relay.wait_until(self._mark.exists, TIMEOUT_S), self._text
+        return int(self._mark.read_text())
+
     @property
     def bridge_pid(self) -> int:
         assert self._bridge is not None
         return self._bridge.pid
 
-    def kill(self, number: signal.Signals) -> None:
+    @property
+    def gate(self) -> Process:
+        """The gate process; the first call must come while the bridge lives."""
+        if self._gate is None:
+            self._gate = Process(child_of(self.bridge_pid, b"mavbridge.gate"))
+        return self._gate
+
+    def kill(self, number: signal.Signals) -> int:
+        """Send a signal to the bridge alone; returns the moment."""
         assert self._bridge is not None
+        at_ns = time.monotonic_ns()
         self._bridge.send_signal(number)
+        return at_ns
+
+    def kill_group(self, number: signal.Signals) -> int:
+        """Send a signal as a terminal does, to the whole process group; returns the moment."""
+        at_ns = time.monotonic_ns()
+        os.killpg(self.bridge_pid, number)
+        return at_ns
 
     def end(self) -> tuple[int, str]:
         """Exit status and everything that the bridge printed."""
@@ -133,13 +216,29 @@ class Flight:
         try:
             self._bridge.wait(TIMEOUT_S)
         finally:
-            if self._bridge.poll() is None:
-                self._bridge.kill()
-                self._bridge.wait()
+            self.close()
+        return self._bridge.returncode, self._text
+
+    def close(self) -> None:
+        """Free everything, and end what a failed test has left."""
+        if self._gate is not None:
+            self._gate.close()
+            self._gate = None
+        if self._bridge is None:
+            return
+        if self._bridge.poll() is None:
+            self._bridge.kill()
+            self._bridge.wait()
+        if self._reader is not None:
             self._reader.join(TIMEOUT_S)
-            if self._bridge.stdout is not None:
-                self._bridge.stdout.close()
-        return self._bridge.returncode, "".join(self._lines)
+            self._reader = None
+        if self._bridge.stdout is not None:
+            self._bridge.stdout.close()
+
+    def end_vehicle(self) -> None:
+        """The vehicle writes its report."""
+        self._vehicle.terminate()
+        self._vehicle.wait(TIMEOUT_S)
 
     def report(self) -> Any:
         return json.loads((self.folder / "report.json").read_text())
@@ -150,16 +249,32 @@ class Flight:
 
 
 @contextmanager
-def flight(folder: Path, *vehicle_flags: str) -> Iterator[Flight]:
-    """A vehicle and a relay, ready for ``Flight.start``; both end with the block."""
+def flight(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[Flight]:
+    """A vehicle and a relay, ready for ``Flight.start``; both end with the block.
+
+    Without ``renders`` the camera shows noise, costs nothing and can be paused.
+    """
     bridge_port = free_port()
     shm = f"test-{bridge_port}-{os.getpid()}"
-    with Relay(bridge_port) as relay:
-        command = [sys.executable, "-m", "sitl", "--connect", f"udpout:127.0.0.1:{relay.port}"]
-        command += ["--camera", f"shm:{shm}", "--report", str(folder / "fc.json")]
-        vehicle = subprocess.Popen([*command, *vehicle_flags], stderr=subprocess.DEVNULL)
+    with ExitStack() as stack:
+        relay = stack.enter_context(Relay(bridge_port))
+        filming = ("--camera", f"shm:{shm}") if renders else ()
+        flying = Flight(folder, relay, shm, (*filming, *vehicle_flags))
+        stack.callback(flying.end_vehicle)
+        if not renders:
+            flying.camera = stack.enter_context(FrameFeed(shm))
+        stack.callback(flying.close)
+        yield flying
+
+
+def child_of(parent_pid: int, text: bytes) -> int:
+    """The child process whose command line contains a text."""
+    for entry in Path("/proc").glob("[0-9]*"):
         try:
-            yield Flight(folder, relay, bridge_port, shm)
-        finally:
-            vehicle.terminate()
-            vehicle.wait(TIMEOUT_S)
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            command = (entry / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if parent == parent_pid and text in command:
+            return int(entry.name)
+    raise AssertionError(f"process {parent_pid} has no child with {text!r} in its command line")

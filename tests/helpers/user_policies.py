@@ -1,6 +1,9 @@
 """Policies as a user might write them, with what can go wrong in them."""
 
+import ctypes
+import os
 import time
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +11,8 @@ from numpy.typing import NDArray
 from policy.contract import Contract
 
 Array = NDArray[np.float32]
+HANG_S = 20
+"""Longer than any test waits."""
 
 
 class Climbing:
@@ -48,23 +53,119 @@ class SingleRate:
         return chunk
 
 
-class Exploding(Climbing):
-    """Fails after a second of flight."""
+class Leaning(Climbing):
+    """Takes off, then leans, turns and climbs; ``misbehave`` is called once it leans steadily."""
+
+    contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
+    lean_calls, fault_calls = 60, 160
+    """Calls into the flight after which it leans, and after which its fault begins."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._flown: int | None = None
+
+    def reset(self) -> None:
+        """A flight begins, or loading is done."""
+        self._flown = -1 if self._flown is None else 0
 
     def predict_fast(
         self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
     ) -> Array:
-        if self._calls > 100:
-            raise RuntimeError("the user's policy is broken")
-        return super().predict_fast(feature, state, action_history, num_diffusion_steps)
+        chunk = super().predict_fast(feature, state, action_history, num_diffusion_steps)
+        if self._flown is None or self._flown < 0:
+            return chunk
+        self._flown += 1
+        if self._flown > self.lean_calls:
+            chunk[:] = (0.3, 0.25, 0.0, 0.5)
+        if self._flown > self.fault_calls:
+            self.misbehave(chunk)
+        return chunk
+
+    def misbehave(self, chunk: Array) -> None:
+        """A policy without a fault."""
+
+    @property
+    def has_begun(self) -> bool:
+        return self._flown == self.fault_calls + 1
 
 
-class Hanging(Climbing):
-    """Stops answering after a second of flight, and comes back while the sticks are given back."""
+def mark_fault() -> None:
+    """Tell the test when the fault began."""
+    path = Path(os.environ["MAVBRIDGE_TEST_MARK"])
+    draft = path.with_suffix(".draft")
+    draft.write_text(str(time.monotonic_ns()))
+    draft.rename(path)
+
+
+class Heavy(Leaning):
+    """Holds 500 MB, which the kernel frees before it closes the sockets of a dead process."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ballast = np.ones(500 * 2**20 // 8)
+
+
+class Segfaulting(Leaning):
+    def misbehave(self, chunk: Array) -> None:
+        mark_fault()
+        ctypes.string_at(0)
+
+
+class HangingNatively(Heavy):
+    """Sleeps in C with the interpreter's lock held: no other thread of Python runs."""
+
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+            libc = ctypes.PyDLL(None)
+            for _ in range(HANG_S * 10):
+                libc.usleep(100_000)
+
+
+class HangingInPython(Leaning):
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+            deadline_ns = time.monotonic_ns() + HANG_S * 10**9
+            while time.monotonic_ns() < deadline_ns:
+                pass
+
+
+class HangingEncoder(Leaning):
+    """Its encoder stops answering once the flight leans."""
+
+    def encode_visual(self, image: Array) -> Array:
+        if self._flown is not None and self._flown > self.fault_calls:
+            mark_fault()
+            time.sleep(HANG_S)  # noqa: TID251 - the hang itself
+        return super().encode_visual(image)
+
+
+class AlwaysNan(Leaning):
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+        chunk[:] = np.nan
+
+
+class NanEveryOther(Leaning):
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+        if self._flown is not None and self._flown % 2:
+            chunk[:] = np.nan
+
+
+class Slow(Leaning):
+    """Each call takes longer than its own contract allows."""
 
     def predict_fast(
         self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
     ) -> Array:
-        if self._calls == 100:
-            time.sleep(2.5)  # noqa: TID251 - the hang itself
+        time.sleep(0.9)  # noqa: TID251 - the slow policy itself
         return super().predict_fast(feature, state, action_history, num_diffusion_steps)
+
+
+class Exploding(Leaning):
+    def misbehave(self, chunk: Array) -> None:
+        raise RuntimeError("the user's policy is broken")

@@ -10,7 +10,6 @@ import pytest
 from helpers.fakes import ListSink
 from helpers.pilots import pursuit, single_rate, steady
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.records import Tick
@@ -25,11 +24,15 @@ from policy.errors import PolicyError
 from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 MS = NS_PER_MS
+HOP_NS = MS // 10
 CLIMB = (0.5, 0.0, 0.0, 0.0)
+STAMP_ERROR_NS = MS + MS // 2
+"""The vehicle cuts its stamps off to a millisecond, and answers TIMESYNC at its next step."""
 FIXED = Delays(
     camera=Delay(p50_ns=5 * MS),
     vision=Delay(p50_ns=12 * MS),
     action=Delay(p50_ns=3 * MS),
+    hop=Delay(p50_ns=HOP_NS),
     uplink=Delay(p50_ns=MS // 2),
     downlink=Delay(p50_ns=MS // 2),
 )
@@ -91,16 +94,23 @@ def test_ages_are_what_was_injected(watched: Watched) -> None:
         # The stamp is that of the vehicle's last step, up to 2.5 ms before the shutter.
         assert 5 * MS <= vision.started_ns - vision.captured_ns < 5 * MS + STEP_NS
     ticks = flown(watched.sink)
-    assert len(ticks) == pytest.approx(101, abs=1)
     boot_ns = visions[0].captured_ns % STEP_NS
-    for tick in ticks:
+    first = {tick.chunk_serial: tick for tick in reversed(ticks)}
+    assert len(first) == pytest.approx(101, abs=1)
+    for tick in list(first.values())[:-1]:
         assert tick.predict_ns == 3 * MS
-        assert tick.sent_ns - tick.woke_ns == 3 * MS
-        ready = [v.captured_ns for v in visions if v.ready_ns <= tick.woke_ns]
+        assert tick.chunk_computed_ns is not None
+        assert tick.sent_ns - tick.chunk_computed_ns == HOP_NS
+        solved_ns = tick.chunk_computed_ns - 3 * MS
+        ready = [v.captured_ns for v in visions if v.ready_ns <= solved_ns]
         assert tick.feature_captured_ns == max(ready)
         assert tick.state is not None
-        assert 0 <= tick.woke_ns - tick.state.attitude_ns <= 10 * MS
-        assert (tick.state.attitude_ns - MS // 2) % STEP_NS == boot_ns
+        # The downlink, and a hop: every solve starts on an attitude that has just come.
+        assert abs(solved_ns - HOP_NS - MS // 2 - tick.state.attitude_ns) <= STAMP_ERROR_NS
+        force_ns = tick.state.specific_force_ns  # this stamp is in us
+        assert (force_ns - boot_ns + MS // 2) % STEP_NS <= MS
+        # The last one: at its rate of 100 Hz the accelerometer is a few steps out of phase.
+        assert 0 <= tick.state.attitude_ns - force_ns <= 10 * MS
 
 
 def test_exposures_and_steps_show_the_truth_behind_each_frame(watched: Watched) -> None:
@@ -118,7 +128,7 @@ def test_each_image_is_encoded_once_and_each_action_gets_its_feature(watched: Wa
     visions, ticks = watched.sink.visions, flown(watched.sink)
     by_frame = {vision.frame_id: np.float32(vision.rgb.mean()) for vision in visions}
     features = [by_frame[int(tick.feature_frame_id or 0)] for tick in ticks]
-    assert features == watched.features[: len(ticks)]
+    assert features == [watched.features[int(tick.chunk_serial or 0) - 1] for tick in ticks]
     assert [np.float32(mean) for mean in watched.encoded][: len(visions)] == list(by_frame.values())
 
 
@@ -173,16 +183,20 @@ def test_a_pilot_with_the_true_state_flies_all_gates() -> None:
 def test_thirty_frames_feed_a_hundred_actions_a_second() -> None:
     sink = climb(BLIND, seed=5)
     ticks = flown(sink)
-    assert {b.due_ns - a.due_ns for a, b in pairwise(ticks)} == {10 * MS}
+    slots = [tick for tick in sink.ticks if tick.is_slot]
+    assert {(tick.due_ns - slots[0].due_ns) % (10 * MS) for tick in slots} == {0}
     assert sum(tick.missed_slots for tick in ticks) == 0
+    assert max(b.sent_ns - a.sent_ns for a, b in pairwise(ticks)) < 15 * MS
     captured = [vision.captured_ns for vision in sink.visions]
     assert set(np.diff(captured) // STEP_NS) <= {13, 14}  # 33.3 ms on the grid of 2.5
-    frames = [tick.feature_frame_id for tick in ticks]
+    solves = {tick.chunk_serial: tick.feature_frame_id for tick in ticks}
+    assert len(solves) == pytest.approx(100, abs=2)
+    frames = list(solves.values())
     served = [frames.count(frame) for frame in sorted(set(map(int, filter(None, frames))))]
     assert set(served[1:-1]) <= {2, 3, 4, 5}
     assert len(served) == pytest.approx(30, abs=2)
-    stamps = [e.sent_ns if isinstance(e, Tick) else e.ready_ns for e in sink.events]
-    assert stamps == sorted(stamps)
+    for stamps in ([t.sent_ns for t in sink.ticks], [v.ready_ns for v in sink.visions]):
+        assert stamps == sorted(stamps)
 
 
 def test_a_slow_encoder_takes_the_newest_frame_and_drops_the_rest() -> None:
@@ -194,24 +208,19 @@ def test_a_slow_encoder_takes_the_newest_frame_and_drops_the_rest() -> None:
     assert sink.visions[-1].dropped_frames > len(starts)
 
 
-def test_an_action_that_takes_longer_than_its_slot_misses_slots() -> None:
-    sink = climb(replace(BLIND, delays=Delays(action=Delay(p50_ns=25 * MS))))
-    assert {tick.missed_slots for tick in flown(sink)[1:]} == {2}
+def test_an_action_that_takes_longer_than_its_slot_costs_no_slot() -> None:
+    ticks = flown(climb(replace(BLIND, delays=Delays(action=Delay(p50_ns=25 * MS)))))
+    assert {tick.missed_slots for tick in ticks} == {0}
+    assert max(b.sent_ns - a.sent_ns for a, b in pairwise(ticks)) < 15 * MS
+    assert len({tick.chunk_serial for tick in ticks}) == pytest.approx(1000 / 25, abs=3)
 
 
 def test_single_rate_takes_the_time_of_the_whole_network_for_every_action() -> None:
     sink = climb(replace(BLIND, delays=FIXED), is_dual=False)
     ticks = flown(sink)
-    assert len(ticks) == pytest.approx(30, abs=2)
+    assert len({tick.chunk_serial for tick in ticks}) == pytest.approx(30, abs=2)
     assert {tick.predict_ns for tick in ticks} == {15 * MS}
     assert {vision.ready_ns - vision.started_ns for vision in sink.visions} == {0}
-
-
-def test_state_pacing_acts_on_states_that_have_just_come() -> None:
-    sink = climb(replace(BLIND, rates=Rates(pace="state"), delays=FIXED))
-    ages = [t.woke_ns - t.state.attitude_ns for t in flown(sink)[1:] if t.state is not None]
-    assert len(ages) > 90
-    assert max(ages) == 0
 
 
 @pytest.mark.parametrize("program", ["hover", "circle", "square", "yaw"])
@@ -243,7 +252,7 @@ def test_a_crash_ends_the_flight() -> None:
     assert result.course_s is None
 
 
-def test_a_policy_that_fails_gives_the_sticks_back() -> None:
+def test_the_error_of_a_policy_that_fails_is_not_swallowed() -> None:
     one = flight()
 
     def fail() -> tuple[float, float, float, float]:
@@ -253,7 +262,6 @@ def test_a_policy_that_fails_gives_the_sticks_back() -> None:
 
     with pytest.raises(PolicyError, match="no idea"):
         one.fly(steady(fail))
-    assert one.vehicle.ap.rc.channels_us[2] == 1000
 
 
 def never_ready() -> EpisodeResult:

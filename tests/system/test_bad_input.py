@@ -1,10 +1,13 @@
 """What a user can get wrong: one clear error each, never a traceback."""
 
+import os
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from helpers.frame_feed import FrameFeed
 from mavbridge.__main__ import main
 from mavbridge.core.processes import free_port
 
@@ -39,9 +42,11 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         ([], "--connect"),
         (["--connect", "udp:127.0.0.1:1", "--fly-high"], "Unknown option: --fly-high"),
         (["--connect", "udp:127.0.0.1:1", "--action-rate", "fast"], "--action-rate"),
-        (["--connect", "udp:127.0.0.1:1", "--action-rate", "0"], "between 10 and 500 Hz"),
+        (["--connect", "udp:127.0.0.1:1", "--action-rate", "0"], "between 0.5 and 500 Hz"),
         (["--connect", "udp:127.0.0.1:1", "--num-diffusion-steps", "0"], "between 1 and 100"),
         (["--connect", "udp:127.0.0.1:1", "--readonly", "--arm"], "--readonly sends nothing"),
+        (["--connect", "udp:127.0.0.1:1", "--set", "RC_OVERRIDE_TIME"], "use NAME=VALUE"),
+        (["--connect", "udp:127.0.0.1:1", "--accept-risk", "all"], "endless-override"),
         (["--connect", "udp:127.0.0.1:1", "--config", "none.toml"], "none.toml"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "toge:medium"], "--allow-untrained"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "tog"], "tog"),
@@ -133,22 +138,33 @@ def video(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_port_in_use(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture
+def camera() -> Iterator[str]:
+    """One that delivers frames for as long as the test lasts."""
+    name = f"test-{os.getpid()}-bad-input"
+    with FrameFeed(name):
+        yield f"shm:{name}"
+
+
+def test_a_port_in_use(camera: str, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         connect = f"udp:127.0.0.1:{other.getsockname()[1]}"
-        flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
-        status, text = run(capsys, *flags)
+        status, text = run(capsys, "--connect", connect, "--policy", "scripted", "--camera", camera)
     assert status == 1
-    assert "another program listens there" in text
+    assert "Address already in use" in text
+    assert f"process {os.getpid()} " in text
+    assert "ms" not in text.split()  # no table of a flight that never was
 
 
-def test_no_heartbeat(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_heartbeat(camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = tmp_path / "report.json"
+    flags = ("--policy", "scripted", "--camera", camera, "--connect-timeout", "0.2")
     connect = f"udp:127.0.0.1:{free_port()}"
-    flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
-    status, text = run(capsys, *flags, "--connect-timeout", "0.2")
+    status, text = run(capsys, "--connect", connect, *flags, "--report", str(report))
     assert status == 1
     assert "heard nothing" in text
+    assert not report.exists()
 
 
 def test_a_camera_that_ends(video: Path, capsys: pytest.CaptureFixture[str]) -> None:

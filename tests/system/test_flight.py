@@ -3,15 +3,15 @@
 import json
 import os
 import signal
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pymavlink import mavutil
 
-from helpers.stand import Override, flight
+from helpers.flight_logs import logged_overrides
+from helpers.relay import Override
+from helpers.stand import child_of, flight
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 
@@ -22,12 +22,16 @@ NEUTRAL = Override(1500, 1500, 1500, 1500)
 RELEASE = Override(0, 0, 0, 0)
 
 
-def assert_released(overrides: list[Override]) -> None:
-    """The flight ends with neutral, then ten zeros, then nothing.
+def is_neutral(override: Override) -> bool:
+    """Centred, but for the steps of the roll channel by which the link hears itself."""
+    return override._replace(roll=1500) == NEUTRAL and 1500 <= override.roll <= 1502
 
-    A busy machine may release in flight, too, when an input came too late.
-    """
-    assert overrides[-11:] == [NEUTRAL, *[RELEASE] * 10]
+
+def assert_released(overrides: list[Override]) -> None:
+    """The flight ends with neutral, then releases until the vehicle has confirmed one."""
+    first = overrides.index(RELEASE)
+    assert is_neutral(overrides[first - 1])
+    assert set(overrides[first:]) == {RELEASE}
 
 
 def pwm_us(sticks: Sticks) -> Override:
@@ -38,13 +42,6 @@ def pwm_us(sticks: Sticks) -> Override:
         throttle=round(1500 + 500 * sticks.throttle),
         yaw=round(1500 + 500 * sticks.yaw),
     )
-
-
-def logged_overrides(path: Path) -> Iterator[Override]:
-    log = mavutil.mavlogfile(str(path))
-    while (message := log.recv_match(type="RC_CHANNELS_OVERRIDE")) is not None:
-        yield Override(*(getattr(message, f"chan{k}_raw") for k in range(1, 5)))
-    log.f.close()
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ def test_takes_off_and_holds_its_altitude(flown: Flown) -> None:
 
 def test_gives_the_sticks_back_at_the_end(flown: Flown) -> None:
     assert_released(flown.overrides)
-    assert flown.vehicle["releases"]["count"] >= 10
+    assert flown.vehicle["releases"]["count"] >= 1
 
 
 def test_reports_what_it_did(flown: Flown) -> None:
@@ -110,8 +107,8 @@ def test_the_recording_is_what_happened(flown: Flown) -> None:
     rows = [row.tick for row in back.tick_rows() if row.tick.sent is not None]
     sent = [pwm_us(tick.sent) for tick in rows if tick.sent is not None]
     sticks = [override for override in flown.overrides if override != RELEASE]
-    assert sticks[: len(sent)] == sent
-    assert set(sticks[len(sent) :]) == {NEUTRAL}
+    assert sent == sticks[-len(sent) :]  # but for a few before the recording began
+    assert len(sticks) - len(sent) < 10
     assert list(logged_overrides(flown.recording / "link.tlog")) == flown.overrides
     frame_ids = set(back.frames["frame_id"].to_pylist())
     assert {tick.feature_frame_id for tick in rows} - {None} <= frame_ids
@@ -140,26 +137,18 @@ def test_an_exception_in_the_policy_gives_the_sticks_back(tmp_path: Path) -> Non
     assert "Traceback" not in output
 
 
-def test_a_policy_that_hangs_loses_the_sticks_for_good(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
-        flying.start(*FLY, "--policy", "helpers.user_policies:Hanging")
-        status, output = flying.end()
-    assert status == 1
-    assert "the action loop has hung" in output
-    overrides = flying.relay.overrides
-    assert overrides[-10:] == [RELEASE] * 10
-    assert RELEASE not in overrides[:-10]  # the sticks of the thread that came back stayed here
-
-
-def test_without_arm_and_mode_nothing_is_sent(tmp_path: Path) -> None:
+def test_somebody_elses_arming_is_not_engaging(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
         flying.start("--dual-rate", "--policy", "scripted:hover")
-        assert flying.wait_for("disarmed: arm the vehicle, or start with --arm")
+        assert flying.wait_for("not engaged: press e, use the engage switch, or --arm")
+        flying.relay.set_mode("ALT_HOLD")
+        flying.relay.arm()
+        flying.observe(3.0)
         flying.kill(signal.SIGINT)
         status, output = flying.end()
     assert status == 0, output
     assert flying.relay.overrides == []
-    assert [entry["mode"] for entry in flying.vehicle_report()["modes"]] == ["STABILIZE"]
+    assert flying.vehicle_report()["armed_s"] > 1
 
 
 def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:
@@ -201,7 +190,8 @@ def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
     assert (folder / "frames.parquet").exists()
     logged = list(logged_overrides(folder / "link.tlog"))
     assert len(logged) > 0
-    assert logged == flying.relay.overrides[: len(logged)]
+    assert logged == flying.relay.overrides
+    assert logged[-1] == RELEASE  # the gate has outlived its parent
 
 
 def test_a_killed_writer_does_not_touch_the_flight(tmp_path: Path) -> None:
@@ -210,27 +200,14 @@ def test_a_killed_writer_does_not_touch_the_flight(tmp_path: Path) -> None:
         flags = ("--policy", "scripted:square", "--duration", "2", "--record", str(folder))
         flying.start(*FLY, *flags)
         assert flying.relay.has_flown.wait(60)
-        os.kill(writer_of(flying.bridge_pid), signal.SIGKILL)
+        os.kill(child_of(flying.bridge_pid, b"spawn_main"), signal.SIGKILL)
         status, output = flying.end()
     assert status == 0, output
     assert output.count("recording no more images: the writer process has died") == 1
-    assert flying.relay.overrides[-10:] == [RELEASE] * 10
+    assert_released(flying.relay.overrides)
     assert flying.report()["observer_drops"]["recorder"] > 0
     back = open_flight(folder)
     assert_rows_match_frames(back)
     document = json.loads((folder / "meta.json").read_text())
     assert document["ticks"] == back.ticks.num_rows
     assert document["finished"] is False
-
-
-def writer_of(bridge_pid: int) -> int:
-    """The bridge's child that spawn has started for the video."""
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            command = (entry / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if parent == bridge_pid and b"spawn_main" in command:
-            return int(entry.name)
-    raise AssertionError("no writer process")

@@ -35,15 +35,20 @@ class FlightJob:
 
 
 def fly(
-    policy: PolicyConfig, rates: Rates, duration_s: float, *, module: str = FLIGHT_PROCESS
+    policy: PolicyConfig,
+    rates: Rates,
+    duration_s: float,
+    *,
+    module: str = FLIGHT_PROCESS,
+    flags: tuple[str, ...] = (),
 ) -> Flight:
-    """Fly once with the program ``module``, which takes the flags of ``FlightJob``.
+    """Fly once with the program ``module``, which takes the flags of ``FlightJob`` and ``flags``.
 
     Raises:
         UserError: the program or the vehicle failed; quotes the end of its log.
     """
-    label = f"{module}, {name_of(policy)}, {solves_of(policy)}"
-    print_status(f"flight of {duration_s:g} s at {rates.action_rate:g} Hz: {label}")
+    label = ", ".join((module, name_of(policy), solves_of(policy), *flags))
+    print_status(f"flight of {duration_s:g} s, sticks at {rates.stick_rate:g} Hz: {label}")
     port = free_port()
     camera = f"shm:mavbridge-bench-{port}"
     with TemporaryDirectory(prefix="mavbridge-bench-") as name:
@@ -59,7 +64,8 @@ def fly(
         )
         with running(*vehicle_command, log=vehicle_log) as vehicle:
             try:
-                with running(sys.executable, "-m", module, *to_flags(job), log=log) as process:
+                command = (sys.executable, "-m", module, *to_flags(job), *flags)
+                with running(*command, log=log) as process:
                     wait(process, f"python -m {module}", log, duration_s + STARTING_S)
             except UserError:
                 if vehicle.poll() is not None:  # then the flight's log is not the reason

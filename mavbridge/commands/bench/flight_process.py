@@ -6,31 +6,34 @@ then its values are replaced by a slow level climb. Only for a simulated vehicle
 """
 
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 
 from cyclopts import App
-from rich.console import Console
 
 from mavbridge.commands.bench.flight import FlightJob
-from mavbridge.commands.bench.missed_slots import (
-    GcTimer,
-    MissedSlotProbe,
-    stolen_ms_since,
-    stolen_ns,
-)
+from mavbridge.commands.bench.missed_slots import GateProbe, stolen_ms_since, stolen_ns
 from mavbridge.commands.bench.results import OURS, Flight, name_of, solves_of, to_json
-from mavbridge.config.flight import CameraConfig, FlyConfig, Limits, LinkConfig
+from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.clock import NS_PER_S, MonotonicClock, period_ns
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.errors import PeerError
 from mavbridge.core.records import Event, Tick
-from mavbridge.flight.app import fly_executable
+from mavbridge.flight.app import fly_executable, start_gate
 from mavbridge.flight.policies import load_configured_policy
+from mavbridge.gate.departure import Ending
+from mavbridge.observe.output import flight_console
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
 from policy.contract import Executable, FloatArray
 
 CLIMB_STICK = 0.3
 """0.3 m/s up in ALT_HOLD: beyond its dead zone, some 20 m in a minute."""
-MAX_FEATURE_AGE_S = 5.0
+NO_CEILING = EnvelopeConfig(max_height=0.0)
+"""Ten minutes of that are beyond the usual 120 m."""
+LEAST_SHARE = 0.95
+"""Share of the asked duration; a flight that ended earlier is no measurement."""
+MAX_AGE_S = 5.0
 """A slow engine is to be measured, not released: far from what any of them needs."""
 app = App(help=__doc__)
 
@@ -38,30 +41,47 @@ app = App(help=__doc__)
 @app.default
 def main(job: FlightJob) -> None:
     """Fly once and write the figures."""
+    measure_flight(job)
+
+
+def measure_flight(
+    job: FlightJob, alter: Callable[[Executable], Executable] = lambda executable: executable
+) -> None:
+    """Fly the policy, changed by ``alter``, and write the figures."""
     clock = MonotonicClock()
     executable = load_configured_policy(job.policy, clock).executable
     loops = job.rates.loops(is_dual=executable.dual_rate)
-    meter = FlightMeter(action_hz=loops.action_hz, vision_hz=loops.max_vision_hz)
+    meter = FlightMeter(
+        stick_hz=job.rates.stick_rate, action_hz=loops.action_hz, vision_hz=loops.max_vision_hz
+    )
     config = FlyConfig(
         link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}"),
         policy=job.policy,
         camera=CameraConfig(camera=job.camera),
         rates=job.rates,
-        limits=Limits(max_feature_age=MAX_FEATURE_AGE_S),
+        envelope=NO_CEILING,
         mode="ALT_HOLD",
         arm=True,
         duration=job.duration,
     )
-    with GcTimer(clock) as gc_timer:
-        probe = MissedSlotProbe(period_ns=period_ns(loops.action_hz), gc_timer=gc_timer)
-        console = Console(stderr=True)
-        climb = level_climb(executable)
-        fly_executable(config, climb, clock=clock, console=console, sinks=(meter, probe))
-    job.out.write_text(to_json(_flight(job.policy, executable.engine, meter, probe)))
+    climb = level_climb(alter(executable))
+    with ExitStack() as stack:
+        gate = start_gate(config, clock, stack)
+        probe, console = GateProbe(gate.process.pid, clock), flight_console()
+        watch = ReleaseWatch(lambda reason: gate.process.send(Ending(reason=reason)))
+        sinks = (meter, probe, watch)
+        fly_executable(config, climb, clock=clock, console=console, sinks=sinks, gate=gate)
+        summary = gate.process.summary
+    flight = _flight(job.policy, executable.engine, meter, probe)
+    if flight.duration_s < LEAST_SHARE * job.duration:
+        lasted = f"the flight lasted {flight.duration_s:g} s instead of {job.duration:g} s"
+        raise PeerError(f"{lasted}: {watch.reason}")
+    lost = summary.dropped_messages if summary else 0
+    job.out.write_text(to_json(replace(flight, lost_reports=lost)))
 
 
 def level_climb(executable: Executable) -> Executable:
-    """An executable that does the same work and returns other sticks."""
+    """An executable that does the same work and returns other sticks, however late it is."""
 
     def act(
         encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
@@ -70,7 +90,14 @@ def level_climb(executable: Executable) -> Executable:
         chunk[...] = (CLIMB_STICK, 0.0, 0.0, 0.0)
         return chunk
 
-    return replace(executable, act=act)
+    contract = replace(
+        executable.contract,
+        max_state_age_s=MAX_AGE_S,
+        max_velocity_age_s=MAX_AGE_S,
+        max_feature_age_s=MAX_AGE_S,
+        max_chunk_age_s=MAX_AGE_S,
+    )
+    return replace(executable, contract=contract, act=act)
 
 
 class FlightMeter:
@@ -79,8 +106,8 @@ class FlightMeter:
     Waiting, handshake and arming are cheap ticks on time: they would flatter a slow engine.
     """
 
-    def __init__(self, *, action_hz: float, vision_hz: float) -> None:
-        self._timing = FlightTiming(action_hz=action_hz, vision_hz=vision_hz)
+    def __init__(self, *, stick_hz: float, action_hz: float, vision_hz: float) -> None:
+        self._timing = FlightTiming(stick_hz=stick_hz, action_hz=action_hz, vision_hz=vision_hz)
         self._cpu_start_ns: int | None = None
         self.stolen_start_ns: int | None = None
         self.cpu_ns = 0
@@ -102,28 +129,57 @@ class FlightMeter:
         )
 
 
-def _flight(
-    policy: PolicyConfig, engine: str, meter: FlightMeter, probe: MissedSlotProbe
-) -> Flight:
+class ReleaseWatch:
+    """A ``TickSink`` that ends the flight once the policy has lost the sticks.
+
+    Nobody is there to engage it again.
+    """
+
+    def __init__(self, end: Callable[[str], object]) -> None:
+        self._end = end
+        self._has_flown = False
+        self.reason: str | None = None
+        """Why the policy lost the sticks; None before that."""
+
+    def emit(self, event: Event) -> None:
+        """Look at one tick."""
+        if not isinstance(event, Tick):
+            return
+        self._has_flown = self._has_flown or event.trace is not None
+        if self._has_flown and self.reason is None and event.release_reason is not None:
+            self.reason = event.release_reason
+            self._end(self.reason)
+
+
+def _flight(policy: PolicyConfig, engine: str, meter: FlightMeter, probe: GateProbe) -> Flight:
     report = meter.report()
-    action, vision = report.action, report.vision
+    sticks, action, vision = report.sticks, report.action, report.vision
+    elapsed_ns = report.duration_s * NS_PER_S
     return Flight(
         runner=OURS,
         policy=name_of(policy),
         solves=solves_of(policy),
         engine=engine,
+        asked_stick_hz=sticks.target_hz,
         asked_action_hz=action.target_hz,
         asked_vision_hz=vision.target_hz,
         duration_s=report.duration_s,
+        stick_hz=sticks.rate_hz,
         action_hz=action.rate_hz,
         vision_hz=vision.rate_hz,
-        missed_slots=action.missed_slots,
+        missed_slots=sticks.missed_slots,
+        lateness_ms=sticks.lateness_ms,
+        coasting_sends=sticks.coasting_sends,
+        chunks=action.chunks,
+        late_chunks=action.late_chunks,
         period_ms=action.period_ms,
         predict_ms=action.predict_ms,
         encode_ms=vision.encode_ms,
         feature_age_ms=report.feature_age_ms,
+        state_age_ms=report.state_age_ms,
         state_to_wire_ms=report.state_to_wire_ms,
-        cpu_cores=round(meter.cpu_ns / (report.duration_s * NS_PER_S), 3),
+        cpu_cores=round((meter.cpu_ns + probe.cpu_ns) / elapsed_ns, 3),
+        gate_cpu_cores=round(probe.cpu_ns / elapsed_ns, 3),
         stolen_ms=stolen_ms_since(meter.stolen_start_ns),
         missed_by_cause=probe.missed_by_cause,
     )

@@ -28,14 +28,7 @@ class LinkClient:
     """Takes ``--out FILE``, too, and writes a ``ClientTiming`` there."""
 
 
-OUR_CLIENTS = tuple(
-    LinkClient(
-        name=f"{OURS}, {name}",
-        command=(sys.executable, "-m", LINK_PROCESS, "--pace", pace),
-        writes_timing=True,
-    )
-    for pace, name in (("clock", "100 Hz clock"), ("state", "--pace state"))
-)
+OUR_CLIENT = LinkClient(name=OURS, command=(sys.executable, "-m", LINK_PROCESS), writes_timing=True)
 
 
 def time_link(client: LinkClient, attitudes: int) -> LinkLatency:

@@ -1,11 +1,14 @@
-"""Client of the link test: our link and action loop, with a policy that repeats the roll rate.
+"""Client of the link test: gate and policy loop, with a policy that repeats the roll rate.
 
 ``python -m mavbridge.commands.bench.link_process --port P --out FILE``. No torch is loaded and no
-camera runs, but every tick does all that a flight's does, from draining the socket to the send.
+camera runs, but every attitude goes the way of a flight's: from the socket through the gate to the
+flight process, through the policy loop, and as a chunk back to the gate.
 """
 
 import signal
 import threading
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,62 +16,93 @@ from cyclopts import App
 
 from mavbridge.commands.bench.results import ClientTiming, to_json
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
-from mavbridge.config.rates import Pace, Rates
+from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.realtime import settle_process, settle_thread
-from mavbridge.core.records import Event, FeatureFrame, FloatArray, Tick
-from mavbridge.flight.bridge import build_action_loop
+from mavbridge.core.records import Event, FeatureFrame, FloatArray, Frame, Tick
+from mavbridge.core.workers import Worker
+from mavbridge.flight.bridge import Bridge, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.link_settings import link_settings
-from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.sockets import make_transport
+from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.settings import flight_settings, gate_settings
+from mavbridge.gate.departure import Ending
 from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract, Executable
 
 ROLL = ACTION_NAMES.index("roll")
+MOST_CHUNKS_HZ = 200.0
+"""Twice the vehicle's rate: an attitude that follows a late one closely is answered at once."""
 DAY_NS = 24 * 3600 * NS_PER_S
+WATCH_S = 0.1
+END_S = 5.0
+"""For the release of a vehicle that may be gone already, and for threads to end."""
 app = App(help=__doc__)
 
 
 @app.default
-def main(*, port: int, out: Path, pace: Pace = "clock") -> None:
+def main(*, port: int, out: Path) -> None:
     """Answer until SIGTERM, then write the figures to ``out``."""
-    settle_process()
-    settle_thread(realtime=True, cpu=None)  # as a flight does
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    clock, meter, cache = MonotonicClock(), ClientMeter(), FeatureCache()
-    cache.publish(
-        FeatureFrame(
-            frame_id=0,
-            captured_ns=clock.now_ns() + DAY_NS,  # never too old
-            ready_ns=clock.now_ns(),
-            value=np.zeros((1, 1), np.float32),
-        )
-    )
+    meter = ClientMeter()
     config = FlyConfig(
         link=LinkConfig(connect=f"udp:127.0.0.1:{port}"),
-        rates=Rates(pace=pace),
         # No smoothing: the vehicle must find its number unchanged.
-        limits=Limits(tau=0.0, max_slew=0.0, max_attitude_age=0.25, max_velocity_age=1.0),
+        limits=Limits(tau=0.0, max_slew=0.0),
+        rates=Rates(action_rate=MOST_CHUNKS_HZ),
+        arm=True,
+        on_fault="release",
+        then="release",
     )
-    executable = Executable(
-        contract=Contract(),
-        name="roll rate",
-        engine="none",
-        dual_rate=True,
-        encode=lambda _: np.zeros((1, 1), np.float32),
-        act=repeat_roll_rate,
-    )
-    transport = make_transport(config.link.connect, clock)
-    settings = link_settings(config.link, state_hz=config.rates.action_rate)
-    link = MavlinkLink(transport, clock, settings)
-    loop = build_action_loop(config, executable, clock=clock, link=link, cache=cache, sink=meter)
+    gate = GateProcess(gate_settings(config, is_dual=True, tlog_fd=None, wall_offset_ns=0))
     try:
-        loop.run(stop)
+        bridge = link_bridge(config, gate, meter)
+        gate.send(flight_settings(config, ROLL_RATE))
+        _serve(bridge, gate, stop)
     finally:
-        link.close()
+        gate.close()
     out.write_text(to_json(meter.timing()))
+
+
+def link_bridge(config: FlyConfig, gate: GateProcess, meter: "ClientMeter") -> Bridge:
+    """The policy loop and its view of the vehicle; the vision loop is built and never runs."""
+    clock, cache = MonotonicClock(), FeatureCache()
+    now_ns = clock.now_ns()
+    feature = np.zeros((1, 1), np.float32)
+    cache.publish(
+        FeatureFrame(frame_id=0, captured_ns=now_ns + DAY_NS, ready_ns=now_ns, value=feature)
+    )
+    return build_bridge(
+        config,
+        ROLL_RATE,
+        clock=clock,
+        send=gate.send,
+        camera=NoCamera(),
+        sinks=(meter,),
+        watches_images=False,
+        cache=cache,
+    )
+
+
+def _serve(bridge: Bridge, gate: GateProcess, stop: threading.Event) -> None:
+    """Run until told to stop or until the gate ends, and raise what a thread has raised."""
+
+    def run_settled(ended: threading.Event, *, run: Callable[[threading.Event], None]) -> None:
+        settle_thread(realtime=True, cpu=None)  # as a flight does
+        run(ended)
+
+    settle_process()
+    policy = Worker("mavbridge-policy", partial(run_settled, run=bridge.policy.run))
+    listen = partial(gate.listen, view=bridge.view)
+    listener = Worker("mavbridge-gate", partial(run_settled, run=listen))
+    listener.start()
+    policy.start()
+    while listener.is_alive and policy.is_alive and not stop.wait(WATCH_S):
+        pass
+    gate.send(Ending(reason="the measurement is over"))
+    listener.ends_within(END_S)
+    for worker in (policy, listener):
+        worker.join(END_S)
 
 
 def repeat_roll_rate(
@@ -80,27 +114,50 @@ def repeat_roll_rate(
     return chunk
 
 
+ROLL_RATE = Executable(
+    # Wide ages: a vehicle that is served late is to be measured.
+    contract=Contract(max_state_age_s=1.0, max_velocity_age_s=1.0, max_chunk_age_s=1.0),
+    name="roll rate",
+    engine="none",
+    dual_rate=True,
+    encode=lambda _: np.zeros((1, 1), np.float32),
+    act=repeat_roll_rate,
+)
+
+
+class NoCamera:
+    """A camera that never delivers."""
+
+    dropped_frames = 0
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        """Nothing; ``timeout_ns`` is not waited for."""
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
 class ClientMeter:
-    """A ``TickSink`` that times ticks which sent sticks."""
+    """A ``TickSink`` that times the first send of each attitude."""
 
     def __init__(self) -> None:
-        self._work, self._state_to_wire = Histogram(), Histogram()
+        self._state_to_wire, self._chunk_to_wire = Histogram(), Histogram()
         self._last_attitude_ns = 0
 
     def emit(self, event: Event) -> None:
         """Count a tick."""
-        if not isinstance(event, Tick) or event.sent is None or event.state is None:
+        if not isinstance(event, Tick) or event.sent is None or event.chunk_computed_ns is None:
             return
-        self._work.add(event.sent_ns - event.woke_ns)
-        if event.state.attitude_ns != self._last_attitude_ns:
+        if event.state is not None and event.state.attitude_ns != self._last_attitude_ns:
             self._last_attitude_ns = event.state.attitude_ns
             self._state_to_wire.add(event.sent_ns - event.state.attitude_ns)
+            self._chunk_to_wire.add(event.sent_ns - event.chunk_computed_ns)
 
     def timing(self) -> ClientTiming:
         """Percentiles so far."""
         return ClientTiming(
             state_to_wire_ms=self._state_to_wire.percentiles_ms(),
-            work_ms=self._work.percentiles_ms(),
+            chunk_to_wire_ms=self._chunk_to_wire.percentiles_ms(),
         )
 
 

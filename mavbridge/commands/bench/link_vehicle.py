@@ -23,13 +23,22 @@ from mavbridge.mavlink.transport.sockets import UdpTransport
 
 ATTITUDE_HZ = 97.0
 """Not 100: the phase against a client with a 100 Hz clock of its own then takes every value."""
-CODES = 1000
-CODE_SPAN = 500
-"""A code k stands for a stick of (k - 500) / 500, which is 1000 + k us of PWM."""
+CODES = 200
+CODE_SPAN = 100
+CODE_US = 5
+"""A code k stands for a stick of (k - 100) / 100, which is 1000 + 5 k us of PWM: a client may move
+the channel by 2 us beside its answer."""
 WARM_ANSWERS = 100
 CONNECT_S = 30.0
-PENDING_LIMIT = 200
-"""Answers later than two seconds count as lost."""
+PENDING_LIMIT = 150
+"""Answers later than 1.5 seconds count as lost; fewer than there are codes."""
+SENT_MESSAGES = (
+    mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    mav.MAVLINK_MSG_ID_RAW_IMU,
+    mav.MAVLINK_MSG_ID_RC_CHANNELS,
+)
+"""Intervals of others are denied."""
 PARAMS = {
     "RCMAP_ROLL": 1.0,
     "RCMAP_PITCH": 2.0,
@@ -37,6 +46,7 @@ PARAMS = {
     "RCMAP_YAW": 4.0,
     "RC_OVERRIDE_TIME": 3.0,
     "RC_OPTIONS": 32.0,
+    "FS_THR_ENABLE": 1.0,
     "FS_THR_VALUE": 975.0,
     "MAV_GCS_SYSID": 255.0,
     "MAV_GCS_SYSID_HI": 255.0,
@@ -80,6 +90,11 @@ def stick_of(code: int) -> float:
 def code_of(stick: float) -> int:
     """Inverse of ``stick_of``."""
     return round(stick * CODE_SPAN) + CODE_SPAN
+
+
+def code_of_pwm(pwm_us: int) -> int:
+    """The code that RC_CHANNELS_OVERRIDE carries."""
+    return round((pwm_us - 1000) / CODE_US)
 
 
 class RoundTrips:
@@ -176,12 +191,18 @@ class LinkVehicle:
         name = message.get_type()
         if name == "RC_CHANNELS_OVERRIDE":
             self._channels_us[:4] = [getattr(message, f"chan{k}_raw") for k in range(1, 5)]
-            self._round_trips.answer(message.chan1_raw - 1000, arrived_ns)
+            self._round_trips.answer(code_of_pwm(message.chan1_raw), arrived_ns)
         elif name == "MANUAL_CONTROL":
             self._round_trips.answer(code_of(message.y / 1000), arrived_ns)
         elif name == "COMMAND_LONG":
-            reply = mav.MAVLink_command_ack_message(message.command, mav.MAV_RESULT_ACCEPTED)
-            self._transport.send(self._pack(reply))
+            is_denied = (
+                message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL
+                and message.param1 not in SENT_MESSAGES
+            )
+            result = mav.MAV_RESULT_DENIED if is_denied else mav.MAV_RESULT_ACCEPTED
+            self._transport.send(
+                self._pack(mav.MAVLink_command_ack_message(message.command, result))
+            )
         elif name == "PARAM_REQUEST_READ" and message.param_id in PARAMS:
             value, kind = PARAMS[message.param_id], mav.MAV_PARAM_TYPE_REAL32
             reply = mav.MAVLink_param_value_message(
@@ -193,7 +214,7 @@ class LinkVehicle:
         boot_ms = self._boot_ms()
         yield mav.MAVLink_local_position_ned_message(boot_ms, 0.0, 0.0, -10.0, 0.0, 0.0, 0.0)
         yield mav.MAVLink_raw_imu_message(boot_ms * 1000, 0, 0, -1000, 0, 0, 0, 0, 0, 0)
-        if number % 4 == 0:
+        if number % 2 == 0:
             channels_us = (*self._channels_us, *[0] * 10)
             yield mav.MAVLink_rc_channels_message(boot_ms, 8, *channels_us, 255)
         if number % round(ATTITUDE_HZ) == 0:

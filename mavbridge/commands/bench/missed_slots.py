@@ -1,38 +1,38 @@
-"""Why slots of the action loop were missed: counters of the system, read at every tick."""
+"""Why slots of the gate were missed, and its processor time: counters of the system."""
 
-import gc
 import os
+from collections import deque
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.records import Event, Tick
 
-Cause = Literal["host", "kernel", "gc", "inference", "loop", "lock"]
-CAUSES: tuple[Cause, ...] = get_args(Cause)
-"""host: the hypervisor gave our processor to others; kernel: the thread could run and was not put
-on a processor; gc: Python's collector; inference: the policy took longer than the period; loop: the
-rest of the tick did; lock: the thread was neither running nor runnable, so it waited for the
-interpreter lock (or for something inside the policy) until after its slot."""
-PROC_STAT = Path("/proc/stat")
+Cause = Literal["host", "kernel", "gate"]
+"""host: the hypervisor gave our processor to others; kernel: the gate could run and was not put on
+a processor; gate: neither, so its own work or its link took that long."""
+PROC = Path("/proc")
+MAX_READINGS = 512
+"""More than a second at 400 Hz."""
 STEAL_FIELD = 8
 """The line "cpu" is: cpu user nice system idle iowait irq softirq steal (proc_stat(5))."""
-SCHEDSTAT = Path("/proc/thread-self/schedstat")
-"""For the reading thread: ns on a processor, ns in a run queue, turns (sched-stats.rst)."""
 
 
 class Counters(NamedTuple):
-    """Time lost outside the loop's own work; each only ever grows, and stays 0 where unknown."""
+    """Times of the gate and of its machine; each only ever grows, and stays 0 where unknown."""
 
     host_ns: int
-    kernel_ns: int
-    gc_ns: int
+    """Taken by the hypervisor since boot, from all processors."""
+    waited_ns: int
+    """The gate could run and was not running."""
+    cpu_ns: int
+    """The gate ran."""
 
 
 def stolen_ns() -> int | None:
     """Processor time that the hypervisor has taken since boot; None = not known."""
     try:
-        fields = PROC_STAT.read_text().split("\n", 1)[0].split()
+        fields = (PROC / "stat").read_text().split("\n", 1)[0].split()
     except OSError:
         return None
     if len(fields) <= STEAL_FIELD:
@@ -48,77 +48,67 @@ def stolen_ms_since(start_ns: int | None) -> float | None:
     return round((now_ns - start_ns) / NS_PER_MS, 1)
 
 
-def find_cause(first: Tick, second: Tick, lost: Counters, period_ns: int) -> Cause:
-    """The first cause, outermost first, that explains at least half of the overrun.
+def read_counters(pid: int) -> Counters:
+    """Counters of a process with one thread; schedstat is documented in sched-stats.rst."""
+    try:
+        cpu_ns, waited_ns = map(int, (PROC / str(pid) / "schedstat").read_text().split()[:2])
+    except (OSError, ValueError):
+        cpu_ns = waited_ns = 0
+    return Counters(host_ns=stolen_ns() or 0, waited_ns=waited_ns, cpu_ns=cpu_ns)
 
-    Time that the hypervisor or the kernel took is inside everything else that was slow meanwhile,
-    so they come first. What no counter explains was work if the first tick outlasted its period,
-    and waiting if it did not. ``lost`` is how much the counters grew between the ends of two
-    consecutive ticks.
+
+def find_cause(first: Tick, second: Tick, before: Counters, after: Counters) -> Cause:
+    """The first cause, outermost first, that explains at least half of the gap between two sends.
+
+    Time that the hypervisor took is inside all other times, so it comes first.
     """
-    overrun_ns = second.woke_ns - first.woke_ns - period_ns
-    for cause, lost_ns in zip(CAUSES, lost, strict=False):
-        if 2 * lost_ns >= overrun_ns:
-            return cause
-    work_ns = first.sent_ns - first.woke_ns
-    if work_ns < period_ns:
-        return "lock"
-    return "inference" if 2 * (first.predict_ns or 0) >= work_ns else "loop"
+    gap_ns = second.sent_ns - first.sent_ns
+    if 2 * (after.host_ns - before.host_ns) >= gap_ns:
+        return "host"
+    return "kernel" if 2 * (after.waited_ns - before.waited_ns) >= gap_ns else "gate"
 
 
-class GcTimer:
-    """Adds up the time inside the garbage collector within the ``with`` block."""
+class GateProbe:
+    """A ``TickSink`` that reads the gate's counters from the policy's first action to its last.
 
-    def __init__(self, clock: Clock) -> None:
+    It runs in the flight process, so reading costs the gate nothing, but may come late: a gap is
+    explained by what the counters grew since they were last read before it began.
+    """
+
+    def __init__(self, pid: int, clock: Clock) -> None:
+        self._pid = pid
         self._clock = clock
-        self._start_ns = 0
-        self.total_ns = 0
-
-    def __enter__(self) -> "GcTimer":
-        gc.callbacks.append(self._on_gc)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        gc.callbacks.remove(self._on_gc)
-
-    def _on_gc(self, phase: str, _info: dict[str, int]) -> None:
-        if phase == "start":
-            self._start_ns = self._clock.now_ns()
-        else:
-            self.total_ns += self._clock.now_ns() - self._start_ns
-
-
-class MissedSlotProbe:
-    """A ``TickSink`` that counts the slots missed between ticks in which the policy flew, by cause.
-
-    Reading the counters costs the action thread some 30 us a tick, after its sticks have left.
-    """
-
-    def __init__(self, *, period_ns: int, gc_timer: GcTimer) -> None:
-        self._period_ns = period_ns
-        self._gc_timer = gc_timer
-        self._last: tuple[Tick, Counters] | None = None
+        self._last: Tick | None = None
+        self._read: deque[tuple[int, Counters]] = deque(maxlen=MAX_READINGS)
+        self._first: Counters | None = None
+        self._newest: Counters | None = None
         self.missed_by_cause: dict[str, int] = {}
+        """Slots missed while the policy flew."""
+
+    @property
+    def cpu_ns(self) -> int:
+        """Processor time of the gate; 0 where the system does not tell."""
+        if self._first is None or self._newest is None:
+            return 0
+        return self._newest.cpu_ns - self._first.cpu_ns
 
     def emit(self, event: Event) -> None:
-        """Look at one tick; called by the action thread."""
+        """Look at one tick."""
         if not isinstance(event, Tick):
             return
         if event.trace is None:
             self._last = None
             return
-        now = Counters(stolen_ns() or 0, _runnable_ns(), self._gc_timer.total_ns)
+        now = read_counters(self._pid)
+        self._first, self._newest = self._first or now, now
         if self._last is not None and event.missed_slots:
-            tick, before = self._last
-            lost = Counters(*(after - old for after, old in zip(now, before, strict=True)))
-            cause = find_cause(tick, event, lost, self._period_ns)
+            cause = find_cause(self._last, event, self._before(self._last.sent_ns), now)
             slots = self.missed_by_cause.get(cause, 0)
             self.missed_by_cause[cause] = slots + event.missed_slots
-        self._last = (event, now)
+        self._last = event
+        self._read.append((self._clock.now_ns(), now))
 
-
-def _runnable_ns() -> int:
-    try:
-        return int(SCHEDSTAT.read_text().split()[1])
-    except (OSError, LookupError, ValueError):
-        return 0
+    def _before(self, at_ns: int) -> Counters:
+        """The newest counters that were read by a time, or the oldest that are kept."""
+        early = (counters for read_ns, counters in reversed(self._read) if read_ns <= at_ns)
+        return next(early, self._read[0][1])

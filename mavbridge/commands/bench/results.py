@@ -55,22 +55,41 @@ class Flight:
     policy: str
     solves: str
     engine: str
+    asked_stick_hz: float
     asked_action_hz: float
     asked_vision_hz: float
     duration_s: float
+    stick_hz: float | None
+    """All sends, those between two slots as well."""
     action_hz: float | None
+    """Chunks computed."""
     vision_hz: float | None
     missed_slots: int
+    """Slots of the stick grid without a send within one period."""
+    lateness_ms: Percentiles | None
+    """From a slot to its send."""
+    coasting_sends: int | None
+    """Sends of a chunk whose successor was late."""
+    chunks: int
+    late_chunks: int | None
+    """Chunks that came more than 1.5 periods after the one before."""
     period_ms: Percentiles | None
+    """Between two chunks."""
     predict_ms: Percentiles | None
     encode_ms: Percentiles | None
     feature_age_ms: Percentiles | None
+    state_age_ms: Percentiles | None
+    """From an attitude's arrival at this computer to each send that is based on it."""
     state_to_wire_ms: Percentiles | None
     """From an attitude's arrival at this computer to the send of the first sticks made from it."""
     cpu_cores: float
-    """Processor time of the bridge's process over elapsed time."""
+    """Processor time of all our processes over elapsed time."""
+    gate_cpu_cores: float | None
+    """The gate's share of it."""
     stolen_ms: float | None
     missed_by_cause: Mapping[str, int] | None
+    lost_reports: int = 0
+    """Messages of the gate that its reader was too slow for: the figures lack them."""
     vehicle_gap_ms: Mapping[str, float] | None = None
     """p50, p99 and max between stick messages, as the vehicle saw them arrive."""
 
@@ -82,7 +101,7 @@ class Flight:
     @property
     def missed_fraction(self) -> float:
         """Missed over asked slots."""
-        asked = self.asked_action_hz * self.duration_s
+        asked = self.asked_stick_hz * self.duration_s
         return self.missed_slots / asked if asked > 0 else 1.0
 
 
@@ -92,8 +111,8 @@ class ClientTiming:
 
     state_to_wire_ms: Percentiles | None = None
     """From the kernel's arrival stamp of an attitude to the send."""
-    work_ms: Percentiles | None = None
-    """From waking for the tick to the send."""
+    chunk_to_wire_ms: Percentiles | None = None
+    """The last part of it: from the end of the policy's computation to the send."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,17 +228,22 @@ def engine_table(timings: Iterable[EngineTiming]) -> Table:
 
 
 _FLIGHT_ROWS: tuple[tuple[str, Callable[[Flight], str]], ...] = (
-    ("actions, Hz", lambda f: f"{number(f.action_hz, 1)} of {f.asked_action_hz:g}"),
+    ("sticks, Hz", lambda f: f"{number(f.stick_hz, 1)} of {f.asked_stick_hz:g}"),
+    ("missed slots", lambda f: f"{f.missed_slots} ({f.missed_fraction:.3%})"),
+    ("by cause", lambda f: causes(f.missed_by_cause)),
+    ("stick lateness, ms", lambda f: spread(f.lateness_ms, 3)),
+    ("chunks, Hz", lambda f: f"{number(f.action_hz, 1)} of {f.asked_action_hz:g}"),
+    ("late chunks", lambda f: f"{number(f.late_chunks, 0)} of {f.chunks}"),
     ("images, Hz", lambda f: f"{number(f.vision_hz, 1)} of {f.asked_vision_hz:g}"),
-    ("missed slots", lambda f: f"{f.missed_slots} ({f.missed_fraction:.2%})"),
-    ("by cause", lambda f: _causes(f.missed_by_cause)),
-    ("action period, ms", lambda f: spread(f.period_ms)),
+    ("chunk period, ms", lambda f: spread(f.period_ms)),
     ("sample one chunk, ms", lambda f: spread(f.predict_ms)),
     ("encode one image, ms", lambda f: spread(f.encode_ms)),
     ("feature age at send, ms", lambda f: spread(f.feature_age_ms)),
+    ("attitude age at send, ms", lambda f: spread(f.state_age_ms)),
     ("attitude to wire, ms", lambda f: spread(f.state_to_wire_ms)),
     ("gaps at the vehicle, ms", lambda f: _gaps(f.vehicle_gap_ms)),
     ("processor time, cores", lambda f: number(f.cpu_cores, 2)),
+    ("of it the gate", lambda f: number(f.gate_cpu_cores, 2)),
     ("stolen by the host, ms", lambda f: number(f.stolen_ms, 0)),
 )
 
@@ -233,7 +257,8 @@ def flight_table(flights: Iterable[Flight]) -> Table:
     return make_table(title, header, rows)
 
 
-def _causes(slots_by_cause: Mapping[str, int] | None) -> str:
+def causes(slots_by_cause: Mapping[str, int] | None) -> str:
+    """Missed slots by cause, in words."""
     if slots_by_cause is None:
         return "-"
     return ", ".join(f"{cause} {slots}" for cause, slots in slots_by_cause.items()) or "none"
@@ -253,10 +278,10 @@ def link_table(links: Iterable[LinkLatency]) -> Table:
             f"{link.answered} of {link.sent}",
             spread(link.round_trip_ms, 2),
             spread(link.timing.state_to_wire_ms, 2),
-            spread(link.timing.work_ms, 2),
+            spread(link.timing.chunk_to_wire_ms, 2),
         )
         for link in links
     ]
-    header = ("client", "answered", "round trip", "attitude to wire", "work")
+    header = ("client", "answered", "round trip", "attitude to wire", "chunk to wire")
     title = "Link alone: attitude out of the vehicle to sticks back in, ms (p50 / p99 / max)"
     return make_table(title, header, rows)

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from mavbridge.commands.bench.engines import EAGER, time_engines
 from mavbridge.commands.bench.flight import fly
-from mavbridge.commands.bench.link import OUR_CLIENTS, time_link
+from mavbridge.commands.bench.link import OUR_CLIENT, time_link
 from mavbridge.commands.bench.results import (
     BASELINE,
     OURS,
@@ -32,6 +32,7 @@ from mavbridge.core.stopping import INTERRUPTED
 
 ROOFLINE = "roofline f32"
 BARE_CLIENT = "bare pymavlink loop"
+MS_PER_S = 1000.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,13 +64,12 @@ def measure(config: BenchConfig, effort: Effort) -> BenchResult:
         (config.policy,), rounds=effort.engine_rounds, block_s=effort.engine_block_s
     )
     flight = fly(config.policy, config.rates, effort.flight_s)
-    links = tuple(time_link(client, effort.attitudes) for client in OUR_CLIENTS)
     return BenchResult(
         machine=this_machine(),
         quick=effort is QUICK,
         engines=engines,
         flights=(flight,),
-        links=links,
+        links=(time_link(OUR_CLIENT, effort.attitudes),),
         notes=notes,
     )
 
@@ -112,7 +112,8 @@ def ratios(result: BenchResult) -> dict[str, float]:
 
     Engines: median time over that of eager torch and over the roofline. Flights: period over the
     asked one; and period, processor time an action and latency over the baseline's with the same
-    policy. Link: what a client does once it is awake, over the bare loop's round trip.
+    policy; and the lateness of sticks at the 99th percentile over their period. Link: round trip
+    over the bare loop's.
     """
     found = dict(_flight_ratios(result))
     times = {(one.policy, one.work, one.engine): one.p50_ms for one in result.engines}
@@ -123,10 +124,9 @@ def ratios(result: BenchResult) -> dict[str, float]:
                 found[f"{policy}, {work}: {engine} / {reference}"] = time_ms / least_ms
     bare = next((link for link in result.links if link.client == BARE_CLIENT), None)
     for link in result.links:
-        work_ms = link.timing.work_ms
-        if bare is not None and bare.round_trip_ms.p50 > 0 and work_ms is not None:
-            ratio = work_ms.p50 / bare.round_trip_ms.p50
-            found[f"link: {link.client}: work / {BARE_CLIENT}"] = ratio
+        if bare is not None and bare.round_trip_ms.p50 > 0 and link is not bare:
+            ratio = link.round_trip_ms.p50 / bare.round_trip_ms.p50
+            found[f"link: {link.client}: round trip / {BARE_CLIENT}"] = ratio
     return found
 
 
@@ -139,6 +139,9 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
         engine = flight.engine.partition("-")[0]
         name = f"flight: {flight.policy}, {flight.solves}, {engine}"
         yield f"{name}: period / asked period", flight.asked_action_hz / flight.action_hz
+        if flight.lateness_ms is not None:
+            periods = flight.lateness_ms.p99 * flight.asked_stick_hz / MS_PER_S
+            yield f"{name}: stick lateness p99 / period", periods
         baseline = baselines.get(flight.policy)
         if baseline is None or not baseline.action_hz:
             continue

@@ -114,6 +114,7 @@ class _LabelledRecorder:
         self._writer = writer
         self._truths: dict[int, FrameTruth] = {}
         self._ticks = self._frames = 0
+        self._chunk_serial = 0
         flight.watch_exposures(self._keep_truth)
 
     def _keep_truth(self, exposure: Exposure) -> None:
@@ -136,11 +137,18 @@ class _LabelledRecorder:
         if from_ns is None:
             return
         if isinstance(event, Tick):
-            if event.woke_ns >= from_ns and event.trace is not None:
-                labels = TickLabels(expert=self._pilot.expert_sticks)
-                self._writer.tick(replace(event, serial=self._ticks), labels)
-                self._ticks += 1
+            self._record(event, from_ns)
         elif event.captured_ns >= from_ns:
             truth = self._truths.get(event.frame_id)
             self._writer.frame(replace(event, serial=self._frames), truth)
             self._frames += 1
+
+    def _record(self, tick: Tick, from_ns: int) -> None:
+        """Record the first send of each chunk: one row for each decision of the policy."""
+        serial = tick.chunk_serial
+        if tick.woke_ns < from_ns or serial is None or serial == self._chunk_serial:
+            return
+        self._chunk_serial = serial
+        labels = TickLabels(expert=self._pilot.expert_sticks(serial))
+        self._writer.tick(replace(tick, serial=self._ticks), labels)
+        self._ticks += 1

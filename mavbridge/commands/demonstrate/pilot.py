@@ -23,6 +23,8 @@ STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
 """Least and most length of a turn. Where a student flies, the expert takes over now and then: a
 student that crashes at the first gate would otherwise learn nothing about the later ones (DAgger,
 Ross et al. 2011, mixes the two at random)."""
+SOLVES_KEPT = 64
+"""Solves whose expert sticks are kept until their ticks are recorded."""
 NOMINAL_SHARE = 0.25
 """Flights without random conditions: what most users fly first."""
 AIRBORNE_SHARE = 0.35
@@ -96,9 +98,11 @@ class Pilot:
         )
         self._turns = TurnSchedule(variation.seed)
         self._expert: Expert | None = None
-        self.expert_sticks: Sticks | None = None
+        self._solves = 0
+        self._expert_sticks: dict[int, Sticks] = {}
+        """By the serial of the chunk that was computed with them."""
         self.begin_ns: int | None = None
-        """When the demonstration begins; None before the first action."""
+        """When the demonstration begins; None before the policy has the vehicle's sticks."""
         expert = Executable(
             contract=contract,
             name=f"expert at {speed_mps:g} m/s",
@@ -107,19 +111,30 @@ class Pilot:
             encode=lambda _: np.zeros((1, 1), np.float32),
             act=self._act,
         )
-        self.executable = replace(student or expert, act=self._act)
+        self.executable = replace(student or expert, act=self._act, reset=self._start)
+
+    def expert_sticks(self, chunk_serial: int) -> Sticks | None:
+        """The expert's sticks at the state of a recent chunk; None before its demonstration."""
+        return self._expert_sticks.get(chunk_serial)
+
+    def _start(self) -> None:
+        """The policy has the sticks now: a vehicle that is put in the air is under control."""
+        if self._student is not None:
+            self._student.reset()
+        self._expert = self._begin(self._flight.clock.now_ns())
 
     def _act(
         self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
     ) -> FloatArray:
-        now_ns = self._flight.clock.now_ns()
-        if self._expert is None:
-            self._expert = self._begin(now_ns)
-        now_s, body = now_ns / NS_PER_S, self._flight.vehicle.ap.truth
-        sticks = self._expert.sticks(body, now_s)
-        self.expert_sticks = Sticks(*sticks)
-        disturbed = self._disturbance.flown(StickPositions(*sticks), now_s)
+        self._solves += 1
         horizon = self.executable.contract.horizon
+        if self._expert is None:  # not engaged yet: the gate wants to see chunks first
+            return np.zeros((1, horizon, len(Sticks._fields)), np.float32)
+        now_s, body = self._flight.clock.now_ns() / NS_PER_S, self._flight.vehicle.ap.truth
+        sticks = self._expert.sticks(body, now_s)
+        self._expert_sticks[self._solves] = Sticks(*sticks)
+        self._expert_sticks.pop(self._solves - SOLVES_KEPT, None)
+        disturbed = self._disturbance.flown(StickPositions(*sticks), now_s)
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
         if self._student is None:
             return chunk
@@ -128,7 +143,7 @@ class Pilot:
         return students if self._turns.is_students(now_s) else chunk
 
     def _begin(self, now_ns: int) -> Expert:
-        """Start at the first action, so that a vehicle put in the air is under control at once.
+        """Put the vehicle where the demonstration starts, and make the expert that flies it.
 
         The expert does not know the vehicle's parameters, which no learner could see: it flies as
         many courses without them (37 of 40, and 37 of 40 with).

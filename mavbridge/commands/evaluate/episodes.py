@@ -25,10 +25,12 @@ from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.processes import END_TIMEOUT_S, end, free_port, running, wait
 from mavbridge.flight.app import fly_executable
 from mavbridge.flight.policies import load_configured_policy, load_for_episodes
+from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delays
 from mavbridge.simulation.flight import MODE, SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult, Outcome, StickMeter
 from mavbridge.simulation.world import NOMINAL_VEHICLE, random_vehicle
+from policy.contract import Executable
 
 SCRIPTED = "scripted"
 STARTUP_S = 90.0
@@ -94,8 +96,14 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         vehicle=NOMINAL_VEHICLE if conditions_seed is None else random_vehicle(conditions_seed),
     )
     loaded = load_for_episodes(config.policy, flight.clock)
-    result = flight.fly(loaded.executable, max_time_s=config.max_time, should_stop=should_stop)
+    executable = _measured(loaded.executable, config)
+    result = flight.fly(executable, max_time_s=config.max_time, should_stop=should_stop)
     return FlownEpisode(engine=loaded.executable.engine, notes=tuple(loaded.notes), result=result)
+
+
+def _measured(executable: Executable, config: EvaluateConfig) -> Executable:
+    """The executable, with a contract that allows the ages which the flags ask for."""
+    return replace(executable, contract=contract_with_ages(executable.contract, config.limits))
 
 
 class _BridgeJob(NamedTuple):
@@ -172,7 +180,7 @@ def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> tuple[str, StickMeter
         arm=True,
         duration=settings.max_time,
     )
-    executable = load_configured_policy(config.policy, clock).executable
+    executable = _measured(load_configured_policy(config.policy, clock).executable, settings)
     with Path("/dev/null").open("w") as nowhere:
         console = Console(file=nowhere)
         fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))

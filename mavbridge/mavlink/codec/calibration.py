@@ -1,7 +1,6 @@
 """Sticks <-> PWM with the vehicle's own radio calibration: the one table of signs and channels."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from mavbridge.core.vehicle import Sticks
@@ -11,6 +10,12 @@ Pwm: TypeAlias = tuple[int, int, int, int]
 
 PWM_SIGN = Sticks(throttle=1.0, yaw=1.0, pitch=-1.0, roll=1.0)
 """ArduPilot: stick forward (+pitch, nose down) is PWM below trim; the others rise with it."""
+
+PWM_LIMITS_US = (800, 2200)
+"""Range of a radio. No other value is sent, even if the vehicle's calibration asks for it."""
+
+DEAD_ZONE_US = 20
+"""RCn_DZ that ArduPilot gives to roll and pitch by default."""
 
 FS_THR_MARGIN_US = 10
 """ArduPilot's own arming check wants RC3_MIN this far above FS_THR_VALUE."""
@@ -26,15 +31,25 @@ class RcChannel:
     trim_us: int
     max_us: int
     is_reversed: bool = False
+    dead_zone_us: int = DEAD_ZONE_US
+    """Movement about the centre that the vehicle takes for none."""
 
     def __post_init__(self) -> None:
         """Refuse a calibration that sticks cannot be mapped with."""
         if not 1 <= self.number <= 8:
             raise ValueError(f"channel {self.number} is not one of 1..8")
-        if not 500 <= self.min_us < self.max_us <= 2500:
+        low_us, high_us = PWM_LIMITS_US
+        for part, value_us in (("MIN", self.min_us), ("MAX", self.max_us)):
+            if not low_us <= value_us <= high_us:
+                name, nearest_us = f"RC{self.number}_{part}", min(max(value_us, low_us), high_us)
+                raise ValueError(
+                    f"{name} {value_us} is not in {low_us}..{high_us} us: calibrate the radio, or "
+                    f"use --set {name}={nearest_us}"
+                )
+        if self.min_us >= self.max_us:
             raise ValueError(
-                f"RC{self.number}_MIN {self.min_us} and RC{self.number}_MAX {self.max_us} "
-                "must lie in 500..2500 us, in this order"
+                f"RC{self.number}_MIN {self.min_us} is not below RC{self.number}_MAX "
+                f"{self.max_us}: calibrate the radio"
             )
 
     def to_us(self, stick: float, *, centre_us: float) -> int:
@@ -61,41 +76,51 @@ class RcCalibration:
     roll: RcChannel
     throttle_floor_us: int = 0
     """Lowest throttle that is not a radio failsafe (FS_THR_VALUE and a margin)."""
+    _mapping: tuple[tuple[RcChannel, float, float], ...] = field(
+        init=False, repr=False, compare=False
+    )
+    """Channel, sign and centre in us of each stick, in the order of ``Sticks``."""
 
     def __post_init__(self) -> None:
         """Refuse two sticks on one channel."""
         numbers = [channel.number for channel in self.channels]
         if len(set(numbers)) != 4:
-            raise ValueError(f"RCMAP_* puts two sticks on one channel: {numbers}")
-        if self.throttle_floor_us >= self.throttle.max_us:
             raise ValueError(
-                f"FS_THR_VALUE leaves no throttle below RC{self.throttle.number}_MAX "
-                f"{self.throttle.max_us}"
+                f"RCMAP_* puts two sticks on one channel: {numbers}; use --set RCMAP_ROLL=1 and so "
+                "on to give each its own"
             )
+        for channel in self.channels[1:]:
+            if not channel.min_us <= channel.trim_us <= channel.max_us:
+                name, middle_us = f"RC{channel.number}_TRIM", (channel.min_us + channel.max_us) // 2
+                raise ValueError(
+                    f"{name} {channel.trim_us} is not in {channel.min_us}..{channel.max_us} us, "
+                    f"its MIN and MAX: calibrate the radio, or use --set {name}={middle_us}"
+                )
+        # Throttle is a range channel: its centre is the middle, not RCn_TRIM.
+        throttle_us = (self.throttle.min_us + self.throttle.max_us) / 2
+        if self.throttle_floor_us >= throttle_us:
+            raise ValueError(
+                f"FS_THR_VALUE {self.throttle_floor_us - FS_THR_MARGIN_US} makes a failsafe of the "
+                f"throttle's middle, {throttle_us:g} us: use --set FS_THR_VALUE=975"
+            )
+        centres_us = (throttle_us, *(channel.trim_us for channel in self.channels[1:]))
+        mapping = tuple(zip(self.channels, PWM_SIGN, centres_us, strict=True))
+        object.__setattr__(self, "_mapping", mapping)  # once, since each stick needs it
 
     @property
     def channels(self) -> tuple[RcChannel, RcChannel, RcChannel, RcChannel]:
         """Channels in the order of ``Sticks``."""
         return self.throttle, self.yaw, self.pitch, self.roll
 
-    def _mapping(self) -> Iterator[tuple[RcChannel, float, float]]:
-        """Channel, sign and centre in us of each stick, in the order of ``Sticks``.
-
-        Throttle is a range channel: its centre is the middle, not RCn_TRIM.
-        """
-        middle_us = (self.throttle.min_us + self.throttle.max_us) / 2
-        centres_us = (middle_us, *(channel.trim_us for channel in self.channels[1:]))
-        return zip(self.channels, PWM_SIGN, centres_us, strict=True)
-
     def to_pwm_us(self, sticks: Sticks) -> Pwm:
         """PWM of throttle, yaw, pitch, roll, inside the calibrated range."""
         throttle, yaw, pitch, roll = (
             channel.to_us(stick * sign, centre_us=centre_us)
-            for stick, (channel, sign, centre_us) in zip(sticks, self._mapping(), strict=True)
+            for stick, (channel, sign, centre_us) in zip(sticks, self._mapping, strict=True)
         )
         return max(throttle, self.throttle_floor_us), yaw, pitch, roll
 
     def to_sticks(self, pwm_us: Pwm) -> Sticks:
         """Sticks that correspond to these PWM values."""
-        pairs = zip(pwm_us, self._mapping(), strict=True)
+        pairs = zip(pwm_us, self._mapping, strict=True)
         return Sticks(*(c.to_stick(us, centre_us=centre) * sign for us, (c, sign, centre) in pairs))

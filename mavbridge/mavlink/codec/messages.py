@@ -17,27 +17,33 @@ class Heartbeat(NamedTuple):
     autopilot: int
     base_mode: int
     custom_mode: int
+    system_status: int = 0
 
 
 class Attitude(NamedTuple):
     """ATTITUDE_QUATERNION (31) or ATTITUDE (30)."""
 
     is_quaternion: bool
-    boot_ms: int
+    boot_us: int
+    """Vehicle's clock since it started; 0 = the vehicle does not say. Also in the next two."""
     ned_from_body_wxyz: tuple[float, float, float, float]
     rate_body_radps: tuple[float, float, float]
 
 
 class LocalVelocity(NamedTuple):
-    """Velocity of LOCAL_POSITION_NED (32)."""
+    """LOCAL_POSITION_NED (32)."""
 
+    boot_us: int
     velocity_ned_mps: tuple[float, float, float]
+    position_ned_m: tuple[float, float, float] | None = None
+    """From the estimator's origin; None where it is no number."""
 
 
 class SpecificForce(NamedTuple):
     """Accelerometer of HIGHRES_IMU (105), SCALED_IMU (26), SCALED_IMU2 (116) or RAW_IMU (27)."""
 
     message_name: str
+    boot_us: int
     specific_force_body_mps2: tuple[float, float, float]
 
 
@@ -45,6 +51,32 @@ class RcChannels(NamedTuple):
     """RC_CHANNELS (65): the channels that the vehicle acts on, in microseconds; 0 = absent."""
 
     channels_us: tuple[int, ...]
+    boot_us: int = 0
+    """Vehicle's clock since it started."""
+
+
+class SystemStatus(NamedTuple):
+    """SYS_STATUS (1)."""
+
+    present: int
+    """MAV_SYS_STATUS_SENSOR bits of the sensors that it has and uses."""
+    healthy: int
+    battery_percent: int
+    """-1 = not known."""
+
+
+class LandedState(NamedTuple):
+    """EXTENDED_SYS_STATE (245)."""
+
+    landed_state: int
+    """MAV_LANDED_STATE."""
+
+
+class EstimatorFlags(NamedTuple):
+    """EKF_STATUS_REPORT (193, ArduPilot) or ESTIMATOR_STATUS (230, PX4)."""
+
+    flags: int
+    """ESTIMATOR_STATUS_FLAGS; the lowest ten bits mean the same in both."""
 
 
 class CommandAck(NamedTuple):
@@ -80,6 +112,8 @@ class AutopilotVersion(NamedTuple):
     """AUTOPILOT_VERSION (148)."""
 
     version: str
+    unique_id: str = ""
+    """The hardware's own number in hexadecimal digits; empty if it has none."""
 
 
 Body: TypeAlias = (
@@ -88,12 +122,19 @@ Body: TypeAlias = (
     | LocalVelocity
     | SpecificForce
     | RcChannels
+    | SystemStatus
+    | LandedState
+    | EstimatorFlags
     | CommandAck
     | ParamValue
     | StatusText
     | Timesync
     | AutopilotVersion
 )
+
+
+Measurement: TypeAlias = Attitude | LocalVelocity | SpecificForce
+"""Parts of the vehicle's state, each with the vehicle's own stamp."""
 
 
 class ReceivedMessage(NamedTuple):
@@ -120,6 +161,13 @@ class ParamRequest(NamedTuple):
     name: str
 
 
+class ParamWrite(NamedTuple):
+    """PARAM_SET (23) as ArduPilot reads it: the number itself, whatever its type."""
+
+    name: str
+    value: float
+
+
 class StreamRequest(NamedTuple):
     """REQUEST_DATA_STREAM (66), for vehicles without SET_MESSAGE_INTERVAL."""
 
@@ -127,4 +175,4 @@ class StreamRequest(NamedTuple):
     rate_hz: int
 
 
-Request: TypeAlias = CommandRequest | ParamRequest | StreamRequest
+Request: TypeAlias = CommandRequest | ParamRequest | ParamWrite | StreamRequest

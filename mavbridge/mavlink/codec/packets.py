@@ -5,12 +5,13 @@ from collections.abc import Iterator, Sequence
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.vehicle import Sticks
-from mavbridge.mavlink.codec.calibration import Pwm, RcCalibration
+from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
 from mavbridge.mavlink.codec.fast_path import decode_state_packet, pack_override
 from mavbridge.mavlink.codec.messages import (
     CommandRequest,
     Endpoint,
     ParamRequest,
+    ParamWrite,
     ReceivedMessage,
     Request,
     StreamRequest,
@@ -22,8 +23,9 @@ RELEASE_US = 0
 IGNORE_US = 65535
 """RC_CHANNELS_OVERRIDE ch 1-8: leave the channel as it is. Not a release."""
 
-PWM_LIMITS_US = (800, 2200)
-"""Range of a radio. No other value is sent, even if the vehicle's calibration asks for it."""
+_TEXT_BYTES = 50
+"""Text of one STATUSTEXT; a longer one is sent as several with one id."""
+_TEXT_CHUNKS = 4
 
 _PACKET_STARTS = (b"\xfd", b"\xfe")
 """MAVLink 2 and 1."""
@@ -41,6 +43,7 @@ class Codec:
         self._mav = dialect.MAVLink(None, srcSystem=source_system, srcComponent=source_component)
         self._mav.robust_parsing = True
         self.bad_data_count = 0
+        self._text_id = 0
 
     def forget_partial(self) -> None:
         """Drop an unfinished packet: the next bytes do not continue it."""
@@ -139,13 +142,16 @@ class Codec:
         return self._pack(self._mav.manual_control_encode(target_system, x, y, z, r, 0))
 
     def encode_request(self, target: Endpoint, request: Request) -> bytes:
-        """COMMAND_LONG, PARAM_REQUEST_READ or REQUEST_DATA_STREAM."""
+        """COMMAND_LONG, PARAM_REQUEST_READ, PARAM_SET or REQUEST_DATA_STREAM."""
         match request:
             case CommandRequest(command, params):
                 padded = (*params, *(0.0,) * (7 - len(params)))
                 message = self._mav.command_long_encode(*target, command, 0, *padded)
             case ParamRequest(name):
                 message = self._mav.param_request_read_encode(*target, name.encode(), -1)
+            case ParamWrite(name, value):
+                real = dialect.MAV_PARAM_TYPE_REAL32
+                message = self._mav.param_set_encode(*target, name.encode(), value, real)
             case StreamRequest(stream, rate_hz):
                 message = self._mav.request_data_stream_encode(*target, stream, rate_hz, 1)
         return self._pack(message)
@@ -153,6 +159,22 @@ class Codec:
     def encode_timesync(self, ts1: int) -> bytes:
         """TIMESYNC request."""
         return self._pack(self._mav.timesync_encode(0, ts1))
+
+    def encode_statustext(self, severity: int, text: str) -> list[bytes]:
+        """STATUSTEXT, in as many packets as the text needs; cut off after 200 bytes.
+
+        Characters beyond ASCII become question marks, since ground stations differ about them.
+        """
+        data = text.encode("ascii", "replace")[: _TEXT_BYTES * _TEXT_CHUNKS]
+        if len(data) <= _TEXT_BYTES:
+            return [self._pack(self._mav.statustext_encode(severity, data))]
+        self._text_id = self._text_id % 65535 + 1
+        # The last chunk is told by a zero byte, so that a full one needs an empty one behind it.
+        chunks = [data[at : at + _TEXT_BYTES] for at in range(0, len(data) + 1, _TEXT_BYTES)]
+        return [
+            self._pack(self._mav.statustext_encode(severity, chunk, self._text_id, sequence))
+            for sequence, chunk in enumerate(chunks)
+        ]
 
 
 def pwm_of(sticks: Sticks, calibration: RcCalibration) -> Pwm:

@@ -11,12 +11,15 @@ from mavbridge.mavlink.codec.messages import (
     Body,
     CommandAck,
     Endpoint,
+    EstimatorFlags,
     Heartbeat,
+    LandedState,
     LocalVelocity,
     ParamValue,
     RcChannels,
     SpecificForce,
     StatusText,
+    SystemStatus,
     Timesync,
 )
 
@@ -37,7 +40,7 @@ def _require_finite(*values: float) -> None:
 
 
 def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
-    return Heartbeat(m.type, m.autopilot, m.base_mode, m.custom_mode)
+    return Heartbeat(m.type, m.autopilot, m.base_mode, m.custom_mode, m.system_status)
 
 
 def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body:
@@ -46,14 +49,14 @@ def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body
     _require_finite(*quaternion, *rate)
     if not 0.9 < math.hypot(*quaternion) < 1.1:
         raise UnusableError
-    return Attitude(True, m.time_boot_ms, quaternion, rate)
+    return Attitude(True, 1000 * m.time_boot_ms, quaternion, rate)
 
 
 def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
     rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
     _require_finite(m.roll, m.pitch, m.yaw, *rate)
     quaternion = _quaternion_from_euler(m.roll, m.pitch, m.yaw)
-    return Attitude(False, m.time_boot_ms, quaternion, rate)
+    return Attitude(False, 1000 * m.time_boot_ms, quaternion, rate)
 
 
 def _quaternion_from_euler(
@@ -73,24 +76,42 @@ def _quaternion_from_euler(
 
 def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:
     _require_finite(m.vx, m.vy, m.vz)
-    return LocalVelocity(velocity_ned_mps=(m.vx, m.vy, m.vz))
+    position = (m.x, m.y, m.z)
+    is_position = math.isfinite(sum(position))
+    velocity = (m.vx, m.vy, m.vz)
+    return LocalVelocity(1000 * m.time_boot_ms, velocity, position if is_position else None)
 
 
 def _highres_imu(m: dialect.MAVLink_highres_imu_message) -> Body:
     _require_finite(m.xacc, m.yacc, m.zacc)
     if m.fields_updated & _HIGHRES_ACCEL_FIELDS != _HIGHRES_ACCEL_FIELDS:
         raise UnusableError
-    return SpecificForce("HIGHRES_IMU", (m.xacc, m.yacc, m.zacc))
+    return SpecificForce("HIGHRES_IMU", m.time_usec, (m.xacc, m.yacc, m.zacc))
 
 
-def _milli_g_imu(m: dialect.MAVLink_scaled_imu_message) -> Body:
+def _raw_imu(m: dialect.MAVLink_raw_imu_message) -> Body:
+    return _milli_g_imu(m, m.time_usec)
+
+
+def _scaled_imu(m: dialect.MAVLink_scaled_imu_message) -> Body:
+    return _milli_g_imu(m, 1000 * m.time_boot_ms)
+
+
+def _milli_g_imu(
+    m: dialect.MAVLink_raw_imu_message | dialect.MAVLink_scaled_imu_message, boot_us: int
+) -> Body:
     x, y, z = (value * MG_TO_MPS2 for value in (m.xacc, m.yacc, m.zacc))
-    return SpecificForce(m.get_type(), (x, y, z))
+    return SpecificForce(m.get_type(), boot_us, (x, y, z))
 
 
 def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
     values = (getattr(m, f"chan{number}_raw") for number in range(1, 19))
-    return RcChannels(channels_us=tuple(values)[: m.chancount or 18])
+    return RcChannels(tuple(values)[: m.chancount or 18], 1000 * m.time_boot_ms)
+
+
+def _sys_status(m: dialect.MAVLink_sys_status_message) -> Body:
+    present = m.onboard_control_sensors_present & m.onboard_control_sensors_enabled
+    return SystemStatus(present, m.onboard_control_sensors_health, m.battery_remaining)
 
 
 def _command_ack(m: dialect.MAVLink_command_ack_message) -> Body:
@@ -105,7 +126,9 @@ def _param_value(m: dialect.MAVLink_param_value_message) -> Body:
 
 def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
     v = m.flight_sw_version
-    return AutopilotVersion(version=f"{v >> 24 & 255}.{v >> 16 & 255}.{v >> 8 & 255}")
+    version = f"{v >> 24 & 255}.{v >> 16 & 255}.{v >> 8 & 255}"
+    number = bytes(m.uid2).rstrip(b"\0").hex() or (f"{m.uid:x}" if m.uid else "")
+    return AutopilotVersion(version=version, unique_id=number)
 
 
 READERS: dict[str, Callable[[dialect.MAVLink_message], Body]] = {
@@ -114,10 +137,14 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body]] = {
     "ATTITUDE_QUATERNION": _attitude_quaternion,
     "LOCAL_POSITION_NED": _local_position,
     "HIGHRES_IMU": _highres_imu,
-    "SCALED_IMU": _milli_g_imu,
-    "SCALED_IMU2": _milli_g_imu,
-    "RAW_IMU": _milli_g_imu,
+    "SCALED_IMU": _scaled_imu,
+    "SCALED_IMU2": _scaled_imu,
+    "RAW_IMU": _raw_imu,
     "RC_CHANNELS": _rc_channels,
+    "SYS_STATUS": _sys_status,
+    "EXTENDED_SYS_STATE": lambda m: LandedState(m.landed_state),
+    "EKF_STATUS_REPORT": lambda m: EstimatorFlags(m.flags),
+    "ESTIMATOR_STATUS": lambda m: EstimatorFlags(m.flags),
     "COMMAND_ACK": _command_ack,
     "PARAM_VALUE": _param_value,
     "STATUSTEXT": lambda m: StatusText(text=m.text),

@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import LinkStats
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 
@@ -27,6 +27,11 @@ class LinkCounters:
         self._first_ns = arrived_ns if self._first_ns is None else self._first_ns
         self._last_ns = arrived_ns
 
+    @property
+    def heard_ns(self) -> int:
+        """Arrival of the newest message; 0 before the first."""
+        return self._last_ns
+
     def new_sequence(self) -> None:
         """Expect any sequence number next: the sender has restarted."""
         self._last_sequence = None
@@ -37,6 +42,7 @@ class LinkCounters:
         """The totals so far."""
         received = self._by_name.total()
         span_ns = self._last_ns - (self._first_ns or 0)
+        error_ns = timesync.error_ns(self._last_ns)
         return LinkStats(
             messages_per_s=tuple(
                 (name, count * NS_PER_S / span_ns)
@@ -49,4 +55,6 @@ class LinkCounters:
             echo_confirmed=echo_confirmed if self.sent else None,
             unusable_packets=unusable_packets,
             vehicle_clock_offset_ns=timesync.offset_ns,
+            is_timesync_good=timesync.is_good,
+            timesync_error_ms=None if error_ns is None else error_ns / NS_PER_MS,
         )

@@ -22,17 +22,38 @@ class StreamGroup(NamedTuple):
     messages: tuple[str, ...]
     stream: int
     rate_hz: float
+    is_optional: bool = False
+    """Nothing waits for it: a vehicle that does not grant it is flown without."""
 
 
-def telemetry_streams(*, state_hz: float, rc_hz: float) -> tuple[StreamGroup, ...]:
-    """The telemetry that the bridge needs."""
+RC_CHANNELS_HZ = 1000 / 17
+"""RC_CHANNELS for the echo check, which needs 20 Hz or more: every 17 ms (ArduPilot counts in whole
+ms), so that no usual rate of a joystick (10, 20, 25, 50 Hz) is in step with it and stays unseen
+between two samples. Costs 3.2 kB/s."""
+LANDED_HZ, ESTIMATOR_HZ, SYSTEM_HZ = 5.0, 5.0, 2.0
+HEARTBEAT_HZ = 10.0
+"""Shows arming and a change of mode within 100 ms where one packet is lost (at 1 Hz within 1 s).
+ArduPilot grants it, PX4 does not."""
+
+
+def telemetry_streams(*, state_hz: float, is_px4: bool) -> tuple[StreamGroup, ...]:
+    """The telemetry that the bridge needs, then what it also watches."""
     attitude, imu = ("ATTITUDE_QUATERNION", "ATTITUDE"), ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
     return (
         StreamGroup(attitude, dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
         StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
         StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
-        StreamGroup(("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, rc_hz),
+        StreamGroup(("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, RC_CHANNELS_HZ),
+        _optional("SYS_STATUS", SYSTEM_HZ),
+        _optional("EXTENDED_SYS_STATE", LANDED_HZ),
+        _optional("ESTIMATOR_STATUS" if is_px4 else "EKF_STATUS_REPORT", ESTIMATOR_HZ),
+        *(() if is_px4 else (_optional("HEARTBEAT", HEARTBEAT_HZ),)),
     )
+
+
+def _optional(message: str, rate_hz: float) -> StreamGroup:
+    """Group of one message; its legacy stream, which would also set other messages, is not used."""
+    return StreamGroup((message,), 0, rate_hz, is_optional=True)
 
 
 class _Stream:
@@ -43,6 +64,8 @@ class _Stream:
         self.rate_hz = group.rate_hz
         self.attempts = 0
         self.is_settled = False
+        self.is_given_up = False
+        """An optional group that the vehicle does not grant."""
         self.received = 0
         self._choice = 0
 
@@ -60,6 +83,9 @@ class _Stream:
     def refuse(self) -> None:
         """Half the rate, then the next message: "denied" may mean too fast or unknown."""
         self.attempts = 0
+        if self.group.is_optional:
+            self._give_up()
+            return
         if self.rate_hz / 2 >= _LOWEST_HZ:
             self.rate_hz /= 2
             return
@@ -70,6 +96,11 @@ class _Stream:
         """The vehicle does not answer SET_MESSAGE_INTERVAL."""
         self.attempts = 0
         self._choice = len(self.group.messages)
+        if self.group.is_optional:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        self.is_settled = self.is_given_up = True
 
 
 def message_id(name: str) -> int:
@@ -94,8 +125,8 @@ class StreamRequester:
 
     @property
     def is_settled(self) -> bool:
-        """Every group is granted."""
-        return all(stream.is_settled for stream in self._streams)
+        """Every group that is needed is granted."""
+        return all(stream.is_settled or stream.group.is_optional for stream in self._streams)
 
     def receive(self, name: str) -> None:
         """Count one message."""
@@ -106,9 +137,11 @@ class StreamRequester:
         """Take the vehicle's answer to the open request."""
         if self._pending is None or ack.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             return
+        if ack.result in _UNDECIDED:
+            return  # asked again as if there were no answer
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
             self._pending.accept()
-        elif ack.result not in _UNDECIDED:
+        else:
             self._pending.refuse()
         self._pending = None
 
@@ -139,9 +172,10 @@ class StreamRequester:
                 return
             span_s = (now_ns - self._window_ns) / NS_PER_S
             for stream in self._streams:
-                if stream.received < _ENOUGH * stream.rate_hz * span_s:
+                is_slow = stream.received < _ENOUGH * stream.rate_hz * span_s
+                if is_slow and not stream.is_given_up:
                     stream.is_settled = False
-                    self.renewals += 1
+                    self.renewals += not stream.group.is_optional
         self._window_ns = now_ns
         for stream in self._streams:
             stream.received = 0

@@ -2,59 +2,86 @@
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Reading, Telemetry
-from mavbridge.mavlink.codec.messages import Attitude, LocalVelocity, SpecificForce
+from mavbridge.mavlink.codec.messages import Attitude, LocalVelocity, Measurement
 
 _YIELD_NS = 300 * NS_PER_MS
 """Silence after which a better message gives way to a worse one."""
+_RESTART_STEP_US = 1_000_000
+_RESTART_STAMPS = 2
+"""One stamp from long ago may be a late datagram; two in a row are a clock that has restarted."""
 
 _FORCE_RANK = {"HIGHRES_IMU": 0, "RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2}
 """Float m/s^2 first, then the first IMU in milli-g, then the second."""
 
 
-class _BestReading:
-    """Readings of one quantity; a worse message never replaces a better one that still comes."""
+class _Filter:
+    """Decides which messages of one quantity are taken.
+
+    A worse message never replaces a better one that still comes, nor a datagram that is late or
+    doubled the one that overtook it: the vehicle's own stamps decide.
+    """
 
     def __init__(self) -> None:
         self._rank = 0
-        self.newest: Reading | None = None
+        self._arrived_ns: int | None = None
+        self._happened_ns = 0
+        self._boot_us = 0
+        self._old_stamps = 0
 
-    def offer(self, rank: int, reading: Reading) -> None:
-        """Take a reading; a lower rank is better."""
-        held = self.newest
-        if held is None or rank <= self._rank or reading.arrived_ns - held.arrived_ns > _YIELD_NS:
-            self._rank, self.newest = rank, reading
+    def delay_ns(self, rank: int, boot_us: int, arrived_ns: int, happened_ns: int) -> int | None:
+        """Delay of a message that is taken, or None; a lower rank is better."""
+        if self._arrived_ns is not None:
+            if rank > self._rank and arrived_ns - self._arrived_ns <= _YIELD_NS:
+                return None
+            if 0 < boot_us <= self._boot_us:
+                is_far_back = boot_us + _RESTART_STEP_US < self._boot_us
+                self._old_stamps = self._old_stamps + 1 if is_far_back else 0
+                if self._old_stamps < _RESTART_STAMPS:
+                    return None
+            if happened_ns < self._happened_ns:
+                # By a better offset of the clocks; but what is newer happened later.
+                happened_ns = self._happened_ns
+        self._rank, self._boot_us, self._old_stamps = rank, boot_us, 0
+        self._arrived_ns = arrived_ns
+        self._happened_ns = happened_ns if happened_ns < arrived_ns else arrived_ns
+        return arrived_ns - self._happened_ns
 
 
 class TelemetryCollector:
     """Joins messages into one ``Telemetry``."""
 
     def __init__(self) -> None:
-        self._attitude, self._rate, self._force = _BestReading(), _BestReading(), _BestReading()
+        self._attitude_filter, self._velocity_filter = _Filter(), _Filter()
+        self._force_filter = _Filter()
+        self._attitude: Reading | None = None
+        self._rate: Reading | None = None
         self._velocity: Reading | None = None
+        self._force: Reading | None = None
 
-    def receive(self, body: Attitude | LocalVelocity | SpecificForce, arrived_ns: int) -> None:
-        """Take a message."""
-        match body:
-            case Attitude():
-                rank = 0 if body.is_quaternion else 1
-                self._attitude.offer(rank, Reading(arrived_ns, body.ned_from_body_wxyz))
-                self._rate.offer(rank, Reading(arrived_ns, body.rate_body_radps))
-            case LocalVelocity():
-                self._velocity = Reading(arrived_ns, body.velocity_ned_mps)
-            case SpecificForce():
-                reading = Reading(arrived_ns, body.specific_force_body_mps2)
-                self._force.offer(_FORCE_RANK[body.message_name], reading)
-
-    @property
-    def attitude_ns(self) -> int:
-        """Arrival of the newest attitude; 0 before the first."""
-        return self._attitude.newest.arrived_ns if self._attitude.newest else 0
+    def receive(self, body: Measurement, arrived_ns: int, happened_ns: int) -> None:
+        """Take a message, with its arrival and the time that it tells about."""
+        boot_us = body.boot_us
+        if isinstance(body, Attitude):
+            rank = 0 if body.is_quaternion else 1
+            delay_ns = self._attitude_filter.delay_ns(rank, boot_us, arrived_ns, happened_ns)
+            if delay_ns is not None:
+                self._attitude = Reading(arrived_ns, body.ned_from_body_wxyz, delay_ns)
+                self._rate = Reading(arrived_ns, body.rate_body_radps, delay_ns)
+        elif isinstance(body, LocalVelocity):
+            delay_ns = self._velocity_filter.delay_ns(0, boot_us, arrived_ns, happened_ns)
+            if delay_ns is not None:
+                self._velocity = Reading(arrived_ns, body.velocity_ned_mps, delay_ns)
+        else:
+            rank = _FORCE_RANK[body.message_name]
+            delay_ns = self._force_filter.delay_ns(rank, boot_us, arrived_ns, happened_ns)
+            if delay_ns is not None:
+                self._force = Reading(arrived_ns, body.specific_force_body_mps2, delay_ns)
 
     def snapshot(self) -> Telemetry:
         """The newest reading of each quantity."""
         return Telemetry(
-            ned_from_body_wxyz=self._attitude.newest,
-            rate_body_radps=self._rate.newest,
+            ned_from_body_wxyz=self._attitude,
+            rate_body_radps=self._rate,
             velocity_ned_mps=self._velocity,
-            specific_force_body_mps2=self._force.newest,
+            specific_force_body_mps2=self._force,
         )

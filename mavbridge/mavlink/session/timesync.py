@@ -1,19 +1,43 @@
-"""Offset between the vehicle's clock and ours, by TIMESYNC."""
+"""Offset between the vehicle's clock and ours, by TIMESYNC, and when things happened by it."""
 
 from collections import deque
+from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.histogram import Histogram
 from mavbridge.mavlink.codec.messages import Timesync
 
-TIMESYNC_HZ = 2.0
-"""TIMESYNC requests; the minimum-delay filter wants a few a second."""
-_WINDOW = 20
-_OUTSTANDING = 8
+TIMESYNC_HZ = 5.0
+"""TIMESYNC requests: the offset is good a second after the first, and a step is seen in 0.2 s."""
+GOOD_EXCHANGES = 5
+"""Exchanges that must agree before the vehicle's stamps are trusted."""
+LONGEST_ROUND_TRIP_NS = 2 * NS_PER_S
+"""Slower exchanges say too little about the offset; a link this slow loses its heartbeats."""
+LONGEST_DELAY_NS = 30 * NS_PER_S
+"""A stamp that seems older than this at its arrival is of another clock, for example Unix time."""
+_OUTSTANDING = 16
+_DRIFT_PER = 10_000
+"""Clocks may drift apart by 1 in 10,000: crystals of autopilots and computers are within half."""
+_UNSTEADY_PER = 200
+"""A clock that is off by more than 1 in 200 has stepped, or does not run evenly."""
+
+
+class _Exchange(NamedTuple):
+    at_ns: int
+    offset_ns: int
+    """Vehicle's clock minus ours, if both ways took equally long."""
+    error_ns: int
+    """Half of the round trip: the most by which the offset may be wrong."""
 
 
 class TimesyncFilter:
-    """Keeps the offset of the fastest recent exchange, which was queued for the shortest time.
+    """Keeps the exchange that tells most about the offset.
+
+    A request and its answer that together take t give the offset within t / 2, whichever way was
+    the slower one. So the fastest exchange is kept, however long ago it was, until the drift that
+    clocks may have makes a newer one as good: a delay that begins in flight does not move the
+    offset, and shows as age. An exchange that contradicts the kept one shows that the vehicle's
+    clock has stepped or drifts, and takes its place.
 
     Only answers to our own outstanding requests count: replies are broadcast, and those to another
     station would look like absurd round trips.
@@ -21,9 +45,15 @@ class TimesyncFilter:
 
     def __init__(self) -> None:
         self._outstanding: deque[int] = deque(maxlen=_OUTSTANDING)
-        self._samples: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
+        self._best: _Exchange | None = None
+        self._agreeing = 0
         self._next_ns = 0
         self.round_trips = Histogram()
+
+    def restart(self) -> None:
+        """Forget the offset: the vehicle has rebooted, or is another one."""
+        self._outstanding.clear()
+        self._best, self._agreeing = None, 0
 
     def request(self, now_ns: int) -> int | None:
         """The ts1 of the request that is due, if any."""
@@ -39,11 +69,47 @@ class TimesyncFilter:
             return
         self._outstanding.remove(reply.ts1)
         round_trip_ns = arrived_ns - reply.ts1
-        if 0 <= round_trip_ns < NS_PER_S:
-            self._samples.append((round_trip_ns, reply.tc1 - (reply.ts1 + arrived_ns) // 2))
-            self.round_trips.add(round_trip_ns)
+        if not 0 <= round_trip_ns < LONGEST_ROUND_TRIP_NS:
+            return
+        self.round_trips.add(round_trip_ns)
+        offset_ns = reply.tc1 - (reply.ts1 + arrived_ns) // 2
+        new, best = _Exchange(arrived_ns, offset_ns, round_trip_ns // 2), self._best
+        if best is None:
+            self._best = new
+        else:
+            known_ns = self._error_ns(best, arrived_ns)
+            apart_ns = abs(offset_ns - best.offset_ns) - known_ns - new.error_ns
+            if apart_ns * _UNSTEADY_PER > arrived_ns - best.at_ns:
+                self._agreeing = 0
+            if apart_ns > 0 or new.error_ns <= known_ns:
+                self._best = new
+        self._agreeing += 1
+
+    def _error_ns(self, exchange: _Exchange, now_ns: int) -> int:
+        return exchange.error_ns + (now_ns - exchange.at_ns) // _DRIFT_PER
 
     @property
     def offset_ns(self) -> int | None:
         """Vehicle clock minus ours; None before the first exchange."""
-        return min(self._samples)[1] if self._samples else None
+        return None if self._best is None else self._best.offset_ns
+
+    def error_ns(self, now_ns: int) -> int | None:
+        """The most by which the offset may be wrong; None before the first exchange."""
+        return None if self._best is None else self._error_ns(self._best, now_ns)
+
+    @property
+    def is_good(self) -> bool:
+        """Enough exchanges agree: the vehicle's stamps are trusted."""
+        return self._agreeing >= GOOD_EXCHANGES
+
+    def happened_ns(self, boot_us: int, arrived_ns: int) -> int:
+        """Our time of something that the vehicle stamped ``boot_us`` after its start.
+
+        The arrival where the vehicle's stamp says nothing: it is missing (0), the offset is not
+        good yet, or it is a stamp of another clock. Never later than the arrival.
+        """
+        if self._best is None or not boot_us or self._agreeing < GOOD_EXCHANGES:
+            return arrived_ns
+        happened_ns = 1000 * boot_us - self._best.offset_ns
+        is_plausible = 0 <= arrived_ns - happened_ns <= LONGEST_DELAY_NS
+        return happened_ns if is_plausible else arrived_ns

@@ -4,8 +4,8 @@ A state machine without I/O. The link steps it at every tick, so connecting, rec
 rebooted vehicle are all handled alike, and the action loop never waits for any of them.
 """
 
-from collections.abc import Callable, Iterator
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -18,34 +18,49 @@ from mavbridge.mavlink.codec.messages import (
     AutopilotVersion,
     CommandAck,
     CommandRequest,
+    EstimatorFlags,
     Heartbeat,
+    LandedState,
     LocalVelocity,
     ParamValue,
     RcChannels,
     ReceivedMessage,
     Request,
-    SpecificForce,
     StatusText,
+    SystemStatus,
 )
-from mavbridge.mavlink.session import params
+from mavbridge.mavlink.session.condition import ConditionMessage, VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
-from mavbridge.mavlink.session.echo import EchoCheck
-from mavbridge.mavlink.session.modes import ModeTable
+from mavbridge.mavlink.session.echo import EchoCheck, EchoFault
+from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 from mavbridge.mavlink.session.streams import StreamRequester, message_id, telemetry_streams
-from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.settings import LinkSettings
 
-RC_CHANNELS_HZ = 20.0
-"""RC_CHANNELS for the echo check and the pilot's sticks; the check needs 10 Hz or more."""
+RECEIVER_WAIT_NS = 2 * NS_PER_S
+"""Longest wait, once streams are granted, for RC_CHANNELS and SYS_STATUS to show a receiver:
+SYS_STATUS comes at 2 Hz, and PX4 sends RC_CHANNELS only if it has one."""
 HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
 """Heartbeats come at 1 Hz: a vehicle that loses three in a row is lost."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
-_VERSION_ATTEMPTS = 4
+_VERSION_ATTEMPTS = 8
+"""Its unique id names the file of remembered parameters: worth more than one lost packet."""
 _REBOOT_STEP_MS = 1000
 _REBOOT_STAMPS = 2
 """One old stamp may be a delayed datagram; two in a row are a clock that has restarted."""
-_SWITCH_ON_US = 1800
-"""ArduPilot's threshold of a high auxiliary switch."""
+_SWITCH_ON_US, _SWITCH_OFF_US = 1800, 1200
+"""ArduPilot's thresholds of a high and a low auxiliary switch; between them nothing changes."""
+_MULTIROTORS = (
+    *(dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_HEXAROTOR, dialect.MAV_TYPE_OCTOROTOR),
+    *(dialect.MAV_TYPE_TRICOPTER, dialect.MAV_TYPE_COAXIAL),
+    *(dialect.MAV_TYPE_DECAROTOR, dialect.MAV_TYPE_DODECAROTOR),
+)
+_ECHO_FAULTS: dict[EchoFault, str] = {
+    "unseen": "another station may be overriding them, or the receiver has priority",
+    "foreign": "another station is overriding them (a joystick on our system id?)",
+    "returned": "it also acts on the sticks that it had before us: another station is overriding "
+    "or releasing them, or the override switch is off",
+    "silent": "its sticks have stood still for 0.4 s while ours moved",
+}
 
 
 class VehicleSession:
@@ -65,7 +80,7 @@ class VehicleSession:
         *,
         report: Callable[[str], None],
     ) -> None:
-        self._source_system = config.source_system
+        _require_multirotor(identity.vehicle_type)
         self._is_override = config.output == "rc-override"
         if self._is_override and identity.autopilot == "px4":
             raise PeerError(
@@ -75,23 +90,21 @@ class VehicleSession:
             raise PeerError("ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override")
         self.identity = identity
         self._report = report
-        self.modes = ModeTable(autopilot=identity.autopilot, vehicle_type=identity.vehicle_type)
-        self.telemetry = TelemetryCollector()
+        self.condition = VehicleCondition(
+            autopilot=identity.autopilot, min_battery_percent=config.min_battery_percent
+        )
         self.echo = EchoCheck()
-        self.calibration: RcCalibration | None = None
         self.version: str | None = None
+        self._unique_id = ""
         self._version_attempts = 0
         self._version_due_ns = 0
-        self._params = params.ParamReader(params.FIRST_NAMES if self._is_override else ())
-        self._is_reading_channels = False
-        self._streams = StreamRequester(
-            telemetry_streams(state_hz=config.state_hz, rc_hz=RC_CHANNELS_HZ)
-        )
-        self._has_advised = False
-        self._status: VehicleStatus | None = None
-        """None after a message that may have changed it."""
-        self._heartbeat: tuple[int, Heartbeat] | None = None
-        self._rc: tuple[int, RcChannels] | None = None
+        streams = telemetry_streams(state_hz=config.state_hz, is_px4=identity.autopilot == "px4")
+        self._streams = StreamRequester(streams)
+        self._params = VehicleParams(identity, config, streams=streams, report=report)
+        self._receiver_due_ns: int | None = None
+        """End of the wait for a receiver to show; None until the streams are granted."""
+        self._is_switch_on = False
+        """Override switch; between high and low it stays as it was, as in the vehicle."""
         self._boot_ms = 0
         self._old_stamps = 0
 
@@ -104,28 +117,48 @@ class VehicleSession:
         """Take one message from this vehicle."""
         self._streams.receive(message.name)
         match message.body:
-            case Attitude() | LocalVelocity() | SpecificForce() as body:
-                if isinstance(body, Attitude):
-                    self._watch_boot(body.boot_ms)
-                self.telemetry.receive(body, arrived_ns)
+            case Attitude() as body:
+                self._watch_boot(body.boot_us // 1000)
+            case (
+                Heartbeat() | SystemStatus() | LandedState() | EstimatorFlags() | LocalVelocity()
+            ) as body:
+                self._receive_condition(body, arrived_ns)
             case RcChannels() as body:
-                self._status = None
-                self._rc = (arrived_ns, body)
-                if (pwm_us := self._stick_channels_us(body)) is not None:
-                    self.echo.received(pwm_us, arrived_ns)
-            case Heartbeat() as body:
-                self._status = None
-                self._heartbeat = (arrived_ns, body)
+                self._receive_rc(body, arrived_ns)
             case CommandAck() as body:
                 self._streams.receive_ack(body)
             case ParamValue() as body:
-                self._params.receive(body)
-            case AutopilotVersion(version):
-                self.version = version
+                self._params.receive(body, self.status(arrived_ns))
+            case AutopilotVersion(version, unique_id):
+                self.version, self._unique_id = version, unique_id
             case StatusText(text):
                 self._report(f"vehicle: {text}")
             case _:
                 pass  # handled by the link, or not used
+
+    def _receive_condition(self, body: ConditionMessage, arrived_ns: int) -> None:
+        self.condition.receive(body, arrived_ns, may_be_ours=self.echo.has_sent)
+
+    def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
+        pwm_us = self._stick_channels_us(rc)
+        if pwm_us is not None:
+            self.echo.received(pwm_us, rc.boot_us, arrived_ns)
+        self.condition.receive_rc(
+            rc,
+            arrived_ns,
+            # Without a calibration (PX4) the sticks are among the first four by custom.
+            channels_us=rc.channels_us[:4] if pwm_us is None else pwm_us,
+            sticks=self.calibration.to_sticks(pwm_us)
+            if self.calibration and pwm_us and all(pwm_us)
+            else None,
+            may_be_ours=self.echo.has_sent,
+            is_released=self.echo.is_released and not self.echo.is_sending,
+        )
+        if (switch := self._params.override_switch) is not None:
+            switch_us = self._switch_us(switch)
+            self._is_switch_on = switch_us >= _SWITCH_ON_US or (
+                self._is_switch_on and not 0 < switch_us < _SWITCH_OFF_US
+            )
 
     def _watch_boot(self, boot_ms: int) -> None:
         if boot_ms + _REBOOT_STEP_MS < self._boot_ms:
@@ -141,11 +174,7 @@ class VehicleSession:
         return t, y, p, r
 
     def step(self, now_ns: int) -> Iterator[Request]:
-        """Requests that are due.
-
-        Raises:
-            PeerError: the vehicle cannot be flown with its present parameters.
-        """
+        """Requests that are due."""
         is_version_open = self.version is None and self._version_attempts < _VERSION_ATTEMPTS
         if is_version_open and now_ns >= self._version_due_ns:
             self._version_due_ns = now_ns + _VERSION_TIMEOUT_NS
@@ -153,85 +182,125 @@ class VehicleSession:
             number = float(message_id("AUTOPILOT_VERSION"))
             yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
         # Streams come after parameters: a vehicle slows its streams down while it sends those.
-        if self._is_override and self.calibration is None:
-            yield from self._params.step(now_ns)
-            self._advance_params()
-        elif (request := self._streams.step(now_ns)) is not None:
-            yield request
-        if not self._has_advised and self._unfinished() is None:
-            self._has_advised = True
-            for advice in params.override_advice(self._params.values):
-                self._report(advice)
-
-    def _advance_params(self) -> None:
-        if not self._params.is_done:
+        unique_id = None if is_version_open else self._unique_id
+        yield from self._params.step(now_ns, self.status(now_ns), unique_id=unique_id)
+        if not self._params.is_read:
             return
-        if self._is_reading_channels:
-            self.calibration = params.calibration(self._params.values)
-        else:
-            self._is_reading_channels = True
-            self._params.request(params.calibration_names(self._params.values))
+        if (request := self._streams.step(now_ns)) is not None:
+            yield request
+        if self._receiver_due_ns is None and self._streams.is_settled:
+            self._receiver_due_ns = now_ns + RECEIVER_WAIT_NS
 
-    def _unfinished(self) -> str | None:
+    # --- parameters
+
+    @property
+    def calibration(self) -> RcCalibration | None:
+        """The radio calibration to fly with; None before it is read, or if it cannot be used."""
+        return self._params.calibration
+
+    @property
+    def known_params(self) -> Mapping[str, float]:
+        """All parameters that matter and that the vehicle has sent, by name."""
+        return self._params.values
+
+    @property
+    def param_interruption(self) -> str | None:
+        """A change of a parameter in flight that ends every engagement so far; stays once set."""
+        return self._params.interruption
+
+    def begin_restore(self) -> None:
+        """Begin to put back the parameters that were set for the flight; ``step`` does it."""
+        self._params.begin_restore()
+
+    @property
+    def is_restored(self) -> bool:
+        """Nothing is left to put back, or no more can be done about it now."""
+        return self._params.is_restored
+
+    def _unfinished(self, now_ns: int) -> str | None:
         """The step of the set-up that is not finished, or None."""
-        if self._is_override and self.calibration is None:
-            return "reading the vehicle's radio calibration"
+        if not self._params.is_read:
+            return "reading the vehicle's parameters"
         if not self._streams.is_settled and self._streams.renewals == 0:
             return "requesting telemetry from the vehicle"
+        if not self._is_receiver_settled(now_ns):
+            return "looking for the pilot's radio receiver"
         return None
 
-    def status(self) -> VehicleStatus | None:
+    def _is_receiver_settled(self, now_ns: int) -> bool:
+        """Everything that tells of a receiver has come, or was waited for."""
+        due_ns = self._receiver_due_ns
+        return self.condition.has_seen_radio or (due_ns is not None and now_ns >= due_ns)
+
+    def status(self, now_ns: int) -> VehicleStatus | None:
         """The vehicle's own report; None before its first heartbeat."""
-        if self._status is None and self._heartbeat is not None:
-            heartbeat = self._heartbeat[1]
-            rc_ns, rc = self._rc or (None, RcChannels(()))
-            pwm_us, rc_sticks = self._stick_channels_us(rc), None
-            if self.calibration and pwm_us and all(pwm_us):
-                rc_sticks = self.calibration.to_sticks(pwm_us)
-            self._status = VehicleStatus(
-                mode=self.modes.name(heartbeat.custom_mode),
-                armed=bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED),
-                rc_sticks=rc_sticks,
-                rc_channels_us=rc.channels_us,
-                rc_arrived_ns=rc_ns,
-            )
-        return self._status
+        status = self.condition.status(now_ns)
+        is_absent = status is not None and status.has_receiver is None and not self._is_override
+        if status is not None and is_absent and self._is_receiver_settled(now_ns):
+            return replace(status, has_receiver=False)
+        return status
 
     def problem(self, now_ns: int) -> str | None:
         """The reason why it cannot be flown now, or None."""
-        if self._heartbeat is None:
+        if self.condition.heartbeat is None:
             return "waiting for the vehicle's heartbeat"
-        if now_ns - self._heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
+        if now_ns - self.condition.heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
             return "the vehicle's heartbeat is lost"
-        if (unfinished := self._unfinished()) is not None or not self._is_override:
+        if (unfinished := self._unfinished(now_ns)) is not None:
             return unfinished
-        obstacles, switch = self._override_check
-        if obstacles:
-            return f"the vehicle would ignore our sticks: {obstacles}"
-        if switch is not None:
-            channels_us = self._rc[1].channels_us if self._rc else ()
-            if len(channels_us) < switch or channels_us[switch - 1] < _SWITCH_ON_US:
-                return f"the override switch (RC{switch}) is off: switch it on to fly"
+        if (forbidden := self._params.problem(self.status(now_ns))) is not None:
+            return forbidden
+        switch = self._params.override_switch
+        if switch is not None and not self._is_switch_on:
+            return f"the override switch (RC{switch}) is off: switch it on to fly"
         return None
 
-    @cached_property
-    def _override_check(self) -> tuple[str, int | None]:
-        """Obstacles to overriding (empty = none), and the channel of the override switch."""
-        values = self._params.values
-        obstacles = params.override_obstacles(values, self._source_system)
-        return "; ".join(obstacles), params.override_switch(values)
+    def _switch_us(self, number: int) -> int:
+        """An auxiliary channel in us; 0 = not known."""
+        channels_us = self.condition.rc[1].channels_us if self.condition.rc else ()
+        return channels_us[number - 1] if len(channels_us) >= number else 0
+
+    @property
+    def is_switched_off(self) -> bool:
+        """The pilot's override switch is low: the vehicle ignores our sticks."""
+        switch = self._params.override_switch
+        return switch is not None and 0 < self._switch_us(switch) < _SWITCH_OFF_US
 
     def overruled(self, now_ns: int) -> str | None:
-        """The likely reason why it ignores the sticks that we send, or None."""
-        if not self.echo.failed(now_ns):
+        """The likely reason why it follows other sticks than those that we send, or None."""
+        fault = self.echo.fault(now_ns)
+        if fault is None or fault == "silent" or self._is_rc_silent(now_ns):
             return None
-        if self._rc is None or now_ns - self._rc[0] > NS_PER_S:
-            reason = "no RC_CHANNELS arrive to check against"
-        else:
-            reason = "another station may be overriding them, or the receiver has priority"
-        return f"the vehicle ignores our sticks: {reason}"
+        return f"the vehicle ignores our sticks: {_ECHO_FAULTS[fault]}"
+
+    def unheard(self, now_ns: int) -> str | None:
+        """The reason why our sticks do not reach it, as far as can be told, or None."""
+        fault = self.echo.fault(now_ns)
+        if fault is not None and self._is_rc_silent(now_ns):
+            return "no RC_CHANNELS arrive to check our sticks against"
+        if fault == "silent":
+            return f"the vehicle does not hear our sticks: {_ECHO_FAULTS[fault]}"
+        return None
+
+    def _is_rc_silent(self, now_ns: int) -> bool:
+        rc = self.condition.rc
+        return rc is None or now_ns - rc[0] > NS_PER_S
 
     @property
     def echo_confirmed(self) -> bool:
         """It was seen to act on our sticks, or its output has no echo to check."""
         return not self._is_override or self.echo.confirmed
+
+    @property
+    def is_released(self) -> bool:
+        """It was seen to act on other sticks than ours since the release, or has none of ours."""
+        return self.echo.is_released
+
+
+def _require_multirotor(vehicle_type: int) -> None:
+    if vehicle_type not in _MULTIROTORS:
+        kind = dialect.enums["MAV_TYPE"].get(vehicle_type)
+        name = kind.name.removeprefix("MAV_TYPE_") if kind else "unknown"
+        raise PeerError(
+            f"the vehicle is a {name} (MAV_TYPE {vehicle_type}), and only multirotors are flown"
+        )

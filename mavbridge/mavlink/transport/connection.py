@@ -1,18 +1,18 @@
 """Transport and codec together: messages in, packets out, reconnecting by itself."""
 
-import threading
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol
+from typing import Protocol, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDownError
 
 REOPEN_NS = NS_PER_S
-DRAIN_BUDGET_NS = 4 * NS_PER_MS
-"""Longest stretch of reading: a flood must not keep the action loop from its next slot. What is
+DRAIN_BUDGET_NS = 2 * NS_PER_MS
+"""Longest stretch of reading: a flood must not keep the gate from its next slot. What is
 left stays with the kernel, which drops what it cannot hold."""
 
 
@@ -23,16 +23,12 @@ class PacketLog(Protocol):
         """Take the packet, or drop and count it."""
 
 
-class Arrival(NamedTuple):
-    """A message with its arrival time and the address that it came from."""
-
-    message: ReceivedMessage
-    arrived_ns: int
-    sender: Address | None
+Arrival: TypeAlias = tuple[ReceivedMessage, int, Address | None]
+"""A message with its arrival in ns and the address that it came from; plain, as it is hot."""
 
 
 class Connection:
-    """Packets in and out; used by one thread, but another one may stop it from sending."""
+    """Packets in and out; used by one thread, and never waits."""
 
     def __init__(
         self,
@@ -48,10 +44,9 @@ class Connection:
         self._reopen_ns: int | None = None
         self.peer: Address | None = None
         """The vehicle's address, to which packets are sent; None until it is found."""
-        self._lock = threading.Lock()
-        self._is_blocked = False
         self.texts: list[str] = []
         """Messages for the user; the reader empties the list."""
+        self._was_open = False
         self._open(clock.now_ns())
 
     @property
@@ -63,12 +58,19 @@ class Connection:
         self._reopen_ns = None
         try:
             self._transport.open()
-        except TransportDownError as error:
+        except (TransportDownError, UserError) as error:
+            if isinstance(error, UserError) and not self._was_open:
+                raise
             self._lose(error, now_ns)
             return
+        self._was_open = True
         self._codec.forget_partial()
 
-    def _lose(self, error: TransportDownError, now_ns: int) -> None:
+    def fileno(self) -> int | None:
+        """Descriptor to wait for with ``select``; None while there is none."""
+        return None if self.is_down else self._transport.fileno()
+
+    def _lose(self, error: TransportDownError | UserError, now_ns: int) -> None:
         self._transport.close()
         self._reopen_ns = now_ns + REOPEN_NS
         self.texts.append(f"connection lost ({error}); reconnecting")
@@ -87,37 +89,24 @@ class Connection:
                 for message in decode(data):
                     if self._log is not None:
                         self._log.put(Packet(arrived_ns, message.packet))
-                    yield Arrival(message, arrived_ns, sender)
+                    yield message, arrived_ns, sender
                 if self._clock.now_ns() - now_ns > DRAIN_BUDGET_NS:
                     return
         except TransportDownError as error:
             self._lose(error, self._clock.now_ns())
 
-    def wait(self, until_ns: int) -> None:
-        """Return when something may have arrived, or at the given time."""
+    def send(self, data: bytes) -> bool:
+        """Send one packet; False: it was not sent."""
         if self.is_down:
-            self._clock.sleep_until_ns(until_ns)
-        else:
-            self._transport.wait(until_ns)
-
-    def send(self, data: bytes, *, is_forced: bool = False) -> bool:
-        """Send one packet; False: it was not sent. ``is_forced`` overrides ``block_sends``."""
-        with self._lock:
-            if self.is_down or (self._is_blocked and not is_forced):
-                return False
-            try:
-                is_sent = self._transport.send(data, self.peer)
-            except TransportDownError as error:
-                self._lose(error, self._clock.now_ns())
-                return False
-            if is_sent and self._log is not None:
-                self._log.put(Packet(self._clock.now_ns(), data))
-            return is_sent
-
-    def block_sends(self) -> None:
-        """Drop everything that is sent from now on, from any thread, unless it is forced."""
-        with self._lock:
-            self._is_blocked = True
+            return False
+        try:
+            is_sent = self._transport.send(data, self.peer)
+        except TransportDownError as error:
+            self._lose(error, self._clock.now_ns())
+            return False
+        if is_sent and self._log is not None:
+            self._log.put(Packet(self._clock.now_ns(), data))
+        return is_sent
 
     def close(self) -> None:
         """Free the socket or port."""

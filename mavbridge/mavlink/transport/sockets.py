@@ -1,5 +1,6 @@
 """Bytes in and out of a socket or serial port, never blocking, with the kernel's arrival stamps."""
 
+import contextlib
 import errno
 import os
 import select
@@ -7,25 +8,35 @@ import socket
 import struct
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import serial
 
-from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
+from mavbridge.mavlink.transport.holders import device_holder, udp_holder
 
 Address: TypeAlias = tuple[str, int]
 
 TCP_SILENCE_NS = 5 * NS_PER_S
 """Heartbeats come at 1 Hz: a connection this quiet is dead, even if the kernel has not noticed."""
 _CHUNK_BYTES = 65536
+_STREAM_BYTES = 2048
+"""A piece of a TCP stream: some fifty packets, after which a reader may leave the rest."""
+_ERRORS_A_DRAIN = 16
+"""Answers of the network to earlier sends that one drain skips."""
+_SERIAL_BITS = 10
+"""Bits on the wire of one byte: 8, and a start and a stop bit."""
+_STAMP_STEP_NS = 2 * NS_PER_MS
+"""A backlog of a serial port that took longer than this to arrive gets several stamps."""
 _SO_TIMESTAMPNS = 35
 """asm-generic/socket.h; Python's socket module does not name it."""
 _TIMESPEC = struct.Struct("@qq")
 
 
-class Chunk(NamedTuple):
+class Received(NamedTuple):
     """Bytes as they arrived."""
 
     data: bytes
@@ -49,11 +60,11 @@ class Transport(Protocol):
             TransportDownError: it cannot be opened now.
         """
 
-    def drain(self) -> Iterator[Chunk]:
+    def drain(self) -> Iterator[Received]:
         """Everything that has arrived. Raises TransportDownError when the connection is lost."""
 
-    def wait(self, until_ns: int) -> None:
-        """Return when ``drain`` has something to yield, or at the given time."""
+    def fileno(self) -> int | None:
+        """Descriptor that turns readable when ``drain`` has something to yield; None if closed."""
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Hand one whole packet to the kernel; False: dropped, because it cannot be sent now.
@@ -76,18 +87,15 @@ class _Base(Generic[_Handle]):
         self._clock = clock
         self._handle: _Handle | None = None
 
-    def wait(self, until_ns: int) -> None:
+    def fileno(self) -> int | None:
         """See `Transport`."""
-        timeout_ns = until_ns - self._clock.now_ns()
-        if self._handle is None:
-            self._clock.sleep_until_ns(until_ns)
-        elif timeout_ns > 0:
-            select.select([self._handle], [], [], timeout_ns / NS_PER_S)
+        return None if self._handle is None else self._handle.fileno()
 
     def close(self) -> None:
         """See `Transport`."""
         if self._handle is not None:
-            self._handle.close()
+            with contextlib.suppress(OSError):  # the port may be gone already
+                self._handle.close()
             self._handle = None
 
 
@@ -111,24 +119,24 @@ class UdpTransport(_Base[socket.socket]):
         except OSError as error:
             udp.close()
             host, port = self._address
-            hint = (
-                "another program listens there: stop it, or choose another port"
-                if error.errno == errno.EADDRINUSE
-                else "check the address"
-            )
+            hint = "check the address"
+            if error.errno == errno.EADDRINUSE:
+                hint = f"{udp_holder(port)}, or choose another port"
             raise UserError(f"cannot use udp {host}:{port}: {error.strerror}; {hint}") from error
         self._handle = udp
 
-    def drain(self) -> Iterator[Chunk]:
+    def drain(self) -> Iterator[Received]:
         """Datagrams, with the kernel's arrival stamp where there is one."""
-        while self._handle is not None:
+        errors = 0
+        while self._handle is not None and errors < _ERRORS_A_DRAIN:
             try:
                 data, control, _, sender = self._handle.recvmsg(_CHUNK_BYTES, 64)
             except BlockingIOError:
                 return
             except OSError:
-                continue  # the network's answer to an earlier send: nobody listens there yet
-            yield Chunk(data, self._arrival_ns(control), sender)
+                errors += 1  # the network's answer to an earlier send: nobody listens there yet
+                continue
+            yield Received(data, self._arrival_ns(control), sender)
 
     def _arrival_ns(self, control: list[tuple[int, int, bytes]]) -> int:
         now_ns = self._clock.now_ns()
@@ -199,11 +207,11 @@ class TcpTransport(_StreamTransport[socket.socket]):
         host, port = self._address
         return TransportDownError(f"tcp {host}:{port}: {errno.errorcode.get(code or 0, code)}")
 
-    def drain(self) -> Iterator[Chunk]:
+    def drain(self) -> Iterator[Received]:
         """Bytes received so far."""
         while self._handle is not None:
             try:
-                data = self._handle.recv(_CHUNK_BYTES)
+                data = self._handle.recv(_STREAM_BYTES)
             except BlockingIOError:
                 break
             except OSError as error:
@@ -214,7 +222,7 @@ class TcpTransport(_StreamTransport[socket.socket]):
                 raise TransportDownError("tcp: the vehicle closed the connection")
             self._is_connected = True
             self._heard_ns = self._clock.now_ns()
-            yield Chunk(data, self._heard_ns, None)
+            yield Received(data, self._heard_ns, None)
         if self._handle is not None and self._clock.now_ns() - self._heard_ns > TCP_SILENCE_NS:
             raise TransportDownError(f"tcp: silent for {TCP_SILENCE_NS // NS_PER_S} s")
 
@@ -238,6 +246,10 @@ class SerialTransport(_StreamTransport[serial.Serial]):
         self._device = device
         self._baud = baud
         self._was_open = False
+        self._backlog: deque[Received] = deque()
+        """Read, but not drained yet."""
+        self._emptied_ns = 0
+        """When the port was last seen empty: what comes later arrived later."""
 
     def open(self) -> None:
         """Open the port, non-blocking and exclusive."""
@@ -249,23 +261,49 @@ class SerialTransport(_StreamTransport[serial.Serial]):
             raise UserError(
                 f"cannot open {self._device} at {self._baud} baud: {error}; check the name, that "
                 "no other program uses it, and that you have permission (group dialout)"
+                f"{device_holder(self._device)}"
             ) from error
         self._was_open = True
         self._unsent = b""
+        self._backlog.clear()
+        self._emptied_ns = self._clock.now_ns()
 
-    def _down(self, error: Exception) -> TransportDownError:
+    def _down(self, error: Exception | str) -> TransportDownError:
         return TransportDownError(f"serial {self._device}: {error}")
 
-    def drain(self) -> Iterator[Chunk]:
-        """Bytes received so far."""
-        if self._handle is None:
-            return
-        try:
-            data = self._handle.read(_CHUNK_BYTES)
-        except OSError as error:
-            raise self._down(error) from error
-        if data:
-            yield Chunk(data, self._clock.now_ns(), None)
+    def drain(self) -> Iterator[Received]:
+        """Bytes received so far, in pieces whose stamps tell when they came over the wire."""
+        if not self._backlog:
+            self._read()
+        while self._backlog:
+            yield self._backlog.popleft()
+
+    def _read(self) -> None:
+        """Read all there is. The last byte came just now, each one before it a byte time earlier.
+
+        Bypasses pyserial, which reads no more than the kernel's line buffer of 4,095 bytes.
+        """
+        data = b""
+        while self._handle is not None and len(data) < _CHUNK_BYTES:
+            try:
+                if not select.select([self._handle], [], [], 0)[0]:
+                    break
+                piece = os.read(self._handle.fileno(), _CHUNK_BYTES)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                raise self._down(error) from error
+            if not piece:
+                raise self._down("the device is gone")
+            data += piece
+        now_ns, byte_ns = self._clock.now_ns(), _SERIAL_BITS * NS_PER_S // self._baud
+        step = max(1, _STAMP_STEP_NS // byte_ns)
+        for at in range(0, len(data), step):
+            piece = data[at : at + step]
+            after_ns = (len(data) - at - len(piece)) * byte_ns
+            self._backlog.append(Received(piece, max(now_ns - after_ns, self._emptied_ns), None))
+        if len(data) < _CHUNK_BYTES:
+            self._emptied_ns = now_ns
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """See `Transport`. Bypasses pyserial, whose write loops forever on a full buffer."""
@@ -278,6 +316,7 @@ class SerialTransport(_StreamTransport[serial.Serial]):
             raise self._down(error) from error
 
 
+_SERIAL = ("/dev/", "COM")
 _FORMS = "udp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyX,BAUD"
 
 
@@ -291,14 +330,23 @@ def make_transport(spec: str, clock: Clock) -> Transport:
         return UdpTransport(_address(spec, rest), clock, listen=kind != "udpout")
     if kind == "tcp":
         return TcpTransport(_address(spec, rest), clock)
-    if spec.startswith(("/dev/", "COM")):
-        device, _, baud = spec.partition(",")
-        if baud and not baud.isdigit():
-            raise UserError(f"--connect {spec}: {baud!r} is not a baud rate; use {_FORMS}")
-        return SerialTransport(device, int(baud or 57600), clock)
+    if spec.startswith(_SERIAL):
+        return SerialTransport(spec.partition(",")[0], _baud(spec), clock)
     if spec.count(":") == 1:  # a bare HOST:PORT listens, as in pymavlink
         return UdpTransport(_address(spec, spec), clock, listen=True)
     raise UserError(f"--connect {spec!r} is not understood; use {_FORMS}")
+
+
+def serial_baud(spec: str) -> int | None:
+    """Bits per second of the port that a connection string names; None: it is not serial."""
+    return _baud(spec) if spec.startswith(_SERIAL) else None
+
+
+def _baud(spec: str) -> int:
+    baud = spec.partition(",")[2]
+    if baud and not (baud.isdigit() and int(baud)):
+        raise UserError(f"--connect {spec}: {baud!r} is not a baud rate; use {_FORMS}")
+    return int(baud or 57600)
 
 
 def _address(spec: str, text: str) -> Address:

@@ -14,6 +14,7 @@ from typing import Literal
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.tlog import TlogJob
 from mavbridge.recording.video.frame_files import VideoJob
 from mavbridge.recording.video.ring import FrameRing
 from mavbridge.recording.video.writer_process import (
@@ -156,7 +157,7 @@ class FrameSender:
                         self._free.append(slot)
                         self.written += 1
                     case Failed(reason=reason):
-                        self._failure = WriterError(f"the video cannot be written: {reason}")
+                        self._failure = WriterError(reason)
                     case Notice() as notice:
                         self._notices.add(notice)
                         if notice is Notice.MAPPED and self._ring is not None:
@@ -181,7 +182,8 @@ class FrameSender:
 class VideoWriter(FrameSender):
     """One video, written by a process of its own; used by one thread.
 
-    A producer that is killed leaves a whole video: the writer notices and finishes it.
+    A producer that is killed leaves a whole video: the writer notices and finishes it. The process
+    outlives ``finish`` if the log of the link has not ended by then; it waits for that itself.
     """
 
     def __init__(
@@ -192,6 +194,7 @@ class VideoWriter(FrameSender):
         hz: float,
         rows: Path | None = None,
         with_truth: bool = False,
+        tlog: TlogJob | None = None,
     ) -> None:
         """Start the process and wait until it runs.
 
@@ -201,19 +204,25 @@ class VideoWriter(FrameSender):
             hz: nominal frame rate.
             rows: path and stem of a frames table to make, or None.
             with_truth: the table has the columns of ``FrameTruth``.
+            tlog: log of the link to write beside it; its pipe is closed here.
         """
+        self._tlog = tlog
         job = VideoJob(video=video, hz=hz, rows=rows, with_truth=with_truth)
         # Not fork: threads and an engine run here.
         context = multiprocessing.get_context("spawn")
         pipe, its_pipe = context.Pipe()
         process = context.Process(
             target=run_writer,
-            args=(its_pipe, job, NICENESS if pressure == "online" else 0),
+            args=(its_pipe, job, NICENESS if pressure == "online" else 0, tlog),
             name="mavbridge-writer",
             daemon=True,
         )
-        process.start()
-        its_pipe.close()  # else this process would keep the pipe open when the writer dies
+        try:
+            process.start()
+        finally:
+            its_pipe.close()  # else this process would keep the pipe open when the writer dies
+            if tlog is not None:
+                tlog.records.close()
         super().__init__(pipe, process, pressure)
         # A producer that ends without ``close`` must not be waited for by its writer.
         weakref.finalize(self, self._resources.close)
@@ -234,7 +243,8 @@ class VideoWriter(FrameSender):
         """End the process; what was submitted and not written may be lost. May be called twice."""
         super().close()
         self._process.join(END_S)
-        if self._process.is_alive():
+        is_keeping_log = self._tlog is not None and Notice.DONE in self._notices
+        if self._process.is_alive() and not is_keeping_log:
             self._process.kill()
             self._process.join(END_S)
 

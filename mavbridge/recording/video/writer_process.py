@@ -1,8 +1,9 @@
-"""The process that turns frames into a video and its table.
+"""The process that turns frames into a video and its table, and keeps the log of the link.
 
-It ends by itself, with everything closed, also when its producer is killed: then the pipe ends. A
-signal to the process group (Ctrl-C) is the producer's to act on. Imports neither the loops nor the
-network, so that it starts quickly.
+It ends by itself, with everything closed, also when its producer is killed: then the pipe ends. The
+log has a pipe of its own, from another process, whose end it awaits last. A signal to the process
+group (Ctrl-C) is the producer's to act on. Imports neither the loops nor the network, so that it
+starts quickly.
 """
 
 import os
@@ -12,11 +13,15 @@ from multiprocessing.connection import Connection
 from typing import NamedTuple, TypeAlias
 
 from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.tlog import TlogJob, TlogThread
 from mavbridge.recording.video.frame_files import FILE_ERRORS, FrameFiles, VideoJob
 from mavbridge.recording.video.ring import FrameRing, RingShape
 
 IDLE_S = 0.5
 """Longest wait of rows for a next frame."""
+TLOG_S = 60.0
+"""Longest wait for the end of the log once the producer is gone: the process of the link has the
+vehicle to bring to safety."""
 NICENESS = 10
 
 
@@ -34,7 +39,8 @@ class Written(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """Message from the writer: it has failed; it closes its files, and ends."""
+    """Message from the writer: it has failed; it closes its files, and ends. ``reason`` is for the
+    user, a sentence without its full stop."""
 
     reason: str
 
@@ -57,28 +63,43 @@ ToWriter: TypeAlias = RingShape | Submit | Notice
 FromWriter: TypeAlias = Written | Failed | Notice
 
 
-def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob, niceness: int) -> None:
+def run_writer(
+    pipe: "Connection[FromWriter, ToWriter]",
+    job: VideoJob,
+    niceness: int,
+    tlog_job: TlogJob | None,
+) -> None:
     """Entry point of the process."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     if niceness:
         os.nice(niceness)
-    service = WriterService(pipe, job)
+    tlog = None if tlog_job is None else TlogThread(tlog_job)
+    service = WriterService(pipe, job, tlog)
     service.send(Notice.READY)
     while service.is_open:
         service.serve(IDLE_S)
+    if tlog is not None:
+        tlog.finish(0.0 if service.has_failed else TLOG_S)
 
 
 class WriterService:
     """Does one job, message by message."""
 
-    def __init__(self, pipe: "Connection[FromWriter, ToWriter]", job: VideoJob) -> None:
+    def __init__(
+        self,
+        pipe: "Connection[FromWriter, ToWriter]",
+        job: VideoJob,
+        tlog: TlogThread | None = None,
+    ) -> None:
         self._pipe = pipe
+        self._tlog = tlog
         self._files = FrameFiles(job)
         self._folder = job.video.parent
         self._ring: FrameRing | None = None
         self.is_open = True
+        self.has_failed = False
 
     def send(self, message: FromWriter) -> None:
         """Send a message, if the producer is still there."""
@@ -89,6 +110,9 @@ class WriterService:
 
     def serve(self, timeout_s: float) -> None:
         """Wait for one message and handle it."""
+        if self._tlog is not None and self._tlog.failure is not None:
+            self._fail("log of the link", self._tlog.failure)
+            return
         try:
             if not self._pipe.poll(timeout_s):
                 self._files.flush()
@@ -99,9 +123,14 @@ class WriterService:
                 message = Notice.FINISH
             self._handle(message)
         except FILE_ERRORS as error:
-            self._files.abandon()
-            self._close()
-            self.send(Failed(f"{self._folder}: {getattr(error, 'strerror', None) or error}"))
+            self._fail("video", error)
+
+    def _fail(self, what: str, error: Exception) -> None:
+        self.has_failed = True
+        self._files.abandon()
+        self._close()
+        reason = getattr(error, "strerror", None) or error
+        self.send(Failed(f"the {what} cannot be written: {self._folder}: {reason}"))
 
     def _handle(self, message: ToWriter) -> None:
         match message:

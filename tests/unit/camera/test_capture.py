@@ -150,8 +150,8 @@ def test_a_stream_over_http_flows_and_its_end_is_noticed(mjpeg_server, monkeypat
 
     before_ns = clock.now_ns()
     camera = Grabber(open_once, clock=clock, reopen_delays_s=(0.0,))
-    assert capture.FFMPEG_OPTIONS_VARIABLE not in os.environ
     frame = camera.read(10 * NS_PER_S)
+    assert capture.FFMPEG_OPTIONS_VARIABLE not in os.environ
     assert before_ns < frame.captured_ns <= clock.now_ns()
     assert frame.rgb.shape == (48, 64, 3)
     assert frame.rgb[..., 0].mean() == pytest.approx(200, abs=5)

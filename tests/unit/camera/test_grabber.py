@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.fakes import START_NS, FakeClock
-from mavbridge.camera.deadlines import FIRST_FRAME_NS, STALL_NS
+from mavbridge.camera.deadlines import REOPENED_NS, STALL_NS
 from mavbridge.camera.grabber import Grabber, Image
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import CameraError
@@ -32,12 +32,15 @@ class ScriptedSource:
             assert self.idle.wait(10) or self.closed.is_set()
 
     def fail(self, reason):
-        self._script.put(CameraError(reason))
+        self.crash(CameraError(reason))
+
+    def crash(self, error):
+        self._script.put(error)
 
     def next_image(self):
         self.idle.set()
         item = self._script.get(timeout=10)
-        if isinstance(item, CameraError):
+        if isinstance(item, Exception):
             raise item
         return Image(captured_ns=item, rgb=np.full((2, 2, 3), item % 256, np.uint8))
 
@@ -57,12 +60,12 @@ def source():
 
 
 def opening(*sources):
-    """Opens these one after another; a CameraError fails its attempt, and there are no more."""
+    """Opens these one after another; an exception fails its attempt, and there are no more."""
     pending = list(sources)
 
     def open_source():
         item = pending.pop(0) if pending else CameraError("no more sources")
-        if isinstance(item, CameraError):
+        if isinstance(item, Exception):
             raise item
         return item
 
@@ -96,23 +99,83 @@ def test_the_newest_frame_wins_and_the_others_are_counted(source, clock):
     end(grabber, source)
 
 
-def test_a_source_that_cannot_be_opened_fails_at_the_door(clock):
-    with pytest.raises(CameraError, match="no such device"):
-        Grabber(opening(CameraError("no such device")), clock=clock)
+def test_before_the_first_frame_it_is_opened_until_that_works(source, clock):
+    refusals = [CameraError(f"no such device, attempt {k}") for k in range(5)]
+    grabber = Grabber(opening(*refusals, source), clock=clock, reopen_delays_s=(0.0,))
+    clock.advance_ns(3600 * NS_PER_S)
+    source.put(START_NS)
+    assert grabber.read(WAIT_NS).frame_id == 1
+    end(grabber, source)
 
 
-@pytest.mark.parametrize(("frames", "patience_ns"), [(0, FIRST_FRAME_NS), (1, STALL_NS)])
-def test_a_source_that_is_open_and_silent_is_dead(source, clock, frames, patience_ns):
+def test_while_nothing_was_delivered_it_says_why(source, clock):
+    opened = threading.Event()
+
+    def refuse_once():
+        if not opened.is_set():
+            opened.set()
+            raise CameraError("no such device")
+        return source
+
+    grabber = Grabber(refuse_once, clock=clock, reopen_delays_s=(0.05,))
+    assert opened.wait(10)
+    assert grabber.waiting_reason in {"it is being opened", "no such device"}
+    assert source.idle.wait(10)
+    assert grabber.waiting_reason == "it is open, and has delivered no frame yet"
+    clock.advance_ns(3600 * NS_PER_S)
+    assert grabber.read(0) is None
+    end(grabber, source)
+
+
+def test_a_source_that_falls_silent_is_dead(source, clock):
     grabber = Grabber(opening(source), clock=clock)
-    for _ in range(frames):
-        source.put(START_NS)
-        grabber.read(WAIT_NS)
-    clock.advance_ns(patience_ns)
+    source.put(START_NS)
+    grabber.read(WAIT_NS)
+    clock.advance_ns(STALL_NS)
     assert grabber.read(0) is None
     clock.advance_ns(1)
     with pytest.raises(CameraError, match="stopped delivering"):
         grabber.read(0)
     end(grabber, source)
+
+
+def test_a_source_that_is_silent_after_it_was_reopened_is_dead(source, clock):
+    second = ScriptedSource()
+    grabber = Grabber(opening(source, second), clock=clock, reopen_delays_s=(0.0,))
+    source.put(START_NS)
+    grabber.read(WAIT_NS)
+    source.fail("unplugged")
+    assert second.idle.wait(10)
+    clock.advance_ns(REOPENED_NS)
+    assert grabber.read(0) is None
+    clock.advance_ns(1)
+    with pytest.raises(CameraError, match="stopped delivering"):
+        grabber.read(0)
+    end(grabber, second)
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+def test_any_other_exception_of_a_source_reaches_read_by_name(source, clock, frames):
+    grabber = Grabber(opening(source), clock=clock)
+    for _ in range(frames):
+        source.put(START_NS)
+        grabber.read(WAIT_NS)
+    cause = ValueError("cannot reshape 614400 bytes")
+    source.crash(cause)
+    for _ in range(2):
+        with pytest.raises(CameraError, match=r"ValueError\('cannot reshape 614400") as caught:
+            grabber.read(WAIT_NS)
+        assert caught.value.__cause__ is cause
+    grabber.close()
+    assert source.closed.is_set()
+    assert "mavbridge-camera" not in [thread.name for thread in threading.enumerate()]
+
+
+def test_an_exception_of_the_opener_reaches_read_by_name(clock):
+    grabber = Grabber(opening(OSError("out of file descriptors")), clock=clock)
+    with pytest.raises(CameraError, match=r"OSError.*out of file descriptors"):
+        grabber.read(WAIT_NS)
+    grabber.close()
 
 
 def test_a_frame_that_waits_is_given_even_if_nothing_came_since(source, clock):
@@ -139,6 +202,8 @@ def test_a_lost_source_is_opened_again_and_closed_first(source, clock):
 def test_when_all_attempts_fail_it_is_dead_with_the_last_reason(source, clock):
     attempts = [CameraError("gone"), CameraError("still gone")]
     grabber = Grabber(opening(source, *attempts), clock=clock, reopen_delays_s=(0.0, 0.0))
+    source.put(START_NS)
+    grabber.read(WAIT_NS)
     source.fail("unplugged")
     with pytest.raises(CameraError, match="still gone; 2 attempts to reopen it have failed"):
         grabber.read(WAIT_NS)
@@ -150,6 +215,8 @@ def test_sources_that_open_but_deliver_nothing_use_up_the_attempts(source, clock
     for other in others:
         other.fail("no picture")
     grabber = Grabber(opening(source, *others), clock=clock, reopen_delays_s=(0.0, 0.0))
+    source.put(START_NS)
+    grabber.read(WAIT_NS)
     source.fail("unplugged")
     with pytest.raises(CameraError, match="no picture"):
         grabber.read(WAIT_NS)
@@ -175,7 +242,7 @@ def test_while_it_is_being_opened_again_there_is_no_frame_and_no_error(source, c
     grabber.read(WAIT_NS)
     source.fail("unplugged")
     assert source.closed.wait(10)
-    clock.advance_ns(STALL_NS + FIRST_FRAME_NS)
+    clock.advance_ns(STALL_NS + REOPENED_NS)
     assert grabber.read(0) is None
     grabber.close()
 

@@ -1,15 +1,19 @@
 import sys
+import threading
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from helpers.fakes import FakeClock
+from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import open as camera_open
-from mavbridge.camera.open import open_camera
+from mavbridge.camera.latency import LatencyCompensatedCamera
+from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
+from mavbridge.config.flight import CameraConfig
+from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 from sitl.camera.shm import FramePublisher
 
@@ -48,28 +52,79 @@ def openers(monkeypatch):
 )
 @pytest.mark.usefixtures("openers")
 def test_live_sources(spec, asked):
-    with pytest.raises(NotOpenedError) as caught:
-        open_camera(spec, image_size=224, clock=FakeClock())
-    assert caught.value.args == asked
+    with pytest.raises(CameraError) as caught:
+        open_camera(spec, image_size=224, clock=MonotonicClock())
+    assert isinstance(caught.value.__cause__, NotOpenedError)
+    assert caught.value.__cause__.args == asked
 
 
-def test_an_existing_file_is_a_video(tmp_path):
+@pytest.fixture
+def video(tmp_path):
     path = tmp_path / "a.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20, (32, 32))
     writer.write(np.zeros((32, 32, 3), np.uint8))
     writer.release()
-    camera = open_camera(str(path), image_size=224, clock=FakeClock())
+    return str(path)
+
+
+def test_an_existing_file_is_a_video(video):
+    camera = open_camera(video, image_size=224, clock=FakeClock())
     assert isinstance(camera, VideoFileCamera)
     camera.close()
 
 
+def test_the_latency_lies_between_exposure_and_arrival(video):
+    camera = open_camera(video, image_size=224, clock=FakeClock(), latency_ms=120.5)
+    assert isinstance(camera, LatencyCompensatedCamera)
+    frame = camera.read(0)
+    assert frame.captured_ns == START_NS - round(120.5 * NS_PER_MS)
+    assert frame.rgb.shape == (32, 32, 3)
+    assert camera.dropped_frames == 0
+    camera.close()
+
+
+def test_the_wait_for_a_frame_through_the_wrapper_is_the_cameras(video):
+    clock = FakeClock()
+    camera = open_camera(video, image_size=224, clock=clock, latency_ms=10)
+    camera.read(0)
+    with pytest.raises(CameraError, match="video ended after 1 frames"):
+        camera.read(0)
+    camera.close()
+
+
+def test_shared_memory_carries_its_own_stamps_and_refuses_a_latency():
+    with pytest.raises(UserError, match="--camera-latency 40 cannot be used with shm:fpv"):
+        check_camera("shm:fpv", latency_ms=40.0)
+    with pytest.raises(UserError, match="--camera-latency"):
+        open_camera("shm:fpv", image_size=224, clock=FakeClock(), latency_ms=40.0)
+    check_camera("shm:fpv")
+    check_camera("rtsp://host/cam", latency_ms=40.0)
+
+
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
 def test_shared_memory():
+    clock = FakeClock()
     publisher = FramePublisher("mb-test-open", 8, 8)
-    camera = open_camera("shm:mb-test-open", image_size=224, clock=FakeClock())
+    publisher.publish(np.zeros((8, 8, 3), np.uint8), captured_ns=clock.now_ns())
+    camera = open_camera("shm:mb-test-open", image_size=224, clock=clock)
     assert isinstance(camera, SharedMemoryCamera)
+    assert clock.now_ns() == START_NS
     camera.close()
     publisher.close()
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
+def test_shared_memory_that_never_appears_is_counted_down_and_refused():
+    lines = []
+    with pytest.raises(CameraError, match=r"no frame within 3 s \(--camera-timeout\): shm:mb-none"):
+        open_camera(
+            "shm:mb-none", image_size=224, clock=FakeClock(), timeout_s=3.0, report=lines.append
+        )
+    assert [line.partition(" (")[0] for line in lines] == [
+        "waiting for the camera: 2 s left",
+        "waiting for the camera: 1 s left",
+    ]
+    assert "python -m sitl --camera shm:mb-none" in lines[0]
 
 
 @pytest.mark.parametrize("spec", ["", "nowhere.mp4", "-1", "ftp://host/x", "camera", "."])
@@ -81,8 +136,9 @@ def test_anything_else_is_refused_with_the_forms_there_are(spec):
 
 
 def test_a_device_that_is_not_there_is_refused():
-    with pytest.raises(CameraError, match="camera 999 cannot be opened"):
-        open_camera("999", image_size=224, clock=FakeClock())
+    with pytest.raises(CameraError, match=r"within 0\.3 s .*camera 999 cannot be opened"):
+        open_camera("999", image_size=224, clock=MonotonicClock(), timeout_s=0.3)
+    assert "mavbridge-camera" not in [thread.name for thread in threading.enumerate()]
 
 
 @pytest.mark.parametrize("package", ["mss", "Xlib"])
@@ -93,3 +149,17 @@ def test_the_screen_without_its_packages_names_the_extra(monkeypatch, package):
     monkeypatch.delitem(sys.modules, "mavbridge.camera.screen", raising=False)
     with pytest.raises(UserError, match=r"pip install 'mavbridge\[screen\]'"):
         open_camera("screen:", image_size=224, clock=FakeClock())
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"camera_timeout": 0.0}, "--camera-timeout must be between 0.1 and 3600 s"),
+        ({"camera_latency": -1.0}, "--camera-latency must be between 0 and 2000 ms"),
+        ({"max_frozen_image": -0.1}, "--max-frozen-image must be between 0 and 60 s"),
+        ({"max_black_image": float("nan")}, "--max-black-image must be between 0 and 60 s"),
+    ],
+)
+def test_settings_that_no_camera_has_are_refused(settings, complaint):
+    with pytest.raises(UserError, match=complaint):
+        CameraConfig(**settings)

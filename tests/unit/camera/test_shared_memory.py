@@ -199,18 +199,27 @@ def test_a_writer_that_closed_is_named_as_the_cause(camera, writer, clock):
     assert clock.now_ns() <= START_NS + 2 * NS_PER_S + NS_PER_MS
 
 
-def test_a_segment_without_frames_has_ten_seconds(camera, clock):
-    assert camera.read(9 * NS_PER_S) is None
-    with pytest.raises(CameraError, match="no new frame"):
-        camera.read(2 * NS_PER_S)
+def test_a_segment_without_frames_is_waited_for(camera, writer, clock):
+    assert camera.read(100 * NS_PER_S) is None
+    assert camera.waiting_reason == f"shm:{writer.path.name}: no frame in it yet"
+    writer.publish(1, clock.now_ns())
+    assert camera.read(0) is not None
 
 
 @pytest.mark.parametrize("age_s", [-3, 3, 1e9])
 def test_stamps_of_another_clock_are_refused(camera, writer, age_s):
     writer.publish(1, START_NS - round(age_s * NS_PER_S))
-    assert camera.read(0) is None
+    assert camera.read(11 * NS_PER_S) is None
+    assert "CLOCK_MONOTONIC" in camera.waiting_reason
+
+
+def test_stamps_that_leave_our_clock_are_refused(camera, writer, clock):
+    writer.publish(1, START_NS)
+    assert camera.read(0) is not None
+    writer.publish(2, START_NS - 100 * NS_PER_S)
     with pytest.raises(CameraError, match="CLOCK_MONOTONIC"):
-        camera.read(11 * NS_PER_S)
+        camera.read(3 * NS_PER_S)
+    assert clock.now_ns() <= START_NS + 2 * NS_PER_S + NS_PER_MS
 
 
 def test_a_writer_that_starts_again_is_followed_and_ids_keep_rising(writer):
@@ -242,17 +251,31 @@ def test_a_name_that_appears_late_is_waited_for(path):
     def start_after_nine_seconds():
         if clock.now_ns() - START_NS >= 9 * NS_PER_S and not writers:
             writers.append(HandWriter(path))
+            writers[0].publish(1, clock.now_ns())
 
     clock.on_sleep = start_after_nine_seconds
-    SharedMemoryCamera(path.name, clock=clock).close()
-    assert writers
+    camera = SharedMemoryCamera(path.name, clock=clock)
+    assert camera.read(8 * NS_PER_S) is None
+    assert camera.read(2 * NS_PER_S).frame_id == 1
+    camera.close()
     writers[0].close()
 
 
-def test_a_name_that_never_appears_says_what_to_start_and_what_is_there(writer, clock):
-    with pytest.raises(CameraError, match="python -m sitl --camera shm:nobody") as caught:
-        SharedMemoryCamera("nobody", clock=clock)
-    assert writer.path.name in str(caught.value)
+def test_a_name_that_is_not_there_says_what_to_start_and_what_is_there(writer, clock):
+    camera = SharedMemoryCamera("nobody", clock=clock)
+    assert camera.read(0) is None
+    assert "python -m sitl --camera shm:nobody" in camera.waiting_reason
+    assert writer.path.name in camera.waiting_reason
+    camera.close()
+
+
+def test_a_file_in_another_format_that_appears_late_is_refused(path):
+    clock = HookedClock()
+    camera = SharedMemoryCamera(path.name, clock=clock)
+    clock.on_sleep = lambda: path.write_bytes(b"something else")
+    with pytest.raises(CameraError, match="wrong magic"):
+        camera.read(NS_PER_S)
+    camera.close()
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from mavbridge.core.stopping import StopRequest, stop_on_signals
+from helpers.fakes import FakeClock
+from mavbridge.core.stopping import ONE_REQUEST_NS, StopRequest, stop_on_signals
 
 WAITING = """
 import sys
@@ -57,9 +58,43 @@ def test_a_signal_wakes_who_waits() -> None:
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_asked_twice_is_asked_once() -> None:
-    stop = StopRequest()
-    stop.set()
-    stop.set()
-    assert stop.is_set()
+def test_a_second_request_is_counted_and_a_burst_is_one() -> None:
+    clock = FakeClock()
+    stop = StopRequest(clock)
+    assert not stop.wait(0.0)
+    for _ in range(3):
+        stop.set()
+        clock.advance_ns(ONE_REQUEST_NS - 1)
+    assert stop.requests == 1
     assert stop.wait(0.0)
+    assert not any(stop.wait(0.0, requests=2) for _ in range(4))
+    clock.advance_ns(1)
+    stop.set()
+    assert stop.requests == 2
+    assert stop.wait(0.0, requests=2)
+
+
+END = """
+import sys, threading
+from mavbridge.core.stopping import end_process
+{before}
+end_process(5, lambda: print("last words", file=sys.stderr))
+"""
+WRITER_ASLEEP = """
+threading.Thread(target=lambda: sys.stderr.write("x" * 1_000_000), daemon=True).start()
+"""
+
+
+@pytest.mark.parametrize(("before", "expected"), [("", b"last words\n"), (WRITER_ASLEEP, None)])
+def test_the_process_ends_whether_or_not_anybody_reads(before: str, expected: bytes | None) -> None:
+    """``sys.exit`` fails here: it waits for the lock of the stream that the writer holds."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-c", END.format(before=before)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, env=environment) as ending:
+        assert ending.stderr is not None
+        try:
+            assert ending.wait(30.0) == 5
+        finally:
+            ending.kill()
+        if expected is not None:
+            assert ending.stderr.read() == expected

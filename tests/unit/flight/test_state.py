@@ -10,7 +10,7 @@ from helpers.fakes import level_telemetry, without
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Release, Telemetry
-from mavbridge.flight.state import Freshness, StateFrame, build_state
+from mavbridge.flight.state import Freshness, FrozenStateCheck, StateFrame, build_state
 
 NOW_NS = 5_000_000_000
 LIMITS = Freshness(attitude_ns=50 * NS_PER_MS, velocity_ns=100 * NS_PER_MS)
@@ -118,6 +118,16 @@ def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
     assert refused == Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
 
 
+def test_a_reading_that_arrived_just_now_but_happened_long_ago_is_old() -> None:
+    late = Reading(NOW_NS, (1.0, 0.0, 0.0, 0.0), delay_ns=LIMITS.attitude_ns)
+    fresh = replace(telemetry(), ned_from_body_wxyz=late)
+    state = build_state(fresh, NOW_NS, frame="ned_frd", freshness=LIMITS)
+    assert isinstance(state, VehicleState)
+    assert (state.attitude_ns, state.rate_ns) == (NOW_NS - LIMITS.attitude_ns, NOW_NS)
+    refused = build_state(fresh, NOW_NS + 1, frame="ned_frd", freshness=LIMITS)
+    assert isinstance(refused, Release)
+
+
 def test_each_part_keeps_its_own_stamp_and_the_array_is_frozen() -> None:
     source = replace(telemetry(), velocity_ned_mps=Reading(NOW_NS - 7, (0.0, 0.0, 0.0)))
     state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
@@ -125,3 +135,37 @@ def test_each_part_keeps_its_own_stamp_and_the_array_is_frozen() -> None:
     assert (state.velocity_ns, state.attitude_ns) == (NOW_NS - 7, NOW_NS)
     with pytest.raises(ValueError, match="read-only"):
         state.values[0] = pi
+
+
+def frozen_for(seconds: float, *, rate_radps: float, moves: bool = False) -> str | None:
+    """What the check with a limit of 0.5 s says of the last of these states, at 100 Hz."""
+    check, problem = FrozenStateCheck(max_frozen_ns=500 * NS_PER_MS), None
+    for step in range(round(100 * seconds) + 1):
+        turned = rate_radps * step / 100 if moves else 0.0
+        state = build_state(
+            telemetry(q=(1.0, turned / 2, 0.0, 0.0), w=(rate_radps, 0.0, 0.0)),
+            NOW_NS,
+            frame="ned_frd",
+            freshness=LIMITS,
+        )
+        assert isinstance(state, VehicleState)
+        problem = check.problem(replace(state, attitude_ns=NOW_NS + step * 10 * NS_PER_MS))
+    return problem
+
+
+def test_an_attitude_that_stays_the_same_while_the_vehicle_turns_is_frozen() -> None:
+    assert frozen_for(0.5, rate_radps=0.01) is None
+    assert "frozen for more than 500 ms" in (frozen_for(0.52, rate_radps=0.01) or "")
+
+
+def test_a_vehicle_that_turns_slowly_or_not_at_all_is_not_frozen() -> None:
+    assert frozen_for(5.0, rate_radps=2e-4, moves=True) is None
+    assert frozen_for(5.0, rate_radps=0.0) is None
+
+
+def test_the_check_of_a_frozen_attitude_can_be_switched_off() -> None:
+    check = FrozenStateCheck(max_frozen_ns=0)
+    state = build_state(telemetry(w=(1.0, 0.0, 0.0)), NOW_NS, frame="ned_frd", freshness=LIMITS)
+    assert isinstance(state, VehicleState)
+    assert check.problem(state) is None
+    assert check.problem(replace(state, attitude_ns=NOW_NS + 10**10)) is None

@@ -1,211 +1,365 @@
-from dataclasses import replace
-from itertools import product
+"""Every row of the table in docs/SAFETY.md: engaging, and losing the sticks."""
 
-import numpy as np
+from dataclasses import replace
+from typing import Any
+
 import pytest
 
+from helpers.gate_facts import AIRBORNE, ON_GROUND, Stepped, flying
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.errors import PeerError
-from mavbridge.core.vehicle import Release
-from mavbridge.gate.engagement import (
-    PREPARE_TIMEOUT_NS,
-    RETAKE_NS,
-    Directive,
-    Engagement,
-    Facts,
-    Hold,
-    Phase,
-    check_chunk,
+from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.gate.departure import DepartureSettings, Ending
+from mavbridge.gate.engagement import ACT_TIMEOUT_NS, PREPARE_TIMEOUT_NS, Phase
+from mavbridge.gate.facts import Hand, Move
+
+NOTHING = Move()
+LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
+
+# --- engaging
+
+
+def test_somebody_elses_arming_is_not_engaging() -> None:
+    stepped = Stepped(ON_GROUND)
+    assert set(stepped.run(1)) == {NOTHING}
+    assert set(stepped.run(5, armed=True)) == {NOTHING}
+    assert stepped.phase is Phase.WAITING
+
+
+def test_arm_brings_the_vehicle_into_its_mode_arms_it_and_flies_once() -> None:
+    stepped = Stepped(replace(ON_GROUND, mode="STABILIZE"), arm=True)
+    assert stepped.step() == Move(hand=Hand.IDLE)  # until the vehicle shows our sticks
+    assert stepped.step(echo_confirmed=True) == Move(hand=Hand.IDLE, mode="ALT_HOLD")
+    stepped.run(1)
+    assert stepped.step(mode="ALT_HOLD").mode is None
+    assert Move(hand=Hand.IDLE, arm=True) in stepped.run(1.1)
+    assert stepped.step(armed=True) == Move(hand=Hand.POLICY)
+    assert stepped.phase is Phase.FLYING
+
+
+def test_requests_are_a_second_apart() -> None:
+    stepped = Stepped(replace(ON_GROUND, mode="STABILIZE"), arm=True)
+    moves = stepped.run(10, echo_confirmed=True)
+    assert sum(move.mode == "ALT_HOLD" for move in moves) == 10
+
+
+def test_a_mode_of_the_flag_is_asked_for_even_where_another_would_do() -> None:
+    stepped = Stepped(ON_GROUND, arm=True, mode="LOITER", modes=("ALT_HOLD", "LOITER"))
+    assert stepped.step(echo_confirmed=True).mode == "LOITER"
+
+
+def test_a_mode_that_the_vehicle_lacks_is_a_failure_at_once() -> None:
+    stepped = Stepped(ON_GROUND, arm=True, mode="ALTCTL")
+    stepped.run(0.1, is_released=True)
+    assert stepped.phase is Phase.ENDED
+    assert "has no mode ALTCTL, it has" in (stepped.engagement.failure or "")
+    assert {move.mode for move in stepped.moves} == {None}
+
+
+def test_in_the_air_nothing_is_sent_before_the_policy_flies() -> None:
+    stepped = Stepped(replace(AIRBORNE, mode="LOITER"), mode="ALT_HOLD")
+    stepped.step()
+    assert stepped.step("engage") == Move(mode="ALT_HOLD")
+    assert stepped.step() == NOTHING
+    assert stepped.step(mode="ALT_HOLD") == Move(hand=Hand.POLICY)
+
+
+@pytest.mark.parametrize("reason", ["release", "stop", "time"])
+def test_a_pilot_who_never_lost_the_sticks_keeps_them(reason: str) -> None:
+    stepped = Stepped(replace(AIRBORNE, mode="LOITER", is_released=True), mode="ALT_HOLD")
+    stepped.step()
+    stepped.step("engage")
+    before = len(stepped.moves)
+    if reason == "stop":
+        stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+    stepped.run(PREPARE_TIMEOUT_NS / NS_PER_S + 1 if reason == "time" else 0)
+    stepped.step("release" if reason == "release" else None)
+    stepped.run(0.1)
+    asked = [move for move in stepped.moves[before:] if move.mode not in (None, "ALT_HOLD")]
+    assert not asked
+    assert {move.hand for move in stepped.moves} <= {None, Hand.RELEASE}
+    assert stepped.phase in (Phase.RELEASED, Phase.ENDED)
+
+
+def test_a_vehicle_that_does_not_get_ready_ends_it_with_a_reason() -> None:
+    stepped = Stepped(ON_GROUND, arm=True)
+    stepped.run(PREPARE_TIMEOUT_NS / NS_PER_S + 2)
+    assert stepped.phase is Phase.ENDED
+    assert "not ready after 90 s" in (stepped.engagement.failure or "")
+    assert stepped.moves[-2].hand is not Hand.IDLE
+
+
+def test_a_policy_that_is_too_slow_is_refused_before_arming() -> None:
+    stepped = Stepped(ON_GROUND, arm=True)
+    stepped.run(2, echo_confirmed=True, chunk_problem="stale", slowness="5 chunks too late")
+    assert stepped.phase is Phase.ENDED
+    assert stepped.engagement.failure == "5 chunks too late"
+    assert not any(move.arm for move in stepped.moves)
+
+
+def test_one_that_is_disarmed_while_preparing_is_not_armed_again() -> None:
+    stepped = Stepped(ON_GROUND, arm=True)
+    stepped.run(0.5, echo_confirmed=True)
+    stepped.step(armed=True, chunk_problem="no image feature yet")
+    stepped.step(armed=False, chunk_problem=None, is_released=True)
+    assert not any(move.arm for move in stepped.run(5))
+    assert "disarmed" in stepped.reason
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"armed": False}, "disarmed"),
+        ({"mode": "STABILIZE"}, "not fly in STABILIZE, only in ALT_HOLD or ALTCTL"),
+        ({"mode": "GUIDED"}, "GUIDED"),
+        ({"mode": "RTL"}, "RTL"),
+        ({"chunk_problem": "the image is 400 ms old"}, "the image is 400 ms old"),
+        ({"link_problem": "reading the vehicle's radio calibration"}, "calibration"),
+        ({"is_failsafe": True}, "failsafe"),
+        ({"envelope_problem": "tilt 70 deg"}, "tilt"),
+    ],
 )
-
-S = NS_PER_S
-READY = Facts(
-    now_ns=0,
-    link_problem=None,
-    input_problem=None,
-    mode="ALT_HOLD",
-    armed=True,
-    is_overruled=False,
-    echo_confirmed=True,
-)
-GROUND = replace(READY, armed=False)
+def test_an_act_that_cannot_be_followed_is_refused_and_forgotten(
+    changes: dict[str, Any], told: str
+) -> None:
+    stepped = Stepped(replace(AIRBORNE, **changes))
+    stepped.step()
+    assert stepped.step("engage") == NOTHING
+    assert told in (stepped.engagement.refusal or "")
+    good = {name: getattr(AIRBORNE, name) for name in changes}
+    assert set(stepped.run(2, **good)) == {NOTHING}
+    assert stepped.step("engage") == Move(hand=Hand.POLICY)
 
 
-def released(directive: Directive) -> str:
-    assert isinstance(directive.sticks, Release), directive
-    return directive.sticks.reason
+def test_the_switch_engages_by_going_high_while_armed_and_releases_by_going_low() -> None:
+    stepped = Stepped(replace(AIRBORNE, rc_channels_us=HIGH), engage_channel=8)
+    assert set(stepped.run(1)) == {NOTHING}  # it was high from the start
+    stepped.step(rc_channels_us=LOW)
+    assert stepped.step(rc_channels_us=HIGH) == Move(hand=Hand.POLICY)
+    assert stepped.step(rc_channels_us=LOW) == Move(hand=Hand.RELEASE)
+    assert "engage switch" in stepped.reason
 
 
-def flying(**options: object) -> Engagement:
-    settings: dict[str, object] = {"wanted_mode": None, "arm": False, "readonly": False} | options
-    engagement = Engagement(**settings)  # type: ignore[arg-type]
-    assert engagement.step(READY).sticks is Hold.FLY
-    return engagement
+def test_a_switch_that_went_high_while_disarmed_does_not_engage_later() -> None:
+    stepped = Stepped(replace(ON_GROUND, rc_channels_us=LOW), engage_channel=8)
+    stepped.step()
+    stepped.step(rc_channels_us=HIGH)
+    assert set(stepped.run(2, armed=True)) == {NOTHING}
 
 
-def test_it_waits_for_the_pilot_to_arm_unless_asked() -> None:
-    engagement = Engagement(wanted_mode=None, arm=False, readonly=False)
-    directive = engagement.step(GROUND)
-    assert "disarmed" in released(directive)
-    assert directive.request is None
-    assert engagement.step(READY).sticks is Hold.FLY
+def test_the_key_does_not_overrule_a_switch_that_is_off() -> None:
+    stepped = Stepped(replace(AIRBORNE, rc_channels_us=LOW), engage_channel=8)
+    stepped.step()
+    assert stepped.step("engage") == NOTHING
+    assert "switch" in (stepped.engagement.refusal or "")
 
 
-def test_asked_to_arm_it_idles_changes_mode_arms_and_flies() -> None:
-    engagement = Engagement(wanted_mode="alt_hold", arm=True, readonly=False)
-    start = replace(GROUND, mode="STABILIZE", echo_confirmed=False, input_problem="no feature")
-    assert engagement.step(start) == Directive(sticks=Hold.IDLE)
-    no_echo = replace(start, input_problem=None)
-    assert engagement.step(no_echo) == Directive(sticks=Hold.IDLE)
-    echoed = replace(no_echo, echo_confirmed=True)
-    assert engagement.step(echoed) == Directive(sticks=Hold.IDLE, request="mode")
-    in_mode = replace(echoed, mode="ALT_HOLD")
-    assert engagement.step(in_mode) == Directive(sticks=Hold.IDLE, request="arm")
-    assert engagement.step(replace(in_mode, armed=True)).sticks is Hold.FLY
+def test_engage_on_arm_counts_the_first_arming_alone() -> None:
+    stepped = Stepped(ON_GROUND, engage_on_arm=True)
+    stepped.run(0.1)
+    assert stepped.step(armed=True) == Move(hand=Hand.POLICY)
+    stepped.step(armed=False)
+    stepped.run(2, is_released=True)
+    assert set(stepped.run(2, armed=True)) == {NOTHING}
 
 
-def test_it_arms_once_and_never_again_by_itself() -> None:
-    engagement = flying(arm=True)
-    for _ in range(3):
-        directive = engagement.step(GROUND)
-        assert "disarmed" in released(directive)
-        assert directive.request is None
+def test_a_vehicle_that_is_armed_when_it_is_found_was_not_armed_for_us() -> None:
+    stepped = Stepped(engage_on_arm=True)
+    assert set(stepped.run(2)) == {NOTHING}
 
 
-def test_arming_in_a_mode_without_sticks_needs_a_mode_flag() -> None:
-    engagement = Engagement(wanted_mode=None, arm=True, readonly=False)
-    assert "--mode" in released(engagement.step(replace(GROUND, mode="AUTO")))
+# --- losing the sticks to somebody else: release in the same step, no mode command, latched
 
-
-def test_a_mode_is_asked_for_without_arming_when_only_that_was_wanted() -> None:
-    engagement = Engagement(wanted_mode="ACRO", arm=False, readonly=False)
-    directive = engagement.step(GROUND)
-    assert released(directive)
-    assert directive.request == "mode"
-    assert engagement.step(replace(READY)).request == "mode"
-
-
-def test_the_pilot_takes_over_by_changing_the_mode_until_disarmed() -> None:
-    engagement = flying()
-    assert "ALT_HOLD to LOITER" in released(engagement.step(replace(READY, mode="LOITER")))
-    assert engagement.phase is Phase.LATCHED
-    # Changing back does not hand the sticks back; a link problem does not clear it either.
-    assert "somebody else" in released(engagement.step(READY))
-    released(engagement.step(replace(READY, link_problem="lost")))
-    assert "somebody else" in released(engagement.step(READY))
-    released(engagement.step(GROUND))
-    assert engagement.step(READY).sticks is Hold.FLY
-
-
-def test_a_mode_change_behind_a_link_problem_is_a_takeover_too() -> None:
-    engagement = flying()
-    released(engagement.step(replace(READY, link_problem="heartbeat lost")))
-    assert "ALT_HOLD to RTL" in released(engagement.step(replace(READY, mode="RTL")))
-
-
-def test_a_link_problem_releases_for_as_long_as_it_lasts() -> None:
-    engagement = flying()
-    assert released(engagement.step(replace(READY, link_problem="lost"))) == "lost"
-    assert engagement.step(READY).sticks is Hold.FLY
-
-
-def test_inputs_must_stay_good_before_the_sticks_are_taken_back() -> None:
-    engagement = flying()
-    bad = replace(READY, input_problem="too old")
-    assert released(engagement.step(replace(bad, now_ns=S))) == "too old"
-    assert "waiting to see" in released(engagement.step(replace(READY, now_ns=S + RETAKE_NS // 2)))
-    assert released(engagement.step(replace(bad, now_ns=S + RETAKE_NS // 2))) == "too old"
-    assert "waiting to see" in released(engagement.step(replace(READY, now_ns=S + RETAKE_NS)))
-    assert engagement.step(replace(READY, now_ns=S + 2 * RETAKE_NS)).sticks is Hold.FLY
-
-
-def test_sticks_that_the_vehicle_no_longer_takes_are_left_until_disarmed() -> None:
-    engagement = flying()
-    overruled = replace(READY, link_problem="does not act on our sticks", is_overruled=True)
-    assert "does not act" in released(engagement.step(overruled))
-    assert "somebody else" in released(engagement.step(READY))
-    released(engagement.step(GROUND))
-    assert engagement.step(READY).sticks is Hold.FLY
-
-
-def test_an_override_that_fails_on_the_ground_is_tried_again() -> None:
-    engagement = Engagement(wanted_mode="ALT_HOLD", arm=True, readonly=False)
-    overruled = replace(GROUND, link_problem="does not act", is_overruled=True)
-    released(engagement.step(overruled))
-    assert engagement.step(GROUND).sticks is Hold.IDLE
-
-
-def test_a_mode_that_was_reached_is_not_asked_for_again_over_the_pilot() -> None:
-    engagement = Engagement(wanted_mode="ALT_HOLD", arm=True, readonly=False)
-    assert engagement.step(GROUND).request == "arm"
-    waiting = replace(READY, input_problem="no feature")
-    released(engagement.step(waiting))
-    directive = engagement.step(replace(waiting, mode="LAND"))
-    assert "ALT_HOLD to LAND" in released(directive)
-    assert directive.request is None
-    assert engagement.step(replace(READY, mode="LAND")).request is None
-
-
-def test_an_arming_that_never_flew_is_the_only_one() -> None:
-    engagement = Engagement(wanted_mode=None, arm=True, readonly=False)
-    assert engagement.step(GROUND).request == "arm"
-    released(engagement.step(replace(READY, input_problem="no feature")))
-    directive = engagement.step(GROUND)
-    assert directive.request is None
-    assert "disarmed" in released(directive)
-
-
-@pytest.mark.parametrize("armed", [False, True])
-@pytest.mark.parametrize("mode", ["ALT_HOLD", "AUTO"])
-def test_readonly_runs_whatever_the_vehicle_does(armed: bool, mode: str) -> None:
-    engagement = Engagement(wanted_mode=None, arm=False, readonly=True)
-    directive = engagement.step(replace(READY, armed=armed, mode=mode, echo_confirmed=False))
-    assert directive == Directive(sticks=Hold.FLY)
-
-
-def test_preparing_has_a_deadline() -> None:
-    engagement = Engagement(wanted_mode="ALT_HOLD", arm=True, readonly=False)
-    engagement.step(replace(GROUND, echo_confirmed=False))
-    with pytest.raises(PeerError, match="not ready after 90 s"):
-        engagement.step(replace(GROUND, now_ns=PREPARE_TIMEOUT_NS + 1, echo_confirmed=False))
-
-
-EVENTS = [
-    replace(READY, armed=armed, mode=mode, link_problem=link, input_problem=inputs)
-    for armed, mode, link, inputs in product(
-        [False, True], ["ALT_HOLD", "LOITER", "RTL"], [None, "link"], [None, "input"]
-    )
+TAKEOVERS: list[tuple[dict[str, Any], str]] = [
+    ({"mode": "LOITER"}, "mode changed from ALT_HOLD to LOITER"),
+    ({"armed": False}, "disarmed"),
+    ({"is_switched_off": True}, "override switch"),
+    ({"overruled": "the vehicle ignores our sticks"}, "ignores our sticks"),
+    ({"interruption": "the vehicle has rebooted"}, "rebooted"),
+    ({"is_failsafe": True, "mode": "RTL"}, "failsafe"),
 ]
 
 
-@pytest.mark.parametrize("arm", [False, True])
-def test_every_pair_of_events_keeps_the_rules(arm: bool) -> None:
-    """From every state that two events reach, every third event: sticks only where allowed."""
-    for first, second, third in product(EVENTS, repeat=3):
-        third = replace(third, now_ns=10 * S)  # long after any input that failed
-        engagement = Engagement(wanted_mode=None, arm=arm, readonly=False)
-        for facts in (first, second):
-            engagement.step(facts)
-        was_latched = engagement.phase is Phase.LATCHED
-        directive = engagement.step(third)
-        if directive.sticks is Hold.FLY:
-            assert third.armed
-            assert third.link_problem is None
-            assert third.input_problem is None
-            assert third.mode in ("ALT_HOLD", "LOITER")
-            assert not was_latched
-        if directive.sticks is Hold.IDLE:
-            assert arm
-            assert not third.armed
-        if directive.request == "arm":
-            assert arm
-            assert not first.armed
-            assert not second.armed
+@pytest.mark.parametrize(("changes", "told"), TAKEOVERS)
+@pytest.mark.parametrize("on_fault", ["auto", "land"])
+def test_a_takeover_releases_at_once_and_sends_no_mode(
+    changes: dict[str, Any], told: str, on_fault: Any
+) -> None:
+    stepped = flying(departure=DepartureSettings(on_fault=on_fault, then=on_fault))
+    assert stepped.step(**changes) == Move(hand=Hand.RELEASE)
+    assert told in stepped.reason
+    moves = stepped.run(3, is_released=False)
+    assert {move.mode for move in moves} == {None}
+    assert moves[-1] == NOTHING
+    assert stepped.phase is Phase.RELEASED
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_chunk_that_is_not_finite_is_refused(bad: float) -> None:
-    chunk = np.zeros((1, 16, 4), dtype=np.float32)
-    assert check_chunk(chunk) is None
-    chunk[0, 7, 2] = bad
-    assert isinstance(check_chunk(chunk), Release)
+@pytest.mark.parametrize(("changes", "told"), TAKEOVERS)
+def test_what_was_taken_comes_back_only_by_an_act(changes: dict[str, Any], told: str) -> None:
+    stepped = flying()
+    stepped.step(**changes)
+    stepped.run(0.1, is_released=True)
+    back = {name: getattr(AIRBORNE, name) for name in changes}
+    back.pop("interruption", None)
+    assert set(stepped.run(2, **back)) == {NOTHING}
+    stepped.run(1, armed=False)
+    assert set(stepped.run(1, armed=True)) == {NOTHING}  # disarming resets nothing
+    assert told in stepped.reason
+    assert stepped.step("engage") == Move(hand=Hand.POLICY)
+
+
+def test_a_release_that_is_confirmed_ends_at_once() -> None:
+    stepped = flying()
+    stepped.step(mode="LOITER")
+    assert stepped.step(is_released=True) == NOTHING
+    assert stepped.phase is Phase.RELEASED
+
+
+# --- our own faults and ends
+
+FAULTS = [
+    {"chunk_fault": "no chunk of the policy that may be flown for 100 ms"},
+    {"link_problem": "the vehicle's heartbeat is lost"},
+    {"envelope_problem": "tilt 63 deg is beyond 60 deg"},
+]
+
+
+@pytest.mark.parametrize("changes", FAULTS)
+def test_a_fault_is_neutral_in_the_same_step_then_a_safe_mode(changes: dict[str, Any]) -> None:
+    stepped = flying(replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0)))
+    assert stepped.step(**changes) == Move(hand=Hand.NEUTRAL, mode="BRAKE")
+    assert stepped.phase is Phase.LEAVING
+    assert {move.hand for move in stepped.run(0.05)} == {Hand.NEUTRAL}
+    assert stepped.step(mode="BRAKE") == Move(hand=Hand.RELEASE)
+
+
+@pytest.mark.parametrize("changes", FAULTS)
+def test_inputs_that_come_back_do_not_fly_again(changes: dict[str, Any]) -> None:
+    stepped = flying()
+    stepped.step(**changes)
+    stepped.run(1)
+    back = dict.fromkeys(changes)
+    moves = stepped.run(3, is_released=True, **back)
+    assert moves[-1] == NOTHING
+    assert all(move.hand is not Hand.POLICY for move in moves)
+
+
+def test_the_flight_process_dies() -> None:
+    stepped = flying()
+    stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+    assert stepped.step().hand is Hand.NEUTRAL
+    stepped.run(0.1)
+    stepped.step(is_released=True)
+    stepped.step()
+    assert stepped.phase is Phase.ENDED
+
+
+def test_the_duration_counts_from_the_first_engagement() -> None:
+    stepped = Stepped(duration_ns=NS_PER_S)
+    stepped.run(3)
+    stepped.step("engage")
+    stepped.run(0.99)
+    assert stepped.phase is Phase.FLYING
+    assert stepped.step().hand is Hand.NEUTRAL
+    stepped.run(0.1, is_released=True)
+    assert stepped.phase is Phase.ENDED
+
+
+def test_the_duration_ends_it_also_after_a_takeover() -> None:
+    stepped = flying(duration_ns=NS_PER_S)
+    stepped.step(mode="LOITER")
+    stepped.run(0.5, is_released=True)
+    assert stepped.phase is Phase.RELEASED
+    stepped.run(0.6)
+    assert stepped.phase is Phase.ENDED
+
+
+def test_the_operators_release_is_a_normal_end_and_the_gate_stays() -> None:
+    stepped = flying()
+    assert stepped.step("release").hand is Hand.NEUTRAL
+    stepped.run(1, is_released=True)
+    assert stepped.phase is Phase.RELEASED
+    assert stepped.step("engage").hand is Hand.POLICY
+
+
+def test_a_stop_before_any_flight_ends_without_a_word_to_the_vehicle() -> None:
+    stepped = Stepped()
+    stepped.engagement.stop(Ending(reason="the flight is over"))
+    assert stepped.step() == NOTHING
+    assert stepped.phase is Phase.ENDED
+
+
+def test_readonly_flies_whenever_it_could_and_never_asks() -> None:
+    stepped = Stepped(replace(AIRBORNE, armed=False, mode="RTL"), readonly=True)
+    assert {move.hand for move in stepped.run(1)} == {Hand.POLICY}
+    assert stepped.step(chunk_problem="no chunk") == NOTHING
+    assert stepped.step(chunk_problem=None).hand is Hand.POLICY
+    assert not any(move.arm or move.mode for move in stepped.moves)
+
+
+# --- sequences that once went wrong
+
+
+def test_a_takeover_releases_at_least_once_even_if_nothing_seems_to_be_held() -> None:
+    stepped = flying()
+    move = stepped.step(is_released=True, interruption="the vehicle has rebooted")
+    assert move == Move(hand=Hand.RELEASE)
+    assert stepped.step() == Move()
+    assert stepped.phase is Phase.RELEASED
+
+
+def test_a_takeover_in_the_very_step_of_a_fault_wins() -> None:
+    stepped = flying(departure=DepartureSettings(on_fault="hold"))
+    move = stepped.step(mode="RTL", chunk_fault="no chunk", envelope_problem="too high")
+    assert move == Move(hand=Hand.RELEASE)
+    assert not any(move.mode for move in stepped.run(3))
+
+
+def test_the_safe_mode_of_the_last_flight_is_the_pilots_in_the_next_one() -> None:
+    stepped = flying(departure=DepartureSettings(on_fault="hold"))
+    stepped.step(chunk_fault="no chunk")
+    stepped.run(0.2, mode="BRAKE")
+    stepped.run(1.5)
+    stepped.step(mode="ALT_HOLD", chunk_fault=None)
+    stepped.step("engage")
+    assert stepped.phase is Phase.FLYING
+    stepped.step(mode="BRAKE")
+    assert stepped.phase is Phase.RELEASING
+
+
+def test_an_act_that_waits_for_a_mode_is_given_up_soon_and_touches_no_stick() -> None:
+    stepped = Stepped(
+        replace(AIRBORNE, is_released=True), mode="LOITER", modes=("ALT_HOLD", "LOITER")
+    )
+    stepped.step()
+    stepped.step("engage")
+    assert stepped.moves[-1] == Move(mode="LOITER")
+    moves = stepped.run(ACT_TIMEOUT_NS / NS_PER_S + 1.5)
+    assert {move.hand for move in moves} <= {None, Hand.RELEASE}
+    assert stepped.phase is Phase.RELEASED
+    assert stepped.engagement.failure is None
+    assert "not ready after 3 s" in (stepped.engagement.refusal or "")
+
+
+def test_a_pilots_mode_is_not_changed_back_while_ours_is_awaited() -> None:
+    stepped = Stepped(mode="LOITER", modes=("ALT_HOLD", "LOITER"))
+    stepped.step()
+    stepped.step("engage")
+    stepped.step(mode="LAND")
+    assert stepped.phase is Phase.RELEASING
+    assert not any(move.mode for move in stepped.run(3))
+
+
+@pytest.mark.parametrize("phase", ["leaving", "releasing", "holding"])
+def test_an_act_while_the_last_flight_ends_is_refused_aloud(phase: str) -> None:
+    stepped = flying(
+        replace(AIRBORNE, has_receiver=phase == "leaving", pilot_sticks=None),
+        departure=DepartureSettings(on_fault="hold"),
+    )
+    if phase == "releasing":
+        stepped.step(mode="RTL")
+    else:
+        stepped.step(chunk_fault="no chunk")
+        stepped.run(0.2, mode="BRAKE" if phase == "holding" else "ALT_HOLD")
+    assert stepped.phase.value == phase
+    stepped.step("engage")
+    assert f"still ending ({phase})" in (stepped.engagement.refusal or "")

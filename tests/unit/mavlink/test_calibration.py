@@ -56,8 +56,11 @@ def test_the_mapping_stays_in_range_and_inverts_to_half_a_microsecond(sticks: St
     ("arguments", "message"),
     [
         ({"number": 9, "min_us": 1100, "trim_us": 1500, "max_us": 1900}, "not one of 1..8"),
-        ({"number": 1, "min_us": 1900, "trim_us": 1500, "max_us": 1100}, "in this order"),
-        ({"number": 1, "min_us": 0, "trim_us": 1500, "max_us": 1900}, "500..2500"),
+        ({"number": 1, "min_us": 1900, "trim_us": 1500, "max_us": 1100}, "not below RC1_MAX 1100"),
+        (
+            {"number": 1, "min_us": 0, "trim_us": 1500, "max_us": 1900},
+            "RC1_MIN 0 is not in 800..2200.*--set RC1_MIN=800",
+        ),
     ],
 )
 def test_an_unusable_calibration_is_refused(arguments: dict[str, int], message: str) -> None:

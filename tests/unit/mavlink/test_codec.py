@@ -14,12 +14,16 @@ from mavbridge.mavlink.codec.messages import (
     Body,
     CommandAck,
     Endpoint,
+    EstimatorFlags,
     Heartbeat,
+    LandedState,
     LocalVelocity,
     ParamValue,
+    ParamWrite,
     RcChannels,
     SpecificForce,
     StatusText,
+    SystemStatus,
     Timesync,
 )
 from mavbridge.mavlink.codec.packets import (
@@ -38,14 +42,16 @@ def codec() -> Codec:
 
 
 def attitude(q: tuple[float, ...], rate: tuple[float, ...], *, quaternion: bool) -> Attitude:
-    return Attitude(is_quaternion=quaternion, boot_ms=7, ned_from_body_wxyz=q, rate_body_radps=rate)
+    return Attitude(
+        is_quaternion=quaternion, boot_us=7000, ned_from_body_wxyz=q, rate_body_radps=rate
+    )
 
 
 R = sqrt(0.5)
 CASES: list[tuple[dialect.MAVLink_message, Body]] = [
     (
         m.heartbeat_encode(2, 3, 0x81, 2, 4),
-        Heartbeat(vehicle_type=2, autopilot=3, base_mode=0x81, custom_mode=2),
+        Heartbeat(vehicle_type=2, autopilot=3, base_mode=0x81, custom_mode=2, system_status=4),
     ),
     (
         m.attitude_quaternion_encode(7, 0.5, 0.5, -0.5, 0.5, 1, 2, 3),
@@ -65,24 +71,41 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
         attitude((0.5, -0.5, 0.5, 0.5), (0, 0, 0), quaternion=False),
     ),
     (
-        m.local_position_ned_encode(7, 9, 9, 9, 1.5, -2.5, 0.25),
-        LocalVelocity(velocity_ned_mps=(1.5, -2.5, 0.25)),
+        m.local_position_ned_encode(7, 9, -8, 7, 1.5, -2.5, 0.25),
+        LocalVelocity(boot_us=7000, velocity_ned_mps=(1.5, -2.5, 0.25), position_ned_m=(9, -8, 7)),
     ),
     (
+        m.local_position_ned_encode(7, 9, nan, 7, 1.5, -2.5, 0.25),
+        LocalVelocity(boot_us=7000, velocity_ned_mps=(1.5, -2.5, 0.25)),
+    ),
+    (
+        m.sys_status_encode(0b111, 0b101, 0b011, 0, 0, 0, 87, *[0] * 6),
+        SystemStatus(present=0b101, healthy=0b011, battery_percent=87),
+    ),
+    (m.extended_sys_state_encode(0, 2), LandedState(landed_state=2)),
+    (m.ekf_status_report_encode(831, *[0.5] * 5), EstimatorFlags(flags=831)),
+    (m.estimator_status_encode(7, 0xE5, *[0.5] * 8), EstimatorFlags(flags=0xE5)),
+    (
         m.highres_imu_encode(7, 1, 2, -9.75, *[0.5] * 10, 8191),
-        SpecificForce(message_name="HIGHRES_IMU", specific_force_body_mps2=(1, 2, -9.75)),
+        SpecificForce(
+            message_name="HIGHRES_IMU", boot_us=7, specific_force_body_mps2=(1, 2, -9.75)
+        ),
     ),
     (
         m.raw_imu_encode(7, 1000, 0, -1001, *[0] * 6),
-        SpecificForce(message_name="RAW_IMU", specific_force_body_mps2=(9.80665, 0, -9.81645665)),
+        SpecificForce(
+            message_name="RAW_IMU", boot_us=7, specific_force_body_mps2=(9.80665, 0, -9.81645665)
+        ),
     ),
     (
         m.scaled_imu2_encode(7, 0, -500, 0, *[0] * 6),
-        SpecificForce(message_name="SCALED_IMU2", specific_force_body_mps2=(0, -4.903325, 0)),
+        SpecificForce(
+            message_name="SCALED_IMU2", boot_us=7000, specific_force_body_mps2=(0, -4.903325, 0)
+        ),
     ),
     (
         m.rc_channels_encode(7, 8, *range(1001, 1009), *[0] * 10, 255),
-        RcChannels(channels_us=tuple(range(1001, 1009))),
+        RcChannels(channels_us=tuple(range(1001, 1009)), boot_us=7000),
     ),
     (
         m.command_ack_encode(511, 3, 0, 0, 255, 191),
@@ -97,6 +120,16 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
     (
         m.autopilot_version_encode(0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 0),
         AutopilotVersion(version="4.7.1"),
+    ),
+    (
+        m.autopilot_version_encode(0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 0xAB),
+        AutopilotVersion(version="4.7.1", unique_id="ab"),
+    ),
+    (
+        m.autopilot_version_encode(
+            0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 1, b"\x01\xff".ljust(18, b"\0")
+        ),
+        AutopilotVersion(version="4.7.1", unique_id="01ff"),
     ),
 ]
 
@@ -188,6 +221,14 @@ def sent(data: bytes) -> dialect.MAVLink_message:
     return message
 
 
+def test_a_parameter_is_set_as_the_number_itself() -> None:
+    message = sent(codec().encode_request(TARGET, ParamWrite("RC_OVERRIDE_TIME", 0.5)))
+    assert message.get_type() == "PARAM_SET"
+    assert (message.target_system, message.target_component) == TARGET
+    assert (message.param_id, message.param_value) == ("RC_OVERRIDE_TIME", 0.5)
+    assert message.param_type == dialect.MAV_PARAM_TYPE_REAL32
+
+
 def test_override_holds_the_stick_channels_and_ignores_the_rest() -> None:
     pwm_us = pwm_of(Sticks(0.5, 0.25, 0.5, -0.25), ARDUPILOT)
     message = sent(codec().encode_override(TARGET, pwm_us, ARDUPILOT))
@@ -257,3 +298,33 @@ def test_the_heartbeat_is_an_onboard_controller_without_autopilot() -> None:
         dialect.MAV_TYPE_ONBOARD_CONTROLLER,
         dialect.MAV_AUTOPILOT_INVALID,
     )
+
+
+@pytest.mark.parametrize("length", [0, 1, 49, 50, 51, 99, 100, 101, 200])
+def test_a_text_arrives_whole_in_as_many_chunks_as_it_needs(length: int) -> None:
+    text = "".join(chr(97 + k % 26) for k in range(length))
+    packets = codec().encode_statustext(dialect.MAV_SEVERITY_NOTICE, text)
+    chunks = [message for packet in packets for message in WireEnd().read(packet)]
+    assert "".join(chunk.text for chunk in chunks) == text
+    assert [chunk.chunk_seq for chunk in chunks] == list(range(len(chunks)))
+    assert {chunk.severity for chunk in chunks} == {5}
+    if length <= 50:
+        assert [chunk.id for chunk in chunks] == [0]
+    else:
+        assert {chunk.id for chunk in chunks} == {1}
+        assert all(len(chunk.text) == 50 for chunk in chunks[:-1])
+        assert len(chunks[-1].text) < 50  # a zero byte tells that it is the last
+
+
+def test_texts_are_bounded_ascii_and_told_apart() -> None:
+    ours = codec()
+    read = [
+        [
+            message
+            for packet in ours.encode_statustext(4, text)
+            for message in WireEnd().read(packet)
+        ]
+        for text in ("5\N{DEGREE SIGN}" + "x" * 300, "y" * 60)
+    ]
+    assert "".join(chunk.text for chunk in read[0]) == "5?" + "x" * 198
+    assert read[0][0].id != read[1][0].id

@@ -1,6 +1,7 @@
 """The link against a vehicle made of bytes, on a virtual clock."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,15 +10,31 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.fakes import FakeClock
 from helpers.wire import CALIBRATION, WireEnd
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import PeerError
+from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.observers import BoundedQueue
-from mavbridge.core.vehicle import IDLE, Command, LinkSnapshot, Packet, Release, Sticks
+from mavbridge.core.vehicle import (
+    IDLE,
+    Command,
+    ForwardedPacket,
+    LinkSnapshot,
+    Packet,
+    Release,
+    Sticks,
+)
+from mavbridge.mavlink.codec.messages import Measurement
+from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.settings import LinkSettings
-from mavbridge.mavlink.transport.sockets import Address, Chunk, TransportDownError
+from mavbridge.mavlink.transport.sockets import Address, Received, TransportDownError
 
 MS = NS_PER_MS
-PARAMS = CALIBRATION | {"MAV_GCS_SYSID": 255.0, "RC_OVERRIDE_TIME": 3.0}
+PARAMS = CALIBRATION | {
+    "MAV_GCS_SYSID": 255.0,
+    "RC_OVERRIDE_TIME": 3.0,
+    "RC_OPTIONS": 0.0,
+    "FS_THR_ENABLE": 1.0,
+}
 
 
 class Vehicle:
@@ -26,7 +43,10 @@ class Vehicle:
     def __init__(self, clock: FakeClock) -> None:
         self.clock = clock
         self.end = WireEnd()
-        self.inbox: list[Chunk] = []
+        self.inbox: list[Received] = []
+        self.delay_ns = 0
+        """Each way."""
+        self.under_way: list[tuple[int, bytes]] = []
         self.received: list[Any] = []
         self.params = dict(PARAMS)
         self.mode, self.armed = 2, False
@@ -35,47 +55,57 @@ class Vehicle:
         self.shows_rc = True
         self.is_down = False
         self.is_deaf = False
+        self.open_error: UserError | None = None
         self.address = ("127.0.0.1", 1)
         self.answered_to: Address | None = None
         self.opened = 0
         self.boot_ns = clock.now_ns()
         self.is_alive = True
+        self.results: dict[tuple[int, float | None], int] = {}
+        """MAV_RESULT of commands, and of modes by their number."""
 
     # transport
 
     def open(self) -> None:
         self.opened += 1
+        if self.open_error is not None:
+            raise self.open_error
         if self.is_down:
             raise TransportDownError("tcp: refused")
 
-    def drain(self) -> Iterator[Chunk]:
+    def drain(self) -> Iterator[Received]:
         if self.is_down:
             raise TransportDownError("tcp: gone")
-        chunks, self.inbox = self.inbox, []
-        yield from chunks
+        now_ns, chunks = self.clock.now_ns(), self.inbox
+        self.inbox = [chunk for chunk in chunks if chunk.arrived_ns > now_ns]
+        yield from (chunk for chunk in chunks if chunk.arrived_ns <= now_ns)
 
-    def wait(self, until_ns: int) -> None:
-        """The next message comes 3 ms from now, or after the wait."""
-        arrival_ns = self.clock.now_ns() + 3 * MS
-        self.clock.sleep_until_ns(min(arrival_ns, until_ns))
-        if arrival_ns <= until_ns and self.is_alive:
-            self.tick(1)
+    def fileno(self) -> int | None:
+        return 7
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         if self.is_down or self.is_deaf:
             return False
         self.answered_to = peer
-        for message in self.end.read(data):
-            self.received.append(message)
-            self.answer(message)
+        self.under_way.append((self.clock.now_ns() + self.delay_ns, data))
+        self.take()
         return True
+
+    def take(self) -> None:
+        while self.under_way and self.under_way[0][0] <= self.clock.now_ns():
+            for message in self.end.read(self.under_way.pop(0)[1]):
+                self.received.append(message)
+                self.answer(message)
 
     def close(self) -> None: ...
 
     # vehicle
 
     def put(self, message: dialect.MAVLink_message) -> None:
-        self.inbox.append(Chunk(self.end.pack(message), self.clock.now_ns(), self.address))
+        self.put_bytes(self.end.pack(message))
+
+    def put_bytes(self, data: bytes) -> None:
+        self.inbox.append(Received(data, self.clock.now_ns() + self.delay_ns, self.address))
 
     def answer(self, message: Any) -> None:
         mav = self.end.mav
@@ -83,8 +113,16 @@ class Vehicle:
             case "PARAM_REQUEST_READ" if message.param_id in self.params:
                 value = self.params[message.param_id]
                 self.put(mav.param_value_encode(message.param_id.encode(), value, 9, 99, 0))
+            case "PARAM_SET":
+                self.params[message.param_id] = message.param_value
+                value = message.param_value
+                self.put(mav.param_value_encode(message.param_id.encode(), value, 9, 99, 0))
             case "COMMAND_LONG":
-                self.put(mav.command_ack_encode(message.command, 0))
+                key = (message.command, message.param2 if message.command == 176 else None)
+                self.put(mav.command_ack_encode(message.command, self.results.get(key, 0)))
+            case "TIMESYNC":
+                tc1 = self.clock.now_ns() - self.boot_ns
+                self.put(mav.timesync_encode(tc1, message.ts1))
             case "RC_CHANNELS_OVERRIDE" if self.follows_overrides:
                 for k in range(8):
                     value = getattr(message, f"chan{k + 1}_raw")
@@ -92,19 +130,14 @@ class Vehicle:
                         self.channels[k] = value
 
     def tick(self, tick: int) -> None:
+        self.take()
         mav, ms = self.end.mav, (self.clock.now_ns() - self.boot_ns) // MS
         if tick % 100 == 0 and self.is_alive:
-            self.inbox.append(
-                Chunk(
-                    self.end.heartbeat(mode=self.mode, armed=self.armed),
-                    self.clock.now_ns(),
-                    self.address,
-                )
-            )
+            self.put_bytes(self.end.heartbeat(mode=self.mode, armed=self.armed))
         self.put(mav.attitude_quaternion_encode(ms, 1, 0, 0, 0, 0, 0, 0))
         self.put(mav.local_position_ned_encode(ms, 0, 0, 0, 0, 0, 0))
-        self.put(mav.highres_imu_encode(ms, 0, 0, -9.81, *[0.0] * 10, 8191))
-        if tick % 5 == 0 and self.shows_rc:
+        self.put(mav.highres_imu_encode(1000 * ms, 0, 0, -9.81, *[0.0] * 10, 8191))
+        if tick % 2 == 0 and self.shows_rc:
             self.put(mav.rc_channels_encode(ms, 8, *self.channels, *[0] * 10, 255))
 
     def names(self) -> list[str]:
@@ -118,11 +151,13 @@ class Rig:
         self.clock = FakeClock()
         self.vehicle = Vehicle(self.clock)
         self.packet_log: BoundedQueue[Packet] = BoundedQueue(20_000)
+        self.forwarded: list[ForwardedPacket] = []
         self.link = MavlinkLink(
             self.vehicle,
             self.clock,
             LinkSettings(connect="memory", **config),
             packet_log=self.packet_log,
+            forward=self.forwarded.append,
         )
         self.ticks = 0
         self.texts: list[str] = []
@@ -166,7 +201,8 @@ def test_from_first_heartbeat_to_ready() -> None:
         for message in rig.vehicle.received
         if message.get_type() == "COMMAND_LONG" and message.command == 511
     }
-    assert intervals == {31: 10000, 32: 10000, 105: 10000, 65: 50000}
+    needed = {31: 10000, 32: 10000, 105: 10000, 65: 17000}
+    assert intervals == needed | {1: 500_000, 245: 200_000, 193: 200_000, 0: 100_000}
     assert any("RC_OVERRIDE_TIME is 3" in text for text in rig.texts)
 
 
@@ -201,8 +237,14 @@ def test_commands_are_echoed_and_confirmed() -> None:
     snapshot = rig.run(0.2, Command(sticks=IDLE))
     assert snapshot.echo_confirmed
     assert snapshot.problem is None
-    assert rig.overrides()[-1] == IDLE_US
-    assert rig.link.send(Command(sticks=Sticks(0.0, 0.0, 0.001, 0.5))) == Sticks(0, 0, 0, 0.5)
+    roll_us, *others_us = rig.overrides()[-1]
+    assert (roll_us in range(1500, 1503), others_us) == (True, IDLE_US[1:])
+    sent = {rig.link.send(Command(sticks=Sticks(0.0, 0.0, 0.001, 0.5)))}
+    for _ in range(10):
+        rig.clock.advance_ns(10 * MS)
+        sent.add(rig.link.send(Command(sticks=Sticks(0.0, 0.0, 0.001, 0.5))))
+    # what was really sent: roll steps by 1 us of 400
+    assert sent == {Sticks(0, 0, 0, 0.5 - k / 400) for k in range(3)}
     assert rig.link.stats().echo_confirmed is True
 
 
@@ -223,6 +265,43 @@ def test_a_vehicle_that_would_ignore_us_is_reported_before_a_stick_is_sent(
     assert problem is not None
     assert "would ignore our sticks" in problem
     assert expected in problem
+
+
+def test_a_radio_calibration_that_would_fail_in_flight_is_a_problem_and_not_an_error() -> None:
+    rig = Rig()
+    rig.vehicle.params["RC1_MAX"] = 2250.0
+    assert "--set RC1_MAX=2200" in (rig.run(8.0).problem or "")
+    assert rig.link.send(Command(sticks=Sticks(0.0, 0.0, 0.0, 1.0))) is None
+
+
+def test_a_parameter_is_set_over_the_wire_also_after_a_reboot(tmp_path: Path) -> None:
+    rig = Rig(set_params=(("RC_OVERRIDE_TIME", 0.5),), state_folder=tmp_path)
+    assert rig.run(8.0).problem is None
+    assert rig.vehicle.params["RC_OVERRIDE_TIME"] == 0.5
+    assert "RC_OVERRIDE_TIME set from 3 to 0.5 for this flight" in rig.texts
+    rig.vehicle.boot_ns = rig.clock.now_ns()
+    assert rig.run(8.0).problem is None
+    (file,) = tmp_path.iterdir()
+    assert '"before": 3.0' in file.read_text()
+    assert not rig.link.is_restored
+    rig.link.begin_restore()
+    rig.run(1.0)
+    assert rig.link.is_restored
+    assert rig.vehicle.params["RC_OVERRIDE_TIME"] == rig.link.known_params["RC_OVERRIDE_TIME"] == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_parameter_that_matters_and_changes_in_flight_is_an_interruption() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.vehicle.armed = True
+    assert rig.run(1.5, Command(sticks=IDLE)).interruption is None
+    rig.vehicle.put(rig.vehicle.end.mav.param_value_encode(b"RC1_MAX", 1950, 9, 99, 0))
+    snapshot = rig.run(0.1, Command(sticks=IDLE))
+    assert snapshot.interruption == "RC1_MAX was changed from 1900 to 1950 in flight"
+    assert "disarm" in (snapshot.problem or "")
+    rig.vehicle.armed = False
+    assert rig.run(2.0, Release("disarmed")).problem is None
 
 
 @pytest.mark.parametrize("resting_throttle_us", [1000, 1100])
@@ -247,30 +326,59 @@ def test_without_rc_channels_there_is_nothing_to_check_against() -> None:
     assert "no RC_CHANNELS" in (rig.run(1.3, Command(sticks=IDLE)).problem or "")
 
 
-def test_a_release_is_sent_ten_times_and_then_nothing() -> None:
+def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() -> None:
     rig = Rig()
     rig.run(8.0)
-    rig.run(0.2, Command(sticks=IDLE))
-    rig.run(3.0, Release("pilot"))
-    assert rig.overrides()[20:] == [RELEASE_US] * 10
-    rig.run(1.0, Command(sticks=IDLE))
+    for k in range(2):
+        rig.run(0.2, Command(sticks=IDLE))
+        count = len(rig.overrides())
+        rig.run(0.01, Release("pilot"))
+        assert rig.overrides()[count:] == [RELEASE_US]  # in the same tick
+        rig.run(0.05 + 0.05 * k, Release("pilot"))
+        rig.run(1.0)  # nobody asks
+        assert rig.overrides()[count:] == [RELEASE_US] * (2 + k)
+    rig.run(0.01, Release("pilot"))
+    rig.run(0.01, Command(sticks=IDLE))
     count = len(rig.overrides())
-    rig.link.send(Release("end"))
-    rig.link.hand_back()
-    assert rig.overrides()[count:] == [RELEASE_US] * 10
-    assert rig.link.stats().sent_overrides == 120
+    rig.run(0.01, Release("pilot"))
+    assert rig.overrides()[count:] == [RELEASE_US]  # the last one was before an override
+    rig.run(3.0, Release("pilot"))
+    assert rig.overrides()[count:] == [RELEASE_US] * 20
+    assert rig.link.stats().sent_overrides == 41
 
 
-def test_releases_that_could_not_be_sent_are_sent_later() -> None:
+def test_a_release_that_could_not_be_sent_goes_before_everything_else() -> None:
     rig = Rig()
     rig.run(8.0)
     rig.run(0.2, Command(sticks=IDLE))
     rig.vehicle.is_deaf = True
-    rig.run(1.0, Release("pilot"))
+    rig.run(1.5, Release("pilot"))
     assert RELEASE_US not in rig.overrides()
     rig.vehicle.is_deaf = False
-    rig.run(1.0, Release("pilot"))
-    assert rig.overrides()[20:] == [RELEASE_US] * 10
+    count = len(rig.vehicle.received)
+    rig.link.send(Command(sticks=IDLE))
+    assert rig.vehicle.names()[count:] == ["RC_CHANNELS_OVERRIDE"] * 2
+    assert rig.overrides()[-2] == RELEASE_US != rig.overrides()[-1]
+
+
+@pytest.mark.parametrize("still_asked", [False, True])
+def test_a_release_is_the_first_packet_after_a_reopen(still_asked: bool) -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.run(0.2, Command(sticks=IDLE))
+    rig.vehicle.is_down = True
+    rig.run(0.02, Command(sticks=IDLE))  # now it is noticed
+    rig.run(0.01, Release("pilot"))
+    rig.run(2.5, Release("pilot") if still_asked else None)
+    count = len(rig.vehicle.received)
+    rig.vehicle.is_down = False
+    rig.run(1.2, Release("pilot") if still_asked else None)
+    names = rig.vehicle.names()[count:]
+    assert names[0] == "RC_CHANNELS_OVERRIDE"
+    assert "HEARTBEAT" in names
+    releases = rig.overrides()[20:]
+    assert all(release == RELEASE_US for release in releases)
+    assert len(releases) > 10 if still_asked else len(releases) == 1
 
 
 def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
@@ -285,23 +393,10 @@ def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
     assert rig.link.stats().sent_overrides == 20
 
 
-def test_after_a_forced_release_only_releases_leave() -> None:
-    rig = Rig()
-    rig.run(8.0)
-    rig.run(0.2, Command(sticks=IDLE))
-    rig.link.force_release()
-    assert rig.overrides()[20:] == [RELEASE_US] * 10
-    count = len(rig.vehicle.received)
-    rig.run(1.0, Command(sticks=IDLE))  # the owner has come back
-    rig.link.hand_back()
-    assert len(rig.vehicle.received) == count
-
-
 def test_nothing_is_released_that_was_never_overridden() -> None:
     rig = Rig()
     rig.run(8.0)
     rig.run(1.0, Release("disarmed"))
-    rig.link.hand_back()
     assert rig.overrides() == []
 
 
@@ -309,8 +404,10 @@ def test_readonly_sends_no_stick() -> None:
     rig = Rig(readonly=True)
     rig.run(8.0)
     rig.run(1.0, Command(sticks=IDLE))
-    rig.link.hand_back()
     assert rig.overrides() == []
+    rig.link.announce("mavbridge: the policy has the sticks")
+    rig.run(0.1)
+    assert "STATUSTEXT" not in {message.get_type() for message in rig.vehicle.received}
 
 
 def test_the_override_switch_decides() -> None:
@@ -353,14 +450,60 @@ def test_after_reconnecting_packets_go_to_the_same_peer() -> None:
     assert rig.vehicle.answered_to == ("127.0.0.1", 1)
 
 
-def test_a_vehicle_that_comes_back_from_another_port_is_followed() -> None:
+def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved() -> None:
+    rig = Rig()
+    assert rig.run(8.0).interruption is None
+    told = []
+    for port in (2, 1):
+        rig.vehicle.address = ("127.0.0.1", port)
+        told.append(rig.run(10.0).interruption)
+        assert rig.vehicle.answered_to == ("127.0.0.1", port)
+        assert rig.run(0.1).problem is None
+    assert all(text is not None and text in rig.texts for text in told)
+    assert "now sends from 127.0.0.1:2 instead of 127.0.0.1:1" in str(told[0])
+    assert told[0] != told[1]
+
+
+def test_in_flight_a_vehicle_that_moves_is_not_followed() -> None:
     rig = Rig()
     rig.run(8.0)
+    rig.link.is_engaged = True
+    rig.run(0.5, Command(sticks=IDLE))
     rig.vehicle.address = ("127.0.0.1", 2)
-    assert rig.run(2.2).problem is not None
+    count = len(rig.forwarded)
+    snapshot = rig.run(9.0, Command(sticks=IDLE))
+    assert snapshot.interruption is not None
+    for part in ("127.0.0.1:1 is silent", "heard from 127.0.0.1:2", "engage again"):
+        assert part in snapshot.interruption
+    assert rig.vehicle.answered_to == ("127.0.0.1", 1)
+    assert len(rig.forwarded) == count
+    attitude = snapshot.telemetry.ned_from_body_wxyz
+    assert attitude is not None
+    assert rig.clock.now_ns() - attitude.happened_ns >= 9 * NS_PER_S
+    rig.link.is_engaged = False
+    rig.run(1.0, Release("moved"))
     assert rig.vehicle.answered_to == ("127.0.0.1", 2)
     assert rig.run(5.0).problem is None
-    assert any("now sends from" in text for text in rig.texts)
+    assert rig.overrides()[-20:] == [RELEASE_US] * 20  # by the calibration of the last override
+
+
+@pytest.mark.parametrize("is_engaged", [False, True])
+def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
+    is_engaged: bool,
+) -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.link.is_engaged = is_engaged
+    for _ in range(3):
+        stranger = Received(WireEnd().heartbeat(mode=9), rig.clock.now_ns(), ("10.0.0.9", 4))
+        rig.vehicle.inbox.append(stranger)
+        snapshot = rig.run(1.0, Command(sticks=IDLE))
+    assert (snapshot.interruption, snapshot.problem) == (None, None)
+    assert snapshot.status is not None
+    assert snapshot.status.mode == "ALT_HOLD"
+    told = [text for text in rig.texts if "10.0.0.9:4" in text]
+    assert len(told) == 1
+    assert "is ignored: the vehicle is at 127.0.0.1:1" in told[0]
 
 
 def test_one_old_stamp_is_no_reboot_and_costs_no_release() -> None:
@@ -371,10 +514,24 @@ def test_one_old_stamp_is_no_reboot_and_costs_no_release() -> None:
     rig.vehicle.put(mav.attitude_quaternion_encode(3, 1, 0, 0, 0, 0, 0, 0))
     assert rig.run(0.2, Command(sticks=IDLE)).problem is None
     assert not any("rebooted" in text for text in rig.texts)
-    rig.vehicle.boot_ns = rig.clock.now_ns()
-    assert rig.run(0.05).problem is not None
-    rig.link.hand_back()
-    assert rig.overrides()[-10:] == [RELEASE_US] * 10
+
+
+def test_a_reboot_ends_the_engagement_and_still_leaves_a_release() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    told = []
+    for _ in range(2):
+        rig.link.is_engaged = True
+        rig.run(0.2, Command(sticks=IDLE))
+        rig.vehicle.boot_ns = rig.clock.now_ns()
+        told.append(rig.run(0.05, Command(sticks=IDLE)).interruption)
+        count = len(rig.overrides())
+        rig.run(0.2, Release("reboot"))
+        assert rig.overrides()[count:] == [RELEASE_US] * 4
+        assert rig.run(8.0).problem is None
+    assert "the vehicle has rebooted" in str(told[0])
+    assert "the vehicle has rebooted" in str(told[1])
+    assert told[0] != told[1]
 
 
 def test_a_reboot_starts_the_handshake_again() -> None:
@@ -383,12 +540,12 @@ def test_a_reboot_starts_the_handshake_again() -> None:
     reads = rig.vehicle.names().count("PARAM_REQUEST_READ")
     rig.vehicle.boot_ns = rig.clock.now_ns()
     assert rig.run(0.05).problem is not None
-    assert rig.run(5.0).problem is None
+    assert rig.run(8.0).problem is None
     assert rig.vehicle.names().count("PARAM_REQUEST_READ") == 2 * reads
     assert any("rebooted" in text for text in rig.texts)
 
 
-def test_mode_and_arm_are_requested_once_a_second_and_refusals_are_reported() -> None:
+def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() -> None:
     rig = Rig()
     rig.run(8.0)
     for _ in range(150):
@@ -400,12 +557,119 @@ def test_mode_and_arm_are_requested_once_a_second_and_refusals_are_reported() ->
         for message in rig.vehicle.received
         if message.get_type() == "COMMAND_LONG" and message.command in (176, 400)
     ]
-    assert sorted(commands) == [(176, 1, 1), (176, 1, 1), (400, 1, 0), (400, 1, 0)]
+    assert commands.count((176, 1, 1)) == 30  # every 50 ms
+    assert commands.count((400, 1, 0)) == 2  # once a second
+    assert len(commands) == 32
     rig.vehicle.put(rig.vehicle.end.mav.command_ack_encode(400, dialect.MAV_RESULT_FAILED))
     rig.vehicle.put(rig.vehicle.end.mav.statustext_encode(2, b"Arm: Throttle too high"))
     rig.run(0.01)
     assert "the vehicle answered COMPONENT_ARM_DISARM with FAILED" in rig.texts
     assert "vehicle: Arm: Throttle too high" in rig.texts
+
+
+def test_a_refused_mode_is_named_until_another_is_asked_for() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.vehicle.results[176, 17.0] = dialect.MAV_RESULT_FAILED
+    rig.link.set_mode("BRAKE")
+    assert rig.run(0.02).refused_mode == "BRAKE"
+    rig.link.set_mode("BRAKE")
+    assert rig.run(0.02).refused_mode == "BRAKE"
+    rig.link.set_mode("LAND")  # at once, though a mode was asked for just now
+    assert rig.run(0.02).refused_mode is None
+    modes = [m.param2 for m in rig.vehicle.received if getattr(m, "command", 0) == 176]
+    assert modes == [17, 9]
+    rig.link.set_mode("BRAKE")
+    assert rig.run(4.0).refused_mode == "BRAKE"
+    rig.vehicle.is_deaf = True
+    rig.link.set_mode("BRAKE")  # long after the refusal, and not answered yet
+    assert rig.link.poll().refused_mode is None
+
+
+def test_announcements_reach_the_vehicles_link() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.link.announce("mavbridge flies")
+    rig.link.announce("mavbridge released: " + "x" * 60, is_warning=True)
+    texts = [m for m in rig.vehicle.received if m.get_type() == "STATUSTEXT"]
+    assert [(m.severity, m.text) for m in texts] == [
+        (dialect.MAV_SEVERITY_NOTICE, "mavbridge flies"),
+        (dialect.MAV_SEVERITY_WARNING, "mavbridge released: " + "x" * 30),
+        (dialect.MAV_SEVERITY_WARNING, "x" * 30),
+    ]
+
+
+def ages_ms(rig: Rig, snapshot: LinkSnapshot) -> list[float]:
+    telemetry = snapshot.telemetry
+    readings = (
+        telemetry.ned_from_body_wxyz,
+        telemetry.rate_body_radps,
+        telemetry.velocity_ned_mps,
+        telemetry.specific_force_body_mps2,
+    )
+    assert all(reading is not None for reading in readings)
+    return [(rig.clock.now_ns() - r.happened_ns) / MS for r in readings if r is not None]
+
+
+@pytest.mark.parametrize("is_from_the_start", [True, False])
+def test_200_ms_of_delay_each_way_are_200_ms_of_age(is_from_the_start: bool) -> None:
+    rig = Rig()
+    if is_from_the_start:
+        rig.vehicle.delay_ns = 200 * MS
+    snapshot = rig.run(12.0)
+    assert snapshot.problem is None
+    assert rig.link.stats().is_timesync_good
+    if not is_from_the_start:
+        assert ages_ms(rig, snapshot) == [10] * 4  # the tick that has passed since
+        rig.vehicle.delay_ns = 200 * MS
+        snapshot = rig.run(0.2)
+        assert ages_ms(rig, snapshot) == [210] * 4
+        snapshot = rig.run(60.0)
+    assert ages_ms(rig, snapshot) == pytest.approx([210] * 4, abs=1)
+    error_ms = rig.link.stats().timesync_error_ms
+    assert error_ms is not None
+    assert error_ms == pytest.approx(205 if is_from_the_start else 12, abs=7)
+
+
+def test_what_is_forwarded_gives_the_same_readings_elsewhere() -> None:
+    rig = Rig()
+    rig.vehicle.delay_ns = 30 * MS
+    snapshot = rig.run(12.0)
+    codec, collector = Codec(source_system=255, source_component=191), TelemetryCollector()
+    names = []
+    for packet in rig.forwarded:
+        for message in codec.decode_datagram(packet.data):
+            names.append(message.name)
+            if isinstance(message.body, Measurement):
+                collector.receive(message.body, packet.arrived_ns, packet.happened_ns)
+            else:
+                assert packet.happened_ns == packet.arrived_ns
+    assert collector.snapshot() == snapshot.telemetry
+    arrivals_ns = [packet.arrived_ns for packet in rig.forwarded]
+    assert arrivals_ns == sorted(arrivals_ns)
+    assert {"HEARTBEAT", "COMMAND_ACK", "PARAM_VALUE", "RC_CHANNELS", "TIMESYNC"} <= set(names)
+
+
+def test_it_says_what_to_select_on_unless_the_connection_is_lost() -> None:
+    rig = Rig()
+    assert rig.link.fileno() == 7
+    rig.vehicle.is_down = True
+    rig.run(0.01)
+    assert rig.link.fileno() is None
+    rig.vehicle.is_down = False
+    rig.run(1.1)
+    assert rig.link.fileno() == 7
+
+
+def test_a_port_that_was_taken_meanwhile_is_waited_for() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.vehicle.is_down = True
+    rig.run(0.1, Command(sticks=IDLE))
+    rig.vehicle.is_down, rig.vehicle.open_error = False, UserError("port in use")
+    assert rig.run(3.0, Command(sticks=IDLE)).problem is not None
+    rig.vehicle.open_error = None
+    assert rig.run(2.0).problem is None
 
 
 def test_no_vehicle_is_an_error_with_advice() -> None:
@@ -419,28 +683,12 @@ def test_a_vehicle_heard_in_time_is_not_given_up_while_it_settles() -> None:
     assert Rig(connect_timeout_s=0.1).run(8.0).problem is None
 
 
-def test_it_waits_for_the_attitude_and_no_longer() -> None:
-    rig = Rig()
-    rig.run(8.0)
-    now_ns = rig.clock.now_ns()
-    newest_ns = rig.link.wait_for_attitude(newer_than_ns=now_ns, until_ns=now_ns + 10 * MS)
-    assert newest_ns == rig.clock.now_ns() == now_ns + 3 * MS
-    newest_ns = rig.link.wait_for_attitude(newer_than_ns=now_ns + 5 * MS, until_ns=now_ns + 12 * MS)
-    assert newest_ns == rig.clock.now_ns() == now_ns + 6 * MS
-    rig.vehicle.is_alive = False
-    rig.link.wait_for_attitude(newer_than_ns=now_ns + 7 * MS, until_ns=now_ns + 12 * MS)
-    assert rig.clock.now_ns() == now_ns + 12 * MS
-    rig.vehicle.is_down = True
-    rig.link.wait_for_attitude(newer_than_ns=now_ns + 13 * MS, until_ns=now_ns + 20 * MS)
-    assert rig.clock.now_ns() == now_ns + 20 * MS
-
-
 def test_other_systems_on_the_link_are_ignored() -> None:
     rig = Rig()
     rig.run(8.0)
     stranger = WireEnd(system=9)
     rig.vehicle.inbox.append(
-        Chunk(
+        Received(
             stranger.pack(stranger.mav.attitude_encode(0, 1, 1, 1, 1, 1, 1)),
             0,
             rig.vehicle.address,
@@ -473,6 +721,17 @@ def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
     assert rig.overrides() == []
 
 
+def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -> None:
+    rig = px4_rig(output="manual-control")
+    before, count = rig.run(8.0).telemetry.velocity_ned_mps, len(rig.forwarded)
+    assert before is not None
+    rig.vehicle.put(rig.vehicle.end.mav.estimator_status_encode(0, 0xE5, *[0.0] * 8))
+    assert rig.run(0.2).telemetry.velocity_ned_mps == before
+    assert all(packet.data[7] != 32 for packet in rig.forwarded[count:])
+    rig.vehicle.put(rig.vehicle.end.mav.estimator_status_encode(0, 831, *[0.0] * 8))
+    assert rig.run(0.2).telemetry.velocity_ned_mps != before
+
+
 def test_ardupilot_with_manual_control_is_refused() -> None:
     with pytest.raises(PeerError, match="--output rc-override"):
         Rig(output="manual-control").run(3.0)
@@ -491,7 +750,8 @@ def test_acks_for_other_stations_are_ignored() -> None:
         for message in rig.vehicle.received
         if message.get_type() == "COMMAND_LONG" and message.command == 511
     ]
-    assert intervals == [31, 32, 105, 65]
+    assert intervals[:8] == [31, 32, 105, 65, 1, 245, 193, 0]
+    assert set(intervals[8:]) == {1, 245, 193, 0}  # which this vehicle grants and never sends
 
 
 def test_px4_with_rc_override_is_refused() -> None:

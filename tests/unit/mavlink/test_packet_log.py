@@ -1,3 +1,4 @@
+import os
 from datetime import datetime
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from pymavlink.dialects.v10 import ardupilotmega as dialect1
 from helpers.wire import WireEnd
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.recording.flight_writer import TlogWriter
+from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 
 
 def packets(count: int) -> list[bytes]:
@@ -52,13 +53,15 @@ def test_every_packet_comes_out_of_the_codec_as_it_was_sent(sizes: list[int], co
 def test_pymavlink_reads_the_log(tmp_path: Path) -> None:
     path = tmp_path / "link.tlog"
     unix_ns = 1_700_000_000_123_456_789
-    log = TlogWriter(path, wall_offset_ns=unix_ns - 5_000_000_000)
+    fd = os.open(path, os.O_CREAT | os.O_WRONLY)
+    log = PacketPipe(fd, wall_offset_ns=unix_ns - 5_000_000_000)
     end = WireEnd()
     for k in range(5):
         stamp_ns = 5_000_000_000 + k * 10_000_000
         sent = end.pack(end.mav.manual_control_encode(1, k, 0, 0, 0, 0))
         arrived = [Packet(stamp_ns, end.heartbeat()), Packet(stamp_ns, packets(1)[0])]
-        log.append([*arrived, Packet(stamp_ns + 2_000_000, sent)])
+        for packet in (*arrived, Packet(stamp_ns + 2_000_000, sent)):
+            log.put(packet)
     log.close()
     reader = mavutil.mavlogfile(str(path))
     read = []

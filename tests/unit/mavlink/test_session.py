@@ -3,7 +3,6 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.mavlink.codec.messages import (
@@ -12,18 +11,17 @@ from mavbridge.mavlink.codec.messages import (
     CommandRequest,
     Endpoint,
     Heartbeat,
-    ParamValue,
+    LocalVelocity,
     SpecificForce,
     StreamRequest,
     Timesync,
 )
-from mavbridge.mavlink.session import params, streams
+from mavbridge.mavlink.session import streams
 from mavbridge.mavlink.session.discovery import VehicleDiscovery
-from mavbridge.mavlink.session.echo import NUDGE_US, EchoCheck
 from mavbridge.mavlink.session.modes import ModeTable
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
-from mavbridge.mavlink.session.timesync import TimesyncFilter
+from mavbridge.mavlink.session.timesync import GOOD_EXCHANGES, TimesyncFilter
 
 S = NS_PER_S
 
@@ -106,91 +104,36 @@ def test_other_senders_are_described(
 
 
 def test_mode_names_of_both_autopilots() -> None:
-    copter = ModeTable(autopilot="ardupilot", vehicle_type=dialect.MAV_TYPE_QUADROTOR)
+    copter = ModeTable(autopilot="ardupilot")
     assert copter.name(2) == "ALT_HOLD"
-    assert copter.number("alt_hold") == 2
+    assert copter.command("alt_hold") == (2, 0)
     assert copter.name(99) == "99"
-    px4 = ModeTable(autopilot="px4", vehicle_type=dialect.MAV_TYPE_QUADROTOR)
-    assert px4.name(3 << 16 | 2 << 24) == "POSCTL"
-    assert px4.number("ACRO") == 5
     with pytest.raises(UserError, match="no mode 'HOVER'; it has ACRO"):
-        copter.number("HOVER")
-
-
-# --- parameters
-
-
-def test_parameters_are_requested_a_few_at_a_time_and_again_when_lost() -> None:
-    names = tuple(f"P{k}" for k in range(20))
-    reader = params.ParamReader(names)
-    first = [request.name for request in reader.step(0)]
-    assert first == list(names[:16])
-    assert list(reader.step(S // 10)) == []
-    for name in first[1:]:
-        reader.receive(ParamValue(name=name, value=1.0))
-    again = [request.name for request in reader.step(S)]
-    assert again == ["P0", *names[16:]]
-    for name in again:
-        reader.receive(ParamValue(name=name, value=2.0))
-    assert reader.is_done
-    assert reader.values["P0"] == 2.0
-
-
-def test_a_parameter_that_does_not_exist_is_given_up() -> None:
-    reader = params.ParamReader(("NONE",))
-    requested = sum(len(list(reader.step(k * S))) for k in range(20))
-    assert requested == 4
-    assert reader.is_done
-    assert reader.values == {}
-
-
-def test_calibration_comes_from_the_vehicle() -> None:
-    ours = params.calibration(CALIBRATION | {"RC2_REVERSED": 1.0, "RC2_TRIM": 1510.0})
-    assert ours.pitch.number == 2
-    assert ours.pitch.is_reversed
-    assert ours.pitch.trim_us == 1510
-    assert ours.throttle_floor_us == 985
+        copter.command("HOVER")
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "main", "sub"),
     [
-        ({"RC1_MIN": None}, "RC1_MIN"),
-        ({"RCMAP_YAW": 3.0}, "two sticks on one channel"),
-        ({"RC4_MAX": 900.0}, "unusable"),
+        *(("MANUAL", 1, 0), ("ALTCTL", 2, 0), ("POSCTL", 3, 0), ("ACRO", 5, 0)),
+        *(("OFFBOARD", 6, 0), ("STABILIZED", 7, 0), ("AUTO.TAKEOFF", 4, 2), ("AUTO.LOITER", 4, 3)),
+        *(("AUTO.MISSION", 4, 4), ("AUTO.RTL", 4, 5), ("AUTO.LAND", 4, 6)),
     ],
 )
-def test_an_unusable_calibration_is_the_peers_error(
-    change: dict[str, float | None], message: str
-) -> None:
-    values = {k: v for k, v in (CALIBRATION | change).items() if v is not None}
-    with pytest.raises(PeerError, match=message):
-        params.calibration(values)
+def test_modes_of_px4_and_their_sub_modes(name: str, main: int, sub: int) -> None:
+    px4 = ModeTable(autopilot="px4")
+    assert px4.name(main << 16 | sub << 24) == name
+    assert px4.command(name.lower()) == (main, sub)
 
 
-@pytest.mark.parametrize(
-    ("values", "source_system", "expected"),
-    [
-        ({"MAV_GCS_SYSID": 255.0}, 255, None),
-        ({"MAV_GCS_SYSID": 255.0}, 42, "--source-system 255"),
-        ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 250.0}, 245, None),
-        ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 0.0}, 245, "obeys system 240"),
-        ({"SYSID_MYGCS": 252.0}, 255, "obeys system 252"),
-        ({"RC_OPTIONS": 34.0}, 255, "RC_OPTIONS bit 1"),
-        ({"RC_OPTIONS": 32.0}, 255, None),
-        ({"RC_OVERRIDE_TIME": 0.0}, 255, "RC_OVERRIDE_TIME is 0"),
-    ],
-)
-def test_obstacles_are_read_from_parameters(
-    values: dict[str, float], source_system: int, expected: str | None
-) -> None:
-    found = list(params.override_obstacles(values, source_system))
-    assert found == [] if expected is None else expected in found[0]
-
-
-def test_the_override_switch_is_found() -> None:
-    assert params.override_switch({"RC7_OPTION": 46.0, "RC8_OPTION": 31.0}) == 7
-    assert params.override_switch({"RC7_OPTION": 0.0}) is None
+def test_modes_of_px4_without_a_name_of_their_own() -> None:
+    px4 = ModeTable(autopilot="px4")
+    assert px4.name(3 << 16 | 2 << 24) == "POSCTL"  # slow: flown with sticks all the same
+    assert px4.name(4 << 16 | 8 << 24) == "AUTO.8"
+    assert px4.name(10 << 16) == "10"
+    for name in ("AUTO", "AUTO.8", "LOITER"):
+        with pytest.raises(UserError, match=r"AUTO\.LOITER"):
+            px4.command(name)
 
 
 # --- streams
@@ -206,19 +149,68 @@ def ids(request: object) -> tuple[float, float]:
 
 
 def one_group() -> streams.StreamRequester:
-    return streams.StreamRequester(streams.telemetry_streams(state_hz=100, rc_hz=20)[:1])
+    return streams.StreamRequester(streams.telemetry_streams(state_hz=100, is_px4=False)[:1])
 
 
-def test_streams_are_requested_one_after_the_other_at_the_action_rate() -> None:
-    requester = streams.StreamRequester(streams.telemetry_streams(state_hz=100, rc_hz=20))
+@pytest.mark.parametrize(
+    ("is_px4", "watched"),
+    [
+        (False, [(1, 500_000), (245, 200_000), (193, 200_000), (0, 100_000)]),
+        (True, [(1, 500_000), (245, 200_000), (230, 200_000)]),
+    ],
+)
+def test_streams_are_requested_one_after_the_other_what_is_needed_first(
+    is_px4: bool, watched: list[tuple[int, int]]
+) -> None:
+    requester = streams.StreamRequester(streams.telemetry_streams(state_hz=100, is_px4=is_px4))
     requested = []
-    for k in range(4):
-        requested.append(ids(requester.step(k)))
-        assert requester.step(k) is None  # acks carry no id: one at a time
+    while (request := requester.step(len(requested))) is not None:
+        assert requester.is_settled == (len(requested) >= 4)
+        requested.append(ids(request))
+        assert requester.step(len(requested)) is None  # acks carry no id: one at a time
         requester.receive_ack(ack(0, command=400))  # an ack of another command
-        assert requester.step(k) is None
+        assert requester.step(len(requested)) is None
         requester.receive_ack(ack(0))
-    assert requested == [(31, 10000), (32, 10000), (105, 10000), (65, 50000)]
+    assert requested == [(31, 10000), (32, 10000), (105, 10000), (65, 17000), *watched]
+
+
+@pytest.mark.parametrize("answer", [None, dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_FAILED])
+def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
+    requester = streams.StreamRequester(streams.telemetry_streams(state_hz=100, is_px4=False))
+    requested = []
+    for tick in range(3000):
+        for message in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU"):
+            requester.receive(message)
+        if tick % 2:
+            requester.receive("RC_CHANNELS")
+        if (request := requester.step(tick * 10 * NS_PER_MS)) is None:
+            continue
+        requested.append(request)
+        is_needed = ids(request)[0] in (31, 32, 105, 65)
+        if is_needed:
+            requester.receive_ack(ack(0))
+        elif answer is not None:
+            requester.receive_ack(ack(answer))
+        assert requester.is_settled == (len(requested) >= 4)
+    # never the legacy request, which would change the rates of other messages as well
+    attempts = 4 if answer is None else 1
+    assert [ids(request)[0] for request in requested[4:]] == [
+        number for number in (1, 245, 193, 0) for _ in range(attempts)
+    ]
+    assert requester.renewals == 0
+
+
+def test_a_watched_stream_that_stops_is_asked_for_again_and_not_lost() -> None:
+    wanted = streams.telemetry_streams(state_hz=100, is_px4=False)[4:5]
+    requester, requested_s = streams.StreamRequester(wanted), []
+    for tick in range(1000):
+        if tick < 300 and tick % 50 == 0:
+            requester.receive("SYS_STATUS")
+        if requester.step(tick * 10 * NS_PER_MS) is not None:
+            requested_s.append(tick // 100)
+            requester.receive_ack(ack(0))
+    assert requested_s == [0, 4, 6, 8]
+    assert requester.renewals == 0
     assert requester.is_settled
 
 
@@ -230,6 +222,15 @@ def test_denied_means_slower_then_another_message_then_the_legacy_stream() -> No
     assert requested == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
     assert requester.step(9) == StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
     assert requester.is_settled
+
+
+def test_a_request_that_is_undecided_is_repeated_without_haste() -> None:
+    requester, requested_s = one_group(), []
+    for tick in range(300):
+        if requester.step(tick * 10 * NS_PER_MS) is not None:
+            requested_s.append(tick / 100)
+            requester.receive_ack(ack(dialect.MAV_RESULT_TEMPORARILY_REJECTED))
+    assert requested_s == [0.0, 0.5, 1.0, 1.5, 2.0]  # the last is the legacy stream
 
 
 def test_an_unanswered_request_is_repeated_and_then_the_legacy_stream_used() -> None:
@@ -257,6 +258,96 @@ def test_a_stream_that_slows_down_is_requested_again() -> None:
 
 # --- timesync
 
+BOOT_NS = 70 * S
+"""Vehicle's clock minus ours, in these tests."""
+
+
+def exchange(
+    sync: TimesyncFilter, at_ns: int, *, up_ns: int, down_ns: int, offset_ns: int = BOOT_NS
+) -> None:
+    """One request and its answer, with the time that each takes."""
+    ts1 = sync.request(at_ns)
+    assert ts1 is not None
+    answered_ns = at_ns + up_ns
+    sync.receive(Timesync(tc1=answered_ns + offset_ns, ts1=ts1), answered_ns + down_ns)
+
+
+def good_timesync(*, way_ns: int = NS_PER_MS) -> TimesyncFilter:
+    sync = TimesyncFilter()
+    for k in range(GOOD_EXCHANGES):
+        assert not sync.is_good
+        exchange(sync, k * S, up_ns=way_ns, down_ns=way_ns)
+    assert sync.is_good
+    return sync
+
+
+def boot_us(at_ns: int) -> int:
+    return (at_ns + BOOT_NS) // 1000
+
+
+def test_things_happened_when_the_vehicle_says_once_the_offset_is_good() -> None:
+    assert TimesyncFilter().happened_ns(boot_us(9 * S), 10 * S) == 10 * S
+    sync = good_timesync()
+    assert sync.happened_ns(boot_us(9 * S), 9 * S + 200 * NS_PER_MS) == 9 * S
+    assert sync.happened_ns(boot_us(9 * S), 9 * S) == 9 * S
+    assert sync.happened_ns(boot_us(9 * S + NS_PER_MS), 9 * S) == 9 * S  # never later
+    assert sync.happened_ns(0, 9 * S) == 9 * S  # not stamped
+    assert sync.happened_ns(1_700_000_000_000_000, 9 * S) == 9 * S  # Unix time
+    assert sync.happened_ns(5, 9 * S) == 9 * S  # seconds after a reboot that is not known yet
+    sync.restart()
+    assert sync.happened_ns(boot_us(9 * S), 10 * S) == 10 * S
+    assert (sync.offset_ns, sync.error_ns(10 * S), sync.is_good) == (None, None, False)
+
+
+@pytest.mark.parametrize(("up_ms", "down_ms"), [(200, 200), (0, 400), (400, 0)])
+def test_a_delay_that_begins_later_does_not_move_the_offset(up_ms: int, down_ms: int) -> None:
+    sync = good_timesync()
+    for k in range(10, 200):
+        exchange(sync, k * S, up_ns=up_ms * NS_PER_MS, down_ns=down_ms * NS_PER_MS)
+        assert sync.is_good
+    assert sync.offset_ns == BOOT_NS
+    assert sync.happened_ns(boot_us(300 * S), 300 * S + down_ms * NS_PER_MS) == 300 * S
+    drift_ns = 200 * S // 10_000  # what it may have come to
+    assert sync.error_ns(204 * S) == pytest.approx(NS_PER_MS + drift_ns, rel=1e-3)
+
+
+def test_a_delay_from_the_start_is_seen_and_its_error_reported() -> None:
+    sync = good_timesync(way_ns=200 * NS_PER_MS)
+    assert sync.happened_ns(boot_us(9 * S), 9 * S + 200 * NS_PER_MS) == 9 * S
+    assert sync.error_ns(4 * S) == pytest.approx(200 * NS_PER_MS, rel=1e-3)
+
+
+def test_a_drifting_clock_is_followed() -> None:
+    sync = good_timesync()
+    for k in range(10, 1000):
+        drifted_ns = BOOT_NS + k * 300_000  # 300 ppm, which a simulator on a busy computer has
+        exchange(sync, k * S, up_ns=NS_PER_MS, down_ns=NS_PER_MS, offset_ns=drifted_ns)
+        assert sync.is_good
+        assert sync.offset_ns is not None
+        assert abs(sync.offset_ns - drifted_ns) < 4 * NS_PER_MS
+
+
+def test_a_clock_that_steps_is_not_trusted_until_exchanges_agree_again() -> None:
+    sync = good_timesync()
+    for k in range(GOOD_EXCHANGES):
+        stepped_ns = BOOT_NS + S
+        exchange(sync, (10 + k) * S, up_ns=1, down_ns=1, offset_ns=stepped_ns)
+        assert sync.offset_ns == stepped_ns
+        assert sync.is_good == (k == GOOD_EXCHANGES - 1)
+
+
+def test_a_clock_that_does_not_run_evenly_is_never_trusted() -> None:
+    sync = TimesyncFilter()
+    for k in range(50):
+        exchange(sync, k * S, up_ns=1, down_ns=1, offset_ns=BOOT_NS - k * S // 20)
+        assert not sync.is_good
+
+
+def test_an_exchange_that_took_seconds_is_not_used() -> None:
+    sync = TimesyncFilter()
+    exchange(sync, 0, up_ns=S, down_ns=S)
+    assert sync.offset_ns is None
+
 
 def test_only_answers_to_our_own_requests_count() -> None:
     sync = TimesyncFilter()
@@ -278,64 +369,8 @@ def test_the_fastest_exchange_sets_the_offset() -> None:
         ts1 = sync.request(k * S)
         assert ts1 is not None
         # all the delay on the way back: the offset of a slow exchange is off by half of it
-        sync.receive(Timesync(tc1=ts1 + 70 * S, ts1=ts1), ts1 + delay_ns)
-    assert sync.offset_ns == 70 * S - 500_000
-
-
-# --- echo
-
-A, B, C = (1100, 1500, 1500, 1500), (1500, 1500, 1500, 1500), (1000, 1500, 1500, 1500)
-"""Throttle, yaw, pitch, roll in us."""
-
-
-def test_an_override_that_shows_up_is_confirmed() -> None:
-    echo = EchoCheck()
-    echo.received(C, 0)
-    echo.sent(A, S)
-    echo.received(C, S + 1)
-    assert not echo.confirmed
-    echo.received(A, S + 2)
-    assert echo.confirmed
-    assert not echo.failed(S + 3)
-
-
-def test_an_override_that_never_shows_up_fails_and_is_tried_again_later() -> None:
-    echo = EchoCheck()
-    echo.received(C, 0)
-    for k in range(100):
-        echo.sent(A, k * 10 * NS_PER_MS)
-        echo.received(C, k * 10 * NS_PER_MS)
-    assert not echo.failed(S)
-    assert echo.failed(S + 1)
-    echo.released()
-    assert echo.failed(3 * S)
-    assert not echo.failed(5 * S)
-
-
-def test_an_echo_that_stops_in_flight_is_noticed() -> None:
-    echo = EchoCheck()
-    for k in range(300):
-        echo.sent(A, k * 10 * NS_PER_MS)
-        echo.received(A if k < 100 else B, k * 10 * NS_PER_MS)
-    assert echo.failed(3 * S)
-
-
-def test_sticks_at_rest_are_nudged_until_they_are_seen() -> None:
-    echo = EchoCheck()
-    echo.received(A, 0)  # the receiver rests where we will hold the sticks
-    for k in range(50):
-        nudged = echo.with_nudge(A)
-        assert nudged == (1100, 1500, 1500, 1500 + NUDGE_US)
-        echo.sent(nudged, S + k * 10 * NS_PER_MS)
-        echo.received(A, S + k * 10 * NS_PER_MS)  # a vehicle that ignores us shows no nudge
-    assert not echo.confirmed
-    assert echo.failed(S + S + 1)
-    echo.received(nudged, 2 * S)
-    assert echo.confirmed
-    assert echo.with_nudge(A) == A
-    echo.sent(A, 2 * S)
-    echo.received(A, 2 * S + 1)
-    assert not echo.failed(3 * S)
+        sync.receive(Timesync(tc1=ts1 + BOOT_NS, ts1=ts1), ts1 + delay_ns)
+    assert sync.offset_ns == BOOT_NS - 500_000
 
 
 # --- telemetry and counters
@@ -345,33 +380,63 @@ def test_a_worse_message_never_overwrites_a_better_live_one() -> None:
     telemetry = TelemetryCollector()
 
     def force(source: str, value: float, at_ns: int) -> None:
-        telemetry.receive(
-            SpecificForce(message_name=source, specific_force_body_mps2=(value, 0, 0)), at_ns
-        )
+        telemetry.receive(SpecificForce(source, at_ns // 1000, (value, 0, 0)), at_ns, at_ns)
 
     force("RAW_IMU", 1.0, 0)
-    force("HIGHRES_IMU", 2.0, 1)
-    force("RAW_IMU", 3.0, 2)
-    reading = telemetry.snapshot().specific_force_body_mps2
-    assert reading is not None
-    assert reading == (1, (2.0, 0, 0))
+    force("HIGHRES_IMU", 2.0, 1000)
+    force("RAW_IMU", 3.0, 2000)
+    assert telemetry.snapshot().specific_force_body_mps2 == (1000, (2.0, 0, 0), 0)
     force("SCALED_IMU2", 4.0, S)
-    assert telemetry.snapshot().specific_force_body_mps2 == (S, (4.0, 0, 0))
+    assert telemetry.snapshot().specific_force_body_mps2 == (S, (4.0, 0, 0), 0)
 
     def attitude(quaternion: bool, at_ns: int) -> None:
-        telemetry.receive(
-            Attitude(
-                is_quaternion=quaternion,
-                boot_ms=0,
-                ned_from_body_wxyz=(1, 0, 0, 0),
-                rate_body_radps=(0, 0, 0),
-            ),
-            at_ns,
-        )
+        body = Attitude(quaternion, 0, (1, 0, 0, 0), (0, 0, 0))
+        telemetry.receive(body, at_ns, at_ns)
 
     attitude(True, 0)
     attitude(False, 1)
-    assert telemetry.snapshot().rate_body_radps == (0, (0, 0, 0))
+    assert telemetry.snapshot().rate_body_radps == (0, (0, 0, 0), 0)
+
+
+def velocities(*received: tuple[int, float, int]) -> list[tuple[float, int]]:
+    """What is held after each of these, of (stamp in ms, value, delay in ms), one every 10 ms."""
+    telemetry, held = TelemetryCollector(), []
+    for k, (stamp_ms, value, delay_ms) in enumerate(received):
+        arrived_ns = (1000 + k) * 10 * NS_PER_MS
+        body = LocalVelocity(stamp_ms * 1000, (value, 0, 0))
+        telemetry.receive(body, arrived_ns, arrived_ns - delay_ms * NS_PER_MS)
+        reading = telemetry.snapshot().velocity_ned_mps
+        assert reading is not None
+        assert reading.happened_ns <= reading.arrived_ns <= arrived_ns
+        held.append((reading.values[0], (arrived_ns - reading.happened_ns) // NS_PER_MS))
+    return held
+
+
+def test_the_age_of_a_reading_counts_from_when_it_happened() -> None:
+    assert velocities((5000, 1.0, 200), (5010, 2.0, 200)) == [(1.0, 200), (2.0, 200)]
+
+
+def test_a_late_or_doubled_datagram_never_replaces_a_newer_one() -> None:
+    late = velocities((5000, 1.0, 0), (4990, 2.0, 0), (5000, 3.0, 0), (5010, 4.0, 0))
+    assert late == [(1.0, 0), (1.0, 10), (1.0, 20), (4.0, 0)]
+    # A second and more, once and again, but never twice in a row.
+    late = velocities((5000, 1.0, 0), (3000, 2.0, 0), (5010, 3.0, 0), (3010, 4.0, 0))
+    assert late == [(1.0, 0), (1.0, 10), (3.0, 0), (3.0, 10)]
+
+
+def test_two_old_stamps_in_a_row_are_a_clock_that_has_restarted() -> None:
+    held = velocities((5000, 1.0, 0), (10, 2.0, 0), (20, 3.0, 0), (30, 4.0, 0))
+    assert held == [(1.0, 0), (1.0, 10), (3.0, 0), (4.0, 0)]
+
+
+def test_unstamped_readings_are_taken_as_they_come() -> None:
+    assert velocities((0, 1.0, 0), (0, 2.0, 0)) == [(1.0, 0), (2.0, 0)]
+
+
+def test_a_newer_reading_never_happened_before_an_older_one() -> None:
+    # The offset of the clocks has just become good, and tells of a delay of 35 ms.
+    held = velocities((5000, 1.0, 0), (5010, 2.0, 35), (5020, 3.0, 35), (5030, 4.0, 30))
+    assert held == [(1.0, 0), (2.0, 10), (3.0, 20), (4.0, 30)]
 
 
 def test_losses_are_gaps_in_the_sequence() -> None:
@@ -391,4 +456,6 @@ def test_losses_are_gaps_in_the_sequence() -> None:
     assert stats.rtt_ms is not None
     assert stats.rtt_ms.p50 == pytest.approx(2.0, rel=0.01)
     assert (stats.unusable_packets, stats.vehicle_clock_offset_ns) == (3, -NS_PER_MS)
+    assert not stats.is_timesync_good
+    assert stats.timesync_error_ms == pytest.approx(1 + 9e-4 * 1000, rel=1e-3)
     assert stats.echo_confirmed is None  # nothing was sent: there was nothing to confirm

@@ -4,6 +4,7 @@ import os
 import pty
 import select
 import socket
+import sys
 import tty
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from helpers.fakes import FakeClock
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.processes import free_port
+from mavbridge.mavlink.transport.holders import device_holder, udp_holder
 from mavbridge.mavlink.transport.sockets import (
     TCP_SILENCE_NS,
     SerialTransport,
@@ -51,6 +53,7 @@ def test_connection_strings(spec: str, kind: type) -> None:
         "tcp:1:x",
         "bluetooth",
         "/dev/ttyS0,fast",
+        "/dev/ttyS0,0",
         "ws:a:b:c",
     ],
 )
@@ -83,13 +86,67 @@ def test_udp_listens_answers_whom_it_is_told_and_stamps_arrival() -> None:
     ours.close()
 
 
-def test_a_port_in_use_is_the_users_error() -> None:
+def test_a_port_in_use_is_the_users_error_and_says_whose_it_is() -> None:
     port = free_port()
     first = make_transport(f"udp:127.0.0.1:{port}", FakeClock())
     first.open()
-    with pytest.raises(UserError, match=f"{port}.*stop it, or choose another port"):
+    with pytest.raises(UserError, match=f"{port}.*stop it, or choose another port") as caught:
         make_transport(f"udpin:127.0.0.1:{port}", FakeClock()).open()
+    if sys.platform == "linux":
+        assert f"process {os.getpid()} ({Path(sys.executable)}" in str(caught.value)
     first.close()
+
+
+def processes(root: Path, *, command: str) -> Path:
+    """A /proc in which process 42 is bound to port 14550, and nobody to another."""
+    (root / "net").mkdir()
+    line = "  1: 0100007F:38D6 00000000:0000 07 00000000:00000000 00:00000000 00000000  0  0 9876 2"
+    (root / "net" / "udp").write_text("  sl  local_address ...\n" + line + "\n")
+    for number, target in (("41", "socket:[1111]"), ("42", "socket:[9876]")):
+        (root / number / "fd").mkdir(parents=True)
+        (root / number / "fd" / "5").symlink_to(target)
+        (root / number / "cmdline").write_text(command.replace(" ", "\0") + "\0")
+    (root / "43").mkdir()  # of another user, or ended meanwhile
+    return root
+
+
+def test_the_holder_of_a_port_is_named(tmp_path: Path) -> None:
+    proc = processes(tmp_path, command="nc -ul 14550")
+    assert udp_holder(14550, proc) == "process 42 (nc -ul 14550) has it: stop it"
+    assert udp_holder(14551, proc) == "another program listens there: stop it"
+    assert udp_holder(14550, tmp_path / "none") == "another program listens there: stop it"
+
+
+def test_a_gate_that_still_gives_the_sticks_back_should_be_waited_for(tmp_path: Path) -> None:
+    proc = processes(tmp_path, command="python -m mavbridge.gate --connect udp:0.0.0.0:14550")
+    advice = udp_holder(14550, proc)
+    assert "process 42: python -m mavbridge.gate" in advice
+    assert "giving the sticks back: wait until it has, stop it with kill 42" in advice
+
+
+def test_the_holder_of_a_device_is_named(tmp_path: Path) -> None:
+    proc = processes(tmp_path, command="cat")
+    (proc / "42" / "fd" / "6").symlink_to("/dev/ttyACM0")
+    assert device_holder("/dev/ttyACM0", proc) == "; process 42 (cat) has it: stop it"
+    assert device_holder("/dev/ttyACM1", proc) == ""
+
+
+@pytest.mark.parametrize("spec", ["udp:127.0.0.1:{}", "udpout:127.0.0.1:{}", "tcp:127.0.0.1:{}"])
+def test_the_descriptor_wakes_a_select_while_it_is_open(spec: str) -> None:
+    port = free_port()
+    ours = make_transport(spec.format(port), FakeClock())
+    assert ours.fileno() is None
+    with socket.create_server(("127.0.0.1", port)):
+        ours.open()
+        descriptor = ours.fileno()
+        assert descriptor is not None
+        assert not select.select([descriptor], [], [], 0)[0]
+        if spec.startswith("udp:"):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+                vehicle.sendto(b"wake", ("127.0.0.1", port))
+            assert select.select([descriptor], [], [], 2)[0]
+    ours.close()
+    assert ours.fileno() is None
 
 
 def test_udp_to_nobody_is_no_error() -> None:
@@ -125,6 +182,29 @@ def test_tcp_connects_talks_and_notices_the_end() -> None:
     ours.close()
 
 
+def test_a_reader_may_leave_the_rest_of_a_tcp_backlog_for_later() -> None:
+    clock, sent = MonotonicClock(), bytes(k % 251 for k in range(20_000))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ours = make_transport(f"tcp:127.0.0.1:{server.getsockname()[1]}", clock)
+        ours.open()
+        vehicle, _ = server.accept()
+        with vehicle:
+            vehicle.sendall(sent)
+            first = drain_first(ours, clock)
+            assert 0 < len(first) <= 2048
+            assert first + drain_until(ours, sent[len(first) :], clock) == sent
+    ours.close()
+
+
+def drain_first(transport: Transport, clock: MonotonicClock) -> bytes:
+    """The first piece of what comes, waited for like ``drain_until``."""
+    deadline_ns = clock.now_ns() + 2_000_000_000
+    while clock.now_ns() < deadline_ns:
+        for chunk in transport.drain():
+            return chunk.data
+    return b""
+
+
 def test_tcp_refused_can_be_tried_again() -> None:
     clock = MonotonicClock()
     ours = make_transport(f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}", clock)
@@ -152,6 +232,61 @@ def test_serial_reads_and_writes_and_notices_the_end() -> None:
     ours.close()
     os.close(theirs_fd)
     os.close(ours_fd)
+
+
+def test_a_serial_backlog_is_drained_to_its_end_with_the_times_it_took_to_come() -> None:
+    clock = FakeClock()
+    ours_fd, theirs_fd = pty.openpty()
+    tty.setraw(theirs_fd)
+    ours = SerialTransport(os.ttyname(theirs_fd), 57600, clock)
+    ours.open()
+    sent = bytes(k % 251 for k in range(9000))
+    assert os.write(ours_fd, sent) == len(sent)
+    clock.advance_ns(10_000_000_000)
+    chunks = list(ours.drain())
+    assert b"".join(chunk.data for chunk in chunks) == sent
+    assert list(ours.drain()) == []
+    byte_ns, seen = 10 * 1_000_000_000 // 57600, 0
+    for chunk in chunks:
+        seen += len(chunk.data)
+        assert chunk.arrived_ns == clock.now_ns() - (len(sent) - seen) * byte_ns
+        assert len(chunk.data) * byte_ns <= 2_000_000
+    # What came since the port was last seen empty cannot have come before that.
+    empty_ns = clock.now_ns()
+    clock.advance_ns(10_000_000)
+    assert os.write(ours_fd, sent[:2000]) == 2000
+    stamps = [chunk.arrived_ns for chunk in ours.drain()]
+    assert (stamps[0], stamps[-1]) == (empty_ns, clock.now_ns())
+    assert stamps == sorted(stamps)
+    ours.close()
+    os.close(theirs_fd)
+    os.close(ours_fd)
+
+
+def test_what_a_drain_has_left_of_a_serial_backlog_is_not_lost() -> None:
+    ours_fd, theirs_fd = pty.openpty()
+    tty.setraw(theirs_fd)
+    ours = SerialTransport(os.ttyname(theirs_fd), 57600, FakeClock())
+    ours.open()
+    os.write(ours_fd, bytes(100))
+    first = next(iter(ours.drain()))
+    os.write(ours_fd, bytes(range(100)))
+    rest = b"".join(chunk.data for chunk in [*ours.drain(), *ours.drain()])
+    assert first.data + rest == bytes(100) + bytes(range(100))
+    ours.close()
+    os.close(theirs_fd)
+    os.close(ours_fd)
+
+
+def test_a_serial_device_that_is_unplugged_is_noticed() -> None:
+    ours_fd, theirs_fd = pty.openpty()
+    ours = SerialTransport(os.ttyname(theirs_fd), 57600, MonotonicClock())
+    ours.open()
+    os.close(theirs_fd)
+    os.close(ours_fd)
+    with pytest.raises(TransportDownError, match="serial"):
+        drain_until(ours, b"x", MonotonicClock())
+    ours.close()
 
 
 def test_a_serial_port_that_does_not_exist_is_the_users_error(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ class Recording:
 
 
 def show(path: Path, *batches: list[Event]) -> Recording:
-    view = RerunView(str(path), action_hz=100, vision_hz=30)
+    view = RerunView(str(path), vision_hz=30)
     for batch in batches:
         view.consume(batch)
     view.close()
@@ -81,11 +81,13 @@ def test_what_was_not_measured_is_a_gap_never_a_zero(rrd: Path) -> None:
     assert all(math.isnan(seen.values("rc", channel)[0]) for channel in range(4))
 
 
-def test_periods_and_jitter_go_on_across_batches(rrd: Path) -> None:
-    seen = show(rrd, [make_tick(0), make_tick(1)], [make_tick(4, missed_slots=2)], [make_tick(5)])
+def test_periods_go_on_across_batches_and_only_slots_are_late(rrd: Path) -> None:
+    between = make_tick(5, is_slot=False)
+    seen = show(rrd, [make_tick(0), make_tick(1)], [make_tick(4, missed_slots=2)], [between])
     assert math.isnan(seen.values("period/action")[0])
     assert seen.values("period/action")[1:] == [10.0, 30.0, 10.0]
-    assert seen.values("jitter/action")[1:] == [0.0, 20.0, 0.0]
+    assert seen.values("lateness/sticks")[:3] == [2.0, 2.0, 2.0]
+    assert math.isnan(seen.values("lateness/sticks")[3])
     assert seen.values("missed/action") == [0, 0, 2, 2]
 
 
@@ -208,7 +210,7 @@ def test_every_plot_is_in_the_blueprint() -> None:
 
 def test_an_unwritable_path_is_refused_before_the_flight(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cannot be written"):
-        RerunView(str(tmp_path / "missing" / "f.rrd"), action_hz=100, vision_hz=30)
+        RerunView(str(tmp_path / "missing" / "f.rrd"), vision_hz=30)
 
 
 def test_two_flights_in_one_process_do_not_mix(tmp_path: Path) -> None:
@@ -225,7 +227,7 @@ from helpers.factories import make_tick, make_vision_tick
 from mavbridge.core.observers import ObserverThread
 from mavbridge.observe.rerun_flight import RerunView
 
-view = RerunView(sys.argv[1], action_hz=100, vision_hz=30)
+view = RerunView(sys.argv[1], vision_hz=30)
 observer = ObserverThread("viewer", view, capacity=100)
 observer.emit(make_tick())
 observer.emit(make_vision_tick())

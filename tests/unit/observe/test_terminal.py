@@ -1,7 +1,7 @@
 import io
 
 import pytest
-from rich.console import Console, RenderableType
+from rich.console import Console
 
 from helpers.factories import (
     START_NS,
@@ -11,17 +11,12 @@ from helpers.factories import (
     make_tick,
     make_vision_tick,
 )
+from helpers.reports import report_of
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import Tick
-from mavbridge.core.vehicle import LinkStats, Percentiles
-from mavbridge.observe.terminal import (
-    PLAIN_PERIOD_S,
-    FlightScreen,
-    timing_table,
-    verdicts,
-)
-from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
+from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.observe.terminal import MAX_MESSAGES, PLAIN_PERIOD_S, FlightScreen
 
 ONE_UP_AND_ERASE = "\x1b[1A\x1b[2K"
 REFRESH_TICKS = round(100 / STATUS_HZ)
@@ -30,12 +25,6 @@ REFRESH_TICKS = round(100 / STATUS_HZ)
 def make_screen(console: Console | None = None, *, readonly: bool = False) -> FlightScreen:
     console = console or Console(file=io.StringIO())
     return FlightScreen(console, action_hz=100, vision_hz=30, readonly=readonly)
-
-
-def rendered(what: RenderableType, width: int = 100) -> str:
-    console = Console(file=io.StringIO(), width=width, record=True)
-    console.print(what)
-    return console.export_text()
 
 
 def fly(screen: FlightScreen, *, ticks: int, first: int = 0) -> str:
@@ -48,26 +37,6 @@ def fly(screen: FlightScreen, *, ticks: int, first: int = 0) -> str:
         if index % REFRESH_TICKS == 0:
             line = screen.status_line().plain
     return line
-
-
-def report_of(
-    *ticks: Tick, link: LinkStats | None = None, rerun_drops: int | None = None
-) -> TimingReport:
-    timing = FlightTiming(action_hz=100, vision_hz=30)
-    for tick in ticks:
-        timing.emit(tick)
-    return timing.report(
-        mode="dual",
-        engine="torch",
-        policy="toge-small",
-        autopilot="ardupilot",
-        link=link,
-        observer_drops=ObserverDrops(rerun=rerun_drops, recorder=None),
-    )
-
-
-def verdict_lines(report: TimingReport) -> list[str]:
-    return [verdict.plain for verdict in verdicts(report)]
 
 
 def test_the_line_of_a_good_flight() -> None:
@@ -85,6 +54,13 @@ def test_before_the_first_tick_the_line_says_so() -> None:
     ("tick", "expected"),
     [
         (make_released_tick(0, "no feature yet"), "RELEASED  ALT_HOLD armed"),
+        (
+            make_released_tick(0, "no receiver", sent=NEUTRAL, phase="holding"),
+            "NEUTRAL  ALT_HOLD armed",
+        ),
+        (make_released_tick(0, "press e", phase="waiting"), "WAITING  ALT_HOLD armed"),
+        (make_tick(0, is_coasting=True), "COASTING  ALT_HOLD armed"),
+        (make_tick(0, trace=None), "PREPARING  ALT_HOLD armed"),
         (make_tick(0, armed=False), "FLYING  ALT_HOLD disarmed"),
         (make_tick(0, mode=None), "FLYING  mode unknown armed"),
         (make_tick(0, feature_captured_ns=None), "feature - ms"),
@@ -164,9 +140,10 @@ def test_messages_are_printed_once_in_order() -> None:
     screen = make_screen(Console(file=out, width=80))
     screen.emit(make_released_tick(0, reason="no [bold] state", texts=("vehicle: Arming motors",)))
     screen.emit(make_released_tick(1, reason="no [bold] state"))
-    screen.emit(make_tick(2, trace=None))
-    screen.emit(make_tick(3))
-    screen.emit(make_tick(4, sent=None))
+    screen.emit(make_tick(2, trace=None, phase="preparing"))
+    screen.emit(make_tick(3, phase="flying"))
+    screen.emit(make_released_tick(4, reason="mode", phase="released"))
+    screen.emit(make_tick(5, sent=None, phase="flying"))
     for _ in range(2):
         screen.refresh()
     assert out.getvalue().splitlines() == [
@@ -174,8 +151,19 @@ def test_messages_are_printed_once_in_order() -> None:
         "RELEASED: no [bold] state",
         "PREPARING: sticks idle",
         "FLYING: the policy has the sticks",
+        "RELEASED: mode",
         "READ-ONLY: the policy runs, nothing is sent",
     ]
+
+
+def test_a_reason_that_keeps_changing_is_shown_once_a_second() -> None:
+    out = io.StringIO()
+    screen = make_screen(Console(file=out, width=80))
+    for index in range(201):
+        screen.emit(make_released_tick(index, reason=f"{index} ms old", phase="waiting"))
+    screen.refresh()
+    lines = out.getvalue().splitlines()
+    assert lines == [f"WAITING: {index} ms old" for index in (0, 100, 200)]
 
 
 def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
@@ -190,100 +178,51 @@ def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
     assert out.getvalue().endswith(ONE_UP_AND_ERASE)
 
 
-def test_the_table_holds_what_was_measured_in_milliseconds() -> None:
-    table = timing_table(report_of(*(make_tick(index) for index in range(11))))
-    assert table is not None
-    text = rendered(table)
-    rows = {
-        cells[0]: cells[1:]
-        for line in text.splitlines()
-        if line.startswith("│")
-        for cells in [[cell.strip() for cell in line.strip("│").split("│")]]
-    }
-    assert rows["action period"] == ["10.00"] * 4
-    assert rows["predict"] == ["2.00"] * 4
-    assert rows["feature age at send"] == ["40.00"] * 4
-    assert rows["attitude age at send"] == ["3.00"] * 4
-    assert not rows.keys() & {"vision encode", "link round trip"}
-    assert "A slot is one period" in text
+def test_the_keys_are_named_below_the_line() -> None:
+    out = io.StringIO()
+    console = Console(file=out, width=100, force_terminal=True, color_system=None)
+    screen = make_screen(console)
+    screen.start(hint="e engages")
+    screen.refresh()
+    assert screen.close(60.0)
+    assert "waiting for the first tick\ne engages" in out.getvalue().replace("\r", "")
 
 
-def test_the_table_fits_eighty_columns() -> None:
-    slow = [make_tick(k, woke_ns=START_NS + k * 100_000 * NS_PER_MS) for k in range(3)]
-    table = timing_table(report_of(*slow))
-    assert table is not None
-    assert max(len(line) for line in rendered(table).splitlines()) <= 80
-
-
-def test_verdicts_compare_targets_and_results() -> None:
-    link = LinkStats(
-        messages_per_s=(),
-        lost_fraction=0.0,
-        rtt_ms=Percentiles(p50=1, p99=1, p999=1, max=1),
-        sent_overrides=11,
-        echo_confirmed=True,
-    )
-    report = report_of(*(make_tick(index) for index in range(11)), link=link, rerun_drops=0)
-    assert verdict_lines(report) == [
-        "action   100.0 Hz of 100 Hz, 0 missed slots in 11 ticks",
-        "vision   - Hz of 30 Hz, 0 frames dropped by the camera",
-        "link     11 stick messages sent, echo confirmed, 0.00% of the vehicle's messages lost",
-        "sticks   never released",
-    ]
-
-
-def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
-    reasons = ["a", "b", "c", "d"]
-    report = report_of(
-        *(make_released_tick(index, reason) for index, reason in enumerate(reasons)), rerun_drops=1
-    )
-    assert verdict_lines(report)[-2:] == [
-        "sticks   released 4 times, last for: b (0.0 s); c (0.0 s); d (0.0 s)",
-        "rerun    missed 1 event",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("confirmed", "lost", "expected"),
-    [
-        (False, 0.5, "NO ECHO from the vehicle, 50.00% of the vehicle's messages lost"),
-        (None, None, "echo not checked, loss not measured"),
-    ],
-)
-def test_the_link_verdict_is_honest(
-    confirmed: bool | None, lost: float | None, expected: str
-) -> None:
-    link = LinkStats(
-        messages_per_s=(),
-        lost_fraction=lost,
-        rtt_ms=None,
-        sent_overrides=1,
-        echo_confirmed=confirmed,
-    )
-    assert verdict_lines(report_of(make_tick(), link=link))[2] == (
-        f"link     1 stick message sent, {expected}"
-    )
-
-
-@pytest.mark.parametrize(
-    ("period_ns", "style"),
-    [(TICK_NS, "green"), (TICK_NS * 105 // 100, "yellow"), (TICK_NS * 2, "red")],
-)
-def test_a_loop_that_misses_its_rate_is_not_green(period_ns: int, style: str) -> None:
-    ticks = [make_tick(k, woke_ns=START_NS + k * period_ns) for k in range(101)]
-    assert verdicts(report_of(*ticks))[0].spans[1].style == style
-
-
-def test_show_report_prints_table_and_verdicts() -> None:
+def test_close_prints_what_is_left_and_may_be_called_again() -> None:
     out = io.StringIO()
     screen = make_screen(Console(file=out, width=100))
+    screen.start(hint="e engages")
+    screen.show_message("the last message")
     screen.show_report(report_of(*(make_tick(index) for index in range(11))))
+    assert screen.close(60.0)
+    assert out.getvalue().startswith("e engages\nthe last message\n")
     assert "toge-small on torch, ardupilot" in out.getvalue()
     assert "100.0 Hz of 100 Hz" in out.getvalue()
+    shown = out.getvalue()
+    assert screen.close(60.0)
+    assert out.getvalue() == shown
 
 
-def test_a_flight_without_measurements_has_no_table() -> None:
+def test_a_screen_that_never_started_prints_what_it_has_at_the_end() -> None:
     out = io.StringIO()
-    make_screen(Console(file=out, width=100)).show_report(report_of())
-    assert "p99" not in out.getvalue()
+    screen = make_screen(Console(file=out, width=100))
+    screen.show_report(report_of())
+    assert screen.close(60.0)
+    assert "p99" not in out.getvalue()  # nothing was measured: no table
     assert "never released" in out.getvalue()
+
+
+def test_the_oldest_messages_are_dropped_and_counted() -> None:
+    out = io.StringIO()
+    screen = make_screen(Console(file=out, width=100))
+    for number in range(MAX_MESSAGES + 3):
+        screen.show_message(f"message {number}")
+    screen.refresh()
+    assert out.getvalue().splitlines()[:2] == ["(3 older messages were dropped)", "message 3"]
+
+
+def test_a_status_of_the_end_replaces_the_line() -> None:
+    screen = make_screen()
+    screen.emit(make_tick(0))
+    screen.show_status("ending the flight")
+    assert screen.status_line().plain == "ending the flight"

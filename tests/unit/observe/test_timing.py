@@ -44,7 +44,7 @@ def report_of(timing: FlightTiming, link: LinkStats | None = None) -> TimingRepo
 
 
 def timed(*ticks: Tick) -> TimingReport:
-    timing = FlightTiming(action_hz=100, vision_hz=30)
+    timing = FlightTiming(stick_hz=100, action_hz=100, vision_hz=30)
     for tick in ticks:
         timing.emit(tick)
     return report_of(timing)
@@ -57,33 +57,73 @@ def all_equal(value: float) -> Percentiles:
 def test_a_perfect_flight() -> None:
     report = timed(*(make_tick(index) for index in range(101)))
     assert report.duration_s == 1.0
-    assert report.action.rate_hz == 100.0
-    assert report.action.ticks == 101
-    assert report.action.missed_slots == 0
-    assert report.action.period_ms == all_equal(10.0)
-    assert report.action.jitter_ms == all_equal(0.0)
-    assert report.action.predict_ms == all_equal(2.0)
+    sticks, action = report.sticks, report.action
+    assert (sticks.rate_hz, sticks.flying_s) == (100.0, 1.0)
+    assert (sticks.sends, sticks.slots, sticks.missed_slots) == (101, 101, 0)
+    assert sticks.coasting_sends == 0
+    assert sticks.lateness_ms == all_equal(2.0)
+    assert action.rate_hz == 100.0
+    assert (action.chunks, action.late_chunks) == (101, 0)
+    assert action.period_ms == all_equal(10.0)
+    assert action.predict_ms == all_equal(2.0)
     assert report.feature_age_ms == all_equal(40.0)
     assert report.state_age_ms == all_equal(3.0)
     assert report.state_to_wire_ms == all_equal(3.0)
     assert report.releases == ()
 
 
-def test_a_stall_counts_its_slots_and_is_the_largest_period_and_jitter() -> None:
-    report = timed(make_tick(0), make_tick(1), make_tick(7, missed_slots=5), make_tick(8))
-    assert report.action.missed_slots == 5
+def test_a_stall_counts_its_slots_and_makes_its_chunk_late() -> None:
+    last = (make_tick(7, missed_slots=5, chunk_serial=2), make_tick(8, chunk_serial=3))
+    report = timed(make_tick(0), make_tick(1), *last)
+    assert (report.sticks.missed_slots, report.sticks.slots) == (5, 9)
+    assert (report.action.chunks, report.action.late_chunks) == (4, 1)
     assert report.action.period_ms is not None
     assert report.action.period_ms.max == 60.0
-    assert report.action.jitter_ms is not None
-    assert report.action.jitter_ms.max == 50.0
 
 
-def test_waking_early_and_late_are_both_jitter() -> None:
-    late = make_tick(1, woke_ns=START_NS + TICK_NS + 2 * NS_PER_MS)
-    report = timed(make_tick(0), late, make_tick(2))
-    assert report.action.jitter_ms == all_equal(2.0)
+def test_lateness_is_that_of_slots_and_a_send_between_two_has_none() -> None:
+    late = make_tick(1, sent_ns=START_NS + TICK_NS + 7 * NS_PER_MS)
+    between = make_tick(2, is_slot=False, sent_ns=START_NS + 2 * TICK_NS + 9 * NS_PER_MS)
+    sticks = timed(make_tick(0), late, between, make_tick(3)).sticks
+    assert (sticks.sends, sticks.slots) == (4, 3)
+    assert sticks.lateness_ms is not None
+    assert sticks.lateness_ms.max == 7.0
+
+
+def test_a_slow_inference_costs_a_late_chunk_and_no_stick() -> None:
+    """Two sends go on with the chunk before; the second one coasts."""
+    old = {"chunk_serial": 1, "chunk_computed_ns": make_tick(1).chunk_computed_ns}
+    report = timed(
+        make_tick(0),
+        make_tick(1),
+        make_tick(2, **old),
+        make_tick(3, is_coasting=True, **old),
+        make_tick(4, chunk_serial=2),
+    )
+    assert (report.sticks.sends, report.sticks.missed_slots) == (5, 0)
+    assert report.sticks.coasting_sends == 1
+    assert (report.action.chunks, report.action.late_chunks) == (3, 1)
     assert report.action.period_ms is not None
-    assert report.action.period_ms.max == 12.0
+    assert report.action.period_ms.max == 30.0
+
+
+@pytest.mark.parametrize(("gap_ms", "late"), [(15, 0), (16, 1)])
+def test_a_chunk_is_late_beyond_one_and_a_half_periods(gap_ms: int, late: int) -> None:
+    first = make_tick(0)
+    assert first.chunk_computed_ns is not None
+    second = make_tick(1, chunk_computed_ns=first.chunk_computed_ns + gap_ms * NS_PER_MS)
+    assert timed(first, second).action.late_chunks == late
+
+
+def test_a_chunk_that_was_overtaken_makes_the_next_one_not_late() -> None:
+    action = timed(make_tick(0), make_tick(2), make_tick(4)).action
+    assert (action.chunks, action.late_chunks, action.rate_hz) == (3, 0, 100.0)
+    assert action.period_ms == all_equal(10.0)
+
+
+def test_the_pause_of_a_release_is_no_late_chunk() -> None:
+    report = timed(make_tick(0), make_released_tick(1), make_tick(50), make_tick(51))
+    assert (report.action.chunks, report.action.late_chunks) == (3, 0)
 
 
 def test_only_the_first_send_of_an_attitude_counts_as_state_to_wire() -> None:
@@ -102,15 +142,17 @@ def test_ages_of_what_was_not_flown_are_not_counted() -> None:
     assert report.action.predict_ms is None
     assert report.action.period_ms is None
     assert report.action.rate_hz is None
+    assert report.sticks.rate_hz is None
 
 
 def test_a_loop_that_waits_fast_and_flies_slowly_is_reported_slow() -> None:
     waiting = [make_released_tick(index) for index in range(500)]
-    flying = [make_tick(500 + 5 * index, missed_slots=4) for index in range(11)]
-    action = timed(*waiting, *flying, *(make_released_tick(600 + k) for k in range(9))).action
-    assert action.rate_hz == 20.0
-    assert action.flying_s == 0.5
-    assert (action.ticks, action.missed_slots) == (11, 40)
+    flying = [make_tick(500 + 5 * k, missed_slots=4, chunk_serial=k) for k in range(11)]
+    report = timed(*waiting, *flying, *(make_released_tick(600 + k) for k in range(9)))
+    sticks, action = report.sticks, report.action
+    assert (sticks.rate_hz, sticks.flying_s) == (20.0, 0.5)
+    assert (sticks.sends, sticks.missed_slots) == (11, 40)
+    assert (action.rate_hz, action.late_chunks) == (20.0, 10)
     assert action.period_ms == all_equal(50.0)
 
 
@@ -149,7 +191,7 @@ def test_the_release_list_is_bounded_and_the_count_is_not() -> None:
 
 
 def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
-    timing = FlightTiming(action_hz=100, vision_hz=30)
+    timing = FlightTiming(stick_hz=100, action_hz=100, vision_hz=30)
     for number in range(1, 32):
         timing.emit(make_vision_tick(number, dropped_frames=40 + number // 10))
     vision = report_of(timing).vision
@@ -163,6 +205,7 @@ def test_a_flight_without_a_tick_measured_nothing() -> None:
     report = timed()
     assert report.duration_s == 0.0
     assert report.action.rate_hz is None
+    assert report.sticks.rate_hz is None
     assert report.action.period_ms is None
     assert report.vision.rate_hz is None
     assert report.vision.encode_ms is None
@@ -171,31 +214,36 @@ def test_a_flight_without_a_tick_measured_nothing() -> None:
 def test_one_tick_has_no_rate_and_no_period() -> None:
     report = timed(make_tick(0))
     assert report.action.rate_hz is None
+    assert report.sticks.rate_hz is None
     assert report.action.period_ms is None
 
 
-@pytest.mark.parametrize("action_hz", [50.0, 100.0, 250.0])
-def test_jitter_is_against_the_rate_that_was_asked_for(action_hz: float) -> None:
-    timing = FlightTiming(action_hz=action_hz, vision_hz=30)
+@pytest.mark.parametrize(("action_hz", "late"), [(50.0, 0), (100.0, 0), (250.0, 1)])
+def test_lateness_is_against_the_rate_that_was_asked_for(action_hz: float, late: int) -> None:
+    timing = FlightTiming(stick_hz=400, action_hz=action_hz, vision_hz=30)
     timing.emit(make_tick(0))
     timing.emit(make_tick(1))
-    jitter_ms = abs(10 - 1000 / action_hz)
-    assert report_of(timing).action.jitter_ms == all_equal(jitter_ms)
+    report = report_of(timing)
+    assert report.action.late_chunks == late
+    assert (report.sticks.target_hz, report.action.target_hz) == (400, action_hz)
 
 
 def test_json_has_the_keys_of_the_report_in_order() -> None:
-    timing = FlightTiming(action_hz=100, vision_hz=30)
+    timing = FlightTiming(stick_hz=100, action_hz=100, vision_hz=30)
     timing.emit(make_released_tick(0))
     timing.emit(make_tick(1))
     document = json.loads(report_json(report_of(timing, LINK)))
     assert list(document) == [
-        *("duration_s", "mode", "engine", "policy", "autopilot", "action", "vision"),
+        *("duration_s", "mode", "engine", "policy", "autopilot", "sticks", "action", "vision"),
         *("feature_age_ms", "state_age_ms", "state_to_wire_ms", "link", "releases"),
         *("release_count", "observer_drops"),
     ]
+    assert list(document["sticks"]) == [
+        *("target_hz", "rate_hz", "flying_s", "sends", "coasting_sends"),
+        *("slots", "missed_slots", "lateness_ms"),
+    ]
     assert list(document["action"]) == [
-        *("target_hz", "rate_hz", "flying_s", "ticks", "missed_slots"),
-        *("period_ms", "jitter_ms", "predict_ms"),
+        *("target_hz", "rate_hz", "chunks", "late_chunks", "period_ms", "predict_ms")
     ]
     vision_keys = ["target_hz", "rate_hz", "frames", "dropped_frames", "encode_ms"]
     assert list(document["vision"]) == vision_keys
@@ -203,6 +251,8 @@ def test_json_has_the_keys_of_the_report_in_order() -> None:
     assert document["link"] == {
         "unusable_packets": 0,
         "vehicle_clock_offset_ns": None,
+        "is_timesync_good": False,
+        "timesync_error_ms": None,
         "messages_per_s": {"ATTITUDE_QUATERNION": 99.9, "RC_CHANNELS": 20.0},
         "lost_fraction": 0.001,
         "rtt_ms": None,

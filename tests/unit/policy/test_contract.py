@@ -1,10 +1,13 @@
 import json
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from policy.checkpoints.header import read_contract
 from policy.contract import (
     AGE,
+    FLIGHT_TERMS,
     ROTATION,
     SINCE_EXPOSURE_NAMES,
     STATE_NAMES,
@@ -12,13 +15,54 @@ from policy.contract import (
     Contract,
 )
 from policy.errors import ContractError
+from policy.loading import SHIPPED
 
 
 def test_round_trips_through_its_header_form() -> None:
     contract = Contract(
-        state_frame="enu_flu", feature_dim=256, horizon=8, chunk_dt_s=0.02, since_exposure=True
+        state_frame="enu_flu",
+        feature_dim=256,
+        horizon=8,
+        chunk_dt_s=0.02,
+        since_exposure=True,
+        modes=("ACRO", "LOITER"),
+        max_state_age_s=0.5,
+        max_velocity_age_s=1,
+        max_feature_age_s=60.0,
+        max_chunk_age_s=2.0,
+        max_tilt_deg=180,
+        max_speed_mps=30.0,
+        max_height_m=300.0,
+        max_distance_m=5000.0,
     )
     assert Contract.from_json(contract.to_json()) == contract
+    assert json.loads(contract.to_json())["version"] == 2
+
+
+def header_of_version_1(**changes: object) -> dict[str, Any]:
+    header = json.loads(Contract(**changes).to_json())
+    return {name: value for name, value in header.items() if name not in FLIGHT_TERMS} | {
+        "version": 1
+    }
+
+
+def test_version_1_flies_sticks_in_the_modes_that_hold_altitude() -> None:
+    contract = Contract.from_json(json.dumps(header_of_version_1(horizon=8)))
+    assert contract == Contract(horizon=8)
+    assert contract.version == 2
+    assert (contract.action, contract.modes) == ("sticks", ("ALT_HOLD", "ALTCTL"))
+    ages_s = (contract.max_state_age_s, contract.max_velocity_age_s)
+    assert (*ages_s, contract.max_feature_age_s, contract.max_chunk_age_s) == (0.1, 0.25, 0.3, 0.3)
+    assert contract.max_tilt_deg is None
+    with pytest.raises(ContractError, match=r"\['modes'\]; those of version 1 are"):
+        Contract.from_json(json.dumps({**header_of_version_1(), "modes": ["LOITER"]}))
+
+
+def test_the_shipped_weights_are_read_as_they_are() -> None:
+    contract = read_contract(SHIPPED)
+    assert contract is not None
+    same = {"image_height": 96, "image_width": 96, "feature_dim": 256, "since_exposure": True}
+    assert contract == Contract(**same)
 
 
 def test_a_header_that_does_not_speak_of_the_exposure_is_of_thirteen_numbers() -> None:
@@ -41,7 +85,7 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"version": 2}, "version 2 is not supported"),
+        ({"version": 3}, "version 3 is not supported"),
         ({"state_frame": "nwu"}, "ned_frd"),
         ({"arrays": "jax"}, "numpy"),
         ({"horizon": 0}, "horizon must be an integer in"),
@@ -55,6 +99,23 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
         ({"image_std_rgb": [0.2, 0.2, float("nan")]}, "finite"),
         ({"since_exposure": 1}, "since_exposure must be true or false"),
         ({"colour": "bgr"}, "unknown contract keys"),
+        ({"version": "2"}, "this build reads versions 1 and 2"),
+        ({"action": "rates"}, "'rates' is not flown by this build, which flies 'sticks'"),
+        ({"modes": []}, "at least one mode"),
+        ({"modes": "ALT_HOLD"}, "at least one mode"),
+        ({"modes": ["ALT_HOLD", "GUIDED"]}, r"\['GUIDED'\] are not flown with sticks; known are"),
+        ({"modes": ["alt_hold"]}, "known are STABILIZE"),
+        ({"modes": [["ALT_HOLD"]]}, "known are STABILIZE"),
+        ({"max_state_age_s": 0}, r"max_state_age_s must be in \(0, 60\] seconds, got 0"),
+        ({"max_velocity_age_s": None}, "max_velocity_age_s must be in"),
+        ({"max_feature_age_s": 60.1}, "max_feature_age_s must be in"),
+        ({"max_chunk_age_s": float("nan")}, "max_chunk_age_s must be in"),
+        ({"max_chunk_age_s": True}, "max_chunk_age_s must be in"),
+        ({"max_chunk_age_s": "long"}, "max_chunk_age_s must be in"),
+        ({"max_tilt_deg": 181}, r"max_tilt_deg must be in \(0, 180\] degrees"),
+        ({"max_speed_mps": -1}, "max_speed_mps must be in"),
+        ({"max_height_m": float("inf")}, "max_height_m must be in"),
+        ({"max_distance_m": "far"}, "max_distance_m must be in"),
     ],
 )
 def test_refuses_what_cannot_be_kept(changes: dict[str, object], message: str) -> None:

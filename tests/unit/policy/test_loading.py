@@ -249,6 +249,43 @@ class NoFeatureDim(Dual):
     contract = Contract(arrays="numpy")
 
 
+class Remembers(Single):
+    chunks = 0
+
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        self.chunks += 1
+        return np.full((1, 16, 4), self.chunks / 100, np.float32)
+
+    def reset(self):
+        self.chunks = 0
+
+
+class TorchRemembers:
+    contract = Contract(image_height=32, image_width=32)
+    memory = None
+
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        self.memory = state[:, :1] + (0 if self.memory is None else self.memory) + 0.25
+        return self.memory[:, None].repeat(1, 16, 4)
+
+    def reset(self):
+        self.memory.zero_()
+
+
+class ResetIsNoMethod(Single):
+    reset = True
+
+
+class ResetNeedsMore(Single):
+    def reset(self, seed):
+        pass
+
+
+class ResetFails(Single):
+    def reset(self):
+        raise RuntimeError("no memory to clear")
+
+
 class NeedsMore:
     def __init__(self, weights):
         pass
@@ -279,11 +316,26 @@ def test_a_class_of_the_users_flies(user_module: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "engine", "step"), [("Remembers", "auto", 0.01), ("TorchRemembers", "torch", 0.25)]
+)
+def test_a_policy_that_remembers_is_reset_after_loading_and_by_its_executable(
+    user_module: str, name: str, engine: str, step: float
+) -> None:
+    loaded = load(f"{user_module}:{name}", engine=engine)
+    assert [float(act(loaded).max()) for _ in range(2)] == pytest.approx([step, 2 * step])
+    loaded.executable.reset()
+    assert float(act(loaded).max()) == pytest.approx(step)
+
+
+@pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
         ("NoContract", {}, r"Missing or wrong here: \['contract'\]"),
         ("NoPredict", {}, r"Missing or wrong here: \['predict'\]"),
         ("NoFeatureDim", {}, "needs feature_dim"),
+        ("ResetIsNoMethod", {}, "reset must be a method without arguments.*it is True"),
+        ("ResetNeedsMore", {}, "cannot be: missing a required argument: 'seed'; give its"),
+        ("ResetFails", {}, r"failed to reset: RuntimeError: no memory to clear \(.*policies.py:"),
         ("NeedsMore", {}, r"cannot be made with Class\(\)"),
         ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),
         ("Single", {"image_size": 64}, "takes 32x32"),

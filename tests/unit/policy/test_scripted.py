@@ -94,6 +94,22 @@ def test_takes_off_to_three_metres_and_stays(late_s: float, deadzone: float) -> 
     assert max(abs(v.climb_mps) for v in settled[500:]) < 0.2
 
 
+def test_reset_begins_again_from_the_altitude_of_now() -> None:
+    vehicle = PointMass()
+    policy = ScriptedPolicy("square", lambda: vehicle.now_s)
+
+    def fly_on(duration_s: float) -> None:
+        for _ in range(round(duration_s / STEP_S)):
+            vehicle.step(policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 10)[0, 0])
+
+    fly_on(10.0)
+    assert vehicle.up_m == pytest.approx(3.0, abs=0.5)
+    policy.reset()
+    fly_on(4.0)
+    assert vehicle.up_m == pytest.approx(6.0, abs=0.7)
+    assert math.hypot(vehicle.north_mps, vehicle.east_mps) < 0.25
+
+
 def test_hover_stops_a_drift() -> None:
     vehicle = PointMass(north_mps=2.0, east_mps=-1.0)
     last = fly("hover", 12.0, vehicle)[-1]

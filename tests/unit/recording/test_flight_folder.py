@@ -3,6 +3,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from helpers.factories import make_tick
@@ -13,12 +14,16 @@ from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
-from mavbridge.recording.rows import FrameTruth, TickLabels
+from mavbridge.recording.rows import LATER, TICKS, FrameTruth, TickLabels
+from mavbridge.recording.tlog import open_tlog_pipe
+from policy.contract import FLIGHT_TERMS
 
 
 def record(folder: Path, *, ticks: int = 30, frames: int = 10) -> FlightWriter:
     folder.mkdir(parents=True)
-    writer = FlightWriter(folder, make_meta(), pressure="offline", wall_offset_ns=0)
+    tlog_pipe = open_tlog_pipe()
+    tlog_pipe.writer.close()
+    writer = FlightWriter(folder, make_meta(), pressure="offline", tlog_pipe=tlog_pipe)
     for k in range(ticks):
         writer.tick(make_tick(k))
     for k in range(frames):
@@ -119,6 +124,18 @@ def test_a_flight_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> 
     assert [number_of(rgb) for rgb in back.images()] == list(range(back.frames.num_rows))
 
 
+def test_a_flight_from_before_the_columns_of_chunks_is_read(flight: Path) -> None:
+    path = flight / "ticks.parquet"
+    pq.write_table(pq.read_table(path).drop_columns(sorted(LATER)), path)
+    back = open_flight(flight)
+    assert set(TICKS.names) == set(back.ticks.column_names)
+    ticks = [row.tick for row in back.tick_rows()]
+    assert [tick.index for tick in ticks] == list(range(30))
+    assert {(tick.is_slot, tick.is_coasting, tick.chunk_serial) for tick in ticks} == {
+        (True, False, None)
+    }
+
+
 def test_a_flight_without_a_frame_is_a_flight(tmp_path: Path) -> None:
     writer = record(tmp_path / "flight", frames=0)
     writer.finish(writer.meta)
@@ -182,6 +199,15 @@ def test_what_is_no_flight_says_what_is_wanted(flight: Path) -> None:
         with pytest.raises(MavbridgeError) as error:
             open_flight(path)
         assert told in str(error.value)
+
+
+def test_a_flight_whose_contract_is_of_version_1_is_read(flight: Path) -> None:
+    path = flight / "meta.json"
+    contract = json.loads(path.read_text())["contract"]
+    assert contract["version"] == 2
+    old = {name: value for name, value in contract.items() if name not in FLIGHT_TERMS}
+    _meta(contract={**old, "version": 1})(flight)
+    assert open_flight(flight).meta.contract == make_meta().contract
 
 
 def test_later_keys_in_meta_are_left_aside(flight: Path) -> None:

@@ -1,4 +1,5 @@
 import multiprocessing
+import os
 import resource
 import signal
 from collections.abc import Iterator
@@ -10,10 +11,11 @@ import pytest
 
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, send_signal
-from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.vehicle import Packet
+from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.recorder import Recorder
+from mavbridge.recording.tlog import open_tlog_pipe
 
 DEADLINE_S = 30.0
 
@@ -23,15 +25,17 @@ class RecorderStand:
     """A recorder and what it told a person."""
 
     folder: Path
-    packets: BoundedQueue[Packet] = field(default_factory=lambda: BoundedQueue(100))
     told: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        tlog_pipe = open_tlog_pipe()
+        self.packets = PacketPipe(os.dup(tlog_pipe.writer.fileno()), wall_offset_ns=10**18)
+        tlog_pipe.writer.close()
         self.recorder = Recorder(
             self.folder,
             make_meta(),
-            packets=self.packets,
-            wall_offset_ns=10**18,
+            tlog_pipe=tlog_pipe,
+            packets_dropped=lambda: self.packets.dropped,
             autopilot=lambda: "ardupilot 4.6.0",
             report=self.told.append,
         )
@@ -49,6 +53,7 @@ def stand(folder: Path) -> Iterator[RecorderStand]:
     try:
         yield made
     finally:
+        made.packets.close()
         made.recorder.close(DEADLINE_S)
 
 

@@ -38,6 +38,10 @@ def ticks(draw: st.DrawFn) -> Tick:
         state = replace(make_state(draw(stamps)), values=values)
     return replace(
         make_tick(draw(st.integers(0, 10**6))),
+        is_slot=draw(st.booleans()),
+        is_coasting=draw(st.booleans()),
+        chunk_serial=draw(st.none() | st.integers(0, 10**6)),
+        chunk_computed_ns=draw(st.none() | stamps),
         predict_ns=draw(st.none() | stamps),
         feature_frame_id=draw(st.none() | st.integers(0, 10**6)),
         feature_captured_ns=draw(st.none() | stamps),

@@ -47,6 +47,14 @@ def test_an_event_must_not_wait() -> None:
         clock.sleep_until_ns(1)
 
 
+def test_an_event_may_ask_for_a_time_that_has_passed() -> None:
+    clock, seen = SteppedClock(0), []
+    clock.schedule(5, lambda: clock.sleep_until_ns(5))
+    clock.schedule(5, lambda: seen.append(clock.now_ns()))
+    clock.sleep_until_ns(5)
+    assert seen == [5]
+
+
 def test_a_loop_that_works_as_an_event_is_ahead_of_the_world() -> None:
     world = SteppedClock(100)
     clock = AheadClock(world)

@@ -20,18 +20,22 @@ from mavbridge.core.errors import UserError
         ("flight: toge:small, full solves, torch: period / baseline", 0.5),
         ("flight: toge:small, full solves, torch: cpu an action / baseline", 0.5),
         ("flight: toge:small, full solves, torch: state to wire / baseline", 0.05),
-        ("link: mavbridge, 100 Hz clock: work / bare pymavlink loop", 2.0),
+        ("flight: toge:small, full solves, torch: stick lateness p99 / period", 0.05),
+        ("link: mavbridge: round trip / bare pymavlink loop", 2.0),
     ],
 )
 def test_ratios_compare_two_figures_of_one_run(name: str, value: float) -> None:
     assert ratios(RESULT)[name] == pytest.approx(value)
-    assert len(ratios(RESULT)) == 9
+    assert len(ratios(RESULT)) == 10
 
 
 def test_a_run_without_the_other_side_has_no_ratio_with_it() -> None:
     alone = replace(RESULT, engines=(), flights=RESULT.flights[:1], links=RESULT.links[:1])
-    name = "flight: toge:small, full solves, torch: period / asked period"
-    assert ratios(alone) == {name: pytest.approx(2.0)}
+    name = "flight: toge:small, full solves, torch"
+    assert ratios(alone) == {
+        f"{name}: period / asked period": pytest.approx(2.0),
+        f"{name}: stick lateness p99 / period": pytest.approx(0.05),
+    }
 
 
 def test_a_flight_that_never_acted_has_no_ratio() -> None:

@@ -53,4 +53,4 @@ def test_every_client_has_its_round_trip_and_a_flight_that_sent_nothing_no_laten
     assert not flying.lines
     labels = [label.get_text().replace("\n", ", ") for label in links.get_yticklabels()]
     assert [label.lstrip(", ") for label in labels] == [link.client for link in RESULT.links]
-    assert [line.get_xdata()[0] for line in links.lines[::2]] == [5.0, 0.3]
+    assert [line.get_xdata()[0] for line in links.lines[::2]] == [0.6, 0.3]

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from cyclopts import App
 
-from helpers.factories import make_state
+from helpers.factories import make_released_tick, make_state, make_tick, make_vision_tick
 from mavbridge.commands.bench.flight import FlightJob, to_flags
-from mavbridge.commands.bench.flight_process import CLIMB_STICK, level_climb
+from mavbridge.commands.bench.flight_process import CLIMB_STICK, ReleaseWatch, level_climb
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from policy.contract import Contract, Executable
@@ -24,7 +24,7 @@ from policy.contract import Contract, Executable
                 head_steps=2,
                 allow_untrained=True,
             ),
-            Rates(visual_rate="auto:10:60", action_rate=250.0, realtime=False, pace="state"),
+            Rates(visual_rate="auto:10:60", action_rate=250.0, stick_rate=400.0, realtime=False),
         ),
     ],
 )
@@ -55,6 +55,19 @@ def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
         contract=Contract(), name="a", engine="b", dual_rate=True, encode=lambda rgb: rgb, act=act
     )
     history = np.zeros((1, 4, 4), np.float32)
-    chunk = level_climb(executable).act(history, make_state().values[None], history, 0.01)
+    climb = level_climb(executable)
+    assert climb.contract.max_state_age_s == climb.contract.max_chunk_age_s == 5.0
+    chunk = climb.act(history, make_state().values[None], history, 0.01)
     assert called
     assert (chunk == np.float32([CLIMB_STICK, 0, 0, 0])).all()
+
+
+def test_a_flight_ends_once_the_policy_has_lost_the_sticks() -> None:
+    ended: list[str] = []
+    watch = ReleaseWatch(ended.append)
+    for event in (make_released_tick(0, "not engaged"), make_tick(1), make_vision_tick()):
+        watch.emit(event)
+    assert not ended
+    for index, reason in enumerate(("no chunk", "no chunk; then disarmed")):
+        watch.emit(make_released_tick(2 + index, reason))
+    assert ended == [watch.reason] == ["no chunk"]

@@ -7,22 +7,34 @@ from mavbridge.commands.bench.link_vehicle import (
     PENDING_LIMIT,
     RoundTrips,
     code_of,
+    code_of_pwm,
     stick_of,
 )
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Sticks
-from mavbridge.mavlink.session.params import calibration
+from mavbridge.mavlink.session.echo import NUDGE_STEP_NS, EchoCheck
+from mavbridge.mavlink.session.params.checks import calibration
+
+NUDGE_LEVELS = 3
 
 
-def test_every_code_comes_back_through_policy_and_calibration() -> None:
+def test_every_code_comes_back_through_policy_calibration_and_nudge() -> None:
+    echo = EchoCheck()
+    echo.sent((1500, 1500, 1500, 1504), 0)
+    echo.received((1500, 1500, 1500, 1504), 1, 1)
+    assert echo.confirmed
     feature, history = np.zeros((1, 1), np.float32), np.zeros((1, 4, 4), np.float32)
     state = np.zeros((1, 13), np.float32)
     for code in range(CODES):
         state[0, 7] = stick_of(code)
         chunk = repeat_roll_rate(feature, state, history, None)
         assert chunk.shape == (1, 16, 4)
-        roll_us = calibration(PARAMS).to_pwm_us(Sticks(*chunk[0, 0].tolist()))[3]
-        assert roll_us == 1000 + code
+        pwm_us = calibration(PARAMS).to_pwm_us(Sticks(*chunk[0, 0].tolist()))
+        nudged_us = {
+            echo.with_nudge(pwm_us, level * NUDGE_STEP_NS)[3] for level in range(NUDGE_LEVELS)
+        }
+        assert len(nudged_us) == NUDGE_LEVELS
+        assert {*map(code_of_pwm, nudged_us)} == {code}
 
 
 def test_every_code_comes_back_through_manual_control() -> None:

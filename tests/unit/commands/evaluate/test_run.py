@@ -155,7 +155,7 @@ def test_the_old_names_of_the_clocks_work_with_a_notice(
         (["--clock", "wall", "--vision-delay", "50"], "--vision-delay needs --clock simulated"),
         (["--vision-delay", "-1"], "--vision-delay must be between 0 and 5000 ms"),
         (["--conditions", "stormy"], "--conditions"),
-        (["--action-rate", "0"], "between 10 and 500 Hz"),
+        (["--action-rate", "0"], "between 0.5 and 500 Hz"),
         (["--policy", "toge:medium"], "--allow-untrained"),
         (["--policy", "scripted", "--json", "/proc/none/out.json"], "cannot write"),
         (["--policy", "scripted", "--json", "/"], "cannot write --json /"),

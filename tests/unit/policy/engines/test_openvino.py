@@ -39,7 +39,7 @@ def seeded(config: BuiltinConfig) -> BuiltinPolicy:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         policy = build_policy(config).eval()
-    policy.reset(3)
+    policy.seed_noise(3)
     return policy
 
 
@@ -227,7 +227,7 @@ def test_compiled_graphs_are_cached_and_damage_does_no_harm(
     samples = make_parity_samples(SMALL)
 
     def chunks(seed: int = 0, steps: int = 1) -> FloatArray:
-        policy.reset(seed)
+        policy.seed_noise(seed)
         settings = ExecutionSettings(name="toge", num_diffusion_steps=steps)
         return chunks_of_samples(make_openvino_executable(policy, settings, "f32", "f32"), samples)
 

@@ -113,7 +113,7 @@ def test_a_seed_fixes_the_noise_of_a_flight() -> None:
     policy = Toge(config).eval()
     chunks = []
     for seed in (7, 7, 8):
-        policy.reset(seed)
+        policy.seed_noise(seed)
         chunks.append(policy.predict(*sample(), 3))
     assert torch.equal(chunks[0], chunks[1])
     assert not torch.equal(chunks[0], chunks[2])

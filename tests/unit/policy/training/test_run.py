@@ -14,7 +14,7 @@ from safetensors import safe_open
 
 from helpers.flight_folders import write_spot_flight
 from helpers.training_runs import check_resuming, check_stopping, make_hooks, weights_of
-from policy.checkpoints.policy_file import TRAINING_KEY, load_checkpoint
+from policy.checkpoints.policy_file import TRAINING_KEY, load_checkpoint, save_checkpoint
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData
 from policy.data.flight_folders import read_flight
@@ -155,16 +155,30 @@ def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(
         run(flights[:2], further, network=other)
 
 
+def with_contract(checkpoint: Path, contract: Contract, path: Path) -> Path:
+    """The same weights under another contract."""
+    policy = load_checkpoint(checkpoint, fallback=NETWORK)
+    assert isinstance(policy.config, TogeConfig)
+    other = Toge(replace(policy.config, contract=replace(contract, feature_dim=0)))
+    other.load_state_dict(policy.state_dict())
+    save_checkpoint(path, other)
+    return path
+
+
 def test_a_frozen_encoder_stays_and_the_head_learns(
     flights: list[FlightData], tmp_path: Path, whole: TrainResult
 ) -> None:
-    made = settings(tmp_path, start_from=whole.checkpoint, freeze_encoder=True, steps=3)
+    wider = replace(CONTRACT, modes=("LOITER",), max_chunk_age_s=1.0)
+    start_from = with_contract(whole.checkpoint, wider, tmp_path / "start.safetensors")
+    made = settings(tmp_path, start_from=start_from, freeze_encoder=True, steps=3)
     stages: list[str] = []
     result = run(flights, made, lambda progress: stages.append(progress.stage))
     before, after = weights_of(whole.checkpoint), weights_of(result.checkpoint)
     encoder = [name for name in before if name.startswith("backbone.")]
     assert [name for name in encoder if before[name] != after[name]] == []
     assert before["head.unet.out.weight"] != after["head.unet.out.weight"]
+    trained = load_checkpoint(result.checkpoint, fallback=NETWORK).contract
+    assert (trained.modes, trained.max_chunk_age_s) == (("LOITER",), 1.0)
     assert not any(stage.startswith("encoder") for stage in stages)
     with pytest.raises(PolicyError, match="--start-from"):
         replace(made, start_from=None)

@@ -1,0 +1,95 @@
+"""Notices a camera that goes on delivering, but shows nothing: a frozen or a blank image."""
+
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import ImageArray
+
+TAKEOFF_NS = 2 * NS_PER_S
+"""Time from the last word that the vehicle is landed in which its image may still be at rest: the
+motors spin up and the thrust rises before it leaves the ground (0.5 s in the simulator)."""
+SAMPLED_ROWS = 32
+"""Rows compared first: enough to tell two images of a real sensor apart, by their noise."""
+GRID = 32
+"""Pixels a side of the grid that decides whether an image shows anything."""
+DARK = 24
+"""Brightest value of a dark pixel: video black is 16, and a covered sensor adds a little noise."""
+PLAIN_SPREAD = 3
+"""Most that a pixel of a plain image differs from its mean. One value in twenty lies beyond that
+in an overcast sky with a noise of 1.5 levels; none does in a decoder's grey."""
+SHOWING_SHARE = 0.01
+"""Share of the grid's values that must be neither dark nor plain; hot pixels are fewer."""
+
+
+class ImageWatch:
+    """Says why an image should not be flown by; a limit of 0 turns its part off.
+
+    Frozen: no value of any pixel has changed for longer than the limit. In flight that is a fault
+    of every source: a sensor's noise differs in every frame, and in the simulator's noiseless view
+    from a vehicle that hovers no image stays the same for 0.07 s. At rest on the ground a simulator
+    draws the same image for ever, so the time counts only while the vehicle is airborne, and
+    TAKEOFF_NS later than that.
+
+    Blank: for longer than the limit nearly all pixels have been dark (a cap on the lens, no
+    exposure) or of one colour (a lost video signal, a decoder without a key frame, dense fog). That
+    counts on the ground as well.
+    """
+
+    def __init__(self, *, max_frozen_s: float, max_black_s: float) -> None:
+        self._max_frozen_s = max_frozen_s
+        self._max_black_s = max_black_s
+        self._last: ImageArray | None = None
+        self._changed_ns = 0
+        self._grounded_ns: int | None = None
+        self._blank_since_ns: int | None = None
+
+    def check(self, rgb: ImageArray, captured_ns: int, *, is_airborne: bool) -> str | None:
+        """Reason not to fly by this image, or None; call it with each image, in order.
+
+        ``rgb`` is [H, W, 3] uint8; it is kept for the next call and must not be changed.
+        ``is_airborne`` is False also where that is not known.
+        """
+        blank = self._blank(rgb, captured_ns) if self._max_black_s > 0 else None
+        frozen = self._frozen(rgb, captured_ns, is_airborne) if self._max_frozen_s > 0 else None
+        return blank or frozen
+
+    def _frozen(self, rgb: ImageArray, captured_ns: int, is_airborne: bool) -> str | None:
+        last, self._last = self._last, rgb
+        if last is None or not _is_same(last, rgb):
+            self._changed_ns = captured_ns
+        if not is_airborne:
+            self._grounded_ns = captured_ns
+        counted_from_ns = self._changed_ns
+        if self._grounded_ns is not None:
+            counted_from_ns = max(counted_from_ns, self._grounded_ns + TAKEOFF_NS)
+        if captured_ns - counted_from_ns <= self._max_frozen_s * NS_PER_S:
+            return None
+        return f"the image has been frozen for {(captured_ns - self._changed_ns) / NS_PER_S:.1f} s"
+
+    def _blank(self, rgb: ImageArray, captured_ns: int) -> str | None:
+        if not is_blank(rgb):
+            self._blank_since_ns = None
+            return None
+        if self._blank_since_ns is None:
+            self._blank_since_ns = captured_ns
+        blank_s = (captured_ns - self._blank_since_ns) / NS_PER_S
+        if blank_s <= self._max_black_s:
+            return None
+        return f"the image has been black or of one colour for {blank_s:.1f} s"
+
+
+def _is_same(one: ImageArray, other: ImageArray) -> bool:
+    """Compare all pixels, but only where some rows do not differ already."""
+    step = max(1, len(one) // SAMPLED_ROWS)
+    return np.array_equal(one[::step], other[::step]) and np.array_equal(one, other)
+
+
+def is_blank(rgb: ImageArray) -> bool:
+    """Return whether nearly all pixels are dark, or all of one colour."""
+    height, width, _ = rgb.shape
+    grid = rgb[:: max(1, height // GRID), :: max(1, width // GRID)].reshape(-1, 3)
+    enough = SHOWING_SHARE * grid.size
+    if np.count_nonzero(grid > DARK) < enough:
+        return True
+    values = grid.astype(np.float32)
+    return bool(np.count_nonzero(np.abs(values - values.mean(axis=0)) > PLAIN_SPREAD) < enough)

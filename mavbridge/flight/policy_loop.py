@@ -1,0 +1,184 @@
+"""The fast path: newest attitude + cached feature + sent sticks -> chunk of actions -> the gate."""
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.records import FeatureFrame, FloatArray, VehicleState
+from mavbridge.core.vehicle import Release, Sticks
+from mavbridge.flight.ego_motion import EgoMotion
+from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.history import SentHistory
+from mavbridge.flight.state import Freshness, FrozenStateCheck, StateFrame, build_state
+from mavbridge.flight.vehicle_view import SolveInputs, VehicleView
+from mavbridge.gate.chunks import Chunk
+from mavbridge.gate.wire import Absence
+
+Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
+"""(encoded image, state [1, 13 or 20], history [1, K, 4], seconds since the state of the last chunk
+or None to start afresh) -> chunk [1, horizon, 4]."""
+
+WAIT_NS = 100 * NS_PER_MS
+"""Longest wait for an attitude before the stop flag is checked, and the gate told why it waits."""
+
+MAX_HORIZON = 1024
+"""Most actions of a chunk, as in a contract: the gate has to read each one between two sticks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolicySettings:
+    """Parts of the contract and of the configuration that the loop needs."""
+
+    state_frame: StateFrame
+    since_exposure: bool
+    """The age of the image and the motion since its exposure are appended to the state."""
+    chunk_dt_s: float
+    freshness: Freshness
+    max_feature_age_ns: int
+    max_frozen_ns: int
+    """Longest time for which the attitude may stay exactly the same; 0 = no limit."""
+    period_ns: int
+    """Mean time between two solves, at least; single ones may be closer, as the attitudes come."""
+
+
+class PolicyLoop:
+    """Solves on each new attitude, at most at the policy's rate, in a thread of its own.
+
+    It computes before the flight as well: the gate engages only with a fresh chunk.
+    """
+
+    def __init__(
+        self,
+        *,
+        clock: Clock,
+        view: VehicleView,
+        cache: FeatureCache,
+        history: SentHistory,
+        act: Act,
+        reset: Callable[[], None],
+        send: Callable[[Chunk | Absence], object],
+        settings: PolicySettings,
+    ) -> None:
+        self._clock = clock
+        self._view = view
+        self._cache = cache
+        self._history = history
+        self._act = act
+        self._reset = reset
+        self._send = send
+        self._settings = settings
+        self._ego_motion: EgoMotion | None = None
+        if settings.since_exposure:
+            self._ego_motion = EgoMotion(span_ns=settings.max_feature_age_ns)
+        self._frozen = FrozenStateCheck(max_frozen_ns=settings.max_frozen_ns)
+        self._serial = 0
+        self._flights = 0
+        self._due_ns: int | None = None
+        """Slot of the next solve; an attitude up to a quarter of a period before it will do."""
+        self._chunk_state_ns: int | None = None
+        self.alive_ns = clock.now_ns()
+        """When the last step ended; read by another thread."""
+
+    def run(self, stop: threading.Event) -> None:
+        """Solve until told to stop."""
+        self.alive_ns = self._clock.now_ns()
+        while not stop.is_set():
+            self._clock.sleep_until_ns(self.start_ns)
+            if self._view.wait_for_attitude(newer_than_ns=self.start_ns - 1, timeout_ns=WAIT_NS):
+                self.step()
+            else:
+                self._send(Absence("no attitude from the vehicle"))
+            self.alive_ns = self._clock.now_ns()
+
+    @property
+    def start_ns(self) -> int:
+        """An attitude that arrives from then on starts the next solve."""
+        return 1 if self._due_ns is None else self._due_ns - self._settings.period_ns // 4
+
+    @property
+    def has_news(self) -> bool:
+        """An attitude has come that starts the next solve."""
+        return self._view.attitude_ns >= self.start_ns
+
+    def step(self) -> None:
+        """One solve from what is newest now, or the reason why there is none."""
+        now_ns = self._clock.now_ns()
+        period_ns, due_ns = self._settings.period_ns, self._due_ns or now_ns
+        # A hundredth of tolerance for the vehicle's clock; after a pause the grid starts anew.
+        self._due_ns = max(due_ns, now_ns - period_ns // 2) + period_ns * 99 // 100
+        if self._view.flights != self._flights:
+            self._flights = self._view.flights
+            self._chunk_state_ns = None
+            self._reset()
+        feature = self._cache.latest()
+        state = build_state(
+            self._view.telemetry(),
+            now_ns,
+            frame=self._settings.state_frame,
+            freshness=self._settings.freshness,
+        )
+        if isinstance(state, VehicleState) and self._ego_motion is not None:
+            self._ego_motion.push(state)
+        if isinstance(state, Release):
+            self._refuse(state.reason)
+        elif (frozen := self._frozen.problem(state)) is not None:
+            self._refuse(frozen)
+        elif feature is None:
+            self._refuse("no image feature yet")
+        elif now_ns - feature.captured_ns > self._settings.max_feature_age_ns:
+            limit_ms = self._settings.max_feature_age_ns // NS_PER_MS
+            self._refuse(f"the image feature is older than {limit_ms} ms")
+        elif feature.fault is not None:
+            self._refuse(feature.fault)
+        else:
+            self._solve(state, feature, now_ns)
+
+    def _refuse(self, reason: str) -> None:
+        self._chunk_state_ns = None
+        self._send(Absence(reason))
+
+    def _solve(self, state: VehicleState, feature: FeatureFrame, now_ns: int) -> None:
+        history = self._history.resample(now_ns)
+        last_ns, self._chunk_state_ns = self._chunk_state_ns, state.attitude_ns
+        elapsed_s = None if last_ns is None else (state.attitude_ns - last_ns) / NS_PER_S
+        values = state.values[None]
+        if self._ego_motion is not None:
+            values = self._ego_motion.append_to(state, feature.captured_ns)
+        array = self._act(feature.value, values, history, elapsed_s)
+        done_ns = self._clock.now_ns()
+        is_chunk = array.ndim == 3 and array.shape[0] == 1 and array.shape[2] == 4
+        if not is_chunk or not 0 < array.shape[1] <= MAX_HORIZON:
+            shape = list(array.shape)
+            self._refuse(
+                f"the policy returned {shape} instead of [1, horizon, 4], with at most "
+                f"{MAX_HORIZON} actions"
+            )
+            return
+        if not math.isfinite(float(array.sum())):
+            self._chunk_state_ns = None  # the gate refuses it; the next solve must not build on it
+        self._serial += 1
+        self._view.remember(
+            SolveInputs(
+                serial=self._serial,
+                state=state,
+                feature_frame_id=feature.frame_id,
+                feature_captured_ns=feature.captured_ns,
+                computed_ns=done_ns,
+                predict_ns=done_ns - now_ns,
+            )
+        )
+        self._send(
+            Chunk(
+                serial=self._serial,
+                attitude_ns=min(state.attitude_ns, state.rate_ns),
+                velocity_ns=min(state.velocity_ns, state.specific_force_ns),
+                image_ns=feature.captured_ns,
+                computed_ns=done_ns,
+                first_ns=state.attitude_ns,
+                step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
+                actions=tuple(Sticks(*row) for row in array[0].tolist()),
+            )
+        )

@@ -1,0 +1,180 @@
+"""From the flags of a command, and the contract of a policy, to the settings of link and gate."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
+from mavbridge.core.clock import NS_PER_S, period_ns
+from mavbridge.core.errors import UserError
+from mavbridge.gate.chunks import FreshnessLimits
+from mavbridge.gate.departure import DepartureSettings
+from mavbridge.gate.engagement import EngagementSettings
+from mavbridge.gate.envelope import EnvelopeLimits
+from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.settings import GateSettings
+from mavbridge.gate.smoothing import Smoothing
+from mavbridge.mavlink.settings import LinkSettings
+from policy.contract import Contract, Executable
+
+LEAST = 1e-9
+"""A limit that widens nothing."""
+
+
+def gate_settings(
+    config: FlyConfig, *, is_dual: bool, tlog_fd: int | None, wall_offset_ns: int
+) -> GateSettings:
+    """Settings of the process, before a policy is loaded; chunks are sent besides the slots."""
+    rates = config.rates
+    return GateSettings(
+        link=link_settings(
+            config.link,
+            state_hz=rates.loops(is_dual=is_dual).state_hz,
+            stick_hz=rates.stick_rate + rates.loops(is_dual=is_dual).action_hz,
+            min_battery_percent=config.envelope.min_battery,
+            folder=state_folder(),
+        ),
+        realtime=config.rates.realtime,
+        cpu=config.rates.gate_cpu,
+        tlog_fd=tlog_fd,
+        wall_offset_ns=wall_offset_ns,
+    )
+
+
+def flight_settings(config: FlyConfig, executable: Executable) -> FlightSettings:
+    """Settings of a flight of this policy; raises UserError."""
+    rates, limits, contract = config.rates, config.limits, executable.contract
+    loops = rates.loops(is_dual=executable.dual_rate)
+    return FlightSettings(
+        stick_period_ns=period_ns(rates.stick_rate),
+        chunk_period_ns=period_ns(loops.action_hz),
+        freshness=effective_freshness(contract, limits),
+        smoothing=Smoothing(max_slew_per_s=limits.max_slew, tau_s=limits.tau),
+        envelope=envelope_limits(config.envelope, _policy_envelope(contract)),
+        engagement=engagement_settings(config, contract),
+    )
+
+
+def _policy_envelope(contract: Contract) -> EnvelopeLimits:
+    """Envelope that the policy needs; nothing where its contract is silent."""
+    return EnvelopeLimits(
+        tilt_deg=contract.max_tilt_deg or LEAST,
+        height_m=contract.max_height_m or LEAST,
+        speed_mps=contract.max_speed_mps or LEAST,
+        distance_m=contract.max_distance_m or LEAST,
+    )
+
+
+def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSettings:
+    """Acts and modes that engage; raises UserError for a mode that is not in the contract."""
+    mode = config.mode.upper() if config.mode else None
+    if mode is not None and mode not in contract.modes:
+        raise UserError(
+            f"--mode {mode}: this policy flies in {' or '.join(contract.modes)} only, since its "
+            "actions mean something else, or nothing, in other modes"
+        )
+    return EngagementSettings(
+        modes=contract.modes,
+        mode=mode,
+        arm=config.arm,
+        engage_channel=config.engage_channel,
+        engage_on_arm=config.engage_on_arm,
+        readonly=config.link.readonly,
+        duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
+        departure=DepartureSettings(
+            on_fault=config.on_fault,
+            then=config.then,
+            is_silence_failsafe=config.link.output == "manual-control",
+        ),
+    )
+
+
+def state_folder() -> Path:
+    """Where this user's programs keep what must outlive them, by the XDG rules."""
+    root = Path(os.environ.get("XDG_STATE_HOME", ""))
+    if not root.is_absolute():  # the specification says to ignore such a value
+        root = Path.home() / ".local" / "state"
+    return root / "mavbridge"
+
+
+def link_settings(
+    config: LinkConfig,
+    *,
+    state_hz: float,
+    stick_hz: float,
+    min_battery_percent: float,
+    folder: Path | None = None,
+) -> LinkSettings:
+    """Settings of a link that asks for telemetry at ``state_hz``.
+
+    ``folder`` remembers the old values of parameters, None: nothing is looked up there, and
+    ``--set`` is an error.
+    """
+    return LinkSettings(
+        connect=config.connect,
+        source_system=config.source_system,
+        target_system=config.target_system,
+        connect_timeout_s=config.connect_timeout,
+        output=config.output,
+        readonly=config.readonly,
+        state_hz=state_hz,
+        min_battery_percent=min_battery_percent,
+        stick_hz=stick_hz,
+        set_params=config.set_params,
+        restore_params=config.restore_params,
+        accepted_risks=config.accept_risk,
+        state_folder=folder,
+    )
+
+
+def envelope_limits(config: EnvelopeConfig, policy: EnvelopeLimits | None) -> EnvelopeLimits:
+    """Defaults, widened to what the policy needs; a flag that was given has the last word."""
+    limits = EnvelopeLimits() if policy is None else EnvelopeLimits().widened(policy)
+    return replace(
+        limits,
+        tilt_deg=limits.tilt_deg if config.max_tilt is None else config.max_tilt,
+        height_m=limits.height_m if config.max_height is None else config.max_height,
+        speed_mps=limits.speed_mps if config.max_speed is None else config.max_speed,
+        distance_m=limits.distance_m if config.max_distance is None else config.max_distance,
+    )
+
+
+def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
+    """Ages by which a flight of this policy is judged: the flag's where given, else the contract's.
+
+    Raises:
+        UserError: a flag would loosen a limit of the contract.
+    """
+    return FreshnessLimits(
+        state_ns=_tightened_ns(contract.max_state_age_s, "attitude", limits.max_attitude_age),
+        velocity_ns=_tightened_ns(contract.max_velocity_age_s, "velocity", limits.max_velocity_age),
+        feature_ns=_tightened_ns(contract.max_feature_age_s, "feature", limits.max_feature_age),
+        chunk_ns=_tightened_ns(contract.max_chunk_age_s, "chunk", limits.max_chunk_age),
+    )
+
+
+def _tightened_ns(allowed_s: float, what: str, asked_s: float | None) -> int:
+    if asked_s is not None and asked_s > allowed_s:
+        raise UserError(
+            f"--max-{what}-age {asked_s:g} is looser than the {allowed_s:g} s of this policy's "
+            "contract: give less, or leave it out"
+        )
+    return round((allowed_s if asked_s is None else asked_s) * NS_PER_S)
+
+
+def contract_with_ages(contract: Contract, limits: Limits) -> Contract:
+    """The contract with the ages that the flags give, also looser ones.
+
+    For simulated flights only, which measure what an age does to a policy.
+    """
+
+    def either_s(asked_s: float | None, own_s: float) -> float:
+        return own_s if asked_s is None else asked_s
+
+    return replace(
+        contract,
+        max_state_age_s=either_s(limits.max_attitude_age, contract.max_state_age_s),
+        max_velocity_age_s=either_s(limits.max_velocity_age, contract.max_velocity_age_s),
+        max_feature_age_s=either_s(limits.max_feature_age, contract.max_feature_age_s),
+        max_chunk_age_s=either_s(limits.max_chunk_age, contract.max_chunk_age_s),
+    )

@@ -1,0 +1,104 @@
+"""The gate process: ``python -m mavbridge.gate FD``, started by the flight process.
+
+It prints nothing, since whatever reads its output might not: messages and errors go through the
+channel, file descriptor FD.
+"""
+
+import gc
+import select
+import signal
+import socket
+import sys
+import traceback
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.realtime import settle_gate
+from mavbridge.gate.channel import SocketPort
+from mavbridge.gate.departure import Ending
+from mavbridge.gate.loop import GateLoop
+from mavbridge.gate.settings import GateSettings
+from mavbridge.gate.wire import (
+    GateError,
+    GateMessage,
+    GateSummary,
+    decode_to_gate,
+    encode_from_gate,
+)
+from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.transport.sockets import make_transport
+
+SETTINGS_TIMEOUT_S = 5.0
+LAST_WORDS_S = 2.0
+"""Time for a busy flight process to take the gate's last message; the sticks are given back."""
+LEAD_NS = 250 * NS_PER_MS // 1000
+"""Sticks are decided this long before their slot: the work before a send takes 0.15 ms or more. A
+chunk that comes meanwhile waits for the slot."""
+_SURVIVED = ("SIGINT", "SIGHUP", "SIGTSTP", "SIGTTIN", "SIGTTOU")
+"""Signals of the terminal, which end or stop the flight process: the gate outlives it."""
+
+
+def main() -> None:
+    """Serve one flight process until the sticks are given back."""
+    for name in _SURVIVED:
+        signal.signal(getattr(signal, name), signal.SIG_IGN)
+    port = SocketPort(socket.socket(fileno=int(sys.argv[1])))
+    select.select([port], [], [], SETTINGS_TIMEOUT_S)
+    first, *later = port.receive() or [b""]
+    settings = decode_to_gate(first) if first else None
+    if not isinstance(settings, GateSettings):
+        sys.exit("the flight process sent no settings")
+    try:
+        _run(settings, port, later)
+    except MavbridgeError as error:
+        is_user = isinstance(error, UserError)
+        reason = GateError("user" if is_user else "peer", str(error))
+        port.finish(encode_from_gate(reason), LAST_WORDS_S)
+        sys.exit(1)
+    except Exception:  # noqa: BLE001 - told to the flight process, which shows it
+        port.finish(encode_from_gate(GateError("bug", traceback.format_exc())), LAST_WORDS_S)
+        sys.exit(2)
+
+
+def _run(settings: GateSettings, port: SocketPort, received: list[bytes]) -> None:
+    clock = MonotonicClock()
+    log = None
+    if settings.tlog_fd is not None:
+        log = PacketPipe(settings.tlog_fd, wall_offset_ns=settings.wall_offset_ns)
+    transport = make_transport(settings.link.connect, clock)
+    link = MavlinkLink(
+        transport, clock, settings.link, packet_log=log, forward=lambda p: loop.forward(p)
+    )
+    loop = GateLoop(clock, link, port, received=received, lead_ns=LEAD_NS)
+    signal.signal(signal.SIGTERM, lambda *_: loop.stop(Ending(reason="the gate was told to end")))
+    refusal = settle_gate(realtime=settings.realtime, cpu=settings.cpu)
+    if refusal is not None:
+        port.send(encode_from_gate(GateMessage(refusal)))
+    gc.collect()
+    gc.freeze()
+    try:
+        while not loop.is_done:
+            due_ns = loop.step()
+            ends = (None if port.is_closed else port.fileno(), link.fileno())
+            files = [end for end in ends if end is not None]
+            timeout_ns = due_ns - clock.now_ns()
+            if timeout_ns > 0:
+                select.select(files, [], [], timeout_ns / NS_PER_S)
+    except BaseException:
+        loop.abandon()
+        raise
+    finally:
+        link.close()
+    summary = GateSummary(
+        autopilot=link.autopilot,
+        link=link.stats(),
+        failure=loop.failure,
+        dropped_messages=port.dropped,
+        dropped_packets=log.dropped if log else 0,
+    )
+    port.finish(encode_from_gate(summary), LAST_WORDS_S)
+
+
+if __name__ == "__main__":
+    main()

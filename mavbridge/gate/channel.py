@@ -1,0 +1,115 @@
+"""Messages between two processes over a socket pair; neither side ever waits for the other."""
+
+import socket
+import struct
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Protocol
+
+_LENGTH = struct.Struct("<I")
+_RECEIVE_BYTES = 1 << 16
+_RECEIVES = 16
+"""Most reads at once, so that a flood does not keep the reader from its next slot."""
+_BUFFER_BYTES = 1 << 20
+"""Asked of the kernel for each direction: seconds of telemetry, should the other side be busy."""
+
+
+class Port(Protocol):
+    """One end of a channel of messages."""
+
+    is_closed: bool
+    """The other end is gone; what it sent before was received."""
+
+    def send(self, message: bytes) -> bool:
+        """Hand over a message; False: it was dropped, since the other side does not read."""
+
+    def receive(self) -> Sequence[bytes]:
+        """Messages that have arrived, in order; never waits."""
+
+
+def channel_pair() -> tuple[socket.socket, socket.socket]:
+    """Two connected sockets; neither is inherited by a child unless it is passed on explicitly."""
+    return socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+
+
+class SocketPort:
+    """A ``Port`` over one end of ``channel_pair``; used by one thread.
+
+    A stream and not SOCK_SEQPACKET, which macOS lacks: each message follows its length, and the
+    rest of one that the kernel took in part goes out before the next. End of file is the news of
+    the other process's death.
+    """
+
+    def __init__(self, end: socket.socket) -> None:
+        end.setblocking(False)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+        self._socket = end
+        self._unsent = b""
+        self._partial = b""
+        self.is_closed = False
+        self.dropped = 0
+        """Messages that the other side had no room for."""
+
+    def fileno(self) -> int:
+        """The socket, to ``select`` on."""
+        return self._socket.fileno()
+
+    def send(self, message: bytes) -> bool:
+        """See `Port`."""
+        if self._unsent:
+            self._unsent = self._put(self._unsent)
+        if self._unsent or self.is_closed:
+            self.dropped += 1
+            return False
+        framed = _LENGTH.pack(len(message)) + message
+        rest = self._put(framed)
+        if len(rest) == len(framed):
+            self.dropped += 1
+            return False
+        self._unsent = rest
+        return True
+
+    def _put(self, data: bytes) -> bytes:
+        """Write what the kernel takes now; returns the rest."""
+        try:
+            return data[self._socket.send(data) :]
+        except BlockingIOError:
+            return data
+        except OSError:
+            return data  # the other side is gone: the next receive finds out
+
+    def receive(self) -> list[bytes]:
+        """See `Port`."""
+        messages: list[bytes] = []
+        for _ in range(_RECEIVES):
+            if self.is_closed:
+                break
+            try:
+                data = self._socket.recv(_RECEIVE_BYTES)
+            except BlockingIOError:
+                break
+            except OSError:
+                data = b""  # reset: the other side died with messages unread
+            self.is_closed = not data
+            self._partial += data
+            at = 0
+            while len(self._partial) - at >= _LENGTH.size:
+                (length,) = _LENGTH.unpack_from(self._partial, at)
+                end = at + _LENGTH.size + length
+                if len(self._partial) < end:
+                    break
+                messages.append(self._partial[at + _LENGTH.size : end])
+                at = end
+            self._partial = self._partial[at:]
+        return messages
+
+    def finish(self, message: bytes, timeout_s: float) -> None:
+        """Send the last message and free the socket; waits, for so long, for a reader that lags."""
+        self._socket.settimeout(timeout_s)
+        with suppress(OSError):
+            self._socket.sendall(self._unsent + _LENGTH.pack(len(message)) + message)
+        self._socket.close()
+
+    def close(self) -> None:
+        """Free the socket: the other side sees the end of file."""
+        self._socket.close()

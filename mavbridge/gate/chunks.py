@@ -1,0 +1,192 @@
+"""Chunks of actions: whether one may be flown, for how long, and which action acts now."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import Sticks
+
+LEAST_GRACE_NS = 100 * NS_PER_MS
+GRACE_PERIODS = 3
+"""A late chunk is bridged for 100 ms or three chunk periods, whichever is longer."""
+MAX_REFUSED = 5
+"""Malformed chunks within the window below that end the flight, even if good ones lie between."""
+REFUSED_WINDOW_NS = NS_PER_S
+REFUSED_WINDOW_PERIODS = 10
+RECENT_GAPS = 8
+LEAST_GAPS = 2
+"""Chunks must have come in time for so long before a flight may begin."""
+SLOW_CHUNKS = 5
+"""So many solves in a row that outlast the limit of the attitude: this computer is too slow for the
+policy. The first ones after loading may be slow."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FreshnessLimits:
+    """Greatest ages at the moment of sending of what a stick was computed from."""
+
+    state_ns: int
+    """Attitude and body rates."""
+    velocity_ns: int
+    """Velocity and acceleration."""
+    feature_ns: int
+    """Image, since its exposure."""
+    chunk_ns: int
+    """Since the chunk was computed."""
+
+
+class Chunk(NamedTuple):
+    """Actions of one solve of the policy, with the stamps of everything that it came from."""
+
+    serial: int
+    """Rises by one from chunk to chunk."""
+    attitude_ns: int
+    """When the attitude and the body rates happened, the older of the two."""
+    velocity_ns: int
+    """When velocity and acceleration happened, the older of the two."""
+    image_ns: int
+    """Exposure of the image."""
+    computed_ns: int
+    """When the solve was done."""
+    first_ns: int
+    """When the first action acts."""
+    step_ns: int
+    """Time from one action to the next."""
+    actions: tuple[Sticks, ...]
+    """In time order, as the policy put them out: not clipped, perhaps not finite."""
+
+    @property
+    def end_ns(self) -> int:
+        """End of the horizon: an action acts for one step."""
+        return self.first_ns + len(self.actions) * self.step_ns
+
+    def action_at(self, at_ns: int) -> Sticks:
+        """Action at a time, linear between the actions, held at both ends."""
+        last = len(self.actions) - 1
+        position = min(max((at_ns - self.first_ns) / self.step_ns, 0.0), float(last))
+        low = int(position)
+        weight = position - low
+        pairs = zip(self.actions[low], self.actions[min(low + 1, last)], strict=True)
+        return Sticks(*[(1.0 - weight) * a + weight * b for a, b in pairs])
+
+
+class ChunkBuffer:
+    """Holds the newest chunk that may be flown, and judges it at every send.
+
+    A chunk is taken if it is well formed and within its limits when it arrives. From then on it is
+    flown until the next one is taken: as fresh while it keeps its limits and the next one is not
+    overdue, else coasting. ``fault`` says when even that must end.
+    """
+
+    def __init__(self, limits: FreshnessLimits, *, period_ns: int) -> None:
+        """``period_ns`` is the time between the policy's chunks."""
+        self._limits = limits
+        self._period_ns = period_ns
+        self.grace_ns = max(LEAST_GRACE_NS, GRACE_PERIODS * period_ns)
+        self._refused_ns: deque[int] = deque(maxlen=MAX_REFUSED)
+        self._refusal: str | None = None
+        """Why the newest chunk was not taken; None if it was."""
+        self.newest: Chunk | None = None
+        self._taken_ns = 0
+        self._gaps_ns: deque[int] = deque(maxlen=RECENT_GAPS)
+        """Times between the last chunks that were taken."""
+        self._slow = 0
+        """Chunks in a row whose attitude was too old as soon as they were computed."""
+        self._solve_ns = 0
+        """From the newest chunk's attitude to the end of its solve."""
+
+    def offer(self, chunk: Chunk, now_ns: int) -> bool:
+        """Take a chunk if it may be flown; returns whether it was taken."""
+        if self.newest is not None and chunk.serial <= self.newest.serial:
+            return False
+        self._refusal = _malformed(chunk)
+        if self._refusal is not None:
+            self._refused_ns.append(now_ns)
+            return False
+        self._solve_ns = chunk.computed_ns - chunk.attitude_ns
+        self._slow = self._slow + 1 if self._solve_ns > self._limits.state_ns else 0
+        self._refusal = self._stale(chunk, now_ns)
+        if self._refusal is not None:
+            return False
+        if self.newest is not None:
+            self._gaps_ns.append(now_ns - self._taken_ns)
+        self.newest, self._taken_ns = chunk, now_ns
+        return True
+
+    def explain_absence(self, reason: str) -> None:
+        """Note why the flight process has no chunk to offer."""
+        self._refusal = reason
+
+    @property
+    def slowness(self) -> str | None:
+        """Why the policy can never fly on this computer, or None."""
+        if self._slow < SLOW_CHUNKS:
+            return None
+        return (
+            f"the policy is too slow for this computer, or the link for the policy: the last "
+            f"{self._slow} chunks came too late, the newest {self._solve_ns // NS_PER_MS} ms after "
+            f"its attitude, which may be {self._limits.state_ns // NS_PER_MS} ms old when a stick "
+            "leaves; use a smaller policy, fewer steps or a faster computer"
+        )
+
+    def is_coasting(self, now_ns: int) -> bool:
+        """The chunk is older than its limits, or the next one is overdue by a period."""
+        chunk = self.newest
+        is_overdue = now_ns - self._taken_ns > 2 * self._period_ns
+        return chunk is not None and (is_overdue or self._stale(chunk, now_ns) is not None)
+
+    def problem(self, now_ns: int) -> str | None:
+        """Why no flight may begin now, or None: a chunk must be fresh, by all limits."""
+        chunk = self.newest
+        if chunk is None or now_ns - self._taken_ns > self.grace_ns:
+            return self._refusal or "no chunk from the policy yet"
+        if len(self._gaps_ns) < LEAST_GAPS:
+            return "the policy has only just begun"
+        if (gap_ns := max(self._gaps_ns)) > self.grace_ns:
+            return (
+                f"the policy's chunks come up to {gap_ns // NS_PER_MS} ms apart, beyond the "
+                f"{self.grace_ns // NS_PER_MS} ms that are bridged: it is too slow here for its "
+                "rate; ask for a lower one"
+            )
+        return self._stale(chunk, now_ns)
+
+    def fault(self, now_ns: int) -> str | None:
+        """Why the flight must end now, or None: the grace is over, or too much was malformed."""
+        window_ns = max(REFUSED_WINDOW_NS, REFUSED_WINDOW_PERIODS * self._period_ns)
+        refused = self._refused_ns
+        if len(refused) == MAX_REFUSED and now_ns - refused[0] < window_ns:
+            return f"the policy returned {MAX_REFUSED} unusable chunks within a short time"
+        if self.newest is None or now_ns - self._taken_ns > self.grace_ns:
+            late = f"no chunk of the policy that may be flown for {self.grace_ns // NS_PER_MS} ms"
+            return late if self._refusal is None else f"{late}: {self._refusal}"
+        return None
+
+    def action_at(self, at_ns: int) -> Sticks | None:
+        """The action that acts at a time; None beyond the horizon of the newest chunk."""
+        if self.newest is None or at_ns > self.newest.end_ns:
+            return None
+        return self.newest.action_at(at_ns)
+
+    def _stale(self, chunk: Chunk, now_ns: int) -> str | None:
+        limits = self._limits
+        for name, happened_ns, limit_ns in (
+            ("attitude", chunk.attitude_ns, limits.state_ns),
+            ("velocity", chunk.velocity_ns, limits.velocity_ns),
+            ("image", chunk.image_ns, limits.feature_ns),
+            ("chunk", chunk.computed_ns, limits.chunk_ns),
+        ):
+            if now_ns - happened_ns > limit_ns:
+                # In tens of ms: reasons are compared from step to step.
+                age_ms = (now_ns - happened_ns) // (10 * NS_PER_MS) * 10
+                return f"the {name} is {age_ms} ms old, beyond {limit_ns // NS_PER_MS} ms"
+        return None
+
+
+def _malformed(chunk: Chunk) -> str | None:
+    if not chunk.actions or chunk.step_ns <= 0:
+        return "the policy returned a chunk without actions"
+    if not all(math.isfinite(sum(action)) for action in chunk.actions):
+        return "the policy returned a value that is not finite"
+    return None

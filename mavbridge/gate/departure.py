@@ -1,0 +1,102 @@
+"""The way out of a flight that ends by our own doing: neutral, a safe mode, then the release."""
+
+from dataclasses import dataclass
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import OnFault
+from mavbridge.gate.facts import Facts, Hand, Move
+
+NEUTRAL_NS = 50 * NS_PER_MS
+"""Least time of neutral sticks before they are given back."""
+MODE_SPACING_NS = 100 * NS_PER_MS
+"""Between two requests for the safe mode; ArduPilot answers within 10 ms."""
+MODE_TIMEOUT_NS = 3 * NS_PER_S
+"""Longest wait for the safe mode; HEARTBEAT, which confirms it, may come at 1 Hz."""
+MIDDLE_STICK = 0.2
+"""A receiver's throttle this near to the middle holds height or nearly so (ArduPilot's THR_DZ is
+0.2 of the stick's travel to each side)."""
+THRUST_MODES = ("STABILIZE", "ACRO", "MANUAL", "STABILIZED")
+"""Modes in which the throttle is thrust, or centred sticks do not level: neutral is not safe."""
+HOLD_MODES = ("BRAKE", "AUTO.LOITER")
+"""ArduPilot's and PX4's mode that holds the position whatever the sticks say."""
+LAND_MODES = ("LAND", "AUTO.LAND")
+RTL_MODES = ("RTL", "AUTO.RTL")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ending:
+    """Why a flight ends by our own doing."""
+
+    reason: str
+    is_fault: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepartureSettings:
+    """Actions after a fault, and at a normal end."""
+
+    on_fault: OnFault = "auto"
+    """auto: release to a receiver whose throttle is near the middle, else hold."""
+    then: OnFault = "auto"
+    """auto: release to a receiver, land without one."""
+    is_silence_failsafe: bool = False
+    """The vehicle takes our silence for a failsafe even with a receiver (PX4, MANUAL_CONTROL)."""
+
+
+class Departure:
+    """One way out; ``begin`` starts it, ``step`` goes on until ``is_done``."""
+
+    def __init__(self, settings: DepartureSettings) -> None:
+        self._settings = settings
+        self._began_ns = 0
+        self._request_due_ns = 0
+        self._is_thrust_mode = False
+        self.mode: str | None = None
+        """The safe mode that is asked for; a change to it is no takeover."""
+        self.must_hold = False
+        """Neutral must go on after it, since silence would be a failsafe."""
+        self.is_done = False
+
+    def forget(self) -> None:
+        """The sticks are released: from now on every mode change is somebody else's."""
+        self.mode = None
+
+    def begin(self, facts: Facts, ending: Ending) -> None:
+        """Choose the safe mode for the vehicle as it is now."""
+        self._began_ns = self._request_due_ns = facts.now_ns
+        self._is_thrust_mode = facts.mode in THRUST_MODES
+        has_receiver = facts.has_receiver is True
+        self.must_hold = not has_receiver or self._settings.is_silence_failsafe
+        self.is_done = False
+        choice = self._settings.on_fault if ending.is_fault else self._settings.then
+        if choice == "auto":
+            is_middle = facts.pilot_sticks is not None and (
+                abs(facts.pilot_sticks.throttle) <= MIDDLE_STICK
+            )
+            if ending.is_fault:
+                choice = "release" if has_receiver and is_middle else "hold"
+            else:
+                choice = "release" if has_receiver else "land"
+        if choice == "hold" and not facts.is_position_valid:
+            choice = "land"  # BRAKE and LOITER are refused without a position
+        modes = {"hold": HOLD_MODES, "land": LAND_MODES, "rtl": RTL_MODES}.get(choice, ())
+        self.mode = next((mode for mode in modes if mode in facts.known_modes), None)
+
+    def step(self, facts: Facts) -> Move:
+        """Neutral sticks, and the mode until it is confirmed or refused."""
+        is_confirmed = self.mode is None or facts.mode == self.mode
+        is_refused = self.mode is not None and facts.refused_mode == self.mode
+        # No vehicle refuses to land: an answer that says so is a late one, to the mode before.
+        if is_refused and self.mode not in LAND_MODES:
+            self.mode = next((mode for mode in LAND_MODES if mode in facts.known_modes), None)
+        elapsed_ns = facts.now_ns - self._began_ns
+        self.is_done = self.is_done or elapsed_ns >= (
+            NEUTRAL_NS if is_confirmed else MODE_TIMEOUT_NS
+        )
+        # Where the throttle is thrust, neutral would climb or fall: the mode goes first.
+        is_level_only = self._is_thrust_mode and not (self.mode and is_confirmed)
+        hand = Hand.LEVEL if is_level_only else Hand.NEUTRAL
+        if is_confirmed or self.is_done or facts.now_ns < self._request_due_ns:
+            return Move(hand=hand)
+        self._request_due_ns = facts.now_ns + MODE_SPACING_NS
+        return Move(hand=hand, mode=self.mode)

@@ -1,0 +1,72 @@
+"""Input and output of the state machine at one moment."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+from mavbridge.core.vehicle import Sticks
+
+
+class Hand(Enum):
+    """Who moves the sticks that we send."""
+
+    IDLE = "idle"
+    """Throttle down, the rest centred: what arming demands."""
+    POLICY = "policy"
+    NEUTRAL = "neutral"
+    """All centred: level, and where the mode holds height, at this height."""
+    LEVEL = "level"
+    """All but the throttle centred: where the throttle is thrust, its last value stays."""
+    RELEASE = "release"
+    """Nobody: the sticks are given back."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """Inputs of the state machine at one moment."""
+
+    now_ns: int
+    is_connected: bool
+    """A vehicle was found, and its status is known."""
+    link_problem: str | None
+    """Why sticks may not be sent: no heartbeat, set-up not finished, a risk not accepted."""
+    interruption: str | None
+    """Why every engagement so far is over: a reboot, another address; see ``LinkSnapshot``."""
+    overruled: str | None
+    """Why the vehicle is thought to follow other sticks than ours, or None."""
+    is_switched_off: bool
+    """The pilot's override switch is low."""
+    mode: str
+    known_modes: tuple[str, ...]
+    """Modes that this vehicle has."""
+    armed: bool
+    is_failsafe: bool
+    has_receiver: bool | None
+    pilot_sticks: Sticks | None
+    """Sticks of the receiver, as last seen while we sent none."""
+    rc_channels_us: tuple[int, ...]
+    is_position_valid: bool
+    echo_confirmed: bool
+    is_released: bool
+    refused_mode: str | None
+    chunk_problem: str | None
+    """Why a flight may not begin now: no fresh chunk."""
+    chunk_fault: str | None
+    """Why a flight must end now: no chunk for longer than the grace."""
+    envelope_problem: str | None
+    """Which limit of the flight envelope is exceeded."""
+    landing: str | None = None
+    """The vehicle has landed under the policy: a normal end."""
+    slowness: str | None = None
+    """Why the policy is too slow ever to fly."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Move:
+    """Output of the state machine at one moment."""
+
+    hand: Hand | None = None
+    """None: nothing is sent."""
+    mode: str | None = None
+    """Flight mode to request now."""
+    arm: bool = False
+    """Request to arm now."""

@@ -1,0 +1,221 @@
+"""The gate without I/O: what the link and the policy say goes in, what the sticks do comes out.
+
+One class for the gate process, the simulation and the tests. It never waits: every wait is a state,
+and the caller steps it whenever something has arrived and at ``next_ns``.
+"""
+
+from dataclasses import dataclass
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import (
+    IDLE,
+    NEUTRAL,
+    Command,
+    Decision,
+    LinkSnapshot,
+    Release,
+    Sticks,
+    StickTrace,
+)
+from mavbridge.gate.chunks import Chunk, ChunkBuffer, FreshnessLimits
+from mavbridge.gate.departure import THRUST_MODES, Ending
+from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
+from mavbridge.gate.envelope import Envelope, EnvelopeInput, EnvelopeLimits
+from mavbridge.gate.facts import Facts, Hand, Move
+from mavbridge.gate.grid import Slot, StickGrid
+from mavbridge.gate.smoothing import Smoothing, StickSmoother
+
+PILOT_FRESH_NS = 500 * NS_PER_MS
+"""Oldest RC_CHANNELS that still tells where the pilot's sticks are."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightSettings:
+    """Settings of a flight, known once its policy is loaded."""
+
+    stick_period_ns: int
+    chunk_period_ns: int
+    """Between the policy's chunks."""
+    freshness: FreshnessLimits
+    smoothing: Smoothing
+    envelope: EnvelopeLimits
+    engagement: EngagementSettings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GateInput:
+    """Everything that has arrived since the last step."""
+
+    link: LinkSnapshot
+    chunk: Chunk | None = None
+    absence: str | None = None
+    """Why the flight process cannot compute a chunk."""
+    act: Act | None = None
+    stop: Ending | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GateOutput:
+    """Actions to take now, in this order: sticks, requests, messages."""
+
+    decision: Decision | None
+    """None: send nothing now."""
+    slot: Slot | None
+    """The slot of the stick grid that this step serves; None between slots."""
+    trace: StickTrace | None
+    """The policy's action on its way to ``decision``; None where the policy does not move them."""
+    chunk_serial: int | None
+    is_coasting: bool
+    phase: Phase
+    reason: str
+    """Why the policy does not fly; empty while it does."""
+    mode: str | None
+    """Flight mode to request."""
+    arm: bool
+    messages: tuple[str, ...]
+    """For the user."""
+
+
+class Gate:
+    """Decides at each moment whether sticks leave, and which."""
+
+    def __init__(self, settings: FlightSettings, now_ns: int) -> None:
+        self._chunks = ChunkBuffer(settings.freshness, period_ns=settings.chunk_period_ns)
+        self._smoother = StickSmoother(settings.smoothing)
+        self._lead_ns = round(settings.smoothing.tau_s * NS_PER_S)
+        """A chunk is sampled this far ahead of the send: the lag of our own low-pass."""
+        self._envelope = Envelope(settings.envelope)
+        self._engagement = Engagement(settings.engagement)
+        self._grid = StickGrid(settings.stick_period_ns, now_ns)
+        self._hand: Hand | None = None
+        self._last: Sticks = NEUTRAL
+        """The sticks as last sent."""
+        self._messages: list[str] = []
+
+    @property
+    def next_ns(self) -> int:
+        """When to step again at the latest: the next slot."""
+        return self._grid.next_ns
+
+    @property
+    def phase(self) -> Phase:
+        """State of the engagement."""
+        return self._engagement.phase
+
+    @property
+    def failure(self) -> str | None:
+        """Why there was no flight, or None."""
+        return self._engagement.failure
+
+    def step(self, now_ns: int, given: GateInput) -> GateOutput:
+        """Advance to this moment."""
+        has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
+        if given.absence is not None:
+            self._chunks.explain_absence(given.absence)
+        if given.stop is not None:
+            self._engagement.stop(given.stop)
+        phase_before = self._engagement.phase
+        facts = self._facts(now_ns, given.link)
+        move = self._engagement.step(facts, given.act)
+        self._change_hand(move.hand, now_ns, given.link)
+        phase = self._engagement.phase
+        # A slot that was just served is left out; a new chunk and a change of hands leave at once.
+        slot = self._grid.take(now_ns)
+        is_urgent = phase is not phase_before or (has_news and move.hand is Hand.POLICY)
+        decision, trace = None, None
+        if slot is not None or is_urgent:
+            self._grid.serve(now_ns)
+            is_thrust = facts.mode in THRUST_MODES
+            decision, trace = self._decide(move, now_ns, is_thrust=is_thrust)
+        newest = self._chunks.newest
+        return GateOutput(
+            decision=decision,
+            slot=slot,
+            trace=trace,
+            chunk_serial=newest.serial if trace is not None and newest is not None else None,
+            is_coasting=trace is not None and self._chunks.is_coasting(now_ns),
+            phase=phase,
+            reason=self._engagement.reason,
+            mode=move.mode,
+            arm=move.arm,
+            messages=self._take_messages(),
+        )
+
+    def _facts(self, now_ns: int, link: LinkSnapshot) -> Facts:
+        status, left = link.status, None
+        if status is not None:
+            left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
+        return Facts(
+            now_ns=now_ns,
+            is_connected=status is not None,
+            link_problem=link.problem,
+            interruption=link.interruption,
+            overruled=link.problem if link.is_overruled else None,
+            is_switched_off=link.is_switched_off,
+            mode=status.mode if status else "unknown",
+            known_modes=link.known_modes,
+            armed=status is not None and status.armed,
+            is_failsafe=status is not None and status.is_failsafe,
+            has_receiver=status.has_receiver if status else None,
+            pilot_sticks=status.pilot_sticks if status else None,
+            rc_channels_us=status.rc_channels_us if status else (),
+            is_position_valid=status is not None and status.is_position_valid is not False,
+            echo_confirmed=link.echo_confirmed,
+            is_released=link.is_released,
+            refused_mode=link.refused_mode,
+            chunk_problem=self._chunks.problem(now_ns),
+            chunk_fault=self._chunks.fault(now_ns),
+            slowness=self._chunks.slowness,
+            envelope_problem=left.reason if left and left.kind == "fault" else None,
+            landing=left.reason if left and left.kind == "landed" else None,
+        )
+
+    def _change_hand(self, hand: Hand | None, now_ns: int, link: LinkSnapshot) -> None:
+        """When the policy takes the sticks, start from where they are."""
+        before, self._hand = self._hand, hand
+        if hand is not Hand.POLICY or before is Hand.POLICY:
+            return
+        self._envelope.reset()
+        self._messages += self._envelope.unwatched
+        start, status = NEUTRAL, link.status
+        if before is Hand.IDLE:
+            start = IDLE
+        elif status is not None and status.pilot_sticks and status.rc_arrived_ns is not None:
+            is_fresh = now_ns - status.rc_arrived_ns <= PILOT_FRESH_NS
+            start = status.pilot_sticks if is_fresh else NEUTRAL
+        self._smoother.reset(start)
+
+    def _decide(
+        self, move: Move, now_ns: int, *, is_thrust: bool
+    ) -> tuple[Decision | None, StickTrace | None]:
+        """The sticks to send now; those of the policy with their trace.
+
+        ``is_thrust`` says that the throttle stick is thrust in the present mode.
+        """
+        match move.hand:
+            case None:
+                return None, None
+            case Hand.RELEASE:
+                return Release(self._engagement.reason), None
+            case Hand.IDLE:
+                sticks = IDLE
+            case Hand.NEUTRAL:
+                sticks = NEUTRAL
+            case Hand.LEVEL:
+                sticks = NEUTRAL._replace(throttle=self._last.throttle)
+            case Hand.POLICY:
+                # Beyond the horizon level sticks bridge the rest of the grace.
+                level = NEUTRAL._replace(throttle=self._last.throttle if is_thrust else 0.0)
+                raw = self._chunks.action_at(now_ns + self._lead_ns) or level
+                trace = self._smoother.step(raw, now_ns)
+                self._last = trace.smoothed
+                return Command(sticks=trace.smoothed), trace
+        self._last = sticks
+        return Command(sticks=sticks), None
+
+    def _take_messages(self) -> tuple[str, ...]:
+        refusal, self._engagement.refusal = self._engagement.refusal, None
+        if refusal is not None:
+            self._messages.append(refusal)
+        messages, self._messages = tuple(self._messages), []
+        return messages

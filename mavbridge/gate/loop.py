@@ -1,0 +1,267 @@
+"""The gate with its two edges, the link to the vehicle and the channel to the flight process."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Protocol
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.vehicle import (
+    Decision,
+    ForwardedPacket,
+    LinkSnapshot,
+    LinkStats,
+    Release,
+    Sticks,
+)
+from mavbridge.gate.channel import Port
+from mavbridge.gate.chunks import Chunk
+from mavbridge.gate.departure import Ending
+from mavbridge.gate.engagement import Act, Phase
+from mavbridge.gate.gate import FlightSettings, Gate, GateInput, GateOutput
+from mavbridge.gate.wire import (
+    Absence,
+    GateMessage,
+    GateStatus,
+    GateTick,
+    decode_to_gate,
+    encode_from_gate,
+    encode_packets,
+    encode_tick,
+)
+
+IDLE_PERIOD_NS = 10 * NS_PER_MS
+"""Between two looks at the link before a policy is loaded."""
+FINISH_NS = 4 * NS_PER_S
+"""Longest that putting parameters back may take, or sending a release that was held up."""
+ABANDON_RELEASES, ABANDON_SPACING_NS = 10, 50 * NS_PER_MS
+_HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
+_ENGAGED = (*_HELD, Phase.RELEASING)
+
+
+class GateLink(Protocol):
+    """The part of ``mavlink.link.MavlinkLink`` that the loop uses."""
+
+    is_engaged: bool
+
+    @property
+    def autopilot(self) -> str:
+        """Autopilot and version."""
+
+    @property
+    def is_release_owed(self) -> bool:
+        """A release could not be sent yet."""
+
+    @property
+    def is_restored(self) -> bool:
+        """Every parameter that was set for the flight has its old value."""
+
+    def begin_restore(self) -> None:
+        """Put parameters back; ``service`` does it."""
+
+    def poll(self) -> LinkSnapshot:
+        """Receive everything that has arrived; never blocks."""
+
+    def service(self) -> None:
+        """Send what is due besides sticks; called after them."""
+
+    def send(self, decision: Decision) -> Sticks | None:
+        """Send the decision; returns the sticks as rounded and sent, None when released."""
+
+    def set_mode(self, mode: str) -> None:
+        """Ask for a flight mode."""
+
+    def arm(self) -> None:
+        """Ask to arm."""
+
+    def announce(self, text: str) -> None:
+        """Tell every ground station."""
+
+    def stats(self) -> LinkStats:
+        """Counters for the report."""
+
+
+class GateLoop:
+    """One pass at every wake: receive, decide, send, report. Used by one thread."""
+
+    def __init__(
+        self,
+        clock: Clock,
+        link: GateLink,
+        flight: Port,
+        *,
+        received: Sequence[bytes] = (),
+        lead_ns: int = 0,
+    ) -> None:
+        """Join link and channel.
+
+        Args:
+            clock: time of everything.
+            link: the vehicle.
+            flight: the flight process.
+            received: messages of it that have come before.
+            lead_ns: how long before a slot its work begins; the sticks wait for the slot itself.
+        """
+        self._received = list(received)
+        self._lead_ns = lead_ns
+        self._clock = clock
+        self._link = link
+        self._flight = flight
+        self._gate: Gate | None = None
+        self._packets: list[ForwardedPacket] = []
+        self._status: GateStatus | None = None
+        self._phase = Phase.WAITING
+        self._stop: Ending | None = None
+        self._finish_until_ns: int | None = None
+        self._is_clean = False
+        self.is_done = False
+        """The sticks are given back, and nobody wants more flights."""
+
+    @property
+    def failure(self) -> str | None:
+        """Why there was no flight, or None."""
+        return None if self._gate is None else self._gate.failure
+
+    def forward(self, packet: ForwardedPacket) -> None:
+        """Take a packet of the vehicle for the flight process; the link calls it in ``poll``."""
+        self._packets.append(packet)
+
+    def stop(self, ending: Ending) -> None:
+        """End at the next step, as ``ending`` says."""
+        self._stop = self._stop or ending
+
+    def abandon(self) -> None:
+        """Give the sticks back without any state machine: the gate ends by a bug of its own.
+
+        Ten times over half a second, as any packet may be lost; not where none was ever held.
+        """
+        for _ in range(ABANDON_RELEASES if self._phase is not Phase.WAITING else 0):
+            with suppress(Exception):
+                self._link.send(Release("the gate has failed"))
+            self._clock.sleep_until_ns(self._clock.now_ns() + ABANDON_SPACING_NS)
+
+    def step(self) -> int:
+        """One pass; returns when the next one is due at the latest.
+
+        Raises:
+            PeerError, UserError: the vehicle cannot be found, or cannot be flown.
+        """
+        woke_ns = self._clock.now_ns()
+        snapshot = self._link.poll()
+        self._report_vehicle(snapshot)
+        given = self._receive(snapshot)
+        if self._gate is None:
+            self._link.service()
+            if given.stop is not None:
+                self._finish(woke_ns)
+            return woke_ns + IDLE_PERIOD_NS
+        # A slot that is about to come due is worked for now, so that only the send is left.
+        now_ns, slot_ns = self._clock.now_ns(), self._gate.next_ns
+        at_ns = slot_ns if 0 < slot_ns - now_ns <= self._lead_ns else now_ns
+        output = self._gate.step(at_ns, given)
+        if output.decision is not None and at_ns > now_ns:
+            self._clock.sleep_until_ns(at_ns)
+        sent = None if output.decision is None else self._link.send(output.decision)
+        if output.slot is not None or output.decision is not None or output.phase != self._phase:
+            self._report_tick(output, woke_ns, sent)
+        if output.mode is not None:
+            self._link.set_mode(output.mode)
+        if output.arm:
+            self._link.arm()
+        for text in output.messages:
+            self._flight.send(encode_from_gate(GateMessage(text)))
+        if output.phase is not self._phase:
+            self._change_phase(output)
+        self._link.service()
+        if output.phase is Phase.ENDED:
+            self._finish(woke_ns)
+        return self._gate.next_ns - self._lead_ns
+
+    def _finish(self, now_ns: int) -> None:
+        """Put the vehicle's parameters back, and send what is owed, for a bounded time."""
+        self._link.begin_restore()
+        if self._finish_until_ns is None:
+            self._finish_until_ns = now_ns + FINISH_NS
+        was_clean = self._is_clean
+        self._is_clean = self._link.is_restored and not self._link.is_release_owed
+        # One pass more: it passes on what the link says about the parameters.
+        self.is_done = (was_clean and self._is_clean) or now_ns >= self._finish_until_ns
+
+    def _report_vehicle(self, snapshot: LinkSnapshot) -> None:
+        """Pass the vehicle's packets on, then its status where that has changed."""
+        # Until a policy is loaded nobody reads, and the queue is for what matters then.
+        if self._packets and self._gate is not None:
+            self._flight.send(encode_packets(self._packets))
+        self._packets.clear()
+        vehicle = snapshot.status
+        status = GateStatus(
+            autopilot=self._link.autopilot,
+            mode=vehicle.mode if vehicle else None,
+            armed=vehicle is not None and vehicle.armed,
+            is_landed=vehicle.is_landed if vehicle else None,
+            rc_channels_us=vehicle.rc_channels_us if vehicle else (),
+            rc_sticks=vehicle.rc_sticks if vehicle else None,
+        )
+        if status != self._status:
+            self._status = status
+            self._flight.send(encode_from_gate(status))
+        for text in snapshot.texts:
+            self._flight.send(encode_from_gate(GateMessage(text)))
+
+    def _receive(self, snapshot: LinkSnapshot) -> GateInput:
+        """Take the messages of the flight process, the newest of each kind."""
+        chunk: Chunk | None = None
+        absence: str | None = None
+        act: Act | None = None
+        received, self._received = [*self._received, *self._flight.receive()], []
+        for data in received:
+            match decode_to_gate(data):
+                case Chunk() as chunk:
+                    absence = None
+                case Absence(absence):
+                    pass
+                case FlightSettings() as settings if self._gate is None:
+                    self._gate = Gate(settings, self._clock.now_ns())
+                case Ending() as ending:
+                    self.stop(ending)
+                case "engage" | "release" as act:
+                    pass
+                case _:
+                    pass  # settings that count already
+        if self._flight.is_closed:
+            self.stop(Ending(reason="the flight process has died", is_fault=True))
+        return GateInput(link=snapshot, chunk=chunk, absence=absence, act=act, stop=self._stop)
+
+    def _report_tick(self, output: GateOutput, woke_ns: int, sent: Sticks | None) -> None:
+        now_ns, slot = self._clock.now_ns(), output.slot
+        tick = GateTick(
+            index=slot.index if slot else -1,
+            due_ns=slot.due_ns if slot else woke_ns,
+            woke_ns=woke_ns,
+            sent_ns=now_ns,
+            missed_slots=slot.missed if slot else 0,
+            is_slot=slot is not None,
+            is_coasting=output.is_coasting,
+            chunk_serial=output.chunk_serial,
+            trace=output.trace,
+            sent=sent,
+            phase=output.phase,
+            reason=output.reason,
+        )
+        self._flight.send(encode_tick(tick))
+
+    def _change_phase(self, output: GateOutput) -> None:
+        """Tell everybody who holds the sticks now."""
+        before, self._phase = self._phase, output.phase
+        self._link.is_engaged = self._phase in _ENGAGED
+        text: str | None = None
+        match self._phase:
+            case Phase.FLYING:
+                text = "the policy has the sticks"
+            case Phase.LEAVING:
+                text = f"neutral sticks: {output.reason}"
+            case Phase.HOLDING:
+                text = "neutral sticks go on until you disarm or change the mode"
+            case Phase.RELEASING | Phase.RELEASED if before in _HELD:
+                text = f"sticks given back: {output.reason}"
+        if text is not None:
+            self._link.announce(f"mavbridge: {text}")

@@ -1,0 +1,281 @@
+"""Messages between the flight process and the gate, as bytes.
+
+Little-endian structures where they come at the rates of the loops, JSON where they come seldom, and
+one pickle: the settings, from the parent process that has started the gate.
+"""
+
+import json
+import pickle
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Literal, NamedTuple, TypeAlias
+
+from mavbridge.core.vehicle import ForwardedPacket, LinkStats, Percentiles, Sticks, StickTrace
+from mavbridge.gate.chunks import Chunk
+from mavbridge.gate.departure import Ending
+from mavbridge.gate.engagement import Act, Phase
+from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.settings import GateSettings
+
+_CHUNK = struct.Struct("<cqqqqqqqH")
+_TICK = struct.Struct("<cqqqqqB?iB20d")
+_PACKET = struct.Struct("<qqH")
+_PHASES = tuple(Phase)
+_IS_SLOT, _IS_COASTING, _HAS_TRACE, _HAS_SENT = 1, 2, 4, 8
+_NOTHING = (0.0,) * 4
+_MALFORMED = (
+    *(struct.error, pickle.UnpicklingError, EOFError),
+    *(ValueError, TypeError, LookupError, AttributeError),
+)
+"""Errors of the decoders for bytes that no encoder has made."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GateTick:
+    """One send of the gate, or one slot in which it had nothing to send."""
+
+    index: int
+    due_ns: int
+    woke_ns: int
+    sent_ns: int
+    """After the sticks were handed to the kernel."""
+    missed_slots: int
+    is_slot: bool
+    is_coasting: bool
+    chunk_serial: int | None
+    trace: StickTrace | None
+    sent: Sticks | None
+    """Sticks as sent; None when released, or when nothing was sent."""
+    phase: Phase
+    reason: str
+    """Why the policy does not fly; empty while it does."""
+
+
+class GateStatus(NamedTuple):
+    """The vehicle's word about itself; sent when it changes."""
+
+    autopilot: str
+    mode: str | None
+    armed: bool
+    is_landed: bool | None
+    rc_channels_us: tuple[int, ...]
+    rc_sticks: Sticks | None
+
+
+class GateMessage(NamedTuple):
+    """A line for the user."""
+
+    text: str
+
+
+class GateError(NamedTuple):
+    """The gate ends because of this."""
+
+    kind: Literal["user", "peer", "bug"]
+    text: str
+
+
+class Absence(NamedTuple):
+    """Why the flight process cannot compute a chunk now."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GateSummary:
+    """Last message of a gate that ends in order."""
+
+    autopilot: str
+    link: LinkStats
+    failure: str | None
+    """Why there was no flight, or None."""
+    dropped_messages: int
+    """Messages to the flight process that did not fit into its queue."""
+    dropped_packets: int
+    """Packets that did not fit into the pipe of the telemetry log."""
+
+
+ToGate: TypeAlias = GateSettings | FlightSettings | Chunk | Absence | Act | Ending
+FromGate: TypeAlias = (
+    tuple[ForwardedPacket, ...] | GateTick | GateStatus | GateMessage | GateError | GateSummary
+)
+
+
+def encode_to_gate(message: ToGate) -> bytes:
+    """One message of the flight process."""
+    match message:
+        case Chunk():
+            stamps = message[:7]
+            count = len(message.actions)
+            values = [value for action in message.actions for value in action]
+            return _CHUNK.pack(b"C", *stamps, count) + struct.pack(f"<{4 * count}d", *values)
+        case Absence(reason):
+            return b"N" + reason.encode()
+        case GateSettings() | FlightSettings():
+            return b"S" + pickle.dumps(message)
+        case Ending():
+            return b"E" + json.dumps(asdict(message)).encode()
+        case "engage" | "release":
+            return b"A" + message.encode()
+
+
+def decode_to_gate(data: bytes) -> ToGate:
+    """Inverse of ``encode_to_gate``; raises ValueError for anything else."""
+    try:
+        return _decode_to_gate(data)
+    except _MALFORMED as error:
+        raise ValueError(f"not a message to the gate: {data[:16]!r}") from error
+
+
+def _decode_to_gate(data: bytes) -> ToGate:
+    kind, rest = data[:1], data[1:]
+    match kind:
+        case b"C":
+            return _decode_chunk(data)
+        case b"N":
+            return Absence(rest.decode())
+        case b"S":
+            settings: GateSettings | FlightSettings = pickle.loads(rest)  # noqa: S301 - our parent's
+            return settings
+        case b"E":
+            return Ending(**json.loads(rest))
+        case b"A" if rest == b"engage":
+            return "engage"
+        case b"A" if rest == b"release":
+            return "release"
+    raise ValueError("unknown kind")
+
+
+def _decode_chunk(data: bytes) -> Chunk:
+    _, serial, attitude_ns, velocity_ns, image_ns, computed_ns, first_ns, step_ns, count = (
+        _CHUNK.unpack_from(data)
+    )
+    values = struct.unpack(f"<{4 * count}d", data[_CHUNK.size :])
+    return Chunk(
+        serial=serial,
+        attitude_ns=attitude_ns,
+        velocity_ns=velocity_ns,
+        image_ns=image_ns,
+        computed_ns=computed_ns,
+        first_ns=first_ns,
+        step_ns=step_ns,
+        actions=tuple(Sticks(*values[4 * k : 4 * k + 4]) for k in range(count)),
+    )
+
+
+def encode_tick(tick: GateTick) -> bytes:
+    """One tick."""
+    flags = (
+        _IS_SLOT * tick.is_slot
+        | _IS_COASTING * tick.is_coasting
+        | _HAS_TRACE * (tick.trace is not None)
+        | _HAS_SENT * (tick.sent is not None)
+    )
+    trace, serial = tick.trace, tick.chunk_serial
+    stages = _NOTHING * 4
+    if trace is not None:
+        stages = (*trace.raw, *trace.clipped, *trace.slewed, *trace.smoothed)
+    packed = _TICK.pack(
+        b"T",
+        *(tick.index, tick.due_ns, tick.woke_ns, tick.sent_ns),
+        *(0 if serial is None else serial, flags, serial is not None, tick.missed_slots),
+        _PHASES.index(tick.phase),
+        *stages,
+        *(tick.sent or _NOTHING),
+    )
+    return packed + tick.reason.encode()
+
+
+def _decode_tick(data: bytes) -> GateTick:
+    _, index, due_ns, woke_ns, sent_ns, serial, flags, has_chunk, missed, phase, *values = (
+        _TICK.unpack_from(data)
+    )
+    raw, clipped, slewed, smoothed, sent = (Sticks(*values[4 * k : 4 * k + 4]) for k in range(5))
+    trace = StickTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
+    return GateTick(
+        index=index,
+        due_ns=due_ns,
+        woke_ns=woke_ns,
+        sent_ns=sent_ns,
+        missed_slots=missed,
+        is_slot=bool(flags & _IS_SLOT),
+        is_coasting=bool(flags & _IS_COASTING),
+        chunk_serial=serial if has_chunk else None,
+        trace=trace if flags & _HAS_TRACE else None,
+        sent=sent if flags & _HAS_SENT else None,
+        phase=_PHASES[phase],
+        reason=data[_TICK.size :].decode(),
+    )
+
+
+def encode_packets(packets: Iterable[ForwardedPacket]) -> bytes:
+    """Packets of the vehicle, in order of arrival."""
+    parts = [b"P"]
+    for packet in packets:
+        parts += (
+            _PACKET.pack(packet.arrived_ns, packet.happened_ns, len(packet.data)),
+            packet.data,
+        )
+    return b"".join(parts)
+
+
+def _decode_packets(data: bytes) -> Iterator[ForwardedPacket]:
+    at = 1
+    while at < len(data):
+        arrived_ns, happened_ns, length = _PACKET.unpack_from(data, at)
+        at += _PACKET.size
+        if at + length > len(data):
+            raise ValueError(f"a packet of {length} bytes is cut off")
+        yield ForwardedPacket(arrived_ns, happened_ns, data[at : at + length])
+        at += length
+
+
+def encode_from_gate(message: GateStatus | GateMessage | GateError | GateSummary) -> bytes:
+    """One message of the gate that comes seldom."""
+    match message:
+        case GateStatus():
+            return b"V" + json.dumps(message).encode()
+        case GateMessage():
+            return b"M" + json.dumps(message).encode()
+        case GateError():
+            return b"X" + json.dumps(message).encode()
+        case GateSummary():
+            return b"Z" + json.dumps(asdict(message)).encode()
+
+
+def decode_from_gate(data: bytes) -> FromGate:
+    """Any message of the gate; raises ValueError for anything else."""
+    try:
+        return _decode_from_gate(data)
+    except _MALFORMED as error:
+        raise ValueError(f"not a message of the gate: {data[:16]!r}") from error
+
+
+def _decode_from_gate(data: bytes) -> FromGate:
+    match data[:1]:
+        case b"T":
+            return _decode_tick(data)
+        case b"P":
+            return tuple(_decode_packets(data))
+        case b"V":
+            autopilot, mode, armed, is_landed, channels_us, sticks = json.loads(data[1:])
+            rc_sticks = None if sticks is None else Sticks(*sticks)
+            return GateStatus(autopilot, mode, armed, is_landed, tuple(channels_us), rc_sticks)
+        case b"M":
+            return GateMessage(*json.loads(data[1:]))
+        case b"X":
+            return GateError(*json.loads(data[1:]))
+        case b"Z":
+            return _summary(json.loads(data[1:]))
+    raise ValueError("unknown kind")
+
+
+def _summary(document: dict[str, object]) -> GateSummary:
+    link = dict(document.pop("link"))  # type: ignore[call-overload]
+    rtt = link.pop("rtt_ms")
+    rates = tuple((name, rate_hz) for name, rate_hz in link.pop("messages_per_s"))
+    stats = LinkStats(
+        **link, messages_per_s=rates, rtt_ms=None if rtt is None else Percentiles(**rtt)
+    )
+    return GateSummary(**document, link=stats)  # type: ignore[arg-type]

@@ -1,0 +1,166 @@
+"""The vehicle's condition beside its motion: mode, radio receiver, estimator, landing, battery."""
+
+from typing import TypeAlias
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import Sticks, VehicleStatus
+from mavbridge.mavlink.codec.messages import (
+    EstimatorFlags,
+    Heartbeat,
+    LandedState,
+    LocalVelocity,
+    RcChannels,
+    SystemStatus,
+)
+from mavbridge.mavlink.session.modes import ModeTable
+
+ConditionMessage: TypeAlias = (
+    Heartbeat | LocalVelocity | SystemStatus | LandedState | EstimatorFlags
+)
+
+POSITION_FRESH_NS = 500 * NS_PER_MS
+SLOW_FRESH_NS = 2 * NS_PER_S
+"""Landed state, estimator and battery come at 5 and 2 Hz: silent for longer, they are not known."""
+RADIO_US = range(800, 2201)
+"""Range of a radio; a channel without a source shows 0."""
+_HORIZONTAL_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS
+
+
+class VehicleCondition:
+    """Joins the slow messages of one vehicle into one ``VehicleStatus``."""
+
+    def __init__(self, *, autopilot: str, min_battery_percent: float) -> None:
+        self._is_px4 = autopilot == "px4"
+        self._min_battery_percent = min_battery_percent
+        self.modes = ModeTable(autopilot=autopilot)
+        self.heartbeat: tuple[int, Heartbeat] | None = None
+        self.rc: tuple[int, RcChannels] | None = None
+        self._rc_sticks: Sticks | None = None
+        self._pilot_sticks: Sticks | None = None
+        self._position: tuple[int, LocalVelocity] | None = None
+        self._system: tuple[int, SystemStatus] | None = None
+        self._landed: tuple[int, LandedState] | None = None
+        self._estimator: tuple[int, EstimatorFlags] | None = None
+        self._is_rc_plausible: bool | None = None
+        """Sticks of a radio stood in RC_CHANNELS before our first override."""
+        self._is_rc_healthy: bool | None = None
+        """SYS_STATUS's verdict on the receiver before our first override, if it has one."""
+
+    def receive(self, body: ConditionMessage, arrived_ns: int, *, may_be_ours: bool) -> None:
+        """Take a message; ``may_be_ours``: an override was sent, and hides the receiver."""
+        match body:
+            case Heartbeat():
+                self.heartbeat = (arrived_ns, body)
+            case LocalVelocity():
+                self._position = (arrived_ns, body)
+            case LandedState():
+                self._landed = (arrived_ns, body)
+            case EstimatorFlags():
+                self._estimator = (arrived_ns, body)
+            case SystemStatus():
+                self._system = (arrived_ns, body)
+                bit = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+                if not may_be_ours and body.present & bit:
+                    self._is_rc_healthy = bool(body.healthy & bit)
+
+    def receive_rc(
+        self,
+        rc: RcChannels,
+        arrived_ns: int,
+        *,
+        channels_us: tuple[int, ...],
+        sticks: Sticks | None,
+        may_be_ours: bool,
+        is_released: bool,
+    ) -> None:
+        """Take RC_CHANNELS: all of it, its four stick channels, and the sticks that these mean."""
+        self.rc, self._rc_sticks = (arrived_ns, rc), sticks
+        if not may_be_ours and channels_us:
+            self._is_rc_plausible = all(value_us in RADIO_US for value_us in channels_us)
+        if is_released and self.has_receiver:
+            self._pilot_sticks = sticks
+
+    @property
+    def has_receiver(self) -> bool | None:
+        """A receiver was seen before our first override; None = not known.
+
+        A vehicle whose receiver is gone goes on showing the last sticks that it had, but marks the
+        receiver as unhealthy.
+        """
+        return self._is_rc_plausible if self._is_rc_healthy is not False else False
+
+    @property
+    def has_seen_radio(self) -> bool:
+        """Both messages that tell of a receiver have come."""
+        return self.rc is not None and self._system is not None
+
+    def is_velocity_usable(self, now_ns: int) -> bool:
+        """False for the velocity that PX4 goes on sending without a valid estimate."""
+        flags = self._flags(now_ns)
+        is_valid = flags is None or bool(flags & dialect.ESTIMATOR_VELOCITY_HORIZ)
+        return is_valid or not self._is_px4
+
+    def _flags(self, now_ns: int) -> int | None:
+        if self._estimator is None or now_ns - self._estimator[0] > SLOW_FRESH_NS:
+            return None
+        return self._estimator[1].flags
+
+    def status(self, now_ns: int) -> VehicleStatus | None:
+        """The vehicle's own report; None before its first heartbeat."""
+        if self.heartbeat is None:
+            return None
+        heartbeat = self.heartbeat[1]
+        rc_ns, rc = self.rc or (None, RcChannels(()))
+        is_valid = self._is_position_valid(now_ns)
+        return VehicleStatus(
+            mode=self.modes.name(heartbeat.custom_mode),
+            armed=bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED),
+            rc_sticks=self._rc_sticks,
+            rc_channels_us=rc.channels_us,
+            rc_arrived_ns=rc_ns,
+            is_failsafe=heartbeat.system_status >= dialect.MAV_STATE_CRITICAL,
+            is_landed=self._is_landed(now_ns),
+            has_receiver=self.has_receiver,
+            pilot_sticks=self._pilot_sticks,
+            position_ned_m=self._position_ned_m(now_ns, is_valid),
+            is_position_valid=is_valid,
+            battery_problem=self._battery_problem(now_ns),
+        )
+
+    def _is_position_valid(self, now_ns: int) -> bool | None:
+        flags = self._flags(now_ns)
+        if flags is None:
+            return None
+        is_constant = bool(flags & dialect.ESTIMATOR_CONST_POS_MODE)
+        return bool(flags & _HORIZONTAL_POSITION) and not is_constant
+
+    def _position_ned_m(
+        self, now_ns: int, is_valid: bool | None
+    ) -> tuple[float, float, float] | None:
+        """The position; PX4 sends one without an estimate too, ArduPilot does not."""
+        is_good = is_valid is True or (is_valid is None and not self._is_px4)
+        if self._position is None or not is_good:
+            return None
+        arrived_ns, body = self._position
+        return body.position_ned_m if now_ns - arrived_ns <= POSITION_FRESH_NS else None
+
+    def _is_landed(self, now_ns: int) -> bool | None:
+        if self._landed is None or now_ns - self._landed[0] > SLOW_FRESH_NS:
+            return None
+        state = self._landed[1].landed_state
+        if state == dialect.MAV_LANDED_STATE_UNDEFINED:
+            return None
+        return bool(state == dialect.MAV_LANDED_STATE_ON_GROUND)
+
+    def _battery_problem(self, now_ns: int) -> str | None:
+        if self._system is None or now_ns - self._system[0] > SLOW_FRESH_NS:
+            return None
+        system, bit = self._system[1], dialect.MAV_SYS_STATUS_SENSOR_BATTERY
+        if system.present & bit and not system.healthy & bit:
+            return "the vehicle reports its battery as low or failed"
+        if 0 <= system.battery_percent < self._min_battery_percent:
+            least = f"{self._min_battery_percent:g} % (--min-battery)"
+            return f"the battery is at {system.battery_percent} %, below {least}"
+        return None

@@ -1,0 +1,118 @@
+"""Single keys from the terminal during a flight."""
+
+import os
+import select
+import signal
+import sys
+import termios
+import threading
+from collections.abc import Callable
+
+from mavbridge.core.workers import Worker
+
+ENGAGE_KEY, RELEASE_KEY = "e", "q"
+KEYS_HINT = "e engages, q releases"
+POLL_S = 0.1
+_LOCAL_MODES = 3
+"""Index of the local modes in what ``termios.tcgetattr`` returns."""
+
+
+def ignore_job_control() -> None:
+    """Keep the calling thread's use of the terminal from stopping the process.
+
+    A process in the background that reads the terminal is stopped by SIGTTIN, one that changes or
+    (after ``stty tostop``) writes it by SIGTTOU, unless the thread at it blocks the signal.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN, signal.SIGTTOU})
+
+
+class Keyboard:
+    """Passes each ``e`` and ``q`` to ``on_key``, in lower case, from a thread of its own.
+
+    The terminal gives keys at once and without echo while this process is in its foreground;
+    Ctrl-C stays a signal. Without a terminal nothing happens. ``on_key`` must not block.
+    """
+
+    def __init__(self, on_key: Callable[[str], None], *, fd: int | None = None) -> None:
+        """Read ``fd``, by default standard input."""
+        self._on_key = on_key
+        self._fd = _standard_input() if fd is None else fd
+        self._old_modes: list[int | list[bytes | int]] | None = None
+        self._worker: Worker | None = None
+
+    def start(self) -> bool:
+        """Start to listen; returns whether there is a terminal to listen to."""
+        if self._fd is None or not os.isatty(self._fd):
+            return False
+        fd = self._fd
+        self._worker = Worker("mavbridge-keyboard", lambda stop: self._run(fd, stop))
+        self._worker.start()
+        return True
+
+    def stop(self, timeout_s: float) -> None:
+        """Stop and leave the terminal as it was; may be called at any time, also twice.
+
+        Raises:
+            HungError: ``on_key`` has not returned within the timeout.
+        """
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.join(timeout_s)
+
+    def _run(self, fd: int, stop: threading.Event) -> None:
+        ignore_job_control()
+        try:
+            while not stop.is_set():
+                if not _is_foreground(fd):
+                    stop.wait(POLL_S)  # the shell has given the terminal its own modes
+                    continue
+                self._take(fd)
+                if select.select([fd], [], [], POLL_S)[0] and not self._read(fd):
+                    return
+        except (OSError, termios.error):
+            return  # the terminal is gone
+        finally:
+            self._restore(fd)
+
+    def _take(self, fd: int) -> None:
+        """Have keys delivered singly and without echo: at the start, and after Ctrl-Z and fg."""
+        modes = termios.tcgetattr(fd)
+        if not modes[_LOCAL_MODES] & (termios.ICANON | termios.ECHO):
+            return
+        self._old_modes = termios.tcgetattr(fd)
+        modes[_LOCAL_MODES] &= ~(termios.ICANON | termios.ECHO)
+        # TCSANOW: the other ways wait until a stopped terminal has shown all output.
+        termios.tcsetattr(fd, termios.TCSANOW, modes)
+        termios.tcflush(fd, termios.TCIFLUSH)  # nothing typed before the flight engages in it
+
+    def _restore(self, fd: int) -> None:
+        try:
+            if self._old_modes is not None and _is_foreground(fd):
+                termios.tcsetattr(fd, termios.TCSANOW, self._old_modes)
+        except (OSError, termios.error):
+            pass  # the terminal is gone
+
+    def _read(self, fd: int) -> bool:
+        """Pass on what was typed; returns False at the end of the input."""
+        typed = os.read(fd, 1024).decode(errors="replace").lower()
+        # Several at once are a paste, or the sequence of a function key: that engages nothing.
+        if RELEASE_KEY in typed and not typed.startswith("\x1b"):
+            self._on_key(RELEASE_KEY)
+        elif set(typed) == {ENGAGE_KEY}:
+            self._on_key(ENGAGE_KEY)
+        return bool(typed)
+
+
+def _standard_input() -> int | None:
+    try:
+        return sys.stdin.fileno()
+    except (OSError, ValueError, AttributeError):  # closed, replaced by a buffer, or absent
+        return None
+
+
+def _is_foreground(fd: int) -> bool:
+    """Return whether the terminal's input is this process's; so too where it has no shell."""
+    try:
+        return os.tcgetpgrp(fd) == os.getpgrp()
+    except OSError:  # not our controlling terminal: nobody else's jobs contend for it
+        return True

@@ -1,0 +1,83 @@
+"""Facts of a vehicle that flies well, and an engagement that is stepped through them."""
+
+from dataclasses import replace
+from typing import Any
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.gate.departure import DepartureSettings
+from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
+from mavbridge.gate.facts import Facts, Move
+
+MODES = ("ALT_HOLD", "ALTCTL")
+COPTER_MODES = ("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "BRAKE", "LAND", "RTL", "GUIDED")
+PX4_MODES = ("ALTCTL", "POSCTL", "ACRO", "AUTO.LOITER", "AUTO.LAND", "AUTO.RTL")
+STEP_NS = 10 * NS_PER_MS
+
+AIRBORNE = Facts(
+    now_ns=0,
+    is_connected=True,
+    link_problem=None,
+    interruption=None,
+    overruled=None,
+    is_switched_off=False,
+    mode="ALT_HOLD",
+    known_modes=COPTER_MODES,
+    armed=True,
+    is_failsafe=False,
+    has_receiver=True,
+    pilot_sticks=NEUTRAL,
+    rc_channels_us=(1500,) * 8,
+    is_position_valid=True,
+    echo_confirmed=True,
+    is_released=False,
+    refused_mode=None,
+    chunk_problem=None,
+    chunk_fault=None,
+    envelope_problem=None,
+)
+"""Armed in ALT_HOLD, in the air, with a receiver in the middle and a policy within its limits."""
+ON_GROUND = replace(AIRBORNE, armed=False, echo_confirmed=False)
+
+
+class Stepped:
+    """An engagement, its facts, and everything that it decided."""
+
+    def __init__(self, facts: Facts = AIRBORNE, **settings: Any) -> None:
+        departure = settings.pop("departure", DepartureSettings())
+        modes = settings.pop("modes", MODES)
+        self.engagement = Engagement(
+            EngagementSettings(modes=modes, departure=departure, **settings)
+        )
+        self.facts = facts
+        self.moves: list[Move] = []
+
+    def step(self, act: Act | None = None, **changes: Any) -> Move:
+        """One step, 10 ms after the last; changes of the facts stay."""
+        self.facts = replace(self.facts, now_ns=self.facts.now_ns + STEP_NS, **changes)
+        self.moves.append(self.engagement.step(self.facts, act))
+        return self.moves[-1]
+
+    def run(self, seconds: float, **changes: Any) -> list[Move]:
+        """Steps for a while; returns their moves."""
+        start = len(self.moves)
+        for _ in range(round(seconds * 100)):
+            self.step(**changes)
+        return self.moves[start:]
+
+    @property
+    def phase(self) -> Phase:
+        return self.engagement.phase
+
+    @property
+    def reason(self) -> str:
+        return self.engagement.reason
+
+
+def flying(facts: Facts = AIRBORNE, **settings: Any) -> Stepped:
+    """Engaged by the operator's key."""
+    stepped = Stepped(facts, **settings)
+    stepped.step()
+    stepped.step("engage")
+    assert stepped.phase is Phase.FLYING, stepped.engagement.refusal
+    return stepped

@@ -1,0 +1,127 @@
+"""A vehicle that has parameters and nothing else, in front of the part that deals with them."""
+
+import random
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from helpers.wire import CALIBRATION
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import VehicleStatus
+from mavbridge.mavlink.codec.messages import Endpoint, ParamRequest, ParamValue, ParamWrite
+from mavbridge.mavlink.session.discovery import VehicleIdentity
+from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
+from mavbridge.mavlink.session.streams import telemetry_streams
+from mavbridge.mavlink.settings import LinkSettings
+
+STEP_NS = 10 * NS_PER_MS
+NAMES = ("MIN", "TRIM", "MAX", "REVERSED")
+
+SAFE: dict[str, float] = {
+    **CALIBRATION,
+    "MAV_GCS_SYSID": 255.0,
+    "RC_OVERRIDE_TIME": 1.0,
+    "RC_OPTIONS": 0.0,
+    "RC_FS_TIMEOUT": 1.0,
+    "FS_THR_ENABLE": 1.0,
+    "FS_OPTIONS": 16.0,
+    "RC7_OPTION": 0.0,
+    "RC8_OPTION": 0.0,
+}
+"""Parameters with which a flight may begin."""
+
+
+def lossy(share: float, seed: int) -> Callable[[int], bool]:
+    """Lose this share of the packets, at random."""
+    draw = random.Random(seed)
+    return lambda _: draw.random() < share
+
+
+def status(armed: bool, has_receiver: bool | None) -> VehicleStatus:
+    return VehicleStatus(mode="ALT_HOLD", armed=armed, has_receiver=has_receiver)
+
+
+class ParamVehicle:
+    """Answers one step later; each request or answer for which ``loses(number)`` is lost.
+
+    ``changes`` are made to ``SAFE``; None takes a parameter away.
+    """
+
+    def __init__(
+        self,
+        changes: dict[str, float | None] | None = None,
+        *,
+        autopilot: str = "ardupilot",
+        folder: Path | None = None,
+        loses: Callable[[int], bool] = lambda _: False,
+        values: dict[str, float] | None = None,
+        **settings: Any,
+    ) -> None:
+        found: dict[str, float | None] = {**SAFE, **(changes or {})}
+        self.values = {k: v for k, v in found.items() if v is not None}
+        if values is not None:
+            self.values = values
+        self.folder = folder if folder is not None else Path("unused")
+        self.texts: list[str] = []
+        self.params = VehicleParams(
+            VehicleIdentity(
+                source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot=autopilot
+            ),
+            LinkSettings(state_folder=folder, **settings),
+            streams=telemetry_streams(state_hz=100.0, is_px4=autopilot == "px4"),
+            report=self.texts.append,
+        )
+        self.now_ns = 0
+        self.armed = False
+        self.has_receiver: bool | None = None
+        self.requests: list[ParamRequest | ParamWrite] = []
+        self.refuses: set[str] = set()
+        """Parameters that keep their value."""
+        self.unique_id: str | None = "ab12"
+        self._loses = loses
+        self._packets = 0
+        self._answers: list[ParamValue] = []
+
+    @property
+    def writes(self) -> list[tuple[str, float]]:
+        return [(r.name, r.value) for r in self.requests if isinstance(r, ParamWrite)]
+
+    def problem(self) -> str | None:
+        return self.params.problem(status(self.armed, self.has_receiver))
+
+    def set_by_pilot(self, name: str, value: float) -> None:
+        """A ground station sets a parameter; everybody hears of it."""
+        self.values[name] = value
+        self.params.receive(ParamValue(name, value), status(self.armed, self.has_receiver))
+
+    def fall_silent(self) -> None:
+        """Answer nothing from now on."""
+        self.values.clear()
+        self._answers.clear()
+
+    def run(self, duration_s: float) -> None:
+        for _ in range(round(duration_s * NS_PER_S / STEP_NS)):
+            self.step()
+
+    def step(self) -> None:
+        report = status(self.armed, self.has_receiver)
+        answers, self._answers = self._answers, []
+        for answer in answers:
+            if self._arrives():
+                self.params.receive(answer, report)
+        for request in self.params.step(self.now_ns, report, unique_id=self.unique_id):
+            self.requests.append(request)
+            if self._arrives():
+                self._answers += self._answer(request)
+        self.now_ns += STEP_NS
+
+    def _arrives(self) -> bool:
+        self._packets += 1
+        return not self._loses(self._packets)
+
+    def _answer(self, request: ParamRequest | ParamWrite) -> Iterator[ParamValue]:
+        if request.name not in self.values:
+            return
+        if isinstance(request, ParamWrite) and request.name not in self.refuses:
+            self.values[request.name] = request.value
+        yield ParamValue(request.name, self.values[request.name])

@@ -1,0 +1,221 @@
+"""The loops of a flight and its gate on virtual time, with a vehicle and a policy of fakes."""
+
+from collections.abc import Callable
+from itertools import repeat
+from typing import Any
+
+import numpy as np
+
+from helpers.fakes import START_NS, FakeLink, ListSink
+from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
+from mavbridge.config.rates import Rates
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.records import FloatArray, Frame, ImageArray, Tick
+from mavbridge.core.vehicle import Command, Sticks
+from mavbridge.flight.bridge import build_bridge
+from mavbridge.flight.settings import flight_settings
+from mavbridge.gate.departure import Ending
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.loop import GateLoop
+from mavbridge.simulation.clock import AheadClock, SteppedClock
+from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper, sender
+from mavbridge.simulation.network import DelayedChannel
+from mavbridge.simulation.world import DelayedFeatureCache, DelayedSink, VisionStepper
+from policy.contract import Contract, Executable
+
+MS = NS_PER_MS
+FRAME_NS = NS_PER_S // 30
+HOP_NS = MS // 10
+"""A message between the processes."""
+STEADY = np.full((1, 16, 4), 0.25, np.float32)
+SHARP = Limits(tau=0.0, max_slew=0.0)
+"""No smoothing."""
+
+
+def nan_chunk() -> FloatArray:
+    """One action is not finite."""
+    chunk = STEADY.copy()
+    chunk[0, 9, 1] = np.nan
+    return chunk
+
+
+class EventCamera:
+    """Frames at given times; the newest wins, and what was passed over is counted."""
+
+    def __init__(self, world: SteppedClock, captured_ns: list[int]) -> None:
+        self._arrived: Frame | None = None
+        self.dropped_frames = 0
+        self.arrival_watchers: list[Callable[[], None]] = []
+        for frame_id, at_ns in enumerate(captured_ns, start=1):
+            rgb = np.zeros((4, 4, 3), dtype=np.uint8)
+            frame = Frame(frame_id=frame_id, captured_ns=at_ns, rgb=rgb)
+            world.schedule(at_ns, lambda frame=frame: self._arrive(frame))
+        self.change: Callable[[Frame], Frame] = lambda frame: frame
+
+    @property
+    def has_frame(self) -> bool:
+        return self._arrived is not None
+
+    def _arrive(self, frame: Frame) -> None:
+        self.dropped_frames += self.has_frame
+        self._arrived = frame
+        for watch in self.arrival_watchers:
+            watch()
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        frame, self._arrived = self._arrived, None
+        return None if frame is None else self.change(frame)
+
+    def close(self) -> None:
+        pass
+
+
+class VirtualFlight:
+    """A bridge that engages as soon as everything is ready; ``fly`` lets time pass.
+
+    Durations and outputs of the policy are functions of the number of the solve. Attitudes arrive
+    every ``state_period_ns``, the first one ``state_phase_ns`` after the start.
+    """
+
+    def __init__(
+        self,
+        *,
+        contract: Contract | None = None,
+        rates: Rates | None = None,
+        limits: Limits = SHARP,
+        frames_ns: list[int] | None = None,
+        encode_ns: int = 25 * MS,
+        act_ns: Callable[[int], int] = lambda solve: 3 * MS,
+        chunk: Callable[[int], FloatArray] = lambda solve: STEADY,
+        state_period_ns: int = 10 * MS,
+        state_phase_ns: int = 3 * MS,
+        status: dict[str, Any] | None = None,
+        **config: Any,
+    ) -> None:
+        self.world = SteppedClock(START_NS)
+        self.config = FlyConfig(
+            link=LinkConfig(connect="memory"),
+            rates=rates or Rates(),
+            limits=limits,
+            **({"arm": True} | config),
+        )
+        self._encode_ns, self._act_ns, self._chunk = encode_ns, act_ns, chunk
+        self._state_period_ns = state_period_ns
+        self.link = FakeLink(self.world, **(status or {}))
+        self.measure: Callable[[], None] = lambda: self.link.measure(age_ns=2 * MS)
+        """Called when an attitude is due."""
+        self.sink = ListSink()
+        self.histories: list[FloatArray] = []
+        self.elapsed_s: list[float | None] = []
+        self.states: list[FloatArray] = []
+        self.resets = 0
+        if frames_ns is None:
+            frames_ns = [START_NS + k * FRAME_NS for k in range(400)]
+        self.camera = EventCamera(self.world, frames_ns)
+        self._policy_clock, self._vision_clock = AheadClock(self.world), AheadClock(self.world)
+        self.gate = self._compose(contract or Contract(feature_dim=8, arrays="numpy"))
+        self.world.schedule(START_NS + state_phase_ns, self._measure)
+
+    def _compose(self, contract: Contract) -> GateLoop:
+        world = self.world
+        executable = Executable(
+            contract=contract,
+            name="test",
+            engine="numpy",
+            dual_rate=True,
+            encode=self._encode,
+            act=self._act,
+            reset=self._reset,
+        )
+        to_gate, to_flight = (DelayedChannel(world, repeat(HOP_NS)) for _ in range(2))
+        port = MemoryPort(outgoing=to_gate, incoming=to_flight)
+        self._send = sender(world, self._policy_clock, port)
+        gate = GateLoop(world, self.link, MemoryPort(outgoing=to_flight, incoming=to_gate))
+        self.link.forward = gate.forward
+        self._send(flight_settings(self.config, executable))
+        bridge = build_bridge(
+            self.config,
+            executable,
+            clock=world,
+            send=self._send,
+            camera=self.camera,
+            sinks=(self.sink,),
+            watches_images=False,
+            cache=DelayedFeatureCache(world),
+            policy_clock=self._policy_clock,
+            vision_clock=self._vision_clock,
+            delay_vision=lambda sink: DelayedSink(world, sink),
+        )
+        self.view = bridge.view
+        VisionStepper(world, self._vision_clock, self.camera, bridge.vision)  # type: ignore[arg-type]
+        policy = PolicyStepper(world, self._policy_clock, port, bridge.policy, bridge.view)
+        self._gate_stepper = GateStepper(world, gate)
+        to_flight.on_arrival, to_gate.on_arrival = policy.receive, self._gate_stepper.step
+        return gate
+
+    def _encode(self, rgb: ImageArray) -> FloatArray:
+        self._vision_clock.ahead_ns += self._encode_ns
+        return np.zeros((1, 8), dtype=np.float32)
+
+    def _act(
+        self, feature: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        solve = len(self.histories)
+        self.elapsed_s.append(elapsed_s)
+        self.states.append(state)
+        self.histories.append(history)
+        self._policy_clock.ahead_ns += self._act_ns(solve)
+        return self._chunk(solve)
+
+    def _reset(self) -> None:
+        self.resets += 1
+
+    def _measure(self) -> None:
+        self.measure()
+        self._gate_stepper.step()
+        self.world.schedule(self.world.now_ns() + self._state_period_ns, self._measure)
+
+    # --- events
+
+    def at(self, seconds: float, event: Callable[[], object]) -> "VirtualFlight":
+        """Do something after so much time."""
+        self.world.schedule(START_NS + round(seconds * NS_PER_S), event)
+        return self
+
+    def tell(self, message: Any) -> None:
+        """Send the gate a message."""
+        self._send(message)
+
+    def stop(self, reason: str = "the flight was ended by a signal") -> None:
+        self.tell(Ending(reason=reason))
+
+    def fly(self, seconds: float) -> "VirtualFlight":
+        """Let time pass."""
+        self.world.sleep_until_ns(self.world.now_ns() + round(seconds * NS_PER_S))
+        return self
+
+    # --- what happened
+
+    @property
+    def flown(self) -> list[Tick]:
+        """Ticks in which the policy moved the sticks."""
+        return [tick for tick in self.sink.ticks if tick.trace is not None]
+
+    @property
+    def phase(self) -> Phase:
+        return self.view.phase
+
+    @property
+    def reason(self) -> str:
+        return self.view.reason
+
+    @property
+    def sent(self) -> list[tuple[float, Sticks | None]]:
+        """Seconds since the start and sticks of everything sent; None = a release."""
+        return [
+            (
+                (at_ns - START_NS) / NS_PER_S,
+                decision.sticks if isinstance(decision, Command) else None,
+            )
+            for at_ns, decision in self.link.decisions
+        ]

@@ -1,0 +1,301 @@
+"""Faults of our own, the envelope, and gaps: points 4, 6, 10 and 13 of the gate, on the vehicle."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from helpers.gate_flights import CONTRACT, HOVER, MS, NAN, GateFlight, hovering, leaning
+from mavbridge.config.flight import EnvelopeConfig, Limits
+from mavbridge.config.rates import Rates
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.gate.engagement import Phase
+from sitl.vehicle.autopilot import Battery
+from sitl.vehicle.flight_modes import Mode
+from sitl.vehicle.rc import MID_RECEIVER_US
+
+LEANING = leaning(0.0)
+
+
+class EveryOther:
+    """NaN at every other call; so often did the old bridge change hands."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, t_s: float) -> tuple[float, float, float, float]:
+        self.calls += 1
+        return NAN if t_s > 0.5 and self.calls % 2 else LEANING
+
+
+def largest(flight: GateFlight, since_ns: int = 0) -> float:
+    """The stick farthest from its middle of all that left."""
+    return max(abs(value) for _, sticks in flight.sticks_sent(since_ns) for value in sticks)
+
+
+def test_nan_every_other_time_ends_the_flight_once_and_for_all() -> None:
+    flight = GateFlight(EveryOther(), on_fault="release").fly(0.2)
+    flight.run(3)
+
+    assert flight.phases() == [
+        *(Phase.WAITING, Phase.FLYING, Phase.LEAVING, Phase.RELEASING, Phase.RELEASED)
+    ]
+    assert "unusable chunks" in flight.reason
+    rolls = [sticks.roll for _, sticks in flight.sticks_sent()]
+    assert max(rolls) < 0.31, "the smoother is not seeded again by our own echo"
+
+
+def test_nothing_but_finite_sticks_in_range_ever_leaves() -> None:
+    wild = [NAN, (math.inf, 0, 0, 0), (9.0, -9.0, 0.3, 1e30), (0, 0, 0, -math.inf), LEANING]
+    calls = iter(range(10**6))
+    flight = GateFlight(lambda t_s: wild[next(calls) % 5] if t_s > 0.3 else LEANING)
+    flight.fly(0.2)
+    flight.run(2)
+
+    channels = {value for _, us in flight.overrides() if any(us) for value in us}
+    assert min(channels) >= 985, "above the throttle's failsafe"
+    assert max(channels) <= 2000
+    assert all(math.isfinite(sum(sticks)) for _, sticks in flight.sticks_sent())
+    assert largest(flight) <= 1.0
+
+
+def test_a_policy_that_returns_the_wrong_shape_is_a_fault() -> None:
+    flight = GateFlight().fly(0.5)
+    flight._horizon = 0
+    flight.run(0.5)
+
+    assert flight.phase is not Phase.FLYING
+    assert "[1, 0, 4] instead of [1, horizon, 4]" in flight.reason
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "survives"), [(0.05, True), (0.09, True), (0.13, False), (0.5, False)]
+)
+def test_a_gap_is_bridged_by_coasting_up_to_the_grace(gap_s: float, survives: bool) -> None:
+    flight = GateFlight(on_fault="release").fly()
+    before_ns = flight.clock.now_ns()
+    flight.is_flight_process_stopped = True
+    flight.run(gap_s)
+    flight.is_flight_process_stopped = False
+    flight.run(1.5)
+
+    assert (flight.phase is Phase.FLYING) == survives
+    gap_ticks = [t for t in flight.ticks if before_ns < t.sent_ns and t.is_slot and t.sent]
+    assert any(tick.is_coasting for tick in gap_ticks)
+    assert not any(tick.missed_slots for tick in gap_ticks), "inference never costs a stick"
+    if survives:
+        assert min(t.sent.roll for t in gap_ticks if t.sent) > 0.29, "along the last chunk"
+    else:
+        assert "no chunk of the policy that may be flown for 100 ms" in flight.reason
+
+
+def test_after_a_stop_and_a_continue_nothing_stale_is_ever_sent() -> None:
+    flight = GateFlight(on_fault="hold").fly()
+    before_ns = flight.clock.now_ns()
+    flight.is_flight_process_stopped = True
+    took_s = flight.until(lambda: flight.phase is Phase.LEAVING, within_s=0.3)
+    neutral_ns = flight.clock.now_ns()
+    flight.run(0.5)
+    flight.is_flight_process_stopped = False
+    flight.run(3)
+
+    assert took_s < 0.12, "the grace and 20 ms"
+    assert flight.phase is Phase.RELEASED
+    assert largest(flight, neutral_ns) < 0.01
+    assert flight.ap.mode is Mode.BRAKE
+    assert flight.modes_asked(before_ns) == [Mode.BRAKE]
+
+
+def test_a_policy_that_is_killed_leaves_the_vehicle_neutral_within_60_ms() -> None:
+    flight = GateFlight(on_fault="hold").fly()
+    died_s = flight.t_s
+    flight.die()
+    flight.until(lambda: flight.gate.is_done, within_s=3)
+
+    safe = [e for e in flight.record(died_s) if abs(e["us"][0] - 1500) <= 2]
+    assert safe[0]["t_s"] - died_s < 0.06
+    assert all(abs(e["us"][0] - 1500) <= 2 for e in flight.record(safe[0]["t_s"]))
+    assert "the flight process has died" in flight.reason
+    assert flight.ap.mode is Mode.BRAKE
+    assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4]
+
+
+def test_a_900_ms_solve_flies_no_902_ms_old_attitude() -> None:
+    flight = GateFlight(on_fault="release").fly()
+    flight.solve_ns = 900 * MS
+    flight.run(3)
+
+    assert flight.phase is Phase.RELEASED
+    assert "attitude is" in flight.reason or "no chunk of the policy" in flight.reason
+    flown = [t for t in flight.ticks if t.trace is not None]
+    solves = {tick.chunk_serial for tick in flown}
+    assert all(tick.sent_ns - flown[0].sent_ns < 3 * NS_PER_S for tick in flown)
+    assert len(solves) < 400
+
+
+def test_a_contract_with_longer_limits_flies_a_slow_policy() -> None:
+    slow = replace(
+        CONTRACT,
+        max_state_age_s=2.0,
+        max_velocity_age_s=2.0,
+        max_chunk_age_s=2.0,
+        max_feature_age_s=2.0,
+    )
+    flight = GateFlight(contract=slow, rates=Rates(action_rate=2.0))
+    flight.solve_ns = 400 * MS
+    flight.launch()
+    flight.run(2)
+    flight.act("engage")
+    flight.run(5)
+
+    assert flight.phase is Phase.FLYING, flight.describe()
+    sent_ns = [at_ns for at_ns, _ in flight.sticks_sent()]
+    assert max(b - a for a, b in pairwise(sent_ns)) < 16 * MS, "100 sticks a second all the same"
+
+
+# --- inputs
+
+
+def camera_dies(flight: GateFlight) -> None:
+    flight.features.stopped_ns = flight.clock.now_ns()
+
+
+def image_freezes(flight: GateFlight) -> None:
+    flight.features.fault = "the image has been frozen for 0.6 s"
+
+
+def telemetry_ends(flight: GateFlight) -> None:
+    flight.down.is_silent = True
+
+
+def sensors_freeze(flight: GateFlight) -> None:
+    flight.ap.sensors_frozen = True
+
+
+@pytest.mark.parametrize(
+    ("fail", "told", "within_s"),
+    [
+        (camera_dies, "the image feature is older than 300 ms", 0.45),
+        (image_freezes, "the image has been frozen for 0.6 s", 0.15),
+        (telemetry_ends, "no chunk of the policy", 0.25),
+        (sensors_freeze, "the vehicle's attitude has been frozen for more than 500 ms", 0.7),
+    ],
+)
+def test_inputs_that_fail_end_the_flight_and_do_not_begin_it_again(
+    fail: Callable[[GateFlight], None], told: str, within_s: float
+) -> None:
+    flight = GateFlight(weaving, on_fault="release").fly()
+    fail(flight)
+    flight.until(lambda: flight.phase is Phase.LEAVING, within_s=within_s)
+    assert told in flight.reason
+    neutral_ns = flight.clock.now_ns()
+    flight.features.stopped_ns = flight.features.fault = None
+    flight.down.is_silent = flight.ap.sensors_frozen = False
+    flight.run(4)
+
+    assert flight.phase is Phase.RELEASED, flight.describe()
+    assert largest(flight, neutral_ns) < 0.01
+
+
+def weaving(t_s: float) -> tuple[float, float, float, float]:
+    """Never at rest, so that its state never stands still."""
+    return (0.0, 0.0, 0.0, 0.3 * math.sin(6.0 * t_s))
+
+
+def test_a_frozen_attitude_can_be_accepted_and_hovering_is_not_frozen() -> None:
+    flight = GateFlight(weaving, limits=Limits(max_frozen_state=0.0)).fly()
+    flight.ap.sensors_frozen = True
+    flight.run(2)
+    assert flight.phase is Phase.FLYING
+
+    flight = GateFlight(hovering).fly(5)
+    assert flight.phase is Phase.FLYING, "without noise every value stands still"
+
+
+# --- the envelope
+
+
+def by_height(_: float) -> tuple[float, float, float, float]:
+    return (0.9, 0.0, 0.0, 0.0)
+
+
+def by_speed(_: float) -> tuple[float, float, float, float]:
+    return (0.0, 0.0, 0.9, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("policy", "envelope", "told"),
+    [
+        (by_speed, EnvelopeConfig(max_tilt=10), "tilt 1"),
+        (by_height, EnvelopeConfig(max_height=12), "height 12"),
+        (by_speed, EnvelopeConfig(max_speed=3), "speed 3"),
+        (by_speed, EnvelopeConfig(max_distance=5), "distance"),
+    ],
+)
+def test_leaving_the_envelope_ends_the_flight(
+    policy: Callable[[float], tuple[float, float, float, float]],
+    envelope: EnvelopeConfig,
+    told: str,
+) -> None:
+    flight = GateFlight(policy, envelope=envelope, on_fault="hold").launch()
+    flight.act("engage")
+    flight.until(lambda: flight.phase is Phase.LEAVING, within_s=8)
+    assert told in flight.reason, flight.reason
+    flight.run(2)
+    assert flight.ap.mode is Mode.BRAKE
+
+
+def position_gone(flight: GateFlight) -> None:
+    flight.ap.position_lost = True
+
+
+def battery_low(flight: GateFlight) -> None:
+    flight.ap.battery = Battery(remaining_percent=5)
+
+
+@pytest.mark.parametrize(
+    ("fail", "told", "mode"),
+    [
+        (position_gone, "estimator has lost its position", Mode.LAND),
+        (battery_low, "the battery is at 5 %, below 10 %", Mode.BRAKE),
+    ],
+)
+def test_flags_of_the_vehicle_end_the_flight(
+    fail: Callable[[GateFlight], None], told: str, mode: Mode
+) -> None:
+    contract = replace(CONTRACT, max_velocity_age_s=5.0)  # it comes and goes with the position
+    flight = GateFlight(contract=contract, on_fault="hold").fly()
+    fail(flight)
+    flight.until(lambda: flight.phase is Phase.LEAVING, within_s=2)
+    flight.run(2)
+
+    assert told in flight.reason
+    assert flight.ap.mode is mode, "hold is BRAKE with a position, else LAND"
+
+
+def test_the_default_envelope_is_wide() -> None:
+    flight = GateFlight(by_speed).fly(6)
+    assert flight.phase is Phase.FLYING, flight.describe()
+
+
+def test_a_landing_under_the_policy_is_a_normal_end() -> None:
+    flight = GateFlight(lambda t_s: HOVER if t_s < 1.0 else (-0.8, 0.0, 0.0, 0.0)).fly()
+    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=15)
+
+    assert flight.reason == "the vehicle has landed"
+    assert not flight.modes_asked()
+
+
+def test_the_link_is_lost_and_neutral_and_a_mode_are_sent_all_the_same() -> None:
+    """We hear nothing, the vehicle may well hear us."""
+    flight = GateFlight(on_fault="hold").fly()
+    flight.down.is_silent = True
+    flight.run(5)
+
+    assert flight.ap.mode is Mode.BRAKE
+    assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4]
+    assert flight.sticks_sent()[-1][1] == pytest.approx(NEUTRAL, abs=0.01)
+    assert flight.phase is Phase.RELEASED

@@ -1,0 +1,198 @@
+"""The pilot or the autopilot takes the sticks: points 2, 5 and 8 of the gate, on the vehicle."""
+
+from collections.abc import Callable
+
+import pytest
+
+from helpers.gate_flights import GateFlight, climbing_first, hovering, leaning
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.gate.engagement import Phase
+from sitl.vehicle.flight_modes import Mode
+from sitl.vehicle.rc import MID_RECEIVER_US
+
+MS = NS_PER_MS
+OVERRIDE_SWITCH = {"RC8_OPTION": 46.0}
+MID = (*MID_RECEIVER_US[:7], 2000)
+
+
+def by_mode(flight: GateFlight) -> None:
+    flight.pilot_mode(Mode.LOITER)
+
+
+def by_radio(flight: GateFlight) -> None:
+    flight.receiver(ch5=1680)  # FLTMODE5: LOITER
+
+
+def by_disarming(flight: GateFlight) -> None:
+    flight.ap.disarm(force=True)
+
+
+def by_failsafe(flight: GateFlight) -> None:
+    flight.ap.gcs_failsafe.active = True
+
+
+def by_switch(flight: GateFlight) -> None:
+    flight.receiver(ch8=1000)
+
+
+def by_joystick(flight: GateFlight) -> None:
+    flight.joystick(50, (1700, 1500, 1500, 1500))
+
+
+TAKEOVERS = [
+    (by_mode, "mode changed from ALT_HOLD to LOITER", 0.03),
+    (by_radio, "mode changed from ALT_HOLD to LOITER", 0.25),
+    (by_disarming, "the vehicle has been disarmed", 0.12),
+    (by_failsafe, "a failsafe of the vehicle is active", 0.12),
+    (by_switch, "the pilot's override switch is off", 0.12),
+    (by_joystick, "another station is overriding them", 0.5),
+]
+
+
+@pytest.mark.parametrize(("take", "told", "within_s"), TAKEOVERS)
+def test_a_takeover_releases_and_no_mode_command_ever_leaves(
+    take: Callable[[GateFlight], None], told: str, within_s: float
+) -> None:
+    flight = GateFlight(receiver_us=MID, params=OVERRIDE_SWITCH).fly()
+    before_ns = flight.clock.now_ns()
+    take(flight)
+    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=within_s)
+    given_ns = flight.clock.now_ns()
+    flight.run(3)
+
+    assert flight.phases(before_ns - 50 * MS) == [Phase.FLYING, Phase.RELEASING, Phase.RELEASED]
+    assert told in flight.reason
+    assert not flight.modes_asked()
+    releases = flight.overrides(given_ns - MS)
+    assert releases
+    assert {us for _, us in releases} == {(0, 0, 0, 0)}, "after the takeover nothing but releases"
+
+
+@pytest.mark.parametrize(("take", "told", "within_s"), TAKEOVERS)
+def test_what_was_taken_does_not_come_back_by_itself(
+    take: Callable[[GateFlight], None], told: str, within_s: float
+) -> None:
+    flight = GateFlight(receiver_us=MID, params=OVERRIDE_SWITCH).fly()
+    take(flight)
+    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=2)
+    flight.ap.gcs_failsafe.active = False
+    flight.receiver(ch5=1500, ch8=2000)
+    flight.ap.set_mode(Mode.ALT_HOLD)
+    flight.ap.disarm(force=True)
+    flight.run(1)
+    flight.ap.arm(force=True)
+    flight.run(2)
+
+    assert flight.phase is Phase.RELEASED
+    assert told in flight.reason
+    assert not flight.modes_asked()
+
+
+def test_the_release_leaves_in_the_step_that_hears_of_the_takeover() -> None:
+    flight = GateFlight().fly()
+    flight.pilot_mode(Mode.LOITER)
+    flight.until(lambda: flight.ap.mode is Mode.LOITER, within_s=0.01)
+    changed_ns = flight.clock.now_ns()
+    flight.run(0.2)
+
+    override_ns = [at_ns for at_ns, us in flight.overrides() if any(us)]
+    release_ns = next(at_ns for at_ns, us in flight.overrides() if not any(us))
+    assert release_ns - changed_ns < 5 * MS, "the vehicle's step, and the way here"
+    assert override_ns[-1] < release_ns
+
+
+def test_the_pilot_has_his_sticks_within_60_ms_by_the_vehicles_record() -> None:
+    flight = GateFlight(receiver_us=(1450, 1550, 1520, 1500, 1500, 1500, 1500, 1500)).fly()
+    taken_s = flight.t_s
+    flight.pilot_mode(Mode.LOITER)
+    flight.run(1)
+
+    in_loiter = [entry for entry in flight.record(taken_s) if entry["mode"] == "LOITER"]
+    theirs_s = next(e["t_s"] for e in in_loiter if e["us"] == (1450, 1550, 1520, 1500))
+    assert theirs_s - taken_s < 0.06
+    assert all(e["us"][0] == 1450 for e in in_loiter if e["t_s"] >= theirs_s)
+    assert flight.modes == ["ALT_HOLD", "LOITER"], "the bridge never changes the pilot's mode back"
+
+
+def test_a_mode_change_whose_heartbeat_is_lost_is_seen_within_a_tenth_of_a_second() -> None:
+    flight = GateFlight().fly()
+    flight.down.is_silent = True
+    flight.pilot_mode(Mode.LOITER)
+    flight.run(0.02)
+    flight.down.is_silent = False
+    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=0.2)
+
+    assert took_s < 0.11
+    assert not flight.modes_asked()
+
+
+def test_a_takeover_on_the_way_out_ends_the_requests_for_a_mode() -> None:
+    flight = GateFlight(on_fault="hold").fly()
+    flight.up.is_silent = True  # the request for BRAKE gets lost
+    flight.stop("the camera is gone", is_fault=True)
+    flight.run(0.02)
+    assert flight.phase is Phase.LEAVING
+    flight.pilot_mode(Mode.LOITER)
+    flight.run(0.02)
+    flight.up.is_silent = False
+    taken_ns = flight.clock.now_ns()
+    flight.run(4)
+
+    assert flight.ap.mode is Mode.LOITER
+    assert not flight.modes_asked(taken_ns)
+    assert flight.reason == "the camera is gone; then mode changed from ALT_HOLD to LOITER"
+    assert flight.phase is Phase.ENDED
+
+
+def test_a_takeover_while_neutral_is_held_releases() -> None:
+    flight = GateFlight(climbing_first, receiver_us=None, arm=True).take_off()
+    flight.stop()
+    flight.until(lambda: flight.phase is Phase.HOLDING, within_s=1)
+    assert flight.ap.mode is Mode.LAND
+    before_ns = flight.clock.now_ns()
+    flight.pilot_mode(Mode.RTL)
+    flight.until(lambda: flight.phase is Phase.RELEASING, within_s=0.05)
+    flight.run(2)
+
+    assert flight.phase is Phase.ENDED
+    assert not flight.modes_asked(before_ns)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 20, 25, 50, 100, 200])
+@pytest.mark.parametrize("policy", [hovering, leaning])
+def test_a_joystick_on_our_system_id_is_noticed_within_half_a_second(
+    rate_hz: float, policy: Callable[[float], tuple[float, float, float, float]]
+) -> None:
+    """At 10 Hz within three of its packets: each is shown for a third of a send period only."""
+    flight = GateFlight(policy).fly()
+    flight.joystick(rate_hz, (1700, 1450, 1600, 1500))
+    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=3)
+
+    assert took_s < 0.5, took_s
+    assert "another station" in flight.reason
+    assert not flight.modes_asked()
+
+
+@pytest.mark.parametrize("policy", [hovering, leaning])
+def test_a_vehicle_that_hears_us_no_more_is_noticed_while_the_sticks_stand_still(
+    policy: Callable[[float], tuple[float, float, float, float]],
+) -> None:
+    flight = GateFlight(policy).fly()
+    flight.up.is_silent = True
+    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=3)
+
+    assert took_s < 0.6
+    assert "does not hear our sticks" in flight.reason
+    flight.up.is_silent = False
+    flight.run(0.3)
+    assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4], "the release arrives once it can"
+    flight.run(5)
+    assert flight.phase is Phase.RELEASED, "and the policy does not fly again"
+
+
+def test_a_link_with_a_fifth_of_its_packets_lost_is_flown() -> None:
+    flight = GateFlight().fly()
+    flight.up.loss = flight.down.loss = 0.2
+    flight.run(10)
+
+    assert flight.phase is Phase.FLYING, flight.describe()

@@ -1,0 +1,140 @@
+"""Signals, terminals and ends in order: the gate outlives what ends or stops its parent."""
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from helpers.relay import Override
+from helpers.stand import Process, flight
+from helpers.vehicle_record import aftermath, note, write_row
+from mavbridge.flight.gate_process import GateProcess
+from mavbridge.gate.settings import GateSettings
+from mavbridge.mavlink.settings import LinkSettings
+
+pytestmark = pytest.mark.system
+
+FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy", "helpers.user_policies:Leaning")
+RELEASE = Override(0, 0, 0, 0)
+END_LIMIT_MS = 400
+"""A main thread that shows the state five times a second hears of the signal at once."""
+END_S = 15
+
+
+@pytest.mark.parametrize(
+    ("number", "receiver"),
+    [(signal.SIGINT, "mid"), (signal.SIGHUP, "idle")],
+)
+def test_a_signal_to_the_process_group_ends_the_flight_in_order(
+    number: signal.Signals, receiver: str, tmp_path: Path
+) -> None:
+    with flight(tmp_path, "--receiver", receiver, renders=False) as flying:
+        flying.start(*FLY)
+        flying.wait_for_lean()
+        at_ns = flying.kill_group(number)
+        status, output = flying.end()
+    assert status == 0, output
+    assert flying.relay.overrides[-1] == RELEASE
+    measured = aftermath(flying.vehicle_report(), at_ns, receiver)
+    note(number.name, receiver, measured)
+    assert measured.safe_ms <= END_LIMIT_MS
+    assert not measured.flew_again
+    assert measured.mode is None
+    assert "still armed, in ALT_HOLD" in output
+
+
+def test_a_gate_that_is_told_to_end_gives_the_sticks_back_first(tmp_path: Path) -> None:
+    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+        flying.start(*FLY)
+        flying.wait_for_lean()
+        at_ns = flying.gate.kill(signal.SIGTERM)
+        status, output = flying.end()
+    assert "the gate was told to end" in output
+    assert status == 0, output
+    assert flying.relay.overrides[-1] == RELEASE
+    measured = aftermath(flying.vehicle_report(), at_ns, "mid")
+    note("SIGTERM to the gate", "mid", measured)
+    assert measured.safe_ms <= END_LIMIT_MS
+
+
+@pytest.mark.parametrize("receiver", ["mid", "none"])
+def test_the_flight_process_says_so_when_the_gate_was_killed(receiver: str, tmp_path: Path) -> None:
+    """What remains then is the autopilot's own timeout, 3 s by default, or the radio failsafe."""
+    with flight(tmp_path, "--receiver", receiver, renders=False) as flying:
+        flying.start(*FLY)
+        flying.wait_for_lean()
+        at_ns = flying.gate.kill(signal.SIGKILL)
+        status, output = flying.end()
+        flying.observe(3.2)
+    assert status == 1, output
+    assert "the gate process has died" in output
+    measured = aftermath(flying.vehicle_report(), at_ns, receiver)
+    note("kill -9 of the gate", receiver, measured)
+    assert measured.safe_ms <= 3300
+
+
+def test_a_terminal_that_nobody_reads_does_not_hold_up_the_end(tmp_path: Path) -> None:
+    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+        flying.start(*FLY, is_read=False)
+        flying.wait_for_lean()
+        flying.fill_output()
+        flying.observe(0.5)  # until a thread waits for the reader
+        at_ns = flying.kill(signal.SIGTERM)
+        assert flying.gate.has_ended(END_S)
+        status, _ = flying.end()
+        ended_s = (time.monotonic_ns() - at_ns) / 1e9
+    assert status == 0
+    assert ended_s < 10
+    measured = aftermath(flying.vehicle_report(), at_ns, "mid")
+    note("SIGTERM, output not read", "mid", measured, ended_s=ended_s)
+    assert measured.safe_ms <= END_LIMIT_MS
+    assert flying.relay.overrides[-1] == RELEASE
+
+
+def test_without_a_receiver_the_end_is_a_landing(tmp_path: Path) -> None:
+    with flight(tmp_path, "--receiver", "none", renders=False) as flying:
+        flying.start(*FLY, "--duration", "2")
+        flying.wait_for_lean()
+        status, output = flying.end()
+    assert status == 0, output
+    report = flying.vehicle_report()
+    assert report["final"]["mode"] == "LAND"
+    assert report["final"]["landed"]
+    assert not report["final"]["armed"]
+    assert not report["crashed"]
+    assert not any(entry["failsafe"] for entry in report["sticks"] if entry["armed"])
+
+
+HEAVY = ("numpy", "torch", "cv2", "openvino", "rerun", "rich", "cyclopts")
+START_LIMIT_S = 2.0
+"""The aim on a machine of its own is 0.5 s."""
+
+
+def test_the_gate_loads_nothing_heavy() -> None:
+    script = "import sys, mavbridge.gate.__main__; print(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=30, check=True
+    ).stdout.split()
+    assert [name for name in HEAVY if name in loaded] == []
+
+
+def test_the_gate_starts_at_once_and_stays_small() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind(("127.0.0.1", 0))
+        vehicle.settimeout(START_LIMIT_S)
+        address = f"udpout:127.0.0.1:{vehicle.getsockname()[1]}"
+        started_ns = time.monotonic_ns()
+        gate = GateProcess(GateSettings(link=LinkSettings(connect=address)))
+        try:
+            vehicle.recv(1024)  # its heartbeat
+            started_s = (time.monotonic_ns() - started_ns) / 1e9
+            peak_mb = Process(gate.pid).peak_memory_mb()
+        finally:
+            gate.close()
+            assert gate.wait(5)
+    write_row({"fault": "gate start", "started_s": started_s, "peak_mb": peak_mb})
+    assert peak_mb < 60

@@ -1,0 +1,145 @@
+"""Images of a real sensor, of a simulator at rest, and of a camera that shows nothing."""
+
+import numpy as np
+import pytest
+
+from mavbridge.camera.image_watch import TAKEOFF_NS, ImageWatch, is_blank
+from mavbridge.core.clock import NS_PER_S
+
+PERIOD_NS = NS_PER_S // 20
+RANDOM = np.random.default_rng(7)
+SCENE = RANDOM.integers(30, 220, (48, 64, 3), dtype=np.uint8)
+
+
+def noisy(level, sigma, shape=(224, 224, 3)):
+    """A surface of one colour as a sensor records it."""
+    return (level + sigma * RANDOM.standard_normal(shape)).round().clip(0, 255).astype(np.uint8)
+
+
+def with_pixel(image, row, column):
+    changed = image.copy()
+    changed[row, column, 1] += 1
+    return changed
+
+
+def first_fault(watch, images, *, is_airborne=True, start=0):
+    """Index of the first image that is refused, and why; images come at 20 Hz."""
+    for index, image in enumerate(images, start):
+        reason = watch.check(image, index * PERIOD_NS, is_airborne=is_airborne)
+        if reason is not None:
+            return index, reason
+    return None
+
+
+@pytest.fixture
+def watch():
+    return ImageWatch(max_frozen_s=0.5, max_black_s=0.5)
+
+
+def test_the_same_pixels_beyond_the_limit_are_frozen(watch):
+    copies = [SCENE.copy() for _ in range(40)]
+    assert first_fault(watch, copies) == (11, "the image has been frozen for 0.6 s")
+
+
+@pytest.mark.parametrize("pixel", [(0, 0), (47, 63), (20, 31), (21, 32)])
+def test_one_level_of_one_pixel_is_a_change(watch, pixel):
+    images = [SCENE, with_pixel(SCENE, *pixel)] * 20
+    assert first_fault(watch, images) is None
+
+
+def test_rows_of_a_large_image_that_are_not_sampled_count_as_well(watch):
+    scene = RANDOM.integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    scene[1] = 0
+    assert first_fault(watch, [scene, with_pixel(scene, 1, 5)] * 20) is None
+
+
+def test_a_change_ends_the_fault_and_starts_the_time_again(watch):
+    assert first_fault(watch, [SCENE] * 20) is not None
+    assert first_fault(watch, [with_pixel(SCENE, 3, 3)] * 11, start=20) is None
+    assert first_fault(watch, [with_pixel(SCENE, 3, 3)], start=31) is not None
+
+
+def test_on_the_ground_a_simulator_draws_the_same_image_for_ever(watch):
+    assert first_fault(watch, [SCENE] * 1000, is_airborne=False) is None
+
+
+def test_take_off_has_time_to_move_the_image_and_no_more(watch):
+    assert first_fault(watch, [SCENE] * 100, is_airborne=False) is None
+    allowed = 99 + (TAKEOFF_NS + NS_PER_S // 2) // PERIOD_NS
+    index, reason = first_fault(watch, [SCENE] * 100, start=100)
+    assert index == allowed + 1
+    assert reason == f"the image has been frozen for {index * PERIOD_NS / NS_PER_S:.1f} s"
+
+
+def test_after_take_off_a_change_takes_the_allowance_away(watch):
+    first_fault(watch, [SCENE] * 10, is_airborne=False)
+    # Allowed until 0.45 + 2 s; the image moves from 1 s on and freezes at 2.5 s.
+    assert first_fault(watch, [SCENE] * 10, start=10) is None
+    moving = [with_pixel(SCENE, k % 48, 3) for k in range(30)]
+    assert first_fault(watch, moving, start=20) is None
+    assert first_fault(watch, [moving[-1]] * 30, start=50)[0] == 49 + 11
+
+
+def test_other_image_sizes_are_other_images(watch):
+    assert first_fault(watch, [SCENE, SCENE[:-1]] * 20) is None
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        pytest.param(np.zeros((224, 224, 3), np.uint8), id="black"),
+        pytest.param(np.full((224, 224, 3), 16, np.uint8), id="video black"),
+        pytest.param(noisy(6, 4), id="covered sensor"),
+        pytest.param(np.full((224, 224, 3), (0, 0, 255), np.uint8), id="blue of a lost signal"),
+        pytest.param(np.full((224, 224, 3), 128, np.uint8), id="grey of a decoder"),
+        pytest.param(np.full((1, 1, 3), 128, np.uint8), id="one pixel"),
+    ],
+)
+def test_blank_images(watch, image):
+    assert is_blank(image)
+    index, reason = first_fault(watch, [image] * 40, is_airborne=False)
+    assert (index, reason) == (11, "the image has been black or of one colour for 0.6 s")
+
+
+def test_hot_pixels_do_not_make_a_picture():
+    image = noisy(5, 2)
+    image[RANDOM.integers(224, size=100), RANDOM.integers(224, size=100)] = 255
+    assert is_blank(image)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        pytest.param(SCENE, id="scene"),
+        pytest.param(noisy(180, 2), id="overcast sky of a real sensor"),
+        pytest.param(
+            np.repeat(np.linspace(150, 190, 224, dtype=np.uint8), 224 * 3).reshape(224, 224, 3),
+            id="noiseless gradient of a sky",
+        ),
+        pytest.param(
+            np.where(np.arange(224)[:, None, None] < 10, 200, np.zeros((224, 224, 3))).astype(
+                np.uint8
+            ),
+            id="a lit strip in the dark",
+        ),
+    ],
+)
+def test_images_that_show_something(watch, image):
+    assert not is_blank(image)
+    assert first_fault(watch, [image] * 40, is_airborne=False) is None
+
+
+def test_light_ends_the_black(watch):
+    black = np.zeros_like(SCENE)
+    assert first_fault(watch, [black] * 10, is_airborne=False) is None
+    assert first_fault(watch, [SCENE], is_airborne=False, start=10) is None
+    assert first_fault(watch, [black] * 11, is_airborne=False, start=11) is None
+    assert first_fault(watch, [black], is_airborne=False, start=22) is not None
+
+
+def test_a_limit_of_zero_turns_its_part_off():
+    black = np.zeros_like(SCENE)
+    assert "frozen" in first_fault(ImageWatch(max_frozen_s=0.5, max_black_s=0), [black] * 40)[1]
+    assert "black" in first_fault(ImageWatch(max_frozen_s=0, max_black_s=0.5), [black] * 40)[1]
+    assert first_fault(ImageWatch(max_frozen_s=0, max_black_s=0.5), [SCENE] * 40) is None
+    assert first_fault(ImageWatch(max_frozen_s=0, max_black_s=0), [black] * 40) is None

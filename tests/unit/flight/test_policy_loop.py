@@ -1,0 +1,239 @@
+"""One solve after the other, without a gate; tests/loops has the rest."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers.fakes import START_NS, FakeClock, ListSink
+from helpers.wire import WireEnd
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import FeatureFrame, FloatArray
+from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.history import SentHistory
+from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
+from mavbridge.flight.state import Freshness
+from mavbridge.flight.vehicle_view import VehicleView
+from mavbridge.gate.chunks import Chunk
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.wire import Absence, GateTick
+
+MS = NS_PER_MS
+FRESH = Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS)
+
+
+class Rig:
+    """A policy loop whose policy takes 3 ms, and the messages that it sends."""
+
+    def __init__(self, chunk: Callable[[], FloatArray] | None = None) -> None:
+        self.clock, self.cache, self.end = FakeClock(), FeatureCache(), WireEnd()
+        history = SentHistory(length=2, dt_s=0.05)
+        self.view = VehicleView(
+            history=history, sink=ListSink(), state_frame="ned_frd", freshness=FRESH
+        )
+        self.sent: list[Chunk | Absence] = []
+        self.elapsed_s: list[float | None] = []
+        self.resets = 0
+        self._chunk = chunk or (lambda: np.zeros((1, 3, 4), np.float32))
+        self.loop = PolicyLoop(
+            clock=self.clock,
+            view=self.view,
+            cache=self.cache,
+            history=history,
+            act=self._act,
+            reset=self._reset,
+            send=self.sent.append,
+            settings=PolicySettings(
+                state_frame="ned_frd",
+                since_exposure=False,
+                chunk_dt_s=0.05,
+                freshness=FRESH,
+                max_feature_age_ns=300 * MS,
+                max_frozen_ns=500 * MS,
+                period_ns=10 * MS,
+            ),
+        )
+
+    def _act(self, *inputs: Any) -> FloatArray:
+        self.elapsed_s.append(inputs[-1])
+        self.clock.advance_ns(3 * MS)
+        return self._chunk()
+
+    def _reset(self) -> None:
+        self.resets += 1
+
+    def measure(
+        self, *, attitude_age_ns: int = 0, velocity_age_ns: int = 0, force_age_ns: int = MS
+    ) -> "Rig":
+        mav, now_ns = self.end.mav, self.clock.now_ns()
+        self.view.receive(
+            tuple(
+                ForwardedPacket(now_ns, now_ns - age_ns, self.end.pack(message))
+                for age_ns, message in (
+                    (velocity_age_ns, mav.local_position_ned_encode(0, 0, 0, 0, 0, 0, 0)),
+                    (force_age_ns, mav.highres_imu_encode(0, 0, 0, -9.8, *[0.0] * 10, 7)),
+                    (attitude_age_ns, mav.attitude_quaternion_encode(0, 1, 0, 0, 0, 0, 0, 0)),
+                )
+            )
+        )
+        return self
+
+    def see(self, *, age_ns: int = 30 * MS, fault: str | None = None) -> "Rig":
+        captured_ns = self.clock.now_ns() - age_ns
+        value = np.zeros((1, 8), np.float32)
+        self.cache.publish(
+            FeatureFrame(
+                frame_id=9, captured_ns=captured_ns, ready_ns=captured_ns, value=value, fault=fault
+            )
+        )
+        return self
+
+    def begin_flight(self) -> None:
+        tick = GateTick(
+            index=0,
+            due_ns=0,
+            woke_ns=0,
+            sent_ns=self.clock.now_ns(),
+            missed_slots=0,
+            is_slot=True,
+            is_coasting=False,
+            chunk_serial=None,
+            trace=None,
+            sent=None,
+            phase=Phase.FLYING,
+            reason="",
+        )
+        self.view.receive(tick)
+
+
+@pytest.mark.parametrize(("velocity_ms", "force_ms"), [(20, 1), (1, 20)])
+def test_a_chunk_carries_the_moments_that_it_came_from(velocity_ms: int, force_ms: int) -> None:
+    rig = Rig().see()
+    rig.measure(
+        attitude_age_ns=4 * MS, velocity_age_ns=velocity_ms * MS, force_age_ns=force_ms * MS
+    )
+    rig.loop.step()
+    (chunk,) = rig.sent
+    assert isinstance(chunk, Chunk)
+    assert chunk._replace(actions=()) == Chunk(
+        serial=1,
+        attitude_ns=START_NS - 4 * MS,
+        velocity_ns=START_NS - 20 * MS,  # the older of velocity and acceleration
+        image_ns=START_NS - 30 * MS,
+        computed_ns=START_NS + 3 * MS,
+        first_ns=START_NS - 4 * MS,
+        step_ns=50 * MS,
+        actions=(),
+    )
+    assert chunk.actions == ((0.0,) * 4,) * 3
+
+
+@pytest.mark.parametrize(
+    ("prepare", "reason"),
+    [
+        (lambda rig: rig.see(), "no attitude from the vehicle yet"),
+        (lambda rig: rig.measure(), "no image feature yet"),
+        (
+            lambda rig: rig.measure().see(age_ns=301 * MS),
+            "the image feature is older than 300 ms",
+        ),
+        (lambda rig: rig.measure(attitude_age_ns=101 * MS).see(), "attitude is older than 100 ms"),
+        (lambda rig: rig.measure(velocity_age_ns=251 * MS).see(), "velocity is older than 250 ms"),
+        (lambda rig: rig.measure().see(fault="the image is black"), "the image is black"),
+    ],
+)
+def test_without_usable_inputs_the_policy_is_not_asked(
+    prepare: Callable[[Rig], Rig], reason: str
+) -> None:
+    rig = prepare(Rig())
+    rig.loop.step()
+    assert rig.sent == [Absence(reason)]
+    assert rig.elapsed_s == []
+
+
+@pytest.mark.parametrize(
+    "shape", [(3, 4), (2, 3, 4), (1, 0, 4), (1, 3, 3), (1, 3, 4, 1), (1, 1025, 4)]
+)
+def test_a_chunk_of_another_shape_is_not_passed_on(shape: tuple[int, ...]) -> None:
+    rig = Rig(lambda: np.zeros(shape, np.float32)).measure().see()
+    rig.loop.step()
+    (refused,) = rig.sent
+    assert isinstance(refused, Absence)
+    assert f"returned {list(shape)} instead of [1, horizon, 4]" in refused.reason
+
+
+def run_on(rig: Rig, milliseconds: int) -> Rig:
+    """Good inputs so much later."""
+    rig.clock.advance_ns(milliseconds * MS)
+    rig.measure().see()
+    rig.loop.step()
+    return rig
+
+
+def test_time_since_the_last_chunk_counts_from_state_to_state_and_afresh_after_a_gap() -> None:
+    rig = Rig().measure().see()
+    rig.loop.step()
+    run_on(rig, 7)
+    run_on(rig, 17)
+    assert rig.elapsed_s == [None, pytest.approx(0.01), pytest.approx(0.02)]
+    rig.clock.advance_ns(400 * MS)
+    rig.loop.step()  # everything is stale now
+    run_on(rig, 7)
+    assert rig.elapsed_s[3:] == [None]
+
+
+def test_a_flight_that_begins_resets_the_policy_once() -> None:
+    rig = Rig().measure().see()
+    rig.loop.step()
+    assert rig.resets == 0
+    rig.begin_flight()
+    run_on(rig, 7)
+    run_on(rig, 7)
+    assert rig.resets == 1
+    assert rig.elapsed_s == [None, None, pytest.approx(0.01)]
+
+
+def test_serial_numbers_rise_by_one_and_a_refusal_takes_none() -> None:
+    rig = Rig().measure().see()
+    for _ in range(3):
+        run_on(rig, 7)
+    rig.see(age_ns=400 * MS)
+    rig.loop.step()
+    run_on(rig, 7)
+    assert [one.serial for one in rig.sent if isinstance(one, Chunk)] == [1, 2, 3, 4]
+    assert len(rig.sent) == 5
+
+
+def test_an_attitude_starts_a_solve_from_a_quarter_of_a_period_before_it_is_due() -> None:
+    rig = Rig().measure().see()
+    rig.loop.step()
+    for at_ms, is_wanted in ((7, False), (7.3, False), (7.5, True)):
+        rig.clock = FakeClock(START_NS + round(at_ms * MS))
+        assert rig.measure().loop.has_news is is_wanted, at_ms
+
+
+def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() -> None:
+    rig, stop = Rig().see(), threading.Event()
+    waits = iter([True, False, True])
+
+    def wait(*, newer_than_ns: int, timeout_ns: int) -> bool:
+        has_come = next(waits, None)
+        if has_come is None:
+            stop.set()
+            return False
+        rig.clock.advance_ns(8 * MS)
+        if has_come:
+            rig.measure()
+            assert rig.view.attitude_ns > newer_than_ns
+        return has_come
+
+    rig.view.wait_for_attitude = wait  # type: ignore[method-assign]
+    before_ns = rig.loop.alive_ns
+    rig.loop.run(stop)
+    told = [one if isinstance(one, Absence) else one.serial for one in rig.sent]
+    nothing = Absence("no attitude from the vehicle")
+    assert told == [1, nothing, 2, nothing]
+    assert rig.loop.alive_ns > before_ns

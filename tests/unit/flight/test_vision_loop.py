@@ -1,0 +1,97 @@
+"""The vision loop tells with each feature what is wrong with its image."""
+
+import numpy as np
+
+from helpers.fakes import START_NS, FakeClock, ListSink
+from mavbridge.camera.image_watch import TAKEOFF_NS, ImageWatch
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import Frame
+from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.vision_loop import VisionLoop
+
+FRAME_NS = NS_PER_S // 30
+
+
+class StillCamera:
+    """Delivers the same picture over and over."""
+
+    dropped_frames = 0
+
+    def __init__(self, clock, picture):
+        self._clock = clock
+        self._picture = picture
+        self._frames = 0
+
+    def read(self, timeout_ns):
+        self._clock.advance_ns(FRAME_NS)
+        self._frames += 1
+        return Frame(
+            frame_id=self._frames, captured_ns=self._clock.now_ns(), rgb=self._picture.copy()
+        )
+
+    def close(self):
+        pass
+
+
+def faults(*, picture, image_watch, airborne_from_ns=START_NS, seconds=4):
+    """Time of the first fault after the start, and every fault from then on."""
+    clock, cache = FakeClock(), FeatureCache()
+    sink = ListSink()
+    loop = VisionLoop(
+        camera=StillCamera(clock, picture),
+        encode=lambda rgb: np.zeros((1, 8), np.float32),
+        cache=cache,
+        sink=sink,
+        clock=clock,
+        period_ns=lambda: FRAME_NS,
+        image_watch=image_watch,
+        is_airborne=lambda: clock.now_ns() >= airborne_from_ns,
+    )
+    seen = []
+    while clock.now_ns() < START_NS + seconds * NS_PER_S:
+        loop.step()
+        feature = cache.latest()
+        seen.append(((feature.captured_ns - START_NS) / NS_PER_S, feature.fault))
+    assert len(sink.visions) == len(seen)
+    faulty = [(at_s, fault) for at_s, fault in seen if fault is not None]
+    if not faulty:
+        return None, []
+    first_s = faulty[0][0]
+    return first_s, [fault for at_s, fault in seen if at_s >= first_s]
+
+
+SCENE = np.random.default_rng(3).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+
+
+def watch():
+    return ImageWatch(max_frozen_s=0.5, max_black_s=0.5)
+
+
+def test_a_frozen_image_marks_every_feature_from_the_limit_on():
+    first_s, reasons = faults(picture=SCENE, image_watch=watch())
+    assert 0.5 < first_s - FRAME_NS / NS_PER_S < 0.5 + 1.5 * FRAME_NS / NS_PER_S
+    assert all(reason.startswith("the image has been frozen for") for reason in reasons)
+
+
+def test_before_the_vehicle_is_airborne_a_frozen_image_is_none():
+    never = START_NS + 100 * NS_PER_S
+    assert faults(picture=SCENE, image_watch=watch(), airborne_from_ns=never) == (None, [])
+
+
+def test_a_camera_that_froze_on_the_ground_is_noticed_after_take_off():
+    first_s, _ = faults(picture=SCENE, image_watch=watch(), airborne_from_ns=START_NS + NS_PER_S)
+    expected_s = 1.0 + TAKEOFF_NS / NS_PER_S + 0.5
+    assert expected_s - 2 * FRAME_NS / NS_PER_S < first_s < expected_s + 2 * FRAME_NS / NS_PER_S
+
+
+def test_a_black_image_is_a_fault_on_the_ground_too():
+    never = START_NS + 100 * NS_PER_S
+    first_s, reasons = faults(
+        picture=np.zeros_like(SCENE), image_watch=watch(), airborne_from_ns=never
+    )
+    assert 0.5 < first_s < 0.6
+    assert all(reason.startswith("the image has been black") for reason in reasons)
+
+
+def test_without_a_watch_nothing_is_a_fault():
+    assert faults(picture=np.zeros_like(SCENE), image_watch=None) == (None, [])

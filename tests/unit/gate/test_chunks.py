@@ -1,0 +1,136 @@
+from dataclasses import replace
+
+import pytest
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import Sticks
+from mavbridge.gate.chunks import MAX_REFUSED, SLOW_CHUNKS, Chunk, ChunkBuffer, FreshnessLimits
+
+MS = NS_PER_MS
+LIMITS = FreshnessLimits(
+    state_ns=100 * MS, velocity_ns=250 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
+)
+NAN = Sticks(float("nan"), 0.0, 0.0, 0.0)
+
+
+def chunk(serial: int, computed_ms: int, **changes: object) -> Chunk:
+    """Solved in 2 ms from an attitude 3 ms old; the roll stick rises by 1 per second."""
+    computed_ns = computed_ms * MS
+    made = Chunk(
+        serial=serial,
+        attitude_ns=computed_ns - 5 * MS,
+        velocity_ns=computed_ns - 5 * MS,
+        image_ns=computed_ns - 40 * MS,
+        computed_ns=computed_ns,
+        first_ns=computed_ns - 5 * MS,
+        step_ns=50 * MS,
+        actions=tuple(Sticks(0.0, 0.0, 0.0, 0.05 * k) for k in range(16)),
+    )
+    return made._replace(**changes)  # type: ignore[arg-type]
+
+
+def buffer(period_ms: int = 10, limits: FreshnessLimits = LIMITS) -> ChunkBuffer:
+    return ChunkBuffer(limits, period_ns=period_ms * MS)
+
+
+def test_actions_are_linear_between_their_times_and_held_at_the_ends() -> None:
+    ramp = chunk(1, 1005)
+    for at_ms, roll in ((900, 0.0), (1000, 0.0), (1025, 0.025), (1500, 0.5), (1900, 0.75)):
+        assert ramp.action_at(at_ms * MS).roll == pytest.approx(roll)
+
+
+def test_beyond_the_horizon_there_is_no_action() -> None:
+    held = buffer()
+    assert held.offer(chunk(1, 1005), 1005 * MS)
+    assert held.action_at((1000 + 16 * 50) * MS) is not None
+    assert held.action_at((1000 + 16 * 50) * MS + 1) is None
+
+
+@pytest.mark.parametrize("age", ["attitude_ns", "velocity_ns", "image_ns", "computed_ns"])
+def test_each_age_is_judged_when_the_chunk_arrives(age: str) -> None:
+    limit_ms = {"attitude_ns": 100, "velocity_ns": 250, "image_ns": 300, "computed_ns": 300}[age]
+    assert buffer().offer(chunk(1, 2000, **{age: (2000 - limit_ms) * MS}), 2000 * MS)
+    late = buffer()
+    assert not late.offer(chunk(1, 2000, **{age: (2000 - limit_ms) * MS - 1}), 2000 * MS)
+    assert f"beyond {limit_ms} ms" in (late.problem(2000 * MS) or "")
+
+
+def test_a_900_ms_solve_does_not_fly_the_attitude_that_it_began_with() -> None:
+    slow = buffer(period_ms=1000)
+    assert not slow.offer(chunk(1, 2000, attitude_ns=1098 * MS), 2000 * MS)
+    assert "the attitude is 900 ms old, beyond 100 ms" in (slow.problem(2000 * MS) or "")
+
+
+def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve() -> None:
+    slow = buffer()
+    for serial in range(1, SLOW_CHUNKS):
+        slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 905) * MS), 0)
+    assert slow.slowness is None
+    slow.offer(chunk(9, 9000, attitude_ns=8095 * MS), 9000 * MS)
+    assert "the newest 905 ms after its attitude" in (slow.slowness or "")
+    slow.offer(chunk(10, 9100), 9100 * MS)
+    assert slow.slowness is None
+
+
+def test_a_contract_with_longer_limits_flies_it() -> None:
+    limits = replace(LIMITS, state_ns=2 * NS_PER_S)
+    assert buffer(1000, limits).offer(chunk(1, 2000, attitude_ns=1098 * MS), 2000 * MS)
+
+
+def test_without_a_new_chunk_it_coasts_for_the_grace_and_then_is_at_fault() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert not held.is_coasting(1020 * MS)
+    assert held.is_coasting(1021 * MS)
+    assert held.fault(1100 * MS) is None
+    assert "100 ms" in (held.fault(1100 * MS + 1) or "")
+
+
+@pytest.mark.parametrize(("period_ms", "grace_ms"), [(2, 100), (10, 100), (33, 100), (500, 1500)])
+def test_the_grace_is_100_ms_or_three_periods(period_ms: int, grace_ms: int) -> None:
+    assert buffer(period_ms).grace_ns == grace_ms * MS
+
+
+def test_stale_chunks_that_keep_coming_do_not_prolong_the_grace() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    for serial, now_ms in enumerate(range(1010, 1110, 10), start=2):
+        assert not held.offer(chunk(serial, now_ms, image_ns=600 * MS), now_ms * MS)
+    assert "the image is 500 ms old" in (held.fault(1101 * MS) or "")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"actions": (NAN,)}, {"actions": ()}, {"step_ns": 0}], ids=["nan", "none", "step"]
+)
+def test_a_malformed_chunk_is_not_flown(changes: dict[str, object]) -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert not held.offer(chunk(2, 1010, **changes), 1010 * MS)
+    assert held.newest == chunk(1, 1000)
+
+
+def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -> None:
+    held = buffer()
+    faults = []
+    for serial in range(1, 2 * MAX_REFUSED + 1):
+        now_ms = 1000 + 10 * serial
+        bad = {} if serial % 2 else {"actions": (NAN,)}
+        held.offer(chunk(serial, now_ms, **bad), now_ms * MS)
+        faults.append(held.fault(now_ms * MS))
+    assert faults[:-1] == [None] * (2 * MAX_REFUSED - 1)
+    assert "unusable" in (faults[-1] or "")
+
+
+def test_an_older_chunk_never_replaces_a_newer_one() -> None:
+    held = buffer()
+    held.offer(chunk(2, 1000), 1000 * MS)
+    assert not held.offer(chunk(1, 1001), 1001 * MS)
+
+
+def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:
+    held = buffer()
+    held.explain_absence("no image feature yet")
+    assert held.problem(0) == "no image feature yet"
+    held.offer(chunk(1, 1000), 1000 * MS)
+    held.explain_absence("the image has been frozen for 0.6 s")
+    assert "frozen" in (held.fault(1200 * MS) or "")

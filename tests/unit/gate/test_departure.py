@@ -1,0 +1,171 @@
+"""The way out after a fault and at a normal end, with and without a receiver, on both firmwares."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from helpers.gate_facts import AIRBORNE, PX4_MODES, flying
+from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.gate.departure import DepartureSettings, Ending
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.facts import Hand, Move
+
+MIDDLE = replace(AIRBORNE, pilot_sticks=NEUTRAL)
+IDLE_RECEIVER = replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0))
+NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
+PX4 = replace(NO_RECEIVER, mode="ALTCTL", known_modes=PX4_MODES)
+FAULT = {"chunk_fault": "no chunk"}
+
+
+@pytest.mark.parametrize(
+    ("facts", "choice", "mode"),
+    [
+        (MIDDLE, "auto", None),
+        (IDLE_RECEIVER, "auto", "BRAKE"),
+        (NO_RECEIVER, "auto", "BRAKE"),
+        (replace(NO_RECEIVER, is_position_valid=False), "auto", "LAND"),
+        (MIDDLE, "hold", "BRAKE"),
+        (MIDDLE, "land", "LAND"),
+        (MIDDLE, "rtl", "RTL"),
+        (NO_RECEIVER, "release", None),
+        (PX4, "auto", "AUTO.LOITER"),
+        (PX4, "land", "AUTO.LAND"),
+        (PX4, "rtl", "AUTO.RTL"),
+    ],
+)
+def test_the_mode_after_a_fault(facts: Any, choice: Any, mode: str | None) -> None:
+    stepped = flying(facts, departure=DepartureSettings(on_fault=choice))
+    assert stepped.step(**FAULT) == Move(hand=Hand.NEUTRAL, mode=mode)
+
+
+@pytest.mark.parametrize(
+    ("facts", "choice", "mode"),
+    [(IDLE_RECEIVER, "auto", None), (NO_RECEIVER, "auto", "LAND"), (MIDDLE, "rtl", "RTL")],
+)
+def test_the_mode_at_a_normal_end(facts: Any, choice: Any, mode: str | None) -> None:
+    stepped = flying(facts, departure=DepartureSettings(then=choice))
+    assert stepped.step("release") == Move(hand=Hand.NEUTRAL, mode=mode)
+
+
+def test_the_mode_is_asked_for_until_it_is_confirmed() -> None:
+    stepped = flying(IDLE_RECEIVER)
+    moves = [stepped.step(**FAULT), *stepped.run(0.99)]
+    assert sum(move.mode == "BRAKE" for move in moves) == 10
+    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    assert stepped.step(mode="BRAKE").hand is Hand.RELEASE
+
+
+def test_a_refused_mode_becomes_land() -> None:
+    stepped = flying(IDLE_RECEIVER)
+    stepped.step(**FAULT)
+    moves = stepped.run(0.2, refused_mode="BRAKE")
+    assert "LAND" in {move.mode for move in moves}
+    assert stepped.step(mode="LAND", refused_mode=None).hand is Hand.RELEASE
+
+
+def test_a_late_refusal_does_not_stop_the_landing() -> None:
+    stepped = flying(NO_RECEIVER)
+    stepped.step(**FAULT)
+    stepped.run(0.2, refused_mode="BRAKE")
+    assert "LAND" in {move.mode for move in stepped.run(1, refused_mode="LAND")}
+    stepped.run(0.2, mode="LAND", refused_mode=None)
+    assert stepped.phase is Phase.HOLDING
+
+
+def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
+    stepped = flying(IDLE_RECEIVER)
+    stepped.step(**FAULT)
+    stepped.run(2.98)
+    assert stepped.phase is Phase.LEAVING
+    stepped.run(0.03)
+    assert stepped.phase is Phase.RELEASING
+    assert stepped.engagement.refusal == "the vehicle has not confirmed BRAKE in time"
+    stepped.run(1)
+    assert stepped.phase is Phase.RELEASED
+    assert "whether it took the release is not known" in stepped.engagement.refusal
+
+
+def test_a_receiver_gets_the_sticks_after_50_ms_of_neutral() -> None:
+    stepped = flying(MIDDLE)
+    moves = [stepped.step(**FAULT), *stepped.run(0.06)]
+    assert [move.hand for move in moves] == [Hand.NEUTRAL] * 5 + [Hand.RELEASE] * 2
+
+
+@pytest.mark.parametrize(
+    ("facts", "settings"),
+    [
+        (NO_RECEIVER, DepartureSettings()),
+        (replace(PX4, has_receiver=True), DepartureSettings(is_silence_failsafe=True)),
+    ],
+)
+def test_where_silence_is_a_failsafe_neutral_goes_on_until_disarmed(
+    facts: Any, settings: Any
+) -> None:
+    stepped = flying(facts, departure=settings)
+    stepped.step(**FAULT)
+    moves = stepped.run(0.2, mode="BRAKE" if facts.mode == "ALT_HOLD" else "AUTO.LOITER")
+    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    assert stepped.phase is Phase.HOLDING
+    assert {move.hand for move in stepped.run(60)} == {Hand.NEUTRAL}
+    assert stepped.step(armed=False).hand is Hand.RELEASE
+
+
+def test_without_a_receiver_a_release_holds_neutral_in_the_same_mode() -> None:
+    stepped = flying(NO_RECEIVER, departure=DepartureSettings(on_fault="release"))
+    stepped.step(**FAULT)
+    assert {(move.hand, move.mode) for move in stepped.run(20)} == {(Hand.NEUTRAL, None)}
+    assert stepped.phase is Phase.HOLDING
+
+
+def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
+    stepped = flying(NO_RECEIVER)
+    stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+    stepped.step()
+    stepped.run(0.2, mode="BRAKE")
+    assert stepped.phase is Phase.HOLDING
+    assert {move.hand for move in stepped.run(29, link_problem="no heartbeat")} == {Hand.NEUTRAL}
+    stepped.run(1, link_problem=None)
+    assert {move.hand for move in stepped.run(29, link_problem="no heartbeat")} == {Hand.NEUTRAL}
+    stepped.run(3)
+    assert "lost for 30 s" in stepped.reason
+    assert stepped.phase is Phase.ENDED
+
+
+def test_the_pilot_wins_on_the_way_out() -> None:
+    stepped = flying(NO_RECEIVER)
+    stepped.step(**FAULT)
+    stepped.run(0.1, mode="BRAKE")
+    assert stepped.phase is Phase.HOLDING
+    assert stepped.step(mode="LOITER") == Move(hand=Hand.RELEASE)
+    assert "mode changed from BRAKE to LOITER" in stepped.reason
+
+
+@pytest.mark.parametrize("mode", ["STABILIZE", "ACRO"])
+def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral(mode: str) -> None:
+    stepped = flying(replace(IDLE_RECEIVER, mode=mode), modes=(mode,))
+    moves = [stepped.step(**FAULT), *stepped.run(0.1)]
+    assert {move.hand for move in moves} == {Hand.LEVEL}
+    assert moves[0].mode == "BRAKE"
+    assert stepped.step(mode="BRAKE").hand in (Hand.NEUTRAL, Hand.RELEASE)
+
+
+def test_a_stop_while_holding_after_a_fault_lands_as_a_normal_end_does() -> None:
+    stepped = flying(NO_RECEIVER)
+    stepped.step(**FAULT)
+    stepped.run(0.2, mode="BRAKE", chunk_fault=None)
+    assert stepped.phase is Phase.HOLDING
+    stepped.engagement.stop(Ending(reason="the flight was ended by a signal"))
+    assert stepped.step() == Move(hand=Hand.NEUTRAL, mode="LAND")
+    stepped.run(0.2, mode="LAND")
+    assert stepped.phase is Phase.HOLDING
+    stepped.step(armed=False)
+    stepped.run(0.1, is_released=True)
+    assert stepped.phase is Phase.ENDED
+
+
+def test_the_operators_release_while_holding_lands_too() -> None:
+    stepped = flying(NO_RECEIVER)
+    stepped.step(**FAULT)
+    stepped.run(0.2, mode="BRAKE")
+    assert stepped.step("release") == Move(hand=Hand.NEUTRAL, mode="LAND")

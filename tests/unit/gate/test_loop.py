@@ -1,0 +1,461 @@
+"""The gate between a vehicle and a flight process of fakes."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from helpers.fakes import START_NS, FakeClock, FakeLink
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Release, Sticks
+from mavbridge.gate.chunks import Chunk, FreshnessLimits
+from mavbridge.gate.departure import DepartureSettings, Ending
+from mavbridge.gate.engagement import EngagementSettings, Phase
+from mavbridge.gate.envelope import EnvelopeLimits
+from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.loop import FINISH_NS, IDLE_PERIOD_NS, GateLoop
+from mavbridge.gate.settings import GateSettings
+from mavbridge.gate.smoothing import Smoothing
+from mavbridge.gate.wire import (
+    Absence,
+    FromGate,
+    GateMessage,
+    GateStatus,
+    GateTick,
+    ToGate,
+    decode_from_gate,
+    encode_to_gate,
+)
+from mavbridge.mavlink.settings import LinkSettings
+
+MS = NS_PER_MS
+WANTED = Sticks(0.4, 0.1, -0.2, 0.3)
+FLIGHT = FlightSettings(
+    stick_period_ns=10 * MS,
+    chunk_period_ns=10 * MS,
+    freshness=FreshnessLimits(
+        state_ns=300 * MS, velocity_ns=300 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
+    ),
+    smoothing=Smoothing(max_slew_per_s=0.0, tau_s=0.0),
+    envelope=EnvelopeLimits(),
+    engagement=EngagementSettings(modes=("ALT_HOLD",), departure=DepartureSettings()),
+)
+
+
+class FakePort:
+    """The flight process: its messages wait in ``inbox``, those of the gate are kept decoded."""
+
+    def __init__(self) -> None:
+        self.inbox: list[bytes] = []
+        self.received: list[FromGate] = []
+        self.is_closed = False
+
+    def send(self, message: bytes) -> bool:
+        self.received.append(decode_from_gate(message))
+        return not self.is_closed
+
+    def receive(self) -> list[bytes]:
+        messages, self.inbox = self.inbox, []
+        return messages
+
+
+class Rig:
+    """Steps whenever the loop asks for it; a chunk comes 5 ms after each slot while ``solves``."""
+
+    def __init__(
+        self,
+        *,
+        first: list[ToGate] | None = None,
+        oversleep_ns: int = 0,
+        lead_ns: int = 0,
+        **status: Any,
+    ) -> None:
+        self.clock = FakeClock(oversleep_ns=oversleep_ns)
+        self.link = FakeLink(self.clock, **status)
+        self.port = FakePort()
+        received = [encode_to_gate(message) for message in first or []]
+        self.loop = GateLoop(self.clock, self.link, self.port, received=received, lead_ns=lead_ns)
+        self.link.forward = self.loop.forward
+        self.solves = True
+        self.serial = 0
+
+    def tell(self, *messages: ToGate) -> None:
+        self.port.inbox += [encode_to_gate(message) for message in messages]
+
+    def chunk(self, **changes: Any) -> Chunk:
+        self.serial += 1
+        now_ns = self.clock.now_ns()
+        chunk = Chunk(
+            serial=self.serial,
+            attitude_ns=now_ns,
+            velocity_ns=now_ns,
+            image_ns=now_ns,
+            computed_ns=now_ns,
+            first_ns=now_ns,
+            step_ns=50 * MS,
+            actions=(WANTED,) * 4,
+        )
+        return chunk._replace(**changes)
+
+    def run(self, seconds: float) -> "Rig":
+        until_ns = self.clock.now_ns() + round(seconds * NS_PER_S)
+        while self.clock.now_ns() < until_ns and not self.loop.is_done:
+            due_ns = self.loop.step()
+            if self.solves and due_ns - self.clock.now_ns() > 5 * MS:
+                self.clock.sleep_until_ns(due_ns - 5 * MS)
+                self.tell(self.chunk())
+            else:
+                self.clock.sleep_until_ns(due_ns)
+        return self
+
+    def flying(self) -> "Rig":
+        self.tell(FLIGHT)
+        self.run(0.1)
+        self.tell("engage")
+        self.run(0.1)
+        assert self.ticks[-1].phase is Phase.FLYING, self.texts
+        return self
+
+    def got(self, kind: Any) -> list[Any]:
+        return [message for message in self.port.received if isinstance(message, kind)]
+
+    @property
+    def ticks(self) -> list[GateTick]:
+        return self.got(GateTick)
+
+    @property
+    def texts(self) -> list[str]:
+        return [message.text for message in self.got(GateMessage)]
+
+
+# --- what the flight process hears
+
+
+def test_packets_are_passed_on_before_anything_else_with_their_stamps() -> None:
+    rig = Rig().flying()
+    rig.port.received.clear()
+    rig.link.change(mode="LOITER")
+    rig.link.texts.append("Mode LOITER")
+    rig.link.measure(age_ns=3 * MS)
+    arrived_ns = rig.clock.now_ns()
+    rig.loop.step()
+    packets, *rest = rig.port.received
+    assert isinstance(packets, tuple)
+    assert len(packets) == 3
+    assert {(p.arrived_ns, p.happened_ns) for p in packets} == {(arrived_ns, arrived_ns - 3 * MS)}
+    assert [type(message) for message in rest] == [GateStatus, GateMessage, GateTick]
+
+
+def test_the_vehicles_status_is_told_when_it_changes() -> None:
+    rig = Rig().run(0.1)
+    assert rig.got(GateStatus) == [GateStatus("fake 1.0", "ALT_HOLD", True, False, (), None)]
+    rig.link.change(armed=False)
+    rig.run(0.1)
+    rig.link.status = None
+    rig.run(0.1)
+    assert [(s.mode, s.armed) for s in rig.got(GateStatus)[1:]] == [
+        ("ALT_HOLD", False),
+        (None, False),
+    ]
+
+
+def test_every_stick_is_told_with_its_chunk_as_it_was_sent() -> None:
+    rig = Rig().flying()
+    sent = [tick for tick in rig.ticks if tick.sent is not None]
+    assert [(tick.sent_ns, Command(sticks=tick.sent)) for tick in sent] == rig.link.decisions
+    assert {tick.sent for tick in sent} == {tick.trace.smoothed for tick in sent if tick.trace}
+    assert sent[-1].sent == pytest.approx(WANTED)
+    assert [tick.chunk_serial for tick in sent] == sorted(tick.chunk_serial for tick in sent)
+
+
+def test_slots_in_which_nothing_is_sent_are_told_too() -> None:
+    rig = Rig()
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    assert [tick.index for tick in rig.ticks] == list(range(10))
+    assert {(tick.is_slot, tick.sent) for tick in rig.ticks} == {(True, None)}
+
+
+def test_a_change_of_phase_is_told_even_where_nothing_is_sent() -> None:
+    rig = Rig().flying()
+    rig.solves = False
+    rig.link.change(mode="LOITER")
+    for _ in range(2):
+        rig.loop.step()
+    assert not rig.ticks[-1].is_slot
+    phases = list(dict.fromkeys(tick.phase for tick in rig.ticks))
+    assert phases == [Phase.WAITING, Phase.FLYING, Phase.RELEASING, Phase.RELEASED]
+    assert rig.ticks[-1].reason == "mode changed from ALT_HOLD to LOITER"
+
+
+def test_packets_are_not_passed_on_before_somebody_reads_them() -> None:
+    rig = Rig()
+    for _ in range(1000):
+        rig.link.measure()
+        rig.loop.step()
+    assert rig.got(tuple) == rig.got(GateStatus)
+    rig.tell(FLIGHT)
+    rig.loop.step()
+    rig.link.measure()
+    rig.loop.step()
+    assert [len(one) for one in rig.got(tuple) if not isinstance(one, GateStatus)] == [3]
+
+
+# --- what it says
+
+
+def test_before_a_policy_is_loaded_the_link_is_served_all_the_same() -> None:
+    rig = Rig()
+    rig.tell("engage", rig.chunk(), Absence("loading"))
+    first_ns = rig.loop.step()
+    assert first_ns == START_NS + IDLE_PERIOD_NS
+    rig.run(0.1)
+    assert rig.link.services >= 10
+    assert rig.ticks == []
+    assert rig.link.decisions == []
+
+
+def test_settings_may_come_with_the_first_messages() -> None:
+    rig = Rig(first=[FLIGHT])
+    assert rig.loop.step() == START_NS + 10 * MS
+    assert rig.ticks[0].phase is Phase.WAITING
+
+
+def test_the_first_settings_of_a_flight_count() -> None:
+    rig = Rig(first=[FLIGHT]).flying()
+    rig.tell(replace(FLIGHT, stick_period_ns=50 * MS), GateSettings(link=LinkSettings()))
+    rig.run(0.1)
+    assert {
+        b - a
+        for (a, _), (b, _) in zip(rig.link.decisions[2:], rig.link.decisions[3:], strict=False)
+    } <= {*(5 * MS, 10 * MS)}
+    assert rig.ticks[-1].phase is Phase.FLYING
+
+
+def test_the_newest_of_several_chunks_is_flown() -> None:
+    rig = Rig().flying()
+    rig.solves = False
+    old, new = rig.chunk(), rig.chunk(actions=(NEUTRAL,))
+    rig.tell(old, new)
+    rig.loop.step()
+    assert rig.link.decisions[-1] == (rig.clock.now_ns(), Command(sticks=NEUTRAL))
+    assert rig.ticks[-1].chunk_serial == new.serial
+
+
+def test_an_act_that_has_no_effect_is_answered() -> None:
+    rig = Rig(armed=False)
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    rig.tell("engage")
+    rig.run(0.1)
+    (told,) = rig.texts
+    assert "disarmed" in told
+
+
+def test_why_there_is_no_chunk_is_passed_on_to_the_user() -> None:
+    rig = Rig()
+    rig.solves = False
+    rig.tell(FLIGHT, Absence("the image has been black for 0.6 s"))
+    rig.run(0.1)
+    assert rig.ticks[-1].reason == "the image has been black for 0.6 s"
+
+
+def test_a_chunk_is_the_end_of_the_reason_for_there_being_none() -> None:
+    rig = Rig().flying()
+    rig.solves = False
+    rig.tell(Absence("the image was black"), rig.chunk())
+    rig.run(0.2)
+    assert rig.ticks[-1].phase is not Phase.FLYING
+    assert "no chunk" in rig.ticks[-1].reason
+    assert "black" not in rig.ticks[-1].reason
+
+
+def test_a_message_that_is_none_is_an_error() -> None:
+    rig = Rig()
+    rig.port.inbox.append(b"?")
+    with pytest.raises(ValueError, match="not a message"):
+        rig.loop.step()
+
+
+# --- the vehicle
+
+
+def test_sticks_leave_before_requests_and_other_work() -> None:
+    rig = Rig(has_receiver=False).flying()
+    services, requests = rig.link.services, []
+    rig.link.on_send = lambda: requests.append((rig.link.services, list(rig.link.requests)))
+    rig.tell(Ending(reason="enough"))
+    rig.loop.step()
+    assert requests == [(services, [])]
+    assert rig.link.requests == ["mode LAND"]
+    assert rig.link.services == services + 1
+
+
+def test_the_link_is_engaged_while_we_hold_the_sticks_or_give_them_back() -> None:
+    rig = Rig()
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    assert not rig.link.is_engaged
+    rig.flying()
+    assert rig.link.is_engaged
+    rig.link.change(mode="LOITER")
+    rig.loop.step()
+    assert rig.link.is_engaged
+    rig.run(0.05)
+    assert not rig.link.is_engaged
+
+
+def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
+    rig = Rig(has_receiver=False).flying()
+    rig.tell(Ending(reason="the policy has failed", is_fault=True))
+    rig.run(0.5)
+    assert rig.ticks[-1].phase is Phase.HOLDING
+    assert rig.link.is_engaged
+    rig.link.change(mode="LOITER")
+    rig.run(0.5)
+    assert rig.link.announced == [
+        "mavbridge: the policy has the sticks",
+        "mavbridge: neutral sticks: the policy has failed",
+        "mavbridge: neutral sticks go on until you disarm or change the mode",
+        "mavbridge: sticks given back: the policy has failed; then mode changed from BRAKE to "
+        "LOITER",
+    ]
+
+
+def test_an_oversleep_delays_slots_and_loses_none() -> None:
+    rig = Rig(oversleep_ns=MS)
+    rig.solves = False
+    rig.tell(FLIGHT)
+    rig.run(5.0)
+    assert sum(tick.missed_slots for tick in rig.ticks) == 0
+    assert [tick.index for tick in rig.ticks] == list(range(len(rig.ticks)))
+    assert {tick.sent_ns - tick.due_ns for tick in rig.ticks[2:]} == {MS}
+
+
+def test_slots_that_the_host_has_slept_through_are_counted_and_not_made_up_for() -> None:
+    rig = Rig().flying()
+    before = len(rig.link.decisions)
+    rig.clock.advance_ns(53 * MS)
+    for _ in range(3):
+        rig.loop.step()
+    assert len(rig.link.decisions) == before + 1
+    assert rig.ticks[-1].missed_slots == 5
+    rig.run(0.1)
+    assert sum(tick.missed_slots for tick in rig.ticks) == 5
+    assert rig.ticks[-1].phase is Phase.FLYING
+
+
+def test_work_that_begins_before_the_slot_sends_at_the_slot() -> None:
+    rig = Rig(lead_ns=MS // 2).flying()
+    rig.port.received.clear()
+    rig.run(0.5)
+    on_grid = [tick for tick in rig.ticks if tick.is_slot]
+    assert len(on_grid) > 40
+    assert {tick.sent_ns - tick.due_ns for tick in on_grid} == {0}
+    assert {tick.due_ns - tick.woke_ns for tick in on_grid} == {MS // 2}
+
+
+# --- the end
+
+
+def test_the_death_of_the_flight_process_is_a_fault() -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+    rig.port.is_closed = True
+    rig.loop.step()
+    assert rig.link.decisions[-1][1] == Command(sticks=NEUTRAL)
+    assert rig.link.requests == ["mode BRAKE"]  # not LAND, as at a normal end
+    rig.run(1.0)
+    assert rig.link.hands[-2:] == [Command(sticks=NEUTRAL), Release("the flight process has died")]
+    assert rig.loop.is_done
+
+
+def test_its_death_before_a_flight_leaves_the_vehicle_alone() -> None:
+    rig = Rig()
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    rig.port.is_closed = True
+    rig.run(1.0)
+    assert rig.loop.is_done
+    assert rig.link.decisions == []
+
+
+def test_a_chunk_that_has_come_with_the_end_of_the_channel_does_not_fly() -> None:
+    rig = Rig().flying()
+    rig.tell(rig.chunk(), "engage")
+    rig.port.is_closed = True
+    rig.loop.step()
+    assert rig.link.decisions[-1][1] == Command(sticks=NEUTRAL)
+
+
+def test_the_first_reason_to_end_is_the_one_that_counts() -> None:
+    rig = Rig().flying()
+    rig.loop.stop(Ending(reason="the gate was told to end"))
+    rig.tell(Ending(reason="the policy has failed", is_fault=True))
+    rig.run(1.0)
+    assert rig.link.hands[-1] == Release("the gate was told to end")
+    assert rig.loop.is_done
+
+
+@pytest.mark.parametrize("has_policy", [True, False], ids=["flight", "weights still loading"])
+@pytest.mark.parametrize("seconds", [0.5, 60.0])
+def test_parameters_are_put_back_at_the_end_for_a_bounded_time(
+    has_policy: bool, seconds: float
+) -> None:
+    rig = Rig(first=[FLIGHT] if has_policy else [])
+    rig.link.is_restored = False
+    rig.run(0.1)
+    assert rig.link.restores == 0
+    rig.tell(Ending(reason="enough"))
+    stopped_ns = rig.clock.now_ns()
+    services = rig.link.services
+    rig.run(min(seconds, 1.0))
+    assert not rig.loop.is_done
+    assert rig.link.restores > 10
+    assert rig.link.services > services + 10
+    rig.link.is_restored = seconds < 1.0
+    rig.run(seconds)
+    assert rig.loop.is_done
+    took_ns = rig.clock.now_ns() - stopped_ns
+    assert took_ns == pytest.approx(min(seconds * NS_PER_S, FINISH_NS), abs=40 * MS)
+
+
+def test_what_the_link_says_about_putting_back_is_still_passed_on() -> None:
+    rig = Rig(first=[FLIGHT])
+    rig.run(0.1)
+    rig.tell(Ending(reason="enough"))
+    restore = rig.link.begin_restore
+
+    def begin_restore() -> None:
+        restore()
+        if not rig.loop.is_done:
+            rig.link.texts = ["RC_OVERRIDE_TIME put back to 3"]
+
+    rig.link.begin_restore = begin_restore  # type: ignore[method-assign]
+    rig.run(0.1)
+    assert rig.loop.is_done
+    assert "RC_OVERRIDE_TIME put back to 3" in rig.texts
+
+
+def test_a_gate_that_fails_gives_the_sticks_back_whatever_it_knows() -> None:
+    rig = Rig().flying()
+    rig.loop.abandon()
+    assert [decision for _, decision in rig.link.decisions[-10:]] == [
+        Release("the gate has failed")
+    ] * 10
+
+    def explode() -> None:
+        raise OSError("no link")
+
+    rig.link.on_send = explode
+    rig.loop.abandon()  # and hides no first error behind a second one
+
+
+def test_the_reason_for_no_flight_is_known_at_the_end() -> None:
+    rig = Rig(armed=False, is_landed=True)
+    assert rig.loop.failure is None
+    rig.link.obeys = rig.solves = False
+    engagement = replace(FLIGHT.engagement, arm=True)
+    rig.tell(replace(FLIGHT, engagement=engagement))
+    rig.run(100.0)
+    assert rig.loop.is_done
+    assert "not ready after 90 s" in (rig.loop.failure or "")

@@ -1,0 +1,221 @@
+"""Every message between the processes arrives as it was sent."""
+
+import math
+import struct
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavbridge.core.vehicle import ForwardedPacket, LinkStats, Percentiles, Sticks, StickTrace
+from mavbridge.gate.chunks import Chunk, FreshnessLimits
+from mavbridge.gate.departure import DepartureSettings, Ending
+from mavbridge.gate.engagement import EngagementSettings, Phase
+from mavbridge.gate.envelope import EnvelopeLimits
+from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.settings import GateSettings
+from mavbridge.gate.smoothing import Smoothing
+from mavbridge.gate.wire import (
+    Absence,
+    FromGate,
+    GateError,
+    GateMessage,
+    GateStatus,
+    GateSummary,
+    GateTick,
+    ToGate,
+    decode_from_gate,
+    decode_to_gate,
+    encode_from_gate,
+    encode_packets,
+    encode_tick,
+    encode_to_gate,
+)
+from mavbridge.mavlink.settings import LinkSettings
+
+STICKS = Sticks(0.1, -0.2, 0.3, -0.4)
+FLIGHT = FlightSettings(
+    stick_period_ns=10_000_000,
+    chunk_period_ns=33_333_333,
+    freshness=FreshnessLimits(state_ns=1, velocity_ns=2, feature_ns=3, chunk_ns=4),
+    smoothing=Smoothing(max_slew_per_s=8.0, tau_s=0.05),
+    envelope=EnvelopeLimits(height_m=math.inf),
+    engagement=EngagementSettings(modes=("ALT_HOLD",), departure=DepartureSettings(then="rtl")),
+)
+CHUNK = Chunk(
+    serial=7,
+    attitude_ns=1,
+    velocity_ns=2,
+    image_ns=3,
+    computed_ns=4,
+    first_ns=5,
+    step_ns=6,
+    actions=(STICKS, Sticks(1e-300, -0.0, math.inf, 1.0)),
+)
+TICK = GateTick(
+    index=3,
+    due_ns=10,
+    woke_ns=11,
+    sent_ns=12,
+    missed_slots=2,
+    is_slot=True,
+    is_coasting=False,
+    chunk_serial=7,
+    trace=StickTrace(raw=STICKS, clipped=STICKS, slewed=STICKS, smoothed=STICKS),
+    sent=STICKS,
+    phase=Phase.FLYING,
+    reason="",
+)
+STATUS = GateStatus("ArduPilot 4.6.3", "ALT_HOLD", True, False, (1500,) * 8, STICKS)
+STATS = LinkStats(
+    messages_per_s=(("ATTITUDE_QUATERNION", 99.9), ("HEARTBEAT", 10.0)),
+    lost_fraction=0.25,
+    rtt_ms=Percentiles(p50=1.0, p99=2.0, p999=3.0, max=4.0),
+    sent_overrides=6000,
+    echo_confirmed=None,
+    vehicle_clock_offset_ns=-5,
+)
+SUMMARY = GateSummary(
+    autopilot="PX4", link=STATS, failure="did not arm", dropped_messages=1, dropped_packets=2
+)
+TO_GATE: list[ToGate] = [
+    CHUNK,
+    CHUNK._replace(actions=()),
+    Absence("no image feature yet: größer als 300 ms"),
+    GateSettings(link=LinkSettings(connect="udp:127.0.0.1:14550"), tlog_fd=9, cpu=1),
+    FLIGHT,
+    Ending(reason="the policy has hung", is_fault=True),
+    "engage",
+    "release",
+]
+FROM_GATE: list[FromGate] = [
+    TICK,
+    replace(TICK, trace=None, sent=None, chunk_serial=None, is_slot=False, is_coasting=True),
+    replace(TICK, chunk_serial=0, sent=None),
+    *(replace(TICK, phase=phase, reason=f"weil es {phase.value} heißt") for phase in Phase),
+    (),
+    (ForwardedPacket(1, 2, b"\xfd" * 280), ForwardedPacket(3, 3, b""), ForwardedPacket(4, 1, b"P")),
+    STATUS,
+    GateStatus("none", None, False, None, (), None),
+    GateMessage("PreArm: Gyros inconsistent"),
+    GateError("user", "another gate flies this vehicle"),
+    SUMMARY,
+    replace(SUMMARY, failure=None, link=replace(STATS, rtt_ms=None, lost_fraction=None)),
+]
+
+
+def encoded(message: FromGate) -> bytes:
+    match message:
+        case GateTick():
+            return encode_tick(message)
+        case GateStatus() | GateMessage() | GateError() | GateSummary():
+            return encode_from_gate(message)
+        case packets:
+            return encode_packets(packets)
+
+
+@pytest.mark.parametrize("message", TO_GATE, ids=lambda m: type(m).__name__)
+def test_what_is_sent_to_the_gate_arrives_as_it_was(message: ToGate) -> None:
+    received = decode_to_gate(encode_to_gate(message))
+    assert received == message
+    assert type(received) is type(message)
+
+
+@pytest.mark.parametrize("message", FROM_GATE, ids=lambda m: type(m).__name__)
+def test_what_the_gate_sends_arrives_as_it_was(message: FromGate) -> None:
+    received = decode_from_gate(encoded(message))
+    assert received == message
+    assert type(received) is type(message)
+
+
+stamps = st.integers(-(2**63), 2**63 - 1)
+sticks = st.builds(Sticks, *[st.floats(width=64)] * 4)
+
+
+def bits(values: Any) -> bytes:
+    """NaN is not equal to itself, its bytes are."""
+    return struct.pack(f"<{len(values)}d", *values)
+
+
+@given(st.tuples(*[stamps] * 7), st.lists(sticks, max_size=40))
+def test_any_chunk_arrives_bit_by_bit(seven: tuple[int, ...], actions: list[Sticks]) -> None:
+    sent = Chunk(*seven, tuple(actions))  # type: ignore[call-arg,arg-type]
+    received = decode_to_gate(encode_to_gate(sent))
+    assert isinstance(received, Chunk)
+    assert received[:7] == seven
+    assert [bits(action) for action in received.actions] == [bits(action) for action in actions]
+
+
+@given(
+    st.builds(
+        GateTick,
+        index=stamps,
+        due_ns=stamps,
+        woke_ns=stamps,
+        sent_ns=stamps,
+        missed_slots=st.integers(0, 2**31 - 1),
+        is_slot=st.booleans(),
+        is_coasting=st.booleans(),
+        chunk_serial=st.none() | stamps,
+        trace=st.none()
+        | st.builds(StickTrace, raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks),
+        sent=st.none() | sticks,
+        phase=st.sampled_from(Phase),
+        reason=st.text(st.characters(codec="utf-8"), max_size=50),
+    )
+)
+def test_any_tick_arrives_bit_by_bit(tick: GateTick) -> None:
+    received = decode_from_gate(encode_tick(tick))
+    assert isinstance(received, GateTick)
+    plain = {"trace": None, "sent": None}
+    assert replace(received, **plain) == replace(tick, **plain)  # type: ignore[arg-type]
+    assert (received.trace is None, received.sent is None) == (
+        tick.trace is None,
+        tick.sent is None,
+    )
+    if tick.sent is not None and received.sent is not None:
+        assert bits(received.sent) == bits(tick.sent)
+    if tick.trace is not None and received.trace is not None:
+        for stage in ("raw", "clipped", "slewed", "smoothed"):
+            assert bits(getattr(received.trace, stage)) == bits(getattr(tick.trace, stage))
+
+
+GARBAGE = [b"", b"\0", b"Q", b"A", b"Afly", b"E{}", b"E[]", b"E\xff", b"S", b"Snonsense"]
+
+
+@pytest.mark.parametrize("data", GARBAGE)
+def test_the_gate_refuses_what_is_no_message(data: bytes) -> None:
+    with pytest.raises(ValueError, match="not a message"):
+        decode_to_gate(data)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"Q", b"V{}", b"Vnull", b"V[1]", b"M", b"X[]", b"Z{}", b"Z[]"]
+)
+def test_the_flight_process_refuses_what_is_no_message(data: bytes) -> None:
+    with pytest.raises(ValueError, match="not a message"):
+        decode_from_gate(data)
+
+
+@pytest.mark.parametrize("message", TO_GATE[:1] + TO_GATE[5:], ids=lambda m: type(m).__name__)
+def test_a_message_to_the_gate_that_is_cut_off_is_refused(message: ToGate) -> None:
+    whole = encode_to_gate(message)
+    for length in range(len(whole)):
+        with pytest.raises(ValueError, match="not a message"):
+            decode_to_gate(whole[:length])
+
+
+@pytest.mark.parametrize("message", [TICK, FROM_GATE[-7], STATUS, SUMMARY])
+def test_a_message_of_the_gate_that_is_cut_off_is_refused(message: FromGate) -> None:
+    whole = encoded(message)
+    at_whole_packets = {1, 1 + 18 + 280, 1 + 18 + 280 + 18} if isinstance(message, tuple) else set()
+    for length in set(range(len(whole))) - at_whole_packets:
+        with pytest.raises(ValueError, match="not a message"):
+            decode_from_gate(whole[:length])
+
+
+def test_a_chunk_with_more_bytes_than_it_says_is_refused() -> None:
+    with pytest.raises(ValueError, match="not a message"):
+        decode_to_gate(encode_to_gate(CHUNK) + b"\0")

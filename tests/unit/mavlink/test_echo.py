@@ -1,0 +1,440 @@
+"""The echo check against a vehicle that is a link with delay and loss, and other overriders."""
+
+import heapq
+import math
+import random
+from collections.abc import Callable
+
+import pytest
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.mavlink.codec.calibration import Pwm
+from mavbridge.mavlink.session.echo import (
+    CONFIRM_NS,
+    NUDGE_US,
+    SEEK_NUDGE_US,
+    EchoCheck,
+    EchoFault,
+)
+from mavbridge.mavlink.session.streams import RC_CHANNELS_HZ
+
+S, MS = NS_PER_S, NS_PER_MS
+RECEIVER: Pwm = (1000, 1500, 1500, 1500)
+STICKS: Pwm = (1600, 1550, 1500, 1700)
+"""Throttle, yaw, pitch, roll in us."""
+JOYSTICK: Pwm = (1400, 1500, 1480, 1320)
+
+
+def still(_now_ns: int) -> Pwm:
+    return STICKS
+
+
+def moving(now_ns: int) -> Pwm:
+    wave = math.sin(2 * math.pi * now_ns / S)
+    return 1500 + round(200 * wave), 1500, 1500 - round(300 * wave), 1500 + round(150 * wave)
+
+
+class World:
+    """Our sends, the vehicle, and the network between them, in steps of half a millisecond."""
+
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        send_hz: float = 100.0,
+        rc_hz: float = RC_CHANNELS_HZ,
+        sticks: Callable[[int], Pwm] = still,
+        loss: float = 0.0,
+        delay_ms: float = 1.0,
+        jitter_ms: float = 1.0,
+        rc_jitter_ms: float = 3.0,
+    ) -> None:
+        self.random = random.Random(seed)
+        self.echo = EchoCheck()
+        self.send_hz, self.rc_hz = send_hz, rc_hz
+        self.loss, self.delay_ms, self.jitter_ms = loss, delay_ms, jitter_ms
+        self.rc_jitter_ms = rc_jitter_ms
+        self.sticks = sticks
+        self.is_sending = False
+        self.is_deaf = False
+        """The vehicle hears nothing from us."""
+        self.joystick_hz = 0.0
+        self.joystick: Callable[[int], Pwm] = lambda _now_ns: JOYSTICK
+        self.receiver: Pwm | None = RECEIVER
+        self.override: Pwm | None = None
+        self.shown: Pwm = RECEIVER
+        self.now_ns = 10 * S
+        self._network: list[tuple[int, int, str, Pwm | None, int]] = []
+        self._count = 0
+        phase_ns = self.random.uniform(0, S / rc_hz)
+        self._due = {"send": float(self.now_ns), "rc": self.now_ns + phase_ns, "joystick": 0.0}
+
+    def _is_due(self, name: str, rate_hz: float, spread_ms: float) -> bool:
+        if rate_hz == 0 or self.now_ns < self._due[name]:
+            return False
+        late_ns = self.random.uniform(0, spread_ms) * MS
+        self._due[name] = max(self._due[name], self.now_ns - S / rate_hz) + S / rate_hz
+        self._due[name] += late_ns - spread_ms * MS / 2
+        return True
+
+    def _post(self, kind: str, pwm_us: Pwm | None, stamp_us: int = 0) -> None:
+        if self.random.random() < self.loss:
+            return
+        delay_ms = self.delay_ms + self.random.expovariate(1) * self.jitter_ms
+        self._count += 1
+        at_ns = self.now_ns + round(delay_ms * MS)
+        heapq.heappush(self._network, (at_ns, self._count, kind, pwm_us, stamp_us))
+
+    def start_joystick(self, rate_hz: float, *, after_ours_ms: float) -> None:
+        """Its packets come so long after ours, which stay as long as it takes the next of ours."""
+        self.joystick_hz = rate_hz
+        self._due["joystick"] = self._due["send"] + (self.delay_ms + after_ours_ms) * MS
+
+    def release(self) -> None:
+        """Ten release packets, 50 ms apart, stand for one that arrives."""
+        self.is_sending = False
+        self.echo.released()
+        self._count += 1
+        at_ns = self.now_ns + round(self.delay_ms * MS) + 20 * MS
+        heapq.heappush(self._network, (at_ns, self._count, "stick", None, 0))
+
+    def _step(self) -> None:
+        if self._is_due("send", self.send_hz, 0.2) and self.is_sending:
+            pwm_us = self.echo.with_nudge(self.sticks(self.now_ns), self.now_ns)
+            self.echo.sent(pwm_us, self.now_ns)
+            self._post("stick", pwm_us)
+        if self._is_due("joystick", self.joystick_hz, 1.0):
+            self.override = self.joystick(self.now_ns)
+        if self.override is not None:
+            self.shown = self.override
+        elif self.receiver is not None:
+            self.shown = self.receiver
+        if self._is_due("rc", self.rc_hz, self.rc_jitter_ms):
+            self._post("rc", self.shown, self.now_ns // 1000)
+        while self._network and self._network[0][0] <= self.now_ns:
+            _, _, kind, packet, stamp_us = heapq.heappop(self._network)
+            if kind == "rc" and packet is not None:
+                self.echo.received(packet, stamp_us, self.now_ns)
+            elif kind == "stick" and not self.is_deaf:
+                self.override = packet
+
+    def run(self, duration_s: float) -> EchoFault | None:
+        """Returns the first fault; stops there."""
+        end_ns = self.now_ns + round(duration_s * S)
+        while self.now_ns < end_ns:
+            self._step()
+            if (fault := self.echo.fault(self.now_ns)) is not None:
+                return fault
+            self.now_ns += MS // 2
+        return None
+
+    def engage(self) -> None:
+        """Send until the echo is confirmed."""
+        self.run(0.5)
+        self.is_sending = True
+        while not self.echo.confirmed:
+            assert self.run(0.01) is None
+        assert self.run(0.5) is None
+
+    def seconds_to_fault(self, limit_s: float = 5.0) -> tuple[EchoFault | None, float]:
+        start_ns = self.now_ns
+        return self.run(limit_s), (self.now_ns - start_ns) / S
+
+
+# --- no false alarms
+
+BAD_LINKS = [
+    {"loss": 0.2},
+    {"delay_ms": 200.0, "jitter_ms": 5.0},
+    {"delay_ms": 100.0, "jitter_ms": 20.0, "loss": 0.2},
+    {"delay_ms": 200.0, "jitter_ms": 10.0, "loss": 0.2, "rc_jitter_ms": 15.0},
+    {"rc_hz": 20.0, "loss": 0.2, "rc_jitter_ms": 30.0},
+    {"rc_hz": 25.0, "rc_jitter_ms": 0.0, "jitter_ms": 0.0},
+    {"rc_hz": 50.0, "rc_jitter_ms": 0.0, "jitter_ms": 0.0},
+    {"rc_hz": 100.0, "rc_jitter_ms": 0.0, "jitter_ms": 0.0},
+]
+
+
+@pytest.mark.parametrize("sticks", [still, moving])
+@pytest.mark.parametrize("send_hz", [30.0, 100.0, 400.0])
+@pytest.mark.parametrize("link", BAD_LINKS)
+def test_a_bad_link_raises_no_alarm(
+    link: dict[str, float], send_hz: float, sticks: Callable[[int], Pwm]
+) -> None:
+    world = World(send_hz=send_hz, sticks=sticks, **link)  # type: ignore[arg-type]
+    world.engage()
+    assert world.run(20.0) is None
+
+
+def test_sticks_at_the_receivers_own_place_raise_no_alarm() -> None:
+    world = World(sticks=lambda _now_ns: RECEIVER)
+    world.engage()
+    assert world.run(10.0) is None
+
+
+def test_a_network_that_stalls_towards_us_raises_no_alarm() -> None:
+    world = World()
+    world.engage()
+    for _ in range(10):
+        world.delay_ms = 300.0  # what is sent now comes at once with what is sent later
+        assert world.run(0.3) is None
+        world.delay_ms = 1.0
+        assert world.run(1.0) is None
+
+
+def test_one_stray_release_of_another_station_raises_no_alarm() -> None:
+    world = World(rc_jitter_ms=0.0)
+    world.engage()
+    for _ in range(10):
+        world.override = None
+        assert world.run(1.0) is None
+
+
+# --- another overrider
+
+
+@pytest.mark.parametrize("sticks", [still, moving])
+@pytest.mark.parametrize("send_hz", [30.0, 100.0])
+@pytest.mark.parametrize("joystick_hz", [50.0, 200.0])
+def test_a_joystick_is_noticed_within_half_a_second(
+    joystick_hz: float, send_hz: float, sticks: Callable[[int], Pwm]
+) -> None:
+    """At 50 Hz beside our 100 Hz it has 0 to 50 % of the vehicle's time, by the phase."""
+    for seed in range(20):
+        world = World(seed=seed, send_hz=send_hz, sticks=sticks)
+        world.engage()
+        world.start_joystick(joystick_hz, after_ours_ms=seed / 2)
+        fault, after_s = world.seconds_to_fault()
+        assert fault == "foreign"
+        assert after_s < 0.5
+
+
+def test_a_slow_joystick_is_noticed_as_soon_as_it_is_shown_once() -> None:
+    """At 10 Hz it has 5 % of the vehicle's time on average: one sample in twenty shows it."""
+    times_s = []
+    for seed in range(40):
+        world = World(seed=seed)
+        world.engage()
+        # Clocks that drift apart by 1 %, from any phase on.
+        world.start_joystick(10.1, after_ours_ms=10 * seed / 40)
+        fault, after_s = world.seconds_to_fault()
+        assert fault == "foreign"
+        times_s.append(after_s)
+    assert sorted(times_s)[20] < 0.5
+    assert max(times_s) < 1.5
+
+
+@pytest.mark.parametrize("joystick_hz", [50.0, 200.0])
+def test_a_joystick_that_was_there_first_is_noticed(joystick_hz: float) -> None:
+    for seed in range(10):
+        world = World(seed=seed)
+        world.start_joystick(joystick_hz, after_ours_ms=2.0)
+        world.run(1.0)
+        world.is_sending = True
+        fault, after_s = world.seconds_to_fault()
+        assert fault in ("returned", "unseen")
+        assert after_s < (0.5 if fault == "returned" else CONFIRM_NS / S + 0.01)
+
+
+def test_a_joystick_held_where_our_sticks_rest_is_noticed_when_it_holds_the_vehicle() -> None:
+    world = World()
+    world.engage()
+    world.joystick, world.joystick_hz = still, 2000.0
+    fault, after_s = world.seconds_to_fault()
+    assert fault == "silent"
+    assert after_s < 0.5
+
+
+def test_a_joystick_on_a_bad_link_is_noticed() -> None:
+    for seed in range(20):
+        world = World(seed=seed, rc_hz=20.0, loss=0.2, sticks=moving)
+        world.engage()
+        world.start_joystick(50.0, after_ours_ms=2.0)
+        fault, after_s = world.seconds_to_fault()
+        assert fault == "foreign"
+        assert after_s < 1.5
+
+
+def test_a_fault_stays_known_for_three_seconds_and_only_then_is_forgotten() -> None:
+    world = World()
+    world.engage()
+    world.start_joystick(50.0, after_ours_ms=2.0)
+    assert world.run(1.0) == "foreign"
+    world.joystick_hz = 0.0
+    world.release()
+    seen_ns = world.now_ns
+    assert world.echo.fault(seen_ns + 2 * S) == "foreign"
+    assert world.echo.fault(seen_ns + 3 * S) is None
+
+
+# --- packets that do not arrive
+
+
+@pytest.mark.parametrize("sticks", [still, moving])
+@pytest.mark.parametrize("send_hz", [30.0, 100.0, 400.0])
+@pytest.mark.parametrize("rc_hz", [20.0, RC_CHANNELS_HZ])
+def test_a_vehicle_that_hears_us_no_more_is_noticed_within_half_a_second(
+    rc_hz: float, send_hz: float, sticks: Callable[[int], Pwm]
+) -> None:
+    for seed in range(10):
+        world = World(seed=seed, send_hz=send_hz, rc_hz=rc_hz, sticks=sticks)
+        world.engage()
+        world.is_deaf = True
+        fault, after_s = world.seconds_to_fault()
+        assert fault == "silent"
+        assert 0.3 < after_s < 0.5
+
+
+def test_an_override_that_expires_is_noticed_as_the_sticks_of_before_us() -> None:
+    world = World()
+    world.engage()
+    world.is_deaf = True
+    world.run(0.2)
+    world.override = None
+    assert world.seconds_to_fault()[0] == "returned"
+
+
+def test_a_pause_of_our_own_is_no_silence_of_the_vehicle() -> None:
+    world = World()
+    world.engage()
+    world.is_sending = False
+    world.run(0.35)
+    world.is_sending = True
+    assert world.run(1.0) is None
+
+
+def test_a_vehicle_that_sends_no_rc_channels_any_more_is_noticed() -> None:
+    world = World()
+    world.engage()
+    world.rc_hz = 0.0
+    fault, after_s = world.seconds_to_fault()
+    assert fault == "unseen"
+    assert after_s == pytest.approx(CONFIRM_NS / S, abs=0.03)
+
+
+def test_after_a_silence_the_sticks_of_before_it_are_nobody_elses() -> None:
+    world = World(sticks=moving)
+    world.engage()
+    world.is_deaf = True
+    world.rc_hz = 0.0  # nothing arrives either way
+    assert world.run(2.0) == "unseen"
+    for _ in range(3000):
+        world.now_ns += MS // 2
+        world._step()
+    world.rc_hz = RC_CHANNELS_HZ
+    while world.echo.fault(world.now_ns) is not None:
+        world.now_ns += MS // 2
+        world._step()
+    # The vehicle still has the last stick that it heard, and hears us again a moment later.
+    assert world.run(0.3) is None
+    world.is_deaf = False
+    assert world.run(3.0) is None
+    assert world.echo.confirmed
+
+
+# --- the first echo
+
+
+def test_an_override_that_shows_up_is_confirmed() -> None:
+    echo = EchoCheck()
+    echo.received(RECEIVER, 1, 0)
+    echo.sent(STICKS, S)
+    echo.received(RECEIVER, 2, S + 1)
+    assert not echo.confirmed
+    echo.received(STICKS, 3, S + 2)
+    assert echo.confirmed
+    assert echo.fault(S + 3) is None
+
+
+def test_late_and_doubled_datagrams_are_left_out() -> None:
+    world = World()
+    world.engage()
+    stamp_us, now_ns = world.now_ns // 1000, world.now_ns
+    world.echo.received(STICKS, stamp_us + 1000, now_ns)
+    for _ in range(5):
+        world.echo.received(RECEIVER, stamp_us, now_ns)
+        world.echo.received(JOYSTICK, stamp_us + 1000, now_ns)
+    assert world.echo.fault(now_ns) is None
+
+
+def test_an_override_that_never_shows_up_fails_and_is_tried_again_later() -> None:
+    world = World()
+    world.is_deaf = True
+    world.run(0.5)
+    world.is_sending = True
+    fault, after_s = world.seconds_to_fault()
+    assert fault == "unseen"
+    assert after_s == pytest.approx(1.0, abs=0.02)
+    world.release()
+    assert world.run(1.0) == "unseen"
+    assert world.echo.fault(world.now_ns + 3 * S) is None
+    world.is_deaf = False
+    world.now_ns += 3 * S
+    world.engage()
+
+
+@pytest.mark.parametrize("noise_us", [0, 1, 2])
+def test_a_vehicle_that_ignores_us_is_not_taken_for_one_whose_sticks_rest_where_ours_do(
+    noise_us: int,
+) -> None:
+    world = World()
+    world.is_deaf, world.receiver = True, STICKS
+    world.run(0.5)
+    world.is_sending = True
+    for _ in range(90):
+        roll_us = STICKS[3] + world.random.randint(-noise_us, noise_us)
+        world.receiver = (*STICKS[:3], roll_us)
+        world.run(0.01)
+    assert not world.echo.confirmed
+    assert world.run(0.2) == "unseen"
+
+
+@pytest.mark.parametrize("roll_us", [1100, 1499, 1500, 1501, 1900])
+def test_the_nudge_walks_towards_the_middle_and_shrinks_once_confirmed(roll_us: int) -> None:
+    echo, pwm_us = EchoCheck(), (1500, 1500, 1500, roll_us)
+    inwards = 1 if roll_us <= 1500 else -1
+    for step_us in (SEEK_NUDGE_US, NUDGE_US):
+        nudged = [echo.with_nudge(pwm_us, k * 10 * MS) for k in range(30)]
+        assert {pwm[:3] for pwm in nudged} == {(1500, 1500, 1500)}
+        assert {pwm[3] for pwm in nudged} == {roll_us + k * inwards * step_us for k in range(3)}
+        echo.received(RECEIVER, 1, 0)
+        echo.sent(pwm_us, 1)
+        echo.received(pwm_us, 2, 2)
+        assert echo.confirmed
+
+
+# --- release
+
+
+def test_a_release_is_confirmed_by_other_sticks_than_ours() -> None:
+    world = World(delay_ms=50.0)
+    assert world.echo.is_released
+    world.engage()
+    assert not world.echo.is_released
+    world.release()
+    world.run(0.1)  # still on its way there and back
+    assert not world.echo.is_released
+    assert world.run(0.2) is None
+    assert world.echo.is_released
+    world.engage()
+    assert not world.echo.is_released
+
+
+def test_a_release_without_a_receiver_is_never_confirmed() -> None:
+    world = World()
+    world.receiver = None
+    world.engage()
+    world.release()
+    assert world.run(5.0) is None
+    assert not world.echo.is_released
+    world.engage()  # the sticks of before are our own: the nudge tells them apart
+    assert world.run(2.0) is None
+
+
+def test_a_release_and_another_engagement_raise_no_alarm() -> None:
+    world = World(loss=0.2, delay_ms=50.0, jitter_ms=5.0, sticks=moving)
+    for _ in range(10):
+        world.engage()
+        assert world.run(0.5) is None
+        world.release()
+        assert world.run(0.5) is None

@@ -1,0 +1,358 @@
+"""Parameters: read, judged before a flight, watched in flight."""
+
+import pytest
+
+from helpers.parameters import NAMES, ParamVehicle, lossy, status
+from helpers.wire import CALIBRATION
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import PeerError
+from mavbridge.core.vehicle import Risk
+from mavbridge.mavlink.codec.messages import Endpoint, ParamValue
+from mavbridge.mavlink.session.discovery import VehicleIdentity
+from mavbridge.mavlink.session.params import checks
+from mavbridge.mavlink.session.params.bandwidth import baud_danger
+from mavbridge.mavlink.session.params.reader import ParamReader
+from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
+from mavbridge.mavlink.session.streams import telemetry_streams
+from mavbridge.mavlink.settings import LinkSettings
+
+S = NS_PER_S
+
+# --- reading
+
+
+def test_parameters_are_requested_a_few_at_a_time_and_again_when_lost() -> None:
+    names = tuple(f"P{k}" for k in range(20))
+    reader = ParamReader(names)
+    first = [request.name for request in reader.step(0)]
+    assert first == list(names[:16])
+    assert list(reader.step(S // 10)) == []
+    for name in first[1:]:
+        reader.receive(ParamValue(name=name, value=1.0))
+    again = [request.name for request in reader.step(S)]
+    assert again == ["P0", *names[16:]]
+    for name in again:
+        reader.receive(ParamValue(name=name, value=2.0))
+    assert reader.is_done
+    assert reader.values["P0"] == 2.0
+
+
+def test_a_parameter_that_does_not_exist_is_given_up() -> None:
+    reader = ParamReader(("NONE",))
+    requested = sum(len(list(reader.step(k * S))) for k in range(20))
+    assert requested == 4
+    assert reader.is_done
+    assert reader.values == {}
+
+
+def test_a_parameter_that_nobody_needs_is_not_kept() -> None:
+    reader = ParamReader(("P0",))
+    reader.receive(ParamValue(name="LOG_BITMASK", value=1.0))
+    assert reader.values == {}
+
+
+# --- the radio calibration
+
+
+def test_calibration_comes_from_the_vehicle() -> None:
+    ours = checks.calibration(
+        CALIBRATION | {"RC2_REVERSED": 1.0, "RC2_TRIM": 1510.0, "RC1_DZ": 30.0}
+    )
+    assert ours.pitch.number == 2
+    assert ours.pitch.is_reversed
+    assert ours.pitch.trim_us == 1510
+    assert ours.throttle_floor_us == 985
+    assert (ours.roll.dead_zone_us, ours.yaw.dead_zone_us) == (30, 20)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"RC1_MIN": None}, "not sent parameter RC1_MIN"),
+        ({"RCMAP_ROLL": None}, "not sent parameter RCMAP_ROLL"),
+        ({"RCMAP_YAW": 3.0}, "two sticks on one channel"),
+        ({"RC1_MAX": 2250.0}, "RC1_MAX 2250 is not in 800..2200 us.*--set RC1_MAX=2200"),
+        ({"RC2_MIN": 700.0}, "--set RC2_MIN=800"),
+        ({"RC4_MAX": 1100.0}, "RC4_MIN 1100 is not below RC4_MAX 1100"),
+        ({"RC4_TRIM": 1950.0}, "RC4_TRIM 1950 is not in 1100..1900.*--set RC4_TRIM=1500"),
+        ({"FS_THR_VALUE": 1500.0}, "FS_THR_VALUE 1500.*--set FS_THR_VALUE=975"),
+    ],
+)
+def test_a_calibration_that_the_codec_would_refuse_later_cannot_be_accepted(
+    change: dict[str, float | None], message: str
+) -> None:
+    every_risk: tuple[Risk, ...] = ("endless-override", "no-throttle-failsafe", "slow-serial")
+    vehicle = ParamVehicle(change, accepted_risks=every_risk)
+    vehicle.run(6.0)
+    assert vehicle.params.calibration is None
+    with pytest.raises(AssertionError, match=message):  # the text of the problem
+        assert vehicle.problem() is None
+    for name, value in CALIBRATION.items():
+        vehicle.set_by_pilot(name, float(value))  # mended by the pilot's ground station
+    vehicle.run(4.0)
+    assert vehicle.problem() is None
+    assert vehicle.params.calibration is not None
+
+
+# --- obstacles and risks
+
+
+@pytest.mark.parametrize(
+    ("values", "source_system", "expected"),
+    [
+        ({"MAV_GCS_SYSID": 255.0}, 255, None),
+        ({"MAV_GCS_SYSID": 255.0}, 42, "--source-system 255"),
+        ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 250.0}, 245, None),
+        ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 0.0}, 245, "obeys system 240"),
+        ({"SYSID_MYGCS": 252.0}, 255, "obeys system 252"),
+        ({"RC_OPTIONS": 34.0}, 255, "RC_OPTIONS bit 1 .* --set RC_OPTIONS=32"),
+        ({"RC_OPTIONS": 32.0}, 255, None),
+        ({"RC_OVERRIDE_TIME": 0.0}, 255, "RC_OVERRIDE_TIME is 0"),
+    ],
+)
+def test_obstacles_are_read_from_parameters(
+    values: dict[str, float], source_system: int, expected: str | None
+) -> None:
+    found = list(checks.override_obstacles(values, source_system))
+    if expected is None:
+        assert found == []
+    else:
+        with pytest.raises(AssertionError, match=expected):
+            assert found == []
+
+
+def test_the_override_switch_is_found() -> None:
+    assert checks.override_switch({"RC7_OPTION": 46.0, "RC8_OPTION": 31.0}) == 7
+    assert checks.override_switch({"RC7_OPTION": 0.0}) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "risk", "cure"),
+    [
+        ({"RC_OVERRIDE_TIME": -1.0}, "endless-override", "--set RC_OVERRIDE_TIME=0.5"),
+        ({"FS_THR_ENABLE": 0.0}, "no-throttle-failsafe", "--set FS_THR_ENABLE=1"),
+    ],
+)
+def test_a_risk_is_refused_until_it_is_accepted_or_mended(
+    change: dict[str, float | None], risk: Risk, cure: str
+) -> None:
+    refused = ParamVehicle(change)
+    refused.run(6.0)
+    problem = refused.problem()
+    assert problem is not None
+    assert cure in problem
+    assert f"--accept-risk {risk}" in problem
+    for name in change:
+        refused.set_by_pilot(name, 1.0)
+    assert refused.problem() is None
+
+    accepted = ParamVehicle(change, accepted_risks=(risk,))
+    accepted.run(6.0)
+    assert accepted.problem() is None
+    assert any(text.startswith(f"risk {risk} is accepted") for text in accepted.texts)
+
+
+def test_a_receiver_makes_up_for_a_disabled_throttle_failsafe() -> None:
+    vehicle = ParamVehicle({"FS_THR_ENABLE": 0.0})
+    vehicle.run(6.0)
+    assert "no receiver was seen" in (vehicle.problem() or "")
+    vehicle.has_receiver = True
+    assert vehicle.problem() is None
+
+
+@pytest.mark.parametrize(("time_s", "is_advised"), [(3.0, True), (1.0, False)])
+def test_a_long_override_time_is_a_warning(time_s: float, is_advised: bool) -> None:
+    vehicle = ParamVehicle({"RC_OVERRIDE_TIME": time_s})
+    vehicle.run(6.0)
+    assert vehicle.problem() is None
+    warned = [text for text in vehicle.texts if "--set RC_OVERRIDE_TIME=0.5" in text]
+    assert len(warned) == is_advised
+
+
+@pytest.mark.parametrize(
+    ("baud", "rate_hz", "expected"),
+    [
+        (None, 400, None),
+        (57600, 100, "57600 baud .* 230400 baud"),
+        (115200, 100, "115200 baud .* 230400 baud"),
+        (230400, 100, None),
+        (115200, 50, "115200 baud .* 230400 baud"),
+        (115200, 30, None),
+        (230400, 200, "460800 baud"),
+    ],
+)
+def test_a_serial_port_must_carry_states_and_sticks(
+    baud: int | None, rate_hz: float, expected: str | None
+) -> None:
+    streams = telemetry_streams(state_hz=rate_hz, is_px4=False)
+    found = baud_danger(baud, streams=streams, stick_hz=rate_hz)
+    if expected is None:
+        assert found is None
+    else:
+        with pytest.raises(AssertionError, match=expected):
+            assert found is None
+
+
+def test_many_sticks_fill_a_port_that_carries_few_states() -> None:
+    streams = telemetry_streams(state_hz=10, is_px4=False)
+    assert baud_danger(115200, streams=streams, stick_hz=250) is None
+    assert "230400" in (baud_danger(115200, streams=streams, stick_hz=400) or "")
+
+
+@pytest.mark.parametrize("connect", ["/dev/ttyUSB0", "/dev/ttyUSB0,57600"])
+def test_a_slow_serial_port_is_refused_for_both_autopilots(connect: str) -> None:
+    vehicle = ParamVehicle(connect=connect)
+    vehicle.run(6.0)
+    assert "or --accept-risk slow-serial" in (vehicle.problem() or "")
+    px4 = ParamVehicle(autopilot="px4", output="manual-control", connect=connect)
+    assert "or --accept-risk slow-serial" in (px4.problem() or "")
+    fine = ParamVehicle(
+        autopilot="px4",
+        output="manual-control",
+        connect=connect,
+        accepted_risks=("slow-serial",),
+    )
+    assert fine.problem() is None
+
+
+def test_parameters_of_px4_are_neither_read_nor_set() -> None:
+    vehicle = ParamVehicle(autopilot="px4", output="manual-control")
+    vehicle.run(3.0)
+    assert (vehicle.requests, vehicle.problem()) == ([], None)
+    identity = VehicleIdentity(source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot="px4")
+    settings = LinkSettings(
+        output="manual-control", set_params=(("A", 1.0),), state_folder=vehicle.folder
+    )
+    with pytest.raises(PeerError, match="this is px4"):
+        VehicleParams(identity, settings, streams=(), report=vehicle.texts.append)
+
+
+def test_what_is_known_can_be_listed() -> None:
+    vehicle = ParamVehicle({"RC1_DZ": 25.0, "THR_DZ": 100.0})
+    vehicle.run(6.0)
+    known = vehicle.params.values
+    assert list(known) == sorted(known)
+    assert known["RC1_DZ"] == 25.0
+    assert known["THR_DZ"] == 100.0
+    assert {"RC_FS_TIMEOUT", "FS_OPTIONS", "FS_THR_ENABLE", "RCMAP_YAW"} <= set(known)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_reading_goes_on_through_losses(seed: int) -> None:
+    vehicle = ParamVehicle({"RC_OVERRIDE_TIME": -1.0}, loses=lossy(0.5, seed))
+    vehicle.run(60.0)
+    assert "RC_OVERRIDE_TIME is -1" in (vehicle.problem() or "")
+
+
+def test_a_vehicle_without_the_decisive_parameters_is_flown_with_a_warning() -> None:
+    vehicle = ParamVehicle({"FS_THR_ENABLE": None})
+    vehicle.run(10.0)
+    assert vehicle.problem() is None
+    assert len([text for text in vehicle.texts if "has not sent FS_THR_ENABLE" in text]) == 1
+    vehicle.armed = True
+    vehicle.run(3.0)
+    count = len(vehicle.requests)
+    vehicle.run(10.0)
+    assert len(vehicle.requests) == count  # not asked for in flight
+
+
+# --- changes after reading
+
+
+def test_a_change_on_the_ground_is_taken_in() -> None:
+    vehicle = ParamVehicle()
+    vehicle.run(6.0)
+    vehicle.set_by_pilot("RC1_MAX", 1950.0)
+    vehicle.set_by_pilot("RCMAP_YAW", 5.0)
+    assert "RC5_MIN" in (vehicle.problem() or "")
+    vehicle.values |= {f"RC5_{part}": 1500.0 for part in NAMES} | {
+        "RC5_MIN": 1000.0,
+        "RC5_MAX": 2000.0,
+        "RC5_REVERSED": 0.0,
+    }
+    vehicle.run(4.0)
+    assert vehicle.problem() is None
+    assert vehicle.params.interruption is None
+    calibration = vehicle.params.calibration
+    assert calibration is not None
+    assert (calibration.roll.max_us, calibration.yaw.number) == (1950, 5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("RCMAP_ROLL", 2.0),
+        ("RC1_MIN", 1000.0),
+        ("RC1_MAX", 2250.0),
+        ("RC2_TRIM", 1510.0),
+        ("RC4_REVERSED", 1.0),
+        ("FS_THR_VALUE", 950.0),
+        ("RC_OVERRIDE_TIME", -1.0),
+        ("RC_OVERRIDE_TIME", 0.0),
+        ("RC_OPTIONS", 2.0),
+        ("MAV_GCS_SYSID", 42.0),
+        ("RC7_OPTION", 46.0),
+        ("FS_THR_ENABLE", 0.0),
+    ],
+)
+def test_a_change_in_flight_that_matters_interrupts_for_good(name: str, value: float) -> None:
+    vehicle = ParamVehicle()
+    vehicle.run(6.0)
+    before, old = vehicle.params.calibration, vehicle.values[name]
+    vehicle.armed = True
+    vehicle.run(1.0)
+    vehicle.set_by_pilot(name, value)
+    vehicle.run(1.0)
+    told = f"{name} was changed from {old:g} to {value:g} in flight"
+    assert vehicle.params.interruption == told
+    assert vehicle.params.calibration == before  # a release needs the channels of the override
+    if name != "RC7_OPTION":  # whether that switch is on is for the session to say
+        assert vehicle.problem() is not None
+    vehicle.armed = False
+    vehicle.run(1.0)
+    assert vehicle.params.interruption == told
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("RC_OVERRIDE_TIME", 0.5), ("RC8_OPTION", 9.0), ("RC_OPTIONS", 32.0), ("RC9_MIN", 900.0)],
+)
+def test_other_changes_in_flight_do_not_interrupt(name: str, value: float) -> None:
+    vehicle = ParamVehicle()
+    vehicle.run(6.0)
+    vehicle.armed = True
+    vehicle.set_by_pilot(name, value)
+    vehicle.set_by_pilot("RC1_MAX", vehicle.values["RC1_MAX"])  # heard again, as it is
+    vehicle.run(1.0)
+    assert (vehicle.params.interruption, vehicle.problem()) == (None, None)
+
+
+def test_an_accepted_risk_that_comes_true_in_flight_does_not_interrupt() -> None:
+    vehicle = ParamVehicle(accepted_risks=("endless-override",))
+    vehicle.run(6.0)
+    vehicle.armed = True
+    vehicle.set_by_pilot("RC_OVERRIDE_TIME", -1.0)
+    assert (vehicle.params.interruption, vehicle.problem()) == (None, None)
+
+
+def test_a_calibration_changed_in_flight_counts_from_the_next_time_on_the_ground() -> None:
+    vehicle = ParamVehicle()
+    vehicle.run(6.0)
+    vehicle.armed = True
+    vehicle.set_by_pilot("RC1_MAX", 1950.0)
+    vehicle.run(1.0)
+    assert "disarm to take it in" in (vehicle.problem() or "")
+    vehicle.armed = False
+    vehicle.run(0.1)
+    assert vehicle.problem() is None
+    assert vehicle.params.calibration is not None
+    assert vehicle.params.calibration.roll.max_us == 1950
+
+
+def test_a_vehicle_that_is_met_in_flight_is_read_as_well() -> None:
+    vehicle = ParamVehicle()
+    vehicle.armed = True
+    vehicle.run(6.0)
+    assert vehicle.problem() is None
+    assert vehicle.params.calibration is not None
+    assert status(vehicle.armed, None).armed

@@ -1,0 +1,406 @@
+"""The session with one vehicle: its condition, its receiver, its modes, its echo."""
+
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from helpers.wire import ARDUPILOT, CALIBRATION
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import PeerError
+from mavbridge.core.vehicle import Sticks, VehicleStatus
+from mavbridge.mavlink.codec.messages import (
+    Attitude,
+    Body,
+    CommandAck,
+    CommandRequest,
+    Endpoint,
+    EstimatorFlags,
+    Heartbeat,
+    LandedState,
+    LocalVelocity,
+    ParamRequest,
+    ParamValue,
+    RcChannels,
+    ReceivedMessage,
+    SystemStatus,
+)
+from mavbridge.mavlink.session.commands import ModeAndArm
+from mavbridge.mavlink.session.discovery import VehicleIdentity
+from mavbridge.mavlink.session.vehicle import VehicleSession
+from mavbridge.mavlink.settings import LinkSettings
+
+S, MS = NS_PER_S, NS_PER_MS
+RECEIVER = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
+"""Channels 1 to 8 in us: roll, pitch, throttle, yaw ..."""
+NOTHING = (0,) * 8
+RC_BIT, BATTERY_BIT = (
+    dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER,
+    dialect.MAV_SYS_STATUS_SENSOR_BATTERY,
+)
+NED = LocalVelocity(0, velocity_ned_mps=(1.0, 0.0, 0.0), position_ned_m=(1.0, 2.0, -3.0))
+GOOD_FLAGS, PX4_WITHOUT_GPS = 831, 0xE5
+
+
+class Session:
+    """A session that grants every request; the vehicle's messages are put in by hand."""
+
+    def __init__(self, autopilot: str = "ardupilot", *, is_ready: bool = True, **link: Any) -> None:
+        self.output = "rc-override" if autopilot == "ardupilot" else "manual-control"
+        identity = VehicleIdentity(
+            source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot=autopilot
+        )
+        settings = LinkSettings(output=self.output, **link)  # type: ignore[arg-type]
+        self.session = VehicleSession(identity, settings, report=lambda _text: None)
+        self.params: dict[str, float] = dict(CALIBRATION)
+        self.now_ns = 10 * S
+        self.put(Heartbeat(2, 3, 81, 2 if self.output == "rc-override" else 2 << 16, 4))
+        if is_ready:
+            self.shake_hands()
+
+    def put(self, body: Body, name: str = "ANY") -> None:
+        message = ReceivedMessage(Endpoint(1, 1), 0, name, body, b"")
+        self.session.receive(message, self.now_ns)
+
+    def rc(self, channels_us: tuple[int, ...]) -> None:
+        self.put(RcChannels(channels_us, self.now_ns // 1000), "RC_CHANNELS")
+
+    def answer_requests(self) -> None:
+        for request in self.session.step(self.now_ns):
+            if isinstance(request, ParamRequest) and request.name in self.params:
+                self.put(ParamValue(request.name, self.params[request.name]))
+            elif isinstance(request, CommandRequest):
+                self.put(CommandAck(request.command, 0, Endpoint(0, 0)))
+
+    def shake_hands(self) -> None:
+        for _ in range(60):
+            self.answer_requests()
+            self.now_ns += 100 * MS
+            self.put(Heartbeat(2, 3, 81, 2, 4))
+
+    def override(self, channels_us: tuple[int, ...]) -> None:
+        roll, pitch, throttle, yaw = channels_us[:4]
+        self.session.echo.sent((throttle, yaw, pitch, roll), self.now_ns)
+
+    @property
+    def status(self) -> VehicleStatus:
+        status = self.session.status(self.now_ns)
+        assert status is not None
+        return status
+
+
+# --- heartbeat, landing, battery
+
+
+def test_the_kind_of_vehicle_decides() -> None:
+    for vehicle_type in (2, 3, 13, 14, 15, 29, 35):
+        identity = VehicleIdentity(
+            source=Endpoint(1, 1), address=None, vehicle_type=vehicle_type, autopilot="ardupilot"
+        )
+        VehicleSession(identity, LinkSettings(), report=print)
+
+
+@pytest.mark.parametrize(
+    ("vehicle_type", "name"),
+    [(4, "HELICOPTER"), (1, "FIXED_WING"), (10, "GROUND_ROVER"), (22, "VTOL"), (250, "unknown")],
+)
+def test_anything_but_a_multirotor_is_refused(vehicle_type: int, name: str) -> None:
+    identity = VehicleIdentity(
+        source=Endpoint(1, 1), address=None, vehicle_type=vehicle_type, autopilot="ardupilot"
+    )
+    with pytest.raises(PeerError, match=rf"{name}.* \(MAV_TYPE {vehicle_type}\).*multirotors"):
+        VehicleSession(identity, LinkSettings(), report=print)
+
+
+@pytest.mark.parametrize(
+    ("system_status", "expected"),
+    [(0, False), (3, False), (4, False), (5, True), (6, True), (8, True)],
+)
+def test_a_failsafe_is_told_by_the_heartbeat(system_status: int, expected: bool) -> None:
+    session = Session()
+    session.put(Heartbeat(2, 3, 81, 2, system_status))
+    assert session.status.is_failsafe is expected
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"), [(0, None), (1, True), (2, False), (3, False), (4, False)]
+)
+def test_landed_is_what_the_vehicle_says_and_not_for_ever(
+    state: int, expected: bool | None
+) -> None:
+    session = Session()
+    assert session.status.is_landed is None
+    session.put(LandedState(state))
+    assert session.status.is_landed is expected
+    session.now_ns += 2 * S
+    assert session.status.is_landed is expected
+    session.now_ns += 1
+    assert session.status.is_landed is None
+
+
+@pytest.mark.parametrize(
+    ("system", "expected"),
+    [
+        (SystemStatus(BATTERY_BIT, BATTERY_BIT, 80), None),
+        (SystemStatus(BATTERY_BIT, 0, 80), "the vehicle reports its battery as low or failed"),
+        (SystemStatus(0, 0, 80), None),  # no battery monitor
+        (SystemStatus(0, 0, -1), None),
+        (SystemStatus(BATTERY_BIT, BATTERY_BIT, 15), None),
+        (
+            SystemStatus(BATTERY_BIT, BATTERY_BIT, 14),
+            "the battery is at 14 %, below 15 % (--min-battery)",
+        ),
+    ],
+)
+def test_the_battery(system: SystemStatus, expected: str | None) -> None:
+    session = Session(min_battery_percent=15.0)
+    session.put(system)
+    assert session.status.battery_problem == expected
+    session.now_ns += 3 * S
+    assert session.status.battery_problem is None
+
+
+# --- position
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+@pytest.mark.parametrize(
+    ("flags", "is_valid"),
+    [
+        (GOOD_FLAGS, True),
+        (PX4_WITHOUT_GPS, False),
+        (dialect.ESTIMATOR_POS_HORIZ_REL, True),
+        (dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_CONST_POS_MODE, False),
+        (0, False),
+    ],
+)
+def test_a_position_counts_if_the_estimator_says_so(
+    autopilot: str, flags: int, is_valid: bool
+) -> None:
+    session = Session(autopilot)
+    session.put(EstimatorFlags(flags))
+    session.put(NED)
+    assert session.status.is_position_valid is is_valid
+    assert session.status.position_ned_m == ((1.0, 2.0, -3.0) if is_valid else None)
+
+
+def test_without_flags_only_ardupilots_position_counts() -> None:
+    """ArduPilot sends none without an estimate; PX4 does."""
+    for autopilot, expected in (("ardupilot", (1.0, 2.0, -3.0)), ("px4", None)):
+        session = Session(autopilot)
+        session.put(NED)
+        assert session.status.is_position_valid is None
+        assert session.status.position_ned_m == expected
+
+
+def test_a_position_gets_old() -> None:
+    session = Session()
+    session.put(NED)
+    session.now_ns += 500 * MS
+    assert session.status.position_ned_m is not None
+    session.now_ns += 1
+    assert session.status.position_ned_m is None
+
+
+# --- the receiver
+
+
+@pytest.mark.parametrize(
+    ("channels_us", "system", "expected"),
+    [
+        (RECEIVER, SystemStatus(RC_BIT, RC_BIT, -1), True),
+        (RECEIVER, SystemStatus(0, 0, -1), True),  # firmware without that bit
+        (RECEIVER, SystemStatus(RC_BIT, 0, -1), False),  # the last sticks of a receiver or of ours
+        (NOTHING, SystemStatus(0, 0, -1), False),
+        (NOTHING, SystemStatus(RC_BIT, RC_BIT, -1), False),
+        ((1500, 1500, 0, 1500, 0, 0, 0, 0), SystemStatus(0, 0, -1), False),
+        (RECEIVER, None, True),
+        (None, SystemStatus(RC_BIT, 0, -1), False),
+        (None, SystemStatus(RC_BIT, RC_BIT, -1), None),
+        (None, None, None),
+    ],
+)
+def test_a_receiver_is_learnt_before_the_first_override(
+    channels_us: tuple[int, ...] | None, system: SystemStatus | None, expected: bool | None
+) -> None:
+    session = Session()
+    if channels_us is not None:
+        session.rc(channels_us)
+    if system is not None:
+        session.put(system)
+    assert session.status.has_receiver is expected
+    # From the first override on RC_CHANNELS shows only us, and ArduPilot calls that a receiver.
+    session.override(RECEIVER)
+    session.now_ns += S
+    session.rc(RECEIVER)
+    session.put(SystemStatus(RC_BIT, RC_BIT, -1))
+    assert session.status.has_receiver is expected
+
+
+def test_a_receiver_that_comes_before_the_first_override_counts() -> None:
+    session = Session()
+    session.rc(NOTHING)
+    assert session.status.has_receiver is False
+    session.now_ns += S
+    session.rc(RECEIVER)
+    assert session.status.has_receiver is True
+
+
+def test_px4_without_rc_channels_has_no_receiver() -> None:
+    session = Session("px4", is_ready=False)
+    assert session.status.has_receiver is None
+    session.shake_hands()
+    assert session.status.has_receiver is False
+    session.rc(RECEIVER)
+    assert session.status.has_receiver is True
+
+
+def test_nothing_is_ready_before_the_receiver_was_looked_for() -> None:
+    session = Session(is_ready=False)
+    session.now_ns += 5 * S
+    looked_s = 0.0
+    for tick in range(600):
+        session.answer_requests()
+        session.now_ns += 10 * MS
+        if tick % 50 == 0:
+            session.put(Heartbeat(2, 3, 81, 2, 4))
+        problem = session.session.problem(session.now_ns)
+        looked_s += 0.01 * (problem == "looking for the pilot's radio receiver")
+    assert looked_s == pytest.approx(2.0, abs=0.03)
+    assert session.session.problem(session.now_ns) is None
+
+
+def test_a_receiver_that_shows_at_once_is_not_waited_for() -> None:
+    session = Session(is_ready=False)
+    session.rc(RECEIVER)
+    session.put(SystemStatus(RC_BIT, RC_BIT, -1))
+    for _ in range(300):
+        session.answer_requests()
+        session.now_ns += 20 * MS
+        session.put(Heartbeat(2, 3, 81, 2, 4))
+        assert session.session.problem(session.now_ns) != "looking for the pilot's radio receiver"
+    assert session.session.problem(session.now_ns) is None
+
+
+def test_the_pilots_sticks_are_those_without_ours() -> None:
+    session = Session()
+    assert session.status.pilot_sticks is None
+    session.rc((1500, 1700, 1500, 1500, *RECEIVER[4:]))
+    pilot = Sticks(0.0, 0.0, -0.5, 0.0)
+    assert session.status.pilot_sticks == session.status.rc_sticks == pilot
+    ours = (1900, 1500, 1500, 1500, *RECEIVER[4:])
+    for _ in range(5):
+        session.now_ns += 20 * MS
+        session.override(ours)
+        session.rc(ours)
+    assert session.status.rc_sticks == ARDUPILOT.to_sticks((1500, 1500, 1500, 1900))
+    assert session.status.pilot_sticks == pilot
+    session.session.echo.released()
+    session.now_ns += 20 * MS
+    session.rc(ours)  # still ours
+    assert session.status.pilot_sticks == pilot
+    assert not session.session.is_released
+    session.now_ns += 20 * MS
+    session.rc((1500, 1500, 1700, 1500, *RECEIVER[4:]))
+    assert session.session.is_released
+    assert session.status.pilot_sticks == Sticks(0.5, 0.0, 0.0, 0.0)
+
+
+# --- modes and switches
+
+
+def test_a_refused_mode_is_known_until_another_is_asked_for_or_it_is_granted() -> None:
+    commands = ModeAndArm()
+
+    def answer(result: int, command: int = dialect.MAV_CMD_DO_SET_MODE) -> str | None:
+        commands.receive(CommandAck(command, result, Endpoint(0, 0)))
+        return commands.refused_mode
+
+    assert answer(dialect.MAV_RESULT_FAILED) is None  # nothing was asked for
+    assert commands.set_mode("BRAKE", (17, 0), 0) == CommandRequest(176, (1, 17, 0))
+    assert answer(dialect.MAV_RESULT_IN_PROGRESS) is None
+    assert answer(dialect.MAV_RESULT_FAILED, dialect.MAV_CMD_COMPONENT_ARM_DISARM) is None
+    for refusal in (dialect.MAV_RESULT_FAILED, dialect.MAV_RESULT_TEMPORARILY_REJECTED):
+        assert answer(refusal) == "BRAKE"
+    assert commands.set_mode("BRAKE", (17, 0), 20 * MS) is None  # too soon
+    assert commands.refused_mode == "BRAKE"
+    assert answer(dialect.MAV_RESULT_ACCEPTED) is None
+    assert answer(dialect.MAV_RESULT_DENIED) == "BRAKE"
+    assert commands.set_mode("LAND", (9, 0), S // 2) is not None
+    assert commands.refused_mode is None
+
+
+@pytest.mark.parametrize(
+    ("switch_us", "is_off", "may_fly"),
+    [(1000, True, False), (1500, False, False), (2000, False, True), (0, False, False)],
+)
+def test_the_override_switch_is_told_apart(switch_us: int, is_off: bool, may_fly: bool) -> None:
+    session = Session(is_ready=False)
+    session.params["RC7_OPTION"] = 46.0
+    for _ in range(2):  # the search for a receiver takes as long again
+        session.shake_hands()
+    session.rc((*RECEIVER[:6], switch_us, 1500))
+    assert session.session.is_switched_off is is_off
+    assert (session.session.problem(session.now_ns) is None) is may_fly
+
+
+def test_the_middle_of_the_override_switch_changes_nothing() -> None:
+    session = Session(is_ready=False)
+    session.params["RC7_OPTION"] = 46.0
+    session.shake_hands()
+    session.now_ns += 2 * S
+    for switch_us, may_fly in ((1500, False), (2000, True), (1500, True), (0, True), (1000, False)):
+        session.rc((*RECEIVER[:6], switch_us, 1500))
+        assert (session.session.problem(session.now_ns) is None) is may_fly
+    session.rc((*RECEIVER[:6], 1500, 1500))
+    assert session.session.problem(session.now_ns) is not None
+
+
+def test_without_a_switch_nothing_is_switched_off() -> None:
+    session = Session()
+    session.rc((*RECEIVER[:6], 1000, 1000))
+    assert not session.session.is_switched_off
+
+
+# --- the echo, in words
+
+
+def overruled(session: Session, shown_us: tuple[int, ...], duration_s: float = 1.2) -> str | None:
+    """Sticks of ours at 100 Hz; ``shown_us`` instead of them from 0.3 s on."""
+    session.rc(RECEIVER)
+    for tick in range(round(duration_s * 100)):
+        session.now_ns += 10 * MS
+        ours = (1700 + tick % 3, 1500, 1500, 1500, *RECEIVER[4:])
+        session.override(ours)
+        if shown_us or tick < 30:
+            session.rc(ours if tick < 30 else shown_us)
+        vehicle = session.session
+        if reason := vehicle.overruled(session.now_ns) or vehicle.unheard(session.now_ns):
+            return reason
+    return None
+
+
+@pytest.mark.parametrize(
+    ("shown_us", "expected"),
+    [
+        ((1300, 1500, 1500, 1500, *RECEIVER[4:]), "another station is overriding them"),
+        (RECEIVER, "the sticks that it had before us"),
+        ((1700, 1500, 1500, 1500, *RECEIVER[4:]), "does not hear our sticks"),
+        ((), "no RC_CHANNELS arrive"),
+    ],
+)
+def test_the_reason_names_what_was_seen(shown_us: tuple[int, ...], expected: str) -> None:
+    session = Session()
+    reason = overruled(session, shown_us, 1.5)
+    assert reason is not None
+    assert expected in reason
+    # Where our packets are lost, nobody has taken over: the way out begins with neutral sticks.
+    is_lost = not shown_us or shown_us[0] == 1700
+    assert (session.session.overruled(session.now_ns) is None) is is_lost
+
+
+def test_a_reboot_is_noticed_by_two_old_stamps() -> None:
+    session = Session()
+    for boot_ms, has_rebooted in ((9000, False), (5, False), (9010, False), (5, False), (6, True)):
+        session.put(Attitude(True, 1000 * boot_ms, (1, 0, 0, 0), (0, 0, 0)))
+        assert session.session.has_rebooted is has_rebooted

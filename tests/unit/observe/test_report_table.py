@@ -1,0 +1,114 @@
+import io
+
+import pytest
+from rich.console import Console, RenderableType
+
+from helpers.factories import START_NS, TICK_NS, make_released_tick, make_tick
+from helpers.reports import report_of
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.vehicle import LinkStats, Percentiles
+from mavbridge.observe.report_table import timing_table, verdicts
+from mavbridge.observe.timing import TimingReport
+
+
+def rendered(what: RenderableType, width: int = 100) -> str:
+    console = Console(file=io.StringIO(), width=width, record=True)
+    console.print(what)
+    return console.export_text()
+
+
+def verdict_lines(report: TimingReport) -> list[str]:
+    return [verdict.plain for verdict in verdicts(report)]
+
+
+def test_the_table_holds_what_was_measured_in_milliseconds() -> None:
+    table = timing_table(report_of(*(make_tick(index) for index in range(11))))
+    assert table is not None
+    text = rendered(table)
+    rows = {
+        cells[0]: cells[1:]
+        for line in text.splitlines()
+        if line.startswith("│")
+        for cells in [[cell.strip() for cell in line.strip("│").split("│")]]
+    }
+    assert rows["chunk period"] == ["10.00"] * 4
+    assert rows["stick lateness"] == ["2.00"] * 4
+    assert rows["predict"] == ["2.00"] * 4
+    assert rows["feature age at send"] == ["40.00"] * 4
+    assert rows["attitude age at send"] == ["3.00"] * 4
+    assert not rows.keys() & {"vision encode", "link round trip"}
+    assert "a slot is missed when nothing was" in " ".join(text.split())
+
+
+def test_the_table_fits_eighty_columns() -> None:
+    slow = [make_tick(k, woke_ns=START_NS + k * 100_000 * NS_PER_MS) for k in range(3)]
+    table = timing_table(report_of(*slow))
+    assert table is not None
+    assert max(len(line) for line in rendered(table).splitlines()) <= 80
+
+
+def test_verdicts_compare_targets_and_results() -> None:
+    link = LinkStats(
+        messages_per_s=(),
+        lost_fraction=0.0,
+        rtt_ms=Percentiles(p50=1, p99=1, p999=1, max=1),
+        sent_overrides=11,
+        echo_confirmed=True,
+    )
+    report = report_of(*(make_tick(index) for index in range(11)), link=link, rerun_drops=0)
+    assert verdict_lines(report) == [
+        "sticks   100 Hz grid, 0 slots of 11 missed, 0 sends coasting",
+        "action   100.0 Hz of 100 Hz, 0 late chunks of 11",
+        "vision   - Hz of 30 Hz, 0 frames dropped by the camera",
+        "link     11 stick messages sent, echo confirmed, 0.00% of the vehicle's messages lost",
+        "releases never released",
+    ]
+
+
+def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
+    reasons = ["a", "b", "c", "d"]
+    report = report_of(
+        *(make_released_tick(index, reason) for index, reason in enumerate(reasons)), rerun_drops=1
+    )
+    assert verdict_lines(report)[-2:] == [
+        "releases released 4 times, last for: b (0.0 s); c (0.0 s); d (0.0 s)",
+        "rerun    missed 1 event",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "lost", "expected"),
+    [
+        (False, 0.5, "NO ECHO from the vehicle, 50.00% of the vehicle's messages lost"),
+        (None, None, "echo not checked, loss not measured"),
+    ],
+)
+def test_the_link_verdict_is_honest(
+    confirmed: bool | None, lost: float | None, expected: str
+) -> None:
+    link = LinkStats(
+        messages_per_s=(),
+        lost_fraction=lost,
+        rtt_ms=None,
+        sent_overrides=1,
+        echo_confirmed=confirmed,
+    )
+    assert verdict_lines(report_of(make_tick(), link=link))[3] == (
+        f"link     1 stick message sent, {expected}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "style"),
+    [(TICK_NS, "green"), (TICK_NS * 105 // 100, "yellow"), (TICK_NS * 2, "red")],
+)
+def test_a_policy_that_misses_its_rate_is_not_green(period_ns: int, style: str) -> None:
+    ticks = [make_tick(k, woke_ns=START_NS + k * period_ns) for k in range(101)]
+    assert verdicts(report_of(*ticks))[1].spans[1].style == style
+
+
+@pytest.mark.parametrize(("missed", "style"), [(0, "green"), (1, "yellow")])
+def test_a_slot_that_was_missed_is_not_green(missed: int, style: str) -> None:
+    line = verdicts(report_of(make_tick(0), make_tick(1, missed_slots=missed)))[0]
+    assert f"{missed} slot" in line.plain
+    assert line.spans[1].style == style
