@@ -103,9 +103,12 @@ class Tick:
 
     @property
     def holder(self) -> str:
-        """WAITING for an act, NEUTRAL sticks of ours, or RELEASED; only where nobody flies."""
-        if self.phase == "waiting":
-            return "WAITING"
+        """WAITING for an act, PREPARING after one, NEUTRAL sticks of ours, or RELEASED.
+
+        Only where the policy does not fly.
+        """
+        if self.phase in ("waiting", "preparing"):
+            return self.phase.upper()
         return "NEUTRAL" if self.phase in ("leaving", "holding") else "RELEASED"
 
 

@@ -174,7 +174,7 @@ class VehicleView:
             state=state,
             trace=sent.trace,
             sent=sent.sent,
-            release_reason=None if is_flown or sent.phase is Phase.PREPARING else sent.reason,
+            release_reason=None if is_flown else sent.reason,
             mode=self.status.mode,
             armed=self.status.armed,
             rc_channels_us=self.status.rc_channels_us,

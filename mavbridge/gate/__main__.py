@@ -4,7 +4,6 @@ It prints nothing, since whatever reads its output might not: messages and error
 channel, file descriptor FD.
 """
 
-import gc
 import select
 import signal
 import socket
@@ -75,8 +74,6 @@ def _run(settings: GateSettings, port: SocketPort, received: list[bytes]) -> Non
     refusal = settle_gate(realtime=settings.realtime, cpu=settings.cpu)
     if refusal is not None:
         port.send(encode_from_gate(GateMessage(refusal)))
-    gc.collect()
-    gc.freeze()
     try:
         while not loop.is_done:
             due_ns = loop.step()

@@ -223,8 +223,8 @@ class GateLoop:
                     self._gate = Gate(settings, self._clock.now_ns())
                 case Ending() as ending:
                     self.stop(ending)
-                case "engage" | "release" as act:
-                    pass
+                case "engage" | "release" as new:
+                    act = "release" if act == "release" else new  # whatever came after it
                 case _:
                     pass  # settings that count already
         if self._flight.is_closed:

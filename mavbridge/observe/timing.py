@@ -144,7 +144,7 @@ class FlightTiming:
         self._chunks.add(tick)
         if tick.trace is not None:
             self._add_ages(tick)
-        reason = None if tick.phase == "waiting" else tick.release_reason
+        reason = None if tick.phase in ("waiting", "preparing") else tick.release_reason
         if reason != self._last_reason:
             self._last_reason = reason
             if reason is None:

@@ -8,12 +8,14 @@ flight process, through the policy loop, and as a chunk back to the gate.
 import signal
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from cyclopts import App
 
+from mavbridge.commands.bench.link_vehicle import ATTITUDE_HZ
 from mavbridge.commands.bench.results import ClientTiming, to_json
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import Rates
@@ -47,14 +49,16 @@ def main(*, port: int, out: Path) -> None:
     meter = ClientMeter()
     config = FlyConfig(
         link=LinkConfig(connect=f"udp:127.0.0.1:{port}"),
-        # No smoothing: the vehicle must find its number unchanged.
-        limits=Limits(tau=0.0, max_slew=0.0),
+        # No smoothing: the vehicle must find its number unchanged. Its attitude never changes.
+        limits=Limits(tau=0.0, max_slew=0.0, max_frozen_state=0.0),
         rates=Rates(action_rate=MOST_CHUNKS_HZ),
         arm=True,
         on_fault="release",
         then="release",
     )
-    gate = GateProcess(gate_settings(config, is_dual=True, tlog_fd=None, wall_offset_ns=0))
+    settings = gate_settings(config, is_dual=True, tlog_fd=None, wall_offset_ns=0)
+    link = replace(settings.link, state_hz=ATTITUDE_HZ)
+    gate = GateProcess(replace(settings, link=link))
     try:
         bridge = link_bridge(config, gate, meter)
         gate.send(flight_settings(config, ROLL_RATE))
