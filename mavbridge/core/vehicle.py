@@ -118,6 +118,8 @@ class LinkSnapshot:
     """The vehicle was seen to act on our sticks, or its output has no echo to check."""
     is_released: bool = True
     """The vehicle was seen to act on other sticks than ours since the release, or none was sent."""
+    shows_last: bool = True
+    """Since the release it shows our last sticks, or others that cannot be told from them."""
     interruption: str | None = None
     """Why every engagement so far is over, or None: the vehicle has rebooted, or now sends from
     another address. Stays as it is once it has happened; a later one has another text."""

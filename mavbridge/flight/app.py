@@ -258,6 +258,8 @@ class _Flight:
         is_told = False
         while not listener.ends_within(1 / STATUS_HZ):
             is_holding = view.phase is Phase.HOLDING
+            if is_holding:  # the gate's release and its summary come after the landing
+                until_ns = self._clock.now_ns() + round(END_S * NS_PER_S)
             if is_holding and not is_told:
                 is_told = True
                 screen.show_message(
@@ -265,7 +267,7 @@ class _Flight:
                     "vehicle is disarmed or its mode is changed; Ctrl-C leaves that to the gate "
                     f"(process {self._gate.pid})"
                 )
-            if stop.requests > asked or (not is_holding and self._clock.now_ns() > until_ns):
+            if stop.requests > asked or self._clock.now_ns() > until_ns:
                 break
         if self._has_hung:
             raise PeerError(f"{ending.reason}: it is too slow for this machine, or stuck")

@@ -18,7 +18,10 @@ ACT_TIMEOUT_NS = 3 * NS_PER_S
 REQUEST_SPACING_NS = NS_PER_S
 """Between two requests to arm or for a mode: each refused one prints the vehicle's reason."""
 RELEASE_TIMEOUT_NS = NS_PER_S
-"""Longest wait for the vehicle to show other sticks than ours. Without a receiver it never does."""
+"""Wait for the vehicle to show other sticks than ours. Without a receiver it never does."""
+UNHEARD_RELEASE_TIMEOUT_NS = 4 * NS_PER_S
+"""The same where it does not even show the last ones that we sent, so that the releases may be lost
+as well: longer than it holds ours on its own (RC_OVERRIDE_TIME, 3 s by default)."""
 LOST_NS = 30 * NS_PER_S
 """A vehicle that was held for so long without a word from it is gone: nothing can be held."""
 OPERATOR = "released by the operator"
@@ -84,7 +87,7 @@ class Engagement:
         """Mode that was asked for while preparing."""
         self._prepare_timeout_ns = self._prepare_until_ns = 0
         self._request_due_ns = 0
-        self._release_until_ns = 0
+        self._released_ns = 0
         self._heard_ns = 0
         """While holding: the link was last without a problem."""
         self._was_armed: bool | None = None
@@ -328,7 +331,7 @@ class Engagement:
         had_sticks = self.phase is not Phase.PREPARING or self._arms
         self.phase = Phase.RELEASING
         self.reason = reason
-        self._release_until_ns = facts.now_ns + RELEASE_TIMEOUT_NS
+        self._released_ns = facts.now_ns
         # At least once, also where nothing seems to be held: a reboot may be but a wrong stamp.
         return Move(hand=Hand.RELEASE) if had_sticks else self._release(facts)
 
@@ -365,11 +368,12 @@ class Engagement:
         return move
 
     def _release(self, facts: Facts) -> Move:
-        if facts.is_released or facts.now_ns >= self._release_until_ns:
+        timeout_ns = RELEASE_TIMEOUT_NS if facts.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
+        if facts.is_released or facts.now_ns - self._released_ns >= timeout_ns:
             if not facts.is_released:
                 self.refusal = (
-                    "the vehicle still shows our last sticks, as it does without a receiver: "
-                    "whether it took the release is not known"
+                    "the vehicle still shows our last sticks, as it does without a receiver or "
+                    "with one that rests there: whether it took the release is not known"
                 )
             self.phase = Phase.RELEASED
             self._own_mode = None

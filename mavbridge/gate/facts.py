@@ -54,6 +54,8 @@ class Facts:
     """Why a flight must end now: no chunk for longer than the grace."""
     envelope_problem: str | None
     """Which limit of the flight envelope is exceeded."""
+    shows_last: bool = True
+    """The vehicle shows the last sticks that we sent: held, or a receiver's that rests there."""
     landing: str | None = None
     """The vehicle has landed under the policy: a normal end."""
     slowness: str | None = None

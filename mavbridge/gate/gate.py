@@ -162,6 +162,7 @@ class Gate:
             is_position_valid=status is not None and status.is_position_valid is not False,
             echo_confirmed=link.echo_confirmed,
             is_released=link.is_released,
+            shows_last=link.shows_last,
             refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns),
             chunk_fault=self._chunks.fault(now_ns),

@@ -119,6 +119,7 @@ class MavlinkLink:
             is_switched_off=vehicle.is_switched_off,
             echo_confirmed=vehicle.echo_confirmed,
             is_released=vehicle.is_released,
+            shows_last=vehicle.echo.shows_last,
             interruption=self._interruption,
             known_modes=vehicle.condition.modes.names,
             refused_mode=self._commands.refused_mode,
@@ -313,7 +314,7 @@ class MavlinkLink:
     def send(self, decision: Decision) -> Sticks | None:
         """Send sticks or a release; returns the sticks that were really sent, or None.
 
-        Releases leave every 50 ms for as long as they are asked for, up to 20 after the last
+        Releases leave every 50 ms for as long as they are asked for, up to 80 after the last
         override. One that cannot be sent now is sent before anything else that can.
         """
         if self._config.readonly or self._vehicle is None:

@@ -293,7 +293,7 @@ def test_the_link_is_lost_and_neutral_and_a_mode_are_sent_all_the_same() -> None
     """We hear nothing, the vehicle may well hear us."""
     flight = GateFlight(on_fault="hold").fly()
     flight.down.is_silent = True
-    flight.run(5)
+    flight.run(8)
 
     assert flight.ap.mode is Mode.BRAKE
     assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4]

@@ -36,7 +36,7 @@ def test_a_vehicle_that_moves_in_flight_is_latched_until_the_next_act() -> None:
     flight = GateFlight(on_fault="release").fly()
     flight.network.address = ELSEWHERE
     flight.until(lambda: flight.phase is not Phase.FLYING, within_s=1)
-    flight.run(4)
+    flight.run(6)
     assert flight.phase is Phase.RELEASED
     assert not flight.modes_asked()
 

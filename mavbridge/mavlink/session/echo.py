@@ -78,6 +78,8 @@ class EchoCheck:
         self._fault_ns = 0
         self.is_released = True
         """Other sticks than ours were shown since the release, or none was ever sent."""
+        self.shows_last = False
+        """The sticks that were shown since the release are, or cannot be told from, our last."""
         self.has_sent = False
         """At least one override was sent in this session."""
 
@@ -115,6 +117,7 @@ class EchoCheck:
 
     def released(self) -> None:
         """Overriding has ended: the next one starts a new check."""
+        self.shows_last &= not self.is_sending
         self._since_ns = self._matched_ns = self._held = None
         self._returned_us.clear()
 
@@ -131,7 +134,9 @@ class EchoCheck:
         is_ours = any(_is_near(pwm_us, past) for _, past in reversed(self._sent))
         if self._since_ns is None:
             self._baseline = pwm_us
-            self.is_released |= not is_ours
+            # Ours are shown to the microsecond: a receiver that rests beside them is told apart.
+            self.is_released |= all(pwm_us != past for _, past in self._sent)
+            self.shows_last = bool(self._sent) and _is_near(pwm_us, self._sent[-1][1])
         elif not self.confirmed:
             self._seek(pwm_us, is_ours, now_ns)
         elif is_ours:

@@ -4,9 +4,9 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.mavlink.codec.calibration import RcCalibration
 
 RELEASE_SPACING_NS = 50 * NS_PER_MS
-MOST_RELEASES = 20
-"""Releases after the last override: over a second, as any one may be lost; then silence, so that
-another station may override."""
+MOST_RELEASES = 80
+"""Releases after the last override: over the four seconds for which they are asked for at most;
+then silence, so that another station may override."""
 
 
 class ReleasePlan:

@@ -3,7 +3,7 @@
 from collections import deque
 from typing import NamedTuple
 
-from mavbridge.core.clock import NS_PER_S, period_ns
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, period_ns
 from mavbridge.core.histogram import Histogram
 from mavbridge.mavlink.codec.messages import Timesync
 
@@ -20,6 +20,9 @@ _DRIFT_PER = 10_000
 """Clocks may drift apart by 1 in 10,000: crystals of autopilots and computers are within half."""
 _UNSTEADY_PER = 200
 """A clock that is off by more than 1 in 200 has stepped, or does not run evenly."""
+_UNEVEN_NS = 10 * NS_PER_MS
+"""Unevenness that does no harm: the clock of ArduPilot's SITL runs in lumps of 6 ms, and against
+the wall clock was seen to waver by as much."""
 
 
 class _Exchange(NamedTuple):
@@ -79,7 +82,7 @@ class TimesyncFilter:
         else:
             known_ns = self._error_ns(best, arrived_ns)
             apart_ns = abs(offset_ns - best.offset_ns) - known_ns - new.error_ns
-            if apart_ns * _UNSTEADY_PER > arrived_ns - best.at_ns:
+            if (apart_ns - _UNEVEN_NS) * _UNSTEADY_PER > arrived_ns - best.at_ns:
                 self._agreeing = 0
             if apart_ns > 0 or new.error_ns <= known_ns:
                 self._best = new

@@ -86,6 +86,15 @@ def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
     assert "whether it took the release is not known" in stepped.engagement.refusal
 
 
+def test_while_not_even_our_last_sticks_have_arrived_the_release_goes_on() -> None:
+    stepped = flying(MIDDLE)
+    stepped.step(**FAULT)
+    moves = stepped.run(4, shows_last=False)[6:]
+    assert {move.hand for move in moves} == {Hand.RELEASE}
+    stepped.run(0.1)
+    assert stepped.phase is Phase.RELEASED
+
+
 def test_a_receiver_gets_the_sticks_after_50_ms_of_neutral() -> None:
     stepped = flying(MIDDLE)
     moves = [stepped.step(**FAULT), *stepped.run(0.06)]

@@ -420,6 +420,28 @@ def test_a_release_is_confirmed_by_other_sticks_than_ours() -> None:
     assert not world.echo.is_released
 
 
+def test_a_receiver_that_rests_close_to_our_last_sticks_confirms_the_release() -> None:
+    world = World(sticks=lambda _now_ns: (1500, 1500, 1500, 1500))
+    world.receiver = (1500, 1501, 1500, 1500)
+    world.engage()
+    assert not world.echo.is_released
+    world.release()
+    assert world.run(0.2) is None
+    assert world.echo.is_released
+
+
+def test_a_vehicle_that_has_not_heard_our_last_sticks_does_not_show_them() -> None:
+    world = World()
+    world.engage()
+    world.is_deaf = True
+    world.sticks = lambda _now_ns: (1500, 1500, 1500, 1500)
+    world.run(0.05)
+    world.release()
+    world.run(0.2)
+    assert not world.echo.is_released
+    assert not world.echo.shows_last
+
+
 def test_a_release_without_a_receiver_is_never_confirmed() -> None:
     world = World()
     world.receiver = None
@@ -427,6 +449,7 @@ def test_a_release_without_a_receiver_is_never_confirmed() -> None:
     world.release()
     assert world.run(5.0) is None
     assert not world.echo.is_released
+    assert world.echo.shows_last
     world.engage()  # the sticks of before are our own: the nudge tells them apart
     assert world.run(2.0) is None
 

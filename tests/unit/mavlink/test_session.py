@@ -336,6 +336,15 @@ def test_a_clock_that_steps_is_not_trusted_until_exchanges_agree_again() -> None
         assert sync.is_good == (k == GOOD_EXCHANGES - 1)
 
 
+def test_a_clock_that_wavers_by_a_few_milliseconds_is_trusted() -> None:
+    """The simulator's, against the wall clock; answers take almost no time."""
+    sync = good_timesync()
+    for k in range(1000):
+        wavering_ns = BOOT_NS + (0, 4, -4, 2, -3)[k % 5] * NS_PER_MS
+        exchange(sync, 10 * S + k * S // 5, up_ns=50_000, down_ns=50_000, offset_ns=wavering_ns)
+        assert sync.is_good
+
+
 def test_a_clock_that_does_not_run_evenly_is_never_trusted() -> None:
     sync = TimesyncFilter()
     for k in range(50):
