@@ -33,7 +33,7 @@ class SticksReport:
     coasting_sends: int
     """Sends of a chunk that was too old, within the grace."""
     slots: int
-    """Slots with a send of their own, and missed ones."""
+    """Slots of the grid in that time, also those that a chunk's own send has served."""
     missed_slots: int
     lateness_ms: Percentiles | None
     """Time from a slot to its send."""
@@ -207,7 +207,7 @@ class _Sticks:
     def __init__(self, target_hz: float) -> None:
         self._target_hz = target_hz
         self._last_ns: int | None = None
-        self._sends = self._coasting = self._slots = self._missed = 0
+        self._sends = self._coasting = self._stretches = self._missed = 0
         self._intervals = self._flying_ns = 0
         self._lateness = Histogram()
 
@@ -218,9 +218,10 @@ class _Sticks:
         self._sends += 1
         self._coasting += tick.is_coasting
         if tick.is_slot:
-            self._slots += 1
             self._lateness.add(max(0, tick.sent_ns - tick.due_ns))
-        if self._last_ns is not None:
+        if self._last_ns is None:
+            self._stretches += 1
+        else:
             self._missed += tick.missed_slots
             self._intervals += 1
             self._flying_ns += tick.woke_ns - self._last_ns
@@ -234,7 +235,7 @@ class _Sticks:
             flying_s=round(self._flying_ns / NS_PER_S, 3),
             sends=self._sends,
             coasting_sends=self._coasting,
-            slots=self._slots + self._missed,
+            slots=self._stretches + round(self._flying_ns * self._target_hz / NS_PER_S),
             missed_slots=self._missed,
             lateness_ms=self._lateness.percentiles_ms(),
         )
