@@ -81,9 +81,9 @@ class Keyboard:
             return
         self._old_modes = termios.tcgetattr(fd)
         modes[_LOCAL_MODES] &= ~(termios.ICANON | termios.ECHO)
+        termios.tcflush(fd, termios.TCIFLUSH)  # nothing typed before the flight engages in it
         # TCSANOW: the other ways wait until a stopped terminal has shown all output.
         termios.tcsetattr(fd, termios.TCSANOW, modes)
-        termios.tcflush(fd, termios.TCIFLUSH)  # nothing typed before the flight engages in it
 
     def _restore(self, fd: int) -> None:
         try:

@@ -136,10 +136,9 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
 
 
 @pytest.mark.parametrize("phase", list(Phase))
-def test_a_reason_is_told_unless_somebody_of_ours_has_the_sticks(phase: Phase) -> None:
+def test_a_reason_is_told_unless_the_policy_has_the_sticks(phase: Phase) -> None:
     (tick,) = Viewed().receive(replace(NOBODY, phase=phase)).sink.ticks
-    is_ours = phase in (Phase.PREPARING, Phase.FLYING)
-    assert tick.release_reason == (None if is_ours else "wait")
+    assert tick.release_reason == (None if phase is Phase.FLYING else "wait")
 
 
 def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:

@@ -85,7 +85,7 @@ def test_two_runs_write_the_same_and_other_vehicles_fly_otherwise(
 
 def test_images_later_than_the_age_limit_are_not_flown_by() -> None:
     config = EvaluateConfig(policy=CIRCLE, max_time=1.0, vision_delay=400.0)
-    with pytest.raises(PeerError, match="within 30 s: images or states are older"):
+    with pytest.raises(PeerError, match="within 30 s: the image feature is older than 300 ms"):
         fly_simulated(EpisodeSpec(config=config, index=0), lambda: False)
 
 
