@@ -44,7 +44,7 @@ def test_a_signal_to_the_process_group_ends_the_flight_in_order(
     assert measured.safe_ms <= END_LIMIT_MS
     assert not measured.flew_again
     assert measured.mode is None
-    assert "still armed, in ALT_HOLD" in output
+    assert "still armed in ALT_HOLD" in output
 
 
 def test_a_gate_that_is_told_to_end_gives_the_sticks_back_first(tmp_path: Path) -> None:
