@@ -24,19 +24,25 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
         return port
 
 
+def child_environment() -> dict[str, str]:
+    """Our environment, in which a Python child imports this mavbridge wherever it is started."""
+    import_path = (str(IMPORT_ROOT), os.environ.get("PYTHONPATH", ""))
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, import_path)),
+        "PYTHONSAFEPATH": "1",
+    }
+
+
 @contextmanager
 def running(*command: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Run a process beside the block, its output in ``log``; the block's end ends it.
 
     A Python child imports this mavbridge, whatever modules the working directory holds.
     """
-    import_path = (str(IMPORT_ROOT), os.environ.get("PYTHONPATH", ""))
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, import_path)),
-        "PYTHONSAFEPATH": "1",
-    }
     with log.open("wb") as out:
-        process = subprocess.Popen(command, env=environment, stdout=out, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(
+            command, env=child_environment(), stdout=out, stderr=subprocess.STDOUT
+        )
         try:
             yield process
         finally:

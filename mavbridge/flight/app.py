@@ -36,7 +36,7 @@ from mavbridge.flight.settings import effective_freshness, flight_settings, gate
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Phase
 from mavbridge.mavlink.transport.sockets import make_transport
-from mavbridge.observe.keyboard import Keyboard
+from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
@@ -204,7 +204,7 @@ class _Flight:
         keyboard = Keyboard(self._on_key)
         self._stack.callback(keyboard.stop, JOIN_S)
         has_keys = not self._config.link.readonly and keyboard.start()
-        screen.start(hint="e engages, q releases" if has_keys else None)
+        screen.start(hint=KEYS_HINT if has_keys else None)
         ending = Ending(reason="the flight was ended by a signal")
         while listener.is_alive and not stop.is_set():
             if (fault := self._fault(vision, policy)) is not None:
@@ -214,7 +214,7 @@ class _Flight:
         self._end(ending, listener, stop)
 
     def _on_key(self, key: str) -> None:
-        self._gate.send("engage" if key == "e" else "release")
+        self._gate.send("engage" if key == ENGAGE_KEY else "release")
 
     def _scheduled(
         self, run: Callable[[threading.Event], None], *, realtime: bool, cpu: int | None

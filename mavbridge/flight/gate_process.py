@@ -1,6 +1,5 @@
 """The gate process as its parent sees it: started, fed with chunks, listened to, waited for."""
 
-import os
 import select
 import socket
 import subprocess
@@ -8,7 +7,7 @@ import sys
 import threading
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
-from mavbridge.core.processes import IMPORT_ROOT
+from mavbridge.core.processes import child_environment
 from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.gate.channel import SocketPort, channel_pair
 from mavbridge.gate.settings import GateSettings
@@ -95,12 +94,10 @@ class GateProcess:
 
 
 def _spawn(end: socket.socket, settings: GateSettings) -> subprocess.Popen[bytes]:
-    import_path = (str(IMPORT_ROOT), os.environ.get("PYTHONPATH", ""))
     passed = [end.fileno()] + ([] if settings.tlog_fd is None else [settings.tlog_fd])
     return subprocess.Popen(
         [sys.executable, "-m", "mavbridge.gate", str(end.fileno())],
-        env=os.environ
-        | {"PYTHONPATH": os.pathsep.join(filter(None, import_path)), "PYTHONSAFEPATH": "1"},
+        env=child_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

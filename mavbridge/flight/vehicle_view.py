@@ -19,7 +19,7 @@ from mavbridge.gate.wire import (
     GateSummary,
     GateTick,
 )
-from mavbridge.mavlink.codec.messages import Attitude, LocalVelocity, SpecificForce
+from mavbridge.mavlink.codec.messages import LocalVelocity, Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 
@@ -92,8 +92,7 @@ class VehicleView:
     @property
     def attitude_ns(self) -> int:
         """Arrival of the newest attitude; 0 before the first."""
-        attitude = self._telemetry.snapshot().ned_from_body_wxyz
-        return 0 if attitude is None else attitude.arrived_ns
+        return self._telemetry.attitude_arrived_ns
 
     def wait_for_attitude(self, *, newer_than_ns: int, timeout_ns: int) -> bool:
         """Wait for an attitude that arrived after ``newer_than_ns``; False: none came in time."""
@@ -133,7 +132,7 @@ class VehicleView:
         before_ns = self.attitude_ns
         for arrived_ns, happened_ns, data in packets:
             for message in self._codec.decode_datagram(data):
-                if isinstance(message.body, Attitude | LocalVelocity | SpecificForce):
+                if isinstance(message.body, Measurement):
                     self._telemetry.receive(message.body, arrived_ns, happened_ns)
                     if isinstance(message.body, LocalVelocity) and message.body.position_ned_m:
                         self.height_m = -message.body.position_ned_m[2]

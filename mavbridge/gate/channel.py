@@ -73,10 +73,8 @@ class SocketPort:
         """Write what the kernel takes now; returns the rest."""
         try:
             return data[self._socket.send(data) :]
-        except BlockingIOError:
-            return data
         except OSError:
-            return data  # the other side is gone: the next receive finds out
+            return data  # no room, or the other side is gone, which the next receive finds out
 
     def receive(self) -> list[bytes]:
         """See `Port`."""

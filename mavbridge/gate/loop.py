@@ -9,7 +9,6 @@ from mavbridge.core.vehicle import (
     Decision,
     ForwardedPacket,
     LinkSnapshot,
-    LinkStats,
     Release,
     Sticks,
 )
@@ -75,9 +74,6 @@ class GateLink(Protocol):
 
     def announce(self, text: str) -> None:
         """Tell every ground station."""
-
-    def stats(self) -> LinkStats:
-        """Counters for the report."""
 
 
 class GateLoop:

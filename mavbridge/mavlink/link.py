@@ -47,7 +47,7 @@ _DOWN = "the connection to the vehicle is lost: reconnecting"
 
 
 class MavlinkLink:
-    """Implements ``ports.Link`` over a transport; used by one thread, and never waits.
+    """The session with one vehicle over a transport; used by one thread, and never waits.
 
     ``forward`` gets every packet of the chosen vehicle, in order, while ``poll`` runs; it must
     neither wait nor raise. Problems of the transport are never raised once it has been opened:

@@ -24,7 +24,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.processes import END_TIMEOUT_S, end, free_port, running, wait
 from mavbridge.flight.app import fly_executable
-from mavbridge.flight.policies import load_configured_policy, load_for_episodes
+from mavbridge.flight.policies import is_scripted, load_configured_policy, load_for_episodes
 from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delays
 from mavbridge.simulation.flight import MODE, SimulatedFlight, SimulationSettings
@@ -32,7 +32,6 @@ from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult,
 from mavbridge.simulation.world import NOMINAL_VEHICLE, random_vehicle
 from policy.contract import Executable
 
-SCRIPTED = "scripted"
 STARTUP_S = 90.0
 """Limit on a flight's time beyond its own: imports, compiling an engine, arming."""
 _POLL_S = 0.1
@@ -86,7 +85,7 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         rates=config.rates,
         limits=config.limits,
         delays=replace(delays, vision=vision),
-        draw_images=config.policy.policy.partition(":")[0] != SCRIPTED,
+        draw_images=not is_scripted(config.policy),
     )
     conditions_seed = spec.conditions_seed
     flight = SimulatedFlight(

@@ -77,6 +77,11 @@ class TelemetryCollector:
             if delay_ns is not None:
                 self._force = Reading(arrived_ns, body.specific_force_body_mps2, delay_ns)
 
+    @property
+    def attitude_arrived_ns(self) -> int:
+        """Arrival of the newest attitude; 0 before the first."""
+        return 0 if self._attitude is None else self._attitude.arrived_ns
+
     def snapshot(self) -> Telemetry:
         """The newest reading of each quantity."""
         return Telemetry(
