@@ -9,13 +9,13 @@ from pathlib import Path
 
 from sitl import UsageError
 from sitl.app import print_status, run_vehicle
+from sitl.ardupilot.autopilot import VehicleConfig
+from sitl.ardupilot.rc import IDLE_RECEIVER_US, MID_RECEIVER_US
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import stop_on_signal
 from sitl.course.layout import course_to_json, make_course
-from sitl.vehicle.autopilot import VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions
-from sitl.vehicle.rc import IDLE_RECEIVER_US, MID_RECEIVER_US
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,6 +7,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from sitl import UsageError
+from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
@@ -15,7 +16,6 @@ from sitl.link.rc_input import RcInput
 from sitl.link.transport import Transport, open_transport
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
 

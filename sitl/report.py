@@ -10,12 +10,12 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import Course
 from sitl.course.referee import Crash, GateCounter, GatePass, struck_gate
 from sitl.rotation import Vec3, cos_tilt, to_euler
-from sitl.vehicle.autopilot import Autopilot
-from sitl.vehicle.flight_modes import Mode
 
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))

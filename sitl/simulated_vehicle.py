@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sitl.ardupilot.autopilot import STEP_NS, Autopilot, VehicleConfig
+from sitl.ardupilot.params import Params
 from sitl.course.layout import AirborneStart, Course
 from sitl.link.server import MavlinkServer
 from sitl.report import FlightLog
-from sitl.vehicle.autopilot import STEP_NS, Autopilot, VehicleConfig
 from sitl.vehicle.dynamics import BodyState
-from sitl.vehicle.params import Params
 
 MAX_STEPS_AT_ONCE = 400
 """One second of simulated time; after a longer stall the rest follows in later calls."""

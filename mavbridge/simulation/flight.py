@@ -33,10 +33,10 @@ from mavbridge.simulation.world import (
     VisionStepper,
 )
 from policy.contract import Executable, FloatArray
+from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.camera.fpv import FpvRenderer
 from sitl.course.layout import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 
 MAX_TIME_S = 60.0
 """Default limit: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""

@@ -14,10 +14,10 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.network import DelayedChannel
+from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.camera.fpv import FpvRenderer
 from sitl.rotation import Quat, Vec3
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
-from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import random_conditions
 from sitl.vehicle.dynamics import BodyState
 

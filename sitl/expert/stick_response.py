@@ -4,9 +4,9 @@ import cmath
 import math
 from typing import NamedTuple
 
-from sitl.vehicle.control import clamp
+from sitl.ardupilot.control import clamp
+from sitl.ardupilot.params import Params
 from sitl.vehicle.dynamics import GRAVITY_MPS2
-from sitl.vehicle.params import Params
 
 DRAG_PER_S = 0.125  # linear drag over mass, compensated by lean
 DEAD_ZONE_SLOPE = 0.08

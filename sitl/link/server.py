@@ -8,12 +8,12 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.link.commands import DENIED, execute, mode_by_number
-from sitl.link.endpoint import MavlinkEndpoint
-from sitl.link.messages import Message
+from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.commands import DENIED, execute, mode_by_number
+from sitl.ardupilot.endpoint import MavlinkEndpoint
+from sitl.ardupilot.messages import Message
+from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
 from sitl.report import FlightLog
-from sitl.vehicle.autopilot import Autopilot
-from sitl.vehicle.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
 
 MAX_RC_FIELDS = 18
 _OPTION_GCS_ONLY = 1

@@ -1,1 +1,1 @@
-"""The simulated quadrotor: physics, flight controller, parameters, radio."""
+"""The simulated quadrotor without its firmware: physics, air, sensors."""

@@ -22,7 +22,7 @@ class Conditions:
     """Conditions of one flight; factors of 1 and offsets of 0 change nothing.
 
     The fields from ``angle_max_cdeg`` to ``lean_accel_max_cdegps2`` become firmware parameters
-    (`sitl.vehicle.params`).
+    (`sitl.ardupilot.params`).
     """
 
     seed: int = 0  # of gusts, sensor noise and image noise

@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from sitl.ardupilot.autopilot import VehicleConfig
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.autopilot import VehicleConfig
 
 GCS = 255
 TICK_NS = 5 * NS_PER_MS

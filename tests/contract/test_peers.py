@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from mavbridge.core.processes import free_port
+from sitl.ardupilot.params import Params
 from sitl.clock import NS_PER_S, Clock
-from sitl.vehicle.params import Params
 
 PEERS = Path(__file__).parents[2] / ".venv-peers" / "bin"
 CLIENT = Path(__file__).parents[1] / "helpers" / "mavsdk_client.py"

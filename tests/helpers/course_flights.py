@@ -6,15 +6,15 @@ from itertools import pairwise
 
 import numpy as np
 
+from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
+from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_S
 from sitl.course.layout import AirborneStart, Course
 from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance
 from sitl.expert.stick_response import StickPositions
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
-from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, Conditions
-from sitl.vehicle.flight_modes import Mode
 
 TICK_NS = NS_PER_S // 100
 REST_S = 3.0

@@ -17,7 +17,7 @@ from helpers.gate_flights import (
 )
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.gate.engagement import Phase
-from sitl.vehicle.flight_modes import Mode
+from sitl.ardupilot.flight_modes import Mode
 
 ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
 SWITCH = 7

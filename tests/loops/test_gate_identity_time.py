@@ -12,8 +12,8 @@ from helpers.wire import WireEnd
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.gate.engagement import Phase
-from sitl.vehicle.flight_modes import Mode
-from sitl.vehicle.rc import MID_RECEIVER_US
+from sitl.ardupilot.flight_modes import Mode
+from sitl.ardupilot.rc import MID_RECEIVER_US
 
 ELSEWHERE = ("sitl", 2)
 

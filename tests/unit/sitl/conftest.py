@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import pytest
 
+from sitl.ardupilot.autopilot import STEP_NS, Autopilot, VehicleConfig
+from sitl.ardupilot.flight_modes import Mode
+from sitl.ardupilot.params import Params
 from sitl.clock import NS_PER_S
 from sitl.rotation import to_euler
-from sitl.vehicle.autopilot import STEP_NS, Autopilot, VehicleConfig
-from sitl.vehicle.flight_modes import Mode
-from sitl.vehicle.params import Params
 
 STEPS_PER_STICK_UPDATE = 8
 

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from sitl.ardupilot.messages import BUILDERS
+from sitl.ardupilot.streams import Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.faults import FaultyLink, LinkFaults, Reboot, SensorFreeze, VehicleFaults
-from sitl.link.messages import BUILDERS
-from sitl.link.streams import Streams
 from sitl.simulated_vehicle import SimulatedVehicle
 
 

@@ -8,17 +8,17 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.course_flights import fly_course, pwm_us
+from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
+from sitl.ardupilot.params import Params
+from sitl.ardupilot.streams import Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import AirborneStart, make_course
 from sitl.expert.demonstrator import Expert
 from sitl.expert.stick_response import StickPositions
-from sitl.link.streams import Streams
 from sitl.rotation import IDENTITY, to_euler
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.autopilot import STEP_NS, VehicleConfig
 from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.dynamics import Quadrotor
-from sitl.vehicle.params import Params
 
 ALOFT = AirborneStart(
     position_ned_m=(0.0, 0.0, -30.0),

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from sitl.vehicle.autopilot import VehicleConfig
+from sitl.ardupilot.autopilot import VehicleConfig
+from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.conditions import NOMINAL
-from sitl.vehicle.flight_modes import Mode
 
 HOLDING = (Mode.BRAKE, Mode.LOITER, Mode.POSHOLD)
 PILOTED = (Mode.LOITER, Mode.POSHOLD)

@@ -6,9 +6,9 @@ from typing import TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.link.endpoint import MavlinkEndpoint
-from sitl.vehicle.autopilot import Autopilot
-from sitl.vehicle.flight_modes import Mode
+from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.endpoint import MavlinkEndpoint
+from sitl.ardupilot.flight_modes import Mode
 
 ACCEPTED: int = mav.MAV_RESULT_ACCEPTED
 DENIED: int = mav.MAV_RESULT_DENIED

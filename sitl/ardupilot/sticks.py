@@ -7,8 +7,8 @@ Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_thr
 import math
 from typing import NamedTuple
 
-from sitl.vehicle.params import Params
-from sitl.vehicle.rc import RcEngine
+from sitl.ardupilot.params import Params
+from sitl.ardupilot.rc import RcEngine
 
 THROTTLE_FULL = 1000.0
 

@@ -8,8 +8,8 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import zip_longest
 
+from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, Params
 from sitl.clock import NS_PER_S
-from sitl.vehicle.params import RC_CHANNELS_WITH_PARAMS, Params
 
 CHANNELS = 16
 PRIMARY_CHANNELS = 8  # channels 1-8 and 9-16 differ in what 0 and the highest values mean

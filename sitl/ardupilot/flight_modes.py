@@ -3,12 +3,12 @@
 import math
 from enum import IntEnum
 
+from sitl.ardupilot import sticks as pilot
+from sitl.ardupilot.control import AttitudeController, HeightController, mix, thrust_for
+from sitl.ardupilot.params import Params
+from sitl.ardupilot.sticks import Sticks
 from sitl.rotation import Vec3, cos_tilt, to_euler, wrap_pi
-from sitl.vehicle import sticks as pilot
-from sitl.vehicle.control import AttitudeController, HeightController, mix, thrust_for
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
-from sitl.vehicle.params import Params
-from sitl.vehicle.sticks import Sticks
 
 STOPPED = (0.0, 0.0, 0.0, 0.0)
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down

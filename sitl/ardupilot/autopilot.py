@@ -8,16 +8,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from sitl.ardupilot.failsafe import GcsFailsafe, RadioFailsafe
+from sitl.ardupilot.flight_modes import STOPPED, FlightControl, Mode
+from sitl.ardupilot.params import Params
+from sitl.ardupilot.rc import IDLE_RECEIVER_US, ModeSwitch, RcEngine
+from sitl.ardupilot.sticks import climb_rate_mps, read_sticks
 from sitl.clock import NS_PER_S
 from sitl.rotation import Quat, Vec3, cos_tilt
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.dynamics import PHYSICS_STEP_NS, BodyState, Quadrotor
 from sitl.vehicle.environment import SensorNoise, Wind
-from sitl.vehicle.failsafe import GcsFailsafe, RadioFailsafe
-from sitl.vehicle.flight_modes import STOPPED, FlightControl, Mode
-from sitl.vehicle.params import Params
-from sitl.vehicle.rc import IDLE_RECEIVER_US, ModeSwitch, RcEngine
-from sitl.vehicle.sticks import climb_rate_mps, read_sticks
 
 SUBSTEPS = 2
 STEP_NS = SUBSTEPS * PHYSICS_STEP_NS

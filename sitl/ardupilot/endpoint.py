@@ -5,10 +5,10 @@ from collections.abc import Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.messages import BUILDERS, Message
+from sitl.ardupilot.streams import PARAM_SLOWDOWN, Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.link.messages import BUILDERS, Message
-from sitl.link.streams import PARAM_SLOWDOWN, Streams
-from sitl.vehicle.autopilot import Autopilot
 
 TIMESYNC_PERIOD_NS = 10 * NS_PER_S
 PARAM_PERIOD_NS = 4 * NS_PER_MS

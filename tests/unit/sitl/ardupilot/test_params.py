@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from sitl.vehicle.params import Params
+from sitl.ardupilot.params import Params
 
 
 def test_names_are_sorted_and_fit_the_wire():

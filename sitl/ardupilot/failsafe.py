@@ -1,7 +1,7 @@
 """Detects the loss of the pilot's sticks or of the ground station; the autopilot acts on it."""
 
+from sitl.ardupilot.params import Params
 from sitl.clock import NS_PER_S
-from sitl.vehicle.params import Params
 
 LOW_READS_TO_FAIL = 3
 GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter looks at the ground station in its 3 Hz loop

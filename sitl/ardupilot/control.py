@@ -2,6 +2,7 @@
 
 import math
 
+from sitl.ardupilot.params import Params
 from sitl.rotation import (
     IDENTITY,
     Vec3,
@@ -20,7 +21,6 @@ from sitl.vehicle.dynamics import (
     YAW_TORQUE_PER_THRUST_M,
     BodyState,
 )
-from sitl.vehicle.params import Params
 
 RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
 """With a 28 ms motor lag 18/s keeps the rate loop at a damping ratio of about 0.7."""

@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from sitl.ardupilot.autopilot import Autopilot
 from sitl.rotation import Vec3, conjugate, rotate, to_euler
-from sitl.vehicle.autopilot import Autopilot
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 
 Message: TypeAlias = Any  # a pymavlink message (the library has no types)

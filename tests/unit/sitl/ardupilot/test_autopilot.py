@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from sitl.vehicle.flight_modes import Mode
+from sitl.ardupilot.flight_modes import Mode
 
 
 def test_alt_hold_holds_the_height_within_30_cm(pilot):

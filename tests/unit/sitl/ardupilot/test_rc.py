@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sitl.ardupilot import sticks as pilot_sticks
+from sitl.ardupilot.params import Params
+from sitl.ardupilot.rc import IDLE_RECEIVER_US, RcEngine
+from sitl.ardupilot.sticks import Sticks, read_sticks
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.vehicle import sticks as pilot_sticks
-from sitl.vehicle.params import Params
-from sitl.vehicle.rc import IDLE_RECEIVER_US, RcEngine
-from sitl.vehicle.sticks import Sticks, read_sticks
 
 KEEP = 65535
 

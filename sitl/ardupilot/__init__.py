@@ -1,0 +1,1 @@
+"""ArduCopter as a peer sees it: modes, radio, parameters, failsafes, and its side of MAVLink."""
