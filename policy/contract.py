@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from policy.errors import ContractError
 
-CONTRACT_VERSION = 2
-READABLE_VERSIONS = (1, 2)
+CONTRACT_VERSION = 3
+READABLE_VERSIONS = (1, 2, 3)
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -44,7 +44,20 @@ AGE, ROTATION, VELOCITY_CHANGE = slice(13, 14), slice(14, 17), slice(17, 20)
 
 ACTION_NAMES = ("throttle", "yaw", "pitch", "roll")
 """Sticks in [-1, 1]: up, nose right, stick forward (nose down), right; 0 = centred."""
-ACTION_DIM = len(ACTION_NAMES)
+ACTION_DIM = 4
+ActionKind = Literal["sticks", "rates", "attitude", "velocity"]
+"""Meaning of the four numbers of an action.
+
+- sticks: ``ACTION_NAMES``.
+- rates: collective thrust in [0, 1]; roll, pitch, yaw rate in rad/s about the body's axes.
+- attitude: collective thrust in [0, 1]; roll and pitch in rad; yaw rate in rad/s.
+- velocity: x, y, z in m/s; yaw rate in rad/s.
+
+Axes and signs of the last three are those of ``Contract.state_frame``: in ned_frd a positive pitch
+is nose up and a positive yaw rate nose right, in enu_flu both are the other way round.
+"""
+VelocityFrame = Literal["world", "heading"]
+"""Velocities along the world's axes, or along level axes that turn with the nose."""
 
 IMAGENET_MEAN_RGB = (0.485, 0.456, 0.406)
 IMAGENET_STD_RGB = (0.229, 0.224, 0.225)
@@ -52,21 +65,35 @@ IMAGENET_STD_RGB = (0.229, 0.224, 0.225)
 FloatArray = NDArray[np.float32]
 StateFrame = Literal["ned_frd", "enu_flu"]
 Arrays = Literal["numpy", "torch"]
-ActionKind = Literal["sticks"]
-
 STICK_MODES = (
     *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
     *("MANUAL", "STABILIZED", "ALTCTL", "POSCTL"),
 )
 """Autopilot modes that are flown with sticks: ArduPilot copter, then PX4; PX4 has ACRO as well."""
+ATTITUDE_MODES = ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")
+"""Modes that follow an attitude or body rates; the first needs no position."""
+ACTION_MODES: dict[ActionKind, tuple[str, ...]] = {
+    "sticks": STICK_MODES,
+    "rates": ATTITUDE_MODES,
+    "attitude": ATTITUDE_MODES,
+    "velocity": ("GUIDED", "OFFBOARD"),
+}
+_USUAL_STICK_MODES = ("ALT_HOLD", "ALTCTL")
 MAX_AGE_LIMIT_S = 60.0
+ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 FLIGHT_TERMS = (
     *("action", "modes"),
     *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
-    *("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m"),
+    *ENVELOPE_TERMS,
 )
 """Fields that came with version 2. They say when a policy may fly, and change no array of it; a
 contract of version 1 is read with their defaults."""
+ACTION_TERMS = (
+    *("velocity_frame", "hover_thrust"),
+    *("full_lean_deg", "full_yaw_rate_degps", "full_climb_mps", "full_descent_mps"),
+    *("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
+)
+"""Fields that came with version 3: what an action meant in training; read likewise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,10 +127,23 @@ class Contract:
     since_exposure: bool = False
     """The state is followed by ``SINCE_EXPOSURE_NAMES``."""
     action: ActionKind = "sticks"
-    """Meaning of the four numbers of an action: stick positions, ``ACTION_NAMES``."""
-    modes: tuple[str, ...] = ("ALT_HOLD", "ALTCTL")
-    """Autopilot modes in which the policy may fly, of ``STICK_MODES``: the same sticks mean a lean
-    angle in one and a body rate in another."""
+    velocity_frame: VelocityFrame = "world"
+    hover_thrust: float = 0.39
+    """Thrust that hovers, as in training; a vehicle that hovers at another one gets all in
+    proportion. For rates and attitude; 0.39 is the bundled simulator's."""
+    full_lean_deg: float = 30.0
+    """Vehicle motion at full stick, in training; linear from the dead zone on. For sticks, in modes
+    that hold the height, as the next six; the defaults are ArduCopter's own."""
+    full_yaw_rate_degps: float = 202.5
+    full_climb_mps: float = 2.5
+    full_descent_mps: float = 2.5
+    lean_dead_zone: float = 0.04
+    """Share of the stick's travel, to each side of the centre, that did nothing in training."""
+    yaw_dead_zone: float = 0.04
+    throttle_dead_zone: float = 0.2
+    modes: tuple[str, ...] = ()
+    """Autopilot modes in which the policy may fly, best first: the same sticks mean a lean angle in
+    one and a body rate in another. Empty: the usual ones of ``action``."""
     max_state_age_s: float = 0.1
     """Oldest attitude and body rates that a stick may come from."""
     max_velocity_age_s: float = 0.25
@@ -124,7 +164,15 @@ class Contract:
 
     def __post_init__(self) -> None:
         """Refuse values that no runtime could serve."""
-        for name, known in (("state_frame", StateFrame), ("arrays", Arrays)):
+        if self.modes == () and self.action in ACTION_MODES:
+            is_sticks = self.action == "sticks"
+            modes = _USUAL_STICK_MODES if is_sticks else ACTION_MODES[self.action]
+            object.__setattr__(self, "modes", modes)
+        for name, known in (
+            ("state_frame", StateFrame),
+            ("arrays", Arrays),
+            ("velocity_frame", VelocityFrame),
+        ):
             if (value := getattr(self, name)) not in get_args(known):
                 one, other = get_args(known)
                 raise ContractError(f"{name} {value!r} is unknown; use {one!r} or {other!r}")
@@ -156,16 +204,16 @@ class Contract:
             raise ContractError(f"image_std_rgb must be positive, got {self.image_std_rgb}")
 
     def _require_flight_terms(self) -> None:
-        if self.action not in get_args(ActionKind):
+        if self.action not in ACTION_MODES:
             raise ContractError(
-                f"action {self.action!r} is not flown by this build, which flies 'sticks' "
-                f"({', '.join(ACTION_NAMES)} in [-1, 1])"
+                f"action {self.action!r} is unknown; use one of {', '.join(ACTION_MODES)}"
             )
         if not isinstance(self.modes, tuple) or not self.modes:
             raise ContractError(f"modes must be a tuple of at least one mode, got {self.modes!r}")
-        if unknown := [mode for mode in self.modes if mode not in STICK_MODES]:
+        known = ACTION_MODES[self.action]
+        if unknown := [mode for mode in self.modes if mode not in known]:
             raise ContractError(
-                f"modes {unknown} are not flown with sticks; known are {', '.join(STICK_MODES)}"
+                f"modes {unknown} are not flown with {self.action}; known are {', '.join(known)}"
             )
         for name, value, high, unit in (
             ("max_state_age_s", self.max_state_age_s, MAX_AGE_LIMIT_S, "seconds"),
@@ -176,12 +224,21 @@ class Contract:
             ("max_speed_mps", self.max_speed_mps, 1e3, "m/s"),
             ("max_height_m", self.max_height_m, 1e5, "m"),
             ("max_distance_m", self.max_distance_m, 1e6, "m"),
+            ("hover_thrust", self.hover_thrust, 1.0, "of full thrust"),
+            ("full_lean_deg", self.full_lean_deg, 80.0, "degrees"),
+            ("full_yaw_rate_degps", self.full_yaw_rate_degps, 2000.0, "degrees/s"),
+            ("full_climb_mps", self.full_climb_mps, 100.0, "m/s"),
+            ("full_descent_mps", self.full_descent_mps, 100.0, "m/s"),
         ):
-            if value is None and not name.endswith("_age_s"):
+            if value is None and name in ENVELOPE_TERMS:
                 continue
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
             if value is None or not is_number or not 0 < value <= high:
                 raise ContractError(f"{name} must be in (0, {high:g}] {unit}, got {value!r}")
+        for name in ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"):
+            share = getattr(self, name)
+            if not isinstance(share, int | float) or not 0 <= share < 0.9:
+                raise ContractError(f"{name} must be in [0, 0.9) of the travel, got {share!r}")
 
     @property
     def state_dim(self) -> int:
@@ -194,7 +251,7 @@ class Contract:
 
     @classmethod
     def from_json(cls, text: str) -> "Contract":
-        """Read the header form; one of version 1 gets the default ``FLIGHT_TERMS``.
+        """Read the header form; an older one gets the defaults of the fields that came later.
 
         Raises:
             ContractError: not JSON, another version, unknown keys, or values out of range.
@@ -209,10 +266,11 @@ class Contract:
         if version not in READABLE_VERSIONS:
             raise ContractError(
                 f"contract version {version!r} is not supported; this build reads versions "
-                f"{' and '.join(map(str, READABLE_VERSIONS))}: export the checkpoint again"
+                f"{', '.join(map(str, READABLE_VERSIONS))}: export the checkpoint again"
             )
         known = {each.name for each in fields(cls) if each.init}
-        known -= set(FLIGHT_TERMS) if version == 1 else set()
+        known -= set(FLIGHT_TERMS) if version < 2 else set()
+        known -= set(ACTION_TERMS) if version < 3 else set()
         if unknown := sorted(set(data) - known):
             raise ContractError(
                 f"unknown contract keys {unknown}; those of version {version} are {sorted(known)}"
@@ -251,8 +309,9 @@ class SingleRatePolicy(Protocol):
     """The minimum that flies: image, state and history in, a chunk out.
 
     Shapes, float32: image [B, 3, H, W] normalised by the contract, state [B, state_dim] in SI
-    units, action_history [B, K, 4]; returns [B, horizon, 4] sticks in [-1, 1]. Arrays are numpy or
-    torch, as ``contract.arrays`` says. Any class with these members will do; nothing is inherited.
+    units, action_history [B, K, 4]; returns [B, horizon, 4] actions of ``contract.action``. Arrays
+    are numpy or torch, as ``contract.arrays`` says. Any class with these members will do; nothing
+    is inherited.
 
     A policy that keeps something from one chunk to the next may also have ``reset()``, without
     arguments: it is called once after loading, and whenever a flight begins. The vision thread

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mavbridge.core.vehicle import Sticks, StickTrace
+from mavbridge.core.vehicle import ActionTrace, Sticks
 
 FloatArray: TypeAlias = NDArray[np.float32]
 ImageArray: TypeAlias = NDArray[np.uint8]
@@ -70,7 +70,7 @@ class Tick:
     feature_frame_id: int | None
     feature_captured_ns: int | None
     state: VehicleState | None
-    trace: StickTrace | None
+    trace: ActionTrace | None
     sent: Sticks | None
     """Sticks as sent, after rounding to PWM; None when released or read-only."""
     release_reason: str | None

@@ -7,8 +7,11 @@ handed to the kernel).
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
-Output: TypeAlias = Literal["rc-override", "manual-control"]
-"""RC_CHANNELS_OVERRIDE (ArduPilot) or MANUAL_CONTROL (PX4)."""
+Output: TypeAlias = Literal["rc-override", "manual-control", "attitude", "rates", "velocity"]
+"""RC_CHANNELS_OVERRIDE (ArduPilot), MANUAL_CONTROL (PX4), SET_ATTITUDE_TARGET with an attitude or
+with body rates, SET_POSITION_TARGET_LOCAL_NED with a velocity."""
+ActionKind: TypeAlias = Literal["sticks", "rates", "attitude", "velocity"]
+"""Meaning of the four numbers of an action; ``Action`` has a class for each."""
 OnFault: TypeAlias = Literal["auto", "release", "hold", "land", "rtl"]
 """Action that follows the neutral sticks when a flight ends by our own doing."""
 
@@ -29,6 +32,76 @@ class Sticks(NamedTuple):
     roll: float
 
 
+class BodyRates(NamedTuple):
+    """Collective thrust in [0, 1] and body rates, in FRD axes: + right side down, nose up, nose
+    right."""
+
+    thrust: float
+    roll_radps: float
+    pitch_radps: float
+    yaw_radps: float
+
+
+class AttitudeThrust(NamedTuple):
+    """Collective thrust in [0, 1], roll and pitch by MAVLink's signs (+ right side down, + nose
+    up), and a yaw rate, + nose right."""
+
+    thrust: float
+    roll_rad: float
+    pitch_rad: float
+    yaw_rate_radps: float
+
+
+class Velocity(NamedTuple):
+    """Velocity and yaw rate, + nose right: north, east, down, or forward, right, down in level axes
+    that turn with the nose (``ActionMeaning.is_heading_frame``)."""
+
+    x_mps: float
+    y_mps: float
+    z_mps: float
+    yaw_rate_radps: float
+
+
+Action: TypeAlias = Sticks | BodyRates | AttitudeThrust | Velocity
+ACTION_CLASSES: dict[ActionKind, type[Action]] = {
+    "sticks": Sticks,
+    "rates": BodyRates,
+    "attitude": AttitudeThrust,
+    "velocity": Velocity,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StickGains:
+    """Vehicle motion at full stick, and the stick's travel that does nothing.
+
+    Linear in between. The defaults are ArduCopter's own.
+    """
+
+    lean_deg: float = 30.0
+    """Roll or pitch."""
+    yaw_rate_degps: float = 202.5
+    climb_mps: float = 2.5
+    descent_mps: float = 2.5
+    lean_dead_zone: float = 0.04
+    """Share of the travel to each side of the centre; also in the next two."""
+    yaw_dead_zone: float = 0.04
+    throttle_dead_zone: float = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionMeaning:
+    """What a policy means by the four numbers of an action."""
+
+    kind: ActionKind = "sticks"
+    stick_gains: StickGains | None = None
+    """What full stick was in training; None: sticks go to the vehicle as they are."""
+    hover_thrust: float = 0.39
+    """Thrust that hovers, in training: for rates and attitude."""
+    is_heading_frame: bool = False
+    """Velocities are forward, right, down, and not north, east, down."""
+
+
 NEUTRAL = Sticks(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
 IDLE = Sticks(throttle=-1.0, yaw=0.0, pitch=0.0, roll=0.0)
 """Throttle at the bottom, the rest centred: what arming demands."""
@@ -36,9 +109,9 @@ IDLE = Sticks(throttle=-1.0, yaw=0.0, pitch=0.0, roll=0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """Hold the vehicle's sticks here."""
+    """Have the vehicle do this until the next command."""
 
-    sticks: Sticks
+    action: Action
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +176,28 @@ class VehicleStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ModeRoles:
+    """Flight modes of one firmware by name, and what each is good for."""
+
+    names: tuple[str, ...] = ()
+    """All that can be asked for."""
+    hold: str = ""
+    """Holds the position whatever the sticks say; empty where there is none, also in the next."""
+    land: str = ""
+    rtl: str = ""
+    takeoff: str = ""
+    """The autopilot climbs to a height by its own means in it."""
+    thrust: tuple[str, ...] = ()
+    """The throttle stick is thrust in them, or centred sticks do not level."""
+    setpoint: tuple[str, ...] = ()
+    """They follow setpoints, and the sticks do nothing."""
+    needs_setpoints_first: bool = False
+    """A mode of ``setpoint`` is entered only while setpoints flow already."""
+    is_silence_failsafe: bool = False
+    """Sticks that end are a failsafe, even where a receiver has the next ones."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSnapshot:
     """Everything that the link knows at one tick."""
 
@@ -123,8 +218,7 @@ class LinkSnapshot:
     interruption: str | None = None
     """Why every engagement so far is over, or None: the vehicle has rebooted, or now sends from
     another address. Stays as it is once it has happened; a later one has another text."""
-    known_modes: tuple[str, ...] = ()
-    """Flight modes of this vehicle by name."""
+    modes: ModeRoles = ModeRoles()
     refused_mode: str | None = None
     """Mode that the vehicle has just refused to enter, or None."""
     texts: tuple[str, ...] = ()
@@ -132,13 +226,13 @@ class LinkSnapshot:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StickTrace:
+class ActionTrace:
     """One action on its way from the policy to the wire."""
 
-    raw: Sticks
-    clipped: Sticks
-    slewed: Sticks
-    smoothed: Sticks
+    raw: Action
+    clipped: Action
+    slewed: Action
+    smoothed: Action
 
 
 class Packet(NamedTuple):

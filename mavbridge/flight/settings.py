@@ -81,11 +81,7 @@ def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSett
         engage_on_arm=config.engage_on_arm,
         readonly=config.link.readonly,
         duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
-        departure=DepartureSettings(
-            on_fault=config.on_fault,
-            then=config.then,
-            is_silence_failsafe=config.link.output == "manual-control",
-        ),
+        departure=DepartureSettings(on_fault=config.on_fault, then=config.then),
     )
 
 

@@ -15,12 +15,6 @@ MODE_TIMEOUT_NS = 3 * NS_PER_S
 MIDDLE_STICK = 0.2
 """A receiver's throttle this near to the middle holds height or nearly so (ArduPilot's THR_DZ is
 0.2 of the stick's travel to each side)."""
-THRUST_MODES = ("STABILIZE", "ACRO", "MANUAL", "STABILIZED")
-"""Modes in which the throttle is thrust, or centred sticks do not level: neutral is not safe."""
-HOLD_MODES = ("BRAKE", "AUTO.LOITER")
-"""ArduPilot's and PX4's mode that holds the position whatever the sticks say."""
-LAND_MODES = ("LAND", "AUTO.LAND")
-RTL_MODES = ("RTL", "AUTO.RTL")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,8 +33,6 @@ class DepartureSettings:
     """auto: release to a receiver whose throttle is near the middle, else hold."""
     then: OnFault = "auto"
     """auto: release to a receiver, land without one."""
-    is_silence_failsafe: bool = False
-    """The vehicle takes our silence for a failsafe even with a receiver (PX4, MANUAL_CONTROL)."""
 
 
 class Departure:
@@ -64,9 +56,9 @@ class Departure:
     def begin(self, facts: Facts, ending: Ending) -> None:
         """Choose the safe mode for the vehicle as it is now."""
         self._began_ns = self._request_due_ns = facts.now_ns
-        self._is_thrust_mode = facts.mode in THRUST_MODES
+        self._is_thrust_mode = facts.mode in facts.modes.thrust
         has_receiver = facts.has_receiver is True
-        self.must_hold = not has_receiver or self._settings.is_silence_failsafe
+        self.must_hold = not has_receiver or facts.modes.is_silence_failsafe
         self.is_done = False
         choice = self._settings.on_fault if ending.is_fault else self._settings.then
         if choice == "auto":
@@ -79,16 +71,17 @@ class Departure:
                 choice = "release" if has_receiver else "land"
         if choice == "hold" and not facts.is_position_valid:
             choice = "land"  # BRAKE and LOITER are refused without a position
-        modes = {"hold": HOLD_MODES, "land": LAND_MODES, "rtl": RTL_MODES}.get(choice, ())
-        self.mode = next((mode for mode in modes if mode in facts.known_modes), None)
+        roles = facts.modes
+        by_choice = {"hold": roles.hold, "land": roles.land, "rtl": roles.rtl}
+        self.mode = by_choice.get(choice) or None
 
     def step(self, facts: Facts) -> Move:
         """Neutral sticks, and the mode until it is confirmed or refused."""
         is_confirmed = self.mode is None or facts.mode == self.mode
         is_refused = self.mode is not None and facts.refused_mode == self.mode
         # No vehicle refuses to land: an answer that says so is a late one, to the mode before.
-        if is_refused and self.mode not in LAND_MODES:
-            self.mode = next((mode for mode in LAND_MODES if mode in facts.known_modes), None)
+        if is_refused and self.mode != facts.modes.land:
+            self.mode = facts.modes.land or None
         elapsed_ns = facts.now_ns - self._began_ns
         self.is_done = self.is_done or elapsed_ns >= (
             NEUTRAL_NS if is_confirmed else MODE_TIMEOUT_NS

@@ -220,7 +220,7 @@ class Engagement:
         """Mode to ask for; None if the present one will do."""
         wanted = self._settings.mode
         if wanted is None and facts.mode not in self._settings.modes:
-            known = [mode for mode in self._settings.modes if mode in facts.known_modes]
+            known = [mode for mode in self._settings.modes if mode in facts.modes.names]
             wanted = known[0] if known else self._settings.modes[0]
         return None if wanted == facts.mode else wanted
 
@@ -255,9 +255,9 @@ class Engagement:
     def _impossibility(self, facts: Facts) -> str | None:
         """Why waiting will not help, or None."""
         wanted = self._wanted_mode(facts)
-        if wanted is None or not facts.known_modes or wanted in facts.known_modes:
+        if wanted is None or not facts.modes.names or wanted in facts.modes.names:
             return facts.slowness
-        return f"this vehicle has no mode {wanted}, it has {', '.join(facts.known_modes)}"
+        return f"this vehicle has no mode {wanted}, it has {', '.join(facts.modes.names)}"
 
     def _give_up_preparing(self, facts: Facts) -> Move:
         """The vehicle, or an input, was not ready in time."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import Enum
 
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.vehicle import ModeRoles, Sticks
 
 
 class Hand(Enum):
@@ -36,8 +36,8 @@ class Facts:
     is_switched_off: bool
     """The pilot's override switch is low."""
     mode: str
-    known_modes: tuple[str, ...]
-    """Modes that this vehicle has."""
+    modes: ModeRoles
+    """Modes that this vehicle has; empty before it was found."""
     armed: bool
     is_failsafe: bool
     has_receiver: bool | None

@@ -10,15 +10,15 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
+    ActionTrace,
     Command,
     Decision,
     LinkSnapshot,
     Release,
     Sticks,
-    StickTrace,
 )
 from mavbridge.gate.chunks import Chunk, ChunkBuffer, FreshnessLimits
-from mavbridge.gate.departure import THRUST_MODES, Ending
+from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
 from mavbridge.gate.envelope import Envelope, EnvelopeInput, EnvelopeLimits
 from mavbridge.gate.facts import Facts, Hand, Move
@@ -62,7 +62,7 @@ class GateOutput:
     """None: send nothing now."""
     slot: Slot | None
     """The slot of the stick grid that this step serves; None between slots."""
-    trace: StickTrace | None
+    trace: ActionTrace | None
     """The policy's action on its way to ``decision``; None where the policy does not move them."""
     chunk_serial: int | None
     is_coasting: bool
@@ -125,7 +125,7 @@ class Gate:
         decision, trace = None, None
         if slot is not None or is_urgent:
             self._grid.serve(now_ns)
-            is_thrust = facts.mode in THRUST_MODES
+            is_thrust = facts.mode in facts.modes.thrust
             decision, trace = self._decide(move, now_ns, is_thrust=is_thrust)
         newest = self._chunks.newest
         return GateOutput(
@@ -153,7 +153,7 @@ class Gate:
             overruled=link.problem if link.is_overruled else None,
             is_switched_off=link.is_switched_off,
             mode=status.mode if status else "unknown",
-            known_modes=link.known_modes,
+            modes=link.modes,
             armed=status is not None and status.armed,
             is_failsafe=status is not None and status.is_failsafe,
             has_receiver=status.has_receiver if status else None,
@@ -188,7 +188,7 @@ class Gate:
 
     def _decide(
         self, move: Move, now_ns: int, *, is_thrust: bool
-    ) -> tuple[Decision | None, StickTrace | None]:
+    ) -> tuple[Decision | None, ActionTrace | None]:
         """The sticks to send now; those of the policy with their trace.
 
         ``is_thrust`` says that the throttle stick is thrust in the present mode.
@@ -209,10 +209,11 @@ class Gate:
                 level = NEUTRAL._replace(throttle=self._last.throttle if is_thrust else 0.0)
                 raw = self._chunks.action_at(now_ns + self._lead_ns) or level
                 trace = self._smoother.step(raw, now_ns)
+                assert isinstance(trace.smoothed, Sticks)
                 self._last = trace.smoothed
-                return Command(sticks=trace.smoothed), trace
+                return Command(action=trace.smoothed), trace
         self._last = sticks
-        return Command(sticks=sticks), None
+        return Command(action=sticks), None
 
     def _take_messages(self) -> tuple[str, ...]:
         refusal, self._engagement.refusal = self._engagement.refusal, None

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.vehicle import NEUTRAL, Sticks, StickTrace
+from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +43,7 @@ class StickSmoother:
         self._slewed = start
         self._smoothed = start
 
-    def step(self, raw: Sticks, now_ns: int) -> StickTrace:
+    def step(self, raw: Sticks, now_ns: int) -> ActionTrace:
         """Filter one action, which must be finite; the first after a reset spans no time."""
         dt_s = 0.0
         if self._last_ns is not None:
@@ -54,7 +54,7 @@ class StickSmoother:
         slewed = self._slew(clipped, dt_s)
         smoothed = self._low_pass(before, slewed, dt_s)
         self._slewed, self._smoothed = slewed, smoothed
-        return StickTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
+        return ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
 
     def _slew(self, target: Sticks, dt_s: float) -> Sticks:
         limit = self._settings.max_slew_per_s

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
-from mavbridge.core.vehicle import ForwardedPacket, LinkStats, Percentiles, Sticks, StickTrace
+from mavbridge.core.vehicle import ActionTrace, ForwardedPacket, LinkStats, Percentiles, Sticks
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Phase
@@ -44,7 +44,7 @@ class GateTick:
     is_slot: bool
     is_coasting: bool
     chunk_serial: int | None
-    trace: StickTrace | None
+    trace: ActionTrace | None
     sent: Sticks | None
     """Sticks as sent; None when released, or when nothing was sent."""
     phase: Phase
@@ -192,7 +192,7 @@ def _decode_tick(data: bytes) -> GateTick:
         _TICK.unpack_from(data)
     )
     raw, clipped, slewed, smoothed, sent = (Sticks(*values[4 * k : 4 * k + 4]) for k in range(5))
-    trace = StickTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
+    trace = ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
     return GateTick(
         index=index,
         due_ns=due_ns,

@@ -121,7 +121,7 @@ class MavlinkLink:
             is_released=vehicle.is_released,
             shows_last=vehicle.echo.shows_last,
             interruption=self._interruption,
-            known_modes=vehicle.condition.modes.names,
+            modes=vehicle.condition.modes.roles,
             refused_mode=self._commands.refused_mode,
             texts=texts,
         )
@@ -322,13 +322,15 @@ class MavlinkLink:
         if isinstance(decision, Release):
             self._send_release()
             return None
+        if not isinstance(decision.action, Sticks):
+            raise TypeError(f"{type(decision.action).__name__} cannot be sent yet")
         if self._config.output == "rc-override":
-            return self._send_override(decision.sticks, self._vehicle)
+            return self._send_override(decision.action, self._vehicle)
         system = self._vehicle.identity.source.system
-        if not self._transmit(self._codec.encode_manual_control(system, decision.sticks)):
+        if not self._transmit(self._codec.encode_manual_control(system, decision.action)):
             return None
         self._counters.sent += 1
-        return manual_control_sticks(decision.sticks)
+        return manual_control_sticks(decision.action)
 
     def _send_override(self, sticks: Sticks, vehicle: VehicleSession) -> Sticks | None:
         calibration = vehicle.calibration

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Event, ImageArray, Tick, VisionTick
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.vehicle import Action, Sticks
 from mavbridge.observe.rerun_target import RerunRecording
 
 JPEG_QUALITY = 85
@@ -282,9 +282,10 @@ def _lateness_ns(tick: Tick) -> int | None:
     return None if tick.trace is None or not tick.is_slot else max(0, tick.sent_ns - tick.due_ns)
 
 
-def _stick_stages(tick: Tick) -> tuple[Sticks, ...]:
+def _stick_stages(tick: Tick) -> tuple[Action, ...]:
     """The series of a stick plot in their order, each with all four axes."""
-    echo, trace, sent = tick.rc_sticks or _STICKS_GAP, tick.trace, tick.sent or _STICKS_GAP
+    echo: Action = tick.rc_sticks or _STICKS_GAP
+    trace, sent = tick.trace, tick.sent or _STICKS_GAP
     if trace is None:
         return (echo, *(_STICKS_GAP,) * 4, sent)
     return echo, trace.raw, trace.clipped, trace.slewed, trace.smoothed, sent

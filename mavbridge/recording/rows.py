@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from mavbridge.core.records import Tick, VehicleState
-from mavbridge.core.vehicle import Sticks, StickTrace
+from mavbridge.core.vehicle import ActionTrace, Sticks
 from policy.contract import ACTION_DIM, STATE_DIM
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -183,7 +183,7 @@ def _tick(row: dict[str, Any], serial: int) -> Tick:
         array.setflags(write=False)
         state = VehicleState(values=array, **{name: row[name] for name in _STAMPS})
     if row["raw"] is not None:
-        trace = StickTrace(**{name: Sticks(*row[name]) for name in _TRACE})
+        trace = ActionTrace(**{name: Sticks(*row[name]) for name in _TRACE})
     return Tick(**values | {"serial": serial, "state": state, "trace": trace})
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick, VehicleState, VisionTick
-from mavbridge.core.vehicle import NEUTRAL, Sticks, StickTrace
+from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
 
 START_NS = 1_000 * NS_PER_S
 TICK_NS = 10 * NS_PER_MS
@@ -34,9 +34,9 @@ def make_state(at_ns: int = START_NS, **changes: Any) -> VehicleState:
     return replace(state, **changes)
 
 
-def make_trace(sticks: Sticks = NEUTRAL) -> StickTrace:
+def make_trace(sticks: Sticks = NEUTRAL) -> ActionTrace:
     """An action that no stage changes."""
-    return StickTrace(raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks)
+    return ActionTrace(raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks)
 
 
 def make_tick(index: int = 0, **changes: Any) -> Tick:

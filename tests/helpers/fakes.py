@@ -169,14 +169,14 @@ class FakeLink:
             interruption=self.interruption,
             echo_confirmed=self.echo_confirmed,
             is_released=not holds,
-            known_modes=COPTER_MODES,
+            modes=COPTER_MODES,
             texts=texts,
         )
 
     def send(self, decision: Decision) -> Sticks | None:
         self.on_send()
         self.decisions.append((self._clock.now_ns(), decision))
-        return None if isinstance(decision, Release) else decision.sticks
+        return None if isinstance(decision, Release) else decision.action
 
     def service(self) -> None:
         self.services += 1

@@ -4,14 +4,32 @@ from dataclasses import replace
 from typing import Any
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.core.vehicle import NEUTRAL, ModeRoles
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
 from mavbridge.gate.facts import Facts, Move
 
 MODES = ("ALT_HOLD", "ALTCTL")
-COPTER_MODES = ("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "BRAKE", "LAND", "RTL", "GUIDED")
-PX4_MODES = ("ALTCTL", "POSCTL", "ACRO", "AUTO.LOITER", "AUTO.LAND", "AUTO.RTL")
+COPTER_MODES = ModeRoles(
+    names=("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "BRAKE", "LAND", "RTL", "GUIDED"),
+    hold="BRAKE",
+    land="LAND",
+    rtl="RTL",
+    takeoff="GUIDED",
+    thrust=("STABILIZE", "ACRO"),
+    setpoint=("GUIDED", "GUIDED_NOGPS"),
+)
+PX4_MODES = ModeRoles(
+    names=("ALTCTL", "POSCTL", "ACRO", "OFFBOARD", "AUTO.LOITER", "AUTO.LAND", "AUTO.RTL"),
+    hold="AUTO.LOITER",
+    land="AUTO.LAND",
+    rtl="AUTO.RTL",
+    takeoff="AUTO.TAKEOFF",
+    thrust=("MANUAL", "STABILIZED", "ACRO"),
+    setpoint=("OFFBOARD",),
+    needs_setpoints_first=True,
+    is_silence_failsafe=True,
+)
 STEP_NS = 10 * NS_PER_MS
 
 AIRBORNE = Facts(
@@ -22,7 +40,7 @@ AIRBORNE = Facts(
     overruled=None,
     is_switched_off=False,
     mode="ALT_HOLD",
-    known_modes=COPTER_MODES,
+    modes=COPTER_MODES,
     armed=True,
     is_failsafe=False,
     has_receiver=True,

@@ -215,7 +215,7 @@ class VirtualFlight:
         return [
             (
                 (at_ns - START_NS) / NS_PER_S,
-                decision.sticks if isinstance(decision, Command) else None,
+                decision.action if isinstance(decision, Command) else None,
             )
             for at_ns, decision in self.link.decisions
         ]

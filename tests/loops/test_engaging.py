@@ -15,7 +15,7 @@ from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Decision, Release, St
 from mavbridge.gate.engagement import Phase
 
 PERIOD_NS = 10 * MS
-QUARTER = Command(sticks=Sticks(0.25, 0.25, 0.25, 0.25))
+QUARTER = Command(action=Sticks(0.25, 0.25, 0.25, 0.25))
 
 
 def sticks_of(decisions: list[Decision]) -> list[Sticks | None]:
@@ -29,7 +29,7 @@ def test_a_camera_that_stops_ends_the_flight_and_one_that_returns_does_not_fly_a
     times = [START_NS + k * FRAME_NS for k in range(150)]
     gap = [t for t in times if not NS_PER_S < t - START_NS < 2 * NS_PER_S]
     flight = VirtualFlight(frames_ns=gap).fly(3.0)
-    assert flight.link.hands == [QUARTER, Command(sticks=NEUTRAL), Release(flight.reason)]
+    assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
     assert "100 ms: the image feature is older than 300 ms" in flight.reason
     assert flight.phase is Phase.RELEASED
     last = flight.flown[-1]
@@ -71,7 +71,7 @@ def test_a_state_that_is_lost_ends_the_flight_after_the_grace(
 ) -> None:
     flight = VirtualFlight()
     flight.at(1.0, lambda: lose(flight)).fly(3.0)
-    assert flight.link.hands == [QUARTER, Command(sticks=NEUTRAL), Release(flight.reason)]
+    assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
     assert told in flight.reason
     assert flight.sent[-1][0] < 1.0 + seconds + 0.1
     flown_until_s = (flight.flown[-1].sent_ns - START_NS) / NS_PER_S
@@ -103,7 +103,7 @@ def test_one_chunk_with_nan_is_not_flown_and_costs_no_stick() -> None:
 
 def test_a_policy_that_returns_nan_every_other_time_loses_the_sticks_once() -> None:
     flight = VirtualFlight(chunk=lambda k: nan_chunk() if k > 50 and k % 2 else STEADY).fly(3.0)
-    assert flight.link.hands == [QUARTER, Command(sticks=NEUTRAL), Release(flight.reason)]
+    assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
     assert "unusable chunks" in flight.reason
 
 
@@ -137,7 +137,7 @@ def test_arming_goes_through_idle_and_asks_for_the_mode_first() -> None:
     flight = VirtualFlight(status=status, duration=0.5).fly(3.0)
     assert flight.link.requests == ["mode ALT_HOLD", "arm"]
     kinds = flight.link.hands
-    assert kinds[:2] == [Command(sticks=IDLE), QUARTER]
+    assert kinds[:2] == [Command(action=IDLE), QUARTER]
 
 
 def test_a_vehicle_that_does_not_obey_is_asked_once_a_second() -> None:
@@ -152,7 +152,7 @@ def test_a_vehicle_that_does_not_obey_is_asked_once_a_second() -> None:
     ("status", "end", "requests", "phase"),
     [
         ({}, Release("the flight is over"), [], Phase.ENDED),
-        ({"has_receiver": False}, Command(sticks=NEUTRAL), ["mode LAND"], Phase.HOLDING),
+        ({"has_receiver": False}, Command(action=NEUTRAL), ["mode LAND"], Phase.HOLDING),
     ],
     ids=["receiver", "no receiver"],
 )
@@ -161,7 +161,7 @@ def test_a_flight_ends_after_its_duration(
 ) -> None:
     flight = VirtualFlight(status=status, duration=0.5).fly(3.0)
     assert flight.link.hands[0] == QUARTER
-    assert flight.link.hands[1] == Command(sticks=NEUTRAL)
+    assert flight.link.hands[1] == Command(action=NEUTRAL)
     assert flight.link.hands[-1] == end
     assert flight.link.requests == requests
     assert flight.phase is phase

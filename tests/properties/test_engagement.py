@@ -135,7 +135,7 @@ class EngagementMachine(RuleBasedStateMachine):
 
     # --- the vehicle and the inputs
 
-    @rule(mode=st.sampled_from(COPTER_MODES))
+    @rule(mode=st.sampled_from(COPTER_MODES.names))
     def change_mode(self, mode: str) -> None:
         self.step(mode=mode)
 

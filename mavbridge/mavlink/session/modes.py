@@ -3,6 +3,7 @@
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.errors import UserError
+from mavbridge.core.vehicle import ModeRoles
 
 _PX4_MODES = ("MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED")
 """Main modes of px4_custom_mode.h, from number 1 on: bits 16..23 of custom_mode."""
@@ -29,9 +30,29 @@ class ModeTable:
             } | {f"AUTO.{name}": (_PX4_AUTO, sub) for sub, name in _PX4_AUTO_MODES.items()}
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """All modes that can be asked for."""
-        return tuple(self._commands)
+    def roles(self) -> ModeRoles:
+        """All modes that can be asked for, and what each is good for."""
+        if self._is_px4:
+            return ModeRoles(
+                names=tuple(self._commands),
+                hold="AUTO.LOITER",
+                land="AUTO.LAND",
+                rtl="AUTO.RTL",
+                takeoff="AUTO.TAKEOFF",
+                thrust=("MANUAL", "STABILIZED", "ACRO"),
+                setpoint=("OFFBOARD",),
+                needs_setpoints_first=True,
+                is_silence_failsafe=True,
+            )
+        return ModeRoles(
+            names=tuple(self._commands),
+            hold="BRAKE",
+            land="LAND",
+            rtl="RTL",
+            takeoff="GUIDED",
+            thrust=("STABILIZE", "ACRO"),
+            setpoint=("GUIDED", "GUIDED_NOGPS"),
+        )
 
     def name(self, custom_mode: int) -> str:
         """Name of HEARTBEAT.custom_mode, or its number if it has no name."""

@@ -117,7 +117,7 @@ def test_engaging_and_leaving_follow_the_flags() -> None:
         engage_channel=8,
         engage_on_arm=True,
         duration_ns=1_500_000_000,
-        departure=DepartureSettings(on_fault="rtl", then="hold", is_silence_failsafe=True),
+        departure=DepartureSettings(on_fault="rtl", then="hold"),
     )
     assert settings_for(FlyConfig(link=replace(LINK, readonly=True))).engagement.readonly
 

@@ -14,7 +14,7 @@ from mavbridge.gate.facts import Hand, Move
 MIDDLE = replace(AIRBORNE, pilot_sticks=NEUTRAL)
 IDLE_RECEIVER = replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0))
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
-PX4 = replace(NO_RECEIVER, mode="ALTCTL", known_modes=PX4_MODES)
+PX4 = replace(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
 FAULT = {"chunk_fault": "no chunk"}
 
 
@@ -105,7 +105,7 @@ def test_a_receiver_gets_the_sticks_after_50_ms_of_neutral() -> None:
     ("facts", "settings"),
     [
         (NO_RECEIVER, DepartureSettings()),
-        (replace(PX4, has_receiver=True), DepartureSettings(is_silence_failsafe=True)),
+        (replace(PX4, has_receiver=True), DepartureSettings()),
     ],
 )
 def test_where_silence_is_a_failsafe_neutral_goes_on_until_disarmed(

@@ -90,7 +90,7 @@ class Stepped:
             problem=None,
             echo_confirmed=True,
             is_released=self.is_released,
-            known_modes=COPTER_MODES,
+            modes=COPTER_MODES,
         )
         output = self.gate.step(now_ns, GateInput(link=link, chunk=chunk, act=act, stop=stop))
         if output.decision is not None:
@@ -124,12 +124,12 @@ def test_while_nobody_asks_us_to_fly_slots_pass_and_nothing_is_sent() -> None:
 def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() -> None:
     gate = Stepped().engaged()
     early = gate.step(33, gate.chunk(33))
-    assert (early.decision, early.slot) == (Command(sticks=WANTED), None)
+    assert (early.decision, early.slot) == (Command(action=WANTED), None)
     served = gate.step(40)  # 7 ms later
     assert served.slot is not None
-    assert served.decision == Command(sticks=WANTED)
+    assert served.decision == Command(action=WANTED)
     late = gate.step(46, gate.chunk(46))
-    assert (late.decision, late.slot) == (Command(sticks=WANTED), None)
+    assert (late.decision, late.slot) == (Command(action=WANTED), None)
     left_out = gate.step(50)  # 4 ms later
     assert (left_out.decision, left_out.slot) == (None, None)
     after = gate.step(60)
@@ -142,7 +142,7 @@ def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() ->
     [
         ({"mode": "LOITER"}, None, Release("mode changed from ALT_HOLD to LOITER")),
         ({"armed": False}, None, Release("the vehicle has been disarmed")),
-        ({}, "release", Command(sticks=NEUTRAL)),
+        ({}, "release", Command(action=NEUTRAL)),
     ],
 )
 def test_a_change_of_hands_does_not_wait_for_a_slot(
@@ -162,7 +162,7 @@ def test_a_chunk_that_is_not_taken_is_not_news() -> None:
     gate = Stepped().engaged()
     nan = gate.chunk(33, WANTED._replace(roll=float("nan")))
     assert gate.step(33, nan).decision is None
-    assert gate.step(40).decision == Command(sticks=WANTED)
+    assert gate.step(40).decision == Command(action=WANTED)
 
 
 def test_slots_that_a_stall_has_missed_are_counted_and_not_made_up_for() -> None:
@@ -193,7 +193,7 @@ ECHO = Sticks(0.9, 0.9, 0.9, 0.9)
 def first_sticks(gate: Stepped) -> Sticks:
     (first,) = gate.decisions
     assert isinstance(first, Command)
-    return first.sticks
+    return first.action
 
 
 def test_the_policy_starts_from_the_pilots_sticks() -> None:
@@ -201,7 +201,7 @@ def test_the_policy_starts_from_the_pilots_sticks() -> None:
     assert first_sticks(gate.engaged()) == PILOT
     moved = gate.step(40).decision
     assert isinstance(moved, Command)
-    assert max(abs(a - b) for a, b in zip(moved.sticks, PILOT, strict=True)) <= 0.0101
+    assert max(abs(a - b) for a, b in zip(moved.action, PILOT, strict=True)) <= 0.0101
 
 
 def test_without_known_sticks_it_starts_from_neutral_and_never_from_our_own_echo() -> None:
@@ -221,11 +221,11 @@ def test_after_arming_it_starts_from_idle() -> None:
     gate = Stepped(smoothing=SLOW, arm=True, status={"armed": False, "pilot_sticks": PILOT})
     for k in range(3):
         output = gate.step(10 * k, gate.chunk(10 * k))
-    assert output.decision == Command(sticks=IDLE)
+    assert output.decision == Command(action=IDLE)
     assert output.arm
     taken = gate.step(30, gate.chunk(30), armed=True)
     assert taken.phase is Phase.FLYING
-    assert taken.decision == Command(sticks=IDLE)
+    assert taken.decision == Command(action=IDLE)
 
 
 def test_chunks_that_are_refused_do_not_start_the_filter_anew() -> None:
@@ -237,7 +237,7 @@ def test_chunks_that_are_refused_do_not_start_the_filter_anew() -> None:
         sticks = NEUTRAL if k % 2 else NEUTRAL._replace(roll=float("nan"))
         gate.step(at_ms, gate.chunk(at_ms, sticks), rc_sticks=ECHO)
     assert gate.gate.phase is Phase.FLYING
-    assert set(gate.decisions) == {Command(sticks=NEUTRAL)}
+    assert set(gate.decisions) == {Command(action=NEUTRAL)}
 
 
 # --- which
@@ -247,7 +247,7 @@ def test_the_trace_shows_what_became_of_the_action() -> None:
     output = Stepped().engaged(sticks=Sticks(1.5, 0.0, 0.0, 0.0)).outputs[-1]
     assert output.trace is not None
     assert (output.trace.raw.throttle, output.trace.clipped.throttle) == (1.5, 1.0)
-    assert output.decision == Command(sticks=output.trace.smoothed)
+    assert output.decision == Command(action=output.trace.smoothed)
     assert output.chunk_serial == 4
 
 
@@ -255,12 +255,12 @@ def test_beyond_the_horizon_neutral_bridges_the_rest_of_the_grace() -> None:
     gate = Stepped().engaged()
     gate.step(33, gate.chunk(33, actions=2))  # acts until 70
     sent = {at_ms: gate.step(at_ms) for at_ms in range(40, 150, 10)}
-    assert {at_ms for at_ms, out in sent.items() if out.decision == Command(sticks=WANTED)} == {
+    assert {at_ms for at_ms, out in sent.items() if out.decision == Command(action=WANTED)} == {
         *(40, 50, 60, 70)
     }
     flown = [at_ms for at_ms, out in sent.items() if out.phase is Phase.FLYING]
     assert flown == list(range(40, 140, 10))
-    assert all(sent[at_ms].decision == Command(sticks=NEUTRAL) for at_ms in range(80, 150, 10))
+    assert all(sent[at_ms].decision == Command(action=NEUTRAL) for at_ms in range(80, 150, 10))
     assert sent[140].phase is Phase.LEAVING
     assert sent[140].trace is None
     assert sent[140].chunk_serial is None
@@ -277,10 +277,10 @@ def test_where_the_throttle_is_thrust_it_stays_until_the_safe_mode_is_there() ->
     gate = Stepped(modes=("STABILIZE",), status={"mode": "STABILIZE", "has_receiver": False})
     gate.engaged()
     left = gate.step(31, act="release")
-    assert left.decision == Command(sticks=NEUTRAL._replace(throttle=WANTED.throttle))
+    assert left.decision == Command(action=NEUTRAL._replace(throttle=WANTED.throttle))
     assert left.mode == "LAND"
     assert gate.step(40).decision == left.decision
-    assert gate.step(50, mode="LAND").decision == Command(sticks=NEUTRAL)
+    assert gate.step(50, mode="LAND").decision == Command(action=NEUTRAL)
 
 
 def test_read_only_flies_as_if_it_sent() -> None:
@@ -288,7 +288,7 @@ def test_read_only_flies_as_if_it_sent() -> None:
     outputs = [gate.step(10 * k, gate.chunk(10 * k), mode="ALT_HOLD") for k in range(4)]
     assert [out.phase for out in outputs] == [Phase.WAITING] * 2 + [Phase.FLYING] * 2
     assert outputs[-1].trace is not None
-    assert outputs[-1].decision == Command(sticks=WANTED)  # which a read-only link does not send
+    assert outputs[-1].decision == Command(action=WANTED)  # which a read-only link does not send
 
 
 def test_a_landing_counts_from_the_beginning_of_each_flight() -> None:

@@ -162,7 +162,7 @@ def test_the_vehicles_status_is_told_when_it_changes() -> None:
 def test_every_stick_is_told_with_its_chunk_as_it_was_sent() -> None:
     rig = Rig().flying()
     sent = [tick for tick in rig.ticks if tick.sent is not None]
-    assert [(tick.sent_ns, Command(sticks=tick.sent)) for tick in sent] == rig.link.decisions
+    assert [(tick.sent_ns, Command(action=tick.sent)) for tick in sent] == rig.link.decisions
     assert {tick.sent for tick in sent} == {tick.trace.smoothed for tick in sent if tick.trace}
     assert sent[-1].sent == pytest.approx(WANTED)
     assert [tick.chunk_serial for tick in sent] == sorted(tick.chunk_serial for tick in sent)
@@ -238,7 +238,7 @@ def test_the_newest_of_several_chunks_is_flown() -> None:
     old, new = rig.chunk(), rig.chunk(actions=(NEUTRAL,))
     rig.tell(old, new)
     rig.loop.step()
-    assert rig.link.decisions[-1] == (rig.clock.now_ns(), Command(sticks=NEUTRAL))
+    assert rig.link.decisions[-1] == (rig.clock.now_ns(), Command(action=NEUTRAL))
     assert rig.ticks[-1].chunk_serial == new.serial
 
 
@@ -362,10 +362,10 @@ def test_the_death_of_the_flight_process_is_a_fault() -> None:
     rig = Rig(pilot_sticks=IDLE).flying()
     rig.port.is_closed = True
     rig.loop.step()
-    assert rig.link.decisions[-1][1] == Command(sticks=NEUTRAL)
+    assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
     assert rig.link.requests == ["mode BRAKE"]  # not LAND, as at a normal end
     rig.run(1.0)
-    assert rig.link.hands[-2:] == [Command(sticks=NEUTRAL), Release("the flight process has died")]
+    assert rig.link.hands[-2:] == [Command(action=NEUTRAL), Release("the flight process has died")]
     assert rig.loop.is_done
 
 
@@ -384,7 +384,7 @@ def test_a_chunk_that_has_come_with_the_end_of_the_channel_does_not_fly() -> Non
     rig.tell(rig.chunk(), "engage")
     rig.port.is_closed = True
     rig.loop.step()
-    assert rig.link.decisions[-1][1] == Command(sticks=NEUTRAL)
+    assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
 
 
 def test_the_first_reason_to_end_is_the_one_that_counts() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavbridge.core.vehicle import ForwardedPacket, LinkStats, Percentiles, Sticks, StickTrace
+from mavbridge.core.vehicle import ActionTrace, ForwardedPacket, LinkStats, Percentiles, Sticks
 from mavbridge.gate.chunks import Chunk, FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import EngagementSettings, Phase
@@ -63,7 +63,7 @@ TICK = GateTick(
     is_slot=True,
     is_coasting=False,
     chunk_serial=7,
-    trace=StickTrace(raw=STICKS, clipped=STICKS, slewed=STICKS, smoothed=STICKS),
+    trace=ActionTrace(raw=STICKS, clipped=STICKS, slewed=STICKS, smoothed=STICKS),
     sent=STICKS,
     phase=Phase.FLYING,
     reason="",
@@ -160,7 +160,7 @@ def test_any_chunk_arrives_bit_by_bit(seven: tuple[int, ...], actions: list[Stic
         is_coasting=st.booleans(),
         chunk_serial=st.none() | stamps,
         trace=st.none()
-        | st.builds(StickTrace, raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks),
+        | st.builds(ActionTrace, raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks),
         sent=st.none() | sticks,
         phase=st.sampled_from(Phase),
         reason=st.text(st.characters(codec="utf-8"), max_size=50),

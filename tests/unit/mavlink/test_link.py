@@ -234,15 +234,15 @@ def test_heartbeats_go_out_once_a_second_and_only_while_serviced() -> None:
 def test_commands_are_echoed_and_confirmed() -> None:
     rig = Rig()
     rig.run(8.0)
-    snapshot = rig.run(0.2, Command(sticks=IDLE))
+    snapshot = rig.run(0.2, Command(action=IDLE))
     assert snapshot.echo_confirmed
     assert snapshot.problem is None
     roll_us, *others_us = rig.overrides()[-1]
     assert (roll_us in range(1500, 1503), others_us) == (True, IDLE_US[1:])
-    sent = {rig.link.send(Command(sticks=Sticks(0.0, 0.0, 0.001, 0.5)))}
+    sent = {rig.link.send(Command(action=Sticks(0.0, 0.0, 0.001, 0.5)))}
     for _ in range(10):
         rig.clock.advance_ns(10 * MS)
-        sent.add(rig.link.send(Command(sticks=Sticks(0.0, 0.0, 0.001, 0.5))))
+        sent.add(rig.link.send(Command(action=Sticks(0.0, 0.0, 0.001, 0.5))))
     # what was really sent: roll steps by 1 us of 400
     assert sent == {Sticks(0, 0, 0, 0.5 - k / 400) for k in range(3)}
     assert rig.link.stats().echo_confirmed is True
@@ -271,7 +271,7 @@ def test_a_radio_calibration_that_would_fail_in_flight_is_a_problem_and_not_an_e
     rig = Rig()
     rig.vehicle.params["RC1_MAX"] = 2250.0
     assert "--set RC1_MAX=2200" in (rig.run(8.0).problem or "")
-    assert rig.link.send(Command(sticks=Sticks(0.0, 0.0, 0.0, 1.0))) is None
+    assert rig.link.send(Command(action=Sticks(0.0, 0.0, 0.0, 1.0))) is None
 
 
 def test_a_parameter_is_set_over_the_wire_also_after_a_reboot(tmp_path: Path) -> None:
@@ -295,9 +295,9 @@ def test_a_parameter_that_matters_and_changes_in_flight_is_an_interruption() -> 
     rig = Rig()
     rig.run(8.0)
     rig.vehicle.armed = True
-    assert rig.run(1.5, Command(sticks=IDLE)).interruption is None
+    assert rig.run(1.5, Command(action=IDLE)).interruption is None
     rig.vehicle.put(rig.vehicle.end.mav.param_value_encode(b"RC1_MAX", 1950, 9, 99, 0))
-    snapshot = rig.run(0.1, Command(sticks=IDLE))
+    snapshot = rig.run(0.1, Command(action=IDLE))
     assert snapshot.interruption == "RC1_MAX was changed from 1900 to 1950 in flight"
     assert "disarm" in (snapshot.problem or "")
     rig.vehicle.armed = False
@@ -310,8 +310,8 @@ def test_a_vehicle_that_ignores_us_is_noticed(resting_throttle_us: int) -> None:
     rig.vehicle.channels[2] = resting_throttle_us  # 1100: just where IDLE is
     rig.vehicle.follows_overrides = False
     rig.run(8.0)
-    assert rig.run(0.9, Command(sticks=IDLE)).problem is None
-    snapshot = rig.run(0.3, Command(sticks=IDLE))
+    assert rig.run(0.9, Command(action=IDLE)).problem is None
+    snapshot = rig.run(0.3, Command(action=IDLE))
     assert "another station may be overriding" in (snapshot.problem or "")
     assert snapshot.is_overruled
     assert not snapshot.echo_confirmed
@@ -323,14 +323,14 @@ def test_without_rc_channels_there_is_nothing_to_check_against() -> None:
     rig.run(8.0)
     rig.vehicle.shows_rc = False
     rig.vehicle.follows_overrides = False
-    assert "no RC_CHANNELS" in (rig.run(1.3, Command(sticks=IDLE)).problem or "")
+    assert "no RC_CHANNELS" in (rig.run(1.3, Command(action=IDLE)).problem or "")
 
 
 def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() -> None:
     rig = Rig()
     rig.run(8.0)
     for k in range(2):
-        rig.run(0.2, Command(sticks=IDLE))
+        rig.run(0.2, Command(action=IDLE))
         count = len(rig.overrides())
         rig.run(0.01, Release("pilot"))
         assert rig.overrides()[count:] == [RELEASE_US]  # in the same tick
@@ -338,7 +338,7 @@ def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() 
         rig.run(1.0)  # nobody asks
         assert rig.overrides()[count:] == [RELEASE_US] * (2 + k)
     rig.run(0.01, Release("pilot"))
-    rig.run(0.01, Command(sticks=IDLE))
+    rig.run(0.01, Command(action=IDLE))
     count = len(rig.overrides())
     rig.run(0.01, Release("pilot"))
     assert rig.overrides()[count:] == [RELEASE_US]  # the last one was before an override
@@ -350,13 +350,13 @@ def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() 
 def test_a_release_that_could_not_be_sent_goes_before_everything_else() -> None:
     rig = Rig()
     rig.run(8.0)
-    rig.run(0.2, Command(sticks=IDLE))
+    rig.run(0.2, Command(action=IDLE))
     rig.vehicle.is_deaf = True
     rig.run(1.5, Release("pilot"))
     assert RELEASE_US not in rig.overrides()
     rig.vehicle.is_deaf = False
     count = len(rig.vehicle.received)
-    rig.link.send(Command(sticks=IDLE))
+    rig.link.send(Command(action=IDLE))
     assert rig.vehicle.names()[count:] == ["RC_CHANNELS_OVERRIDE"] * 2
     assert rig.overrides()[-2] == RELEASE_US != rig.overrides()[-1]
 
@@ -365,9 +365,9 @@ def test_a_release_that_could_not_be_sent_goes_before_everything_else() -> None:
 def test_a_release_is_the_first_packet_after_a_reopen(still_asked: bool) -> None:
     rig = Rig()
     rig.run(8.0)
-    rig.run(0.2, Command(sticks=IDLE))
+    rig.run(0.2, Command(action=IDLE))
     rig.vehicle.is_down = True
-    rig.run(0.02, Command(sticks=IDLE))  # now it is noticed
+    rig.run(0.02, Command(action=IDLE))  # now it is noticed
     rig.run(0.01, Release("pilot"))
     rig.run(2.5, Release("pilot") if still_asked else None)
     count = len(rig.vehicle.received)
@@ -384,12 +384,12 @@ def test_a_release_is_the_first_packet_after_a_reopen(still_asked: bool) -> None
 def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
     rig = Rig()
     rig.run(8.0)
-    rig.run(0.2, Command(sticks=IDLE))
+    rig.run(0.2, Command(action=IDLE))
     rig.vehicle.is_deaf = True
-    assert rig.link.send(Command(sticks=IDLE)) is None
+    assert rig.link.send(Command(action=IDLE)) is None
     rig.vehicle.is_down = True
     assert rig.run(0.1).problem == "the connection to the vehicle is lost: reconnecting"
-    assert rig.link.send(Command(sticks=IDLE)) is None
+    assert rig.link.send(Command(action=IDLE)) is None
     assert rig.link.stats().sent_overrides == 20
 
 
@@ -403,7 +403,7 @@ def test_nothing_is_released_that_was_never_overridden() -> None:
 def test_readonly_sends_no_stick() -> None:
     rig = Rig(readonly=True)
     rig.run(8.0)
-    rig.run(1.0, Command(sticks=IDLE))
+    rig.run(1.0, Command(action=IDLE))
     assert rig.overrides() == []
     rig.link.announce("mavbridge: the policy has the sticks")
     rig.run(0.1)
@@ -468,10 +468,10 @@ def test_in_flight_a_vehicle_that_moves_is_not_followed() -> None:
     rig = Rig()
     rig.run(8.0)
     rig.link.is_engaged = True
-    rig.run(0.5, Command(sticks=IDLE))
+    rig.run(0.5, Command(action=IDLE))
     rig.vehicle.address = ("127.0.0.1", 2)
     count = len(rig.forwarded)
-    snapshot = rig.run(9.0, Command(sticks=IDLE))
+    snapshot = rig.run(9.0, Command(action=IDLE))
     assert snapshot.interruption is not None
     for part in ("127.0.0.1:1 is silent", "heard from 127.0.0.1:2", "engage again"):
         assert part in snapshot.interruption
@@ -497,7 +497,7 @@ def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
     for _ in range(3):
         stranger = Received(WireEnd().heartbeat(mode=9), rig.clock.now_ns(), ("10.0.0.9", 4))
         rig.vehicle.inbox.append(stranger)
-        snapshot = rig.run(1.0, Command(sticks=IDLE))
+        snapshot = rig.run(1.0, Command(action=IDLE))
     assert (snapshot.interruption, snapshot.problem) == (None, None)
     assert snapshot.status is not None
     assert snapshot.status.mode == "ALT_HOLD"
@@ -509,10 +509,10 @@ def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
 def test_one_old_stamp_is_no_reboot_and_costs_no_release() -> None:
     rig = Rig()
     rig.run(8.0)
-    rig.run(0.2, Command(sticks=IDLE))
+    rig.run(0.2, Command(action=IDLE))
     mav = rig.vehicle.end.mav
     rig.vehicle.put(mav.attitude_quaternion_encode(3, 1, 0, 0, 0, 0, 0, 0))
-    assert rig.run(0.2, Command(sticks=IDLE)).problem is None
+    assert rig.run(0.2, Command(action=IDLE)).problem is None
     assert not any("rebooted" in text for text in rig.texts)
 
 
@@ -522,9 +522,9 @@ def test_a_reboot_ends_the_engagement_and_still_leaves_a_release() -> None:
     told = []
     for _ in range(2):
         rig.link.is_engaged = True
-        rig.run(0.2, Command(sticks=IDLE))
+        rig.run(0.2, Command(action=IDLE))
         rig.vehicle.boot_ns = rig.clock.now_ns()
-        told.append(rig.run(0.05, Command(sticks=IDLE)).interruption)
+        told.append(rig.run(0.05, Command(action=IDLE)).interruption)
         count = len(rig.overrides())
         rig.run(0.2, Release("reboot"))
         assert rig.overrides()[count:] == [RELEASE_US] * 4
@@ -665,9 +665,9 @@ def test_a_port_that_was_taken_meanwhile_is_waited_for() -> None:
     rig = Rig()
     rig.run(8.0)
     rig.vehicle.is_down = True
-    rig.run(0.1, Command(sticks=IDLE))
+    rig.run(0.1, Command(action=IDLE))
     rig.vehicle.is_down, rig.vehicle.open_error = False, UserError("port in use")
-    assert rig.run(3.0, Command(sticks=IDLE)).problem is not None
+    assert rig.run(3.0, Command(action=IDLE)).problem is not None
     rig.vehicle.open_error = None
     assert rig.run(2.0).problem is None
 
@@ -715,7 +715,7 @@ def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
     assert snapshot.echo_confirmed
     assert snapshot.status is not None
     assert snapshot.status.mode == "ALTCTL"
-    rig.run(0.1, Command(sticks=IDLE))
+    rig.run(0.1, Command(action=IDLE))
     rig.run(0.1, Release("pilot"))
     assert rig.vehicle.names().count("MANUAL_CONTROL") == 10
     assert rig.overrides() == []

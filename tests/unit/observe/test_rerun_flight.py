@@ -18,7 +18,7 @@ from helpers.factories import make_released_tick, make_tick, make_trace, make_vi
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Event
-from mavbridge.core.vehicle import Sticks, StickTrace
+from mavbridge.core.vehicle import ActionTrace, Sticks
 from mavbridge.observe.rerun_flight import MAX_IMAGE_WIDTH, PLOTS, RerunView, flight_blueprint
 
 
@@ -103,7 +103,7 @@ def test_every_stage_of_every_stick_has_its_series(rrd: Path) -> None:
         Sticks(throttle=k + 0.125, yaw=k + 0.25, pitch=k + 0.5, roll=k + 0.75) for k in range(6)
     ]
     echo, raw, clipped, slewed, smoothed, sent = stages
-    trace = StickTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
+    trace = ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
     seen = show(rrd, [make_tick(0, trace=trace, sent=sent, rc_sticks=echo)])
     for axis, name in enumerate(Sticks._fields):
         shown = [seen.values(f"sticks/{name}", series)[0] for series in range(6)]

@@ -6,6 +6,7 @@ import pytest
 
 from policy.checkpoints.header import read_contract
 from policy.contract import (
+    ACTION_TERMS,
     AGE,
     FLIGHT_TERMS,
     ROTATION,
@@ -36,20 +37,20 @@ def test_round_trips_through_its_header_form() -> None:
         max_distance_m=5000.0,
     )
     assert Contract.from_json(contract.to_json()) == contract
-    assert json.loads(contract.to_json())["version"] == 2
+    assert json.loads(contract.to_json())["version"] == 3
 
 
 def header_of_version_1(**changes: object) -> dict[str, Any]:
     header = json.loads(Contract(**changes).to_json())
-    return {name: value for name, value in header.items() if name not in FLIGHT_TERMS} | {
-        "version": 1
-    }
+    return {
+        name: value for name, value in header.items() if name not in (*FLIGHT_TERMS, *ACTION_TERMS)
+    } | {"version": 1}
 
 
 def test_version_1_flies_sticks_in_the_modes_that_hold_altitude() -> None:
     contract = Contract.from_json(json.dumps(header_of_version_1(horizon=8)))
     assert contract == Contract(horizon=8)
-    assert contract.version == 2
+    assert contract.version == 3
     assert (contract.action, contract.modes) == ("sticks", ("ALT_HOLD", "ALTCTL"))
     ages_s = (contract.max_state_age_s, contract.max_velocity_age_s)
     assert (*ages_s, contract.max_feature_age_s, contract.max_chunk_age_s) == (0.1, 0.25, 0.3, 0.3)
@@ -85,7 +86,7 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"version": 3}, "version 3 is not supported"),
+        ({"version": 4}, "version 4 is not supported"),
         ({"state_frame": "nwu"}, "ned_frd"),
         ({"arrays": "jax"}, "numpy"),
         ({"horizon": 0}, "horizon must be an integer in"),
@@ -99,9 +100,12 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
         ({"image_std_rgb": [0.2, 0.2, float("nan")]}, "finite"),
         ({"since_exposure": 1}, "since_exposure must be true or false"),
         ({"colour": "bgr"}, "unknown contract keys"),
-        ({"version": "2"}, "this build reads versions 1 and 2"),
-        ({"action": "rates"}, "'rates' is not flown by this build, which flies 'sticks'"),
-        ({"modes": []}, "at least one mode"),
+        ({"version": "2"}, "this build reads versions 1, 2, 3"),
+        ({"action": "torque"}, "'torque' is unknown; use one of sticks, rates, attitude, velocity"),
+        ({"action": "velocity", "modes": ["GUIDED_NOGPS"]}, "known are GUIDED, OFFBOARD"),
+        ({"velocity_frame": "body"}, "velocity_frame 'body' is unknown"),
+        ({"full_lean_deg": 0}, "full_lean_deg must be in"),
+        ({"throttle_dead_zone": 1.0}, "throttle_dead_zone must be in"),
         ({"modes": "ALT_HOLD"}, "at least one mode"),
         ({"modes": ["ALT_HOLD", "GUIDED"]}, r"\['GUIDED'\] are not flown with sticks; known are"),
         ({"modes": ["alt_hold"]}, "known are STABILIZE"),
