@@ -4,12 +4,21 @@ import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from mavbridge.config.checks import check_range
-from mavbridge.config.groups import CAMERA, ENGAGING, ENVELOPE, LIMITS, OUTPUT, RARE, VEHICLE
+from mavbridge.config.groups import (
+    CAMERA,
+    ENGAGING,
+    ENVELOPE,
+    LIMITS,
+    OUTPUT,
+    RARE,
+    SETPOINTS,
+    VEHICLE,
+)
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
@@ -85,6 +94,40 @@ class EnvelopeConfig:
                 check_range(name.replace("_", "-"), value, 0, largest, unit)
 
 
+@Parameter(name="*", group=SETPOINTS)
+@dataclass(frozen=True, kw_only=True)
+class SetpointLimits:
+    """The most that is asked of the vehicle by setpoints; the autopilot limits few of them."""
+
+    setpoint_lean: float = 35.0
+    """Largest lean of an attitude, in degrees."""
+    setpoint_rate: float = 220.0
+    """Fastest roll and pitch rate, in degrees a second."""
+    setpoint_yaw_rate: float = 120.0
+    """Fastest yaw rate, in degrees a second."""
+    setpoint_thrust: float = 0.9
+    """Largest collective thrust, by the policy's scale."""
+    setpoint_speed: float = 8.0
+    """Fastest horizontal velocity, in m/s."""
+    setpoint_climb: float = 3.0
+    """Fastest climb and descent, in m/s."""
+    setpoint_accel: float = 5.0
+    """Fastest change of a velocity, in m/s^2."""
+
+    def __post_init__(self) -> None:
+        """Refuse bounds that no multirotor has."""
+        for name, unit, largest in (
+            ("setpoint_lean", "deg", 80),
+            ("setpoint_rate", "deg/s", 2000),
+            ("setpoint_yaw_rate", "deg/s", 1000),
+            ("setpoint_thrust", "of full thrust", 1),
+            ("setpoint_speed", "m/s", 100),
+            ("setpoint_climb", "m/s", 50),
+            ("setpoint_accel", "m/s^2", 100),
+        ):
+            check_range(name.replace("_", "-"), getattr(self, name), 0.01, largest, unit)
+
+
 @Parameter(name="*", group=VEHICLE)
 @dataclass(frozen=True, kw_only=True)
 class LinkConfig:
@@ -98,8 +141,9 @@ class LinkConfig:
     """System id of the vehicle to fly; 0 = the only one on the link."""
     connect_timeout: Annotated[float, Parameter(group=RARE)] = 30.0
     """Seconds to wait for the vehicle's first heartbeat."""
-    output: Output = "rc-override"
-    """RC_CHANNELS_OVERRIDE (ArduPilot) or MANUAL_CONTROL (PX4)."""
+    output: Output | Literal["auto"] = "auto"
+    """Message that carries the actions: rc-override or manual-control (sticks), attitude, rates,
+    velocity. auto: by the policy's actions and the firmware."""
     readonly: bool = False
     """Run everything, send no stick, mode or arm command."""
     set: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
@@ -185,10 +229,13 @@ class FlyConfig:
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
     envelope: EnvelopeConfig = field(default_factory=EnvelopeConfig)
+    setpoints: SetpointLimits = field(default_factory=SetpointLimits)
     arm: Annotated[bool, Parameter(group=ENGAGING)] = False
     """Arm and engage once, as soon as everything is ready."""
     mode: Annotated[str | None, Parameter(group=ENGAGING)] = None
     """Flight mode to ask for when engaging; one of those that the policy flies in."""
+    takeoff: Annotated[float | None, Parameter(group=ENGAGING)] = None
+    """With --arm: metres to which the autopilot climbs by its own means before the policy flies."""
     engage_channel: Annotated[int | None, Parameter(group=ENGAGING)] = None
     """Radio channel, from 5, whose switch engages when it goes high while armed, and releases when
     it goes low."""
@@ -213,6 +260,10 @@ class FlyConfig:
         """Refuse contradictions."""
         if self.duration is not None:
             check_range("duration", self.duration, 0.1, 86400, "s")
+        if self.takeoff is not None:
+            check_range("takeoff", self.takeoff, 0.5, 100, "m")
+            if not self.arm:
+                raise UserError("--takeoff needs --arm: nothing else takes off by itself")
         if self.engage_channel is not None:
             check_range("engage-channel", self.engage_channel, 5, 18, "")
         engages = self.arm or self.engage_on_arm or self.engage_channel is not None

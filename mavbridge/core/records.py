@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mavbridge.core.vehicle import ActionTrace, Sticks
+from mavbridge.core.vehicle import Action, ActionTrace, Sticks
 
 FloatArray: TypeAlias = NDArray[np.float32]
 ImageArray: TypeAlias = NDArray[np.uint8]
@@ -71,8 +71,8 @@ class Tick:
     feature_captured_ns: int | None
     state: VehicleState | None
     trace: ActionTrace | None
-    sent: Sticks | None
-    """Sticks as sent, after rounding to PWM; None when released or read-only."""
+    sent: Action | None
+    """As sent, after rounding by the message; None when released or read-only."""
     release_reason: str | None
     mode: str | None
     armed: bool

@@ -182,11 +182,12 @@ class ModeRoles:
     names: tuple[str, ...] = ()
     """All that can be asked for."""
     hold: str = ""
-    """Holds the position whatever the sticks say; empty where there is none, also in the next."""
+    """Holds the position whatever the sticks say; empty where there is none, also in the next two.
+    """
     land: str = ""
     rtl: str = ""
-    takeoff: str = ""
-    """The autopilot climbs to a height by its own means in it."""
+    takeoff: tuple[str, ...] = ()
+    """The mode to arm in for a takeoff by the autopilot's own means, then those it goes through."""
     thrust: tuple[str, ...] = ()
     """The throttle stick is thrust in them, or centred sticks do not level."""
     setpoint: tuple[str, ...] = ()

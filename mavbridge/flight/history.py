@@ -6,7 +6,7 @@ from bisect import bisect_right
 import numpy as np
 
 from mavbridge.core.records import FloatArray
-from mavbridge.core.vehicle import NEUTRAL, Sticks
+from mavbridge.core.vehicle import NEUTRAL, Action, Sticks
 from policy.contract import history_ages_ns
 
 
@@ -38,10 +38,10 @@ class SentHistory:
         self._span_ns = self._ages_ns[0] + self._ages_ns[-1]
         self._lock = threading.Lock()
         self._sent_ns: list[int] = []
-        self._sent: list[Sticks] = [NEUTRAL]
+        self._sent: list[Action] = [NEUTRAL]
         """One more than stamps: what was held before the first of them."""
 
-    def append(self, sent: Sticks | None, now_ns: int) -> None:
+    def append(self, sent: Action | None, now_ns: int) -> None:
         """Remember what left at ``now_ns`` (None = released); forget what is too old to matter."""
         with self._lock:
             self._sent_ns.append(now_ns)

@@ -1,5 +1,6 @@
 """From the flags of a command, and the contract of a policy, to the settings of link and gate."""
 
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +8,14 @@ from pathlib import Path
 from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
+from mavbridge.core.vehicle import ActionMeaning
 from mavbridge.gate.chunks import FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import EngagementSettings
 from mavbridge.gate.envelope import EnvelopeLimits
 from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.limits import LimitSettings
+from mavbridge.gate.preparation import PreparationSettings
 from mavbridge.gate.settings import GateSettings
 from mavbridge.gate.smoothing import Smoothing
 from mavbridge.mavlink.settings import LinkSettings
@@ -49,9 +53,35 @@ def flight_settings(config: FlyConfig, executable: Executable) -> FlightSettings
         stick_period_ns=period_ns(rates.stick_rate),
         chunk_period_ns=period_ns(loops.action_hz),
         freshness=effective_freshness(contract, limits),
-        smoothing=Smoothing(max_slew_per_s=limits.max_slew, tau_s=limits.tau),
+        meaning=action_meaning(contract),
+        output=None if config.link.output == "auto" else config.link.output,
+        smoothing=Smoothing(limits=limit_settings(config).of(contract.action), tau_s=limits.tau),
         envelope=envelope_limits(config.envelope, _policy_envelope(contract)),
         engagement=engagement_settings(config, contract),
+    )
+
+
+def action_meaning(contract: Contract) -> ActionMeaning:
+    """What the policy means by the four numbers of an action."""
+    return ActionMeaning(
+        kind=contract.action,
+        hover_thrust=contract.hover_thrust,
+        is_heading_frame=contract.velocity_frame == "heading",
+    )
+
+
+def limit_settings(config: FlyConfig) -> LimitSettings:
+    """Bounds of what leaves, for every kind of action."""
+    bounds = config.setpoints
+    return LimitSettings(
+        stick_slew_per_s=config.limits.max_slew,
+        lean_rad=math.radians(bounds.setpoint_lean),
+        rate_radps=math.radians(bounds.setpoint_rate),
+        yaw_rate_radps=math.radians(bounds.setpoint_yaw_rate),
+        thrust=bounds.setpoint_thrust,
+        speed_mps=bounds.setpoint_speed,
+        climb_mps=bounds.setpoint_climb,
+        accel_mps2=bounds.setpoint_accel,
     )
 
 
@@ -73,15 +103,19 @@ def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSett
             f"--mode {mode}: this policy flies in {' or '.join(contract.modes)} only, since its "
             "actions mean something else, or nothing, in other modes"
         )
+    is_setpoint = contract.action != "sticks"
     return EngagementSettings(
-        modes=contract.modes,
-        mode=mode,
+        preparation=PreparationSettings(
+            modes=contract.modes, mode=mode, takeoff_m=config.takeoff, is_setpoint=is_setpoint
+        ),
         arm=config.arm,
         engage_channel=config.engage_channel,
         engage_on_arm=config.engage_on_arm,
         readonly=config.link.readonly,
         duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
-        departure=DepartureSettings(on_fault=config.on_fault, then=config.then),
+        departure=DepartureSettings(
+            on_fault=config.on_fault, then=config.then, is_setpoint=is_setpoint
+        ),
     )
 
 
@@ -111,7 +145,7 @@ def link_settings(
         source_system=config.source_system,
         target_system=config.target_system,
         connect_timeout_s=config.connect_timeout,
-        output=config.output,
+        output="rc-override" if config.output == "auto" else config.output,
         readonly=config.readonly,
         state_hz=state_hz,
         min_battery_percent=min_battery_percent,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.vehicle import Action
 
 LEAST_GRACE_NS = 100 * NS_PER_MS
 GRACE_PERIODS = 3
@@ -54,22 +54,24 @@ class Chunk(NamedTuple):
     """When the first action acts."""
     step_ns: int
     """Time from one action to the next."""
-    actions: tuple[Sticks, ...]
-    """In time order, as the policy put them out: not clipped, perhaps not finite."""
+    actions: tuple[Action, ...]
+    """All of one kind, in NED and FRD axes, in time order, as the policy put them out: not clipped,
+    perhaps not finite."""
 
     @property
     def end_ns(self) -> int:
         """End of the horizon: an action acts for one step."""
         return self.first_ns + len(self.actions) * self.step_ns
 
-    def action_at(self, at_ns: int) -> Sticks:
+    def action_at(self, at_ns: int) -> Action:
         """Action at a time, linear between the actions, held at both ends."""
         last = len(self.actions) - 1
         position = min(max((at_ns - self.first_ns) / self.step_ns, 0.0), float(last))
         low = int(position)
         weight = position - low
-        pairs = zip(self.actions[low], self.actions[min(low + 1, last)], strict=True)
-        return Sticks(*[(1.0 - weight) * a + weight * b for a, b in pairs])
+        first, second = self.actions[low], self.actions[min(low + 1, last)]
+        pairs = zip(first, second, strict=True)
+        return type(first)(*[(1.0 - weight) * a + weight * b for a, b in pairs])
 
 
 class ChunkBuffer:
@@ -163,7 +165,7 @@ class ChunkBuffer:
             return late if self._refusal is None else f"{late}: {self._refusal}"
         return None
 
-    def action_at(self, at_ns: int) -> Sticks | None:
+    def action_at(self, at_ns: int) -> Action | None:
         """The action that acts at a time; None beyond the horizon of the newest chunk."""
         if self.newest is None or at_ns > self.newest.end_ns:
             return None

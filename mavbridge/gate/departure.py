@@ -33,6 +33,9 @@ class DepartureSettings:
     """auto: release to a receiver whose throttle is near the middle, else hold."""
     then: OnFault = "auto"
     """auto: release to a receiver, land without one."""
+    is_setpoint: bool = False
+    """The policy's actions are setpoints: there is nothing to release to, so that a mode which
+    holds stands for release, and silence follows it."""
 
 
 class Departure:
@@ -58,7 +61,8 @@ class Departure:
         self._began_ns = self._request_due_ns = facts.now_ns
         self._is_thrust_mode = facts.mode in facts.modes.thrust
         has_receiver = facts.has_receiver is True
-        self.must_hold = not has_receiver or facts.modes.is_silence_failsafe
+        is_setpoint = self._settings.is_setpoint
+        self.must_hold = not is_setpoint and (not has_receiver or facts.modes.is_silence_failsafe)
         self.is_done = False
         choice = self._settings.on_fault if ending.is_fault else self._settings.then
         if choice == "auto":
@@ -69,6 +73,8 @@ class Departure:
                 choice = "release" if has_receiver and is_middle else "hold"
             else:
                 choice = "release" if has_receiver else "land"
+        if choice == "release" and is_setpoint:
+            choice = "hold"
         if choice == "hold" and not facts.is_position_valid:
             choice = "land"  # BRAKE and LOITER are refused without a position
         roles = facts.modes

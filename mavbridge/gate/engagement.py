@@ -10,13 +10,12 @@ from typing import Literal, TypeAlias
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.gate.departure import Departure, DepartureSettings, Ending
 from mavbridge.gate.facts import Facts, Hand, Move
+from mavbridge.gate.preparation import Preparation, PreparationSettings
 
 PREPARE_TIMEOUT_NS = 90 * NS_PER_S
 """For mode change and arming; a cold autopilot needs some 40 s for its estimator."""
 ACT_TIMEOUT_NS = 3 * NS_PER_S
 """For the change of mode that an act asks for while armed: no act comes true much later."""
-REQUEST_SPACING_NS = NS_PER_S
-"""Between two requests to arm or for a mode: each refused one prints the vehicle's reason."""
 RELEASE_TIMEOUT_NS = NS_PER_S
 """Wait for the vehicle to show other sticks than ours. Without a receiver it never does."""
 UNHEARD_RELEASE_TIMEOUT_NS = 4 * NS_PER_S
@@ -57,10 +56,7 @@ Act: TypeAlias = Literal["engage", "release"]
 class EngagementSettings:
     """The acts that may engage, and the modes in which they may."""
 
-    modes: tuple[str, ...]
-    """Modes in which the policy may fly."""
-    mode: str | None = None
-    """Mode to ask for when engaging; None = the present one, or with ``arm`` the first of modes."""
+    preparation: PreparationSettings
     arm: bool = False
     """Arm once and engage once, as soon as everything is ready."""
     engage_channel: int | None = None
@@ -83,18 +79,14 @@ class Engagement:
         self._wants_arm = settings.arm
         self._own_mode: str | None = None
         """The mode that we fly in, or asked for and got; any change of it is a takeover."""
-        self._asked_mode: str | None = None
-        """Mode that was asked for while preparing."""
+        self._preparation = Preparation(settings.preparation)
         self._prepare_timeout_ns = self._prepare_until_ns = 0
-        self._request_due_ns = 0
         self._released_ns = 0
         self._heard_ns = 0
         """While holding: the link was last without a problem."""
         self._was_armed: bool | None = None
         """As last seen; None before the vehicle was found."""
         self._has_been_armed = False
-        self._arms = False
-        """It was disarmed when preparing began: the sticks idle on the ground, and we arm it."""
         self._was_ready = False
         """The vehicle was armed at the last step of preparing."""
         self._switch_is_low = False
@@ -169,10 +161,11 @@ class Engagement:
         return facts.chunk_problem or facts.envelope_problem
 
     def _mode_objection(self, facts: Facts) -> str | None:
-        if facts.mode in self._settings.modes:
+        if facts.mode in self._settings.preparation.modes:
             return None
-        allowed = " or ".join(self._settings.modes)
-        return f"the policy may not fly in {facts.mode}, only in {allowed}: change the mode"
+        allowed = " or ".join(self._settings.preparation.modes)
+        wrong = f"the policy may not fly in {facts.mode}, only in {allowed}"
+        return f"{wrong}: change the mode, or use --mode"
 
     # --- phases
 
@@ -194,7 +187,7 @@ class Engagement:
             self.refusal = "not engaged: the vehicle is disarmed; arm it first, or use --arm"
         elif (objection := self._objection(facts)) is not None:
             self.refusal = f"not engaged: {objection}"
-        elif self._settings.mode is not None and facts.mode != self._settings.mode:
+        elif self._settings.preparation.mode not in (None, facts.mode):
             return self._begin_preparing(facts, ACT_TIMEOUT_NS)
         elif (objection := self._mode_objection(facts)) is not None:
             self.refusal = f"not engaged: {objection}"
@@ -210,25 +203,17 @@ class Engagement:
     def _begin_preparing(self, facts: Facts, timeout_ns: int) -> Move:
         self.phase = Phase.PREPARING
         self._own_mode = facts.mode if facts.armed else None
-        self._asked_mode = None
-        self._arms, self._was_ready = not facts.armed, False
+        self._preparation.begin(facts)
+        self._was_ready = False
         self._prepare_timeout_ns, self._prepare_until_ns = timeout_ns, facts.now_ns + timeout_ns
         self._seen_interruption = facts.interruption
         return self._prepare(facts, None)
 
-    def _wanted_mode(self, facts: Facts) -> str | None:
-        """Mode to ask for; None if the present one will do."""
-        wanted = self._settings.mode
-        if wanted is None and facts.mode not in self._settings.modes:
-            known = [mode for mode in self._settings.modes if mode in facts.modes.names]
-            wanted = known[0] if known else self._settings.modes[0]
-        return None if wanted == facts.mode else wanted
-
     def _prepare(self, facts: Facts, act: Act | None) -> Move:
         if self._stop_reason is not None or act == "release":
             return self._depart(facts, self._stop_reason or Ending(reason=OPERATOR))
-        wanted = self._wanted_mode(facts)
-        if facts.mode == self._asked_mode or (wanted is None and self._own_mode is None):
+        is_first_mode = self._own_mode is None and self._preparation.wanted_mode(facts) is None
+        if is_first_mode or self._preparation.is_own_mode(facts):
             self._own_mode = facts.mode
         taken = self._takeover(facts)
         if taken is None and self._was_ready and not facts.armed:
@@ -237,31 +222,17 @@ class Engagement:
             return self._give_back(facts, taken)
         self._was_ready = facts.armed
         is_late = facts.now_ns > self._prepare_until_ns
-        if is_late or self._impossibility(facts) is not None:
+        if is_late or self._preparation.impossibility(facts) is not None:
             return self._give_up_preparing(facts)
-        objection = self._objection(facts)
-        if facts.armed and wanted is None and objection is None:
+        preparing = self._preparation.step(facts, self._objection(facts))
+        if not preparing.waits_for:
             return self._take_off(facts)
-        # Somebody who has armed it keeps the sticks until the policy takes them.
-        hand = Hand.IDLE if self._arms and facts.link_problem is None else None
-        self.reason = objection or f"waiting for {wanted or 'the vehicle to arm'}"
-        is_ready = facts.armed or facts.echo_confirmed
-        if objection is not None or not is_ready or facts.now_ns < self._request_due_ns:
-            return Move(hand=hand)
-        self._request_due_ns = facts.now_ns + REQUEST_SPACING_NS
-        self._asked_mode = wanted
-        return Move(hand=hand, mode=wanted, arm=wanted is None)
-
-    def _impossibility(self, facts: Facts) -> str | None:
-        """Why waiting will not help, or None."""
-        wanted = self._wanted_mode(facts)
-        if wanted is None or not facts.modes.names or wanted in facts.modes.names:
-            return facts.slowness
-        return f"this vehicle has no mode {wanted}, it has {', '.join(facts.modes.names)}"
+        self.reason = preparing.waits_for
+        return preparing.move
 
     def _give_up_preparing(self, facts: Facts) -> Move:
         """The vehicle, or an input, was not ready in time."""
-        problem = self._impossibility(facts) or (
+        problem = self._preparation.impossibility(facts) or (
             f"the vehicle is not ready after {self._prepare_timeout_ns // NS_PER_S} s "
             f"(mode {facts.mode}, armed {facts.armed}, overrides seen {facts.echo_confirmed}, "
             f"inputs {facts.chunk_problem or 'fine'}): see its messages above"
@@ -328,7 +299,7 @@ class Engagement:
 
     def _give_back(self, facts: Facts, reason: str) -> Move:
         """Somebody took over: release in this same step, and no mode command."""
-        had_sticks = self.phase is not Phase.PREPARING or self._arms
+        had_sticks = self.phase is not Phase.PREPARING or self._preparation.arms
         self.phase = Phase.RELEASING
         self.reason = reason
         self._released_ns = facts.now_ns
@@ -337,7 +308,7 @@ class Engagement:
 
     def _depart(self, facts: Facts, ending: Ending) -> Move:
         """Our own fault or end: neutral, a safe mode, then the release."""
-        if self.phase is Phase.PREPARING and not (self._arms and facts.armed):
+        if self.phase is Phase.PREPARING and not (self._preparation.arms and facts.armed):
             return self._give_back(facts, ending.reason)  # we never had the sticks in the air
         self.phase = Phase.LEAVING
         self.reason = ending.reason

@@ -10,10 +10,10 @@ class Hand(Enum):
     """Who moves the sticks that we send."""
 
     IDLE = "idle"
-    """Throttle down, the rest centred: what arming demands."""
+    """Throttle down, the rest centred: what arming demands; or a setpoint that stays down."""
     POLICY = "policy"
     NEUTRAL = "neutral"
-    """All centred: level, and where the mode holds height, at this height."""
+    """All centred: level, and where the mode holds height, at this height; a setpoint at rest."""
     LEVEL = "level"
     """All but the throttle centred: where the throttle is thrust, its last value stays."""
     RELEASE = "release"
@@ -45,6 +45,9 @@ class Facts:
     """Sticks of the receiver, as last seen while we sent none."""
     rc_channels_us: tuple[int, ...]
     is_position_valid: bool
+    height_m: float | None
+    """Above the estimator's origin; None without a valid position."""
+    is_landed: bool | None
     echo_confirmed: bool
     is_released: bool
     refused_mode: str | None
@@ -72,3 +75,5 @@ class Move:
     """Flight mode to request now."""
     arm: bool = False
     """Request to arm now."""
+    takeoff_m: float | None = None
+    """Request to climb to this height now, by the autopilot's own means."""

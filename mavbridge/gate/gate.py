@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import (
-    IDLE,
-    NEUTRAL,
+    Action,
+    ActionMeaning,
     ActionTrace,
     Command,
     Decision,
     LinkSnapshot,
+    Output,
     Release,
     Sticks,
 )
@@ -23,7 +24,8 @@ from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
 from mavbridge.gate.envelope import Envelope, EnvelopeInput, EnvelopeLimits
 from mavbridge.gate.facts import Facts, Hand, Move
 from mavbridge.gate.grid import Slot, StickGrid
-from mavbridge.gate.smoothing import Smoothing, StickSmoother
+from mavbridge.gate.limits import first_action, idle_action, neutral_action
+from mavbridge.gate.smoothing import ActionSmoother, Smoothing
 
 PILOT_FRESH_NS = 500 * NS_PER_MS
 """Oldest RC_CHANNELS that still tells where the pilot's sticks are."""
@@ -33,6 +35,9 @@ PILOT_FRESH_NS = 500 * NS_PER_MS
 class FlightSettings:
     """Settings of a flight, known once its policy is loaded."""
 
+    meaning: ActionMeaning
+    output: Output | None = None
+    """Message that carries the actions; None = the usual one of their kind and the vehicle."""
     stick_period_ns: int
     chunk_period_ns: int
     """Between the policy's chunks."""
@@ -72,6 +77,8 @@ class GateOutput:
     mode: str | None
     """Flight mode to request."""
     arm: bool
+    takeoff_m: float | None
+    """Height to which the autopilot is to climb by its own means, to request."""
     messages: tuple[str, ...]
     """For the user."""
 
@@ -81,15 +88,17 @@ class Gate:
 
     def __init__(self, settings: FlightSettings, now_ns: int) -> None:
         self._chunks = ChunkBuffer(settings.freshness, period_ns=settings.chunk_period_ns)
-        self._smoother = StickSmoother(settings.smoothing)
+        self._meaning = settings.meaning
+        self._neutral, self._idle = neutral_action(self._meaning), idle_action(self._meaning)
+        self._smoother = ActionSmoother(settings.smoothing, self._neutral)
         self._lead_ns = round(settings.smoothing.tau_s * NS_PER_S)
         """A chunk is sampled this far ahead of the send: the lag of our own low-pass."""
         self._envelope = Envelope(settings.envelope)
         self._engagement = Engagement(settings.engagement)
         self._grid = StickGrid(settings.stick_period_ns, now_ns)
         self._hand: Hand | None = None
-        self._last: Sticks = NEUTRAL
-        """The sticks as last sent."""
+        self._last = self._neutral
+        """As last sent."""
         self._messages: list[str] = []
 
     @property
@@ -138,6 +147,7 @@ class Gate:
             reason=self._engagement.reason,
             mode=move.mode,
             arm=move.arm,
+            takeoff_m=move.takeoff_m,
             messages=self._take_messages(),
         )
 
@@ -160,6 +170,8 @@ class Gate:
             pilot_sticks=status.pilot_sticks if status else None,
             rc_channels_us=status.rc_channels_us if status else (),
             is_position_valid=status is not None and status.is_position_valid is not False,
+            height_m=-status.position_ned_m[2] if status and status.position_ned_m else None,
+            is_landed=status.is_landed if status else None,
             echo_confirmed=link.echo_confirmed,
             is_released=link.is_released,
             shows_last=link.shows_last,
@@ -178,13 +190,15 @@ class Gate:
             return
         self._envelope.reset()
         self._messages += self._envelope.unwatched
-        start, status = NEUTRAL, link.status
+        status = link.status
         if before is Hand.IDLE:
-            start = IDLE
-        elif status is not None and status.pilot_sticks and status.rc_arrived_ns is not None:
+            self._smoother.reset(self._idle)
+            return
+        pilot: Sticks | None = None
+        if status is not None and status.rc_arrived_ns is not None:
             is_fresh = now_ns - status.rc_arrived_ns <= PILOT_FRESH_NS
-            start = status.pilot_sticks if is_fresh else NEUTRAL
-        self._smoother.reset(start)
+            pilot = status.pilot_sticks if is_fresh and before is None else None
+        self._smoother.reset(first_action(self._meaning, link.telemetry, pilot))
 
     def _decide(
         self, move: Move, now_ns: int, *, is_thrust: bool
@@ -193,27 +207,40 @@ class Gate:
 
         ``is_thrust`` says that the throttle stick is thrust in the present mode.
         """
+        action: Action
         match move.hand:
             case None:
                 return None, None
             case Hand.RELEASE:
                 return Release(self._engagement.reason), None
             case Hand.IDLE:
-                sticks = IDLE
+                action = self._idle
             case Hand.NEUTRAL:
-                sticks = NEUTRAL
+                action = self._neutral
+                if self._meaning.kind == "velocity":  # braked within the limits, not at once
+                    action = self._smoother.step(action, now_ns).smoothed
             case Hand.LEVEL:
-                sticks = NEUTRAL._replace(throttle=self._last.throttle)
+                action = self._level(is_thrust=True)
             case Hand.POLICY:
+                raw = self._chunks.action_at(now_ns + self._lead_ns)
                 # Beyond the horizon level sticks bridge the rest of the grace.
-                level = NEUTRAL._replace(throttle=self._last.throttle if is_thrust else 0.0)
-                raw = self._chunks.action_at(now_ns + self._lead_ns) or level
-                trace = self._smoother.step(raw, now_ns)
-                assert isinstance(trace.smoothed, Sticks)
+                level = self._level(is_thrust=is_thrust)
+                if raw is None and self._meaning.kind == "rates":
+                    return Command(
+                        action=level
+                    ), None  # an attitude, which has no place among rates
+                trace = self._smoother.step(raw or level, now_ns)
                 self._last = trace.smoothed
                 return Command(action=trace.smoothed), trace
-        self._last = sticks
-        return Command(action=sticks), None
+        self._last = action
+        return Command(action=action), None
+
+    def _level(self, *, is_thrust: bool) -> Action:
+        """Neutral, with the last throttle where that is thrust."""
+        neutral, last = self._neutral, self._last
+        if isinstance(neutral, Sticks) and isinstance(last, Sticks) and is_thrust:
+            return neutral._replace(throttle=last.throttle)
+        return neutral
 
     def _take_messages(self) -> tuple[str, ...]:
         refusal, self._engagement.refusal = self._engagement.refusal, None

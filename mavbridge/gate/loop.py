@@ -6,11 +6,13 @@ from typing import Protocol
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.vehicle import (
+    Action,
+    ActionMeaning,
     Decision,
     ForwardedPacket,
     LinkSnapshot,
+    Output,
     Release,
-    Sticks,
 )
 from mavbridge.gate.channel import Port
 from mavbridge.gate.chunks import Chunk
@@ -63,14 +65,20 @@ class GateLink(Protocol):
     def service(self) -> None:
         """Send what is due besides sticks; called after them."""
 
-    def send(self, decision: Decision) -> Sticks | None:
-        """Send the decision; returns the sticks as rounded and sent, None when released."""
+    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
+        """Choose the message that carries such actions; raises PeerError where none can."""
+
+    def send(self, decision: Decision) -> Action | None:
+        """Send the decision; returns the action as rounded and sent, None when released."""
 
     def set_mode(self, mode: str) -> None:
         """Ask for a flight mode."""
 
     def arm(self) -> None:
         """Ask to arm."""
+
+    def takeoff(self, height_m: float) -> None:
+        """Ask the autopilot to climb to this height above the ground by its own means."""
 
     def announce(self, text: str) -> None:
         """Tell every ground station."""
@@ -159,18 +167,24 @@ class GateLoop:
         sent = None if output.decision is None else self._link.send(output.decision)
         if output.slot is not None or output.decision is not None or output.phase != self._phase:
             self._report_tick(output, woke_ns, sent)
-        if output.mode is not None:
-            self._link.set_mode(output.mode)
-        if output.arm:
-            self._link.arm()
-        for text in output.messages:
-            self._flight.send(encode_from_gate(GateMessage(text)))
+        self._follow(output)
         if output.phase is not self._phase:
             self._change_phase(output)
         self._link.service()
         if output.phase is Phase.ENDED:
             self._finish(woke_ns)
         return self._gate.next_ns - self._lead_ns
+
+    def _follow(self, output: GateOutput) -> None:
+        """Send the requests, and show the messages."""
+        if output.mode is not None:
+            self._link.set_mode(output.mode)
+        if output.arm:
+            self._link.arm()
+        if output.takeoff_m is not None:
+            self._link.takeoff(output.takeoff_m)
+        for text in output.messages:
+            self._flight.send(encode_from_gate(GateMessage(text)))
 
     def _finish(self, now_ns: int) -> None:
         """Put the vehicle's parameters back, and send what is owed, for a bounded time."""
@@ -217,6 +231,7 @@ class GateLoop:
                     pass
                 case FlightSettings() as settings if self._gate is None:
                     self._gate = Gate(settings, self._clock.now_ns())
+                    self._link.begin_flight(settings.meaning, settings.output)
                 case Ending() as ending:
                     self.stop(ending)
                 case "engage" | "release" as new:
@@ -227,7 +242,7 @@ class GateLoop:
             self.stop(Ending(reason="the flight process has died", is_fault=True))
         return GateInput(link=snapshot, chunk=chunk, absence=absence, act=act, stop=self._stop)
 
-    def _report_tick(self, output: GateOutput, woke_ns: int, sent: Sticks | None) -> None:
+    def _report_tick(self, output: GateOutput, woke_ns: int, sent: Action | None) -> None:
         now_ns, slot = self._clock.now_ns(), output.slot
         tick = GateTick(
             index=slot.index if slot else -1,

@@ -11,17 +11,26 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
-from mavbridge.core.vehicle import ActionTrace, ForwardedPacket, LinkStats, Percentiles, Sticks
+from mavbridge.core.vehicle import (
+    ACTION_CLASSES,
+    Action,
+    ActionTrace,
+    ForwardedPacket,
+    LinkStats,
+    Percentiles,
+    Sticks,
+)
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Phase
 from mavbridge.gate.gate import FlightSettings
 from mavbridge.gate.settings import GateSettings
 
-_CHUNK = struct.Struct("<cqqqqqqqH")
-_TICK = struct.Struct("<cqqqqqB?iB20d")
+_CHUNK = struct.Struct("<cBqqqqqqqH")
+_TICK = struct.Struct("<cqqqqqB?iBBB20d")
 _PACKET = struct.Struct("<qqH")
 _PHASES = tuple(Phase)
+_CLASSES = tuple(ACTION_CLASSES.values())
 _IS_SLOT, _IS_COASTING, _HAS_TRACE, _HAS_SENT = 1, 2, 4, 8
 _NOTHING = (0.0,) * 4
 _MALFORMED = (
@@ -45,8 +54,8 @@ class GateTick:
     is_coasting: bool
     chunk_serial: int | None
     trace: ActionTrace | None
-    sent: Sticks | None
-    """Sticks as sent; None when released, or when nothing was sent."""
+    sent: Action | None
+    """As sent; None when released, or when nothing was sent."""
     phase: Phase
     reason: str
     """Why the policy does not fly; empty while it does."""
@@ -109,7 +118,8 @@ def encode_to_gate(message: ToGate) -> bytes:
             stamps = message[:7]
             count = len(message.actions)
             values = [value for action in message.actions for value in action]
-            return _CHUNK.pack(b"C", *stamps, count) + struct.pack(f"<{4 * count}d", *values)
+            kind = _class_index(message.actions[0]) if count else 0
+            return _CHUNK.pack(b"C", kind, *stamps, count) + struct.pack(f"<{4 * count}d", *values)
         case Absence(reason):
             return b"N" + reason.encode()
         case GateSettings() | FlightSettings():
@@ -147,10 +157,15 @@ def _decode_to_gate(data: bytes) -> ToGate:
     raise ValueError("unknown kind")
 
 
+def _class_index(action: Action) -> int:
+    return _CLASSES.index(type(action))
+
+
 def _decode_chunk(data: bytes) -> Chunk:
-    _, serial, attitude_ns, velocity_ns, image_ns, computed_ns, first_ns, step_ns, count = (
+    _, kind, serial, attitude_ns, velocity_ns, image_ns, computed_ns, first_ns, step_ns, count = (
         _CHUNK.unpack_from(data)
     )
+    make = _CLASSES[kind]
     values = struct.unpack(f"<{4 * count}d", data[_CHUNK.size :])
     return Chunk(
         serial=serial,
@@ -160,7 +175,7 @@ def _decode_chunk(data: bytes) -> Chunk:
         computed_ns=computed_ns,
         first_ns=first_ns,
         step_ns=step_ns,
-        actions=tuple(Sticks(*values[4 * k : 4 * k + 4]) for k in range(count)),
+        actions=tuple(make(*values[4 * k : 4 * k + 4]) for k in range(count)),
     )
 
 
@@ -181,6 +196,8 @@ def encode_tick(tick: GateTick) -> bytes:
         *(tick.index, tick.due_ns, tick.woke_ns, tick.sent_ns),
         *(0 if serial is None else serial, flags, serial is not None, tick.missed_slots),
         _PHASES.index(tick.phase),
+        0 if trace is None else _class_index(trace.raw),
+        0 if tick.sent is None else _class_index(tick.sent),
         *stages,
         *(tick.sent or _NOTHING),
     )
@@ -188,11 +205,14 @@ def encode_tick(tick: GateTick) -> bytes:
 
 
 def _decode_tick(data: bytes) -> GateTick:
-    _, index, due_ns, woke_ns, sent_ns, serial, flags, has_chunk, missed, phase, *values = (
-        _TICK.unpack_from(data)
+    _, index, due_ns, woke_ns, sent_ns, serial, flags, has_chunk, missed, *rest = _TICK.unpack_from(
+        data
     )
-    raw, clipped, slewed, smoothed, sent = (Sticks(*values[4 * k : 4 * k + 4]) for k in range(5))
+    phase, traced, sent_kind, *values = rest
+    fours = [values[4 * k : 4 * k + 4] for k in range(5)]
+    raw, clipped, slewed, smoothed = (_CLASSES[traced](*four) for four in fours[:4])
     trace = ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
+    sent = _CLASSES[sent_kind](*fours[4])
     return GateTick(
         index=index,
         due_ns=due_ns,

@@ -7,10 +7,12 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import (
+    ActionMeaning,
     Decision,
     ForwardedPacket,
     LinkSnapshot,
     LinkStats,
+    Output,
     Release,
     Sticks,
     Telemetry,
@@ -294,6 +296,12 @@ class MavlinkLink:
         if request is None or self._vehicle is None or self._config.readonly:
             return
         self._transmit(self._codec.encode_request(self._vehicle.identity.source, request))
+
+    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
+        """Choose the message that carries such actions."""
+
+    def takeoff(self, height_m: float) -> None:
+        """Ask the autopilot to climb to this height above the ground by its own means."""
 
     def announce(self, text: str, *, is_warning: bool = False) -> None:
         """Send a STATUSTEXT, for a pilot who sees only a ground station; read-only, say nothing."""

@@ -9,7 +9,8 @@ from typing import Literal
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.records import Event, Tick
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.vehicle import Action
+from policy.contract import ACTION_DIM
 from sitl.simulated_vehicle import SimulatedVehicle
 
 READY_NS = 30 * NS_PER_S
@@ -62,7 +63,7 @@ class StickMeter:
 
     def __init__(self) -> None:
         self.engaged_ns: int | None = None
-        self._last: tuple[int, Sticks] | None = None
+        self._last: tuple[int, Action] | None = None
         self._travel = 0.0
         self._moved_ns = 0
 
@@ -87,7 +88,7 @@ class StickMeter:
         """Mean over the sticks of |change| per second; None before two actions in a row."""
         if not self._moved_ns:
             return None
-        return self._travel / len(Sticks._fields) / (self._moved_ns / NS_PER_S)
+        return self._travel / ACTION_DIM / (self._moved_ns / NS_PER_S)
 
 
 class EpisodeInterruptedError(MavbridgeError):

@@ -12,14 +12,16 @@ from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.records import Event, Tick, VisionTick
 from mavbridge.core.vehicle import (
     NEUTRAL,
+    Action,
+    ActionMeaning,
     Command,
     Decision,
     ForwardedPacket,
     LinkSnapshot,
     LinkStats,
+    Output,
     Reading,
     Release,
-    Sticks,
     Telemetry,
     VehicleStatus,
 )
@@ -173,7 +175,13 @@ class FakeLink:
             texts=texts,
         )
 
-    def send(self, decision: Decision) -> Sticks | None:
+    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
+        self.meaning = meaning
+
+    def takeoff(self, height_m: float) -> None:
+        self.requests.append(f"takeoff {height_m:g}")
+
+    def send(self, decision: Decision) -> Action | None:
         self.on_send()
         self.decisions.append((self._clock.now_ns(), decision))
         return None if isinstance(decision, Release) else decision.action

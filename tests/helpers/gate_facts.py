@@ -8,6 +8,9 @@ from mavbridge.core.vehicle import NEUTRAL, ModeRoles
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
 from mavbridge.gate.facts import Facts, Move
+from mavbridge.gate.limits import LimitSettings
+from mavbridge.gate.preparation import PreparationSettings
+from mavbridge.gate.smoothing import Smoothing
 
 MODES = ("ALT_HOLD", "ALTCTL")
 COPTER_MODES = ModeRoles(
@@ -15,7 +18,7 @@ COPTER_MODES = ModeRoles(
     hold="BRAKE",
     land="LAND",
     rtl="RTL",
-    takeoff="GUIDED",
+    takeoff=("GUIDED",),
     thrust=("STABILIZE", "ACRO"),
     setpoint=("GUIDED", "GUIDED_NOGPS"),
 )
@@ -24,7 +27,7 @@ PX4_MODES = ModeRoles(
     hold="AUTO.LOITER",
     land="AUTO.LAND",
     rtl="AUTO.RTL",
-    takeoff="AUTO.TAKEOFF",
+    takeoff=("AUTO.LOITER", "AUTO.TAKEOFF"),
     thrust=("MANUAL", "STABILIZED", "ACRO"),
     setpoint=("OFFBOARD",),
     needs_setpoints_first=True,
@@ -47,6 +50,8 @@ AIRBORNE = Facts(
     pilot_sticks=NEUTRAL,
     rc_channels_us=(1500,) * 8,
     is_position_valid=True,
+    height_m=10.0,
+    is_landed=False,
     echo_confirmed=True,
     is_released=False,
     refused_mode=None,
@@ -55,18 +60,34 @@ AIRBORNE = Facts(
     envelope_problem=None,
 )
 """Armed in ALT_HOLD, in the air, with a receiver in the middle and a policy within its limits."""
-ON_GROUND = replace(AIRBORNE, armed=False, echo_confirmed=False)
+ON_GROUND = replace(AIRBORNE, armed=False, echo_confirmed=False, height_m=0.0, is_landed=True)
+
+
+def stick_smoothing(
+    *, max_slew_per_s: float = 0.0, tau_s: float = 0.0, max_dt_s: float = 0.15
+) -> Smoothing:
+    """Filter of sticks; without arguments it changes nothing."""
+    limits = LimitSettings(stick_slew_per_s=max_slew_per_s).of("sticks")
+    return Smoothing(limits=limits, tau_s=tau_s, max_dt_s=max_dt_s)
+
+
+def engagement_settings(**settings: Any) -> EngagementSettings:
+    """Settings of the engagement, those of the way in among them; modes are ``MODES``."""
+    ways_in = ("modes", "mode", "takeoff_m", "is_setpoint")
+    preparation = {name: settings.pop(name) for name in ways_in if name in settings}
+    departure = settings.pop("departure", DepartureSettings())
+    return EngagementSettings(
+        preparation=PreparationSettings(**{"modes": MODES, **preparation}),
+        departure=departure,
+        **settings,
+    )
 
 
 class Stepped:
     """An engagement, its facts, and everything that it decided."""
 
     def __init__(self, facts: Facts = AIRBORNE, **settings: Any) -> None:
-        departure = settings.pop("departure", DepartureSettings())
-        modes = settings.pop("modes", MODES)
-        self.engagement = Engagement(
-            EngagementSettings(modes=modes, departure=departure, **settings)
-        )
+        self.engagement = Engagement(engagement_settings(**settings))
         self.facts = facts
         self.moves: list[Move] = []
 

@@ -19,7 +19,7 @@ QUARTER = Command(action=Sticks(0.25, 0.25, 0.25, 0.25))
 
 
 def sticks_of(decisions: list[Decision]) -> list[Sticks | None]:
-    return [one.sticks if isinstance(one, Command) else None for one in decisions]
+    return [one.action if isinstance(one, Command) else None for one in decisions]
 
 
 # --- losing the inputs

@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.gate_facts import stick_smoothing
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import NEUTRAL, Sticks
-from mavbridge.gate.smoothing import Smoothing, StickSmoother
+from mavbridge.gate.smoothing import ActionSmoother
 
-SETTINGS = Smoothing(max_slew_per_s=8.0, tau_s=0.05)
+SLEW_PER_S = 8.0
+SETTINGS = stick_smoothing(max_slew_per_s=SLEW_PER_S, tau_s=0.05)
 DURATION_S = 2.0
 
 
@@ -21,7 +23,7 @@ def policy(t_s: float, amplitude: float, frequency_hz: float, offset: float) -> 
 
 
 def trace(times_s: np.ndarray, amplitude: float, frequency_hz: float, offset: float) -> np.ndarray:
-    smoother = StickSmoother(SETTINGS)
+    smoother = ActionSmoother(SETTINGS, NEUTRAL)
     smoother.reset(NEUTRAL)
     out = []
     for t_s in times_s:
@@ -80,7 +82,7 @@ def test_at_the_limits_the_rate_shows_by_less_than_one_tick_of_slew(
     swing: tuple[float, float, float], rate_hz: int, jitter: float, seed: int
 ) -> None:
     # Where between two ticks the input met the clip or the slew limit cannot be known.
-    assert errors(swing, rate_hz, jitter, seed).max() < SETTINGS.max_slew_per_s / rate_hz
+    assert errors(swing, rate_hz, jitter, seed).max() < SLEW_PER_S / rate_hz
 
 
 @settings(max_examples=100, deadline=None)
@@ -91,13 +93,13 @@ def test_at_the_limits_the_rate_shows_by_less_than_one_tick_of_slew(
 def test_sticks_stay_in_range_and_under_the_slew_limit(
     wanted: list[tuple[float, float, float, float]], gaps_ms: list[float]
 ) -> None:
-    smoother = StickSmoother(SETTINGS)
+    smoother = ActionSmoother(SETTINGS, NEUTRAL)
     smoother.reset(NEUTRAL)
     now_ns, last, last_ns = 0, NEUTRAL, 0
     for raw, gap_ms in zip(wanted, gaps_ms, strict=False):
         now_ns += round(gap_ms * 1e6)
         out = smoother.step(Sticks(*raw), now_ns).smoothed
-        reach = SETTINGS.max_slew_per_s * (now_ns - last_ns) / NS_PER_S
+        reach = SLEW_PER_S * (now_ns - last_ns) / NS_PER_S
         for before, after in zip(last, out, strict=True):
             assert -1.0 <= after <= 1.0
             assert abs(after - before) <= reach + 1e-9
@@ -105,7 +107,7 @@ def test_sticks_stay_in_range_and_under_the_slew_limit(
 
 
 def test_a_step_reaches_63_percent_after_tau() -> None:
-    smoother = StickSmoother(Smoothing(max_slew_per_s=0.0, tau_s=0.1, max_dt_s=0.2))
+    smoother = ActionSmoother(stick_smoothing(max_slew_per_s=0.0, tau_s=0.1, max_dt_s=0.2), NEUTRAL)
     smoother.reset(NEUTRAL)
     one = Sticks(1.0, 0.0, 0.0, 0.0)
     smoother.step(one, 0)
@@ -115,7 +117,9 @@ def test_a_step_reaches_63_percent_after_tau() -> None:
 
 
 def test_a_reset_starts_from_the_given_sticks_and_a_stall_does_not_jump() -> None:
-    smoother = StickSmoother(Smoothing(max_slew_per_s=8.0, tau_s=0.0, max_dt_s=0.03))
+    smoother = ActionSmoother(
+        stick_smoothing(max_slew_per_s=8.0, tau_s=0.0, max_dt_s=0.03), NEUTRAL
+    )
     start = Sticks(0.4, 0.0, 0.0, -0.2)
     smoother.reset(start)
     assert smoother.step(NEUTRAL, 10**9).smoothed == start
@@ -125,7 +129,7 @@ def test_a_reset_starts_from_the_given_sticks_and_a_stall_does_not_jump() -> Non
 
 @pytest.mark.parametrize("rate_hz", [10, 16, 50, 100, 200])
 def test_the_slew_is_the_same_for_a_policy_that_cannot_keep_up(rate_hz: int) -> None:
-    smoother = StickSmoother(Smoothing(max_slew_per_s=2.0, tau_s=0.0))
+    smoother = ActionSmoother(stick_smoothing(max_slew_per_s=2.0, tau_s=0.0), NEUTRAL)
     smoother.reset(NEUTRAL)
     full = Sticks(1.0, 0.0, 0.0, 0.0)
     for tick in range(round(0.4 * rate_hz) + 1):
@@ -134,7 +138,9 @@ def test_the_slew_is_the_same_for_a_policy_that_cannot_keep_up(rate_hz: int) -> 
 
 
 def test_stages_can_be_switched_off() -> None:
-    smoother = StickSmoother(Smoothing(max_slew_per_s=0.0, tau_s=0.0, max_dt_s=0.03))
+    smoother = ActionSmoother(
+        stick_smoothing(max_slew_per_s=0.0, tau_s=0.0, max_dt_s=0.03), NEUTRAL
+    )
     smoother.reset(NEUTRAL)
     trace_ = smoother.step(Sticks(2.0, -0.5, 0.25, 0.0), 0)
     assert trace_.raw == (2.0, -0.5, 0.25, 0.0)

@@ -38,7 +38,7 @@ class ModeTable:
                 hold="AUTO.LOITER",
                 land="AUTO.LAND",
                 rtl="AUTO.RTL",
-                takeoff="AUTO.TAKEOFF",
+                takeoff=("AUTO.LOITER", "AUTO.TAKEOFF"),
                 thrust=("MANUAL", "STABILIZED", "ACRO"),
                 setpoint=("OFFBOARD",),
                 needs_setpoints_first=True,
@@ -49,7 +49,7 @@ class ModeTable:
             hold="BRAKE",
             land="LAND",
             rtl="RTL",
-            takeoff="GUIDED",
+            takeoff=("GUIDED",),
             thrust=("STABILIZE", "ACRO"),
             setpoint=("GUIDED", "GUIDED_NOGPS"),
         )

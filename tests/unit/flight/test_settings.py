@@ -12,6 +12,7 @@ from mavbridge.flight.settings import flight_settings, gate_settings
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import EngagementSettings
 from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.preparation import PreparationSettings
 from policy.contract import Contract, Executable
 
 LINK = LinkConfig(connect="udp:127.0.0.1:14550")
@@ -72,7 +73,7 @@ def test_ages_are_those_of_the_contract_and_a_flag_may_tighten_them() -> None:
 
 def test_smoothing_is_that_of_the_flags() -> None:
     smoothing = settings_for(FlyConfig(link=LINK, limits=Limits(tau=0.1, max_slew=3.0))).smoothing
-    assert (smoothing.tau_s, smoothing.max_slew_per_s) == (0.1, 3.0)
+    assert (smoothing.tau_s, smoothing.limits.change_per_s) == (0.1, (3.0,) * 4)
 
 
 @pytest.mark.parametrize(
@@ -111,8 +112,7 @@ def test_engaging_and_leaving_follow_the_flags() -> None:
         duration=1.5,
     )
     assert settings_for(config).engagement == EngagementSettings(
-        modes=("ALT_HOLD", "ALTCTL"),
-        mode="ALTCTL",
+        preparation=PreparationSettings(modes=("ALT_HOLD", "ALTCTL"), mode="ALTCTL"),
         arm=True,
         engage_channel=8,
         engage_on_arm=True,

@@ -6,11 +6,12 @@ from typing import Any
 import pytest
 
 from helpers.fakes import AIRBORNE_STATUS, START_NS
-from helpers.gate_facts import COPTER_MODES
+from helpers.gate_facts import COPTER_MODES, engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
+    ActionMeaning,
     Command,
     Decision,
     LinkSnapshot,
@@ -20,7 +21,7 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.gate.chunks import Chunk, FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings, Ending
-from mavbridge.gate.engagement import Act, EngagementSettings, Phase
+from mavbridge.gate.engagement import Act, Phase
 from mavbridge.gate.envelope import EnvelopeLimits
 from mavbridge.gate.gate import FlightSettings, Gate, GateInput, GateOutput
 from mavbridge.gate.smoothing import Smoothing
@@ -42,14 +43,15 @@ class Stepped:
         status: dict[str, Any] | None = None,
         **rules: Any,
     ) -> None:
-        engagement = EngagementSettings(
+        engagement = engagement_settings(
             **({"modes": ("ALT_HOLD",), "departure": DepartureSettings()} | rules)
         )
         settings = FlightSettings(
+            meaning=ActionMeaning(),
             stick_period_ns=10 * MS,
             chunk_period_ns=10 * MS,
             freshness=AGES,
-            smoothing=smoothing or Smoothing(max_slew_per_s=0.0, tau_s=0.0),
+            smoothing=smoothing or stick_smoothing(),
             envelope=EnvelopeLimits(),
             engagement=engagement,
         )
@@ -185,7 +187,7 @@ def test_the_next_step_is_due_at_the_next_slot() -> None:
 
 # --- from where
 
-SLOW = Smoothing(max_slew_per_s=1.0, tau_s=0.0)
+SLOW = stick_smoothing(max_slew_per_s=1.0, tau_s=0.0)
 PILOT = Sticks(0.1, 0.0, -0.3, 0.05)
 ECHO = Sticks(0.9, 0.9, 0.9, 0.9)
 

@@ -4,29 +4,38 @@ import pytest
 
 from helpers.factories import START_NS
 from helpers.fakes import FakeClock
+from helpers.gate_facts import engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import Decision, LinkSnapshot, Sticks, Telemetry, VehicleStatus
+from mavbridge.core.vehicle import (
+    Action,
+    ActionMeaning,
+    Decision,
+    LinkSnapshot,
+    Output,
+    Sticks,
+    Telemetry,
+    VehicleStatus,
+)
 from mavbridge.gate.chunks import Chunk, FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings
-from mavbridge.gate.engagement import EngagementSettings
 from mavbridge.gate.envelope import EnvelopeLimits
 from mavbridge.gate.gate import FlightSettings
 from mavbridge.gate.loop import GateLoop
-from mavbridge.gate.smoothing import Smoothing
 from mavbridge.gate.wire import encode_to_gate
 
 PERIOD_NS = 10 * NS_PER_MS
 LEAD_NS = NS_PER_MS
 DAY_NS = 86_400_000 * NS_PER_MS
 FLIGHT = FlightSettings(
+    meaning=ActionMeaning(),
     stick_period_ns=PERIOD_NS,
     chunk_period_ns=DAY_NS,  # one chunk is enough
     freshness=FreshnessLimits(
         state_ns=DAY_NS, velocity_ns=DAY_NS, feature_ns=DAY_NS, chunk_ns=DAY_NS
     ),
-    smoothing=Smoothing(max_slew_per_s=0.0, tau_s=0.0),
+    smoothing=stick_smoothing(),
     envelope=EnvelopeLimits(),
-    engagement=EngagementSettings(modes=("ALT_HOLD",), departure=DepartureSettings()),
+    engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings()),
 )
 
 
@@ -46,7 +55,10 @@ class ReadyVehicle:
         status = VehicleStatus(mode="ALT_HOLD", armed=True)
         return LinkSnapshot(telemetry=Telemetry(), status=status, problem=None)
 
-    def send(self, _decision: Decision) -> Sticks | None:
+    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
+        pass
+
+    def send(self, _decision: Decision) -> Action | None:
         self.sent_ns.append(self._clock.now_ns())
         return None
 

@@ -6,16 +6,16 @@ from typing import Any
 import pytest
 
 from helpers.fakes import START_NS, FakeClock, FakeLink
+from helpers.gate_facts import engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Release, Sticks
+from mavbridge.core.vehicle import IDLE, NEUTRAL, ActionMeaning, Command, Release, Sticks
 from mavbridge.gate.chunks import Chunk, FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings, Ending
-from mavbridge.gate.engagement import EngagementSettings, Phase
+from mavbridge.gate.engagement import Phase
 from mavbridge.gate.envelope import EnvelopeLimits
 from mavbridge.gate.gate import FlightSettings
 from mavbridge.gate.loop import FINISH_NS, IDLE_PERIOD_NS, GateLoop
 from mavbridge.gate.settings import GateSettings
-from mavbridge.gate.smoothing import Smoothing
 from mavbridge.gate.wire import (
     Absence,
     FromGate,
@@ -31,14 +31,15 @@ from mavbridge.mavlink.settings import LinkSettings
 MS = NS_PER_MS
 WANTED = Sticks(0.4, 0.1, -0.2, 0.3)
 FLIGHT = FlightSettings(
+    meaning=ActionMeaning(),
     stick_period_ns=10 * MS,
     chunk_period_ns=10 * MS,
     freshness=FreshnessLimits(
         state_ns=300 * MS, velocity_ns=300 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
     ),
-    smoothing=Smoothing(max_slew_per_s=0.0, tau_s=0.0),
+    smoothing=stick_smoothing(),
     envelope=EnvelopeLimits(),
-    engagement=EngagementSettings(modes=("ALT_HOLD",), departure=DepartureSettings()),
+    engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings()),
 )
 
 

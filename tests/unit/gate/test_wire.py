@@ -9,14 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavbridge.core.vehicle import ActionTrace, ForwardedPacket, LinkStats, Percentiles, Sticks
+from helpers.gate_facts import engagement_settings, stick_smoothing
+from mavbridge.core.vehicle import (
+    ActionMeaning,
+    ActionTrace,
+    ForwardedPacket,
+    LinkStats,
+    Percentiles,
+    Sticks,
+)
 from mavbridge.gate.chunks import Chunk, FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings, Ending
-from mavbridge.gate.engagement import EngagementSettings, Phase
+from mavbridge.gate.engagement import Phase
 from mavbridge.gate.envelope import EnvelopeLimits
 from mavbridge.gate.gate import FlightSettings
 from mavbridge.gate.settings import GateSettings
-from mavbridge.gate.smoothing import Smoothing
 from mavbridge.gate.wire import (
     Absence,
     FromGate,
@@ -37,12 +44,13 @@ from mavbridge.mavlink.settings import LinkSettings
 
 STICKS = Sticks(0.1, -0.2, 0.3, -0.4)
 FLIGHT = FlightSettings(
+    meaning=ActionMeaning(),
     stick_period_ns=10_000_000,
     chunk_period_ns=33_333_333,
     freshness=FreshnessLimits(state_ns=1, velocity_ns=2, feature_ns=3, chunk_ns=4),
-    smoothing=Smoothing(max_slew_per_s=8.0, tau_s=0.05),
+    smoothing=stick_smoothing(max_slew_per_s=8.0, tau_s=0.05),
     envelope=EnvelopeLimits(height_m=math.inf),
-    engagement=EngagementSettings(modes=("ALT_HOLD",), departure=DepartureSettings(then="rtl")),
+    engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings(then="rtl")),
 )
 CHUNK = Chunk(
     serial=7,

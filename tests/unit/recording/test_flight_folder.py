@@ -204,7 +204,7 @@ def test_what_is_no_flight_says_what_is_wanted(flight: Path) -> None:
 def test_a_flight_whose_contract_is_of_version_1_is_read(flight: Path) -> None:
     path = flight / "meta.json"
     contract = json.loads(path.read_text())["contract"]
-    assert contract["version"] == 2
+    assert contract["version"] == 3
     old = {name: value for name, value in contract.items() if name not in FLIGHT_TERMS}
     _meta(contract={**old, "version": 1})(flight)
     assert open_flight(flight).meta.contract == make_meta().contract

@@ -1,0 +1,158 @@
+"""Bounds of what leaves, by kind of action, and the actions that are safe in themselves."""
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from mavbridge.core.vehicle import (
+    IDLE,
+    NEUTRAL,
+    Action,
+    ActionKind,
+    ActionMeaning,
+    AttitudeThrust,
+    BodyRates,
+    Sticks,
+    Telemetry,
+    Velocity,
+)
+
+Four: TypeAlias = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionLimits:
+    """Bounds of the four numbers of an action, and of their change."""
+
+    low: Four
+    high: Four
+    change_per_s: Four
+    """Fastest change of each; infinite = no limit."""
+    pair: tuple[int, int] | None = None
+    """Two numbers that are one vector: its length is kept within ``high``, its direction stays."""
+
+    def clip(self, action: Action) -> Action:
+        """The nearest action within the bounds."""
+        bounds = zip(action, self.low, self.high, strict=True)
+        values = [min(max(value, low), high) for value, low, high in bounds]
+        if self.pair is not None:
+            self._shorten(values, list(action), self.high[self.pair[0]])
+        return type(action)(*values)
+
+    def approach(self, now: Action, goal: Action, dt_s: float) -> Action:
+        """``goal``, or as far towards it as the limits of change allow in this time."""
+        reach = [rate * dt_s if rate < math.inf else rate for rate in self.change_per_s]
+        moves = [min(max(b - a, -most), most) for a, b, most in zip(now, goal, reach, strict=True)]
+        if self.pair is not None:
+            wanted = [b - a for a, b in zip(now, goal, strict=True)]
+            self._shorten(moves, wanted, reach[self.pair[0]])
+        return type(now)(
+            *[
+                b if most == math.inf else a + move
+                for a, b, move, most in zip(now, goal, moves, reach, strict=True)
+            ]
+        )
+
+    def _shorten(self, values: list[float], vector: list[float], longest: float) -> None:
+        """Put the pair of ``vector`` into ``values``, no longer than ``longest``."""
+        assert self.pair is not None
+        one, other = self.pair
+        length = math.hypot(vector[one], vector[other])
+        scale = longest / length if length > longest else 1.0
+        values[one], values[other] = scale * vector[one], scale * vector[other]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LimitSettings:
+    """Bounds in the units of each kind; those of other kinds are not used."""
+
+    stick_slew_per_s: float = 8.0
+    """Fastest stick, in full deflections a second; 0 = no limit."""
+    lean_rad: float = math.radians(35.0)
+    """Largest lean of an attitude, roll and pitch together."""
+    rate_radps: float = math.radians(220.0)
+    """Fastest roll and pitch rate."""
+    yaw_rate_radps: float = math.radians(120.0)
+    thrust: float = 0.9
+    speed_mps: float = 8.0
+    """Horizontal, in any direction."""
+    climb_mps: float = 3.0
+    """Up or down."""
+    accel_mps2: float = 5.0
+    """Of a velocity, in any horizontal direction; also up and down."""
+
+    def of(self, kind: ActionKind) -> ActionLimits:
+        """Limits of one kind of action."""
+        free, lean, rate, yaw = math.inf, self.lean_rad, self.rate_radps, self.yaw_rate_radps
+        match kind:
+            case "sticks":
+                slew = self.stick_slew_per_s or free
+                return ActionLimits(low=(-1.0,) * 4, high=(1.0,) * 4, change_per_s=(slew,) * 4)
+            case "rates":
+                return ActionLimits(
+                    low=(0.0, -rate, -rate, -yaw),
+                    high=(self.thrust, rate, rate, yaw),
+                    change_per_s=(free,) * 4,
+                )
+            case "attitude":
+                return ActionLimits(
+                    low=(0.0, -lean, -lean, -yaw),
+                    high=(self.thrust, lean, lean, yaw),
+                    change_per_s=(free, rate, rate, free),
+                    pair=(1, 2),
+                )
+            case "velocity":
+                speed, climb, accel = self.speed_mps, self.climb_mps, self.accel_mps2
+                return ActionLimits(
+                    low=(-speed, -speed, -climb, -yaw),
+                    high=(speed, speed, climb, yaw),
+                    change_per_s=(accel, accel, accel, free),
+                    pair=(0, 1),
+                )
+
+
+def neutral_action(meaning: ActionMeaning) -> Action:
+    """Level, or at rest: body rates alone would keep a lean, so theirs is an attitude."""
+    match meaning.kind:
+        case "sticks":
+            return NEUTRAL
+        case "velocity":
+            return Velocity(0.0, 0.0, 0.0, 0.0)
+        case _:
+            return AttitudeThrust(meaning.hover_thrust, 0.0, 0.0, 0.0)
+
+
+def idle_action(meaning: ActionMeaning) -> Action:
+    """Keeps the vehicle on the ground while it is armed."""
+    match meaning.kind:
+        case "sticks":
+            return IDLE
+        case "velocity":
+            return Velocity(0.0, 0.0, 0.0, 0.0)
+        case _:
+            return AttitudeThrust(0.0, 0.0, 0.0, 0.0)
+
+
+def first_action(meaning: ActionMeaning, telemetry: Telemetry, pilot: Sticks | None) -> Action:
+    """What the vehicle does in the air when the policy takes over, so that nothing jumps.
+
+    ``pilot`` are the sticks that the vehicle follows now; None = not known.
+    """
+    attitude, velocity = telemetry.ned_from_body_wxyz, telemetry.velocity_ned_mps
+    w, x, y, z = attitude.values if attitude else (1.0, 0.0, 0.0, 0.0)
+    match meaning.kind:
+        case "sticks":
+            return pilot or NEUTRAL
+        case "rates":
+            return BodyRates(meaning.hover_thrust, 0.0, 0.0, 0.0)
+        case "attitude":
+            roll_rad = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+            pitch_rad = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
+            return AttitudeThrust(meaning.hover_thrust, roll_rad, pitch_rad, 0.0)
+        case "velocity":
+            north, east, down = velocity.values if velocity else (0.0, 0.0, 0.0)
+            if meaning.is_heading_frame:
+                heading_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+                cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+                north, east = cos * north + sin * east, cos * east - sin * north
+            return Velocity(north, east, down, 0.0)

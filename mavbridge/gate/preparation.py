@@ -1,0 +1,134 @@
+"""The way into a flight: mode, arming, and a takeoff by the autopilot's own means."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.gate.facts import Facts, Hand, Move
+
+REQUEST_SPACING_NS = NS_PER_S
+"""Between two requests to arm or for a mode: each refused one prints the vehicle's reason."""
+ARRIVED = 0.9
+"""Share of the takeoff height at which the policy's mode is asked for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PreparationSettings:
+    """The state that the vehicle has to be in before the policy flies."""
+
+    modes: tuple[str, ...]
+    """Modes in which the policy may fly."""
+    mode: str | None = None
+    """The one of them to ask for; None = the present one, or when we arm it the first of modes."""
+    takeoff_m: float | None = None
+    """Height above the place of arming to which the autopilot climbs by itself, when we arm it."""
+    is_setpoint: bool = False
+    """The policy's actions are setpoints, and not sticks."""
+
+
+class Preparing(NamedTuple):
+    """One step of preparing."""
+
+    move: Move
+    waits_for: str
+    """What is missing, in words for the user; empty: ready to fly."""
+
+
+class Preparation:
+    """One way in; ``begin`` starts it, ``step`` goes on until it waits for nothing."""
+
+    def __init__(self, settings: PreparationSettings) -> None:
+        self._settings = settings
+        self._request_due_ns = 0
+        self._ground_m: float | None = None
+        self._is_up = False
+        self._asked_mode: str | None = None
+        self.arms = False
+        """It was disarmed when this began: we keep it idle on the ground, and arm it."""
+
+    def begin(self, facts: Facts) -> None:
+        """Start with the vehicle as it is now."""
+        self.arms = not facts.armed
+        self._is_up = self._settings.takeoff_m is None or not self.arms
+        self._asked_mode = self._ground_m = None
+
+    @property
+    def is_taking_off(self) -> bool:
+        """The autopilot is to climb, or climbs, by its own means."""
+        return not self._is_up
+
+    def is_own_mode(self, facts: Facts) -> bool:
+        """The present mode was asked for, or is one that the autopilot's takeoff goes through."""
+        has_takeoff = self._settings.takeoff_m is not None and self.arms
+        return facts.mode == self._asked_mode or (has_takeoff and facts.mode in facts.modes.takeoff)
+
+    def wanted_mode(self, facts: Facts) -> str | None:
+        """Mode to ask for; None if the present one will do."""
+        wanted = self._settings.mode
+        if self.is_taking_off:
+            wanted = facts.mode if facts.armed else next(iter(facts.modes.takeoff), None)
+        elif wanted is None and facts.mode not in self._settings.modes:
+            known = [mode for mode in self._settings.modes if mode in facts.modes.names]
+            wanted = known[0] if known else self._settings.modes[0]
+        return None if wanted == facts.mode else wanted
+
+    def impossibility(self, facts: Facts) -> str | None:
+        """Why waiting will not help, or None."""
+        names, wanted = facts.modes.names, self.wanted_mode(facts)
+        if wanted is None or not names or wanted in names:
+            return facts.slowness
+        return f"this vehicle has no mode {wanted}, it has {', '.join(names)}"
+
+    def step(self, facts: Facts, objection: str | None) -> Preparing:
+        """Advance; with an ``objection`` nothing new is asked for."""
+        self._watch_climb(facts)
+        wanted = self.wanted_mode(facts)
+        climb_m = self._settings.takeoff_m if self.is_taking_off and facts.armed else None
+        hand = self._hand(facts, wanted)
+        if facts.armed and wanted is None and climb_m is None and objection is None:
+            return Preparing(Move(hand=hand), "")
+        waits_for = objection or self._waits_for(facts, wanted, climb_m)
+        is_heard = facts.armed or facts.echo_confirmed
+        if objection is not None or not is_heard or facts.now_ns < self._request_due_ns:
+            return Preparing(Move(hand=hand), waits_for)
+        if climb_m is not None and facts.is_landed is False:
+            return Preparing(Move(hand=hand), waits_for)
+        self._request_due_ns = facts.now_ns + REQUEST_SPACING_NS
+        self._asked_mode = wanted
+        is_arming = wanted is None and not facts.armed
+        return Preparing(Move(hand=hand, mode=wanted, arm=is_arming, takeoff_m=climb_m), waits_for)
+
+    def _watch_climb(self, facts: Facts) -> None:
+        if not facts.armed:
+            self._ground_m = facts.height_m
+        elif self.is_taking_off and facts.height_m is not None:
+            assert self._settings.takeoff_m is not None
+            self._ground_m = facts.height_m if self._ground_m is None else self._ground_m
+            climbed_m = facts.height_m - self._ground_m
+            self._is_up = climbed_m >= ARRIVED * self._settings.takeoff_m
+
+    def _waits_for(self, facts: Facts, wanted: str | None, climb_m: float | None) -> str:
+        if self.is_taking_off and facts.height_m is None:
+            return "waiting for a position: the autopilot's own takeoff needs one"
+        if climb_m is not None:
+            return f"taking off to {climb_m:g} m"
+        return f"waiting for {wanted or 'the vehicle to arm'}"
+
+    def _hand(self, facts: Facts, wanted: str | None) -> Hand | None:
+        """What to send meanwhile.
+
+        Somebody who has armed it keeps the sticks until the policy takes them. Setpoints end a
+        takeoff, but some modes are only entered while they flow.
+        """
+        if facts.link_problem is not None:
+            return None
+        if self._settings.is_setpoint:
+            if self.is_taking_off:
+                return None
+            if self.arms and self._settings.takeoff_m is None:
+                return Hand.IDLE
+            needs_flow = facts.modes.needs_setpoints_first and wanted in facts.modes.setpoint
+            return Hand.NEUTRAL if needs_flow else None
+        if not self.arms:
+            return None
+        return Hand.NEUTRAL if self._settings.takeoff_m and facts.armed else Hand.IDLE
