@@ -2,7 +2,9 @@
 
     toge[:SIZE][:BACKBONE]   TOGE, e.g. toge, toge:medium, toge:small:resnet18
     resnet-unet[:SIZE]       ResNet-UNet, single-rate
-    scripted[:PROGRAM]       a fixed program, e.g. scripted:square
+    scripted[:PROGRAM][:ACTION][:air]
+                             a fixed program in any kind of action, e.g. scripted:square:velocity;
+                             air: begin in the air, without the climb
     package.module:Class     any class that keeps contract.SingleRatePolicy or DualRatePolicy
 
 torch is imported only where a policy needs it.
@@ -30,7 +32,7 @@ from policy.contract import (
 from policy.engines.executable import EngineName, ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError, user_code
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
-from policy.scripted import ScriptedPolicy
+from policy.scripted.spec import IN_AIR, make_scripted
 
 if TYPE_CHECKING:
     from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
@@ -38,7 +40,10 @@ if TYPE_CHECKING:
 SHIPPED = Path(__file__).parent / "weights" / "toge.safetensors"
 """Flown by ``toge`` where no other weights are named; its card is beside it."""
 BUILTIN_KINDS = ("toge", "resnet-unet")
-_FORMS = "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM] or package.module:Class"
+_FORMS = (
+    "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air] or "
+    "package.module:Class"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +74,8 @@ class PolicyRequest:
     """Height and width that the policy takes; None leaves it to the contract."""
     seed: int = 0
     """Seed of untrained weights and of the flight's initial noise."""
+    starts_in_air: bool = False
+    """The vehicle flies already when the policy takes over: a scripted program does not climb."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,13 +208,15 @@ def _executable(
 
 def _scripted(
     options: list[str], request: PolicyRequest, now_s: Callable[[], float]
-) -> ScriptedPolicy:
+) -> SingleRatePolicy:
     if request.checkpoint is not None:
         raise PolicyError(
             f"scripted policies have no weights: leave out --checkpoint {request.checkpoint}"
         )
-    program = ":".join(options) or "hover"
-    return ScriptedPolicy(program, now_s, contract=_contract(request.image_size))
+    contract = _contract(request.image_size)
+    if request.starts_in_air and options[-1:] != [IN_AIR]:
+        options = [*(options or ["hover"]), IN_AIR]
+    return make_scripted(options, now_s, contract=contract)
 
 
 def _parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | None]:

@@ -9,13 +9,12 @@ from pathlib import Path
 
 from sitl import UsageError
 from sitl.app import print_status, run_vehicle
-from sitl.ardupilot.autopilot import VehicleConfig
-from sitl.ardupilot.rc import IDLE_RECEIVER_US, MID_RECEIVER_US
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import stop_on_signal
 from sitl.course.layout import course_to_json, make_course
 from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, VehicleConfig
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,20 +31,25 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sitl",
-        description="A simulated ArduCopter that speaks MAVLink, with an FPV camera in shared "
-        "memory over a course of gates.",
+        description="A simulated ArduCopter or PX4 that speaks MAVLink, with an FPV camera in "
+        "shared memory over a course of gates.",
         allow_abbrev=False,
     )
     parser.set_defaults(run=_fly)
     add = parser.add_argument
     connect_help = "MAVLink: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeatable"
     add("--connect", action="append", metavar="LINK", help=connect_help)
+    onboard_help = "such a link for a companion computer: PX4 gives it other streams"
+    add("--connect-onboard", action="append", metavar="LINK", help=onboard_help)
+    names = ("ardupilot", "px4")
+    add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
     add("--report", type=Path, metavar="FILE", help="write a report (docs/flight_report.md)")
     add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
     end_help = "stop one second after the last gate, or at a crash"
     add("--end-with-course", action="store_true", help=end_help)
-    receiver_help = "RC receiver: throttle down (default), every stick centred, or none"
-    add("--receiver", choices=("idle", "mid", "none"), default="idle", help=receiver_help)
+    receiver_help = "RC receiver: throttle down, every stick centred, or none (default: idle; "
+    receiver_help += "none with PX4, which looks at one only if COM_RC_IN_MODE tells it to)"
+    add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
     rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/rc_input.py)"
     add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
     type_help = "MAV_TYPE of its heartbeats (default: 2, quadrotor)"
@@ -77,14 +81,18 @@ def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _fly(args: argparse.Namespace) -> None:
-    if not args.connect:
+    links, onboard = args.connect or [], args.connect_onboard or []
+    if not links + onboard:
         raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
     conditions = NOMINAL if args.conditions is None else random_conditions(args.conditions)
+    receiver = args.receiver or ("none" if args.autopilot == "px4" else "idle")
     run_vehicle(
-        args.connect,
+        links + onboard,
         VehicleConfig(
-            receiver=args.receiver != "none",
-            receiver_us=MID_RECEIVER_US if args.receiver == "mid" else IDLE_RECEIVER_US,
+            autopilot=args.autopilot,
+            onboard_links=frozenset(range(len(links), len(links + onboard))),
+            receiver=receiver != "none",
+            receiver_us=MID_RECEIVER_US if receiver == "mid" else IDLE_RECEIVER_US,
             vehicle_type=args.vehicle_type,
             conditions=conditions,
         ),

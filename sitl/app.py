@@ -7,7 +7,6 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from sitl import UsageError
-from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
@@ -16,6 +15,7 @@ from sitl.link.rc_input import RcInput
 from sitl.link.transport import Transport, open_transport
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
 
@@ -113,7 +113,7 @@ class _Status:
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
         self._connected: set[int] = set()
-        self._mode = vehicle.ap.mode
+        self._mode = vehicle.ap.mode_name
         self._armed = vehicle.ap.armed
         self._texts = 0
         self._crashed = False
@@ -126,15 +126,15 @@ class _Status:
     def print_changes(self) -> None:
         """Compare with the last step."""
         ap, log = self._vehicle.ap, self._vehicle.log
-        if ap.mode is not self._mode:
-            print_status(f"mode {ap.mode.name}")
+        if ap.mode_name != self._mode:
+            print_status(f"mode {ap.mode_name}")
         if ap.armed != self._armed:
             print_status("armed" if ap.armed else "disarmed")
         if log.crash is not None and not self._crashed:
             print_status(f"crash: hit {log.crash.hit} at {log.crash.speed_mps:.1f} m/s")
         for text in log.texts[self._texts :]:
             print_status(str(text["text"]))
-        self._mode, self._armed, self._crashed = ap.mode, ap.armed, log.crashed
+        self._mode, self._armed, self._crashed = ap.mode_name, ap.armed, log.crashed
         self._texts = len(log.texts)
 
 

@@ -10,11 +10,10 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from sitl.ardupilot.autopilot import Autopilot
-from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import Course
 from sitl.course.referee import Crash, GateCounter, GatePass, struck_gate
+from sitl.firmware import Autopilot
 from sitl.rotation import Vec3, cos_tilt, to_euler
 
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash
@@ -126,8 +125,8 @@ class FlightLog:
 
     def on_step(self, ap: Autopilot) -> None:
         """Measure the vehicle after a control step."""
-        if not self._modes or self._modes[-1]["mode"] != ap.mode.name:
-            self._modes.append({"t_s": self._t_s(ap.now_ns), "mode": ap.mode.name})
+        if not self._modes or self._modes[-1]["mode"] != ap.mode_name:
+            self._modes.append({"t_s": self._t_s(ap.now_ns), "mode": ap.mode_name})
         self._sticks.update(ap, max(ap.now_ns, self._arrived_ns))
         if ap.armed:
             self._armed_ns += ap.now_ns - self._last_ns
@@ -185,7 +184,7 @@ class FlightLog:
             "modes": self._modes,
             "statustexts": self.texts,
             "final": {
-                "mode": ap.mode.name,
+                "mode": ap.mode_name,
                 "armed": ap.armed,
                 "landed": ap.landed,
                 "position_ned_m": body.position_ned_m,
@@ -202,7 +201,7 @@ class FlightLog:
 class _StickEntry(NamedTuple):
     stamp_ns: int
     us: tuple[int, int, int, int]  # roll, pitch, throttle, yaw
-    mode: Mode
+    mode: str
     armed: bool
     failsafe: bool
     lean_deg: float  # between the vehicle's axis and the vertical
@@ -214,28 +213,21 @@ class _StickRecord:
 
     def __init__(self) -> None:
         self._entries: deque[_StickEntry] = deque(maxlen=MAX_STICK_ENTRIES)
-        self._channels_us: list[int] = []
         self._due_ns = 0
 
     def update(self, ap: Autopilot, stamp_ns: int) -> None:
         """Look at the vehicle after a control step; ``stamp_ns`` is the time of an entry."""
         last = self._entries[-1] if self._entries else None
-        failsafe = ap.radio_failsafe.active
-        is_same = last is not None and (ap.mode, ap.armed, failsafe) == last[2:5]
+        us, state = ap.sticks_us, (ap.mode_name, ap.armed, ap.in_failsafe)
+        is_same = last is not None and state == last[2:5]
         is_due = ap.armed and ap.now_ns >= self._due_ns
-        if is_same and not is_due and ap.rc.channels_us == self._channels_us:
-            return
-        self._channels_us = ap.rc.channels_us.copy()
-        us = ap.rc.sticks_us()
         if is_same and not is_due and last is not None and us == last.us:
             return
         body = ap.truth
         lean_deg = math.degrees(math.acos(max(-1.0, min(1.0, cos_tilt(body.ned_from_body_wxyz)))))
         climb_mps = -body.velocity_ned_mps[2]
         self._due_ns = ap.now_ns + STICK_PERIOD_NS
-        self._entries.append(
-            _StickEntry(stamp_ns, us, ap.mode, ap.armed, failsafe, lean_deg, climb_mps)
-        )
+        self._entries.append(_StickEntry(stamp_ns, us, *state, lean_deg, climb_mps))
 
     def summary(self, start_ns: int) -> list[dict[str, Any]]:
         """The ``sticks`` list of the report."""
@@ -243,7 +235,7 @@ class _StickRecord:
             {
                 "t_s": (entry.stamp_ns - start_ns) / NS_PER_S,
                 "us": entry.us,
-                "mode": entry.mode.name,
+                "mode": entry.mode,
                 "armed": entry.armed,
                 "failsafe": entry.failsafe,
                 "lean_deg": round(entry.lean_deg, 2),

@@ -3,15 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl.ardupilot.autopilot import STEP_NS, Autopilot, VehicleConfig
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.firmware import ArduCopter
+from sitl.clock import NS_PER_S
 from sitl.course.layout import AirborneStart, Course
-from sitl.link.server import MavlinkServer
+from sitl.firmware import Autopilot, Firmware, Params, Server
+from sitl.px4.firmware import Px4
 from sitl.report import FlightLog
+from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import BodyState
 
-MAX_STEPS_AT_ONCE = 400
-"""One second of simulated time; after a longer stall the rest follows in later calls."""
+MAX_CATCH_UP_NS = NS_PER_S
+"""Simulated in one call; after a longer stall the rest follows in later calls."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,12 +36,26 @@ class SimulatedVehicle:
         course: Course | None = None,
     ) -> None:
         self._config = config or VehicleConfig()
-        self.params = Params(self._config.conditions)
         self.log = FlightLog(boot_ns, course)
-        self.ap = Autopilot(self.params, self._config, boot_ns)
+        make = Px4 if self._config.autopilot == "px4" else ArduCopter
+        self._firmware: Firmware = make(self._config, links, boot_ns, self.log)
         self._transmitter_us: Sequence[int] | None = None
-        self.server = MavlinkServer(self.ap, links, self.log)
         self.pose = Pose(stamp_ns=boot_ns, body=self.ap.truth)
+
+    @property
+    def ap(self) -> Autopilot:
+        """The flight controller since its last boot."""
+        return self._firmware.ap
+
+    @property
+    def params(self) -> Params:
+        """The firmware's parameters."""
+        return self._firmware.params
+
+    @property
+    def server(self) -> Server:
+        """The vehicle's links."""
+        return self._firmware.server
 
     @property
     def bad_frames(self) -> int:
@@ -52,21 +68,22 @@ class SimulatedVehicle:
         self.server.receive(link_id, data, now_ns)
 
     def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the pilot's sticks and switches (`RcEngine.set_receiver`); a reboot leaves them."""
+        """Move the pilot's sticks and switches ; a reboot leaves them."""
         self._transmitter_us = values_us
-        self.ap.rc.set_receiver(values_us)
+        self.ap.set_receiver(values_us)
 
     def step(self, now_ns: int) -> None:
         """Advance the simulation to ``now_ns`` in whole control steps, then queue what is due.
 
         Missed control steps are all run; missed message slots are dropped.
         """
-        steps = min((now_ns - self.ap.now_ns) // STEP_NS, MAX_STEPS_AT_ONCE)
-        for _ in range(steps):
-            self.ap.step()
-            self.log.on_step(self.ap)
-        self.pose = Pose(stamp_ns=self.ap.now_ns, body=self.ap.truth)
-        self.server.step()
+        ap = self.ap
+        behind_ns = min(now_ns - ap.now_ns, MAX_CATCH_UP_NS)
+        for _ in range(behind_ns // ap.step_ns):
+            ap.step()
+            self.log.on_step(ap)
+        self.pose = Pose(stamp_ns=ap.now_ns, body=ap.truth)
+        self.server.step(now_ns)
         if self.server.reboot_requested:
             self.reboot()
 
@@ -75,15 +92,14 @@ class SimulatedVehicle:
         return self.server.links[link_id].take_outgoing()
 
     def launch(self, start: AirborneStart) -> None:
-        """Put the vehicle in the air in this state, armed and in ALT_HOLD."""
+        """Put the vehicle in the air in this state, armed, in ALT_HOLD or ALTCTL."""
         self.ap.launch(start.position_ned_m, start.velocity_ned_mps, start.ned_from_body_wxyz)
         self.log.start_over(start.next_gate)
         self.pose = Pose(stamp_ns=self.ap.now_ns, body=self.ap.truth)
 
     def reboot(self) -> None:
         """Restart on the ground at the origin: time_boot_ms is 0, parameters stay."""
-        self.ap = Autopilot(self.params, self._config, self.ap.now_ns)
+        self._firmware.reboot()
         if self._transmitter_us is not None:
-            self.ap.rc.set_receiver(self._transmitter_us)
-        self.server.restart(self.ap)
+            self.ap.set_receiver(self._transmitter_us)
         self.log.on_reboot()

@@ -5,6 +5,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
+from mavbridge.camera.blank import BlankCamera
 from mavbridge.camera.capture import open_device, open_stream
 from mavbridge.camera.deadlines import LiveCamera, wait_for_first_frame
 from mavbridge.camera.grabber import Grabber
@@ -18,9 +19,11 @@ from mavbridge.core.ports import Camera
 STREAM_SCHEMES = ("rtsp://", "udp://", "tcp://", "http://", "https://")
 SCREEN_PACKAGES = ("mss", "Xlib")
 """The extra "screen"."""
+NO_CAMERA = "none"
 FORMS = (
     "a device (0, /dev/video0), a stream (rtsp://, udp://, tcp://, http://, https://), "
-    "a video file, shm:NAME or screen:WINDOW TITLE (screen: alone = the whole screen)"
+    "a video file, shm:NAME, screen:WINDOW TITLE (screen: alone = the whole screen), or none for "
+    "a policy that looks at no image"
 )
 
 
@@ -44,7 +47,8 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
                 f"--camera screen: needs the package {missing[0]}: pip install 'mavbridge[screen]'"
             )
         return
-    is_known = kind == "shm" or spec.startswith((*STREAM_SCHEMES, "/dev/video")) or spec.isdecimal()
+    is_device = spec.startswith("/dev/video") or spec.isdecimal()
+    is_known = kind == "shm" or spec == NO_CAMERA or spec.startswith(STREAM_SCHEMES) or is_device
     if not is_known and not Path(spec).is_file():
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
 
@@ -94,6 +98,8 @@ def _open(spec: str, *, image_size: int, clock: Clock) -> Camera:
     kind, _, rest = spec.partition(":")
     if kind == "shm":
         return SharedMemoryCamera(rest, clock=clock)
+    if spec == NO_CAMERA:
+        return BlankCamera(image_size=image_size, clock=clock)
     if kind == "screen":
         from mavbridge.camera.screen import ScreenCamera
 

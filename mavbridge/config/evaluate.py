@@ -16,6 +16,7 @@ from mavbridge.core.errors import UserError
 
 ConditionsKind = Literal["nominal", "random"]
 ClockKind = Literal["simulated", "wall"]
+AutopilotKind = Literal["ardupilot", "px4"]
 
 
 @Parameter(name="*")
@@ -37,6 +38,12 @@ class EvaluateConfig:
     """Seconds that a flight may take, from the policy's first action."""
     conditions: ConditionsKind = "nominal"
     """random: each flight has another vehicle, firmware settings, wind, light, colours and lens."""
+    autopilot: AutopilotKind = "ardupilot"
+    """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
+    gains: float = 1.0
+    """Factor on the lean, yaw rate and climb of ArduPilot at full stick (simulated clock)."""
+    raw_sticks: bool = False
+    """Send the policy's sticks as they are, whatever the vehicle's curves make of them."""
     clock: ClockKind = "simulated"
     """simulated: bridge and simulator in lockstep, faster than real time, the same for the same
     seed. wall: real processes over UDP in real time, one flight at a time."""
@@ -56,6 +63,11 @@ class EvaluateConfig:
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("max-time", self.max_time, 1, 3600, "s")
         check_range("vision-delay", self.vision_delay, 0, 5000, "ms")
+        check_range("gains", self.gains, 0.2, 2.5, "")
+        if self.gains != 1 and (self.is_wall_clock or self.autopilot != "ardupilot"):
+            raise UserError("--gains needs --clock simulated and --autopilot ardupilot")
+        if self.autopilot != "ardupilot" and self.conditions == "random":
+            raise UserError("--conditions random needs --autopilot ardupilot")
         if self.is_wall_clock and self.vision_delay:
             raise UserError("--vision-delay needs --clock simulated: real encoders take their time")
         if self.is_wall_clock and self.workers.is_parallel:

@@ -144,8 +144,15 @@ class LinkConfig:
     output: Output | Literal["auto"] = "auto"
     """Message that carries the actions: rc-override or manual-control (sticks), attitude, rates,
     velocity. auto: by the policy's actions and the firmware."""
+    raw_sticks: Annotated[bool, Parameter(negative="", group=RARE)] = False
+    """Send the policy's sticks as they are. By default they are changed where this vehicle leans,
+    turns or climbs more or less at full stick than the one that the policy was trained for."""
     readonly: bool = False
     """Run everything, send no stick, mode or arm command."""
+    forward: Annotated[str, Parameter(show_default=False)] = ""
+    """Share the link with a ground station: udp:HOST:PORT sends to it, udpin:HOST:PORT listens."""
+    gcs_sticks_win: Annotated[bool, Parameter(negative="")] = False
+    """The sticks of the ground station of --forward take over for good once they are moved."""
     set: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """NAME=VALUE: set a parameter of ArduPilot before arming, put the old value back at the end;
     may be given more than once."""
@@ -160,6 +167,13 @@ class LinkConfig:
         """Refuse ids that MAVLink has no room for, and parameters that cannot be set."""
         if (self.set_params or self.restore_params) and self.readonly:
             raise UserError("--readonly sets no parameter: leave out --set and --restore-params")
+        if self.gcs_sticks_win and not self.forward:
+            raise UserError("--gcs-sticks-win needs --forward, the ground station that it is about")
+        if self.forward and not re.fullmatch(r"udp(in|out)?:[^:]+:\d{1,5}", self.forward):
+            raise UserError(
+                f"--forward {self.forward!r} is not understood; use udp:HOST:PORT to send to a "
+                "ground station, or udpin:HOST:PORT to listen for one"
+            )
         check_range("source-system", self.source_system, 1, 255, "")
         check_range("target-system", self.target_system, 0, 254, "")
         check_range("connect-timeout", self.connect_timeout, 0.1, 3600, "s")
@@ -192,7 +206,7 @@ class CameraConfig:
 
     camera: str = "0"
     """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
-    screen:WINDOW TITLE."""
+    screen:WINDOW TITLE, or none for a policy that looks at no image."""
     window_name: Annotated[str | None, Parameter(group=RARE)] = None
     """Same as --camera "screen:WINDOW TITLE"."""
     camera_timeout: Annotated[float, Parameter(group=RARE)] = 10.0

@@ -18,8 +18,9 @@ class PolicyConfig:
     """The policy, its weights, and what runs it."""
 
     policy: str = "toge"
-    """toge[:small|medium|large[:BACKBONE]], resnet-unet, scripted[:hover|square|circle|yaw],
-    or your own package.module:Class."""
+    """toge[:small|medium|large[:BACKBONE]], resnet-unet, your own package.module:Class, or
+    scripted[:hover|square|circle|yaw|doublet][:sticks|attitude|rates|velocity][:air]; air: the
+    vehicle flies already, so do not climb first."""
     checkpoint: Path | None = None
     """Weights: .safetensors with the contract in its header, or .pt; toge has shipped ones."""
     dual_rate: bool = False

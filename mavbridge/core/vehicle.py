@@ -282,5 +282,8 @@ class LinkStats:
     """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
     is_timesync_good: bool = False
     """Ages count from the vehicle's own stamps; False = from arrival, which hides delay."""
+    saturated: tuple[tuple[str, float], ...] = ()
+    """Share of the stick messages in which a stick of the policy meant more than the vehicle can
+    do, by stick; those at 0 are left out."""
     timesync_error_ms: float | None = None
     """The most by which the offset of the clocks, and so every age, may be wrong."""

@@ -78,7 +78,9 @@ def fly(config: FlyConfig) -> int:
     console = flight_console()
     with ExitStack() as stack:
         gate = start_gate(config, clock, stack)  # finds the vehicle while the weights load
-        loaded = load_configured_policy(config.policy, clock)
+        loaded = load_configured_policy(
+            config.policy, clock, starts_in_air=config.takeoff is not None
+        )
         for note in loaded.notes:
             console.print(Text(note, style="yellow"))
         fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
@@ -297,5 +299,7 @@ class _Flight:
                 f"{summary.dropped_messages} messages of the gate did not fit into its queue: this "
                 "process was too busy to take them"
             )
+        if summary is not None and summary.ground_station is not None:
+            screen.show_message(summary.ground_station)
         is_found = view.status.mode is not None
         self._observers.finish(self._gate.summary, view.status.autopilot if is_found else None)

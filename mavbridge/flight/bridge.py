@@ -8,6 +8,7 @@ from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
+from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
@@ -65,16 +66,18 @@ def build_bridge(
     rate = AdaptiveRate(min_hz=loops.min_vision_hz, max_hz=loops.max_vision_hz)
     sink = FanOut([rate, *sinks] if rate.is_adaptive else sinks)
     limits = effective_freshness(contract, config.limits)
+    frame = action_frame(contract)
     settings = PolicySettings(
         state_frame=contract.state_frame,
         since_exposure=contract.since_exposure,
+        action_frame=frame,
         chunk_dt_s=contract.chunk_dt_s,
         freshness=Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns),
         max_feature_age_ns=limits.feature_ns,
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
         period_ns=period_ns(loops.action_hz),
     )
-    history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s)
+    history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s, frame=frame)
     view = VehicleView(
         history=history,
         sink=sink,

@@ -1,12 +1,11 @@
-"""Chunks and history in seconds: which action acts now, and which sticks were sent before."""
+"""Chunks and history in seconds: which action acts now, and which ones were sent before."""
 
 import threading
 from bisect import bisect_right
 
-import numpy as np
-
 from mavbridge.core.records import FloatArray
-from mavbridge.core.vehicle import NEUTRAL, Action, Sticks
+from mavbridge.core.vehicle import Action, Sticks
+from mavbridge.flight.action_frames import ActionFrame
 from policy.contract import history_ages_ns
 
 
@@ -28,24 +27,26 @@ def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks
 
 
 class SentHistory:
-    """Sticks as they were sent, resampled to the policy's history grid.
+    """Actions as they were sent, resampled to the policy's history grid in the policy's axes.
 
     One thread appends, another one may resample.
     """
 
-    def __init__(self, *, length: int, dt_s: float) -> None:
+    def __init__(self, *, length: int, dt_s: float, frame: ActionFrame | None = None) -> None:
+        """``frame``: kind and axes of the policy's actions; None = sticks."""
+        self._frame = frame or ActionFrame()
         self._ages_ns = history_ages_ns(length, dt_s)
         self._span_ns = self._ages_ns[0] + self._ages_ns[-1]
         self._lock = threading.Lock()
         self._sent_ns: list[int] = []
-        self._sent: list[Action] = [NEUTRAL]
+        self._sent: list[Action] = [self._frame.neutral]
         """One more than stamps: what was held before the first of them."""
 
     def append(self, sent: Action | None, now_ns: int) -> None:
         """Remember what left at ``now_ns`` (None = released); forget what is too old to matter."""
         with self._lock:
             self._sent_ns.append(now_ns)
-            self._sent.append(NEUTRAL if sent is None else sent)
+            self._sent.append(self._frame.neutral if sent is None else sent)
             if (old := bisect_right(self._sent_ns, now_ns - self._span_ns)) > 1:
                 del self._sent_ns[: old - 1], self._sent[: old - 1]
 
@@ -53,4 +54,4 @@ class SentHistory:
         """[1, K, 4], see ``policy.contract.history_ages_ns``."""
         with self._lock:
             rows = [self._sent[bisect_right(self._sent_ns, now_ns - age)] for age in self._ages_ns]
-        return np.array([rows], dtype=np.float32)
+        return self._frame.from_gate(rows)[None]

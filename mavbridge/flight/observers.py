@@ -65,7 +65,11 @@ class FlightObservers:
         """Start the viewer or its file, if one is wanted; it is closed with ``stack``."""
         if self._config.rerun == "off":
             return
-        view = RerunView(self._config.rerun, vision_hz=self._loops.max_vision_hz)
+        view = RerunView(
+            self._config.rerun,
+            vision_hz=self._loops.max_vision_hz,
+            action=self._executable.contract.action,
+        )
         self._viewer = ObserverThread("mavbridge-rerun", view, capacity=RERUN_CAPACITY)
         stack.callback(self._viewer.close, VIEWER_JOIN_S)
 

@@ -1,6 +1,7 @@
 """From the flags of a command to a loaded policy."""
 
 import sys
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,9 +12,15 @@ from policy.loading import LoadedPolicy, PolicyRequest, check_request, load_poli
 BUILT_IN = ("toge", "resnet-unet")
 
 
-def load_configured_policy(wanted: PolicyConfig, clock: Clock) -> LoadedPolicy:
-    """Load the policy that the flags name, or raise PolicyError; scripted ones follow ``clock``."""
-    return load_policy(_request(wanted), now_s=lambda: clock.now_ns() / NS_PER_S)
+def load_configured_policy(
+    wanted: PolicyConfig, clock: Clock, *, starts_in_air: bool = False
+) -> LoadedPolicy:
+    """Load the policy that the flags name, or raise PolicyError.
+
+    A scripted one follows ``clock``, and climbs first unless it ``starts_in_air``.
+    """
+    request = replace(_request(wanted), starts_in_air=starts_in_air)
+    return load_policy(request, now_s=lambda: clock.now_ns() / NS_PER_S)
 
 
 def check_configured_policy(wanted: PolicyConfig) -> None:

@@ -1,4 +1,4 @@
-"""The fast path: newest attitude + cached feature + sent sticks -> chunk of actions -> the gate."""
+"""The fast path: newest attitude + cached feature + sent actions -> chunk -> the gate."""
 
 import math
 import threading
@@ -8,7 +8,8 @@ from typing import TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.records import FeatureFrame, FloatArray, VehicleState
-from mavbridge.core.vehicle import Release, Sticks
+from mavbridge.core.vehicle import Release
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
@@ -35,6 +36,7 @@ class PolicySettings:
     state_frame: StateFrame
     since_exposure: bool
     """The age of the image and the motion since its exposure are appended to the state."""
+    action_frame: ActionFrame
     chunk_dt_s: float
     freshness: Freshness
     max_feature_age_ns: int
@@ -179,6 +181,6 @@ class PolicyLoop:
                 computed_ns=done_ns,
                 first_ns=state.attitude_ns,
                 step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
-                actions=tuple(Sticks(*row) for row in array[0].tolist()),
+                actions=self._settings.action_frame.to_gate(array[0]),
             )
         )

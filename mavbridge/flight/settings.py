@@ -8,7 +8,7 @@ from pathlib import Path
 from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import ActionMeaning
+from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.gate.chunks import FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import EngagementSettings
@@ -53,20 +53,11 @@ def flight_settings(config: FlyConfig, executable: Executable) -> FlightSettings
         stick_period_ns=period_ns(rates.stick_rate),
         chunk_period_ns=period_ns(loops.action_hz),
         freshness=effective_freshness(contract, limits),
-        meaning=action_meaning(contract),
+        meaning=action_meaning(contract, config.link),
         output=None if config.link.output == "auto" else config.link.output,
         smoothing=Smoothing(limits=limit_settings(config).of(contract.action), tau_s=limits.tau),
         envelope=envelope_limits(config.envelope, _policy_envelope(contract)),
         engagement=engagement_settings(config, contract),
-    )
-
-
-def action_meaning(contract: Contract) -> ActionMeaning:
-    """What the policy means by the four numbers of an action."""
-    return ActionMeaning(
-        kind=contract.action,
-        hover_thrust=contract.hover_thrust,
-        is_heading_frame=contract.velocity_frame == "heading",
     )
 
 
@@ -145,15 +136,35 @@ def link_settings(
         source_system=config.source_system,
         target_system=config.target_system,
         connect_timeout_s=config.connect_timeout,
-        output="rc-override" if config.output == "auto" else config.output,
         readonly=config.readonly,
         state_hz=state_hz,
         min_battery_percent=min_battery_percent,
         stick_hz=stick_hz,
+        forward=config.forward,
+        gcs_sticks_win=config.gcs_sticks_win,
         set_params=config.set_params,
         restore_params=config.restore_params,
         accepted_risks=config.accept_risk,
         state_folder=folder,
+    )
+
+
+def action_meaning(contract: Contract, config: LinkConfig) -> ActionMeaning:
+    """What the policy means by its actions; ``--raw-sticks`` keeps silent about its sticks."""
+    gains = StickGains(
+        lean_deg=contract.full_lean_deg,
+        yaw_rate_degps=contract.full_yaw_rate_degps,
+        climb_mps=contract.full_climb_mps,
+        descent_mps=contract.full_descent_mps,
+        lean_dead_zone=contract.lean_dead_zone,
+        yaw_dead_zone=contract.yaw_dead_zone,
+        throttle_dead_zone=contract.throttle_dead_zone,
+    )
+    return ActionMeaning(
+        kind=contract.action,
+        stick_gains=None if config.raw_sticks or contract.action != "sticks" else gains,
+        hover_thrust=contract.hover_thrust,
+        is_heading_frame=contract.velocity_frame == "heading",
     )
 
 

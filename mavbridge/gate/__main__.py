@@ -25,6 +25,7 @@ from mavbridge.gate.wire import (
     encode_from_gate,
 )
 from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.transport.forwarding import Forwarding
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 from mavbridge.mavlink.transport.sockets import make_transport
 
@@ -62,12 +63,20 @@ def main() -> None:
 
 def _run(settings: GateSettings, port: SocketPort, received: list[bytes]) -> None:
     clock = MonotonicClock()
-    log = None
+    log = station = None
     if settings.tlog_fd is not None:
         log = PacketPipe(settings.tlog_fd, wall_offset_ns=settings.wall_offset_ns)
     transport = make_transport(settings.link.connect, clock)
+    if settings.link.forward:
+        wins = settings.link.gcs_sticks_win
+        station = Forwarding(settings.link.forward, clock, sticks_win=wins)
     link = MavlinkLink(
-        transport, clock, settings.link, packet_log=log, forward=lambda p: loop.forward(p)
+        transport,
+        clock,
+        settings.link,
+        packet_log=log,
+        forward=lambda p: loop.forward(p),
+        ground_station=station,
     )
     loop = GateLoop(clock, link, port, received=received, lead_ns=LEAD_NS)
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(Ending(reason="the gate was told to end")))
@@ -75,26 +84,46 @@ def _run(settings: GateSettings, port: SocketPort, received: list[bytes]) -> Non
     if refusal is not None:
         port.send(encode_from_gate(GateMessage(refusal)))
     try:
-        while not loop.is_done:
-            due_ns = loop.step()
-            ends = (None if port.is_closed else port.fileno(), link.fileno())
-            files = [end for end in ends if end is not None]
-            timeout_ns = due_ns - clock.now_ns()
-            if timeout_ns > 0:
-                select.select(files, [], [], timeout_ns / NS_PER_S)
+        _serve(loop, clock, port, link, station)
     except BaseException:
         loop.abandon()
         raise
     finally:
         link.close()
+        if station is not None:
+            station.close()
     summary = GateSummary(
         autopilot=link.autopilot,
         link=link.stats(),
         failure=loop.failure,
         dropped_messages=port.dropped,
         dropped_packets=log.dropped if log else 0,
+        ground_station=station.summary() if station else None,
     )
     port.finish(encode_from_gate(summary), LAST_WORDS_S)
+
+
+def _serve(
+    loop: GateLoop,
+    clock: MonotonicClock,
+    port: SocketPort,
+    link: MavlinkLink,
+    station: Forwarding | None,
+) -> None:
+    """Step at every arrival and whenever something is due, until the loop is done."""
+    while not loop.is_done:
+        due_ns = loop.step()
+        if station is not None:
+            station.flush()  # after the sticks
+        ends = (
+            None if port.is_closed else port.fileno(),
+            link.fileno(),
+            None if station is None else station.fileno(),
+        )
+        files = [end for end in ends if end is not None]
+        timeout_ns = due_ns - clock.now_ns()
+        if timeout_ns > 0:
+            select.select(files, [], [], timeout_ns / NS_PER_S)
 
 
 if __name__ == "__main__":

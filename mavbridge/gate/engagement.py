@@ -187,7 +187,7 @@ class Engagement:
             self.refusal = "not engaged: the vehicle is disarmed; arm it first, or use --arm"
         elif (objection := self._objection(facts)) is not None:
             self.refusal = f"not engaged: {objection}"
-        elif self._settings.preparation.mode not in (None, facts.mode):
+        elif self._preparation.may_change_mode(facts):
             return self._begin_preparing(facts, ACT_TIMEOUT_NS)
         elif (objection := self._mode_objection(facts)) is not None:
             self.refusal = f"not engaged: {objection}"

@@ -62,6 +62,13 @@ class Preparation:
         has_takeoff = self._settings.takeoff_m is not None and self.arms
         return facts.mode == self._asked_mode or (has_takeoff and facts.mode in facts.modes.takeoff)
 
+    def may_change_mode(self, facts: Facts) -> bool:
+        """An act asks for another mode: the flag's, or one that only our setpoints can enter."""
+        if self._settings.mode is not None:
+            return facts.mode != self._settings.mode
+        needs_flow = self._settings.is_setpoint and facts.modes.needs_setpoints_first
+        return needs_flow and facts.mode not in self._settings.modes
+
     def wanted_mode(self, facts: Facts) -> str | None:
         """Mode to ask for; None if the present one will do."""
         wanted = self._settings.mode

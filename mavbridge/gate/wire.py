@@ -103,6 +103,8 @@ class GateSummary:
     """Messages to the flight process that did not fit into its queue."""
     dropped_packets: int
     """Packets that did not fit into the pipe of the telemetry log."""
+    ground_station: str | None = None
+    """What was not passed on between a ground station and the vehicle, for the user."""
 
 
 ToGate: TypeAlias = GateSettings | FlightSettings | Chunk | Absence | Act | Ending
@@ -294,8 +296,14 @@ def _decode_from_gate(data: bytes) -> FromGate:
 def _summary(document: dict[str, object]) -> GateSummary:
     link = dict(document.pop("link"))  # type: ignore[call-overload]
     rtt = link.pop("rtt_ms")
-    rates = tuple((name, rate_hz) for name, rate_hz in link.pop("messages_per_s"))
+    rates, saturated = (
+        tuple((name, number) for name, number in link.pop(key))
+        for key in ("messages_per_s", "saturated")
+    )
     stats = LinkStats(
-        **link, messages_per_s=rates, rtt_ms=None if rtt is None else Percentiles(**rtt)
+        **link,
+        messages_per_s=rates,
+        saturated=saturated,
+        rtt_ms=None if rtt is None else Percentiles(**rtt),
     )
     return GateSummary(**document, link=stats)  # type: ignore[arg-type]

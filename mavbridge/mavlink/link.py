@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import (
+    Action,
     ActionMeaning,
     Decision,
     ForwardedPacket,
@@ -14,7 +15,6 @@ from mavbridge.core.vehicle import (
     LinkStats,
     Output,
     Release,
-    Sticks,
     Telemetry,
 )
 from mavbridge.mavlink.codec.messages import (
@@ -27,16 +27,19 @@ from mavbridge.mavlink.codec.messages import (
     SpecificForce,
     Timesync,
 )
-from mavbridge.mavlink.codec.packets import Codec, manual_control_sticks, pwm_of
+from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.outputs.choice import choose_output
+from mavbridge.mavlink.outputs.output import ActionOutput
+from mavbridge.mavlink.outputs.release import ReleasePlan
 from mavbridge.mavlink.session.commands import ModeAndArm
-from mavbridge.mavlink.session.discovery import VehicleDiscovery, VehicleIdentity
-from mavbridge.mavlink.session.release import ReleasePlan
+from mavbridge.mavlink.session.discovery import Namesakes, VehicleDiscovery, VehicleIdentity
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.settings import LinkSettings
 from mavbridge.mavlink.transport.connection import Connection, PacketLog
+from mavbridge.mavlink.transport.forwarding import Forwarding
 from mavbridge.mavlink.transport.sockets import Address, Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -44,7 +47,6 @@ _HEARTBEAT_HZ = 1.0
 """MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
 _SILENT_NS = 500 * NS_PER_MS
 """Silence after which a vehicle that is heard elsewhere is taken to have moved there."""
-_OTHERS = 16
 _DOWN = "the connection to the vehicle is lost: reconnecting"
 
 
@@ -53,9 +55,10 @@ class MavlinkLink:
 
     ``forward`` gets every packet of the chosen vehicle, in order, while ``poll`` runs; it must
     neither wait nor raise. Problems of the transport are never raised once it has been opened:
-    they stand in the snapshot, and it is opened again once a second.
+    they stand in the snapshot, and it is opened again once a second. ``ground_station`` shares the
+    link; its owner flushes and closes it.
 
-    Raises from ``service``:
+    Raises from ``service`` and ``begin_flight``:
         PeerError: no vehicle within the timeout, two vehicles, or one that cannot be flown.
     """
 
@@ -67,12 +70,15 @@ class MavlinkLink:
         *,
         packet_log: PacketLog | None = None,
         forward: Callable[[ForwardedPacket], None] | None = None,
+        ground_station: Forwarding | None = None,
     ) -> None:
         self._clock = clock
         self._config = config
         self._forward = forward
         self._codec = Codec(source_system=config.source_system, source_component=SOURCE_COMPONENT)
         self._connection = Connection(transport, self._codec, clock, packet_log)
+        self._station = ground_station
+        self._connection.tap = ground_station.pass_on if ground_station else None
         self._discovery = VehicleDiscovery(target_system=config.target_system)
         self._counters = LinkCounters()
         self._timesync = TimesyncFilter()
@@ -84,13 +90,14 @@ class MavlinkLink:
         self._started_ns = clock.now_ns()
         self._heartbeat_due_ns = self._started_ns
         self._vehicle: VehicleSession | None = None
+        self._flight: tuple[ActionMeaning, Output | None] | None = None
+        """The policy's actions, and the output that was asked for; None = no policy is loaded."""
+        self._output: ActionOutput | None = None
+        """None until both the vehicle and the policy are known."""
         self._was_confirmed = False
         self._interruption: str | None = None
         self._interruptions = 0
-        self._moved_ns: int | None = None
-        """When an engaged vehicle was last found to have moved."""
-        self._others: set[Address | None] = set()
-        """Other senders with the vehicle's system id that were reported."""
+        self._namesakes = Namesakes()
 
     def fileno(self) -> int | None:
         """Descriptor for ``select`` to wake up on arrivals; None while the transport is closed."""
@@ -104,29 +111,42 @@ class MavlinkLink:
         if self._vehicle is not None and self._vehicle.has_rebooted:
             self._interrupt("the vehicle has rebooted: its session starts over")
             self._adopt(self._vehicle.identity)
-        now_ns, texts = self._clock.now_ns(), tuple(self._connection.texts)
-        self._connection.texts.clear()
+        now_ns = self._clock.now_ns()
+        overruled = self._share_with(self._station, now_ns) if self._station else None
+        texts = self._connection.take_texts()
         is_down, vehicle = self._connection.is_down, self._vehicle
         if vehicle is None:
             problem = _DOWN if is_down else "waiting for the vehicle's heartbeat"
             return LinkSnapshot(telemetry=Telemetry(), status=None, problem=problem, texts=texts)
-        overruled = vehicle.overruled(now_ns)
+        output = self._output
+        overruled = overruled or (output.overruled(now_ns) if output else None)
         return LinkSnapshot(
             telemetry=self._telemetry.snapshot(),
             status=vehicle.status(now_ns),
             problem=(_DOWN if is_down else vehicle.problem(now_ns))
             or overruled
-            or vehicle.unheard(now_ns),
+            or (output.unheard(now_ns) if output else "no policy is loaded yet"),
             is_overruled=overruled is not None,
             is_switched_off=vehicle.is_switched_off,
-            echo_confirmed=vehicle.echo_confirmed,
-            is_released=vehicle.is_released,
-            shows_last=vehicle.echo.shows_last,
+            echo_confirmed=output is not None and output.echo_confirmed,
+            is_released=output is None or output.echo.is_released,
+            shows_last=output is None or output.echo.shows_last,
             interruption=self._interruption,
             modes=vehicle.condition.modes.roles,
             refused_mode=self._commands.refused_mode,
             texts=texts,
         )
+
+    def _share_with(self, station: Forwarding, now_ns: int) -> str | None:
+        """Pass the ground station's packets on; why its sticks rule out ours, or None."""
+        vehicle = self._vehicle.identity.source if self._vehicle else None
+        for packet in station.receive(vehicle, is_engaged=self.is_engaged):
+            if station.rules.has_won and self._release.left and self._output is not None:
+                self._send_release(self._output)  # once, before its sticks, which it would undo
+                self._release.left = 0
+            self._transmit(packet)
+        self._connection.texts.extend(station.take_texts())
+        return station.rules.overruled(now_ns, is_engaged=self.is_engaged)
 
     def _receive_all(self) -> None:
         vehicle = self._vehicle
@@ -160,6 +180,8 @@ class MavlinkLink:
                     self._report(refusal)
         if is_for_us:
             before = vehicle.param_interruption
+            if (output := self._output) is not None:
+                output.receive(message.body, vehicle, arrived_ns)
             vehicle.receive(message, arrived_ns)
             if (changed := vehicle.param_interruption) is not None and changed != before:
                 self._interrupt(changed)
@@ -168,20 +190,11 @@ class MavlinkLink:
 
     def _notice_other(self, identity: VehicleIdentity, sender: Address | None, now_ns: int) -> None:
         """Another address uses the vehicle's system id: its packets are ignored while we fly."""
-        system, ours = identity.source.system, _name(identity.address)
-        advice = "give it another system id, or keep it off this port"
         if not self.is_engaged or now_ns - self._counters.heard_ns < _SILENT_NS:
-            if sender not in self._others and len(self._others) < _OTHERS:
-                self._others.add(sender)
-                text = f"system {system} is also heard from {_name(sender)}, which is ignored"
-                self._report(f"{text}: the vehicle is at {ours}; {advice}")
-        elif self._moved_ns is None or now_ns - self._moved_ns > NS_PER_S:
-            self._moved_ns = now_ns
-            self._interrupt(
-                f"the vehicle at {ours} is silent, and system {system} is now heard from "
-                f"{_name(sender)}, which is not followed in flight: if it is another vehicle, "
-                f"{advice}; if this one has moved, engage again"
-            )
+            if (text := self._namesakes.heard(identity, sender)) is not None:
+                self._report(text)
+        elif (text := self._namesakes.took_over(identity, sender, now_ns)) is not None:
+            self._interrupt(text)
 
     def _interrupt(self, text: str) -> None:
         """Note why every engagement so far is over; no two such texts are the same."""
@@ -192,8 +205,9 @@ class MavlinkLink:
 
     def stats(self) -> LinkStats:
         """Counters for the report."""
-        has_echo = self._config.output == "rc-override"
-        is_confirmed = self._vehicle is not None and self._vehicle.echo.confirmed
+        output = self._output
+        has_echo = output is not None and output.name == "rc-override"
+        is_confirmed = output is not None and output.echo_confirmed
         return self._counters.stats(
             self._timesync,
             echo_confirmed=(self._was_confirmed or is_confirmed) if has_echo else None,
@@ -262,19 +276,40 @@ class MavlinkLink:
 
     def _follow_vehicle(self, identity: VehicleIdentity, now_ns: int) -> None:
         if (moved := self._discovery.moved(identity, now_ns)) is not None:
-            addresses = f"{_name(moved.address)} instead of {_name(identity.address)}"
-            self._interrupt(f"the vehicle now sends from {addresses}: its session starts over")
+            places = f"{moved.place} instead of {identity.place}"
+            self._interrupt(f"the vehicle now sends from {places}: its session starts over")
             self._adopt(moved)
 
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""
         self._vehicle = VehicleSession(identity, self._config, report=self._report)
+        if self._output is None:
+            self._choose_output(identity)
+        else:
+            self._output.restart()
         self._telemetry = TelemetryCollector()
         self._timesync.restart()
         self._commands = ModeAndArm()
         self._counters.new_sequence()
-        self._others.clear()
+        self._namesakes = Namesakes()
         self._connection.peer = identity.address
+
+    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
+        """Choose what carries the actions of the policy, now or once the vehicle is known; to be
+        called before the first action.
+
+        ``output`` None: the usual one of such actions and this vehicle.
+        """
+        self._flight = meaning, output
+        if self._vehicle is not None:
+            self._choose_output(self._vehicle.identity)
+
+    def _choose_output(self, identity: VehicleIdentity) -> None:
+        if self._flight is not None:
+            meaning, wanted = self._flight
+            self._output = choose_output(
+                meaning, wanted, autopilot=identity.autopilot, codec=self._codec
+            )
 
     def _report(self, text: str) -> None:
         self._connection.texts.append(text)
@@ -297,9 +332,6 @@ class MavlinkLink:
             return
         self._transmit(self._codec.encode_request(self._vehicle.identity.source, request))
 
-    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
-        """Choose the message that carries such actions."""
-
     def takeoff(self, height_m: float) -> None:
         """Ask the autopilot to climb to this height above the ground by its own means."""
 
@@ -317,67 +349,51 @@ class MavlinkLink:
             return False
         return self._connection.send(data)
 
-    # --- sticks
+    # --- actions
 
-    def send(self, decision: Decision) -> Sticks | None:
-        """Send sticks or a release; returns the sticks that were really sent, or None.
+    def send(self, decision: Decision) -> Action | None:
+        """Send an action or a release; returns the action as it was really sent, or None.
 
-        Releases leave every 50 ms for as long as they are asked for, up to 80 after the last
-        override. One that cannot be sent now is sent before anything else that can.
+        Releases leave every 50 ms for as long as they are asked for and the output has any. One
+        that cannot be sent now is sent before anything else that can.
+
+        Raises:
+            CommandRefusedError: an action that this output must not send.
         """
-        if self._config.readonly or self._vehicle is None:
+        vehicle, output = self._vehicle, self._output
+        if self._config.readonly or vehicle is None or output is None:
             return None
         if isinstance(decision, Release):
-            self._send_release()
+            self._send_release(output)
             return None
-        if not isinstance(decision.action, Sticks):
-            raise TypeError(f"{type(decision.action).__name__} cannot be sent yet")
-        if self._config.output == "rc-override":
-            return self._send_override(decision.action, self._vehicle)
-        system = self._vehicle.identity.source.system
-        if not self._transmit(self._codec.encode_manual_control(system, decision.action)):
+        encoded = output.encode(decision.action, vehicle, self._clock.now_ns())
+        if encoded is None or (self._release.is_owed and not self._try_release()):
             return None
+        self._release.acted(output.releases)
+        if not self._connection.send(encoded.packet):
+            return None
+        output.sent(encoded, self._clock.now_ns())
+        if self._station is not None:
+            self._station.rules.on_our_sticks(self._clock.now_ns())
         self._counters.sent += 1
-        return manual_control_sticks(decision.action)
+        return encoded.action
 
-    def _send_override(self, sticks: Sticks, vehicle: VehicleSession) -> Sticks | None:
-        calibration = vehicle.calibration
-        if calibration is None:
-            return None
-        pwm_us = vehicle.echo.with_nudge(pwm_of(sticks, calibration), self._clock.now_ns())
-        data = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
-        if self._release.is_owed and not self._try_release():
-            return None
-        self._release.overridden(calibration)
-        if not self._connection.send(data):
-            return None
-        vehicle.echo.sent(pwm_us, self._clock.now_ns())
-        self._counters.sent += 1
-        return calibration.to_sticks(pwm_us)
-
-    def _send_release(self) -> None:
-        vehicle = self._vehicle
-        if vehicle is None or not self._release.left:
-            return
-        self._was_confirmed |= vehicle.echo.confirmed
-        vehicle.echo.released()
+    def _send_release(self, output: ActionOutput) -> None:
+        self._was_confirmed |= output.echo_confirmed
+        output.echo.released()
         if self._release.is_due(self._clock.now_ns()):
             self._try_release()
 
     def _try_release(self) -> bool:
         """Send a release; False: it was not sent, and goes before all other packets."""
-        vehicle, calibration = self._vehicle, self._release.calibration
-        if vehicle is None or calibration is None:
-            return True  # nothing was ever overridden
-        data = self._codec.encode_release(vehicle.identity.source, calibration)
-        is_sent = self._connection.send(data)
+        vehicle, output = self._vehicle, self._output
+        packet = output.release_packet(vehicle) if output and vehicle else None
+        if packet is None:
+            return True  # nothing was ever sent
+        is_sent = self._connection.send(packet)
         self._release.tried(self._clock.now_ns(), is_sent=is_sent)
         return is_sent
 
     def close(self) -> None:
         """Free the socket or port."""
         self._connection.close()
-
-
-def _name(address: Address | None) -> str:
-    return "this connection" if address is None else f"{address[0]}:{address[1]}"

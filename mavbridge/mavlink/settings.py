@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from mavbridge.core.vehicle import Output, Risk
+from mavbridge.core.vehicle import Risk
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,7 +18,6 @@ class LinkSettings:
     """System id of the vehicle to fly; 0 = the only one on the link."""
     connect_timeout_s: float = 30.0
     """Longest wait for the vehicle's first heartbeat."""
-    output: Output = "rc-override"
     readonly: bool = False
     """Receive and set up streams; send no stick, mode or arm command."""
     state_hz: float = 100.0
@@ -27,6 +26,10 @@ class LinkSettings:
     """Charge below which the battery is reported as low; 0 = only what the vehicle itself says."""
     stick_hz: float = 100.0
     """Rate at which sticks will be sent."""
+    forward: str = ""
+    """Ground station that shares the link: udp:HOST:PORT (send there), udpin:HOST:PORT (listen)."""
+    gcs_sticks_win: bool = False
+    """Its sticks take over once they are moved; else they are dropped."""
     set_params: tuple[tuple[str, float], ...] = ()
     """Parameters to set for the flight, by name; needs a state folder."""
     restore_params: bool = False

@@ -81,7 +81,10 @@ def _link_verdict(link: LinkStats) -> str:
         else f"{link.lost_fraction:.2%} of the vehicle's messages lost"
     )
     sent = f"{_counted(link.sent_overrides, 'stick message')} sent"
-    return f"{sent}, {echo[link.echo_confirmed]}, {lost}"
+    limits = "".join(
+        f", {stick} beyond what the vehicle does in {share:.1%}" for stick, share in link.saturated
+    )
+    return f"{sent}, {echo[link.echo_confirmed]}, {lost}{limits}"
 
 
 def _release_verdict(report: TimingReport) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Event, ImageArray, Tick, VisionTick
-from mavbridge.core.vehicle import Action, Sticks
+from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, Sticks
 from mavbridge.observe.rerun_target import RerunRecording
 
 JPEG_QUALITY = 85
@@ -66,20 +66,26 @@ _STICK_SERIES = (
     _Series("smoothed", _BLUE),
     _Series("sent", _WHITE),
 )
-STICKS = tuple(_Plot(f"sticks/{axis}", _STICK_SERIES) for axis in Sticks._fields)
 _RC_COLORS = enumerate((_BLUE, _ORANGE, _GREEN, _PINK), start=1)
 RC = _Plot("rc", tuple(_Series(f"channel {number}", color) for number, color in _RC_COLORS))
 """Channels 1 to 4 hold the sticks, unless RCMAP_* says otherwise; the stick plots are mapped."""
 PLOTS = (
     *(AGE, ACTION_PERIOD, VISION_PERIOD, LATENESS, VISION_JITTER),
-    *(PREDICT, ENCODE, MISSED, DROPPED, *STICKS, RC),
+    *(PREDICT, ENCODE, MISSED, DROPPED, RC),
 )
 _EVENT_COLUMNS = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
 """The viewer's own time column is too narrow to read, so the text starts with the time."""
 
 
-def flight_blueprint() -> rrb.Blueprint:
-    """Initial layout of the viewer: scene, ages and computing times, loops, sticks."""
+def action_plots(action: ActionKind) -> tuple[_Plot, ...]:
+    """One plot for each of the four numbers of an action of this kind."""
+    return tuple(
+        _Plot(f"{action}/{name}", _STICK_SERIES) for name in ACTION_CLASSES[action]._fields
+    )
+
+
+def flight_blueprint(action: ActionKind = "sticks") -> rrb.Blueprint:
+    """Initial layout of the viewer: scene, ages and computing times, loops, actions."""
     scene = rrb.Vertical(
         rrb.Spatial2DView(origin=CAMERA, name="Camera: what the policy sees"),
         rrb.TextLogView(origin=EVENTS, name="Events", columns=_EVENT_COLUMNS),
@@ -95,17 +101,21 @@ def flight_blueprint() -> rrb.Blueprint:
         _time_series("Jitter [ms]", LATENESS, VISION_JITTER),
         _time_series("Missed slots, dropped frames [since the start]", MISSED, DROPPED),
     )
-    sticks = rrb.Vertical(
+    titles = [name.replace("_", " ") for name in ACTION_CLASSES[action]._fields]
+    actions = rrb.Vertical(
         *(
             _time_series(
-                f"Stick: {axis}", plot, legend=plot is STICKS[0], value_range=(-1.05, 1.05)
+                f"Stick: {title}" if action == "sticks" else title.capitalize(),
+                plot,
+                legend=number == 0,
+                value_range=(-1.05, 1.05) if action == "sticks" else None,
             )
-            for axis, plot in zip(Sticks._fields, STICKS, strict=True)
+            for number, (title, plot) in enumerate(zip(titles, action_plots(action), strict=True))
         ),
         row_shares=[4, 3, 3, 3],  # the first contains the legend for all
     )
     return rrb.Blueprint(
-        rrb.Horizontal(scene, freshness, loops, sticks),
+        rrb.Horizontal(scene, freshness, loops, actions),
         rrb.TimePanel(state="collapsed", timeline="time"),
         collapse_panels=True,
     )
@@ -134,12 +144,13 @@ class RerunView:
     is a gap in its line.
     """
 
-    def __init__(self, target: str, *, vision_hz: float) -> None:
+    def __init__(self, target: str, *, vision_hz: float, action: ActionKind = "sticks") -> None:
         """Check the target; calls that may block are left to ``consume`` and ``close``.
 
         Jitter of vision is measured against ``vision_hz``; ``target`` is that of
-        ``prepare_target``.
+        ``prepare_target``; ``action`` is the kind of the policy's actions.
         """
+        self._action = action
         self._recording = RerunRecording("mavbridge", target)
         self._is_open = False
         self._action_periods, self._vision_periods = _Periods(), _Periods()
@@ -172,8 +183,8 @@ class RerunView:
         if self._is_open:
             return
         self._is_open = True
-        self._recording.open(flight_blueprint())
-        for plot in PLOTS:
+        self._recording.open(flight_blueprint(self._action))
+        for plot in (*PLOTS, *action_plots(self._action)):
             style = rr.SeriesLines(
                 names=[series.name for series in plot.series],
                 colors=[series.color for series in plot.series],
@@ -192,8 +203,8 @@ class RerunView:
         self._send(LATENESS, index, _ms([_lateness_ns(tick) for tick in ticks]))
         self._send(PREDICT, index, _ms([tick.predict_ns for tick in ticks]))
         self._send(MISSED, index, missed)
-        stages = np.array([_stick_stages(tick) for tick in ticks])
-        for axis, plot in enumerate(STICKS):
+        stages = np.array([_stages(tick, self._action) for tick in ticks])
+        for axis, plot in enumerate(action_plots(self._action)):
             self._send(plot, index, stages[:, :, axis])
         shown_us = [tick.rc_channels_us[: len(RC.series)] for tick in ticks]
         gaps = (math.nan,) * len(RC.series)
@@ -282,9 +293,9 @@ def _lateness_ns(tick: Tick) -> int | None:
     return None if tick.trace is None or not tick.is_slot else max(0, tick.sent_ns - tick.due_ns)
 
 
-def _stick_stages(tick: Tick) -> tuple[Action, ...]:
-    """The series of a stick plot in their order, each with all four axes."""
-    echo: Action = tick.rc_sticks or _STICKS_GAP
+def _stages(tick: Tick, action: ActionKind) -> tuple[Action, ...]:
+    """The series of an action's plots in their order, each with all four numbers."""
+    echo: Action = (tick.rc_sticks if action == "sticks" else None) or _STICKS_GAP
     trace, sent = tick.trace, tick.sent or _STICKS_GAP
     if trace is None:
         return (echo, *(_STICKS_GAP,) * 4, sent)

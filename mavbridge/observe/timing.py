@@ -311,5 +311,6 @@ def report_json(report: TimingReport) -> str:
     """The report as JSON, keys in the order of the dataclasses; null = not measured."""
     document = asdict(report)
     if report.link is not None:
-        document["link"]["messages_per_s"] = dict(report.link.messages_per_s)
+        for key in ("messages_per_s", "saturated"):
+            document["link"][key] = dict(document["link"][key])
     return json.dumps(document, indent=2, allow_nan=False) + "\n"

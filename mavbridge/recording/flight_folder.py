@@ -27,7 +27,8 @@ class RecordedFlight:
 
     def tick_rows(self) -> Iterator[TickRow]:
         """The ticks as records, with their labels where the flight is a demonstration."""
-        return read_ticks(self.ticks)
+        contract = self.meta.contract
+        return read_ticks(self.ticks, "sticks" if contract is None else contract.action)
 
     def frame_rows(self) -> Iterator[FrameRow]:
         """The row of each image."""

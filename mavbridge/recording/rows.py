@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from mavbridge.core.records import Tick, VehicleState
-from mavbridge.core.vehicle import ActionTrace, Sticks
+from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
 from policy.contract import ACTION_DIM, STATE_DIM
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -146,14 +146,17 @@ def _attributes(source: object | None, names: Iterable[str]) -> dict[str, object
     return {} if source is None else {name: getattr(source, name) for name in names}
 
 
-def read_ticks(table: pa.Table) -> Iterator[TickRow]:
-    """Records of a ticks table; whole columns are never turned into Python objects at once."""
+def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickRow]:
+    """Records of a ticks table, whose actions are of this kind.
+
+    Whole columns are never turned into Python objects at once.
+    """
     serial = -1
     has_labels = "expert" in table.column_names
     for row in _rows(table):
         serial += 1 + row["dropped_before"]
         labels = TickLabels(expert=_sticks(row["expert"])) if has_labels else None
-        yield TickRow(_tick(row, serial), row["dropped_before"], labels)
+        yield TickRow(_tick(row, serial, ACTION_CLASSES[action]), row["dropped_before"], labels)
 
 
 def read_frames(table: pa.Table) -> Iterator[FrameRow]:
@@ -172,18 +175,18 @@ def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
         yield from batch.to_pylist()
 
 
-def _tick(row: dict[str, Any], serial: int) -> Tick:
+def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
     values = {name: row[name] for name in _TICK if name not in LATER}
     values |= {name: row[name] for name in LATER if row[name] is not None}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
-    values |= {name: _sticks(row[name]) for name in ("sent", "rc_sticks")}
+    values |= {"sent": row["sent"] and make(*row["sent"]), "rc_sticks": _sticks(row["rc_sticks"])}
     state, trace = None, None
     if row["state"] is not None:
         array = np.array(row["state"], np.float32)
         array.setflags(write=False)
         state = VehicleState(values=array, **{name: row[name] for name in _STAMPS})
     if row["raw"] is not None:
-        trace = ActionTrace(**{name: Sticks(*row[name]) for name in _TRACE})
+        trace = ActionTrace(**{name: make(*row[name]) for name in _TRACE})
     return Tick(**values | {"serial": serial, "state": state, "trace": trace})
 
 

@@ -33,14 +33,13 @@ from mavbridge.simulation.world import (
     VisionStepper,
 )
 from policy.contract import Executable, FloatArray
-from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.camera.fpv import FpvRenderer
 from sitl.course.layout import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 MAX_TIME_S = 60.0
 """Default limit: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
-MODE = "ALT_HOLD"
 END_NS = 3 * NS_PER_S
 """Longest that the gate may take to give the sticks back."""
 
@@ -52,6 +51,8 @@ class SimulationSettings:
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
     delays: Delays = field(default_factory=Delays)
+    raw_sticks: bool = False
+    """Sticks leave as the policy has put them out, whatever the vehicle's curves make of them."""
     draw_images: bool = True
     """False: images stay black, where neither the policy nor a sink looks at them."""
     least_camera_px: int = SIM_CAMERA_PX
@@ -156,10 +157,9 @@ class SimulatedFlight:
         """Build the bridge on the stepped clock; its parts run as events from now on."""
         world, hop = self.clock, self._settings.delays.hop
         config = FlyConfig(
-            link=LinkConfig(connect="lockstep"),
+            link=LinkConfig(connect="lockstep", raw_sticks=self._settings.raw_sticks),
             rates=self._settings.rates,
             limits=self._settings.limits,
-            mode=MODE,
             arm=True,
         )
         loops = config.rates.loops(is_dual=executable.dual_rate)

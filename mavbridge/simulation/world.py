@@ -14,11 +14,11 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.network import DelayedChannel
-from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.camera.fpv import FpvRenderer
 from sitl.rotation import Quat, Vec3
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import random_conditions
+from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 from sitl.vehicle.dynamics import BodyState
 
 NOMINAL_VEHICLE = VehicleConfig(estimator_ready_s=0.5, position_ready_s=0.5)
@@ -32,6 +32,28 @@ def random_vehicle(conditions_seed: int) -> VehicleConfig:
         UsageError: the seed is negative.
     """
     return replace(NOMINAL_VEHICLE, conditions=random_conditions(conditions_seed))
+
+
+def make_vehicle(
+    *, autopilot: AutopilotName, gains: float = 1.0, conditions_seed: int | None = None
+) -> VehicleConfig:
+    """A vehicle to evaluate a policy with.
+
+    Args:
+        autopilot: its firmware.
+        gains: factor on ArduCopter's lean, yaw rate and climb rate at full stick.
+        conditions_seed: random conditions, as in ``random_vehicle``; None = nominal ones.
+    """
+    vehicle = NOMINAL_VEHICLE if conditions_seed is None else random_vehicle(conditions_seed)
+    before = vehicle.conditions
+    conditions = replace(
+        before,
+        angle_max_cdeg=gains * before.angle_max_cdeg,
+        pilot_yaw_rate_degps=gains * before.pilot_yaw_rate_degps,
+        pilot_speed_up_cmps=gains * before.pilot_speed_up_cmps,
+        pilot_speed_down_cmps=gains * before.pilot_speed_down_cmps,
+    )
+    return replace(vehicle, autopilot=autopilot, conditions=conditions)
 
 
 class BlankRenderer:

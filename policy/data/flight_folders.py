@@ -153,6 +153,11 @@ def _read_meta(folder: Path) -> dict[str, object]:
 
 def _state_frame(folder: Path) -> StateFrame:
     contract = _read_meta(folder).get("contract")
+    action = contract.get("action", "sticks") if isinstance(contract, dict) else "sticks"
+    if action != "sticks":
+        raise DatasetError(
+            f"{folder} was flown by {action}: this build learns from sticks, and exports them"
+        )
     frame = contract.get("state_frame") if isinstance(contract, dict) else None
     return parse_state_frame(str(folder), frame)
 

@@ -4,23 +4,24 @@ It behaves as a pilot and a companion computer see ArduCopter: modes, arming, fa
 status texts, word for word. Nothing here knows about MAVLink, sockets or the host's time.
 """
 
+import math
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import NamedTuple
 
 from sitl.ardupilot.failsafe import GcsFailsafe, RadioFailsafe
 from sitl.ardupilot.flight_modes import STOPPED, FlightControl, Mode
+from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import Params
-from sitl.ardupilot.rc import IDLE_RECEIVER_US, ModeSwitch, RcEngine
-from sitl.ardupilot.sticks import climb_rate_mps, read_sticks
+from sitl.ardupilot.rc import ModeSwitch, RcEngine
+from sitl.ardupilot.sticks import Sticks, climb_rate_mps, read_sticks
 from sitl.clock import NS_PER_S
+from sitl.firmware import StatusText
 from sitl.rotation import Quat, Vec3, cos_tilt
-from sitl.vehicle.conditions import NOMINAL, Conditions
-from sitl.vehicle.dynamics import PHYSICS_STEP_NS, BodyState, Quadrotor
+from sitl.vehicle.config import STEP_NS, Battery, VehicleConfig
+from sitl.vehicle.dynamics import QUAD, BodyState, Quadrotor
 from sitl.vehicle.environment import SensorNoise, Wind
 
-SUBSTEPS = 2
-STEP_NS = SUBSTEPS * PHYSICS_STEP_NS
+SUBSTEPS = STEP_NS // QUAD.step_ns
 STEP_S = STEP_NS / NS_PER_S
 GPS_PERIOD_NS = NS_PER_S // 5
 
@@ -35,44 +36,10 @@ FAILSAFE_MODES = {
     "FS_GCS_ENABLE": {5: Mode.LAND, 7: Mode.BRAKE},
 }
 """The mode that each value of the parameter selects; any other value but 0 means RTL."""
+FS_OPTION_GUIDED = 4  # goes on without the pilot's sticks
 FS_OPTION_LANDING_CONTINUES = 8
 FS_OPTION_PILOT_CONTINUES = 16
 RC_OPTION_SKIP_NEUTRAL_CHECK = 64
-
-
-class StatusText(NamedTuple):
-    """STATUSTEXT for the ground station, with MAVLink's severity."""
-
-    severity: int
-    text: str
-
-
-class Battery(NamedTuple):
-    """The vehicle's word about its battery; it never empties by itself."""
-
-    voltage_v: float = 12.6
-    current_a: float = 0.0
-    remaining_percent: int = 100
-    is_low: bool = False
-    """ArduCopter's battery failsafe has fired; this vehicle reports it and flies on."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VehicleConfig:
-    """Differences between one simulated vehicle and another."""
-
-    receiver: bool = True
-    """An RC receiver is there; without one the sticks latch and the radio fails."""
-    receiver_us: tuple[int, ...] = IDLE_RECEIVER_US
-    """The receiver's channels at boot, in microseconds."""
-    vehicle_type: int = 2
-    """HEARTBEAT.type, a MAV_TYPE: 2 is a quadrotor, and flies as one whatever it says."""
-    estimator_ready_s: float = 3.0
-    """From boot until arming is possible (about 23 s on the real firmware)."""
-    position_ready_s: float = 5.0
-    """From boot until the estimator has a position (about 40 s on the real firmware)."""
-    conditions: Conditions = NOMINAL
-    """Airframe, air and sensors; `sitl.camera.fpv.FpvRenderer` takes those of the camera."""
 
 
 class Autopilot:
@@ -98,7 +65,8 @@ class Autopilot:
         """Fault: telemetry and control keep the last state, the physics goes on."""
         self.position_lost = False
         """Fault: the estimator has no position any more, as long as this is set."""
-        self._control = FlightControl(params)
+        self.control = FlightControl(params)
+        """Targets and thrust, for telemetry; only this autopilot commands it."""
         self._mode_switch = ModeSwitch()
         self._quad = Quadrotor(config.conditions)
         self._wind = Wind(config.conditions, STEP_S)
@@ -110,12 +78,36 @@ class Autopilot:
         self._gps_due_ns = boot_ns
         self._still_since_ns: int | None = boot_ns
         self._tipped_since_ns: int | None = None
-        self._idle_since_ns = boot_ns
+        self._idle_since_ns = self._armed_ns = boot_ns
 
     @property
     def truth(self) -> BodyState:
         """True state of the vehicle, without sensor faults and noise."""
         return self._physics.body
+
+    @property
+    def step_ns(self) -> int:
+        """Control period: 400 Hz."""
+        return STEP_NS
+
+    @property
+    def mode_name(self) -> str:
+        """Name of the flight mode."""
+        return self.mode.name
+
+    @property
+    def in_failsafe(self) -> bool:
+        """The radio failsafe is active."""
+        return self.radio_failsafe.active
+
+    @property
+    def sticks_us(self) -> tuple[int, int, int, int]:
+        """Roll, pitch, throttle and yaw after overrides; 0: never had a value."""
+        return self.rc.sticks_us()
+
+    def set_receiver(self, values_us: Sequence[int]) -> None:
+        """Move the pilot's sticks and switches (`RcEngine.set_receiver`)."""
+        self.rc.set_receiver(values_us)
 
     @property
     def uptime_ns(self) -> int:
@@ -133,11 +125,21 @@ class Autopilot:
         is_settled = self.uptime_ns >= self.config.position_ready_s * NS_PER_S
         return is_settled and not self.position_lost
 
+    @property
+    def has_gps(self) -> bool:
+        """False for a vehicle that never has a position."""
+        return math.isfinite(self.config.position_ready_s)
+
+    @property
+    def guided(self) -> GuidedControl | None:
+        """Takes setpoints in GUIDED and GUIDED_NOGPS; None in other modes."""
+        return self.control.guided if self.mode.is_guided else None
+
     def prearm_refusal(self) -> str | None:
         """ArduCopter's reason why the vehicle is not ready to arm in any mode (PREARM_CHECK)."""
         if not self.estimator_ready:
             return "AHRS: EKF3 not started"
-        if not self.rc.found:
+        if not self.rc.found and self.params["FS_THR_ENABLE"]:
             return "RC not found"
         if self.radio_failsafe.active:
             return "Radio failsafe on"
@@ -148,10 +150,10 @@ class Autopilot:
 
     def _stick_refusal(self) -> str | None:
         """ArduCopter's reason why mode or sticks forbid arming, or None."""
-        if not self.mode.piloted:
+        if not self.mode.can_arm:
             return f"{self.mode.name} mode not armable"
         if self.mode.needs_position and not self.position_ready:
-            return "Need Position Estimate"
+            return "Need Position Estimate" if self.has_gps else "GPS 1: Bad fix"
         sticks = read_sticks(self.rc, self.params)
         is_thrust = self.mode.manual_throttle and sticks.throttle > 0
         if is_thrust or climb_rate_mps(sticks, self.params) > 0.0:
@@ -172,8 +174,8 @@ class Autopilot:
             self._send_text(SEVERITY_CRITICAL, f"Arm: {refusal}")
             return False
         self.armed = True
-        self._idle_since_ns = self.now_ns
-        self._control.reset(self.sensed)
+        self._armed_ns = self._idle_since_ns = self.now_ns
+        self.control.enter(self.mode, self.sensed)
         self._send_text(SEVERITY_INFO, "Arming motors")
         return True
 
@@ -184,6 +186,19 @@ class Autopilot:
         if self.armed:
             self.armed = False
             self._send_text(SEVERITY_INFO, "Disarming motors")
+        return True
+
+    def take_off(self, height_m: float) -> bool:
+        """Climb to a height above home (NAV_TAKEOFF). True if that has begun.
+
+        Only GUIDED climbs here; the firmware does it in ALT_HOLD and LOITER, too. GUIDED_NOGPS says
+        yes and stays on the ground, as the firmware does.
+        """
+        is_climb = height_m > -self.sensed.position_ned_m[2]
+        if not (self.armed and self.landed and self.mode.is_guided and is_climb):
+            return False
+        if self.mode is Mode.GUIDED:
+            self.control.guided.take_off(height_m, self.sensed)
         return True
 
     def set_mode(self, mode: Mode) -> bool:
@@ -202,7 +217,7 @@ class Autopilot:
             self._send_text(SEVERITY_WARNING, f"Mode change to {mode.name} failed: {refusal}")
             return False
         self.mode = mode
-        self._control.reset(self.sensed)
+        self.control.enter(mode, self.sensed)
         return True
 
     def step(self) -> None:
@@ -236,31 +251,46 @@ class Autopilot:
         self.mode = Mode.ALT_HOLD
         self._idle_since_ns = self.now_ns
         self._still_since_ns = self._tipped_since_ns = None
-        self._control.reset(self.sensed)
+        self.control.enter(self.mode, self.sensed)
 
     def _motors(self) -> tuple[float, ...]:
         if not self.armed:
+            self.control.reset(self.sensed)
             return STOPPED
         sticks = read_sticks(self.rc, self.params)
         if self.landed:
-            if not self._control.wants_takeoff(self.mode, sticks):
-                # LAND and RTL stop the motors on touchdown, the other modes after DISARM_DELAY.
-                delay_s = self.params["DISARM_DELAY"]
-                is_idle = delay_s > 0.0 and self._has_held(self._idle_since_ns, delay_s * NS_PER_S)
-                if is_idle or self.mode.lands:
+            if not self._lifts_off(sticks):
+                if self.mode.lands or self._is_idle(sticks):
                     self.disarm(force=False)
-                return self._control.idle(self.sensed)
+                return self.control.idle(self.sensed)
             self.landed = False
             self._still_since_ns = None
         self._idle_since_ns = self.now_ns
-        return self._control.fly(
-            self.mode, sticks, self.sensed, has_position=self.position_ready, dt_s=STEP_S
+        return self.control.fly(
+            self.mode,
+            sticks,
+            self.sensed,
+            self.now_ns,
+            has_position=self.position_ready,
+            dt_s=STEP_S,
         )
+
+    def _lifts_off(self, sticks: Sticks) -> bool:
+        if self.mode.is_guided:
+            return self.control.guided.lifts_off(self.now_ns, self._armed_ns)
+        return self.control.wants_takeoff(self.mode, sticks)
+
+    def _is_idle(self, sticks: Sticks) -> bool:
+        """On the ground for DISARM_DELAY; in GUIDED only the pilot's throttle at its end counts."""
+        if self.mode.is_guided and not (self.rc.found and sticks.throttle == 0.0):
+            self._idle_since_ns = self.now_ns
+        delay_s = self.params["DISARM_DELAY"]
+        return delay_s > 0.0 and self._has_held(self._idle_since_ns, delay_s * NS_PER_S)
 
     def _detect_landing(self) -> None:
         body = self.sensed
         is_slow = max(abs(v) for v in body.velocity_ned_mps) < LANDED_SPEED_MPS
-        is_pushing = self.armed and self._control.collective > 0.5 * self.params["MOT_THST_HOVER"]
+        is_pushing = self.armed and self.control.collective > 0.5 * self.params["MOT_THST_HOVER"]
         is_still = body.touching and is_slow and not is_pushing
         self._still_since_ns = self._since(self._still_since_ns, is_still)
         if self._has_held(self._still_since_ns, LANDED_AFTER_NS):
@@ -329,6 +359,9 @@ class Autopilot:
         options = self.params.integer("FS_OPTIONS")
         if self.armed and self.mode is Mode.LAND and options & FS_OPTION_LANDING_CONTINUES:
             self._send_text(SEVERITY_WARNING, f"{who} Failsafe - Continuing Landing")
+            return
+        if self.armed and self.mode.is_guided and who == "Radio" and options & FS_OPTION_GUIDED:
+            self._send_text(SEVERITY_WARNING, "Radio Failsafe - Continuing Guided Mode")
             return
         self._send_text(SEVERITY_WARNING, f"{who} Failsafe")
         if not self.armed:

@@ -81,6 +81,11 @@ def _request_message(params: Params7, ap: Autopilot, link: MavlinkEndpoint) -> i
     return ACCEPTED if link.send_now(int(params[0])) else FAILED
 
 
+def _take_off(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int:
+    height_m = params[6]
+    return ACCEPTED if math.isfinite(height_m) and ap.take_off(height_m) else FAILED
+
+
 def _send(message_id: int) -> Handler:
     def handler(_params: Params7, _ap: Autopilot, link: MavlinkEndpoint) -> int:
         link.send_now(message_id)
@@ -100,6 +105,7 @@ def _reboot(params: Params7, ap: Autopilot, link: MavlinkEndpoint) -> int:
 
 _HANDLERS: dict[int, Handler] = {
     mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _params, ap, _link: mode_by_number(Mode.RTL, ap),
+    mav.MAV_CMD_NAV_TAKEOFF: _take_off,
     mav.MAV_CMD_NAV_LAND: lambda _params, ap, _link: mode_by_number(Mode.LAND, ap),
     mav.MAV_CMD_DO_SET_MODE: _set_mode,
     mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,

@@ -1,34 +1,30 @@
 """One MAVLink link of the vehicle, without I/O: bytes in, messages out, messages in, bytes out."""
 
 from collections import deque
-from collections.abc import Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.autopilot import Autopilot
-from sitl.ardupilot.messages import BUILDERS, Message
+from sitl.ardupilot.messages import BUILDERS
 from sitl.ardupilot.streams import PARAM_SLOWDOWN, Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.link.framing import Framing, Message
 
 TIMESYNC_PERIOD_NS = 10 * NS_PER_S
 PARAM_PERIOD_NS = 4 * NS_PER_MS
 MAX_STATUSTEXT = 50
 
 
-class MavlinkEndpoint:
-    """Framing, message intervals and the parameter list of one link.
+class MavlinkEndpoint(Framing):
+    """Message intervals and the parameter list of one link.
 
     Intervals belong to the link, not to the sender that requested them; two ground stations on one
     link share them.
     """
 
     def __init__(self, ap: Autopilot) -> None:
-        self.bad_frames = 0
-        """Garbage, truncated frames and wrong checksums."""
+        super().__init__()
         self.reboot_requested = False
-        self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=mav.MAV_COMP_ID_AUTOPILOT1)
-        self._mav.robust_parsing = True
-        self._outgoing = bytearray()
         self.restart(ap)
 
     def restart(self, ap: Autopilot) -> None:
@@ -40,25 +36,9 @@ class MavlinkEndpoint:
         self._param_due_ns = ap.now_ns
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
 
-    def parse(self, data: bytes) -> Iterator[Message]:
-        """Complete messages in these bytes; unreadable frames are counted and skipped."""
-        for message in self._mav.parse_buffer(data) or ():
-            if message.get_type() == "BAD_DATA":
-                self.bad_frames += 1
-            else:
-                yield message
-
     def send(self, message: Message) -> None:
         """Queue a message."""
-        self._mav.srcSystem = self._ap.params.integer("MAV_SYSID")
-        self._outgoing += message.pack(self._mav)
-        self._mav.seq = (self._mav.seq + 1) % 256
-
-    def take_outgoing(self) -> bytes:
-        """Everything queued since the last call: whole frames, in order."""
-        taken = bytes(self._outgoing)
-        self._outgoing.clear()
-        return taken
+        self.pack(message, self._ap.params.integer("MAV_SYSID"))
 
     def step(self) -> None:
         """Queue what is due by the vehicle's clock."""
@@ -114,6 +94,10 @@ class MavlinkEndpoint:
         name = params.names[index]
         self.send(
             mav.MAVLink_param_value_message(
-                name.encode(), params[name], mav.MAV_PARAM_TYPE_REAL32, len(params.names), index
+                name.encode(),
+                params.on_wire(name),
+                mav.MAV_PARAM_TYPE_REAL32,
+                len(params.names),
+                index,
             )
         )

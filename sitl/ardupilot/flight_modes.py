@@ -4,17 +4,18 @@ import math
 from enum import IntEnum
 
 from sitl.ardupilot import sticks as pilot
-from sitl.ardupilot.control import AttitudeController, HeightController, mix, thrust_for
+from sitl.ardupilot.control import AttitudeController, boosted, lean_for
+from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import Params
 from sitl.ardupilot.sticks import Sticks
-from sitl.rotation import Vec3, cos_tilt, to_euler, wrap_pi
+from sitl.rotation import Quat, Vec3, to_euler, wrap_pi
+from sitl.vehicle.control import HeightController, mix, thrust_for
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
 
 STOPPED = (0.0, 0.0, 0.0, 0.0)
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 
-FAST_DESCENT_MPS = 1.5  # LAND above SLOW_DESCENT_HEIGHT_M (WPNAV_SPEED_DN); LAND_SPEED below it
-SLOW_DESCENT_HEIGHT_M = 10.0
+SLOW_DESCENT_HEIGHT_M = 10.0  # LAND descends by WPNAV_SPEED_DN above it, by LAND_SPEED below
 RTL_SPEED_MPS = 5.0
 RTL_ARRIVED_M = 1.0
 POSITION_GAIN_PER_S = 0.8
@@ -30,11 +31,13 @@ class Mode(IntEnum):
     STABILIZE = 0
     ACRO = 1
     ALT_HOLD = 2
+    GUIDED = 4
     LOITER = 5
     RTL = 6
     LAND = 9
     POSHOLD = 16
     BRAKE = 17
+    GUIDED_NOGPS = 20
 
     @property
     def manual_throttle(self) -> bool:
@@ -43,8 +46,18 @@ class Mode(IntEnum):
 
     @property
     def piloted(self) -> bool:
-        """The sticks fly it; also the modes in which it can be armed."""
+        """The sticks fly it."""
         return self.manual_throttle or self.throttle_is_climb_rate
+
+    @property
+    def is_guided(self) -> bool:
+        """Setpoints fly it; the sticks do nothing."""
+        return self in (Mode.GUIDED, Mode.GUIDED_NOGPS)
+
+    @property
+    def can_arm(self) -> bool:
+        """The motors may be started in it."""
+        return self.piloted or self.is_guided
 
     @property
     def throttle_is_climb_rate(self) -> bool:
@@ -59,7 +72,7 @@ class Mode(IntEnum):
     @property
     def needs_position(self) -> bool:
         """Refused to a vehicle that is armed and has no position."""
-        return self is Mode.RTL or self.holds_position
+        return self in (Mode.RTL, Mode.GUIDED) or self.holds_position
 
     @property
     def lands(self) -> bool:
@@ -76,16 +89,27 @@ class FlightControl:
         self._height = HeightController()
         self._home_reached = False
         self._hold_ned_m: Vec3 | None = None
-        self.collective = 0.0
-        """Commanded mean thrust, as a fraction of full."""
+        self.guided = GuidedControl(params, self._attitude, self._height)
+        self.thrust = self.collective = 0.0
+        """Commanded mean thrust, as a fraction of full: before and after the boost for a lean."""
+
+    @property
+    def target(self) -> tuple[Quat, Vec3]:
+        """Shaped target: attitude (NED from body) and body rates in rad/s."""
+        return self._attitude.target
+
+    def enter(self, mode: Mode, body: BodyState) -> None:
+        """Begin with a mode, or with a flight in it."""
+        self.reset(body)
+        self.guided.enter(body, with_position=mode is Mode.GUIDED)
 
     def reset(self, body: BodyState) -> None:
-        """Forget the targets: before flight and at each mode change."""
+        """Forget the targets; setpoints of a companion computer stay."""
         self._attitude.reset(body)
         self._height.reset(body)
         self._home_reached = False
         self._hold_ned_m = None
-        self.collective = 0.0
+        self.thrust = self.collective = 0.0
 
     def idle(self, body: BodyState) -> tuple[float, ...]:
         """Motors of an armed vehicle that stays on the ground."""
@@ -100,13 +124,30 @@ class FlightControl:
         return mode.throttle_is_climb_rate and is_climb
 
     def fly(
-        self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool, dt_s: float
+        self,
+        mode: Mode,
+        sticks: Sticks,
+        body: BodyState,
+        now_ns: int,
+        *,
+        has_position: bool,
+        dt_s: float,
     ) -> tuple[float, ...]:
         """Motor commands of a flying vehicle, each in [0, 1]."""
-        if mode is Mode.ACRO:
+        if mode.is_guided:
+            turn, self.thrust = self.guided.fly(body, now_ns, has_position=has_position, dt_s=dt_s)
+            self.collective = boosted(self.thrust, body, self._params)
+        elif mode is Mode.ACRO:
             turn = self._attitude.rates(body, self._acro_rates(sticks, body), dt_s)
-            self.collective = pilot.manual_thrust(sticks, self._params)
-            return mix(self.collective, turn)
+            self.thrust = self.collective = pilot.manual_thrust(sticks, self._params)
+        else:
+            turn = self._lean(mode, sticks, body, has_position=has_position, dt_s=dt_s)
+        return mix(self.collective, turn)
+
+    def _lean(
+        self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool, dt_s: float
+    ) -> Vec3:
+        """One step of the modes that lean; the body angular acceleration in rad/s^2."""
         roll, pitch = pilot.lean_angles(sticks, self._params) if mode.piloted else (0.0, 0.0)
         if roll or pitch or not has_position:
             self._hold_ned_m = None
@@ -115,15 +156,14 @@ class FlightControl:
         elif mode.lands:
             roll, pitch = self._lean_home(mode, body)
         yaw_rate = pilot.yaw_rate_radps(sticks, self._params) if mode.piloted else 0.0
-        turn = self._attitude.lean(body, roll, pitch, yaw_rate, dt_s)
         if mode is Mode.STABILIZE:
-            self.collective = pilot.manual_thrust(sticks, self._params)
+            self.thrust = self.collective = pilot.manual_thrust(sticks, self._params)
         else:
             limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
             accel = self._height.update(body, self._climb_mps(mode, sticks, body), limit, dt_s)
-            tilt = cos_tilt(body.ned_from_body_wxyz)
-            self.collective = thrust_for(accel, tilt, self._params["MOT_THST_HOVER"])
-        return mix(self.collective, turn)
+            self.thrust = thrust_for(accel, 1.0, self._params["MOT_THST_HOVER"])
+            self.collective = boosted(self.thrust, body, self._params)
+        return self._attitude.lean(body, roll, pitch, yaw_rate, dt_s)
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
         if mode.throttle_is_climb_rate:
@@ -132,9 +172,14 @@ class FlightControl:
             return 0.0
         height = -body.position_ned_m[2]
         if mode is Mode.RTL and not self._home_reached:
-            return max(0.0, min(2.5, self._params["RTL_ALT"] / 100.0 - height))
+            return max(
+                0.0,
+                min(
+                    self._params["WPNAV_SPEED_UP"] / 100.0, self._params["RTL_ALT"] / 100.0 - height
+                ),
+            )
         if height > SLOW_DESCENT_HEIGHT_M:
-            return -FAST_DESCENT_MPS
+            return -self._params["WPNAV_SPEED_DN"] / 100.0
         return -self._params["LAND_SPEED"] / 100.0
 
     def _lean_home(self, mode: Mode, body: BodyState) -> tuple[float, float]:
@@ -191,7 +236,4 @@ def _lean_towards(
     accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n_mps - body.velocity_ned_mps[0])
     accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e_mps - body.velocity_ned_mps[1])
     scale = limit_mps2 / max(limit_mps2, math.hypot(accel_n_mps2, accel_e_mps2))
-    _, _, yaw = to_euler(body.ned_from_body_wxyz)
-    forward = scale * (accel_n_mps2 * math.cos(yaw) + accel_e_mps2 * math.sin(yaw))
-    right = scale * (accel_e_mps2 * math.cos(yaw) - accel_n_mps2 * math.sin(yaw))
-    return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)
+    return lean_for((scale * accel_n_mps2, scale * accel_e_mps2), body)

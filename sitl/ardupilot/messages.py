@@ -7,15 +7,16 @@ withheld until the estimator has one.
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.flight_modes import Mode
+from sitl.ardupilot.guided import Submode
+from sitl.link.framing import Message
 from sitl.rotation import Vec3, conjugate, rotate, to_euler
+from sitl.vehicle.config import ArduPilotRelease
 from sitl.vehicle.dynamics import GRAVITY_MPS2
-
-Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 
 HOME_LAT_DEG, HOME_LON_DEG, HOME_ALT_M = -35.3632621, 149.1652374, 584.0
 """ArduPilot SITL's default home."""
@@ -42,9 +43,15 @@ _CAPABILITIES = (
     | mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mav.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
+    | mav.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
 )
 """No FTP: clients then fetch parameters with PARAM_REQUEST_LIST."""
-_FIRMWARE_VERSION = 4 << 24 | 7 << 16 | 0 << 8 | mav.FIRMWARE_VERSION_TYPE_DEV
+_FIRMWARE_VERSIONS: dict[ArduPilotRelease, int] = {
+    "4.6": 4 << 24 | 6 << 16 | 3 << 8 | mav.FIRMWARE_VERSION_TYPE_OFFICIAL,
+    "4.7-dev": 4 << 24 | 7 << 16 | mav.FIRMWARE_VERSION_TYPE_DEV,
+    "4.7": 4 << 24 | 7 << 16 | mav.FIRMWARE_VERSION_TYPE_OFFICIAL,
+}
 _EKF_VERTICAL = mav.EKF_ATTITUDE | mav.EKF_VELOCITY_VERT | mav.EKF_POS_VERT_ABS
 _EKF_HORIZONTAL = (
     mav.EKF_VELOCITY_HORIZ
@@ -53,6 +60,8 @@ _EKF_HORIZONTAL = (
     | mav.EKF_PRED_POS_HORIZ_REL
     | mav.EKF_PRED_POS_HORIZ_ABS
 )
+_VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: all but velocity and acceleration
+_POSITION_ONLY = 3576  # all but the position
 _IMU_FIELDS_UPDATED = 8191
 _INT16 = 32767
 
@@ -163,7 +172,7 @@ def _vfr_hud(ap: Autopilot) -> Message:
     north, east, down = ap.sensed.velocity_ned_mps
     speed = math.hypot(north, east)
     throttle = round(100.0 * sum(ap.motor_commands) / len(ap.motor_commands))
-    altitude = HOME_ALT_M - ap.sensed.position_ned_m[2]
+    altitude = HOME_ALT_M - ap.sensed.position_ned_m[2] if ap.has_gps else 0.0
     return mav.MAVLink_vfr_hud_message(
         speed, speed, _heading(_yaw_rad(ap)), throttle, altitude, -down
     )
@@ -259,8 +268,31 @@ def _home_position(ap: Autopilot) -> Message | None:
 def _autopilot_version(ap: Autopilot) -> Message:
     unique = ap.params.integer("MAV_SYSID")
     no_hash = [0] * 8
+    version = _FIRMWARE_VERSIONS[ap.config.ardupilot_release]
     return mav.MAVLink_autopilot_version_message(
-        _CAPABILITIES, _FIRMWARE_VERSION, 0, 0, 0, no_hash, no_hash, no_hash, 0, 0, unique
+        _CAPABILITIES, version, 0, 0, 0, no_hash, no_hash, no_hash, 0, 0, unique
+    )
+
+
+def _attitude_target(ap: Autopilot) -> Message:
+    """The controller's shaped target, whatever was sent; thrust before the boost for a lean."""
+    attitude, rate_radps = ap.control.target
+    return mav.MAVLink_attitude_target_message(_ms(ap), 0, attitude, *rate_radps, ap.control.thrust)
+
+
+def _position_target(ap: Autopilot) -> Message | None:
+    """The setpoint that GUIDED follows, in NED axes; nothing in other modes or for attitudes."""
+    guided = ap.guided if ap.mode is Mode.GUIDED else None
+    if guided is None or guided.submode is Submode.ATTITUDE:
+        return None
+    is_takeoff = guided.submode is Submode.TAKEOFF
+    return mav.MAVLink_position_target_local_ned_message(
+        _ms(ap),
+        mav.MAV_FRAME_LOCAL_NED,
+        _POSITION_ONLY if is_takeoff else _VELOCITY_ONLY,
+        *(0.0, 0.0, 0.0),  # also during a takeoff, as the firmware has it
+        *guided.velocity.velocity_ned_mps,
+        *(0.0, 0.0, 0.0, 0.0, 0.0),
     )
 
 
@@ -307,6 +339,8 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     mav.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
+    mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
+    mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
     mav.MAVLINK_MSG_ID_HOME_POSITION: _home_position,
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended_sys_state,
 }

@@ -1,4 +1,7 @@
-"""Parameters that the simulated firmware reads, with ArduCopter 4.7's names and SITL defaults.
+"""Parameters that the simulated firmware reads, with ArduCopter's names and SITL defaults.
+
+The names in this code are those of the measured firmware, a 4.7 in development: it has the system
+ids of 4.7 and the units of 4.6. On the wire they are those of `VehicleConfig.ardupilot_release`.
 
 Values are float32, as on the wire (PARAM_VALUE carries REAL32). Those that differ from one vehicle
 to the next come from its conditions; their nominal attitude gains and rate limits are this
@@ -9,6 +12,7 @@ import math
 import struct
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.config import ArduPilotRelease
 
 RC_CHANNELS_WITH_PARAMS = 8
 
@@ -19,6 +23,9 @@ _FIXED = {
     "ACRO_RP_RATE": 360.0,  # deg/s
     "ACRO_TRAINER": 2.0,  # 0 none, 1 levels itself, 2 also limits the lean
     "ACRO_Y_RATE": 202.5,  # deg/s
+    "ATC_ACCEL_Y_MAX": 27000.0,  # cdeg/s^2, of GUIDED alone; 0: no limit
+    "ATC_ANGLE_BOOST": 1.0,  # more thrust in a lean
+    "ATC_RATE_Y_MAX": 0.0,  # deg/s, of GUIDED alone; 0: no limit
     "DISARM_DELAY": 10.0,  # s
     "FLTMODE1": 0.0,  # STABILIZE; the modes of the switch's six positions, this vehicle's own
     "FLTMODE2": 9.0,  # LAND
@@ -29,9 +36,11 @@ _FIXED = {
     "FLTMODE_CH": 5.0,  # channel of the switch; 0: none
     "FS_GCS_ENABLE": 0.0,  # 0 off, 1 RTL, 5 LAND, 7 BRAKE
     "FS_GCS_TIMEOUT": 5.0,  # s
-    "FS_OPTIONS": 16.0,  # bit 3: a landing goes on; 4: so does the pilot when the GCS is lost
+    "FS_OPTIONS": 16.0,  # bit 2: GUIDED goes on; 3: a landing; 4: the pilot when the GCS is lost
     "FS_THR_ENABLE": 1.0,  # 0 off, 1 RTL, 3 LAND, 7 BRAKE
     "FS_THR_VALUE": 975.0,  # us
+    "GUID_OPTIONS": 0.0,  # bit 3: SET_ATTITUDE_TARGET.thrust is thrust, not a climb rate
+    "GUID_TIMEOUT": 3.0,  # s; how long a setpoint counts
     "LAND_SPEED": 50.0,  # cm/s
     "MAV_GCS_SYSID": 255.0,
     "MAV_GCS_SYSID_HI": 0.0,
@@ -47,8 +56,35 @@ _FIXED = {
     "RC_OVERRIDE_TIME": 3.0,  # s; 0 refuses overrides, < 0 never expires
     "RTL_ALT": 1500.0,  # cm
     "SCHED_LOOP_RATE": 400.0,  # Hz; bounds the message rates
+    "WPNAV_ACCEL_Z": 100.0,  # cm/s^2
+    "WPNAV_SPEED_DN": 150.0,  # cm/s
+    "WPNAV_SPEED_UP": 250.0,  # cm/s
 }
 _RC_CHANNEL = {"MAX": 2000.0, "MIN": 1000.0, "OPTION": 0.0, "REVERSED": 0.0, "TRIM": 1500.0}
+
+_NAMES_4_6 = {
+    "MAV_GCS_SYSID": "SYSID_MYGCS",
+    "MAV_OPTIONS": "SYSID_ENFORCE",  # its bit 0
+    "MAV_SYSID": "SYSID_THISMAV",
+}
+_ABSENT_IN_4_6 = ("MAV_GCS_SYSID_HI",)
+_NAMES_4_7 = {
+    "ANGLE_MAX": "ATC_ANGLE_MAX",
+    "ATC_ACCEL_P_MAX": "ATC_ACC_P_MAX",
+    "ATC_ACCEL_R_MAX": "ATC_ACC_R_MAX",
+    "ATC_ACCEL_Y_MAX": "ATC_ACC_Y_MAX",
+    "LAND_SPEED": "LAND_SPD_MS",
+    "PILOT_ACCEL_Z": "PILOT_ACC_Z",
+    "PILOT_SPEED_DN": "PILOT_SPD_DN",
+    "PILOT_SPEED_UP": "PILOT_SPD_UP",
+    "RTL_ALT": "RTL_ALT_M",
+    "WPNAV_ACCEL_Z": "WP_ACC_Z",
+    "WPNAV_SPEED_DN": "WP_SPD_DN",
+    "WPNAV_SPEED_UP": "WP_SPD_UP",
+}
+"""All of them in metres or degrees, where the names before were in hundredths of those."""
+_SI_NAMES = frozenset(_NAMES_4_7.values())
+HUNDREDTHS = 100.0
 
 
 def _varied(conditions: Conditions) -> dict[str, float]:
@@ -73,9 +109,11 @@ def _varied(conditions: Conditions) -> dict[str, float]:
 
 
 class Params:
-    """Named numbers in a fixed, sorted order (the order is PARAM_VALUE's index)."""
+    """Named numbers; `on_wire` and `set_on_wire` know them by the names of the release."""
 
-    def __init__(self, conditions: Conditions = NOMINAL) -> None:
+    def __init__(
+        self, conditions: Conditions = NOMINAL, release: ArduPilotRelease = "4.7-dev"
+    ) -> None:
         values = _FIXED | _varied(conditions)
         for index in range(RC_CHANNELS_WITH_PARAMS):
             values |= {f"RC{index + 1}_{name}": value for name, value in _RC_CHANNEL.items()}
@@ -84,10 +122,25 @@ class Params:
                 dead_zones_us[index] if index < len(dead_zones_us) else 0.0
             )
         self._values = {name: _float32(values[name]) for name in sorted(values)}
-        self.names: tuple[str, ...] = tuple(self._values)
+        renamed = {"4.6": _NAMES_4_6, "4.7-dev": {}, "4.7": _NAMES_4_7}[release]
+        absent = _ABSENT_IN_4_6 if release == "4.6" else ()
+        named = {renamed.get(name, name): name for name in self._values if name not in absent}
+        self._by_wire_name = {name: named[name] for name in sorted(named)}
+        self.names: tuple[str, ...] = tuple(self._by_wire_name)
+        """Names on the wire, in PARAM_VALUE's order."""
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
+
+    def on_wire(self, name: str) -> float:
+        """The value in the unit that this name, one of ``names``, has on the wire."""
+        value = self._values[self._by_wire_name[name]]
+        return value / HUNDREDTHS if name in _SI_NAMES else value
+
+    def set_on_wire(self, name: str, value: float) -> bool:
+        """As `set`, by a name and in the unit of the wire."""
+        scale = HUNDREDTHS if name in _SI_NAMES else 1.0
+        return name in self._by_wire_name and self.set(self._by_wire_name[name], scale * value)
 
     def integer(self, name: str) -> int:
         """The value of an enumeration or bit mask."""

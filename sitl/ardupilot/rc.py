@@ -17,10 +17,6 @@ IGNORE = 65535
 RELEASE_ON_AUX = 65534  # releases channels 9-16; on 1-8 it is a value like any other
 RELEASE = 0  # releases channels 1-8; on 9-16 it means "ignore"
 AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
-IDLE_RECEIVER_US = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
-"""An untouched transmitter: throttle down, the rest centred."""
-MID_RECEIVER_US = (1500,) * 8
-"""Every stick centred, the throttle too: what a pilot holds who stands by."""
 
 _RECEIVER_PERIOD_NS = NS_PER_S // 50
 _OPTION_OVERRIDE_SWITCH = 46

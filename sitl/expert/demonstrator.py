@@ -15,7 +15,6 @@ import math
 from dataclasses import dataclass, replace
 
 from sitl import UsageError
-from sitl.ardupilot.control import clamp
 from sitl.ardupilot.params import Params
 from sitl.course.layout import Course, Gate
 from sitl.course.referee import GateCounter, crossing
@@ -23,6 +22,7 @@ from sitl.expert.guidance import Plan, Waypoint, least_acceleration
 from sitl.expert.stick_response import DRAG_PER_S, Demand, StickPositions, StickResponse
 from sitl.rotation import Vec3, rotate, to_euler, wrap_pi
 from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
 
 LAG_S = 0.17  # from stick to lean, of the nominal vehicle

@@ -10,10 +10,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sitl.ardupilot.control import clamp
 from sitl.course.layout import AirborneStart, Course
 from sitl.expert.stick_response import CENTRED, StickPositions
 from sitl.rotation import from_euler
+from sitl.vehicle.control import clamp
 
 QUIET_S = (1.0, 5.0)
 NOISY_S = (0.5, 2.0)

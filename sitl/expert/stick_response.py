@@ -4,8 +4,8 @@ import cmath
 import math
 from typing import NamedTuple
 
-from sitl.ardupilot.control import clamp
 from sitl.ardupilot.params import Params
+from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 
 DRAG_PER_S = 0.125  # linear drag over mass, compensated by lean

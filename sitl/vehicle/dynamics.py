@@ -1,4 +1,4 @@
-"""A 1.2 kg quadrotor as a MuJoCo free body: motors with lag, rotor drag, air drag, a ground to hit.
+"""A quadrotor as a MuJoCo free body: motors with lag, rotor drag, air drag, a ground to hit.
 
 MuJoCo works in north-west-up with a forward-left-up body; everything outside this module is NED and
 FRD. Both differ by a half turn about x, so vectors and the vector part of quaternions flip y and z:
@@ -17,47 +17,56 @@ from sitl.rotation import Quat, Vec3, cos_tilt
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
 GRAVITY_MPS2 = 9.80665
-MASS_KG = 1.2
 INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
 MOTOR_ARM_M = 0.12  # motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase
-MAX_MOTOR_THRUST_N = 7.54
-"""Hover at 0.39 of full thrust, which is ArduCopter's learned-hover order of magnitude."""
 YAW_TORQUE_PER_THRUST_M = 0.016
-MOTOR_LAG_S = 0.028
-ROTOR_DRAG_NSPM = 0.15
-"""Linear drag of spinning rotors, about 0.1 1/s of mass at this size; body drag is MuJoCo's own
-quadratic model on the equivalent inertia box."""
 AIR_DENSITY_KGPM3 = 1.225
 REST_HEIGHT_M = 0.06
 
-PHYSICS_STEP_NS = 1_250_000
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Airframe:
+    """What differs from one quadrotor to another; the defaults are the nominal one's."""
+
+    mass_kg: float = 1.2
+    max_motor_thrust_n: float = 7.54
+    """Hover at 0.39 of full thrust, which is ArduCopter's learned-hover order of magnitude."""
+    motor_lag_s: float = 0.028
+    rotor_drag_nspm: float = 0.15
+    """Linear drag of spinning rotors, about 0.1 1/s of mass at this size; body drag is MuJoCo's own
+    quadratic model on the equivalent inertia box."""
+    step_ns: int = 1_250_000
+    """Of the physics; a firmware's control period is a whole number of them."""
+
+
+QUAD = Airframe()
 
 _BODY = 1  # after the world
 _FULL_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-def _model_xml(conditions: Conditions) -> str:
-    """MuJoCo model of these conditions, to compile: it derives hidden values from masses.
+def _model_xml(airframe: Airframe, conditions: Conditions) -> str:
+    """MuJoCo model to compile, which derives hidden values from the masses.
 
     Motor order and directions are ArduCopter's quad X: front right and rear left turn anticlockwise
     seen from above, so they push the nose to the right.
     """
     density = AIR_DENSITY_KGPM3 * conditions.drag_factor
-    thrust_n = MAX_MOTOR_THRUST_N * conditions.thrust_factor
+    thrust_n = airframe.max_motor_thrust_n * conditions.thrust_factor
     inertia_kgm2 = [conditions.mass_factor * moment for moment in INERTIA_KGM2]
     return f"""
 <mujoco>
-  <option timestep="{PHYSICS_STEP_NS / 1e9}" gravity="0 0 -{GRAVITY_MPS2}" density="{density}"
+  <option timestep="{airframe.step_ns / 1e9}" gravity="0 0 -{GRAVITY_MPS2}" density="{density}"
           integrator="implicitfast"/>
   <default>
-    <general dyntype="filterexact" dynprm="{MOTOR_LAG_S}" gainprm="{thrust_n}"
+    <general dyntype="filterexact" dynprm="{airframe.motor_lag_s}" gainprm="{thrust_n}"
              ctrlrange="0 1" ctrllimited="true"/>
   </default>
   <worldbody>
     <geom type="plane" pos="0 0 {-REST_HEIGHT_M}" size="0 0 1"/>
     <body>
       <freejoint/>
-      <inertial pos="0 0 0" mass="{MASS_KG * conditions.mass_factor}"
+      <inertial pos="0 0 0" mass="{airframe.mass_kg * conditions.mass_factor}"
                 diaginertia="{" ".join(map(str, inertia_kgm2))}"/>
       <geom type="sphere" size="0.02" pos="0.12 0.12 -0.04"/>
       <geom type="sphere" size="0.02" pos="0.12 -0.12 -0.04"/>
@@ -110,11 +119,11 @@ def _flip(v: Sequence[float]) -> Vec3:
 class Quadrotor:
     """The physical model, without state: MuJoCo's data is only scratch space."""
 
-    def __init__(self, conditions: Conditions = NOMINAL) -> None:
-        self._model = mujoco.MjModel.from_xml_string(_model_xml(conditions))
-        self._mass_kg = MASS_KG * conditions.mass_factor
-        self._max_motor_thrust_n = MAX_MOTOR_THRUST_N * conditions.thrust_factor
-        self._rotor_drag_nspm = ROTOR_DRAG_NSPM * conditions.drag_factor
+    def __init__(self, conditions: Conditions = NOMINAL, airframe: Airframe = QUAD) -> None:
+        self._model = mujoco.MjModel.from_xml_string(_model_xml(airframe, conditions))
+        self._mass_kg = airframe.mass_kg * conditions.mass_factor
+        self._max_motor_thrust_n = airframe.max_motor_thrust_n * conditions.thrust_factor
+        self._rotor_drag_nspm = airframe.rotor_drag_nspm * conditions.drag_factor
         self._model.dof_damping[:3] = self._rotor_drag_nspm
         self._data = mujoco.MjData(self._model)
         self._state_size = mujoco.mj_stateSize(self._model, _FULL_STATE)

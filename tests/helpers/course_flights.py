@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_S
 from sitl.course.layout import AirborneStart, Course
@@ -15,6 +14,7 @@ from sitl.expert.disturbance import StickDisturbance
 from sitl.expert.stick_response import StickPositions
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 TICK_NS = NS_PER_S // 100
 REST_S = 3.0

@@ -33,11 +33,11 @@ from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper
 from mavbridge.simulation.network import DelayedChannel
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import Contract, Executable, FloatArray
-from sitl.ardupilot.autopilot import STEP_NS, Autopilot, VehicleConfig
+from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.rc import IDLE_RECEIVER_US, MID_RECEIVER_US
 from sitl.course.layout import AirborneStart
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, STEP_NS, VehicleConfig
 
 MS = NS_PER_MS
 HEIGHT_M = 10.0

@@ -13,9 +13,8 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.engagement import Phase
-from sitl.ardupilot.autopilot import Battery
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.rc import MID_RECEIVER_US
+from sitl.vehicle.config import MID_RECEIVER_US, Battery
 
 LEANING = leaning(0.0)
 

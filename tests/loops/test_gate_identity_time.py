@@ -13,7 +13,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.rc import MID_RECEIVER_US
+from sitl.vehicle.config import MID_RECEIVER_US
 
 ELSEWHERE = ("sitl", 2)
 

@@ -9,7 +9,7 @@ from helpers.gate_flights import CONTRACT, MS, GateFlight, climbing_first
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.rc import IDLE_RECEIVER_US, MID_RECEIVER_US
+from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US
 
 FAULT = "the camera is gone"
 

@@ -8,7 +8,7 @@ from helpers.gate_flights import GateFlight, climbing_first, hovering, leaning
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.rc import MID_RECEIVER_US
+from sitl.vehicle.config import MID_RECEIVER_US
 
 MS = NS_PER_MS
 OVERRIDE_SWITCH = {"RC8_OPTION": 46.0}

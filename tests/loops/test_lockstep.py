@@ -21,7 +21,7 @@ from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult
 from mavbridge.simulation.world import Exposure
 from policy.contract import Executable, FloatArray
 from policy.errors import PolicyError
-from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 MS = NS_PER_MS
 HOP_NS = MS // 10

@@ -27,9 +27,9 @@ from mavbridge.flight.app import fly_executable
 from mavbridge.flight.policies import is_scripted, load_configured_policy, load_for_episodes
 from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delays
-from mavbridge.simulation.flight import MODE, SimulatedFlight, SimulationSettings
+from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult, Outcome, StickMeter
-from mavbridge.simulation.world import NOMINAL_VEHICLE, random_vehicle
+from mavbridge.simulation.world import make_vehicle
 from policy.contract import Executable
 
 STARTUP_S = 90.0
@@ -85,14 +85,16 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         rates=config.rates,
         limits=config.limits,
         delays=replace(delays, vision=vision),
+        raw_sticks=config.raw_sticks,
         draw_images=not is_scripted(config.policy),
     )
-    conditions_seed = spec.conditions_seed
     flight = SimulatedFlight(
         course_seed=spec.course_seed,
         seed=spec.seed,
         settings=settings,
-        vehicle=NOMINAL_VEHICLE if conditions_seed is None else random_vehicle(conditions_seed),
+        vehicle=make_vehicle(
+            autopilot=config.autopilot, gains=config.gains, conditions_seed=spec.conditions_seed
+        ),
     )
     loaded = load_for_episodes(config.policy, flight.clock)
     executable = _measured(loaded.executable, config)
@@ -126,7 +128,7 @@ def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> Flo
         command = (
             *(sys.executable, "-m", "sitl", "--camera", camera, "--end-with-course"),
             *("--connect", f"udpout:127.0.0.1:{port}", "--report", str(report)),
-            *("--course", str(spec.course_seed)),
+            *("--course", str(spec.course_seed), "--autopilot", spec.config.autopilot),
             *("--image-size", str(max(SIM_CAMERA_PX, image_size or 0))),
             *(() if conditions_seed is None else ("--conditions", str(conditions_seed))),
         )
@@ -170,12 +172,11 @@ def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> tuple[str, StickMeter
     """Fly once, as ``mavbridge fly`` does; ended by signals, like that."""
     settings, clock, meter = job.spec.config, MonotonicClock(), StickMeter()
     config = FlyConfig(
-        link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}"),
+        link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}", raw_sticks=settings.raw_sticks),
         policy=settings.policy,
         camera=CameraConfig(camera=job.camera),
         rates=settings.rates,
         limits=settings.limits,
-        mode=MODE,
         arm=True,
         duration=settings.max_time,
     )

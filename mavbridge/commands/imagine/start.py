@@ -86,6 +86,10 @@ def _require_state_frame(flight: RecordedFlight, config: WorldModelConfig) -> No
             f"--start {flight.folder} has its states in {found}, the world model takes {wanted}: "
             "name a flight of that kind, or a world model that was trained on this one"
         )
+    if contract.action != "sticks":
+        raise UserError(
+            f"--start {flight.folder} was flown by {contract.action}, the world model takes sticks"
+        )
 
 
 def _sent_before(flight: RecordedFlight, now_ns: int) -> tuple[tuple[int, Sticks | None], ...]:

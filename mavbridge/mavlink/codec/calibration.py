@@ -1,5 +1,6 @@
 """Sticks <-> PWM with the vehicle's own radio calibration: the one table of signs and channels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -111,6 +112,13 @@ class RcCalibration:
     def channels(self) -> tuple[RcChannel, RcChannel, RcChannel, RcChannel]:
         """Channels in the order of ``Sticks``."""
         return self.throttle, self.yaw, self.pitch, self.roll
+
+    def stick_channels_us(self, channels_us: Sequence[int]) -> Pwm | None:
+        """PWM of the four sticks among a vehicle's channels; None if it has fewer than eight."""
+        if len(channels_us) < 8:
+            return None
+        t, y, p, r = (channels_us[channel.number - 1] for channel in self.channels)
+        return t, y, p, r
 
     def to_pwm_us(self, sticks: Sticks) -> Pwm:
         """PWM of throttle, yaw, pitch, roll, inside the calibrated range."""

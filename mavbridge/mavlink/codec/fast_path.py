@@ -1,6 +1,7 @@
 """The packets between each state and its sticks, without pymavlink's general parser and packer.
 
-The same result in less than half of the time; anything unusual is left to pymavlink.
+The same result in less than half of the time; anything unusual is left to pymavlink. The same way
+are decoded the messages that pymavlink's dialect lacks.
 """
 
 import struct
@@ -17,6 +18,8 @@ _MAVLINK_2 = 0xFD
 _HEADER = struct.Struct("<BBBBBBBHB")
 """Marker, payload length, incompatible and compatible flags, sequence, system, component, id."""
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
+_SIGNED, _SIGNATURE_BYTES = 1, 13
+"""Incompatible flag of a signed packet, and what it has behind the checksum."""
 _OVERRIDE = dialect.MAVLink_rc_channels_override_message
 _OVERRIDE_PAYLOAD = struct.Struct("<8H2B")
 """Channels 1 to 8, target system and component; channels 9 to 18 are zeros, which are cut off."""
@@ -48,22 +51,50 @@ _LAYOUTS = {
     )
 }
 
+_MISSING_LAYOUTS = {
+    436: _Layout(
+        "CURRENT_MODE",
+        193,
+        struct.Struct("<IIB"),
+        namedtuple("CURRENT_MODE", "custom_mode intended_custom_mode standard_mode"),
+    ),
+    410: _Layout(
+        "EVENT",
+        160,
+        struct.Struct("<IIHBBB40s"),
+        namedtuple("EVENT", "id time_boot_ms sequence component system log_levels arguments"),
+    ),
+}
+"""Messages of MAVLink's common dialect that pymavlink's one for ArduPilot does not have, by number;
+layouts as in common.xml, whose fields go by falling size on the wire."""
+MISSING_IDS = {layout.name: number for number, layout in _MISSING_LAYOUTS.items()}
+_LAYOUTS |= _MISSING_LAYOUTS
+
 
 def decode_state_packet(data: bytes) -> ReceivedMessage | None:
-    """Decode one whole, unsigned, sound and usable packet of a state message; otherwise None."""
+    """Decode one whole, unsigned, sound and usable packet of a state message; otherwise None.
+
+    Also one of a message that pymavlink's dialect lacks.
+    """
     if len(data) < _HEADER_BYTES + _CHECKSUM_BYTES:
         return None
     start, length, incompatible, _, sequence, system, component, low, high = _HEADER.unpack_from(
         data
     )
-    layout = _LAYOUTS.get(low | high << 16)
-    if layout is None or start != _MAVLINK_2 or incompatible:
+    number = low | high << 16
+    layout = _LAYOUTS.get(number)
+    if layout is None or start != _MAVLINK_2:
         return None
-    if len(data) != _HEADER_BYTES + length + _CHECKSUM_BYTES or length > layout.payload.size:
+    sealed = data
+    if incompatible:
+        if incompatible != _SIGNED or number not in _MISSING_LAYOUTS:
+            return None
+        sealed = data[:-_SIGNATURE_BYTES]  # without a key nobody can check it
+    if len(sealed) != _HEADER_BYTES + length + _CHECKSUM_BYTES or length > layout.payload.size:
         return None
-    if _checksum(data[1:-_CHECKSUM_BYTES], layout.crc_extra) != data[-_CHECKSUM_BYTES:]:
+    if _checksum(sealed[1:-_CHECKSUM_BYTES], layout.crc_extra) != sealed[-_CHECKSUM_BYTES:]:
         return None
-    payload = data[_HEADER_BYTES:-_CHECKSUM_BYTES].ljust(layout.payload.size, b"\0")
+    payload = sealed[_HEADER_BYTES:-_CHECKSUM_BYTES].ljust(layout.payload.size, b"\0")
     values = layout.payload.unpack(payload)[: len(layout.fields._fields)]
     try:
         body = READERS[layout.name](layout.fields._make(values))

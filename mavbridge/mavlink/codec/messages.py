@@ -1,6 +1,12 @@
 """The part of MAVLink that the bridge uses: one frozen record per message, in SI units, checked."""
 
+import struct
 from typing import NamedTuple, TypeAlias
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+_REAL, _INTEGER = struct.Struct("<f"), struct.Struct("<i")
+_LEAST, _MOST = -(2**31), 2**31 - 1
 
 
 class Endpoint(NamedTuple):
@@ -18,6 +24,21 @@ class Heartbeat(NamedTuple):
     base_mode: int
     custom_mode: int
     system_status: int = 0
+
+
+class CurrentMode(NamedTuple):
+    """CURRENT_MODE (436)."""
+
+    custom_mode: int
+    intended_custom_mode: int
+    """Mode that was asked for last; 0 = the vehicle does not say. Another one than the present: it
+    has left it by itself, for a failsafe."""
+
+
+class Event(NamedTuple):
+    """EVENT (410): something that happened once; what the number means is the firmware's own."""
+
+    event_id: int
 
 
 class Attitude(NamedTuple):
@@ -55,6 +76,43 @@ class RcChannels(NamedTuple):
     """Vehicle's clock since it started."""
 
 
+class ManualControl(NamedTuple):
+    """MANUAL_CONTROL (69) from a vehicle: the sticks that it acts on, as they stand in it."""
+
+    x: int
+    """Forward, -1000 to 1000; so are y, right, and r, nose right."""
+    y: int
+    z: int
+    """Up, 0 to 1000."""
+    r: int
+
+
+class AttitudeTarget(NamedTuple):
+    """ATTITUDE_TARGET (83)."""
+
+    boot_us: int
+    type_mask: int
+    ned_from_body_wxyz: tuple[float, float, float, float]
+    rate_body_radps: tuple[float, float, float]
+    thrust: float
+
+
+class VelocityTarget(NamedTuple):
+    """POSITION_TARGET_LOCAL_NED (85)."""
+
+    boot_us: int
+    type_mask: int
+    velocity_ned_mps: tuple[float, float, float]
+    yaw_rate_radps: float
+
+
+class Altitude(NamedTuple):
+    """GLOBAL_POSITION_INT (33), of which only the height is used."""
+
+    amsl_m: float
+    """Above mean sea level."""
+
+
 class SystemStatus(NamedTuple):
     """SYS_STATUS (1)."""
 
@@ -89,16 +147,38 @@ class CommandAck(NamedTuple):
 
 
 class ParamValue(NamedTuple):
-    """PARAM_VALUE (22) as ArduPilot encodes it: the number itself, whatever its type."""
+    """PARAM_VALUE (22)."""
 
     name: str
     value: float
+    """The number itself, whatever its type."""
+    kind: int = dialect.MAV_PARAM_TYPE_REAL32
+    """MAV_PARAM_TYPE."""
+
+    def from_bytes(self) -> "ParamValue":
+        """The same of a vehicle that writes integers into the bytes of the float, as PX4 does."""
+        if self.kind != dialect.MAV_PARAM_TYPE_INT32:
+            return self
+        (number,) = _INTEGER.unpack(_REAL.pack(self.value))
+        return self._replace(value=float(number))
+
+
+class ParamAbsent(NamedTuple):
+    """PARAM_ERROR (345): the vehicle has no parameter of this name."""
+
+    name: str
 
 
 class StatusText(NamedTuple):
     """STATUSTEXT (253)."""
 
     text: str
+    text_id: int = 0
+    """Number of a text in several pieces; 0 = all of it is here."""
+    sequence: int = 0
+    """Place of this piece among those."""
+    is_full: bool = False
+    """It has no end, so that another piece follows."""
 
 
 class Timesync(NamedTuple):
@@ -118,15 +198,22 @@ class AutopilotVersion(NamedTuple):
 
 Body: TypeAlias = (
     Heartbeat
+    | CurrentMode
+    | Event
     | Attitude
     | LocalVelocity
     | SpecificForce
     | RcChannels
+    | ManualControl
+    | AttitudeTarget
+    | VelocityTarget
+    | Altitude
     | SystemStatus
     | LandedState
     | EstimatorFlags
     | CommandAck
     | ParamValue
+    | ParamAbsent
     | StatusText
     | Timesync
     | AutopilotVersion
@@ -162,10 +249,19 @@ class ParamRequest(NamedTuple):
 
 
 class ParamWrite(NamedTuple):
-    """PARAM_SET (23) as ArduPilot reads it: the number itself, whatever its type."""
+    """PARAM_SET (23)."""
 
     name: str
     value: float
+    kind: int = dialect.MAV_PARAM_TYPE_REAL32
+    """MAV_PARAM_TYPE."""
+
+    def as_bytes(self) -> "ParamWrite":
+        """The same for a vehicle that reads integers from the bytes of the float, as PX4 does."""
+        if self.kind != dialect.MAV_PARAM_TYPE_INT32:
+            return self
+        number = round(min(max(self.value, _LEAST), _MOST))
+        return self._replace(value=_REAL.unpack(_INTEGER.pack(number))[0])
 
 
 class StreamRequest(NamedTuple):

@@ -82,6 +82,10 @@ class Codec:
 
     def _read(self, message: dialect.MAVLink_message) -> ReceivedMessage:
         name = message.get_type()
+        if isinstance(message, dialect.MAVLink_unknown):
+            missing = decode_state_packet(bytes(message.data))
+            if missing is not None:
+                return missing
         reader = READERS.get(name)
         try:
             body = None if reader is None else reader(message)
@@ -149,9 +153,8 @@ class Codec:
                 message = self._mav.command_long_encode(*target, command, 0, *padded)
             case ParamRequest(name):
                 message = self._mav.param_request_read_encode(*target, name.encode(), -1)
-            case ParamWrite(name, value):
-                real = dialect.MAV_PARAM_TYPE_REAL32
-                message = self._mav.param_set_encode(*target, name.encode(), value, real)
+            case ParamWrite(name, value, kind):
+                message = self._mav.param_set_encode(*target, name.encode(), value, kind)
             case StreamRequest(stream, rate_hz):
                 message = self._mav.request_data_stream_encode(*target, stream, rate_hz, 1)
         return self._pack(message)

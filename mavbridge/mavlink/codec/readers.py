@@ -6,26 +6,35 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.mavlink.codec.messages import (
+    Altitude,
     Attitude,
+    AttitudeTarget,
     AutopilotVersion,
     Body,
     CommandAck,
+    CurrentMode,
     Endpoint,
     EstimatorFlags,
+    Event,
     Heartbeat,
     LandedState,
     LocalVelocity,
+    ManualControl,
+    ParamAbsent,
     ParamValue,
     RcChannels,
     SpecificForce,
     StatusText,
     SystemStatus,
     Timesync,
+    VelocityTarget,
 )
 
 MG_TO_MPS2 = 9.80665e-3
 """Milli-g to m/s^2, standard gravity."""
 
+_TEXT_BYTES = 50
+"""Text of one STATUSTEXT."""
 _HIGHRES_ACCEL_FIELDS = 0b111
 """fields_updated bits of xacc, yacc, zacc."""
 
@@ -120,8 +129,34 @@ def _command_ack(m: dialect.MAVLink_command_ack_message) -> Body:
 
 
 def _param_value(m: dialect.MAVLink_param_value_message) -> Body:
-    _require_finite(m.param_value)
-    return ParamValue(name=m.param_id, value=m.param_value)
+    if m.param_type == dialect.MAV_PARAM_TYPE_REAL32:
+        _require_finite(m.param_value)  # the bytes of an integer may be those of NaN
+    return ParamValue(name=m.param_id, value=m.param_value, kind=m.param_type)
+
+
+def _param_error(m: dialect.MAVLink_param_error_message) -> Body | None:
+    is_absent = m.error == dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
+    return ParamAbsent(m.param_id) if is_absent else None
+
+
+def _status_text(m: dialect.MAVLink_statustext_message) -> Body:
+    # pymavlink has cut the zero bytes off.
+    is_full = m.id != 0 and len(m.text.encode("utf-8", "surrogateescape")) >= _TEXT_BYTES
+    return StatusText(m.text, m.id, m.chunk_seq, is_full)
+
+
+def _attitude_target(m: dialect.MAVLink_attitude_target_message) -> Body | None:
+    q, rate = tuple(m.q), (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate)
+    if not math.isfinite(sum((*q, *rate, m.thrust))):
+        return None  # no target
+    return AttitudeTarget(1000 * m.time_boot_ms, m.type_mask, q, rate, m.thrust)
+
+
+def _velocity_target(m: dialect.MAVLink_position_target_local_ned_message) -> Body | None:
+    velocity = (m.vx, m.vy, m.vz)
+    if not math.isfinite(sum(velocity)):
+        return None  # no target
+    return VelocityTarget(1000 * m.time_boot_ms, m.type_mask, velocity, m.yaw_rate)
 
 
 def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
@@ -131,7 +166,7 @@ def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
     return AutopilotVersion(version=version, unique_id=number)
 
 
-READERS: dict[str, Callable[[dialect.MAVLink_message], Body]] = {
+READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
     "HEARTBEAT": _heartbeat,
     "ATTITUDE": _attitude,
     "ATTITUDE_QUATERNION": _attitude_quaternion,
@@ -141,13 +176,20 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body]] = {
     "SCALED_IMU2": _scaled_imu,
     "RAW_IMU": _raw_imu,
     "RC_CHANNELS": _rc_channels,
+    "MANUAL_CONTROL": lambda m: ManualControl(m.x, m.y, m.z, m.r),
+    "ATTITUDE_TARGET": _attitude_target,
+    "POSITION_TARGET_LOCAL_NED": _velocity_target,
+    "GLOBAL_POSITION_INT": lambda m: Altitude(m.alt / 1000),
+    "CURRENT_MODE": lambda m: CurrentMode(m.custom_mode, m.intended_custom_mode),
+    "EVENT": lambda m: Event(m.id),
     "SYS_STATUS": _sys_status,
     "EXTENDED_SYS_STATE": lambda m: LandedState(m.landed_state),
     "EKF_STATUS_REPORT": lambda m: EstimatorFlags(m.flags),
     "ESTIMATOR_STATUS": lambda m: EstimatorFlags(m.flags),
     "COMMAND_ACK": _command_ack,
     "PARAM_VALUE": _param_value,
-    "STATUSTEXT": lambda m: StatusText(text=m.text),
+    "PARAM_ERROR": _param_error,
+    "STATUSTEXT": _status_text,
     "TIMESYNC": lambda m: Timesync(tc1=m.tc1, ts1=m.ts1),
     "AUTOPILOT_VERSION": _autopilot_version,
 }

@@ -1,1 +1,1 @@
-"""The session with one vehicle, without I/O: discovery, parameters, streams, echo check."""
+"""The session with one vehicle, without I/O: discovery, parameters, streams, condition."""

@@ -24,6 +24,8 @@ _AUTOPILOTS = {
     dialect.MAV_AUTOPILOT_PX4: "px4",
 }
 _CAPACITY = 64
+_NAMESAKES = 16
+_NAMESAKE_ADVICE = "give it another system id, or keep it off this port"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +36,11 @@ class VehicleIdentity:
     address: Address | None
     vehicle_type: int
     autopilot: str
+
+    @property
+    def place(self) -> str:
+        """Where it sends from, for a message."""
+        return _place(self.address)
 
 
 class VehicleDiscovery:
@@ -126,3 +133,40 @@ class VehicleDiscovery:
             "heard nothing: is the vehicle running, and does it send to this address? "
             "(udp: listens, udpout: calls)"
         )
+
+
+class Namesakes:
+    """Other senders that use the system id of the chosen vehicle."""
+
+    def __init__(self) -> None:
+        self._reported: set[Address | None] = set()
+        self._took_over_ns: int | None = None
+
+    def heard(self, vehicle: VehicleIdentity, sender: Address | None) -> str | None:
+        """Warning about one that is heard beside the vehicle; None after its first."""
+        if sender in self._reported or len(self._reported) >= _NAMESAKES:
+            return None
+        self._reported.add(sender)
+        return (
+            f"system {vehicle.source.system} is also heard from {_place(sender)}, which is "
+            f"ignored: the vehicle is at {vehicle.place}; {_NAMESAKE_ADVICE}"
+        )
+
+    def took_over(
+        self, vehicle: VehicleIdentity, sender: Address | None, now_ns: int
+    ) -> str | None:
+        """Why the flight is over where the vehicle itself is silent; at most once a second."""
+        if self._took_over_ns is not None and now_ns - self._took_over_ns <= NS_PER_S:
+            return None
+        self._took_over_ns = now_ns
+        return (
+            f"the vehicle at {vehicle.place} is silent, and system "
+            f"{vehicle.source.system} is now heard from {_place(sender)}, which is not followed "
+            f"in flight: if it is another vehicle, {_NAMESAKE_ADVICE}; if this one has moved, "
+            "engage again"
+        )
+
+
+def _place(address: Address | None) -> str:
+    """A stream has no address."""
+    return "this connection" if address is None else f"{address[0]}:{address[1]}"

@@ -17,6 +17,8 @@ class LinkCounters:
         self._first_ns: int | None = None
         self._last_ns = 0
         self.sent = 0
+        self.saturated: Counter[str] = Counter()
+        """Sent messages in which a stick, by name, asked for more than the vehicle can do."""
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
         """Count one message; a gap in its 8-bit sequence is that many lost (modulo 256)."""
@@ -54,6 +56,7 @@ class LinkCounters:
             sent_overrides=self.sent,
             echo_confirmed=echo_confirmed if self.sent else None,
             unusable_packets=unusable_packets,
+            saturated=tuple((name, n / self.sent) for name, n in sorted(self.saturated.items())),
             vehicle_clock_offset_ns=timesync.offset_ns,
             is_timesync_good=timesync.is_good,
             timesync_error_ms=None if error_ns is None else error_ns / NS_PER_MS,

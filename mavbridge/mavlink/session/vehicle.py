@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import VehicleStatus
-from mavbridge.mavlink.codec.calibration import Pwm, RcCalibration
+from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
     Attitude,
     AutopilotVersion,
@@ -31,7 +31,6 @@ from mavbridge.mavlink.codec.messages import (
 )
 from mavbridge.mavlink.session.condition import ConditionMessage, VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
-from mavbridge.mavlink.session.echo import EchoCheck, EchoFault
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 from mavbridge.mavlink.session.streams import StreamRequester, message_id, telemetry_streams
 from mavbridge.mavlink.settings import LinkSettings
@@ -54,23 +53,16 @@ _MULTIROTORS = (
     *(dialect.MAV_TYPE_TRICOPTER, dialect.MAV_TYPE_COAXIAL),
     *(dialect.MAV_TYPE_DECAROTOR, dialect.MAV_TYPE_DODECAROTOR),
 )
-_ECHO_FAULTS: dict[EchoFault, str] = {
-    "unseen": "another station may be overriding them, or the receiver has priority",
-    "foreign": "another station is overriding them (a joystick on our system id?)",
-    "returned": "it also acts on the sticks that it had before us: another station is overriding "
-    "or releasing them, or the override switch is off",
-    "silent": "its sticks have stood still for 0.4 s while ours moved",
-}
 
 
 class VehicleSession:
     """One vehicle from its first heartbeat to its next reboot.
 
-    Reads its version, then its parameters (if the output needs them), then requests its streams and
-    keeps them coming. ``report`` shows a text to the user.
+    Reads its version, then its parameters, then requests its streams and keeps them coming.
+    ``report`` shows a text to the user.
 
     Raises:
-        PeerError: the vehicle cannot be flown with the configured output.
+        PeerError: the vehicle cannot be flown.
     """
 
     def __init__(
@@ -81,24 +73,21 @@ class VehicleSession:
         report: Callable[[str], None],
     ) -> None:
         _require_multirotor(identity.vehicle_type)
-        self._is_override = config.output == "rc-override"
-        if self._is_override and identity.autopilot == "px4":
-            raise PeerError(
-                "PX4 cannot release an RC_CHANNELS_OVERRIDE: use --output manual-control"
-            )
-        if not self._is_override and identity.autopilot == "ardupilot":
-            raise PeerError("ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override")
+        self._is_px4 = identity.autopilot == "px4"
         self.identity = identity
         self._report = report
         self.condition = VehicleCondition(
             autopilot=identity.autopilot, min_battery_percent=config.min_battery_percent
         )
-        self.echo = EchoCheck()
+        self.is_receiver_hidden = False
+        """Our sticks may stand in RC_CHANNELS in place of the receiver's."""
+        self.is_released = True
+        """Other sticks than ours were seen since, or none of ours was sent."""
         self.version: str | None = None
         self._unique_id = ""
         self._version_attempts = 0
         self._version_due_ns = 0
-        streams = telemetry_streams(state_hz=config.state_hz, is_px4=identity.autopilot == "px4")
+        streams = telemetry_streams(state_hz=config.state_hz, is_px4=self._is_px4)
         self._streams = StreamRequester(streams)
         self._params = VehicleParams(identity, config, streams=streams, report=report)
         self._receiver_due_ns: int | None = None
@@ -137,22 +126,21 @@ class VehicleSession:
                 pass  # handled by the link, or not used
 
     def _receive_condition(self, body: ConditionMessage, arrived_ns: int) -> None:
-        self.condition.receive(body, arrived_ns, may_be_ours=self.echo.has_sent)
+        self.condition.receive(body, arrived_ns, may_be_ours=self.is_receiver_hidden)
 
     def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
-        pwm_us = self._stick_channels_us(rc)
-        if pwm_us is not None:
-            self.echo.received(pwm_us, rc.boot_us, arrived_ns)
+        calibration = self.calibration
+        pwm_us = calibration.stick_channels_us(rc.channels_us) if calibration else None
         self.condition.receive_rc(
             rc,
             arrived_ns,
             # Without a calibration (PX4) the sticks are among the first four by custom.
             channels_us=rc.channels_us[:4] if pwm_us is None else pwm_us,
-            sticks=self.calibration.to_sticks(pwm_us)
-            if self.calibration and pwm_us and all(pwm_us)
+            sticks=calibration.to_sticks(pwm_us)
+            if calibration and pwm_us and all(pwm_us)
             else None,
-            may_be_ours=self.echo.has_sent,
-            is_released=self.echo.is_released and not self.echo.is_sending,
+            may_be_ours=self.is_receiver_hidden,
+            is_released=self.is_released,
         )
         if (switch := self._params.override_switch) is not None:
             switch_us = self._switch_us(switch)
@@ -165,13 +153,6 @@ class VehicleSession:
             self._old_stamps += 1
         else:
             self._old_stamps, self._boot_ms = 0, boot_ms
-
-    def _stick_channels_us(self, rc: RcChannels) -> Pwm | None:
-        calibration = self.calibration
-        if calibration is None or len(rc.channels_us) < 8:
-            return None
-        t, y, p, r = (rc.channels_us[channel.number - 1] for channel in calibration.channels)
-        return t, y, p, r
 
     def step(self, now_ns: int) -> Iterator[Request]:
         """Requests that are due."""
@@ -235,7 +216,7 @@ class VehicleSession:
     def status(self, now_ns: int) -> VehicleStatus | None:
         """The vehicle's own report; None before its first heartbeat."""
         status = self.condition.status(now_ns)
-        is_absent = status is not None and status.has_receiver is None and not self._is_override
+        is_absent = status is not None and status.has_receiver is None and self._is_px4
         if status is not None and is_absent and self._is_receiver_settled(now_ns):
             return replace(status, has_receiver=False)
         return status
@@ -265,36 +246,6 @@ class VehicleSession:
         """The pilot's override switch is low: the vehicle ignores our sticks."""
         switch = self._params.override_switch
         return switch is not None and 0 < self._switch_us(switch) < _SWITCH_OFF_US
-
-    def overruled(self, now_ns: int) -> str | None:
-        """The likely reason why it follows other sticks than those that we send, or None."""
-        fault = self.echo.fault(now_ns)
-        if fault is None or fault == "silent" or self._is_rc_silent(now_ns):
-            return None
-        return f"the vehicle ignores our sticks: {_ECHO_FAULTS[fault]}"
-
-    def unheard(self, now_ns: int) -> str | None:
-        """The reason why our sticks do not reach it, as far as can be told, or None."""
-        fault = self.echo.fault(now_ns)
-        if fault is not None and self._is_rc_silent(now_ns):
-            return "no RC_CHANNELS arrive to check our sticks against"
-        if fault == "silent":
-            return f"the vehicle does not hear our sticks: {_ECHO_FAULTS[fault]}"
-        return None
-
-    def _is_rc_silent(self, now_ns: int) -> bool:
-        rc = self.condition.rc
-        return rc is None or now_ns - rc[0] > NS_PER_S
-
-    @property
-    def echo_confirmed(self) -> bool:
-        """It was seen to act on our sticks, or its output has no echo to check."""
-        return not self._is_override or self.echo.confirmed
-
-    @property
-    def is_released(self) -> bool:
-        """It was seen to act on other sticks than ours since the release, or has none of ours."""
-        return self.echo.is_released
 
 
 def _require_multirotor(vehicle_type: int) -> None:

@@ -1,6 +1,6 @@
 """Transport and codec together: messages in, packets out, reconnecting by itself."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Protocol, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
@@ -44,8 +44,10 @@ class Connection:
         self._reopen_ns: int | None = None
         self.peer: Address | None = None
         """The vehicle's address, to which packets are sent; None until it is found."""
+        self.tap: Callable[[bytes], None] | None = None
+        """Gets everything that comes from the peer, as it came; must neither wait nor raise."""
         self.texts: list[str] = []
-        """Messages for the user; the reader empties the list."""
+        """Messages for the user, until `take_texts`."""
         self._was_open = False
         self._open(clock.now_ns())
 
@@ -66,6 +68,12 @@ class Connection:
         self._was_open = True
         self._codec.forget_partial()
 
+    def take_texts(self) -> tuple[str, ...]:
+        """Messages for the user since the last call."""
+        texts = tuple(self.texts)
+        self.texts.clear()
+        return texts
+
     def fileno(self) -> int | None:
         """Descriptor to wait for with ``select``; None while there is none."""
         return None if self.is_down else self._transport.fileno()
@@ -84,6 +92,8 @@ class Connection:
             self._open(now_ns)
         try:
             for data, arrived_ns, sender in self._transport.drain():
+                if self.tap is not None and self.peer in (None, sender):
+                    self.tap(data)
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data):

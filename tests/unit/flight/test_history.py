@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import NEUTRAL, Sticks
+from mavbridge.core.vehicle import IDLE, NEUTRAL, AttitudeThrust, BodyRates, Sticks
+from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.history import SentHistory, sample_chunk
+from policy.contract import Contract
 
 CHUNK = np.array([[0, 0, 0, 0], [1, -1, 0.5, 0], [0, 0, 0, 1]], dtype=np.float32)
 
@@ -45,6 +47,19 @@ def test_what_was_never_sent_and_what_was_released_is_neutral() -> None:
     history.append(stick(0.7), 25 * NS_PER_MS)
     assert history.resample(36 * NS_PER_MS)[0, :, 0] == pytest.approx([0, 0.5, 0, 0.7])
     assert history.resample(36 * NS_PER_MS)[0, 2] == pytest.approx(NEUTRAL)
+
+
+def test_what_was_sent_comes_back_in_the_policys_own_axes_and_kind() -> None:
+    contract = Contract(action="rates", state_frame="enu_flu", hover_thrust=0.5)
+    history = SentHistory(length=4, dt_s=0.01, frame=action_frame(contract))
+    neutral = [0.5, 0, 0, 0]
+    assert history.resample(0)[0].tolist() == [neutral] * 4
+    history.append(BodyRates(0.25, 1.0, 2.0, -3.0), 0)
+    history.append(AttitudeThrust(0.4, 0.1, 0.1, 0.1), 10 * NS_PER_MS)  # the gate's own levelling
+    history.append(None, 20 * NS_PER_MS)
+    history.append(IDLE, 30 * NS_PER_MS)
+    own = [0.25, 1, -2, 3]
+    assert history.resample(40 * NS_PER_MS)[0].tolist() == [own, neutral, neutral, neutral]
 
 
 def test_history_forgets_what_no_resample_can_reach() -> None:

@@ -11,7 +11,8 @@ from helpers.fakes import START_NS, FakeClock, ListSink
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import FeatureFrame, FloatArray
-from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.core.vehicle import ForwardedPacket, Velocity
+from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
@@ -20,17 +21,23 @@ from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.wire import Absence, GateTick
+from policy.contract import Contract
 
 MS = NS_PER_MS
+STICKS_FRAME = ActionFrame()
 FRESH = Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS)
 
 
 class Rig:
     """A policy loop whose policy takes 3 ms, and the messages that it sends."""
 
-    def __init__(self, chunk: Callable[[], FloatArray] | None = None) -> None:
+    def __init__(
+        self,
+        chunk: Callable[[], FloatArray] | None = None,
+        frame: ActionFrame = STICKS_FRAME,
+    ) -> None:
         self.clock, self.cache, self.end = FakeClock(), FeatureCache(), WireEnd()
-        history = SentHistory(length=2, dt_s=0.05)
+        history = SentHistory(length=2, dt_s=0.05, frame=frame)
         self.view = VehicleView(
             history=history, sink=ListSink(), state_frame="ned_frd", freshness=FRESH
         )
@@ -49,6 +56,7 @@ class Rig:
             settings=PolicySettings(
                 state_frame="ned_frd",
                 since_exposure=False,
+                action_frame=frame,
                 chunk_dt_s=0.05,
                 freshness=FRESH,
                 max_feature_age_ns=300 * MS,
@@ -129,6 +137,17 @@ def test_a_chunk_carries_the_moments_that_it_came_from(velocity_ms: int, force_m
         actions=(),
     )
     assert chunk.actions == ((0.0,) * 4,) * 3
+
+
+def test_actions_reach_the_gate_in_its_own_kind_and_axes() -> None:
+    frame = action_frame(Contract(action="velocity", state_frame="enu_flu"))
+    rig = Rig(lambda: np.array([[[1, 2, 3, 0.5]]], np.float32), frame).measure().see()
+    rig.loop.step()
+    (chunk,) = rig.sent
+    assert isinstance(chunk, Chunk)
+    (action,) = chunk.actions
+    assert isinstance(action, Velocity)
+    assert action == Velocity(2.0, 1.0, -3.0, -0.5)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import pytest
 from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
-from mavbridge.flight.settings import flight_settings, gate_settings
+from mavbridge.core.vehicle import ActionMeaning, StickGains
+from mavbridge.flight.settings import action_meaning, flight_settings, gate_settings
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import EngagementSettings
 from mavbridge.gate.gate import FlightSettings
@@ -126,3 +127,33 @@ def test_engaging_and_leaving_follow_the_flags() -> None:
 def test_a_mode_in_which_the_policy_does_not_fly_is_refused(mode: str) -> None:
     with pytest.raises(UserError, match=r"flies in ALT_HOLD or ALTCTL only"):
         settings_for(FlyConfig(link=LINK, mode=mode))
+
+
+def test_the_contract_says_what_full_stick_means_and_raw_sticks_says_nothing() -> None:
+    contract = Contract(
+        full_lean_deg=45.0,
+        full_yaw_rate_degps=100.0,
+        full_climb_mps=3.0,
+        full_descent_mps=1.5,
+        lean_dead_zone=0.01,
+        yaw_dead_zone=0.02,
+        throttle_dead_zone=0.03,
+    )
+    gains = StickGains(
+        lean_deg=45.0,
+        yaw_rate_degps=100.0,
+        climb_mps=3.0,
+        descent_mps=1.5,
+        lean_dead_zone=0.01,
+        yaw_dead_zone=0.02,
+        throttle_dead_zone=0.03,
+    )
+    assert action_meaning(contract, LINK) == ActionMeaning(stick_gains=gains)
+    assert action_meaning(contract, replace(LINK, raw_sticks=True)) == ActionMeaning()
+
+
+def test_other_actions_than_sticks_have_no_gains() -> None:
+    contract = Contract(action="velocity", velocity_frame="heading", hover_thrust=0.5)
+    assert action_meaning(contract, LINK) == ActionMeaning(
+        kind="velocity", hover_thrust=0.5, is_heading_frame=True
+    )

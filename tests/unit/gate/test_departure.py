@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from helpers.gate_facts import AIRBORNE, PX4_MODES, flying
-from mavbridge.core.vehicle import NEUTRAL
+from helpers.gate_facts import AIRBORNE, COPTER_MODES, PX4_MODES, flying
+from mavbridge.core.vehicle import NEUTRAL, ModeRoles
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.facts import Hand, Move
@@ -178,3 +178,38 @@ def test_the_operators_release_while_holding_lands_too() -> None:
     stepped.step(**FAULT)
     stepped.run(0.2, mode="BRAKE")
     assert stepped.step("release") == Move(hand=Hand.NEUTRAL, mode="LAND")
+
+
+SETPOINTS = DepartureSettings(is_setpoint=True)
+
+
+@pytest.mark.parametrize("has_receiver", [True, False])
+@pytest.mark.parametrize(
+    ("mode", "modes", "hold", "land"),
+    [
+        ("GUIDED", COPTER_MODES, "BRAKE", "LAND"),
+        ("OFFBOARD", PX4_MODES, "AUTO.LOITER", "AUTO.LAND"),
+    ],
+)
+def test_setpoints_end_in_a_mode_that_holds_and_then_in_silence(
+    has_receiver: bool, mode: str, modes: ModeRoles, hold: str, land: str
+) -> None:
+    facts = replace(AIRBORNE, mode=mode, modes=modes, has_receiver=has_receiver)
+    rules = {"departure": SETPOINTS, "modes": (mode,), "is_setpoint": True}
+    stepped = flying(facts, **rules)
+    fault = stepped.step(**FAULT)
+    assert (fault.hand, fault.mode) == (Hand.NEUTRAL, hold)
+    after = stepped.run(0.2, mode=hold)
+    assert after[-1].hand is Hand.RELEASE
+    assert stepped.phase is Phase.RELEASING
+    ended = flying(facts, **rules)
+    ended.engagement.stop(Ending(reason="over"))
+    assert ended.step().mode == (hold if has_receiver else land)
+
+
+def test_a_refused_hold_of_setpoints_becomes_a_landing() -> None:
+    facts = replace(AIRBORNE, mode="GUIDED")
+    stepped = flying(facts, departure=SETPOINTS, modes=("GUIDED",), is_setpoint=True)
+    stepped.step(**FAULT)
+    moves = stepped.run(0.3, refused_mode="BRAKE")
+    assert "LAND" in {move.mode for move in moves}

@@ -84,6 +84,7 @@ STATS = LinkStats(
     sent_overrides=6000,
     echo_confirmed=None,
     vehicle_clock_offset_ns=-5,
+    saturated=(("pitch", 0.25), ("yaw", 0.01)),
 )
 SUMMARY = GateSummary(
     autopilot="PX4", link=STATS, failure="did not arm", dropped_messages=1, dropped_packets=2

@@ -1,3 +1,4 @@
+import struct
 from math import nan, pi, sqrt
 from typing import Any
 
@@ -9,7 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.wire import ARDUPILOT, WireEnd
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks
 from mavbridge.mavlink.codec.messages import (
+    Altitude,
     Attitude,
+    AttitudeTarget,
     AutopilotVersion,
     Body,
     CommandAck,
@@ -18,6 +21,8 @@ from mavbridge.mavlink.codec.messages import (
     Heartbeat,
     LandedState,
     LocalVelocity,
+    ManualControl,
+    ParamAbsent,
     ParamValue,
     ParamWrite,
     RcChannels,
@@ -25,6 +30,7 @@ from mavbridge.mavlink.codec.messages import (
     StatusText,
     SystemStatus,
     Timesync,
+    VelocityTarget,
 )
 from mavbridge.mavlink.codec.packets import (
     Codec,
@@ -115,7 +121,25 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
         m.param_value_encode(b"RC1_MIN", 1100.0, 9, 100, 5),
         ParamValue(name="RC1_MIN", value=1100.0),
     ),
+    (
+        m.param_value_encode(b"COM_RC_IN_MODE", 3.0, 6, 100, 5),
+        ParamValue(name="COM_RC_IN_MODE", value=3.0, kind=6),
+    ),
+    (m.param_error_encode(255, 191, b"ANGLE_MAX", -1, 1), ParamAbsent(name="ANGLE_MAX")),
     (m.statustext_encode(4, b"PreArm: no"), StatusText(text="PreArm: no")),
+    (m.statustext_encode(4, b"x" * 50, 7, 1), StatusText("x" * 50, 7, 1, is_full=True)),
+    (m.statustext_encode(4, b"x" * 49, 7, 2), StatusText("x" * 49, 7, 2, is_full=False)),
+    (m.statustext_encode(4, b"x" * 50), StatusText("x" * 50)),
+    (m.manual_control_encode(1, 122, -5, 500, 1000, 0), ManualControl(122, -5, 500, 1000)),
+    (
+        m.attitude_target_encode(7, 7, [0.5, 0.5, -0.5, 0.5], 1, 2, 3, 0.4),
+        AttitudeTarget(7000, 7, (0.5, 0.5, -0.5, 0.5), (1, 2, 3), 0.4),
+    ),
+    (
+        m.position_target_local_ned_encode(7, 1, 3079, nan, nan, nan, 1, 2, -3, 0, 0, 0, 0, 0.5),
+        VelocityTarget(7000, 3079, (1, 2, -3), 0.5),
+    ),
+    (m.global_position_int_encode(7, 0, 0, 489423, 0, 0, 0, 0, 0), Altitude(amsl_m=489.423)),
     (m.timesync_encode(5, -6), Timesync(tc1=5, ts1=-6)),
     (
         m.autopilot_version_encode(0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 0),
@@ -182,6 +206,38 @@ def test_unusable_values_are_counted_and_dropped(
     (incoming,) = ours.decode(WireEnd().pack(message))
     assert incoming.body is None
     assert ours.bad_data_count == 1
+
+
+def test_a_target_that_is_none_is_no_fault() -> None:
+    ours = codec()
+    for message in (
+        m.attitude_target_encode(7, 7, [nan] * 4, 1, 2, 3, 0.4),
+        m.position_target_local_ned_encode(7, 1, 0, 1, 1, 1, nan, 2, -3, 0, 0, 0, 0, 0.5),
+        m.param_error_encode(255, 191, b"COM_RC_IN_MODE", -1, 2),  # a value out of range
+    ):
+        (incoming,) = ours.decode(WireEnd().pack(message))
+        assert incoming.body is None
+    assert ours.bad_data_count == 0
+
+
+@pytest.mark.parametrize("number", [0, 1, -1, 10040, 2**31 - 1, -(2**31)])
+def test_an_integer_parameter_of_px4_stands_in_the_bytes_of_the_float(number: int) -> None:
+    written = ParamWrite("SYS_AUTOSTART", float(number), kind=6).as_bytes()
+    message = sent(codec().encode_request(TARGET, written))
+    assert message.param_type == 6
+    assert struct.pack("<f", message.param_value) == struct.pack("<i", number)
+    answer = m.param_value_encode(b"SYS_AUTOSTART", message.param_value, 6, 100, 5)
+    (incoming,) = codec().decode(WireEnd().pack(answer))
+    assert isinstance(incoming.body, ParamValue)
+    assert incoming.body.from_bytes().value == number
+
+
+def test_a_parameter_that_is_no_integer_is_written_as_it_is() -> None:
+    real = ParamWrite("COM_RC_LOSS_T", 0.5)
+    assert real.as_bytes() == real
+    assert ParamValue("COM_RC_LOSS_T", 0.5, 9).from_bytes().value == 0.5
+    too_much = ParamWrite("SYS_AUTOSTART", 1e12, kind=6).as_bytes()
+    assert ParamValue("SYS_AUTOSTART", too_much.value, 6).from_bytes().value == 2**31 - 1
 
 
 def test_an_unused_message_is_passed_on_for_counting() -> None:

@@ -1,11 +1,18 @@
 """The fast path must give exactly what pymavlink's parser and packer give."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.mavlink.codec.fast_path import decode_state_packet, pack_override
-from mavbridge.mavlink.codec.messages import Endpoint, ReceivedMessage
+from mavbridge.mavlink.codec.messages import (
+    Body,
+    CurrentMode,
+    Endpoint,
+    Event,
+    ReceivedMessage,
+)
 from mavbridge.mavlink.codec.packets import Codec
 
 byte = st.integers(0, 255)
@@ -80,3 +87,45 @@ def test_the_usual_packets_take_the_fast_path() -> None:
         mav.highres_imu_encode(7, 0, 0, -9.8, *[0.0] * 10, 7),
     ):
         assert decode_state_packet(message.pack(mav)) is not None
+
+
+# --- messages that pymavlink's dialect lacks; packets of a real PX4 1.18, system 4
+
+IN_RTL = bytes.fromhex("fd0900004f0401b40100000004050000030005e05d")
+ARMED = bytes.fromhex("fd0e00002404019a0100f3ca900134450000120000006604641c")
+MISSING = [
+    (IN_RTL, "CURRENT_MODE", CurrentMode(5 << 24 | 4 << 16, 3 << 16)),
+    (ARMED, "EVENT", Event(0x190CAF3)),
+]
+
+
+@pytest.mark.parametrize(("data", "name", "body"), MISSING)
+@pytest.mark.parametrize("is_signed", [False, True])
+def test_what_pymavlink_does_not_know_is_decoded_here(
+    data: bytes, name: str, body: Body, is_signed: bool
+) -> None:
+    if is_signed:
+        data = signed(data, crc_extra={"CURRENT_MODE": 193, "EVENT": 160}[name])
+    expected = ReceivedMessage(Endpoint(4, 1), data[4], name, body, data)
+    codec = Codec(source_system=255, source_component=191)
+    assert list(codec.decode_datagram(data)) == [expected]
+    assert by_pymavlink(data) == [expected]  # a serial port, byte by byte
+    heartbeat = dialect.MAVLink(None, srcSystem=4, srcComponent=1)
+    around = heartbeat.heartbeat_encode(2, 12, 0, 0, 4).pack(heartbeat)
+    assert [message.name for message in codec.decode(around + data + around)] == [
+        *("HEARTBEAT", name, "HEARTBEAT")
+    ]
+
+
+def signed(data: bytes, *, crc_extra: int) -> bytes:
+    """The packet with the flag and with room for a signature, which nobody can check."""
+    body = bytes((data[0], data[1], 1, *data[3:-2]))
+    checksum: int = dialect.x25crc(body[1:] + bytes((crc_extra,))).crc
+    return body + checksum.to_bytes(2, "little") + bytes(13)
+
+
+@pytest.mark.parametrize(("data", "name", "body"), MISSING)
+def test_a_damaged_one_is_no_message(data: bytes, name: str, body: Body) -> None:
+    for k in range(10, len(data)):
+        damaged = bytes((*data[:k], data[k] ^ 0x10, *data[k + 1 :]))
+        assert all(message.body is None for message in by_pymavlink(damaged)), (name, body)

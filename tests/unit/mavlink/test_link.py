@@ -14,18 +14,23 @@ from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.vehicle import (
     IDLE,
+    ActionMeaning,
     Command,
     ForwardedPacket,
     LinkSnapshot,
+    Output,
     Packet,
     Release,
     Sticks,
 )
-from mavbridge.mavlink.codec.messages import Measurement
+from mavbridge.mavlink.codec.frames import split_frames
+from mavbridge.mavlink.codec.messages import Endpoint, Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.settings import LinkSettings
+from mavbridge.mavlink.transport.forwarding import Forwarding
+from mavbridge.mavlink.transport.ground_station import Verdict
 from mavbridge.mavlink.transport.sockets import Address, Received, TransportDownError
 
 MS = NS_PER_MS
@@ -147,7 +152,14 @@ class Vehicle:
 class Rig:
     """Ticks both at 100 Hz."""
 
-    def __init__(self, **config: Any) -> None:
+    def __init__(
+        self,
+        *,
+        meaning: ActionMeaning | None = ActionMeaning(),  # noqa: B008 - frozen
+        output: Output | None = None,
+        station: Forwarding | None = None,
+        **config: Any,
+    ) -> None:
         self.clock = FakeClock()
         self.vehicle = Vehicle(self.clock)
         self.packet_log: BoundedQueue[Packet] = BoundedQueue(20_000)
@@ -158,7 +170,10 @@ class Rig:
             LinkSettings(connect="memory", **config),
             packet_log=self.packet_log,
             forward=self.forwarded.append,
+            ground_station=station,
         )
+        if meaning is not None:
+            self.link.begin_flight(meaning, output)
         self.ticks = 0
         self.texts: list[str] = []
 
@@ -709,7 +724,7 @@ def px4_rig(**config: Any) -> Rig:
 
 
 def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
-    rig = px4_rig(output="manual-control")
+    rig = px4_rig()
     snapshot = rig.run(8.0)
     assert snapshot.problem is None
     assert snapshot.echo_confirmed
@@ -722,7 +737,7 @@ def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
 
 
 def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -> None:
-    rig = px4_rig(output="manual-control")
+    rig = px4_rig()
     before, count = rig.run(8.0).telemetry.velocity_ned_mps, len(rig.forwarded)
     assert before is not None
     rig.vehicle.put(rig.vehicle.end.mav.estimator_status_encode(0, 0xE5, *[0.0] * 8))
@@ -735,6 +750,22 @@ def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -
 def test_ardupilot_with_manual_control_is_refused() -> None:
     with pytest.raises(PeerError, match="--output rc-override"):
         Rig(output="manual-control").run(3.0)
+
+
+def test_an_output_that_makes_no_sense_is_refused_at_once_where_the_vehicle_is_known() -> None:
+    rig = Rig(meaning=None)
+    rig.run(8.0)
+    with pytest.raises(PeerError, match="--output rc-override"):
+        rig.link.begin_flight(ActionMeaning(), "manual-control")
+
+
+def test_without_a_policy_nothing_is_sent() -> None:
+    rig = Rig(meaning=None)
+    assert rig.run(8.0, Command(action=IDLE)).problem == "no policy is loaded yet"
+    assert rig.overrides() == []
+    rig.link.begin_flight(ActionMeaning(), None)
+    assert rig.run(0.1).problem is None
+    assert rig.run(0.1, Command(action=IDLE)).echo_confirmed
 
 
 def test_acks_for_other_stations_are_ignored() -> None:
@@ -756,4 +787,59 @@ def test_acks_for_other_stations_are_ignored() -> None:
 
 def test_px4_with_rc_override_is_refused() -> None:
     with pytest.raises(PeerError, match="--output manual-control"):
-        px4_rig().run(3.0)
+        px4_rig(output="rc-override").run(3.0)
+
+
+class Station(Forwarding):
+    """A ground station without a socket."""
+
+    def __init__(self, *, sticks_win: bool) -> None:
+        super().__init__("udp:127.0.0.1:9", FakeClock(), sticks_win=sticks_win)
+        super().close()
+        self.end = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
+        self.inbox: list[Any] = []
+        self.heard = b""
+
+    def pass_on(self, data: bytes) -> None:
+        self.heard += data
+
+    def receive(self, vehicle: Endpoint | None, *, is_engaged: bool) -> Iterator[bytes]:
+        messages, self.inbox = self.inbox, []
+        for message in messages:
+            (frame,), _ = split_frames(bytes(message.pack(self.end)))
+            if self.rules.judge(frame, 0, is_engaged=is_engaged) is Verdict.PASS:
+                yield frame.data
+
+
+def test_a_ground_station_gets_the_vehicle_s_bytes_and_its_commands_get_there() -> None:
+    station = Station(sticks_win=False)
+    rig = Rig(station=station)
+    rig.run(8.0)
+
+    station.inbox.append(station.end.command_long_encode(1, 1, 176, 0, 1, 5, 0, 0, 0, 0, 0))
+    rig.run(0.1)
+
+    names = [m.get_type() for m in WireEnd().read(station.heard)]
+    assert names.count("ATTITUDE_QUATERNION") == rig.ticks
+    assert [m.param2 for m in rig.vehicle.received if m.get_type() == "COMMAND_LONG"][-1] == 5
+
+
+def test_its_sticks_are_dropped_or_end_the_flight_with_one_release_before_them() -> None:
+    for wins in (False, True):
+        station = Station(sticks_win=wins)
+        rig = Rig(station=station)
+        rig.run(8.0)
+        rig.link.is_engaged = True
+        assert rig.run(0.5, Command(action=IDLE)).problem is None
+        rig.vehicle.received.clear()
+
+        station.inbox.append(station.end.rc_channels_override_encode(1, 1, 1700, *[1500] * 7))
+        snapshot = rig.link.poll()
+        assert snapshot.is_overruled == wins
+        rig.run(1.0, Release("overruled") if wins else Command(action=IDLE))
+
+        sent = rig.overrides()
+        assert ([1700, *[1500] * 7] in sent) == wins
+        if wins:
+            assert sent == [RELEASE_US, [1700, *[1500] * 7]]
+            assert "the ground station's sticks have taken over" in (snapshot.problem or "")

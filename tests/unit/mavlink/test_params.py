@@ -204,11 +204,10 @@ def test_a_slow_serial_port_is_refused_for_both_autopilots(connect: str) -> None
     vehicle = ParamVehicle(connect=connect)
     vehicle.run(6.0)
     assert "or --accept-risk slow-serial" in (vehicle.problem() or "")
-    px4 = ParamVehicle(autopilot="px4", output="manual-control", connect=connect)
+    px4 = ParamVehicle(autopilot="px4", connect=connect)
     assert "or --accept-risk slow-serial" in (px4.problem() or "")
     fine = ParamVehicle(
         autopilot="px4",
-        output="manual-control",
         connect=connect,
         accepted_risks=("slow-serial",),
     )
@@ -216,13 +215,11 @@ def test_a_slow_serial_port_is_refused_for_both_autopilots(connect: str) -> None
 
 
 def test_parameters_of_px4_are_neither_read_nor_set() -> None:
-    vehicle = ParamVehicle(autopilot="px4", output="manual-control")
+    vehicle = ParamVehicle(autopilot="px4")
     vehicle.run(3.0)
     assert (vehicle.requests, vehicle.problem()) == ([], None)
     identity = VehicleIdentity(source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot="px4")
-    settings = LinkSettings(
-        output="manual-control", set_params=(("A", 1.0),), state_folder=vehicle.folder
-    )
+    settings = LinkSettings(set_params=(("A", 1.0),), state_folder=vehicle.folder)
     with pytest.raises(PeerError, match="this is px4"):
         VehicleParams(identity, settings, streams=(), report=vehicle.texts.append)
 

@@ -448,6 +448,15 @@ def test_a_newer_reading_never_happened_before_an_older_one() -> None:
     assert held == [(1.0, 0), (2.0, 10), (3.0, 20), (4.0, 30)]
 
 
+def test_sticks_that_ask_for_too_much_are_a_share_of_those_sent() -> None:
+    counters = LinkCounters()
+    counters.sent = 8
+    for names in (("yaw",), (), ("pitch", "yaw")):
+        counters.saturated.update(names)
+    stats = counters.stats(TimesyncFilter(), echo_confirmed=True, unusable_packets=0)
+    assert stats.saturated == (("pitch", 0.125), ("yaw", 0.25))
+
+
 def test_losses_are_gaps_in_the_sequence() -> None:
     counters, sync = LinkCounters(), TimesyncFilter()
     nothing = counters.stats(sync, echo_confirmed=None, unusable_packets=0)

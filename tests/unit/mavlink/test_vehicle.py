@@ -1,4 +1,4 @@
-"""The session with one vehicle: its condition, its receiver, its modes, its echo."""
+"""The session with one vehicle: its condition, its receiver, its modes."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.wire import ARDUPILOT, CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
-from mavbridge.core.vehicle import Sticks, VehicleStatus
+from mavbridge.core.vehicle import ActionMeaning, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
     Attitude,
     Body,
@@ -25,6 +25,8 @@ from mavbridge.mavlink.codec.messages import (
     ReceivedMessage,
     SystemStatus,
 )
+from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.outputs.choice import choose_output
 from mavbridge.mavlink.session.commands import ModeAndArm
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -46,20 +48,25 @@ class Session:
     """A session that grants every request; the vehicle's messages are put in by hand."""
 
     def __init__(self, autopilot: str = "ardupilot", *, is_ready: bool = True, **link: Any) -> None:
-        self.output = "rc-override" if autopilot == "ardupilot" else "manual-control"
         identity = VehicleIdentity(
             source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot=autopilot
         )
-        settings = LinkSettings(output=self.output, **link)  # type: ignore[arg-type]
-        self.session = VehicleSession(identity, settings, report=lambda _text: None)
+        self.session = VehicleSession(identity, LinkSettings(**link), report=lambda _text: None)
+        self.output = choose_output(
+            ActionMeaning(),
+            None,
+            autopilot=autopilot,
+            codec=Codec(source_system=255, source_component=191),
+        )
         self.params: dict[str, float] = dict(CALIBRATION)
         self.now_ns = 10 * S
-        self.put(Heartbeat(2, 3, 81, 2 if self.output == "rc-override" else 2 << 16, 4))
+        self.put(Heartbeat(2, 3, 81, 2 if autopilot == "ardupilot" else 2 << 16, 4))
         if is_ready:
             self.shake_hands()
 
     def put(self, body: Body, name: str = "ANY") -> None:
         message = ReceivedMessage(Endpoint(1, 1), 0, name, body, b"")
+        self.output.receive(body, self.session, self.now_ns)
         self.session.receive(message, self.now_ns)
 
     def rc(self, channels_us: tuple[int, ...]) -> None:
@@ -80,7 +87,7 @@ class Session:
 
     def override(self, channels_us: tuple[int, ...]) -> None:
         roll, pitch, throttle, yaw = channels_us[:4]
-        self.session.echo.sent((throttle, yaw, pitch, roll), self.now_ns)
+        self.output.echo.sent((throttle, yaw, pitch, roll), self.now_ns)
 
     @property
     def status(self) -> VehicleStatus:
@@ -295,14 +302,14 @@ def test_the_pilots_sticks_are_those_without_ours() -> None:
         session.rc(ours)
     assert session.status.rc_sticks == ARDUPILOT.to_sticks((1500, 1500, 1500, 1900))
     assert session.status.pilot_sticks == pilot
-    session.session.echo.released()
+    session.output.echo.released()
     session.now_ns += 20 * MS
     session.rc(ours)  # still ours
     assert session.status.pilot_sticks == pilot
-    assert not session.session.is_released
+    assert not session.output.echo.is_released
     session.now_ns += 20 * MS
     session.rc((1500, 1500, 1700, 1500, *RECEIVER[4:]))
-    assert session.session.is_released
+    assert session.output.echo.is_released
     assert session.status.pilot_sticks == Sticks(0.5, 0.0, 0.0, 0.0)
 
 
@@ -374,8 +381,8 @@ def overruled(session: Session, shown_us: tuple[int, ...], duration_s: float = 1
         session.override(ours)
         if shown_us or tick < 30:
             session.rc(ours if tick < 30 else shown_us)
-        vehicle = session.session
-        if reason := vehicle.overruled(session.now_ns) or vehicle.unheard(session.now_ns):
+        output = session.output
+        if reason := output.overruled(session.now_ns) or output.unheard(session.now_ns):
             return reason
     return None
 
@@ -396,7 +403,7 @@ def test_the_reason_names_what_was_seen(shown_us: tuple[int, ...], expected: str
     assert expected in reason
     # Where our packets are lost, nobody has taken over: the way out begins with neutral sticks.
     is_lost = not shown_us or shown_us[0] == 1700
-    assert (session.session.overruled(session.now_ns) is None) is is_lost
+    assert (session.output.overruled(session.now_ns) is None) is is_lost
 
 
 def test_a_reboot_is_noticed_by_two_old_stamps() -> None:

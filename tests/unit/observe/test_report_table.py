@@ -98,6 +98,20 @@ def test_the_link_verdict_is_honest(
     )
 
 
+def test_the_link_verdict_tells_which_sticks_asked_for_too_much() -> None:
+    link = LinkStats(
+        messages_per_s=(),
+        lost_fraction=0.0,
+        rtt_ms=None,
+        sent_overrides=1000,
+        echo_confirmed=True,
+        saturated=(("pitch", 0.123), ("yaw", 0.001)),
+    )
+    assert verdict_lines(report_of(make_tick(), link=link))[3].endswith(
+        ", pitch beyond what the vehicle does in 12.3%, yaw beyond what the vehicle does in 0.1%"
+    )
+
+
 @pytest.mark.parametrize(
     ("period_ns", "style"),
     [(TICK_NS, "green"), (TICK_NS * 105 // 100, "yellow"), (TICK_NS * 2, "red")],

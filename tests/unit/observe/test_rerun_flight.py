@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -18,8 +18,14 @@ from helpers.factories import make_released_tick, make_tick, make_trace, make_vi
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Event
-from mavbridge.core.vehicle import ActionTrace, Sticks
-from mavbridge.observe.rerun_flight import MAX_IMAGE_WIDTH, PLOTS, RerunView, flight_blueprint
+from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
+from mavbridge.observe.rerun_flight import (
+    MAX_IMAGE_WIDTH,
+    PLOTS,
+    RerunView,
+    action_plots,
+    flight_blueprint,
+)
 
 
 class Recording:
@@ -185,7 +191,7 @@ def test_frames_before_the_first_tick_are_shown(rrd: Path) -> None:
 
 def test_every_plot_names_and_colours_its_series(rrd: Path) -> None:
     seen = show(rrd, [make_tick(0)])
-    for plot in PLOTS:
+    for plot in (*PLOTS, *action_plots("sticks")):
         style = seen.static[f"/{plot.path}"]
         assert len(style["SeriesLines:names"][0]) == len(plot.series)
         assert len(style["SeriesLines:colors"][0]) == len(plot.series)
@@ -198,14 +204,15 @@ def test_the_file_opens_on_the_blueprint_and_no_recording_is_global(rrd: Path) -
     assert rr.get_global_data_recording() is None
 
 
-def test_every_plot_is_in_the_blueprint() -> None:
+@pytest.mark.parametrize("action", get_args(ActionKind))
+def test_every_plot_is_in_the_blueprint(action: ActionKind) -> None:
     shown = {
         str(expression).strip("/")
-        for column in flight_blueprint().root_container.contents
+        for column in flight_blueprint(action).root_container.contents
         for view in column.contents
         for expression in (view.contents if isinstance(view.contents, list) else [])
     }
-    assert shown == {plot.path for plot in PLOTS}
+    assert shown == {plot.path for plot in (*PLOTS, *action_plots(action))}
 
 
 def test_an_unwritable_path_is_refused_before_the_flight(tmp_path: Path) -> None:

@@ -38,12 +38,40 @@ def checkpoint(small_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return path
 
 
-@pytest.mark.parametrize("spec", ["scripted", "scripted:hover", "scripted:square"])
-def test_scripted_flies_dual_rate_without_weights(spec: str) -> None:
+@pytest.mark.parametrize(
+    ("spec", "action"),
+    [
+        ("scripted", "sticks"),
+        ("scripted:hover", "sticks"),
+        ("scripted:hover:air", "sticks"),
+        ("scripted:square:velocity", "velocity"),
+        ("scripted:doublet:rates:air", "rates"),
+    ],
+)
+def test_scripted_flies_dual_rate_without_weights(spec: str, action: str) -> None:
     loaded = load(spec, image_size=64)
+    assert loaded.executable.contract.action == action
     assert loaded.executable.dual_rate
     assert loaded.executable.contract.image_height == 64
     assert act(loaded).shape == (1, 16, 4)
+
+
+@pytest.mark.parametrize(
+    ("spec", "starts_in_air", "climbs"),
+    [
+        ("scripted", False, True),
+        ("scripted", True, False),
+        ("scripted:hover:velocity:air", False, False),
+        ("scripted:hover:velocity:air", True, False),
+        ("scripted:hover:velocity", False, True),
+    ],
+)
+def test_a_scripted_program_climbs_unless_it_starts_in_the_air(
+    spec: str, starts_in_air: bool, climbs: bool
+) -> None:
+    action = act(load(spec, starts_in_air=starts_in_air))[0, 0]
+    up = -action[2] if "velocity" in spec else action[0]
+    assert bool(up > 0.2) is climbs
 
 
 def test_torch_is_imported_by_neither_scripted_policies_nor_cheap_checks() -> None:
@@ -160,6 +188,9 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("", {}, "package.module:Class"),
         ("..toge:Toge", {}, "package.module:Class"),
         ("scripted:loop", {}, "square"),
+        ("scripted:square:position", {}, "velocity"),
+        ("scripted:square:air:rates", {}, "attitude"),
+        ("scripted:square:rates:air:air", {}, "air"),
         ("scripted", {"checkpoint": Path("a.pt")}, "no weights"),
         ("toge:huge", {"allow_untrained": True}, "neither a size"),
         ("toge:small:vgg16", {"allow_untrained": True}, "efficientnet_b3"),

@@ -16,7 +16,7 @@ from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.rows import LATER, TICKS, FrameTruth, TickLabels
 from mavbridge.recording.tlog import open_tlog_pipe
-from policy.contract import FLIGHT_TERMS
+from policy.contract import ACTION_TERMS, FLIGHT_TERMS
 
 
 def record(folder: Path, *, ticks: int = 30, frames: int = 10) -> FlightWriter:
@@ -205,7 +205,8 @@ def test_a_flight_whose_contract_is_of_version_1_is_read(flight: Path) -> None:
     path = flight / "meta.json"
     contract = json.loads(path.read_text())["contract"]
     assert contract["version"] == 3
-    old = {name: value for name, value in contract.items() if name not in FLIGHT_TERMS}
+    later = (*FLIGHT_TERMS, *ACTION_TERMS)
+    old = {name: value for name, value in contract.items() if name not in later}
     _meta(contract={**old, "version": 1})(flight)
     assert open_flight(flight).meta.contract == make_meta().contract
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from helpers.factories import make_released_tick, make_state, make_tick, make_trace
 from helpers.recordings import make_row
 from mavbridge.core.records import Tick, VehicleState
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.vehicle import ActionTrace, Sticks, Velocity
 from mavbridge.recording.rows import (
     DEMONSTRATION_FRAMES,
     DEMONSTRATION_TICKS,
@@ -127,3 +127,12 @@ def test_the_columns_are_those_of_the_document() -> None:
     text = (Path(__file__).parents[3] / "docs" / "flight_folder.md").read_text()
     names = {*DEMONSTRATION_TICKS.names, *DEMONSTRATION_FRAMES.names}
     assert [name for name in names if name not in text] == []
+
+
+def test_actions_of_another_kind_come_back_as_that_kind() -> None:
+    moves = Velocity(1.0, -2.0, 0.5, 0.25)
+    trace = ActionTrace(raw=moves, clipped=moves, slewed=moves, smoothed=moves)
+    tick = make_tick(sent=moves, trace=trace)
+    (row,) = read_ticks(pa.Table.from_batches([ticks_batch([TickRow(tick, 0)], TICKS)]), "velocity")
+    assert (row.tick.sent, row.tick.trace) == (moves, trace)
+    assert isinstance(row.tick.sent, Velocity)

@@ -5,11 +5,12 @@ from collections.abc import Callable
 
 import pytest
 
-from sitl.ardupilot.autopilot import STEP_NS, Autopilot, VehicleConfig
+from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import Params
 from sitl.clock import NS_PER_S
 from sitl.rotation import to_euler
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 STEPS_PER_STICK_UPDATE = 8
 

@@ -15,7 +15,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
 from sitl.app import filming, fly
-from sitl.ardupilot.autopilot import STEP_NS
 from sitl.ardupilot.flight_modes import Mode
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest, stop_on_signal
@@ -23,6 +22,7 @@ from sitl.course.layout import make_course
 from sitl.course.referee import Crash
 from sitl.link.transport import Received
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import STEP_NS
 
 
 class FakeClock:

@@ -44,7 +44,7 @@ class VehicleParams:
         streams: tuple[StreamGroup, ...],
         report: Callable[[str], None],
     ) -> None:
-        self._is_override = config.output == "rc-override"
+        self._is_override = identity.autopilot == "ardupilot"
         changes_any = bool(config.set_params or config.restore_params)
         if changes_any and identity.autopilot != "ardupilot":
             raise PeerError(

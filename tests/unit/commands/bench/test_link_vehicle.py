@@ -12,14 +12,15 @@ from mavbridge.commands.bench.link_vehicle import (
 )
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Sticks
-from mavbridge.mavlink.session.echo import NUDGE_STEP_NS, EchoCheck
+from mavbridge.mavlink.outputs.echo import NUDGE_STEP_NS, EchoCheck
+from mavbridge.mavlink.outputs.override import OVERRIDE_ECHO
 from mavbridge.mavlink.session.params.checks import calibration
 
 NUDGE_LEVELS = 3
 
 
 def test_every_code_comes_back_through_policy_calibration_and_nudge() -> None:
-    echo = EchoCheck()
+    echo = EchoCheck(OVERRIDE_ECHO)
     echo.sent((1500, 1500, 1500, 1504), 0)
     echo.received((1500, 1500, 1500, 1504), 1, 1)
     assert echo.confirmed

@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from sitl.ardupilot import sticks as pilot_sticks
 from sitl.ardupilot.params import Params
-from sitl.ardupilot.rc import IDLE_RECEIVER_US, RcEngine
+from sitl.ardupilot.rc import RcEngine
 from sitl.ardupilot.sticks import Sticks, read_sticks
 from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.vehicle.config import IDLE_RECEIVER_US
 
 KEEP = 65535
 

@@ -1,11 +1,11 @@
 import pytest
 
-from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course.layout import BAR_M, DEPTH_M, AirborneStart, Course, Gate
 from sitl.course.referee import VEHICLE_RADIUS_M, struck_gate
 from sitl.rotation import IDENTITY
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0)
 FAR_GATE = Gate(center_ned_m=(20.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=1)

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from sitl import UsageError
-from sitl.ardupilot.autopilot import Autopilot, VehicleConfig
+from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import Params
 from sitl.camera.fpv import FpvRenderer
 from sitl.course.layout import make_course
 from sitl.rotation import from_euler, multiply
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
+from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import GRAVITY_MPS2, Quadrotor
 
 POSE = ((1.0, 0.3, -2.2), from_euler(0.1, -0.15, 0.05))

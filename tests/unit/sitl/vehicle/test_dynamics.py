@@ -9,15 +9,12 @@ from hypothesis import strategies as st
 from sitl import rotation
 from sitl.vehicle.dynamics import (
     GRAVITY_MPS2,
-    MASS_KG,
-    MAX_MOTOR_THRUST_N,
-    MOTOR_LAG_S,
-    PHYSICS_STEP_NS,
+    QUAD,
     Quadrotor,
 )
 
-HOVER = MASS_KG * GRAVITY_MPS2 / (4.0 * MAX_MOTOR_THRUST_N)
-STEPS_PER_S = 1_000_000_000 // PHYSICS_STEP_NS
+HOVER = QUAD.mass_kg * GRAVITY_MPS2 / (4.0 * QUAD.max_motor_thrust_n)
+STEPS_PER_S = 1_000_000_000 // QUAD.step_ns
 
 
 def fly(commands, seconds, state=None, quad=None):
@@ -34,7 +31,7 @@ def test_it_rests_on_the_ground_and_feels_one_g_upwards():
 
 
 def test_motors_follow_with_a_first_order_lag():
-    body = fly((1.0,) * 4, MOTOR_LAG_S).body
+    body = fly((1.0,) * 4, QUAD.motor_lag_s).body
 
     assert body.motors == pytest.approx([1.0 - math.exp(-1.0)] * 4, rel=0.03)
 
@@ -43,7 +40,7 @@ def test_thrust_lifts_against_gravity():
     state = fly((2.0 * HOVER,) * 4, 0.5)
     up_mps = -state.body.velocity_ned_mps[2]
 
-    assert up_mps == pytest.approx(GRAVITY_MPS2 * (0.5 - 2.0 * MOTOR_LAG_S), rel=0.1)
+    assert up_mps == pytest.approx(GRAVITY_MPS2 * (0.5 - 2.0 * QUAD.motor_lag_s), rel=0.1)
     assert not state.body.touching
 
 

@@ -8,7 +8,6 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.course_flights import fly_course, pwm_us
-from sitl.ardupilot.autopilot import STEP_NS, VehicleConfig
 from sitl.ardupilot.params import Params
 from sitl.ardupilot.streams import Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
@@ -18,6 +17,7 @@ from sitl.expert.stick_response import StickPositions
 from sitl.rotation import IDENTITY, to_euler
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import Quadrotor
 
 ALOFT = AirborneStart(

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from sitl.ardupilot.autopilot import VehicleConfig
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.config import VehicleConfig
 
 HOLDING = (Mode.BRAKE, Mode.LOITER, Mode.POSHOLD)
 PILOTED = (Mode.LOITER, Mode.POSHOLD)

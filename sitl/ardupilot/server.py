@@ -11,8 +11,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.commands import DENIED, execute, mode_by_number
 from sitl.ardupilot.endpoint import MavlinkEndpoint
-from sitl.ardupilot.messages import Message
 from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
+from sitl.ardupilot.setpoints import set_attitude_target, set_position_target
+from sitl.link.framing import Message
 from sitl.report import FlightLog
 
 MAX_RC_FIELDS = 18
@@ -38,6 +39,8 @@ class MavlinkServer:
             "COMMAND_LONG": self._command,
             "COMMAND_INT": self._command,
             "SET_MODE": self._set_mode,
+            "SET_ATTITUDE_TARGET": self._attitude_target,
+            "SET_POSITION_TARGET_LOCAL_NED": self._position_target,
             "REQUEST_DATA_STREAM": self._data_stream,
             "PARAM_REQUEST_LIST": self._param_list,
             "PARAM_REQUEST_READ": self._param_read,
@@ -76,7 +79,7 @@ class MavlinkServer:
                 continue
             handler(link, message, arrived_ns)
 
-    def step(self) -> None:
+    def step(self, _now_ns: int) -> None:
         """Queue what is due on every link; texts go to all, and at a change of mode a heartbeat."""
         if self._ap.mode is not self._mode:
             self._mode = self._ap.mode
@@ -128,6 +131,12 @@ class MavlinkServer:
             x=message.x, y=message.y, z=message.z, r=message.r, now_ns=arrived_ns
         )
 
+    def _attitude_target(self, _link: MavlinkEndpoint, message: Message, arrived_ns: int) -> None:
+        set_attitude_target(message, self._ap, arrived_ns)
+
+    def _position_target(self, _link: MavlinkEndpoint, message: Message, arrived_ns: int) -> None:
+        set_position_target(message, self._ap, arrived_ns)
+
     def _command(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:
         fields = _COMMAND_FIELDS[message.get_type()]
         params = tuple(float(getattr(message, name)) for name in fields)
@@ -154,7 +163,7 @@ class MavlinkServer:
             link.send_param(index)
 
     def _param_set(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:
-        if self._ap.params.set(message.param_id, message.param_value):
+        if self._ap.params.set_on_wire(message.param_id, message.param_value):
             link.send_param(self._ap.params.names.index(message.param_id))
 
     def _mission_list(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:

@@ -8,28 +8,22 @@ from collections.abc import Callable
 import pytest
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.calibration import Pwm
-from mavbridge.mavlink.session.echo import (
-    CONFIRM_NS,
-    NUDGE_US,
-    SEEK_NUDGE_US,
-    EchoCheck,
-    EchoFault,
-)
+from mavbridge.mavlink.outputs.echo import CONFIRM_NS, EchoCheck, EchoFault, Shown
+from mavbridge.mavlink.outputs.override import OVERRIDE_ECHO
 from mavbridge.mavlink.session.streams import RC_CHANNELS_HZ
 
 S, MS = NS_PER_S, NS_PER_MS
-RECEIVER: Pwm = (1000, 1500, 1500, 1500)
-STICKS: Pwm = (1600, 1550, 1500, 1700)
+RECEIVER: Shown = (1000, 1500, 1500, 1500)
+STICKS: Shown = (1600, 1550, 1500, 1700)
 """Throttle, yaw, pitch, roll in us."""
-JOYSTICK: Pwm = (1400, 1500, 1480, 1320)
+JOYSTICK: Shown = (1400, 1500, 1480, 1320)
 
 
-def still(_now_ns: int) -> Pwm:
+def still(_now_ns: int) -> Shown:
     return STICKS
 
 
-def moving(now_ns: int) -> Pwm:
+def moving(now_ns: int) -> Shown:
     wave = math.sin(2 * math.pi * now_ns / S)
     return 1500 + round(200 * wave), 1500, 1500 - round(300 * wave), 1500 + round(150 * wave)
 
@@ -43,14 +37,14 @@ class World:
         seed: int = 0,
         send_hz: float = 100.0,
         rc_hz: float = RC_CHANNELS_HZ,
-        sticks: Callable[[int], Pwm] = still,
+        sticks: Callable[[int], Shown] = still,
         loss: float = 0.0,
         delay_ms: float = 1.0,
         jitter_ms: float = 1.0,
         rc_jitter_ms: float = 3.0,
     ) -> None:
         self.random = random.Random(seed)
-        self.echo = EchoCheck()
+        self.echo = EchoCheck(OVERRIDE_ECHO)
         self.send_hz, self.rc_hz = send_hz, rc_hz
         self.loss, self.delay_ms, self.jitter_ms = loss, delay_ms, jitter_ms
         self.rc_jitter_ms = rc_jitter_ms
@@ -59,12 +53,12 @@ class World:
         self.is_deaf = False
         """The vehicle hears nothing from us."""
         self.joystick_hz = 0.0
-        self.joystick: Callable[[int], Pwm] = lambda _now_ns: JOYSTICK
-        self.receiver: Pwm | None = RECEIVER
-        self.override: Pwm | None = None
-        self.shown: Pwm = RECEIVER
+        self.joystick: Callable[[int], Shown] = lambda _now_ns: JOYSTICK
+        self.receiver: Shown | None = RECEIVER
+        self.override: Shown | None = None
+        self.shown: Shown = RECEIVER
         self.now_ns = 10 * S
-        self._network: list[tuple[int, int, str, Pwm | None, int]] = []
+        self._network: list[tuple[int, int, str, Shown | None, int]] = []
         self._count = 0
         phase_ns = self.random.uniform(0, S / rc_hz)
         self._due = {"send": float(self.now_ns), "rc": self.now_ns + phase_ns, "joystick": 0.0}
@@ -77,7 +71,7 @@ class World:
         self._due[name] += late_ns - spread_ms * MS / 2
         return True
 
-    def _post(self, kind: str, pwm_us: Pwm | None, stamp_us: int = 0) -> None:
+    def _post(self, kind: str, pwm_us: Shown | None, stamp_us: int = 0) -> None:
         if self.random.random() < self.loss:
             return
         delay_ms = self.delay_ms + self.random.expovariate(1) * self.jitter_ms
@@ -159,7 +153,7 @@ BAD_LINKS = [
 @pytest.mark.parametrize("send_hz", [30.0, 100.0, 400.0])
 @pytest.mark.parametrize("link", BAD_LINKS)
 def test_a_bad_link_raises_no_alarm(
-    link: dict[str, float], send_hz: float, sticks: Callable[[int], Pwm]
+    link: dict[str, float], send_hz: float, sticks: Callable[[int], Shown]
 ) -> None:
     world = World(send_hz=send_hz, sticks=sticks, **link)  # type: ignore[arg-type]
     world.engage()
@@ -197,7 +191,7 @@ def test_one_stray_release_of_another_station_raises_no_alarm() -> None:
 @pytest.mark.parametrize("send_hz", [30.0, 100.0])
 @pytest.mark.parametrize("joystick_hz", [50.0, 200.0])
 def test_a_joystick_is_noticed_within_half_a_second(
-    joystick_hz: float, send_hz: float, sticks: Callable[[int], Pwm]
+    joystick_hz: float, send_hz: float, sticks: Callable[[int], Shown]
 ) -> None:
     """At 50 Hz beside our 100 Hz it has 0 to 50 % of the vehicle's time, by the phase."""
     for seed in range(20):
@@ -274,7 +268,7 @@ def test_a_fault_stays_known_for_three_seconds_and_only_then_is_forgotten() -> N
 @pytest.mark.parametrize("send_hz", [30.0, 100.0, 400.0])
 @pytest.mark.parametrize("rc_hz", [20.0, RC_CHANNELS_HZ])
 def test_a_vehicle_that_hears_us_no_more_is_noticed_within_half_a_second(
-    rc_hz: float, send_hz: float, sticks: Callable[[int], Pwm]
+    rc_hz: float, send_hz: float, sticks: Callable[[int], Shown]
 ) -> None:
     for seed in range(10):
         world = World(seed=seed, send_hz=send_hz, rc_hz=rc_hz, sticks=sticks)
@@ -336,7 +330,7 @@ def test_after_a_silence_the_sticks_of_before_it_are_nobody_elses() -> None:
 
 
 def test_an_override_that_shows_up_is_confirmed() -> None:
-    echo = EchoCheck()
+    echo = EchoCheck(OVERRIDE_ECHO)
     echo.received(RECEIVER, 1, 0)
     echo.sent(STICKS, S)
     echo.received(RECEIVER, 2, S + 1)
@@ -391,9 +385,9 @@ def test_a_vehicle_that_ignores_us_is_not_taken_for_one_whose_sticks_rest_where_
 
 @pytest.mark.parametrize("roll_us", [1100, 1499, 1500, 1501, 1900])
 def test_the_nudge_walks_towards_the_middle_and_shrinks_once_confirmed(roll_us: int) -> None:
-    echo, pwm_us = EchoCheck(), (1500, 1500, 1500, roll_us)
+    echo, pwm_us = EchoCheck(OVERRIDE_ECHO), (1500, 1500, 1500, roll_us)
     inwards = 1 if roll_us <= 1500 else -1
-    for step_us in (SEEK_NUDGE_US, NUDGE_US):
+    for step_us in (OVERRIDE_ECHO.seek_nudge, OVERRIDE_ECHO.nudge):
         nudged = [echo.with_nudge(pwm_us, k * 10 * MS) for k in range(30)]
         assert {pwm[:3] for pwm in nudged} == {(1500, 1500, 1500)}
         assert {pwm[3] for pwm in nudged} == {roll_us + k * inwards * step_us for k in range(3)}

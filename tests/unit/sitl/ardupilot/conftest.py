@@ -3,9 +3,9 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.ardupilot.autopilot import STEP_NS
 from sitl.clock import NS_PER_S
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import STEP_NS
 
 
 class Station:

@@ -5,8 +5,8 @@ from itertools import pairwise
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.ardupilot.autopilot import Battery, VehicleConfig
 from sitl.ardupilot.flight_modes import Mode
+from sitl.vehicle.config import Battery, VehicleConfig
 
 WITHOUT_RECEIVER = VehicleConfig(receiver=False, estimator_ready_s=0.0, position_ready_s=0.0)
 RECEIVER = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER

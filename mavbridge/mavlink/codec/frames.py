@@ -1,0 +1,51 @@
+"""Cuts datagrams into MAVLink packets without decoding them, to be passed on as they are."""
+
+from typing import NamedTuple
+
+from mavbridge.mavlink.codec.messages import Endpoint
+
+_V1, _V2 = 0xFE, 0xFD
+_V1_HEADER, _V2_HEADER, _CHECKSUM, _SIGNATURE = 6, 10, 2, 13
+_SIGNED = 0x01
+
+
+class Frame(NamedTuple):
+    """One packet; its checksum and signature are left to whoever receives it."""
+
+    data: bytes
+    source: Endpoint
+    message_id: int
+    payload: bytes
+    """Without the zeros that MAVLink 2 cuts off its end."""
+
+
+def split_frames(data: bytes) -> tuple[list[Frame], bool]:
+    """The packets of a datagram, and whether bytes were left over that are none."""
+    frames: list[Frame] = []
+    at = 0
+    while at < len(data):
+        frame = _frame_at(data, at)
+        if frame is None:
+            return frames, True
+        frames.append(frame)
+        at += len(frame.data)
+    return frames, False
+
+
+def _frame_at(data: bytes, at: int) -> Frame | None:
+    marker = data[at]
+    header = _V1_HEADER if marker == _V1 else _V2_HEADER
+    if marker not in (_V1, _V2) or len(data) - at < header:
+        return None
+    length = data[at + 1]
+    end = at + header + length + _CHECKSUM
+    if marker == _V1:
+        system, component, message_id = data[at + 3 : at + 6]
+    else:
+        system, component = data[at + 5 : at + 7]
+        message_id = int.from_bytes(data[at + 7 : at + 10], "little")
+        end += _SIGNATURE if data[at + 2] & _SIGNED else 0
+    if end > len(data):
+        return None
+    payload = data[at + header : at + header + length]
+    return Frame(data[at:end], Endpoint(system, component), message_id, payload)

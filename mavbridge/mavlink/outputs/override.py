@@ -1,0 +1,71 @@
+"""Sticks by RC_CHANNELS_OVERRIDE, with their echo in RC_CHANNELS: ArduPilot."""
+
+from typing import ClassVar
+
+from mavbridge.core.vehicle import Action, Output, Sticks
+from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.messages import Body, RcChannels
+from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError, pwm_of
+from mavbridge.mavlink.outputs.echo import EchoFault, EchoRules
+from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
+from mavbridge.mavlink.session.vehicle import VehicleSession
+
+OVERRIDE_ECHO = EchoRules(tolerance=2, nudged=3, nudge=1, seek_nudge=4, centre=1500)
+"""In us. A receiver at rest moves by 2; the vehicle itself shows overrides to the microsecond.
+
+Roll is nudged: 1500, 1501 and 1502 us were seen to move nothing, inside the dead zone of 20 us;
+beyond it, 2 us are 0.2 degrees of lean at the usual calibration. Two of the larger steps are well
+inside the dead zone.
+"""
+
+
+class OverrideOutput(ActionOutput):
+    """RC_CHANNELS_OVERRIDE; a release gives the channels back to the receiver."""
+
+    name: ClassVar[Output] = "rc-override"
+    is_sticks = True
+    hides_receiver = True
+    releases = 80
+    """Over the four seconds for which they are asked for at most; then silence, so that another
+    station may override."""
+    _rules = OVERRIDE_ECHO
+    _echo_message = "RC_CHANNELS"
+    _causes: ClassVar[dict[EchoFault, str]] = {
+        "unseen": "another station may be overriding them, or the receiver has priority",
+        "foreign": "another station is overriding them (a joystick on our system id?)",
+        "returned": "it also acts on the sticks that it had before us: another station is "
+        "overriding or releasing them, or the override switch is off",
+        "silent": "its sticks have stood still for 0.4 s while ours moved",
+    }
+
+    def __init__(self, codec: Codec) -> None:
+        super().__init__(codec)
+        self._calibration: RcCalibration | None = None
+        """Calibration of the last override, for its release even after a reboot of the vehicle."""
+
+    def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
+        """The override of the four sticks; None without a calibration."""
+        if not isinstance(action, Sticks):
+            raise CommandRefusedError(f"{type(action).__name__} are not sticks")
+        calibration = vehicle.calibration
+        if calibration is None:
+            return None
+        shown = self.echo.with_nudge(pwm_of(action, calibration), now_ns)
+        throttle, yaw, pitch, roll = shown
+        pwm_us = (throttle, yaw, pitch, roll)
+        packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
+        self._calibration = calibration
+        return Encoded(packet, calibration.to_sticks(pwm_us), shown)
+
+    def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
+        """Compare RC_CHANNELS with what was sent."""
+        if isinstance(body, RcChannels) and vehicle.calibration is not None:
+            pwm_us = vehicle.calibration.stick_channels_us(body.channels_us)
+            if pwm_us is not None:
+                self.echo.received(pwm_us, body.boot_us, arrived_ns)
+
+    def release_packet(self, vehicle: VehicleSession) -> bytes | None:
+        """Give the four channels back."""
+        if self._calibration is None:
+            return None
+        return self._codec.encode_release(vehicle.identity.source, self._calibration)

@@ -1,0 +1,143 @@
+"""ArduCopter, 4.5 to 4.7."""
+
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
+from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.messages import CommandRequest
+from mavbridge.mavlink.profiles import ardupilot_params
+from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
+from mavbridge.mavlink.profiles.modes import ModeTable
+from mavbridge.mavlink.profiles.profile import (
+    Danger,
+    ParamContext,
+    Profile,
+    StreamGroup,
+    optional_stream,
+)
+from mavbridge.mavlink.profiles.sticks import StickCurves
+
+RC_CHANNELS_HZ = 1000 / 17
+"""RC_CHANNELS for the echo check, which needs 20 Hz or more: every 17 ms (ArduPilot counts in whole
+ms), so that no usual rate of a joystick (10, 20, 25, 50 Hz) is in step with it and stays unseen
+between two samples. Costs 3.2 kB/s."""
+HEARTBEAT_HZ = 10.0
+"""Shows arming within 100 ms where one packet is lost (at 1 Hz within 1 s); a change of mode is
+sent at once at any rate."""
+_TARGET_HZ = 50.0
+"""ATTITUDE_TARGET and POSITION_TARGET_LOCAL_NED, for the echo check."""
+
+_MODES = ModeTable(
+    {
+        number: entry.name.removeprefix("COPTER_MODE_")
+        for number, entry in dialect.enums["COPTER_MODE"].items()
+        if not entry.name.endswith("ENUM_END")
+    },
+    roles=ModeRoles(
+        hold="BRAKE",
+        land="LAND",
+        rtl="RTL",
+        takeoff=("GUIDED",),
+        thrust=("STABILIZE", "ACRO"),
+        setpoint=("GUIDED", "GUIDED_NOGPS"),
+    ),
+)
+
+
+class ArduPilot(Profile):
+    """ArduCopter as measured: sticks as PWM through its radio calibration, setpoints in GUIDED."""
+
+    name = "ardupilot"
+    modes = _MODES
+    outputs: ClassVar[Mapping[ActionKind, Output]] = {
+        "sticks": "rc-override",
+        "rates": "rates",
+        "attitude": "attitude",
+        "velocity": "velocity",
+    }
+    refusals: ClassVar[Mapping[Output, str]] = {
+        "manual-control": "ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override"
+    }
+    params = ardupilot_params.FIRST_NAMES
+
+    def streams(self, *, state_hz: float) -> tuple[StreamGroup, ...]:
+        """Legacy streams serve versions that do not know SET_MESSAGE_INTERVAL."""
+        attitude, imu = (
+            ("ATTITUDE_QUATERNION", "ATTITUDE"),
+            ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2"),
+        )
+        return (
+            StreamGroup(attitude, dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
+            StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
+            StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
+            StreamGroup(("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, RC_CHANNELS_HZ),
+            optional_stream("SYS_STATUS", 2.0),
+            optional_stream("EXTENDED_SYS_STATE", 5.0),
+            optional_stream("EKF_STATUS_REPORT", 5.0),
+            optional_stream("HEARTBEAT", HEARTBEAT_HZ),
+        )
+
+    def echo(self, output: Output) -> StreamGroup:
+        """RC_CHANNELS shows overrides to the microsecond; the targets are shaped ones."""
+        if output in ("attitude", "rates"):
+            return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
+        if output == "velocity":
+            return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, is_steady=False)
+        legacy = dialect.MAV_DATA_STREAM_RC_CHANNELS
+        return StreamGroup(("RC_CHANNELS",), legacy, RC_CHANNELS_HZ)
+
+    def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """Calibration and dead zones of the channels that RCMAP_* names."""
+        names = ardupilot_params.calibration_names(values)
+        return names + ardupilot_params.dead_zone_names(values)
+
+    def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """Calibration, and what decides how safe a flight is."""
+        return (*ardupilot_params.calibration_names(values), *ardupilot_params.RISK_NAMES)
+
+    def calibration(self, values: Mapping[str, float]) -> RcCalibration:
+        """RCMAP_* and RCn_*."""
+        return ardupilot_params.calibration(values)
+
+    def override_switch(self, values: Mapping[str, float]) -> int | None:
+        """RCn_OPTION 46."""
+        return ardupilot_params.override_switch(values)
+
+    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """Overrides that are ignored, and thrust that would be taken for a climb rate."""
+        if context.output == "rc-override":
+            yield from ardupilot_params.override_obstacles(values, context.source_system)
+        elif context.output in ("attitude", "rates"):
+            yield from ardupilot_params.thrust_obstacles(values)
+
+    def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
+        """Sticks that would stay for good; setpoints never do (GUID_TIMEOUT)."""
+        if context.output == "rc-override":
+            yield from ardupilot_params.override_dangers(values, has_receiver=context.has_receiver)
+
+    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """Time-outs that are long, and what keeps it from arming."""
+        if context.output == "rc-override":
+            yield from ardupilot_params.override_advice(values)
+        elif context.output is not None:
+            yield from ardupilot_params.setpoint_advice(values, context)
+
+    def stick_curves(
+        self, values: Mapping[str, float], mode: str, gains: StickGains | None
+    ) -> StickCurves:
+        """Leans, yaw rates and climb rates of ALT_HOLD and STABILIZE."""
+        return ardupilot_curves(values, mode, gains)
+
+    def hover_thrust(self, values: Mapping[str, float]) -> float | None:
+        """MOT_THST_HOVER, which it learns in flight."""
+        return values.get("MOT_THST_HOVER")
+
+    def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest:
+        """NAV_TAKEOFF in GUIDED, whose height counts from home, where it was armed."""
+        return CommandRequest(dialect.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, height_m))
+
+
+ARDUPILOT = ArduPilot()

@@ -1,0 +1,195 @@
+"""The meaning of an ArduCopter's parameters for a flight: calibration, obstacles and risks."""
+
+from collections.abc import Iterator, Mapping
+
+from mavbridge.mavlink.codec.calibration import (
+    DEAD_ZONE_US,
+    FS_THR_MARGIN_US,
+    RcCalibration,
+    RcChannel,
+)
+from mavbridge.mavlink.profiles.profile import Danger, ParamContext
+
+STICKS = ("THROTTLE", "YAW", "PITCH", "ROLL")
+"""RCMAP_* suffixes in the order of ``Sticks``."""
+_OPTION_CHANNELS = range(5, 17)
+"""Channels whose RCn_OPTION may hold the override switch."""
+_CALIBRATION_PARTS = ("MIN", "TRIM", "MAX", "REVERSED")
+_OVERRIDE_SWITCH_OPTION = 46
+"""RCn_OPTION "RC Override Enable": while the switch is low, all overrides are refused."""
+_IGNORE_OVERRIDES = 2
+"""Bit 1 of RC_OPTIONS."""
+_THRUST_AS_THRUST = 8
+"""Bit 3 of GUID_OPTIONS; without it the thrust of SET_ATTITUDE_TARGET is a climb rate."""
+_LONGEST_S = 1.0
+"""A longer time-out leaves the vehicle without a pilot for longer than necessary."""
+
+_OLD_NAMES: dict[str, tuple[str, float]] = {
+    "MAV_GCS_SYSID": ("SYSID_MYGCS", 1.0),
+    "ATC_ANGLE_MAX": ("ANGLE_MAX", 0.01),
+    "PILOT_SPD_UP": ("PILOT_SPEED_UP", 0.01),
+    "PILOT_SPD_DN": ("PILOT_SPEED_DN", 0.01),
+}
+"""Names of 4.7 (degrees, m/s), with those up to 4.6 (centidegrees, cm/s) and the factor between."""
+
+RISK_NAMES = ("RC_OVERRIDE_TIME", "RC_OPTIONS", "FS_THR_ENABLE")
+"""Those that decide how safe a flight is: asked for again if the first requests get lost."""
+
+FIRST_NAMES = (
+    *(f"RCMAP_{stick}" for stick in STICKS),
+    *RISK_NAMES,
+    *("RC_FS_TIMEOUT", "FS_THR_VALUE", "FS_OPTIONS", "THR_DZ", "MAV_GCS_SYSID_HI"),
+    *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER"),
+    *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
+    *_OLD_NAMES,
+    *(old for old, _ in _OLD_NAMES.values()),
+    *(f"RC{number}_OPTION" for number in _OPTION_CHANNELS),
+)
+"""Read first; RCMAP_* then tells which RCn_MIN ... to read."""
+
+
+def current_names(values: Mapping[str, float]) -> dict[str, float]:
+    """The same values, with those of older versions also under 4.7's names and in its units."""
+    renamed = {
+        new: values[old] * factor for new, (old, factor) in _OLD_NAMES.items() if old in values
+    }
+    return renamed | dict(values)
+
+
+def sent_name(values: Mapping[str, float], name: str) -> str:
+    """The name by which this vehicle has sent what 4.7 calls ``name``; that if it has not."""
+    old, _ = _OLD_NAMES.get(name, (name, 1.0))
+    return old if old in values and name not in values else name
+
+
+def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
+    """Parameters without which sticks cannot be mapped to channels, as far as RCMAP_* is known."""
+    names = tuple(f"RCMAP_{stick}" for stick in STICKS)
+    numbers = sorted({int(values[name]) for name in names if name in values})
+    return names + tuple(f"RC{number}_{part}" for number in numbers for part in _CALIBRATION_PARTS)
+
+
+def dead_zone_names(values: Mapping[str, float]) -> tuple[str, ...]:
+    """RCn_DZ of the stick channels, as far as RCMAP_* is known."""
+    known = (values.get(f"RCMAP_{stick}") for stick in STICKS)
+    return tuple(f"RC{int(number)}_DZ" for number in known if number is not None)
+
+
+def calibration(values: Mapping[str, float]) -> RcCalibration:
+    """The radio calibration; ValueError if a parameter is missing or contradicts another."""
+    throttle, yaw, pitch, roll = (
+        _channel(values, int(_require(values, f"RCMAP_{stick}"))) for stick in STICKS
+    )
+    floor_us = int(values.get("FS_THR_VALUE", 0)) + FS_THR_MARGIN_US
+    return RcCalibration(
+        throttle=throttle, yaw=yaw, pitch=pitch, roll=roll, throttle_floor_us=floor_us
+    )
+
+
+def _channel(values: Mapping[str, float], number: int) -> RcChannel:
+    return RcChannel(
+        number=number,
+        min_us=int(_require(values, f"RC{number}_MIN")),
+        trim_us=int(_require(values, f"RC{number}_TRIM")),
+        max_us=int(_require(values, f"RC{number}_MAX")),
+        is_reversed=bool(_require(values, f"RC{number}_REVERSED")),
+        dead_zone_us=int(values.get(f"RC{number}_DZ", DEAD_ZONE_US)),
+    )
+
+
+def _require(values: Mapping[str, float], name: str) -> float:
+    if name not in values:
+        raise ValueError(
+            f"the vehicle has not sent parameter {name}, which is asked for again; does it have RC "
+            "input?"
+        )
+    return values[name]
+
+
+def override_switch(values: Mapping[str, float]) -> int | None:
+    """Number of the channel that enables overrides, or None."""
+    options = {number: values.get(f"RC{number}_OPTION") for number in _OPTION_CHANNELS}
+    return next((n for n, option in options.items() if option == _OVERRIDE_SWITCH_OPTION), None)
+
+
+def override_obstacles(values: Mapping[str, float], source_system: int) -> Iterator[str]:
+    """Reasons, as far as parameters show, for which this vehicle would ignore our overrides."""
+    low = current_names(values).get("MAV_GCS_SYSID")
+    if low is not None:
+        high = max(values.get("MAV_GCS_SYSID_HI", 0), low)
+        if not low <= source_system <= high:
+            yield (
+                f"it obeys system {low:.0f} and we are system {source_system}: use "
+                f"--source-system {low:.0f}, or set MAV_GCS_SYSID (SYSID_MYGCS on older firmware)"
+            )
+    options = int(values.get("RC_OPTIONS", 0))
+    if options & _IGNORE_OVERRIDES:
+        yield (
+            "RC_OPTIONS bit 1 (ignore overrides) is set: use "
+            f"--set RC_OPTIONS={options & ~_IGNORE_OVERRIDES}"
+        )
+    if values.get("RC_OVERRIDE_TIME") == 0:
+        yield "RC_OVERRIDE_TIME is 0, which disables overrides: use --set RC_OVERRIDE_TIME=0.5"
+
+
+def thrust_obstacles(values: Mapping[str, float]) -> Iterator[str]:
+    """Reasons for which the thrust of SET_ATTITUDE_TARGET would not be taken as one."""
+    options = values.get("GUID_OPTIONS")
+    if options is None:
+        yield "it has not sent GUID_OPTIONS, which is asked for again"
+    elif not int(options) & _THRUST_AS_THRUST:
+        yield (
+            f"GUID_OPTIONS is {options:g}, with which it takes our thrust for a climb rate: use "
+            f"--set GUID_OPTIONS={int(options) | _THRUST_AS_THRUST}"
+        )
+
+
+def override_dangers(values: Mapping[str, float], *, has_receiver: bool | None) -> Iterator[Danger]:
+    """Settings with which the last sticks would stay for good if this computer died."""
+    time_s = values.get("RC_OVERRIDE_TIME")
+    if time_s is not None and time_s < 0:
+        yield Danger(
+            "endless-override",
+            "if this computer died, the vehicle would hold its last sticks for ever "
+            f"(RC_OVERRIDE_TIME is {time_s:g}): use --set RC_OVERRIDE_TIME=0.5",
+        )
+    if values.get("FS_THR_ENABLE") == 0 and has_receiver is not True:
+        yield Danger(
+            "no-throttle-failsafe",
+            "no receiver was seen, and without its throttle failsafe (FS_THR_ENABLE is 0) the "
+            "vehicle would hold its last sticks for ever if this computer died: use "
+            "--set FS_THR_ENABLE=1",
+        )
+
+
+def override_advice(values: Mapping[str, float]) -> Iterator[str]:
+    """What should be known before a flight by overrides."""
+    missing = [name for name in RISK_NAMES if name not in values]
+    if missing:
+        yield (
+            f"the vehicle has not sent {', '.join(missing)}: whether it holds its last sticks for "
+            "ever if this computer dies is not known"
+        )
+    time_s = values.get("RC_OVERRIDE_TIME", 0.0)
+    if time_s > _LONGEST_S:
+        yield (
+            f"RC_OVERRIDE_TIME is {time_s:g}: if this computer died, the vehicle would hold its "
+            "last sticks for that many seconds: use --set RC_OVERRIDE_TIME=0.5"
+        )
+
+
+def setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    """What should be known before a flight by setpoints in GUIDED."""
+    timeout_s = values.get("GUID_TIMEOUT", 0.0)
+    if timeout_s > _LONGEST_S:
+        yield (
+            f"GUID_TIMEOUT is {timeout_s:g}: if this computer died, the vehicle would hold its "
+            "last setpoint for that many seconds: use --set GUID_TIMEOUT=0.5"
+        )
+    if context.has_receiver is not True and values.get("FS_THR_ENABLE", 0.0) != 0:
+        yield (
+            "no receiver was seen: the vehicle will not arm without one while its throttle "
+            "failsafe is on; setpoints do not need it: --set FS_THR_ENABLE=0"
+        )
+    if context.output in ("attitude", "rates") and values.get("ATC_ANGLE_BOOST") == 0:
+        yield "ATC_ANGLE_BOOST is 0: thrust is not raised when it leans, the policy has to do it"

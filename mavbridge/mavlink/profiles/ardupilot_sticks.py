@@ -1,0 +1,120 @@
+"""What ArduCopter makes of its sticks, from its own parameters.
+
+Formulas: ArduPilot's ``RC_Channel::norm_input_dz``, ``rc_input_to_roll_pitch``, ``input_expo`` and
+Copter's ``get_pilot_desired_yaw_rate`` and ``get_pilot_desired_climb_rate``; the tests hold them
+against leans and rates measured on the firmware.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from mavbridge.core.vehicle import StickGains
+from mavbridge.mavlink.codec.calibration import PWM_SIGN
+from mavbridge.mavlink.profiles.ardupilot_params import (
+    calibration_names,
+    current_names,
+    dead_zone_names,
+    sent_name,
+)
+from mavbridge.mavlink.profiles.sticks import (
+    IDENTITY,
+    MAX_DEAD_ZONE,
+    Axis,
+    Half,
+    StickCurves,
+    VehicleCurves,
+    VehicleLean,
+    curves_between,
+    unusable,
+)
+
+_LEAN_MODES = ("ALT_HOLD", "STABILIZE")
+"""The sticks are a lean and a yaw rate."""
+_POSITIVE = ("ATC_ANGLE_MAX", "PILOT_Y_RATE", "PILOT_SPD_UP")
+_NEEDED = (*_POSITIVE, "PILOT_SPD_DN", "THR_DZ")
+"""4.7's names; PILOT_Y_EXPO came with 4.3."""
+_CLIMB_MODE = "ALT_HOLD"
+_MAX_LEAN_DEG = 85.0
+"""The firmware's own limit; also the next three."""
+_MAX_THR_DZ = 400.0
+_MIN_EXPO, _MAX_EXPO = -0.5, 0.95
+
+
+class YawExpo(NamedTuple):
+    """ArduPilot's ``input_expo``: softer around the middle for a positive ``expo``."""
+
+    expo: float
+
+    def bent(self, share: float) -> float:
+        """Share of the yaw rate."""
+        return (1.0 - self.expo) * share / (1.0 - self.expo * share)
+
+    def straightened(self, share: float) -> float:
+        """Share of the stick."""
+        return share / (1.0 - self.expo + self.expo * share)
+
+
+def ardupilot_curves(
+    values: Mapping[str, float], mode: str, gains: StickGains | None
+) -> StickCurves:
+    """The map from the policy's sticks to those of an ArduCopter with these parameters.
+
+    In ALT_HOLD all sticks are mapped, in STABILIZE all but the throttle, which is thrust there. In
+    every other mode a stick is something that ``gains`` does not tell of (a speed in LOITER and
+    POSHOLD, a body rate in ACRO and SPORT, both in DRIFT) and goes through as it is; so do all if
+    ``gains`` is None.
+    """
+    if gains is None or mode not in _LEAN_MODES:
+        return IDENTITY
+    needed = (*_NEEDED, *calibration_names(values), *dead_zone_names(values))
+    known = current_names(values)
+    if (nothing := unusable(known, needed=needed, positive=_POSITIVE)) is not None:
+        return nothing
+    full_deg, expo = min(known["ATC_ANGLE_MAX"], _MAX_LEAN_DEG), known.get("PILOT_Y_EXPO", 0.0)
+    bend = YawExpo(max(expo, _MIN_EXPO)) if expo and expo < _MAX_EXPO else None
+    yaw = Half(known["PILOT_Y_RATE"], bend=bend, parameter="PILOT_Y_RATE")
+    return curves_between(
+        gains,
+        VehicleCurves(
+            throttle=_throttle(values) if mode == _CLIMB_MODE else None,
+            yaw=_centred(values, "YAW", yaw, PWM_SIGN.yaw),
+            lean=VehicleLean(
+                pitch=_centred(values, "PITCH", Half(full_deg), PWM_SIGN.pitch),
+                roll=_centred(values, "ROLL", Half(full_deg), PWM_SIGN.roll),
+                full=full_deg,
+                is_tangent=False,
+                parameter=sent_name(values, "ATC_ANGLE_MAX"),
+            ),
+        ),
+    )
+
+
+def _centred(values: Mapping[str, float], stick: str, half: Half, sign: float) -> Axis:
+    """A stick around RCn_TRIM, with RCn_DZ microseconds of dead zone on each side."""
+    name = f"RC{int(values[f'RCMAP_{stick}'])}_"
+    trim_us, dead_us = values[name + "TRIM"], values[name + "DZ"]
+
+    def started(span_us: float) -> Half:
+        share = dead_us / span_us if span_us > 0.0 else 0.0
+        return half._replace(start=min(max(share, 0.0), MAX_DEAD_ZONE))
+
+    high, low = started(values[name + "MAX"] - trim_us), started(trim_us - values[name + "MIN"])
+    is_high = (sign > 0.0) != bool(values[name + "REVERSED"])
+    return Axis(high, low) if is_high else Axis(low, high)
+
+
+def _throttle(values: Mapping[str, float]) -> Axis:
+    """Climb rate: none within THR_DZ (permille) of the middle; RC3_DZ us at the bottom are lost."""
+    name = f"RC{int(values['RCMAP_THROTTLE'])}_"
+    range_us = values[name + "MAX"] - values[name + "MIN"]
+    lost = min(max(values[name + "DZ"] / range_us, 0.0), 0.4) if range_us > 0.0 else 0.0
+    dead_zone = min(max(values["THR_DZ"], 0.0), _MAX_THR_DZ) / 1000.0
+    # The firmware counts from the end of the lost part to the top; the stick from the middle.
+    start, end = 2.0 * (1.0 - lost) * dead_zone, 1.0 - 2.0 * lost
+    start = min(start, MAX_DEAD_ZONE * end)
+    known, up = current_names(values), "PILOT_SPD_UP"
+    down = "PILOT_SPD_DN" if known["PILOT_SPD_DN"] else up
+    return Axis(
+        Half(known[up], start, parameter=sent_name(values, up)),
+        Half(abs(known[down]), start, end, parameter=sent_name(values, down)),
+    )

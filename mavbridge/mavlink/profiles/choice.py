@@ -1,0 +1,50 @@
+"""Which firmware and which vehicles can be flown."""
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.errors import PeerError
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.profiles.px4 import PX4
+
+_PROFILES: dict[int, Profile] = {
+    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT,
+    dialect.MAV_AUTOPILOT_PX4: PX4,
+}
+_MULTIROTORS = (
+    *(dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_HEXAROTOR, dialect.MAV_TYPE_OCTOROTOR),
+    *(dialect.MAV_TYPE_TRICOPTER, dialect.MAV_TYPE_COAXIAL),
+    *(dialect.MAV_TYPE_DECAROTOR, dialect.MAV_TYPE_DODECAROTOR),
+)
+
+
+def profile_of(autopilot: int) -> Profile | None:
+    """The profile of a MAV_AUTOPILOT; None: it cannot be flown."""
+    return _PROFILES.get(autopilot)
+
+
+def require_profile(autopilot: int, vehicle_type: int) -> Profile:
+    """The profile of a multirotor's firmware.
+
+    Raises:
+        PeerError: the firmware is another one, or the vehicle is no multirotor.
+    """
+    profile = profile_of(autopilot)
+    if profile is None:
+        name = _name("MAV_AUTOPILOT", autopilot)
+        raise PeerError(
+            f"the vehicle's firmware is {name} (MAV_AUTOPILOT {autopilot}), and only ArduPilot and "
+            "PX4 are flown"
+        )
+    if vehicle_type not in _MULTIROTORS:
+        name = _name("MAV_TYPE", vehicle_type)
+        raise PeerError(
+            f"the vehicle is a {name} (MAV_TYPE {vehicle_type}), and only multirotors are flown"
+        )
+    return profile
+
+
+def _name(enum: str, number: int) -> str:
+    entry = dialect.enums[enum].get(number)
+    name: str = entry.name.removeprefix(f"{enum}_") if entry else "unknown"
+    return name

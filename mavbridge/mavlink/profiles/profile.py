@@ -1,0 +1,142 @@
+"""The shape of a profile: all that the bridge has to know of one firmware."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import ClassVar, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.vehicle import ActionKind, Output, Risk, StickGains
+from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.messages import CommandRequest
+from mavbridge.mavlink.profiles.modes import ModeTable
+from mavbridge.mavlink.profiles.sticks import StickCurves
+
+
+class StreamGroup(NamedTuple):
+    """One quantity: the messages that carry it, best first."""
+
+    messages: tuple[str, ...]
+    stream: int | None
+    """MAV_DATA_STREAM of REQUEST_DATA_STREAM; None where the firmware has none, or it would also
+    set other messages."""
+    rate_hz: float
+    is_optional: bool = False
+    """Nothing waits for it: a vehicle that does not grant it is flown without."""
+    is_steady: bool = True
+    """It comes all the time; False: only when something is new, so that silence says nothing."""
+
+
+def optional_stream(message: str, rate_hz: float, *, is_steady: bool = True) -> StreamGroup:
+    """Group of one message that no flight waits for."""
+    return StreamGroup((message,), None, rate_hz, is_optional=True, is_steady=is_steady)
+
+
+class Danger(NamedTuple):
+    """A setting with which the vehicle flies, but is not safe."""
+
+    risk: Risk
+    text: str
+
+    @property
+    def refusal(self) -> str:
+        """The sentence for a flight that is not begun."""
+        return f"{self.text}, or --accept-risk {self.risk} to fly all the same"
+
+
+class ParamContext(NamedTuple):
+    """What one judges parameters with."""
+
+    output: Output | None
+    """None: not chosen yet, so that only what holds for every output is judged."""
+    source_system: int
+    """Our MAVLink system id."""
+    has_receiver: bool | None
+    """As in ``VehicleStatus``."""
+
+
+class Profile(ABC):
+    """One firmware. Constant: one instance serves all vehicles."""
+
+    name: ClassVar[str]
+    """As a user writes it, and in reports."""
+    modes: ClassVar[ModeTable]
+    outputs: ClassVar[Mapping[ActionKind, Output]]
+    """The usual output of each kind of action."""
+    refusals: ClassVar[Mapping[Output, str]]
+    """Outputs that make no sense here, and why, in a sentence that names another one."""
+    heartbeat_type: ClassVar[int] = dialect.MAV_TYPE_ONBOARD_CONTROLLER
+    """MAV_TYPE of our own HEARTBEAT, once this is the vehicle's firmware."""
+    is_bytewise: ClassVar[bool] = False
+    """An integer parameter stands byte for byte in the float of PARAM_VALUE and PARAM_SET."""
+    sends_invalid_estimates: ClassVar[bool] = False
+    """LOCAL_POSITION_NED comes without a valid estimate too: the estimator's flags decide."""
+    params: ClassVar[tuple[str, ...]]
+    """Parameters to read first, those of other versions of the firmware included."""
+
+    @abstractmethod
+    def streams(self, *, state_hz: float) -> tuple[StreamGroup, ...]:
+        """Telemetry that every flight needs, then what is also watched; without the echo."""
+
+    @abstractmethod
+    def echo(self, output: Output) -> StreamGroup:
+        """Message that shows what the vehicle does with this output.
+
+        It may be one of ``streams``, which then carries the same rate.
+        """
+
+    def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """Parameters that are read because of the values of others."""
+        return ()
+
+    def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """Parameters that are asked for again on the ground for as long as they are missing."""
+        return ()
+
+    def calibration(self, values: Mapping[str, float]) -> RcCalibration | None:
+        """The radio calibration; None where sticks do not go through one.
+
+        Raises:
+            ValueError: a parameter is missing or contradicts another.
+        """
+        return None
+
+    def override_switch(self, values: Mapping[str, float]) -> int | None:
+        """Number of the radio channel that enables overrides, or None."""
+        return None
+
+    @abstractmethod
+    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """Reasons, as far as parameters show, for which the vehicle would not do as it is told.
+
+        Each with the command that mends it; nobody can accept them.
+        """
+
+    @abstractmethod
+    def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
+        """Settings with which it flies, but not safely; accepted ones included."""
+
+    @abstractmethod
+    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """Warnings: they forbid no flight, but should be known before it."""
+
+    @abstractmethod
+    def stick_curves(
+        self, values: Mapping[str, float], mode: str, gains: StickGains | None
+    ) -> StickCurves:
+        """The map from a policy's sticks, which mean ``gains``, to this vehicle's in a mode.
+
+        To be asked for again when parameters or the mode change. None: sticks stay as they are.
+        """
+
+    @abstractmethod
+    def hover_thrust(self, values: Mapping[str, float]) -> float | None:
+        """Collective thrust in 0..1 that hovers, by the vehicle's own estimate; None: not known."""
+
+    @abstractmethod
+    def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:
+        """The command that lets the autopilot climb to a height above the ground by itself.
+
+        ``amsl_m`` is the vehicle's present height above mean sea level, if it is known. None: it
+        cannot be given without that.
+        """

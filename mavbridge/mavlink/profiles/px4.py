@@ -1,0 +1,175 @@
+"""PX4's multicopters, measured on 1.18."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
+from mavbridge.mavlink.codec.messages import CommandRequest
+from mavbridge.mavlink.profiles.modes import ModeTable
+from mavbridge.mavlink.profiles.profile import (
+    Danger,
+    ParamContext,
+    Profile,
+    StreamGroup,
+    optional_stream,
+)
+from mavbridge.mavlink.profiles.px4_sticks import px4_curves
+from mavbridge.mavlink.profiles.sticks import StickCurves
+
+CURRENT_MODE_HZ = 50.0
+"""It shows a change of mode within 30 ms; without one it comes at 2 Hz."""
+POSITION_CEILING_HZ = 125.0
+"""Rate of the estimator's position, and of targets: asked for more, they come at this rate."""
+FAST_HZ = 250.0
+"""Rate of the attitude and of the IMU. Streams are sent every so many steps of the link's own
+clock: 200 Hz asked for come as 125, 250 as 205 to 250."""
+_UNEVEN_HZ = 150.0
+"""Above this, asking for the rate itself gives less than asking for ``FAST_HZ``."""
+_TARGET_HZ = 100.0
+_NO_MAVLINK_STICKS = {0: "RC only", 4: "sticks disabled"}
+"""COM_RC_IN_MODE."""
+_FATAL_ACTIONS = {5: "terminate the flight", 6: "disarm"}
+"""NAV_RCL_ACT."""
+_FATAL_OFFBOARD_ACTIONS = {6: "terminate the flight", 7: "disarm"}
+"""COM_OBL_RC_ACT."""
+_LONGEST_S = 1.0
+_SHORTEST_S = 0.3
+"""A gate on a busy computer may be late by a tenth of this; a link loses a few packets in a row."""
+
+_FIRST_MODES = ("MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED")
+_AUTO_MODES = ("TAKEOFF", "LOITER", "MISSION", "RTL", "LAND")
+_MODES = ModeTable(
+    {
+        **dict(enumerate(_FIRST_MODES, start=1)),
+        10: "TERMINATION",
+        11: "ALTITUDE_CRUISE",
+    },
+    roles=ModeRoles(
+        hold="AUTO.LOITER",
+        land="AUTO.LAND",
+        rtl="AUTO.RTL",
+        takeoff=("AUTO.LOITER", "AUTO.TAKEOFF"),
+        thrust=("MANUAL", "STABILIZED", "ACRO"),
+        setpoint=("OFFBOARD",),
+        needs_setpoints_first=True,
+        is_silence_failsafe=True,
+    ),
+    shift=16,
+    sub_shift=24,
+    sub_modes={"AUTO": dict(enumerate(_AUTO_MODES, start=2))},
+    never_commanded=("TERMINATION",),
+)
+
+
+class Px4(Profile):
+    """PX4 as measured: sticks as MANUAL_CONTROL, setpoints in OFFBOARD."""
+
+    name = "px4"
+    modes = _MODES
+    outputs: ClassVar[Mapping[ActionKind, Output]] = {
+        "sticks": "manual-control",
+        "rates": "rates",
+        "attitude": "attitude",
+        "velocity": "velocity",
+    }
+    refusals: ClassVar[Mapping[Output, str]] = {
+        "rc-override": "PX4 cannot release an RC_CHANNELS_OVERRIDE: use --output manual-control"
+    }
+    heartbeat_type = dialect.MAV_TYPE_GCS
+    """It sends STATUSTEXT only on links on which it hears a ground station."""
+    is_bytewise = True
+    sends_invalid_estimates = True
+    params = (
+        *("COM_RC_IN_MODE", "COM_RC_LOSS_T", "COM_RCL_EXCEPT", "NAV_RCL_ACT", "COM_FAIL_ACT_T"),
+        *("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_DISARM_PRFLT", "COM_DISARM_LAND"),
+        *("MAN_ARM_GESTURE", "MAN_DEADZONE", "MAN_OVERRIDE_SPD", "NAV_DLL_ACT"),
+        *("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_YAW_EXPO", "MPC_Z_MAN_EXPO"),
+        *("MPC_XY_MAN_EXPO", "MPC_HOLD_DZ", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN"),
+        *("MPC_VEL_MANUAL", "MPC_THR_HOVER", "MIS_TAKEOFF_ALT"),
+    )
+
+    def streams(self, *, state_hz: float) -> tuple[StreamGroup, ...]:
+        """RC_CHANNELS comes only where a receiver is, GLOBAL_POSITION_INT only with a position."""
+        fast_hz = state_hz if state_hz <= _UNEVEN_HZ else FAST_HZ
+        slow_hz = min(state_hz, POSITION_CEILING_HZ)
+        return (
+            StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), None, fast_hz),
+            StreamGroup(("LOCAL_POSITION_NED",), None, slow_hz),
+            StreamGroup(("HIGHRES_IMU", "SCALED_IMU"), None, fast_hz),
+            optional_stream("CURRENT_MODE", CURRENT_MODE_HZ, is_steady=False),
+            optional_stream("RC_CHANNELS", 20.0, is_steady=False),
+            optional_stream("SYS_STATUS", 2.0),
+            optional_stream("EXTENDED_SYS_STATE", 5.0),
+            optional_stream("ESTIMATOR_STATUS", 5.0),
+            optional_stream("GLOBAL_POSITION_INT", 2.0, is_steady=False),
+        )
+
+    def echo(self, output: Output) -> StreamGroup:
+        """MANUAL_CONTROL shows the chosen sticks at the sender's rate, targets the setpoints."""
+        if output in ("attitude", "rates"):
+            return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
+        if output == "velocity":
+            return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, is_steady=False)
+        return optional_stream("MANUAL_CONTROL", FAST_HZ, is_steady=False)
+
+    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """COM_RC_IN_MODE without MAVLink's sticks."""
+        mode = values.get("COM_RC_IN_MODE")
+        if context.output == "manual-control" and mode in _NO_MAVLINK_STICKS:
+            yield (
+                f"COM_RC_IN_MODE is {mode:g} ({_NO_MAVLINK_STICKS[int(mode)]}): use "
+                "--set COM_RC_IN_MODE=1 (MAVLink only), or 7 with a receiver (receiver first)"
+            )
+
+    def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
+        """None: sticks and setpoints that end are always a failsafe."""
+        return iter(())
+
+    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """What the end of our packets would do, where that is not what one expects."""
+        if context.output == "manual-control":
+            name, action = "COM_RC_LOSS_T", _FATAL_ACTIONS.get(int(values.get("NAV_RCL_ACT", 2)))
+            act_name = "NAV_RCL_ACT"
+        elif context.output is not None:
+            name, act_name = "COM_OF_LOSS_T", "COM_OBL_RC_ACT"
+            action = _FATAL_OFFBOARD_ACTIONS.get(int(values.get(act_name, 0)))
+        else:
+            return
+        time_s = values.get(name, _LONGEST_S)
+        if time_s > _LONGEST_S:
+            yield (
+                f"{name} is {time_s:g}: if this computer died, the vehicle would go on with the "
+                f"last it was told for that many seconds: use --set {name}=0.5"
+            )
+        if time_s < _SHORTEST_S:
+            yield f"{name} is {time_s:g}: a pause of our packets as short as that is a failsafe"
+        if action is not None:
+            yield f"{act_name} is {values[act_name]:g}: it would {action} if our packets stopped"
+
+    def stick_curves(
+        self, values: Mapping[str, float], mode: str, gains: StickGains | None
+    ) -> StickCurves:
+        """Leans, yaw rates and climb rates of ALTCTL and STABILIZED."""
+        return px4_curves(values, mode, gains)
+
+    def hover_thrust(self, values: Mapping[str, float]) -> float | None:
+        """MPC_THR_HOVER."""
+        return values.get("MPC_THR_HOVER")
+
+    def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:
+        """NAV_TAKEOFF, which is AUTO.TAKEOFF with a height above mean sea level.
+
+        Where it stands and the way it looks are not numbers, and so stay.
+        """
+        if amsl_m is None:
+            return None
+        here = math.nan
+        return CommandRequest(
+            dialect.MAV_CMD_NAV_TAKEOFF, (here, 0, 0, here, here, here, amsl_m + height_m)
+        )
+
+
+PX4 = Px4()

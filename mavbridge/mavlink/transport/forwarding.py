@@ -1,0 +1,151 @@
+"""Shares the link with a ground station by UDP: the vehicle's bytes to it, its packets back."""
+
+import socket
+from collections import deque
+from collections.abc import Iterator
+
+from mavbridge.core.clock import Clock
+from mavbridge.core.errors import UserError
+from mavbridge.mavlink.codec.frames import split_frames
+from mavbridge.mavlink.codec.messages import Endpoint
+from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
+from mavbridge.mavlink.transport.sockets import Address
+
+MAX_DATAGRAMS = 32
+"""From the ground station at one look; the rest waits for the next."""
+MAX_QUEUED_BYTES = 64 * 1024
+"""For the ground station between two sends."""
+MAX_PACKED = 1200
+"""Bytes in one datagram, below any usual MTU; what arrived larger leaves larger."""
+_MAX_DATAGRAM = 65535
+_FORMS = "udp:HOST:PORT to send there, or udpin:HOST:PORT to listen"
+
+
+class Forwarding:
+    """The ground station's end; used by one thread, and never waits.
+
+    It sends to the given address, or to the first that talks where it listens, and hears no other.
+
+    Raises:
+        UserError: the address is malformed or in use, or its host does not exist.
+    """
+
+    def __init__(self, spec: str, clock: Clock, *, sticks_win: bool = False) -> None:
+        kind, address = _parsed(spec)
+        self._clock = clock
+        self.rules = GroundStationRules(sticks_win=sticks_win)
+        self._station: Address | None = None if kind == "udpin" else address
+        self._was_heard = False
+        self._queue: deque[bytes] = deque()
+        self._queued_bytes = 0
+        self.dropped = 0
+        """Datagrams for the ground station: the socket, or our queue, was full."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind(address if kind == "udpin" else ("", 0))
+        except OSError as error:
+            self._socket.close()
+            raise UserError(
+                f"--forward {spec}: {error.strerror}; stop the program that listens there, or "
+                "choose another port"
+            ) from error
+
+    def fileno(self) -> int:
+        """Descriptor that turns readable when the ground station has sent something."""
+        return self._socket.fileno()
+
+    def take_texts(self) -> list[str]:
+        """Messages for the user since the last call."""
+        texts, self.rules.texts = self.rules.texts, []
+        return texts
+
+    def summary(self) -> str | None:
+        """What was not passed on, for the user; None: everything was."""
+        if not (self.dropped or self.rules.dropped):
+            return None
+        return (
+            f"{self.rules.dropped} packets of the ground station were not passed on, and "
+            f"{self.dropped} datagrams for it were lost"
+        )
+
+    def pass_on(self, data: bytes) -> None:
+        """Queue bytes of the vehicle for `flush`, unchanged."""
+        if self._station is None:
+            return
+        if self._queued_bytes + len(data) > MAX_QUEUED_BYTES:
+            self.dropped += 1
+            return
+        self._queue.append(data)
+        self._queued_bytes += len(data)
+
+    def flush(self) -> None:
+        """Send what is queued; what the socket does not take now is dropped."""
+        while self._queue:
+            datagram = self._queue.popleft()
+            while self._queue and len(datagram) + len(self._queue[0]) <= MAX_PACKED:
+                datagram += self._queue.popleft()
+            self._send(datagram)
+        self._queued_bytes = 0
+
+    def receive(self, vehicle: Endpoint | None, *, is_engaged: bool) -> Iterator[bytes]:
+        """Packets of the ground station for the vehicle, unchanged.
+
+        Args:
+            vehicle: who a refused command seems to be answered by; None: it is not answered.
+            is_engaged: our sticks are in use, or being given back.
+        """
+        now_ns = self._clock.now_ns()
+        for _ in range(MAX_DATAGRAMS):
+            try:
+                data, sender = self._socket.recvfrom(_MAX_DATAGRAM)
+            except BlockingIOError:
+                return
+            except OSError:  # the network's answer to an earlier send
+                continue
+            if not self._is_heard(sender):
+                continue
+            frames, has_rest = split_frames(data)
+            self.rules.dropped += has_rest
+            for frame in frames:
+                verdict = self.rules.judge(frame, now_ns, is_engaged=is_engaged)
+                if verdict is Verdict.PASS:
+                    yield frame.data
+                elif verdict is Verdict.DENY and vehicle is not None:
+                    self._send(denial(frame, vehicle))
+
+    def close(self) -> None:
+        """Free the port."""
+        self._socket.close()
+
+    def _is_heard(self, sender: Address) -> bool:
+        if self._station is None:
+            self._station = sender
+        if sender != self._station:
+            return False
+        if not self._was_heard:
+            self._was_heard = True
+            self.rules.texts.append(f"a ground station at {sender[0]}:{sender[1]} shares the link")
+        return True
+
+    def _send(self, datagram: bytes) -> None:
+        if self._station is None:
+            return
+        try:
+            self._socket.sendto(datagram, self._station)
+        except BlockingIOError:
+            self.dropped += 1
+        except OSError:
+            pass  # no route, or nobody listens: a ground station may come later
+
+
+def _parsed(spec: str) -> tuple[str, Address]:
+    kind, _, rest = spec.partition(":")
+    host, _, port = rest.rpartition(":")
+    is_known = kind in ("udp", "udpout", "udpin")
+    if not (is_known and host and port.isdecimal() and 0 < int(port) < 65536):
+        raise UserError(f"--forward {spec!r} is not understood; use {_FORMS}")
+    try:
+        return kind, (socket.gethostbyname(host), int(port))  # now: a resolver may block
+    except OSError as error:
+        raise UserError(f"--forward {spec}: cannot find host {host!r}: {error.strerror}") from error

@@ -1,0 +1,199 @@
+"""Feedback from the measured motion to the four numbers of each kind of action.
+
+Sticks are for an autopilot that holds altitude at mid-stick (ArduPilot ALT_HOLD, PX4 ALTCTL): the
+throttle stick is a climb rate, pitch and roll are lean angles, yaw is a yaw rate. All in NED and
+FRD, velocities in the horizontal frame that turns with the nose.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+from policy.contract import QUATERNION, RATE, VELOCITY, ActionKind, FloatArray
+from policy.scripted.programs import Axis, Motion
+
+Four: TypeAlias = tuple[float, float, float, float]
+
+GRAVITY_MPS2 = 9.80665
+# ArduCopter at full stick, default parameters; and the dead zone of its throttle.
+FULL_CLIMB_MPS = 2.5
+FULL_LEAN_RAD = math.radians(30.0)
+FULL_LEAN_ACCEL_MPS2 = GRAVITY_MPS2 * math.tan(FULL_LEAN_RAD)
+FULL_YAW_RATE_RADPS = math.radians(202.5)
+THROTTLE_DEADZONE = 0.2
+"""Stick within this of the middle holds altitude."""
+
+CLIMB_RATE_GAIN = 0.5  # m/s of command for each m/s short of the wanted climb
+LEAN_PER_MPS = 0.3  # of full lean for each m/s of error: closes in 0.6 s, slower than a lean builds
+LEAN_PER_WANTED_MPS = 0.04  # against drag
+YAW_RATE_GAIN = 0.3
+MAX_LEAN = 0.6
+"""Largest lean of the feedback, of the full one."""
+RATE_PER_LEAN = 4.0  # rad/s for each rad short of the wanted lean
+MAX_LEAN_RATE_RADPS = 1.5
+
+ACCEL_PER_CLIMB = 2.5  # m/s^2 for each m/s short of the wanted climb
+ACCEL_INTEGRAL = 0.8  # m/s^3 for each m/s
+MAX_INTEGRAL_MPS2 = 3.5
+"""Enough for a vehicle that hovers at a third more, or less, than the contract's thrust."""
+LEAST_THRUST, MOST_THRUST = 0.1, 0.85
+
+FULL_PUSH_MPS: dict[Axis, float] = {"pitch": 4.0, "roll": 4.0, "climb": 1.5}
+FULL_PUSH_YAW_RADPS = math.radians(90.0)
+"""Full range of a push where the output is not a stick; a lean is ``FULL_LEAN_RAD``."""
+
+
+class Measured(NamedTuple):
+    """The vehicle's motion."""
+
+    forward_mps: float
+    right_mps: float
+    climb_mps: float
+    yaw_rate_radps: float
+    roll_rad: float
+    pitch_rad: float
+
+
+class Climb(NamedTuple):
+    """Demand of the altitude loop."""
+
+    wanted_mps: float
+    is_held: bool
+    """The height is right: an autopilot that holds it needs no stick."""
+    thrust: float
+    """Collective for it, in [0, 1]."""
+
+
+def measure(state: FloatArray) -> Measured:
+    """Motion from the 13-D state in ``ned_frd``."""
+    north, east, down = (float(v) for v in state[VELOCITY])
+    w, x, y, z = (float(q) for q in state[QUATERNION])
+    # Yaw, roll and pitch of the Z-Y-X Euler angles of a unit quaternion.
+    heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    cos, sin = math.cos(heading), math.sin(heading)
+    return Measured(
+        forward_mps=cos * north + sin * east,
+        right_mps=cos * east - sin * north,
+        climb_mps=-down,
+        yaw_rate_radps=float(state[RATE][2]),
+        roll_rad=math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        pitch_rad=math.asin(clip(2 * (w * y - z * x), 1.0)),
+    )
+
+
+def clip(value: float, limit: float) -> float:
+    """The value within +-limit."""
+    return max(-limit, min(limit, value))
+
+
+class ThrustLoop:
+    """Collective thrust for a climb rate; finds the thrust that hovers in flight."""
+
+    def __init__(self, hover_thrust: float) -> None:
+        self._hover_thrust = hover_thrust
+        self._integral_mps2 = 0.0
+
+    def reset(self) -> None:
+        """Begin at the contract's hover thrust."""
+        self._integral_mps2 = 0.0
+
+    def update(self, error_mps: float, step_s: float, *, is_airborne: bool) -> float:
+        """Thrust for a climb rate that is ``error_mps`` short of the wanted one."""
+        if is_airborne:  # on the ground it would wind up
+            integral = self._integral_mps2 + ACCEL_INTEGRAL * error_mps * step_s
+            self._integral_mps2 = clip(integral, MAX_INTEGRAL_MPS2)
+        accel_mps2 = ACCEL_PER_CLIMB * error_mps + self._integral_mps2
+        thrust = self._hover_thrust * (1.0 + accel_mps2 / GRAVITY_MPS2)
+        return max(LEAST_THRUST, min(MOST_THRUST, thrust))
+
+
+def sticks(wanted: Motion, measured: Measured, climb: Climb) -> Four:
+    """Throttle, yaw, pitch, roll: +pitch leans forward, +roll leans right."""
+    pitch, roll = _leans(wanted, measured)
+    yaw = clip(_yaw_rate(wanted, measured) / FULL_YAW_RATE_RADPS, 1.0)
+    if (push := wanted.push) is None:
+        return _throttle(measured, climb), yaw, pitch, roll
+    match push.axis:
+        case "climb":
+            return push.share, yaw, pitch, roll
+        case "yaw":
+            yaw = push.share
+        case "pitch":
+            pitch = push.share
+        case "roll":
+            roll = push.share
+    return _throttle(measured, climb), yaw, pitch, roll
+
+
+def _throttle(measured: Measured, climb: Climb) -> float:
+    if climb.is_held:
+        return 0.0
+    command = climb.wanted_mps + CLIMB_RATE_GAIN * (climb.wanted_mps - measured.climb_mps)
+    beyond_deadzone = (1 - THROTTLE_DEADZONE) * command / FULL_CLIMB_MPS
+    return clip(math.copysign(THROTTLE_DEADZONE, command) + beyond_deadzone, 1.0)
+
+
+def velocity(wanted: Motion, measured: Measured, climb: Climb) -> Four:
+    """Forward, right, down in m/s, and the yaw rate: the autopilot has the feedback."""
+    forward, right = wanted.forward_mps, wanted.right_mps
+    up, yaw_rate = climb.wanted_mps, wanted.yaw_rate_radps
+    if (push := wanted.push) is not None:
+        match push.axis:
+            case "climb":
+                up = push.share * FULL_PUSH_MPS["climb"]
+            case "yaw":
+                yaw_rate = push.share * FULL_PUSH_YAW_RADPS
+            case "pitch":
+                forward = push.share * FULL_PUSH_MPS["pitch"]
+            case "roll":
+                right = push.share * FULL_PUSH_MPS["roll"]
+    return forward, right, -up, yaw_rate
+
+
+def attitude(wanted: Motion, measured: Measured, climb: Climb) -> Four:
+    """Thrust, roll, pitch (+ nose up) and yaw rate; a push of the climb is not flown."""
+    forward_lean, right_lean = _leans(wanted, measured)
+    yaw_rate = _yaw_rate(wanted, measured)
+    if (push := wanted.push) is not None:
+        match push.axis:
+            case "yaw":
+                yaw_rate = push.share * FULL_PUSH_YAW_RADPS
+            case "pitch":
+                forward_lean = push.share
+            case "roll":
+                right_lean = push.share
+    return climb.thrust, right_lean * FULL_LEAN_RAD, -forward_lean * FULL_LEAN_RAD, yaw_rate
+
+
+def rates(wanted: Motion, measured: Measured, climb: Climb) -> Four:
+    """Thrust and body rates, which close the lean of ``attitude``."""
+    thrust, roll_rad, pitch_rad, yaw_rate = attitude(wanted, measured, climb)
+    roll_rate = clip(RATE_PER_LEAN * (roll_rad - measured.roll_rad), MAX_LEAN_RATE_RADPS)
+    pitch_rate = clip(RATE_PER_LEAN * (pitch_rad - measured.pitch_rad), MAX_LEAN_RATE_RADPS)
+    return thrust, roll_rate, pitch_rate, yaw_rate
+
+
+Control: TypeAlias = Callable[[Motion, Measured, Climb], Four]
+CONTROLS: dict[ActionKind, Control] = {
+    "sticks": sticks,
+    "rates": rates,
+    "attitude": attitude,
+    "velocity": velocity,
+}
+
+
+def _leans(wanted: Motion, measured: Measured) -> tuple[float, float]:
+    """Leans forward and to the right, of the full one."""
+    forward = LEAN_PER_WANTED_MPS * wanted.forward_mps
+    forward += LEAN_PER_MPS * (wanted.forward_mps - measured.forward_mps)
+    right = LEAN_PER_WANTED_MPS * wanted.right_mps
+    right += LEAN_PER_MPS * (wanted.right_mps - measured.right_mps)
+    # A turn at speed v needs the sideways acceleration v * yaw_rate.
+    right += wanted.forward_mps * wanted.yaw_rate_radps / FULL_LEAN_ACCEL_MPS2
+    return clip(forward, MAX_LEAN), clip(right, MAX_LEAN)
+
+
+def _yaw_rate(wanted: Motion, measured: Measured) -> float:
+    """Commanded yaw rate, in rad/s."""
+    error = wanted.yaw_rate_radps - measured.yaw_rate_radps
+    return wanted.yaw_rate_radps + YAW_RATE_GAIN * error

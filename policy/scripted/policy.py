@@ -1,0 +1,168 @@
+"""The policy: climbs, follows a program, and plans it for the length of a chunk."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from policy.contract import ACTION_DIM, STATE_DIM, ActionKind, Contract, FloatArray
+from policy.errors import PolicyError
+from policy.scripted.controllers import CONTROLS, Climb, Measured, ThrustLoop, clip, measure
+from policy.scripted.programs import PROGRAM_NAMES, PROGRAMS, Motion
+
+FEATURE_DIM = 8
+DEFAULT_CONTRACT = Contract()
+
+TAKEOFF_CLIMB_MPS = 1.5
+TAKEOFF_TOLERANCE_M = 0.2
+HOLD_TOLERANCE_M = 0.15
+"""Within it the stick is centred and the autopilot holds altitude by itself."""
+SETTLE_S = 2.0
+"""Between reaching the altitude and the start of the program."""
+CLIMB_PER_ALTITUDE = 1.0  # 1/s
+AIRBORNE_M = 0.3
+MOST_SINK_M = 3.0
+"""A push downwards ends that far below the altitude of the program."""
+MAX_STEP_S = 0.2
+"""Longest time over which one climb-rate reading is integrated."""
+
+
+class ScriptedPolicy:
+    """Takes off from where it is first asked, or was reset, then flies ``program`` for ever.
+
+    The state has no position: altitude is the integral of the measured climb rate, so a ground that
+    is left late costs nothing, and it drifts as the vehicle's own velocity estimate does. A state
+    at rest on the ground is that of a hover, so whoever begins in the air has to say so. Used by
+    one thread.
+
+    Raises:
+        PolicyError: the program or the kind of action is unknown.
+    """
+
+    def __init__(
+        self,
+        program: str,
+        now_s: Callable[[], float],
+        *,
+        action: ActionKind = "sticks",
+        starts_in_air: bool = False,
+        contract: Contract = DEFAULT_CONTRACT,
+    ) -> None:
+        """Prepare a program.
+
+        Args:
+            program: one of ``PROGRAM_NAMES``.
+            now_s: monotonic seconds.
+            action: kind of the actions; velocities are in the heading frame.
+            starts_in_air: keep the altitude of the start; else climb to the program's own.
+            contract: image and chunk; frames, kind and modes are the policy's own.
+        """
+        if program not in PROGRAMS:
+            raise PolicyError(
+                f"scripted program {program!r} is unknown; use one of {list(PROGRAM_NAMES)}"
+            )
+        if action not in CONTROLS:
+            raise PolicyError(
+                f"scripted programs do not put out {action!r}; use one of {list(CONTROLS)}"
+            )
+        self.contract = replace(
+            contract,
+            state_frame="ned_frd",
+            feature_dim=FEATURE_DIM,
+            arrays="numpy",
+            action=action,
+            modes=(),  # the usual ones of that kind
+            velocity_frame="heading",
+        )
+        self._program = PROGRAMS[program]
+        self._control = CONTROLS[action]
+        self._now_s = now_s
+        self._starts_in_air = starts_in_air
+        self._goal_m = 0.0 if starts_in_air else self._program.altitude_m
+        self._thrust_loop = ThrustLoop(self.contract.hover_thrust)
+        self._last_s: float | None = None
+        self._altitude_m = 0.0
+        self.program_start_s: float | None = None
+        """When the program began, or will, by ``now_s``; None before the altitude is reached."""
+
+    def reset(self) -> None:
+        """Begin again: the altitude of now is that of the start."""
+        self._last_s = self.program_start_s = None
+        self._altitude_m = 0.0
+        self._thrust_loop.reset()
+
+    def encode_visual(self, image: FloatArray) -> FloatArray:
+        """Image [1, 3, H, W] -> mean and deviation of each channel, zeros: [1, 8]."""
+        sparse = image[:, :, ::4, ::4]
+        feature = np.zeros((image.shape[0], FEATURE_DIM), np.float32)
+        feature[:, :3] = sparse.mean(axis=(2, 3))
+        feature[:, 3:6] = sparse.std(axis=(2, 3))
+        return feature
+
+    def predict(
+        self,
+        image: FloatArray,
+        state: FloatArray,
+        action_history: FloatArray,
+        num_diffusion_steps: int,
+    ) -> FloatArray:
+        """``encode_visual``, then ``predict_fast``."""
+        feature = self.encode_visual(image)
+        return self.predict_fast(feature, state, action_history, num_diffusion_steps)
+
+    def predict_fast(
+        self,
+        feature: FloatArray,
+        state: FloatArray,
+        action_history: FloatArray,
+        num_diffusion_steps: int,
+    ) -> FloatArray:
+        """State [1, 13] in ``ned_frd`` -> chunk [1, 16, 4]; the other arguments are not used.
+
+        Each action is the program's motion at its own time with the feedback of now.
+
+        Raises:
+            PolicyError: the state is not [1, 13].
+        """
+        if state.shape != (1, STATE_DIM):
+            raise PolicyError(f"state must be [1, {STATE_DIM}], got {list(state.shape)}")
+        now_s = self._now_s()
+        measured = measure(state[0])
+        climb = self._follow(now_s, measured)
+        chunk = np.zeros((1, self.contract.horizon, ACTION_DIM), np.float32)
+        for index in range(self.contract.horizon):
+            wanted = self._wanted(now_s + index * self.contract.chunk_dt_s)
+            chunk[0, index] = self._control(wanted, measured, climb)
+        return chunk
+
+    def _follow(self, now_s: float, measured: Measured) -> Climb:
+        """Integrate altitude, start the program once it is reached, and demand a climb."""
+        step_s = 0.0
+        if self._last_s is not None:
+            step_s = min(max(now_s - self._last_s, 0.0), MAX_STEP_S)
+            self._altitude_m += measured.climb_mps * step_s
+        self._last_s = now_s
+        up = self._altitude_m > self._goal_m - TAKEOFF_TOLERANCE_M
+        if up and self.program_start_s is None:
+            self.program_start_s = now_s + SETTLE_S
+        error_m = self._goal_m - self._altitude_m
+        wanted_mps = clip(CLIMB_PER_ALTITUDE * error_m, TAKEOFF_CLIMB_MPS)
+        return Climb(
+            wanted_mps=wanted_mps,
+            is_held=self.program_start_s is not None and abs(error_m) < HOLD_TOLERANCE_M,
+            thrust=self._thrust_loop.update(
+                wanted_mps - measured.climb_mps,
+                step_s,
+                is_airborne=self._starts_in_air or self._altitude_m > AIRBORNE_M,
+            ),
+        )
+
+    def _wanted(self, time_s: float) -> Motion:
+        start_s = self.program_start_s
+        if start_s is None or time_s < start_s:
+            return Motion()
+        wanted = self._program.motion(time_s - start_s)
+        is_low = self._altitude_m < self._goal_m - MOST_SINK_M
+        if is_low and wanted.push is not None and wanted.push.axis == "climb":
+            return Motion()
+        return wanted

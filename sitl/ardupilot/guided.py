@@ -1,0 +1,244 @@
+"""GUIDED and GUIDED_NOGPS: setpoints of a companion computer instead of the pilot's sticks.
+
+Which message is taken, what an invalid one does, the timeout and the response times are those
+measured on the firmware. Positions as setpoints are not simulated; they are dropped.
+"""
+
+import math
+from enum import Enum, auto
+from typing import NamedTuple
+
+from sitl.ardupilot.control import AttitudeController, lean_for
+from sitl.ardupilot.params import Params
+from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.rotation import Quat, Vec3, from_euler, integrate, to_euler
+from sitl.vehicle.control import HeightController, clamp, thrust_for
+from sitl.vehicle.dynamics import BodyState
+
+OPTION_THRUST = 8
+"""GUID_OPTIONS: SET_ATTITUDE_TARGET.thrust is a collective; else it is a climb rate."""
+ARMING_DELAY_NS = 2 * NS_PER_S
+SPOOL_UP_NS = 500 * NS_PER_MS
+CLIMB_WINDUP_NS = 500 * NS_PER_MS
+"""On top where the height controller lifts it off; a takeoff to 8 m passed 2 m after 3.0 s."""
+TAKEOFF_DECEL_MPS2 = 0.7
+TAKEOFF_GAIN_PER_S = 1.0
+ACCEL_MPS2 = 2.5  # WPNAV_ACCEL
+JERK_MPS3 = 5.0  # PSC_JERK_XY
+SPEED_GAIN_PER_S = 1.8  # of the target's own speed: 2 m/s to 90 % in 1.34 s was measured
+VELOCITY_GAIN_PER_S = 2.0
+POSITION_GAIN_PER_S = 1.0
+MAX_POSITION_ERROR_M = 2.0
+MAX_LEAN_ACCEL_MPS2 = 5.0
+MIN_CLIMB_ACCEL_MPS2 = 0.5
+
+
+class AttitudeSetpoint(NamedTuple):
+    """A valid SET_ATTITUDE_TARGET; body axes are FRD."""
+
+    ned_from_body_wxyz: Quat | None  # None: the rates alone count
+    rate_body_radps: Vec3
+    thrust: float  # what it means is up to GUID_OPTIONS
+
+
+class VelocitySetpoint(NamedTuple):
+    """A valid SET_POSITION_TARGET_LOCAL_NED."""
+
+    velocity_ned_mps: Vec3
+    yaw_rate_radps: float
+
+
+class Submode(Enum):
+    """What GUIDED follows; GUIDED_NOGPS knows ATTITUDE alone."""
+
+    VELOCITY = auto()
+    ATTITUDE = auto()
+    TAKEOFF = auto()
+
+
+class GuidedControl:
+    """Control law of both modes, on the attitude and height controllers of all modes."""
+
+    def __init__(
+        self, params: Params, attitude: AttitudeController, height: HeightController
+    ) -> None:
+        self._params = params
+        self._attitude = attitude
+        self._height = height
+        self.submode = Submode.ATTITUDE
+        self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
+        """Followed in Submode.VELOCITY."""
+        self._takeoff_height_m = 0.0
+        self._setpoint: AttitudeSetpoint | None = None
+        self._has_thrust = False
+        self._received_ns = 0
+        self._spooling_since_ns: int | None = None
+        self._track = _Track()
+        self._yaw = self._yaw_rate_radps = 0.0
+
+    def enter(self, body: BodyState, *, with_position: bool) -> None:
+        """Forget all setpoints: GUIDED brakes then, GUIDED_NOGPS levels and holds its height."""
+        self._setpoint = None
+        self._has_thrust = False
+        self.submode = Submode.ATTITUDE
+        if with_position:
+            self.brake(body)
+
+    def brake(self, body: BodyState) -> None:
+        """Stop and stay: what an invalid setpoint does in GUIDED, too."""
+        self._start(Submode.VELOCITY, body)
+
+    def follow_attitude(self, setpoint: AttitudeSetpoint, body: BodyState, now_ns: int) -> None:
+        """Follow this setpoint until the next one, or until GUID_TIMEOUT."""
+        has_thrust = bool(self._params.integer("GUID_OPTIONS") & OPTION_THRUST)
+        if self._has_thrust and not has_thrust:
+            self._height.reset(body)
+        self._has_thrust = has_thrust
+        self._setpoint = setpoint
+        self._received_ns = now_ns
+        self.submode = Submode.ATTITUDE
+
+    def follow_velocity(self, setpoint: VelocitySetpoint, body: BodyState, now_ns: int) -> None:
+        """Follow this setpoint until the next one, or until GUID_TIMEOUT."""
+        self._start(Submode.VELOCITY, body)
+        self.velocity = setpoint
+        self._received_ns = now_ns
+
+    def take_off(self, height_m: float, body: BodyState) -> None:
+        """Climb to this height above home; any setpoint ends it."""
+        self._start(Submode.TAKEOFF, body)
+        self._takeoff_height_m = height_m
+
+    def lifts_off(self, now_ns: int, armed_ns: int) -> bool:
+        """True once a landed vehicle has spun its motors up for a takeoff.
+
+        A velocity never lifts it off; a thrust or climb rate above zero does, or `take_off`.
+        """
+        wanted = self.submode is Submode.TAKEOFF
+        by_thrust = self.submode is Submode.ATTITUDE and self._has_thrust
+        if self.submode is Submode.ATTITUDE and self._setpoint and not self._is_over(now_ns):
+            wanted = (self._thrust() if by_thrust else self._climb_mps()) > 0.0
+        if not wanted or now_ns - armed_ns < ARMING_DELAY_NS:
+            self._spooling_since_ns = None
+        elif self._spooling_since_ns is None:
+            self._spooling_since_ns = now_ns
+        else:
+            windup_ns = 0 if by_thrust else CLIMB_WINDUP_NS
+            return now_ns - self._spooling_since_ns >= SPOOL_UP_NS + windup_ns
+        return False
+
+    def fly(
+        self, body: BodyState, now_ns: int, *, has_position: bool, dt_s: float
+    ) -> tuple[Vec3, float]:
+        """Body angular acceleration (rad/s^2) and thrust (0..1, of a level vehicle)."""
+        if self.submode is Submode.ATTITUDE:
+            return self._fly_attitude(body, now_ns, dt_s)
+        return self._fly_velocity(body, now_ns, has_position=has_position, dt_s=dt_s)
+
+    def _fly_attitude(self, body: BodyState, now_ns: int, dt_s: float) -> tuple[Vec3, float]:
+        setpoint = self._setpoint
+        if setpoint is None or self._is_over(now_ns):
+            if self._has_thrust:
+                self._height.reset(body)
+                self._has_thrust = False
+            yaw = to_euler(self._attitude.target[0])[2]
+            level = from_euler(0.0, 0.0, yaw)
+            turn = self._attitude.approach(body, level, (0.0, 0.0, 0.0), dt_s)
+            return turn, self._hold_climb(body, 0.0, dt_s)
+        attitude, rate = setpoint.ned_from_body_wxyz, setpoint.rate_body_radps
+        if attitude is None:
+            turn = self._attitude.turn(body, rate, dt_s)
+        else:
+            turn = self._attitude.approach(body, attitude, rate, dt_s)
+            self._setpoint = setpoint._replace(ned_from_body_wxyz=integrate(attitude, rate, dt_s))
+        if self._has_thrust:
+            return turn, self._thrust()
+        return turn, self._hold_climb(body, self._climb_mps(), dt_s)
+
+    def _fly_velocity(
+        self, body: BodyState, now_ns: int, *, has_position: bool, dt_s: float
+    ) -> tuple[Vec3, float]:
+        (north, east, down), yaw_rate = self.velocity
+        if self.submode is Submode.TAKEOFF:
+            to_go_m = self._takeoff_height_m + body.position_ned_m[2]
+            braking = math.sqrt(2.0 * TAKEOFF_DECEL_MPS2 * max(0.0, to_go_m))
+            up = self._params["WPNAV_SPEED_UP"] / 100.0
+            down = -min(up, braking, TAKEOFF_GAIN_PER_S * to_go_m)
+        elif self._is_over(now_ns):
+            north = east = down = yaw_rate = 0.0
+            self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
+        roll = pitch = 0.0
+        if has_position:
+            accel = self._track.step((north, east), body, dt_s)
+            roll, pitch = lean_for(accel, body)
+        self._yaw_rate_radps = self._attitude.slew("Y", yaw_rate, self._yaw_rate_radps, dt_s)
+        self._yaw += self._yaw_rate_radps * dt_s
+        attitude = from_euler(roll, pitch, self._yaw)
+        turn = self._attitude.approach(body, attitude, (0.0, 0.0, self._yaw_rate_radps), dt_s)
+        return turn, self._hold_climb(body, -down, dt_s)
+
+    def _start(self, submode: Submode, body: BodyState) -> None:
+        """Begin with a velocity of zero, unless it flies in this way already."""
+        self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
+        if self.submode is not submode:
+            self.submode = submode
+            self._height.reset(body)
+            self._track.reset(body)
+            self._yaw_rate_radps = 0.0
+            _, _, self._yaw = to_euler(self._attitude.target[0])
+
+    def _is_over(self, now_ns: int) -> bool:
+        timeout_s = max(0.1, self._params["GUID_TIMEOUT"])
+        return now_ns - self._received_ns > timeout_s * NS_PER_S
+
+    def _thrust(self) -> float:
+        return max(0.0, min(1.0, self._setpoint.thrust)) if self._setpoint else 0.0
+
+    def _climb_mps(self) -> float:
+        """Climb rate of a thrust: 0.5 holds the height, 0 and 1 are WPNAV's descent and climb."""
+        above_half = 2.0 * self._thrust() - 1.0
+        limit = "WPNAV_SPEED_UP" if above_half > 0.0 else "WPNAV_SPEED_DN"
+        return above_half * self._params[limit] / 100.0
+
+    def _hold_climb(self, body: BodyState, climb_mps: float, dt_s: float) -> float:
+        limit_mps2 = max(MIN_CLIMB_ACCEL_MPS2, self._params["WPNAV_ACCEL_Z"] / 100.0)
+        accel_mps2 = self._height.update(body, climb_mps, limit_mps2, dt_s)
+        return thrust_for(accel_mps2, 1.0, self._params["MOT_THST_HOVER"])
+
+
+class _Track:
+    """A horizontal target that changes its velocity without jumps, and the vehicle's way to it."""
+
+    def __init__(self) -> None:
+        self._position_m = [0.0, 0.0]
+        self._velocity_mps = [0.0, 0.0]
+        self._accel_mps2 = [0.0, 0.0]
+
+    def reset(self, body: BodyState) -> None:
+        """Begin where the vehicle is, at its velocity."""
+        self._position_m = list(body.position_ned_m[:2])
+        self._velocity_mps = list(body.velocity_ned_mps[:2])
+        self._accel_mps2 = [0.0, 0.0]
+
+    def step(
+        self, wanted_mps: tuple[float, float], body: BodyState, dt_s: float
+    ) -> tuple[float, float]:
+        """North and east acceleration (m/s^2) of the vehicle."""
+        error = [w - v for w, v in zip(wanted_mps, self._velocity_mps, strict=True)]
+        scale = min(SPEED_GAIN_PER_S, ACCEL_MPS2 / max(1e-6, math.hypot(*error)))
+        accel = [0.0, 0.0]
+        for k in range(2):
+            change = clamp(scale * error[k] - self._accel_mps2[k], JERK_MPS3 * dt_s)
+            self._accel_mps2[k] += change
+            self._velocity_mps[k] += self._accel_mps2[k] * dt_s
+            here_m = body.position_ned_m[k]
+            ahead_m = self._position_m[k] + self._velocity_mps[k] * dt_s - here_m
+            self._position_m[k] = here_m + clamp(ahead_m, MAX_POSITION_ERROR_M)
+            speed_error = (
+                self._velocity_mps[k]
+                + POSITION_GAIN_PER_S * (self._position_m[k] - here_m)
+                - body.velocity_ned_mps[k]
+            )
+            accel[k] = self._accel_mps2[k] + VELOCITY_GAIN_PER_S * speed_error
+        shrink = MAX_LEAN_ACCEL_MPS2 / max(MAX_LEAN_ACCEL_MPS2, math.hypot(*accel))
+        return accel[0] * shrink, accel[1] * shrink

@@ -1,0 +1,265 @@
+"""Arming, modes and failsafes: what PX4's commander decides, and what it says about it.
+
+The intended mode is what the pilot or a command asked for last; the mode is what flies, which a
+failsafe may change without touching the intended one.
+"""
+
+from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.firmware import StatusText
+from sitl.px4 import events as ev
+from sitl.px4.events import Event
+from sitl.px4.failsafe import LostSticks, Phase, mode_without_stream
+from sitl.px4.modes import SPOKEN_NAMES, Mode
+from sitl.px4.params import Params
+from sitl.px4.sticks import StickInput
+
+CHECK_PERIOD_NS = 20 * NS_PER_MS
+LOW_THROTTLE, MIDDLE_THROTTLE = -0.8, 0.2
+"""Most that arming allows where the stick is thrust, and where it is a climb rate."""
+
+
+class Commander:
+    """Decides on mode and arming of one boot; texts and events wait in lists for the links."""
+
+    def __init__(self, params: Params, sticks: StickInput, boot_ns: int) -> None:
+        self._params = params
+        self._sticks = sticks
+        self._boot_ns = self.now_ns = boot_ns
+        self.mode = self.intended = Mode.AUTO_LOITER
+        self.armed = False
+        self.terminated = False
+        self.landed = True
+        """Told by the autopilot, as the next three."""
+        self.estimator_ready = self.position_ready = False
+        self.setpoint_fresh = False
+        self.lost_sticks = LostSticks(params)
+        self.texts: list[StatusText] = []
+        """Status texts to send; the reader empties the list, as the next."""
+        self.events: list[Event] = []
+        self._fallback = False
+        self._sticks_missed = True  # lost, and that is known
+        self._ignores_sticks = False  # they were absent at arming
+        self.armed_ns = boot_ns
+        self._landed_ns = boot_ns
+        self._has_flown = False
+        self._check_due_ns = boot_ns
+
+    @property
+    def in_failsafe(self) -> bool:
+        """A failsafe has changed the mode."""
+        return self.armed and (self.lost_sticks.active or self._fallback)
+
+    def can_fly(self, mode: Mode) -> bool:
+        """What the mode needs is there: sticks, a position, a stream of setpoints."""
+        if mode.piloted and not self._sticks.valid:
+            return False
+        if mode.needs_position and not self.position_ready:
+            return False
+        return self.setpoint_fresh if mode is Mode.OFFBOARD else mode is not Mode.AUTO_MISSION
+
+    def can_arm(self) -> bool:
+        """Arming would not be refused for the vehicle's health; sticks may still be too high."""
+        return self.estimator_ready and self.intended.armable and self.can_fly(self.intended)
+
+    def arm(self, reason: int = ev.ARM_REASON_COMMAND) -> bool:
+        """Start the motors; a refusal becomes a text. True if armed afterwards."""
+        if self.armed or self.terminated:
+            return self.armed
+        if not self.can_arm():
+            self._deny(
+                "Arming denied: Resolve system health failures first",
+                "commander_arm_denied_resolve_failures",
+            )
+            return False
+        highest = 1.0
+        if self.intended.piloted:
+            highest = LOW_THROTTLE if self.intended.manual_throttle else MIDDLE_THROTTLE
+        throttle = self._sticks.sticks.throttle
+        is_low_enough = throttle < highest if self.intended.manual_throttle else throttle <= highest
+        if not is_low_enough:
+            self._deny(
+                "Arming denied: throttle not in safe position",
+                "commander_arm_denied_throttle_unsafe",
+            )
+            return False
+        self.start(ignores_sticks=not self._sticks.valid)
+        self._say(ev.SEVERITY_INFO, f"Armed by {ev.REASON_NAMES[reason]}")
+        self._emit("commander_armed_by", ev.LOG_EXTERNAL_INFO, ev.pack("B", reason))
+        return True
+
+    def start(self, *, ignores_sticks: bool) -> None:
+        """Be armed from now on."""
+        self.armed, self._has_flown = True, False
+        self.armed_ns = self.now_ns
+        self._ignores_sticks = ignores_sticks
+        self._sticks_missed = not self._sticks.valid
+
+    def disarm(self, *, force: bool, reason: int = ev.ARM_REASON_COMMAND) -> bool:
+        """Stop the motors; refused in flight unless forced. True if disarmed afterwards."""
+        if not self.armed:
+            return True
+        if not (self.landed or force) or (self.terminated and not force):
+            self._deny("Disarming denied: not landed", "commander_disarm_denied_not_landed")
+            return False
+        self.armed = self._fallback = False
+        self.lost_sticks.clear()
+        self._say(ev.SEVERITY_INFO, f"Disarmed by {ev.REASON_NAMES[reason]}")
+        self._emit("commander_disarmed_by", ev.LOG_EXTERNAL_INFO, ev.pack("B", reason))
+        if not self.intended.armable and not self.terminated:
+            self.intended = Mode.POSCTL if self._sticks.valid else Mode.AUTO_LOITER
+        self.mode = self.intended
+        return True
+
+    def set_mode(self, mode: Mode) -> bool:
+        """Take a commanded mode; a refusal becomes a text. True if it is intended then."""
+        if self.terminated:
+            return False
+        if self.armed and mode is not Mode.AUTO_LAND and not self.can_fly(mode):
+            arguments = ev.pack("IB", self.mode.custom_mode, ev.NAVIGATION_MODES[mode])
+            text = f"Switching to {SPOKEN_NAMES[mode]} is currently not available"
+            self._deny(text, "commander_modeswitch_not_avail", arguments)
+            return False
+        self._intend(mode)
+        return True
+
+    def terminate(self) -> None:
+        """Stop the motors for good; the vehicle stays armed until it is forced to disarm."""
+        self.terminated = True
+        self._intend(Mode.TERMINATION)
+
+    def refuse_frame(self, frame: int) -> None:
+        """A velocity setpoint came in axes that PX4 does not take."""
+        name = "SET_POSITION_TARGET_LOCAL_NED"
+        self._deny(
+            f"{name} coordinate frame {frame} unsupported",
+            "mavlink_rcv_sp_target_unsup_coord",
+            ev.pack("B", frame),
+        )
+
+    def finish_takeoff(self) -> None:
+        """AUTO.TAKEOFF has reached its height."""
+        if self.intended is Mode.AUTO_TAKEOFF:
+            self._intend(Mode.AUTO_LOITER)
+
+    def on_landed_change(self, *, landed: bool) -> None:
+        """The vehicle has left the ground, or has come to rest on it."""
+        self.landed = landed
+        self._landed_ns = self.now_ns
+        self._has_flown = self._has_flown or not landed
+        what = "landing" if landed else "takeoff"
+        self._say(ev.SEVERITY_INFO, f"{what.capitalize()} detected")
+        self._emit(f"commander_{what}_detected", ev.LOG_EXTERNAL_INFO)
+
+    def update(self, now_ns: int) -> None:
+        """Look at sticks, setpoints and time; decide on the mode."""
+        dt_ns, self.now_ns = now_ns - self.now_ns, now_ns
+        self._read_gestures()
+        if self.lost_sticks.update(dt_ns):
+            self._say_failsafe(ev.ACTION_RTL)
+        if now_ns >= self._check_due_ns:
+            self._check_due_ns = now_ns + CHECK_PERIOD_NS
+            self._watch_sticks()
+        if self.armed and not self.terminated:
+            self._yield_to_pilot()
+            self._disarm_by_time()
+        self._choose_mode()
+
+    def _read_gestures(self) -> None:
+        gesture = self._sticks.gesture(self.now_ns)
+        if not gesture or not self._params.integer("MAN_ARM_GESTURE"):
+            return
+        if gesture > 0:
+            self.arm(ev.ARM_REASON_GESTURE)
+        elif self.landed:
+            self.disarm(force=False, reason=ev.ARM_REASON_GESTURE)
+
+    def _watch_sticks(self) -> None:
+        """Start the failsafe when sticks are lost in flight; absence at arming is ignored."""
+        if self._sticks.valid:
+            self._sticks_missed = self._ignores_sticks = False
+            return
+        if self._sticks_missed:
+            return
+        self._sticks_missed = True
+        is_excepted = self.lost_sticks.is_excepted(self.intended)
+        if not self.armed or self._ignores_sticks or is_excepted or self.lost_sticks.active:
+            return
+        if not self._params.integer("NAV_RCL_ACT"):
+            return
+        self.lost_sticks.start()
+        if self.lost_sticks.phase is Phase.HOLDING:
+            self._say_failsafe(ev.ACTION_RTL, hold_s=self.lost_sticks.delay_s)
+        else:
+            self._say_failsafe(ev.ACTION_RTL)
+
+    def _yield_to_pilot(self) -> None:
+        """Fast sticks take an autonomous flight over; not in the Hold before the action."""
+        is_held = self.lost_sticks.phase is Phase.HOLDING
+        is_autonomous = self.mode.is_auto or self.mode is Mode.OFFBOARD
+        if self._sticks.moved_fast and is_autonomous and not is_held and not self.landed:
+            self._intend(Mode.POSCTL if self.position_ready else Mode.ALTCTL)
+            self._say(ev.SEVERITY_INFO, "Pilot took over using sticks")
+            self._emit("commander_rc_override", ev.LOG_EXTERNAL_INFO)
+
+    def _disarm_by_time(self) -> None:
+        if not self.landed:
+            return
+        name = "COM_DISARM_LAND" if self._has_flown else "COM_DISARM_PRFLT"
+        since_ns = self._landed_ns if self._has_flown else self.armed_ns
+        limit_s = self._params[name]
+        if limit_s > 0.0 and self.now_ns - since_ns >= limit_s * NS_PER_S:
+            reason = ev.ARM_REASON_LANDING if self._has_flown else ev.ARM_REASON_INACTION
+            self.disarm(force=False, reason=reason)
+
+    def _choose_mode(self) -> None:
+        if not self.armed or self.terminated:
+            self.mode, self._fallback = self.intended, False
+            return
+        if self.lost_sticks.active:
+            self.mode = self._with_position(self.lost_sticks.mode())
+            return
+        wanted = self.intended
+        if wanted is Mode.OFFBOARD and not self.setpoint_fresh:
+            wanted = mode_without_stream(self._params, has_sticks=self._sticks.valid)
+        wanted = self._with_position(wanted)
+        was_fallback, self._fallback = self._fallback, wanted is not self.intended
+        self.mode = wanted
+        if self._fallback and not was_fallback:
+            self._say_failsafe(ev.ACTION_POSCTL if wanted.piloted else ev.ACTION_RTL)
+
+    def _with_position(self, mode: Mode) -> Mode:
+        """The mode, or one that does without a position."""
+        if self.position_ready or not mode.needs_position:
+            return mode
+        is_stick_flown = mode is Mode.POSCTL and self._sticks.valid
+        return Mode.ALTCTL if is_stick_flown else Mode.AUTO_LAND
+
+    def _intend(self, mode: Mode) -> None:
+        self.intended = self.mode = mode
+        self._fallback = False
+        self.lost_sticks.clear()
+
+    def _say_failsafe(self, action: int, hold_s: float | None = None) -> None:
+        mode = self.intended.custom_mode
+        if hold_s is None:
+            self._say(ev.SEVERITY_CRITICAL, "Failsafe activated")
+            arguments = ev.pack("IBB", mode, action, ev.CAUSE_STICKS_LOST)
+            self._emit("commander_failsafe_enter", ev.LOG_EXTERNAL_CRITICAL, arguments)
+            return
+        seconds = int(hold_s)
+        text = f"Failsafe activated: entering Hold for {seconds} seconds"
+        self._say(ev.SEVERITY_CRITICAL, text)
+        arguments = ev.pack("IBHB", mode, action, seconds, ev.CAUSE_STICKS_LOST)
+        self._emit("commander_failsafe_enter_hold", ev.LOG_EXTERNAL_CRITICAL, arguments)
+
+    def _deny(self, text: str, event: str, arguments: bytes = b"") -> None:
+        self._say(ev.SEVERITY_CRITICAL, text)
+        self._emit(event, ev.LOG_EXTERNAL_CRITICAL, arguments)
+
+    def _say(self, severity: int, text: str) -> None:
+        # The tab marks a text that exists as an event as well; ground stations hide it.
+        self.texts.append(StatusText(severity, text + "\t"))
+
+    def _emit(self, name: str, level: int, arguments: bytes = b"") -> None:
+        uptime_ms = (self.now_ns - self._boot_ns) // NS_PER_MS
+        self.events.append(Event(name, level, arguments, uptime_ms))

@@ -1,0 +1,68 @@
+"""What the vehicle says: status texts, and the events of MAVLink's EVENT(410).
+
+An event's id is the autopilot's component in its top byte and a hash of the event's name below it
+(MAVLink's events interface); its arguments are packed in order, without padding.
+"""
+
+import struct
+from typing import NamedTuple
+
+from sitl.px4.modes import Mode
+
+SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
+LOG_EXTERNAL_CRITICAL, LOG_EXTERNAL_INFO = 2, 6
+_AUTOPILOT_COMPONENT = 1 << 24
+_FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
+
+ARM_REASON_GESTURE, ARM_REASON_COMMAND, ARM_REASON_LANDING = 1, 4, 6
+ARM_REASON_INACTION, ARM_REASON_FAILSAFE = 7, 14
+"""Reasons of arming and disarming, as the events carry them."""
+REASON_NAMES = {
+    ARM_REASON_GESTURE: "stick gesture",
+    ARM_REASON_COMMAND: "external command",
+    ARM_REASON_LANDING: "landing",
+    ARM_REASON_INACTION: "auto preflight disarming",
+    ARM_REASON_FAILSAFE: "failsafe",
+}
+
+ACTION_POSCTL, ACTION_ALTCTL, ACTION_STAB = 2, 3, 4
+ACTION_HOLD, ACTION_RTL, ACTION_LAND, ACTION_DISARM, ACTION_TERMINATE = 5, 6, 7, 9, 10
+CAUSE_STICKS_LOST = 1
+
+NAVIGATION_MODES = {
+    Mode.MANUAL: 0,
+    Mode.ALTCTL: 1,
+    Mode.POSCTL: 2,
+    Mode.AUTO_MISSION: 3,
+    Mode.AUTO_LOITER: 4,
+    Mode.AUTO_RTL: 5,
+    Mode.ACRO: 6,
+    Mode.OFFBOARD: 7,
+    Mode.STAB: 8,
+    Mode.AUTO_TAKEOFF: 10,
+    Mode.AUTO_LAND: 11,
+    Mode.TERMINATION: 255,
+}
+"""Modes as arguments of events."""
+
+
+class Event(NamedTuple):
+    """One EVENT; ``uptime_ms`` is its time since boot."""
+
+    name: str
+    level: int  # 0 emergency .. 7 debug
+    arguments: bytes
+    uptime_ms: int
+
+    @property
+    def number(self) -> int:
+        """The id on the wire."""
+        value = _FNV1A_32_OFFSET
+        for letter in self.name.encode():
+            value = (value ^ letter) * _FNV1A_32_PRIME & 0xFFFFFFFF
+        return _AUTOPILOT_COMPONENT | value & 0xFFFFFF
+
+
+def pack(layout: str, *values: float) -> bytes:
+    """Arguments of an event: `struct` letters without padding."""
+    return struct.pack("<" + layout, *values)

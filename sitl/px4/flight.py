@@ -1,0 +1,289 @@
+"""From mode, sticks, setpoint and state to motors: the control laws of all modes."""
+
+import math
+
+from sitl.px4 import curves
+from sitl.px4.control import (
+    HOVER_THRUST,
+    SIH_QUAD,
+    RateController,
+    VelocityController,
+    attitude_for,
+    yaw_of,
+)
+from sitl.px4.modes import Mode
+from sitl.px4.params import Params
+from sitl.px4.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint, VelocitySetpoint
+from sitl.px4.sticks import Sticks
+from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler
+from sitl.vehicle.control import HeightController, mix, thrust_for
+from sitl.vehicle.dynamics import BodyState
+
+STOPPED = (0.0, 0.0, 0.0, 0.0)
+IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
+STILL_YAW_RADPS = 0.01  # a slower yaw stick holds the heading
+TAKEOFF_CLIMB_MPS = 0.3  # a climb stick beyond this lifts a landed vehicle off
+HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the place of that moment is held
+BRAKING_PER_S = 0.6  # of POSCTL with centred sticks, on top of MPC_ACC_HOR / MPC_VEL_MANUAL
+ARRIVED_M = 1.0
+
+
+class FlightControl:
+    """Control laws of all modes, and the controllers that they share."""
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+        self._rates = RateController(params)
+        self._velocity = VelocityController(params)
+        self._height = HeightController()
+        self._yaw_rate_radps = 0.0
+        self._yaw_hold_rad: float | None = None
+        self._hold_ne_m: tuple[float, float] | None = None
+        self._speed_ne_mps = self._accel_ne_mps2 = (0.0, 0.0)
+        self._home_reached = False
+        self.takeoff_to_m = 0.0
+        """Height at which AUTO.TAKEOFF ends."""
+        self.most_climb_mps = math.inf
+        """Bound on the climb rate while the vehicle leaves the ground."""
+        self.thrust = 0.0
+        """Commanded collective, 0..1."""
+        self.attitude: Quat = IDENTITY
+        """Demanded attitude, as ATTITUDE_TARGET reports it."""
+        self.velocity_ned_mps: Vec3 = (0.0, 0.0, 0.0)
+        """Demanded velocity, as POSITION_TARGET_LOCAL_NED reports it."""
+
+    @property
+    def rates_radps(self) -> Vec3:
+        """Demanded body rates."""
+        return self._rates.rates_radps
+
+    def reset(self, body: BodyState) -> None:
+        """Forget the targets: before flight and at each mode change."""
+        self._rates.reset()
+        self._velocity.reset()
+        self._height.reset(body)
+        self._yaw_rate_radps = 0.0
+        self._yaw_hold_rad = None
+        self._hold_ne_m = None
+        self._speed_ne_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])
+        self._accel_ne_mps2 = (0.0, 0.0)
+        self._home_reached = False
+        self.attitude = body.ned_from_body_wxyz
+        self.velocity_ned_mps = (0.0, 0.0, 0.0)
+        self.thrust = 0.0
+
+    def idle(self, body: BodyState) -> tuple[float, ...]:
+        """Motors of an armed vehicle that stays on the ground."""
+        self.reset(body)
+        return IDLE
+
+    def wants_takeoff(
+        self, mode: Mode, sticks: Sticks, setpoint: Setpoint | None, body: BodyState
+    ) -> bool:
+        """True if sticks, setpoint or mode command a landed vehicle to take off."""
+        if mode is Mode.AUTO_TAKEOFF:
+            return -body.position_ned_m[2] < self.takeoff_to_m
+        if mode.manual_throttle:
+            return curves.manual_thrust(sticks, self._params, HOVER_THRUST) > 0.9 * HOVER_THRUST
+        if mode.piloted:
+            return curves.climb_mps(sticks, self._params) > TAKEOFF_CLIMB_MPS
+        if mode is not Mode.OFFBOARD or setpoint is None:
+            return False
+        if isinstance(setpoint, VelocitySetpoint):
+            return self._offboard_climb_mps(setpoint, body) > TAKEOFF_CLIMB_MPS
+        return setpoint.thrust > 0.9 * HOVER_THRUST
+
+    @staticmethod
+    def is_direct(mode: Mode, setpoint: Setpoint | None) -> bool:
+        """Stick or setpoint is thrust, not a climb rate."""
+        is_velocity = isinstance(setpoint, VelocitySetpoint)
+        return mode.manual_throttle or (mode is Mode.OFFBOARD and not is_velocity)
+
+    def fly(
+        self,
+        mode: Mode,
+        sticks: Sticks,
+        setpoint: Setpoint | None,
+        body: BodyState,
+        *,
+        has_position: bool,
+        dt_s: float,
+    ) -> tuple[float, ...]:
+        """Motor commands of a flying vehicle, each in [0, 1]."""
+        if mode is Mode.OFFBOARD and setpoint is not None:
+            return self._fly_offboard(setpoint, body, dt_s)
+        if mode is Mode.ACRO:
+            self.attitude = body.ned_from_body_wxyz
+            return self._turn_at(
+                curves.acro_rates_radps(sticks, self._params),
+                curves.manual_thrust(sticks, self._params, HOVER_THRUST),
+                body,
+                dt_s,
+            )
+        yaw_rate = self._stick_yaw(sticks if mode.piloted else Sticks(), body, dt_s)
+        yaw = yaw_of(body) if self._yaw_hold_rad is None else self._yaw_hold_rad
+        if mode.manual_throttle:
+            roll, pitch = curves.lean_rad(sticks, self._params)
+            thrust = curves.manual_thrust(sticks, self._params, HOVER_THRUST)
+            return self._lean_to(from_euler(roll, pitch, yaw), yaw_rate, thrust, body, dt_s)
+        if mode is Mode.ALTCTL:
+            forward, right = curves.lean_accel_mps2(sticks, self._params)
+            accel = _to_north_east(forward, right, yaw)
+        elif has_position:
+            wanted = self._wanted_velocity(mode, sticks, body, dt_s)
+            accel = self._velocity.update(body, wanted, dt_s, self._accel_ne_mps2)
+        else:
+            accel = (0.0, 0.0)
+        thrust = self._climb(self._climb_mps(mode, sticks, body), body, dt_s)
+        return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
+
+    def _fly_offboard(self, setpoint: Setpoint, body: BodyState, dt_s: float) -> tuple[float, ...]:
+        if isinstance(setpoint, RateSetpoint):
+            self.attitude = body.ned_from_body_wxyz
+            return self._turn_at(setpoint.rate_body_radps, setpoint.thrust, body, dt_s)
+        if isinstance(setpoint, AttitudeSetpoint):
+            target, yaw_rate = setpoint.ned_from_body_wxyz, setpoint.yaw_rate_radps
+            return self._lean_to(target, yaw_rate, setpoint.thrust, body, dt_s)
+        north, east, _ = setpoint.velocity_ned_mps or (0.0, 0.0, 0.0)
+        if setpoint.position_ned_m is not None:
+            gain = self._params["MPC_XY_P"]
+            north += gain * (setpoint.position_ned_m[0] - body.position_ned_m[0])
+            east += gain * (setpoint.position_ned_m[1] - body.position_ned_m[1])
+        north, east = _shorten(north, east, self._params["MPC_XY_VEL_MAX"])
+        accel = self._velocity.update(body, (north, east), dt_s)
+        climb = self._offboard_climb_mps(setpoint, body)
+        self.velocity_ned_mps = (north, east, -climb)
+        if setpoint.yaw_rad is not None:
+            self._yaw_hold_rad, yaw_rate = setpoint.yaw_rad, setpoint.yaw_rate_radps
+        else:
+            yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
+        yaw = yaw_of(body) if self._yaw_hold_rad is None else self._yaw_hold_rad
+        # The firmware does not limit the acceleration of what a companion asks for.
+        thrust = self._climb(climb, body, dt_s, max_accel_mps2=math.inf)
+        return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
+
+    def _offboard_climb_mps(self, setpoint: VelocitySetpoint, body: BodyState) -> float:
+        climb = -setpoint.velocity_ned_mps[2] if setpoint.velocity_ned_mps else 0.0
+        if setpoint.position_ned_m is not None:
+            climb += self._params["MPC_Z_P"] * (body.position_ned_m[2] - setpoint.position_ned_m[2])
+        return max(-self._params["MPC_Z_VEL_MAX_DN"], min(self._params["MPC_Z_VEL_MAX_UP"], climb))
+
+    def _lean_to(
+        self, target: Quat, yaw_rate_radps: float, thrust: float, body: BodyState, dt_s: float
+    ) -> tuple[float, ...]:
+        self.attitude, self.thrust = target, thrust
+        return mix(thrust, self._rates.attitude(body, target, yaw_rate_radps, dt_s), SIH_QUAD)
+
+    def _turn_at(
+        self, rates_radps: Vec3, thrust: float, body: BodyState, dt_s: float
+    ) -> tuple[float, ...]:
+        self.thrust = thrust
+        return mix(thrust, self._rates.rates(body, rates_radps, dt_s), SIH_QUAD)
+
+    def _stick_yaw(self, sticks: Sticks, body: BodyState, dt_s: float) -> float:
+        """Yaw rate behind MPC_MAN_Y_TAU."""
+        wanted = curves.yaw_rate_radps(sticks, self._params)
+        lag_s = max(dt_s, self._params["MPC_MAN_Y_TAU"])
+        self._yaw_rate_radps += (wanted - self._yaw_rate_radps) * dt_s / lag_s
+        return self._hold_yaw(self._yaw_rate_radps, body)
+
+    def _hold_yaw(self, yaw_rate_radps: float, body: BodyState) -> float:
+        """The rate; where there is none, the heading of that moment is held."""
+        if abs(yaw_rate_radps) > STILL_YAW_RADPS:
+            self._yaw_hold_rad = None
+            return yaw_rate_radps
+        if self._yaw_hold_rad is None:
+            self._yaw_hold_rad = yaw_of(body)
+        return 0.0
+
+    def _climb(
+        self, climb_mps: float, body: BodyState, dt_s: float, max_accel_mps2: float | None = None
+    ) -> float:
+        """Collective that brings about a climb rate."""
+        climb_mps = min(climb_mps, self.most_climb_mps)
+        if max_accel_mps2 is None:
+            max_accel_mps2 = self._params["MPC_ACC_UP_MAX" if climb_mps > 0 else "MPC_ACC_DOWN_MAX"]
+        accel = self._height.update(body, climb_mps, max_accel_mps2, dt_s)
+        thrust = thrust_for(accel, cos_tilt(body.ned_from_body_wxyz), HOVER_THRUST)
+        self.velocity_ned_mps = (*self.velocity_ned_mps[:2], -climb_mps)
+        return max(self._params["MPC_THR_MIN"], min(self._params["MPC_THR_MAX"], thrust))
+
+    def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
+        """Climb rate that mode and sticks ask for: slower near the ground, both ways."""
+        params, height = self._params, -body.position_ned_m[2]
+        low, high = params["MPC_LAND_ALT2"], params["MPC_LAND_ALT1"]
+        share = max(0.0, min(1.0, (height - low) / max(0.1, high - low)))
+        slow, fast = params["MPC_LAND_SPEED"], params["MPC_Z_V_AUTO_DN"]
+        if mode.piloted:
+            up = params["MPC_TKO_SPEED"]
+            up += share * (params["MPC_Z_VEL_MAX_UP"] - up)
+            down = slow + share * (params["MPC_Z_VEL_MAX_DN"] - slow)
+            return max(-down, min(up, curves.climb_mps(sticks, params)))
+        if mode is Mode.AUTO_TAKEOFF:
+            return max(0.0, min(params["MPC_TKO_SPEED"], 1.5 * (self.takeoff_to_m + 0.1 - height)))
+        if mode is Mode.AUTO_RTL and not self._home_reached:
+            up = params["RTL_RETURN_ALT"] - height
+            return max(-params["MPC_Z_V_AUTO_DN"], min(params["MPC_Z_V_AUTO_UP"], up))
+        if mode not in (Mode.AUTO_RTL, Mode.AUTO_LAND):
+            return 0.0
+        return -(slow + share * (fast - slow))
+
+    def _wanted_velocity(
+        self, mode: Mode, sticks: Sticks, body: BodyState, dt_s: float
+    ) -> tuple[float, float]:
+        """Velocity north and east of the modes that hold a place or fly to one."""
+        if mode is Mode.AUTO_RTL and self._rtl_moves(body):
+            north, east = (-self._params["MPC_XY_P"] * p for p in body.position_ned_m[:2])
+            north, east = _shorten(north, east, self._params["MPC_XY_CRUISE"])
+            self._hold_ne_m = None
+        else:
+            forward, right = (0.0, 0.0)
+            if mode is Mode.POSCTL:
+                forward, right = curves.speed_mps(sticks, self._params)
+            north, east = _to_north_east(forward, right, yaw_of(body))
+        self._speed_ne_mps = self._shaped(north, east, dt_s)
+        is_asked = north != 0.0 or east != 0.0
+        if is_asked:
+            self._hold_ne_m = None
+        elif self._hold_ne_m is None and math.hypot(*self._speed_ne_mps) < HOLD_BELOW_MPS:
+            self._hold_ne_m = (body.position_ned_m[0], body.position_ned_m[1])
+            self._speed_ne_mps = (0.0, 0.0)
+        if self._hold_ne_m is not None:
+            self._accel_ne_mps2 = (0.0, 0.0)
+            gain = self._params["MPC_XY_P"]
+            offsets = zip(self._hold_ne_m, body.position_ned_m, strict=False)
+            north, east = (gain * (there - here) for there, here in offsets)
+            return _shorten(north, east, self._params["MPC_XY_CRUISE"])
+        self.velocity_ned_mps = (*self._speed_ne_mps, self.velocity_ned_mps[2])
+        return self._speed_ne_mps
+
+    def _shaped(self, north: float, east: float, dt_s: float) -> tuple[float, float]:
+        """The demanded speed, which approaches the wanted one as in drag: fast at full stick."""
+        per_s = self._params["MPC_ACC_HOR"] / self._params["MPC_VEL_MANUAL"]
+        if north == east == 0.0:
+            per_s += BRAKING_PER_S
+        now_n, now_e = self._speed_ne_mps
+        self._accel_ne_mps2 = _shorten(
+            per_s * (north - now_n), per_s * (east - now_e), self._params["MPC_ACC_HOR"]
+        )
+        accel_n, accel_e = self._accel_ne_mps2
+        return now_n + accel_n * dt_s, now_e + accel_e * dt_s
+
+    def _rtl_moves(self, body: BodyState) -> bool:
+        """RTL is high enough to fly home, and has not arrived."""
+        north, east, down = body.position_ned_m
+        if not self._home_reached and -down > self._params["RTL_RETURN_ALT"] - ARRIVED_M:
+            if math.hypot(north, east) > ARRIVED_M:
+                return True
+            self._home_reached = True
+        return False
+
+
+def _to_north_east(forward: float, right: float, yaw_rad: float) -> tuple[float, float]:
+    cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
+    return forward * cy - right * sy, forward * sy + right * cy
+
+
+def _shorten(north: float, east: float, limit: float) -> tuple[float, float]:
+    scale = limit / max(limit, math.hypot(north, east))
+    return north * scale, east * scale

@@ -1,0 +1,402 @@
+"""Telemetry: from the autopilot's state to MAVLink messages and their units, as PX4 sends them.
+
+EVENT(410) and CURRENT_MODE(436) are missing from pymavlink's ardupilotmega dialect and are packed
+here by their definitions in MAVLink's common and development sets.
+"""
+
+import math
+import struct
+from collections.abc import Callable, Hashable, Iterable
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.link.framing import Message
+from sitl.px4.autopilot import Autopilot
+from sitl.px4.events import Event
+from sitl.px4.modes import Mode
+from sitl.px4.setpoints import VelocitySetpoint
+from sitl.px4.streams import CURRENT_MODE, at_rate
+from sitl.rotation import Vec3, conjugate, rotate, to_euler
+from sitl.vehicle.dynamics import GRAVITY_MPS2
+
+EVENT = 410
+EVENT_CRC_EXTRA, CURRENT_MODE_CRC_EXTRA = 160, 193
+_EVENT = struct.Struct("<IIHBBB40s")
+_CURRENT_MODE = struct.Struct("<IIB")
+EVENT_ARGUMENT_BYTES = 40
+
+HOME_LAT_DEG, HOME_LON_DEG, HOME_ALT_M = 47.397743, 8.545594, 489.4
+"""PX4 SIH's default home."""
+METRES_PER_DEGREE = 111_319.5
+EARTH_FIELD_GAUSS: Vec3 = (0.215, 0.0118, 0.4307)
+GROUND_PRESSURE_HPA = 955.6
+TEMPERATURE_C = 25.0
+
+FIRMWARE_VERSION = 0x01120080  # 1.18.0 beta
+CAPABILITIES = 0xE8FF
+
+_SENSORS = (
+    mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mav.MAV_SYS_STATUS_SENSOR_3D_MAG
+    | mav.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    | mav.MAV_SYS_STATUS_SENSOR_GPS
+    | mav.MAV_SYS_STATUS_AHRS
+    | mav.MAV_SYS_STATUS_SENSOR_BATTERY
+)
+_ESTIMATOR_WITHOUT_POSITION = 0xE5
+_ESTIMATOR_WITH_POSITION = 0x37F
+_STANDARD_MODES = {
+    Mode.POSCTL: 1,
+    Mode.ALTCTL: 4,
+    Mode.AUTO_RTL: 5,
+    Mode.AUTO_MISSION: 6,
+    Mode.AUTO_LAND: 7,
+    Mode.AUTO_TAKEOFF: 8,
+}
+"""MAV_STANDARD_MODE; 0 for the others."""
+_STATE_UNINIT, _STATE_STANDBY, _STATE_ACTIVE = 0, 3, 4
+_STATE_CRITICAL, _STATE_TERMINATED = 5, 8
+_IMU_FIELDS_UPDATED = 0x1FFF
+_INT16 = 32767
+_ODOMETRY_COVARIANCE = [math.nan, *[0.0] * 20]
+
+
+class HandPacked(mav.MAVLink_message):  # type: ignore[misc]  # the library has no types
+    """A message that the dialect lacks: its number, payload and CRC seed."""
+
+    def __init__(self, number: int, name: str, payload: bytes, crc_extra: int) -> None:
+        super().__init__(number, name)
+        self._hand_packed = payload
+        self._hand_crc_extra = crc_extra
+
+    def pack(self, sender: Message, force_mavlink1: bool = False) -> bytes:
+        """The frame."""
+        packed = self._pack(sender, self._hand_crc_extra, self._hand_packed, force_mavlink1)
+        return bytes(packed)
+
+
+def event_message(event: Event, sequence: int) -> Message:
+    """EVENT to everybody."""
+    arguments = event.arguments.ljust(EVENT_ARGUMENT_BYTES, b"\0")
+    levels = event.level | event.level << 4  # the upper half is the level of the vehicle's own log
+    payload = _EVENT.pack(event.number, event.uptime_ms, sequence, 0, 0, levels, arguments)
+    return HandPacked(EVENT, "EVENT", payload, EVENT_CRC_EXTRA)
+
+
+def _current_mode(ap: Autopilot) -> Message:
+    intended = ap.commander.intended
+    standard = _STANDARD_MODES.get(ap.mode, 0)
+    payload = _CURRENT_MODE.pack(ap.mode.custom_mode, intended.custom_mode, standard)
+    return HandPacked(CURRENT_MODE, "CURRENT_MODE", payload, CURRENT_MODE_CRC_EXTRA)
+
+
+def _ms(ap: Autopilot) -> int:
+    return ap.uptime_ns // 1_000_000
+
+
+def _us(ap: Autopilot) -> int:
+    return ap.uptime_ns // 1_000
+
+
+def _int16(values: Iterable[float], scale: float) -> list[int]:
+    return [max(-_INT16, min(_INT16, round(scale * value))) for value in values]
+
+
+def _yaw_rad(ap: Autopilot) -> float:
+    return to_euler(ap.sensed.ned_from_body_wxyz)[2]
+
+
+def _heading(angle_rad: float, units_per_degree: float = 1.0) -> int:
+    full_turn = round(360 * units_per_degree)
+    return round(math.degrees(angle_rad) % 360.0 * units_per_degree) % full_turn
+
+
+def _mag_gauss(ap: Autopilot) -> Vec3:
+    return rotate(conjugate(ap.sensed.ned_from_body_wxyz), EARTH_FIELD_GAUSS)
+
+
+def _lat_lon_e7(north_m: float, east_m: float) -> tuple[int, int]:
+    lat = HOME_LAT_DEG + north_m / METRES_PER_DEGREE
+    lon = HOME_LON_DEG + east_m / (METRES_PER_DEGREE * math.cos(math.radians(HOME_LAT_DEG)))
+    return round(lat * 1e7), round(lon * 1e7)
+
+
+def _heartbeat(ap: Autopilot) -> Message:
+    """Once a second; what is between two of them, arming included, it never shows."""
+    flags = ap.mode.base_flags
+    if ap.mode is Mode.OFFBOARD and isinstance(ap.setpoint, VelocitySetpoint):
+        flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
+    if ap.armed:
+        flags |= mav.MAV_MODE_FLAG_SAFETY_ARMED
+    if ap.commander.terminated:
+        status = _STATE_TERMINATED
+    elif ap.in_failsafe:
+        status = _STATE_CRITICAL
+    elif ap.armed:
+        status = _STATE_ACTIVE
+    else:
+        status = _STATE_STANDBY if ap.commander.can_arm() else _STATE_UNINIT
+    return mav.MAVLink_heartbeat_message(
+        ap.config.vehicle_type, mav.MAV_AUTOPILOT_PX4, flags, ap.mode.custom_mode, status, 3
+    )
+
+
+def _sys_status(ap: Autopilot) -> Message:
+    """PREARM_CHECK is healthy where arming in the intended mode would not be refused."""
+    present = _SENSORS | mav.MAV_SYS_STATUS_PREARM_CHECK
+    present |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.stick_input.count else 0
+    faults = 0
+    if not ap.armed and not ap.commander.can_arm():
+        faults |= mav.MAV_SYS_STATUS_PREARM_CHECK
+    if not ap.stick_input.valid:
+        faults |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+    if ap.battery.is_low:
+        faults |= mav.MAV_SYS_STATUS_SENSOR_BATTERY
+    battery = (*_battery_mv_ca(ap), ap.battery.remaining_percent)
+    return mav.MAVLink_sys_status_message(
+        present, present, present & ~faults, 100, *battery, 0, 0, 0, 0, 0, 0
+    )
+
+
+def _battery_mv_ca(ap: Autopilot) -> tuple[int, int]:
+    return round(1000.0 * ap.battery.voltage_v), round(100.0 * ap.battery.current_a)
+
+
+def _gps_raw_int(ap: Autopilot) -> Message:
+    """The last 8 Hz fix."""
+    north, east, down = ap.gps.position_ned_m
+    vn, ve, _ = ap.gps.velocity_ned_mps
+    return mav.MAVLink_gps_raw_int_message(
+        _us(ap),
+        mav.GPS_FIX_TYPE_NO_FIX if ap.position_lost else mav.GPS_FIX_TYPE_3D_FIX,
+        *_lat_lon_e7(north, east),
+        round(1000.0 * (HOME_ALT_M - down)),
+        70,
+        110,
+        round(100.0 * math.hypot(vn, ve)),
+        _heading(math.atan2(ve, vn), 100.0),
+        10,
+    )
+
+
+def _highres_imu(ap: Autopilot) -> Message:
+    height = -ap.sensed.position_ned_m[2]
+    pressure = GROUND_PRESSURE_HPA * math.exp(-height / 8434.0)
+    return mav.MAVLink_highres_imu_message(
+        _us(ap),
+        *ap.sensed.specific_force_body_mps2,
+        *ap.sensed.rate_body_radps,
+        *_mag_gauss(ap),
+        pressure,
+        0.0,
+        HOME_ALT_M + height,
+        TEMPERATURE_C,
+        _IMU_FIELDS_UPDATED,
+        0,
+    )
+
+
+def _scaled_imu(ap: Autopilot) -> Message:
+    accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
+    gyro, field = _int16(ap.sensed.rate_body_radps, 1000.0), _int16(_mag_gauss(ap), 1000.0)
+    return mav.MAVLink_scaled_imu_message(
+        _ms(ap), *_int16(accel, 1.0), *gyro, *field, round(100.0 * TEMPERATURE_C)
+    )
+
+
+def _global_position_int(ap: Autopilot) -> Message | None:
+    if not ap.position_ready:
+        return None
+    north, east, down = ap.sensed.position_ned_m
+    return mav.MAVLink_global_position_int_message(
+        _ms(ap),
+        *_lat_lon_e7(north, east),
+        round(1000.0 * (HOME_ALT_M - down)),
+        round(-1000.0 * down),
+        *_int16(ap.sensed.velocity_ned_mps, 100.0),
+        _heading(_yaw_rad(ap), 100.0),
+    )
+
+
+def _local_position_ned(ap: Autopilot) -> Message:
+    """Without a position it still comes: zeros that nothing marks as such."""
+    (north, east, down), (vn, ve, vd) = ap.sensed.position_ned_m, ap.sensed.velocity_ned_mps
+    if not ap.position_ready:
+        north = east = vn = ve = 0.0
+    return mav.MAVLink_local_position_ned_message(_ms(ap), north, east, down, vn, ve, vd)
+
+
+def _odometry(ap: Autopilot) -> Message:
+    """Velocity in body axes."""
+    body = ap.sensed
+    velocity = rotate(conjugate(body.ned_from_body_wxyz), body.velocity_ned_mps)
+    return mav.MAVLink_odometry_message(
+        _us(ap),
+        mav.MAV_FRAME_LOCAL_NED,
+        mav.MAV_FRAME_BODY_FRD,
+        *body.position_ned_m,
+        list(body.ned_from_body_wxyz),
+        *velocity,
+        *body.rate_body_radps,
+        _ODOMETRY_COVARIANCE,
+        _ODOMETRY_COVARIANCE,
+        0,
+        mav.MAV_ESTIMATOR_TYPE_AUTOPILOT,
+        100,
+    )
+
+
+def _servo_output_raw(ap: Autopilot) -> Message:
+    """Motors at 1000..2000 us."""
+    motors = (round(1000.0 + 1000.0 * m) for m in ap.motor_commands)
+    return mav.MAVLink_servo_output_raw_message(_us(ap) & 0xFFFFFFFF, 0, *motors, 0, 0, 0, 0)
+
+
+def _rc_channels(ap: Autopilot) -> Message | None:
+    """A receiver's channels; MANUAL_CONTROL never shows here."""
+    if ap.receiver_us is None:
+        return None
+    channels = (*ap.receiver_us, *[65535] * 18)[:18]
+    return mav.MAVLink_rc_channels_message(_ms(ap), len(ap.receiver_us), *channels, 100)
+
+
+def _manual_control(ap: Autopilot) -> Message | None:
+    """The chosen sticks, as single-precision shares of full stick and cut to whole numbers."""
+    if not ap.stick_input.valid:
+        return None
+    forward, right, throttle, yaw = (np.float32(value) for value in ap.stick_input.sticks)
+    thousand, one, two = np.float32(1000.0), np.float32(1.0), np.float32(2.0)
+    x, y, r = (int(value * thousand) for value in (forward, right, yaw))
+    z = int((throttle + one) / two * thousand)
+    return mav.MAVLink_manual_control_message(ap.params.integer("MAV_SYS_ID"), x, y, z, r, 0)
+
+
+def _vfr_hud(ap: Autopilot) -> Message:
+    north, east, down = ap.sensed.velocity_ned_mps
+    speed = math.hypot(north, east)
+    altitude = HOME_ALT_M - ap.sensed.position_ned_m[2]
+    throttle = round(100.0 * ap.flight.thrust) if ap.armed else 0
+    return mav.MAVLink_vfr_hud_message(
+        speed, speed, _heading(_yaw_rad(ap)), throttle, altitude, -down
+    )
+
+
+def _attitude_target(ap: Autopilot) -> Message:
+    """What the rate and attitude loops are asked for, in any mode."""
+    flight = ap.flight
+    return mav.MAVLink_attitude_target_message(
+        _ms(ap), 0, list(flight.attitude), *flight.rates_radps, flight.thrust
+    )
+
+
+def _position_target(ap: Autopilot) -> Message:
+    none = [math.nan] * 3
+    return mav.MAVLink_position_target_local_ned_message(
+        _ms(ap), mav.MAV_FRAME_LOCAL_NED, 0, *none, *ap.flight.velocity_ned_mps, *none, *none[:2]
+    )
+
+
+def _battery_status(ap: Autopilot) -> Message:
+    pack_mv, current_ca = _battery_mv_ca(ap)
+    is_low = ap.battery.is_low
+    return mav.MAVLink_battery_status_message(
+        0,
+        mav.MAV_BATTERY_FUNCTION_ALL,
+        mav.MAV_BATTERY_TYPE_LIPO,
+        _INT16,
+        [pack_mv] + [65535] * 9,
+        current_ca,
+        0,
+        -1,
+        ap.battery.remaining_percent,
+        0,
+        mav.MAV_BATTERY_CHARGE_STATE_LOW if is_low else mav.MAV_BATTERY_CHARGE_STATE_OK,
+    )
+
+
+def _estimator_status(ap: Autopilot) -> Message:
+    """The one message that says whether there is a horizontal position."""
+    flags = _ESTIMATOR_WITH_POSITION if ap.position_ready else _ESTIMATOR_WITHOUT_POSITION
+    if not ap.estimator_ready:
+        flags = 0
+    return mav.MAVLink_estimator_status_message(
+        _us(ap), flags, 0.02, 0.02, 0.02, 0.02, 0.0, 0.0, 0.2, 0.2
+    )
+
+
+def _home_position(ap: Autopilot) -> Message | None:
+    if not ap.position_ready:
+        return None
+    altitude_mm, level = round(HOME_ALT_M * 1000.0), [1.0, 0.0, 0.0, 0.0]
+    return mav.MAVLink_home_position_message(
+        *_lat_lon_e7(0.0, 0.0), altitude_mm, 0.0, 0.0, 0.0, level, 0.0, 0.0, 0.0
+    )
+
+
+def _autopilot_version(ap: Autopilot) -> Message:
+    unique = ap.params.integer("MAV_SYS_ID")
+    no_hash = [0] * 8
+    return mav.MAVLink_autopilot_version_message(
+        CAPABILITIES, FIRMWARE_VERSION, 0, 0, 0, no_hash, no_hash, no_hash, 0, 0, unique
+    )
+
+
+BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
+    mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
+    mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
+    mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(0, _ms(ap)),
+    mav.MAVLINK_MSG_ID_GPS_RAW_INT: _gps_raw_int,
+    mav.MAVLINK_MSG_ID_SCALED_IMU: _scaled_imu,
+    mav.MAVLINK_MSG_ID_ATTITUDE: lambda ap: mav.MAVLink_attitude_message(
+        _ms(ap), *to_euler(ap.sensed.ned_from_body_wxyz), *ap.sensed.rate_body_radps
+    ),
+    mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: lambda ap: mav.MAVLink_attitude_quaternion_message(
+        _ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
+    ),
+    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position_ned,
+    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _global_position_int,
+    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: _servo_output_raw,
+    mav.MAVLINK_MSG_ID_RC_CHANNELS: _rc_channels,
+    mav.MAVLINK_MSG_ID_MANUAL_CONTROL: _manual_control,
+    mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
+    mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
+    mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
+    mav.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
+    # The vehicle's own request; the peer's answer needs no action.
+    mav.MAVLINK_MSG_ID_TIMESYNC: lambda ap: mav.MAVLink_timesync_message(0, ap.uptime_ns),
+    mav.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
+    mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
+    mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,
+    mav.MAVLINK_MSG_ID_HOME_POSITION: _home_position,
+    mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: lambda ap: mav.MAVLink_extended_sys_state_message(
+        mav.MAV_VTOL_STATE_MC, ap.landed_state.value
+    ),
+    mav.MAVLINK_MSG_ID_ODOMETRY: _odometry,
+    CURRENT_MODE: _current_mode,
+}
+"""Every message that can be streamed or requested; None where there is nothing to report yet."""
+
+_SLOW_TOPICS = (
+    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    mav.MAVLINK_MSG_ID_ODOMETRY,
+    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+)
+
+
+def topic_version(message_id: int, ap: Autopilot) -> Hashable:
+    """Changes whenever there is something new to send: it bounds the rate of a stream."""
+    if message_id in _SLOW_TOPICS:
+        return at_rate(ap.uptime_ns, 8)
+    if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
+        sends_attitude = ap.mode is Mode.OFFBOARD and not isinstance(ap.setpoint, VelocitySetpoint)
+        return ap.setpoint_count if sends_attitude else at_rate(ap.uptime_ns, 8)
+    if message_id == mav.MAVLINK_MSG_ID_MANUAL_CONTROL:
+        return ap.stick_input.count
+    if message_id == mav.MAVLINK_MSG_ID_GPS_RAW_INT:
+        return at_rate(ap.uptime_ns, 125)
+    if message_id == CURRENT_MODE:
+        return ap.mode, ap.commander.intended, at_rate(ap.uptime_ns, 500)
+    return ap.uptime_ns

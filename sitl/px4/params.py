@@ -1,0 +1,165 @@
+"""Parameters that the simulated firmware reads or a bridge asks for, with PX4's SIH defaults.
+
+PX4 stores INT32 and float. An INT32 travels as its four bytes in PARAM_VALUE's float field, so a
+peer that reads it as a number sees a denormal.
+"""
+
+import math
+import struct
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+_INTEGERS: Mapping[str, int] = MappingProxyType(
+    {
+        "COM_FLTMODE_BOOT": 4,
+        "COM_OBL_RC_ACT": 0,  # 0 position, 1 altitude, 2 stabilized, 3 RTL, 4 land, 5 hold
+        "COM_RCL_EXCEPT": 0,  # bit 0 mission, 1 hold, 2 offboard: no failsafe when sticks are lost
+        "COM_RC_IN_MODE": 1,  # source of sticks: see `sitl.px4.sticks`
+        "MAN_ARM_GESTURE": 1,
+        "MAV_COMP_ID": 1,
+        "MAV_PROTO_VER": 2,
+        "MAV_SYS_ID": 1,
+        "MAV_TYPE": 2,
+        "MPC_ALT_MODE": 2,
+        "MPC_POS_MODE": 4,
+        "MPC_THR_CURVE": 0,
+        "NAV_DLL_ACT": 0,  # a lost ground station does nothing
+        "NAV_RCL_ACT": 2,  # lost sticks: 1 hold, 2 RTL, 3 land, 5 terminate, 6 disarm
+        "RC_CHAN_CNT": 0,
+        "RC_MAP_PITCH": 0,  # channel from 1; 0: not mapped
+        "RC_MAP_ROLL": 0,
+        "RC_MAP_THROTTLE": 0,
+        "RC_MAP_YAW": 0,
+        "SYS_AUTOSTART": 10040,  # SIH quadrotor
+    }
+)
+_FLOATS: Mapping[str, float] = MappingProxyType(
+    {
+        "COM_DISARM_LAND": 2.0,  # s
+        "COM_DISARM_PRFLT": 10.0,  # s
+        "COM_FAIL_ACT_T": 5.0,  # s
+        "COM_OF_LOSS_T": 1.0,  # s
+        "COM_RC_LOSS_T": 0.5,  # s
+        "COM_SPOOLUP_TIME": 1.0,  # s
+        "MAN_DEADZONE": 0.1,  # of the stick, on each side of the middle
+        "MAN_KILL_GEST_T": -1.0,
+        "MAN_OVERRIDE_SPD": 1.0,  # full sticks a second; -1: off
+        "MC_ACRO_EXPO": 0.0,
+        "MC_ACRO_EXPO_Y": 0.0,
+        "MC_ACRO_P_MAX": 100.0,  # deg/s
+        "MC_ACRO_R_MAX": 100.0,
+        "MC_ACRO_SUPEXPO": 0.0,
+        "MC_ACRO_SUPEXPOY": 0.0,
+        "MC_ACRO_Y_MAX": 100.0,
+        "MC_MAN_TILT_TAU": 0.0,  # s
+        "MC_PITCHRATE_MAX": 220.0,  # deg/s
+        "MC_PITCH_P": 4.0,  # 1/s
+        "MC_ROLLRATE_MAX": 220.0,
+        "MC_ROLL_P": 4.0,
+        "MC_YAWRATE_MAX": 200.0,
+        "MC_YAW_P": 2.8,
+        "MC_YAW_WEIGHT": 0.4,
+        "MIS_TAKEOFF_ALT": 2.5,  # m
+        "MPC_ACC_DOWN_MAX": 3.0,  # m/s^2
+        "MPC_ACC_HOR": 3.0,
+        "MPC_ACC_HOR_MAX": 5.0,
+        "MPC_ACC_UP_MAX": 4.0,
+        "MPC_JERK_AUTO": 4.0,  # m/s^3
+        "MPC_JERK_MAX": 8.0,
+        "MPC_LAND_ALT1": 10.0,  # m: from here on descend more slowly
+        "MPC_LAND_ALT2": 5.0,  # m: from here on with MPC_LAND_SPEED
+        "MPC_LAND_SPEED": 0.7,  # m/s
+        "MPC_MANTHR_MIN": 0.08,
+        "MPC_MAN_TILT_MAX": 35.0,  # deg
+        "MPC_MAN_Y_MAX": 150.0,  # deg/s
+        "MPC_MAN_Y_TAU": 0.08,  # s
+        "MPC_THR_HOVER": 0.5,
+        "MPC_THR_MAX": 1.0,
+        "MPC_THR_MIN": 0.12,
+        "MPC_TILTMAX_AIR": 45.0,  # deg
+        "MPC_TILTMAX_LND": 12.0,
+        "MPC_TKO_RAMP_T": 3.0,  # s
+        "MPC_TKO_SPEED": 1.5,  # m/s
+        "MPC_VEL_MANUAL": 10.0,
+        "MPC_XY_CRUISE": 5.0,
+        "MPC_XY_P": 0.95,
+        "MPC_XY_VEL_D_ACC": 0.2,
+        "MPC_XY_VEL_I_ACC": 0.4,
+        "MPC_XY_VEL_MAX": 12.0,
+        "MPC_XY_VEL_P_ACC": 1.8,
+        "MPC_Z_P": 1.0,
+        "MPC_Z_VEL_I_ACC": 2.0,
+        "MPC_Z_VEL_MAX_DN": 1.5,
+        "MPC_Z_VEL_MAX_UP": 3.0,
+        "MPC_Z_VEL_P_ACC": 4.0,
+        "MPC_Z_V_AUTO_DN": 1.5,
+        "MPC_Z_V_AUTO_UP": 3.0,
+        "NAV_ACC_RAD": 10.0,
+        "RTL_DESCEND_ALT": 10.0,
+        "RTL_MIN_DIST": 10.0,
+        "RTL_RETURN_ALT": 30.0,
+    }
+)
+_INT32_LIMIT = 1 << 31
+
+
+class Params:
+    """Named numbers in a fixed, sorted order (the order is PARAM_VALUE's index)."""
+
+    def __init__(self, *, receiver: bool = False) -> None:
+        """With ``receiver`` its first four channels are mapped, in the order that is usual."""
+        values: dict[str, float] = {**_INTEGERS, **_FLOATS}
+        if receiver:
+            values |= {"RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4}
+            values["RC_CHAN_CNT"] = 8
+        self._values = {name: _float32(values[name]) for name in sorted(values)}
+        self.names: tuple[str, ...] = tuple(self._values)
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def integer(self, name: str) -> int:
+        """The value of an INT32."""
+        return int(self._values[name])
+
+    def set(self, name: str, value: float) -> bool:
+        """Store the value; False for an unknown name or a value that its type cannot hold."""
+        if name not in self._values or not math.isfinite(value):
+            return False
+        if name in _INTEGERS:
+            if not -_INT32_LIMIT <= value < _INT32_LIMIT:
+                return False
+            self._values[name] = int(value)
+            return True
+        try:
+            self._values[name] = _float32(value)
+        except OverflowError:
+            return False
+        return True
+
+    def kind(self, name: str) -> int:
+        """MAV_PARAM_TYPE of PARAM_VALUE."""
+        is_integer = name in _INTEGERS
+        return int(mav.MAV_PARAM_TYPE_INT32 if is_integer else mav.MAV_PARAM_TYPE_REAL32)
+
+    def on_wire(self, name: str) -> float:
+        """The value as PARAM_VALUE's float field carries it."""
+        if name not in _INTEGERS:
+            return self._values[name]
+        (packed,) = struct.unpack("<f", struct.pack("<i", int(self._values[name])))
+        return float(packed)
+
+    def set_from_wire(self, name: str, packed: float) -> bool:
+        """Store what PARAM_SET's float field carries; False as in `set`."""
+        if name not in _INTEGERS:
+            return self.set(name, packed)
+        (value,) = struct.unpack("<i", struct.pack("<f", packed))
+        return self.set(name, value)
+
+
+def _float32(value: float) -> float:
+    """Round as the wire does; raises OverflowError beyond its range."""
+    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
+    return float(rounded)

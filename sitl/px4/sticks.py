@@ -1,0 +1,142 @@
+"""Chooses between the senders of sticks, notices their loss, and reads gestures from them.
+
+MAVLink has no notion of an override here: each link, and the receiver, is a source, COM_RC_IN_MODE
+says which may win, and the last values of the winner hold until it is declared lost. Timers and
+limits are those measured on PX4 1.18.
+"""
+
+import math
+from typing import NamedTuple
+
+from sitl.clock import NS_PER_S
+from sitl.px4.params import Params
+
+RC_SOURCE = -1  # the receiver; links are numbered from 0
+POLL_NS = NS_PER_S // 5
+"""Sticks are looked at when they come, and this long after that, again and again."""
+GESTURE_NS = NS_PER_S
+GESTURE_LOW_THROTTLE, GESTURE_FULL_YAW = -0.9, 0.9
+FAST_SAMPLES = 3  # in a row that must move fast to count as the pilot's will
+
+_ANY_SOURCE_MODES = (2, 3, 5, 6, 7, 8)
+_KEEP_FIRST = 3
+_PRIORITIES = {
+    5: (RC_SOURCE, "low"),
+    6: (None, "low"),
+    7: (RC_SOURCE, "high"),
+    8: (None, "high"),
+}
+"""COM_RC_IN_MODE: whether the receiver comes first (else last), and which link wins."""
+
+
+class Sticks(NamedTuple):
+    """Positions in [-1, 1]; throttle 0 is the middle."""
+
+    forward: float = 0.0  # + nose down
+    right: float = 0.0
+    throttle: float = 0.0
+    yaw: float = 0.0  # + nose right
+
+
+def from_manual_control(x: int, y: int, z: int, r: int) -> Sticks:
+    """Sticks of a MANUAL_CONTROL; a field beyond its range counts as centred."""
+    forward, right, yaw = (v / 1000.0 if -1000 <= v <= 1000 else 0.0 for v in (x, y, r))
+    return Sticks(forward, right, z / 500.0 - 1.0 if 0 <= z <= 1000 else 0.0, yaw)
+
+
+class StickInput:
+    """The sticks that PX4 acts on; stamps are nanoseconds of one clock."""
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+        self.sticks = Sticks()
+        self.valid = False
+        """The winner still sends."""
+        self.count = 0
+        """Samples chosen so far: a reader sees by it that there is a new one."""
+        self.sampled_ns = 0
+        self.moved_fast = False
+        """The newest samples move faster than MAN_OVERRIDE_SPD."""
+        self._source: int | None = None
+        self._first_source: int | None = None
+        self._never_ages = False
+        self._fast_samples = 0
+        self._gesture = 0
+        self._gesture_since_ns = 0
+        self._gesture_done = False
+
+    @property
+    def source(self) -> int | None:
+        """The link that wins, RC_SOURCE, or None."""
+        return self._source if self.valid else None
+
+    def pretend_centred(self, now_ns: int) -> None:
+        """Take the sticks for valid and centred until the first real ones come."""
+        self._choose(Sticks(), now_ns)
+        self._never_ages = True
+
+    def on_sticks(self, source: int, sticks: Sticks, now_ns: int) -> None:
+        """Sticks have come from a source."""
+        if self._wins(source):
+            self._source = source
+            if self._first_source is None:
+                self._first_source = source
+            self._choose(sticks, now_ns)
+
+    def update(self, now_ns: int) -> None:
+        """Notice the loss of the winner."""
+        if self.valid and not self._never_ages and now_ns - self.sampled_ns >= self._lost_after_ns:
+            self.valid = False
+            self.moved_fast = False
+            self._gesture = self._fast_samples = 0
+
+    def gesture(self, now_ns: int) -> int:
+        """1: throttle down and full right yaw were held for a second, -1: full left; else 0.
+
+        Each is reported once.
+        """
+        if not self._gesture or self._gesture_done or now_ns - self._gesture_since_ns < GESTURE_NS:
+            return 0
+        self._gesture_done = True
+        return self._gesture
+
+    @property
+    def _lost_after_ns(self) -> int:
+        polls = math.ceil(self._params["COM_RC_LOSS_T"] * NS_PER_S / POLL_NS - 1e-6)
+        return max(1, polls) * POLL_NS
+
+    def _wins(self, source: int) -> bool:
+        mode = self._params.integer("COM_RC_IN_MODE")
+        is_allowed = mode in _ANY_SOURCE_MODES or mode == (0 if source == RC_SOURCE else 1)
+        if not is_allowed:
+            return False
+        if mode == _KEEP_FIRST:
+            return self._first_source in (None, source)
+        if not self.valid or self._never_ages or source == self._source:
+            return True
+        return mode in _PRIORITIES and self._rank(source, mode) < self._rank(self._source, mode)
+
+    def _rank(self, source: int | None, mode: int) -> float:
+        """The lowest wins."""
+        receiver, links = _PRIORITIES[mode]
+        if source is None:
+            return math.inf
+        if source == RC_SOURCE:
+            return -math.inf if receiver == RC_SOURCE else 1e9
+        return source if links == "low" else -source
+
+    def _choose(self, sticks: Sticks, now_ns: int) -> None:
+        interval_s = (now_ns - self.sampled_ns) / NS_PER_S
+        limit = self._params["MAN_OVERRIDE_SPD"]
+        travel = max(abs(new - old) for new, old in zip(sticks, self.sticks, strict=True))
+        is_fast = self.valid and limit > 0.0 and travel > limit * interval_s
+        self._fast_samples = self._fast_samples + 1 if is_fast else 0
+        self.moved_fast = self._fast_samples >= FAST_SAMPLES
+        self.sticks, self.sampled_ns, self.valid = sticks, now_ns, True
+        self._never_ages = False
+        self.count += 1
+        gesture = 0
+        if sticks.throttle < GESTURE_LOW_THROTTLE and abs(sticks.yaw) > GESTURE_FULL_YAW:
+            gesture = 1 if sticks.yaw > 0.0 else -1
+        if gesture != self._gesture:
+            self._gesture, self._gesture_since_ns, self._gesture_done = gesture, now_ns, False

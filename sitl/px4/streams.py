@@ -1,0 +1,142 @@
+"""Schedules the messages of one link as PX4 does: rates by topic, a bandwidth, silent scaling.
+
+A stream is looked at once a control step. It is sent when its interval has passed and its topic is
+new; a stream that is late by less than half an interval keeps its grid, a later one begins anew.
+So 200 Hz of a 250 Hz topic become 125 Hz, as measured.
+"""
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.clock import NS_PER_MS
+
+CURRENT_MODE = 436  # not in pymavlink's dialect
+NS_PER_US = 1000
+LOWEST_SCALE = 0.05
+FRAME_BYTES = 12
+OTHER_STREAMS_BYTES_PS = 9000
+"""What PX4 sends besides the streams that this vehicle has; it counts for the bandwidth."""
+
+_BOTH = {
+    mav.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+    mav.MAVLINK_MSG_ID_BATTERY_STATUS: 0.5,
+    mav.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
+    mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
+    CURRENT_MODE: 0.5,
+}
+ONBOARD_HZ: Mapping[int, float] = MappingProxyType(
+    _BOTH
+    | {
+        mav.MAVLINK_MSG_ID_ATTITUDE: 100.0,
+        mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
+        mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
+        mav.MAVLINK_MSG_ID_HIGHRES_IMU: 50.0,
+        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 30.0,
+        mav.MAVLINK_MSG_ID_ODOMETRY: 30.0,
+        mav.MAVLINK_MSG_ID_RC_CHANNELS: 20.0,
+        mav.MAVLINK_MSG_ID_TIMESYNC: 10.0,
+        mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: 10.0,
+        mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: 10.0,
+        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 10.0,
+        mav.MAVLINK_MSG_ID_VFR_HUD: 10.0,
+        mav.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
+        mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
+        mav.MAVLINK_MSG_ID_SYS_STATUS: 5.0,
+    }
+)
+"""Of a link to a companion computer (mode Onboard)."""
+GCS_HZ: Mapping[int, float] = MappingProxyType(
+    _BOTH
+    | {
+        mav.MAVLINK_MSG_ID_ATTITUDE: 50.0,
+        mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
+        mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: 50.0,
+        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 50.0,
+        mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
+        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 50.0,
+        mav.MAVLINK_MSG_ID_RC_CHANNELS: 20.0,
+        mav.MAVLINK_MSG_ID_VFR_HUD: 4.0,
+        mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: 1.5,
+        mav.MAVLINK_MSG_ID_GPS_RAW_INT: 1.0,
+        mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 1.0,
+        mav.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
+    }
+)
+"""Of a link to a ground station (mode Normal, with what PX4's SITL script adds)."""
+
+_UNSCALED = (mav.MAVLINK_MSG_ID_HEARTBEAT,)
+
+
+@dataclass(slots=True, kw_only=True)
+class _Stream:
+    interval_us: int
+    sent_us: int
+    version: Hashable = None  # of the topic, when it was sent
+
+
+class Streams:
+    """The message intervals of one link; stamps are the vehicle's clock."""
+
+    def __init__(
+        self, default_hz: Mapping[int, float], bandwidth_bytes_ps: float, now_ns: int
+    ) -> None:
+        self._default_us = {key: round(1e6 / rate) for key, rate in default_hz.items()}
+        self._bandwidth = bandwidth_bytes_ps
+        self._streams: dict[int, _Stream] = {}
+        for message_id, interval_us in self._default_us.items():
+            self.set_interval(message_id, interval_us, now_ns)
+
+    def set_interval(self, message_id: int, interval_us: int, now_ns: int) -> None:
+        """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the link's default."""
+        if interval_us == 0:
+            interval_us = self._default_us.get(message_id, -1)
+        if interval_us < 0:
+            self._streams.pop(message_id, None)
+            return
+        sent_us = now_ns // NS_PER_US
+        self._streams[message_id] = _Stream(interval_us=interval_us, sent_us=sent_us)
+
+    def interval_us(self, message_id: int) -> int:
+        """The interval that MESSAGE_INTERVAL reports; -1: not streamed."""
+        stream = self._streams.get(message_id)
+        return -1 if stream is None else stream.interval_us
+
+    @property
+    def scale(self) -> float:
+        """Factor on all rates that fits them into the link's bandwidth; nobody is told."""
+        wanted = float(OTHER_STREAMS_BYTES_PS)
+        for message_id, stream in self._streams.items():
+            wanted += payload_bytes(message_id) * 1e6 / max(1, stream.interval_us)
+        return max(LOWEST_SCALE, min(1.0, self._bandwidth / wanted))
+
+    def due(self, now_ns: int, version_of: Callable[[int], Hashable]) -> list[int]:
+        """Ids of the messages to send now; ``version_of`` tells a new topic from an old one."""
+        now_us, scale = now_ns // NS_PER_US, self.scale
+        ready = []
+        for message_id, stream in self._streams.items():
+            interval_us = stream.interval_us / (1.0 if message_id in _UNSCALED else scale)
+            if now_us - stream.sent_us < interval_us:
+                continue
+            if (version := version_of(message_id)) == stream.version:
+                continue
+            is_on_grid = now_us - stream.sent_us < 1.5 * interval_us
+            stream.sent_us = int(stream.sent_us + interval_us) if is_on_grid else now_us
+            stream.version = version
+            ready.append(message_id)
+        return ready
+
+
+def payload_bytes(message_id: int) -> int:
+    """Most bytes of the message on the wire, signature aside."""
+    if message_id == CURRENT_MODE:
+        return 9 + FRAME_BYTES
+    fields = mav.mavlink_map[message_id]
+    return int(fields.unpacker.size) + FRAME_BYTES
+
+
+def at_rate(uptime_ns: int, period_ms: int) -> int:
+    """Version of a topic that is published this often."""
+    return uptime_ns // (period_ms * NS_PER_MS)

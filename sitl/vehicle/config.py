@@ -1,0 +1,56 @@
+"""What makes one simulated vehicle differ from another, whatever its firmware."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, TypeAlias
+
+from sitl.vehicle.conditions import NOMINAL, Conditions
+
+STEP_NS = 2_500_000
+"""Grid on which a vehicle is served: receive, advance to now, send."""
+
+IDLE_RECEIVER_US = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
+"""An untouched transmitter: throttle down, the rest centred."""
+MID_RECEIVER_US = (1500,) * 8
+"""Every stick centred, the throttle too: what a pilot holds who stands by."""
+
+AutopilotName: TypeAlias = Literal["ardupilot", "px4"]
+
+ArduPilotRelease: TypeAlias = Literal["4.6", "4.7-dev", "4.7"]
+"""Whose names and units of parameters an ArduPilot has; 4.5 has those of 4.6. The measured one, in
+development between the two, has the new names of the system ids and the old ones of the rest."""
+
+
+class Battery(NamedTuple):
+    """The vehicle's word about its battery; it never empties by itself."""
+
+    voltage_v: float = 12.6
+    current_a: float = 0.0
+    remaining_percent: int = 100
+    is_low: bool = False
+    """The firmware's battery failsafe has fired; this vehicle reports it and flies on."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleConfig:
+    """Differences between one simulated vehicle and another."""
+
+    autopilot: AutopilotName = "ardupilot"
+    ardupilot_release: ArduPilotRelease = "4.7-dev"
+    receiver: bool = True
+    """An RC receiver is there. Without one ArduCopter's sticks latch and its radio fails; PX4 looks
+    at it only if COM_RC_IN_MODE tells it to."""
+    receiver_us: tuple[int, ...] = IDLE_RECEIVER_US
+    """The receiver's channels at boot, in microseconds."""
+    vehicle_type: int = 2
+    """HEARTBEAT.type, a MAV_TYPE: 2 is a quadrotor, and flies as one whatever it says."""
+    estimator_ready_s: float = 3.0
+    """From boot until arming is possible (about 23 s on the real firmware)."""
+    position_ready_s: float = 5.0
+    """From boot until the estimator has a position (about 40 s on the real firmware)."""
+    onboard_links: frozenset[int] = frozenset()
+    """Indices of the links to companion computers, which PX4 gives other streams than a ground
+    station's."""
+    link_bytes_ps: float = 4_000_000.0
+    """Bandwidth that PX4 believes each link to have; too little slows its streams silently."""
+    conditions: Conditions = NOMINAL
+    """Airframe, air and sensors; `sitl.camera.fpv.FpvRenderer` takes those of the camera."""

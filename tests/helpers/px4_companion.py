@@ -1,0 +1,223 @@
+"""A ground station or companion computer of a PX4 vehicle: sticks, setpoints, modes, its events."""
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from helpers.contract_peers import GCS, TICK_NS, Companion, Peer
+from sitl.clock import NS_PER_S
+
+ACCEPTED, REJECTED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_TEMPORARILY_REJECTED
+ALTCTL, POSCTL, ACRO, OFFBOARD, STAB = (2, 0), (3, 0), (5, 0), (6, 0), (7, 0)
+TAKEOFF, LOITER, RTL, LAND = (4, 2), (4, 3), (4, 5), (4, 6)
+MID = (0, 0, 500, 0)
+EVENT, CURRENT_MODE = 410, 436
+STICK_HZ = 50
+VELOCITY_AND_YAW_RATE = 0x5C7
+HOVER_THRUST = 0.484
+
+
+class Modes(NamedTuple):
+    """CURRENT_MODE, decoded by hand: pymavlink's dialect lacks it."""
+
+    custom_mode: int
+    intended_custom_mode: int
+    standard_mode: int
+
+
+def custom(mode: tuple[int, int]) -> int:
+    return mode[0] << 16 | mode[1] << 24
+
+
+def named(messages: list[Any], name: str) -> list[Any]:
+    return [message for message in messages if message.get_type() == name]
+
+
+def modes_in(messages: list[Any]) -> list[Modes]:
+    raw = named(messages, f"UNKNOWN_{CURRENT_MODE}")
+    return [decode_current_mode(m) for m in raw]
+
+
+def decode_current_mode(message: Any) -> Modes:
+    payload = bytes(message.get_msgbuf())[10:-2].ljust(9, b"\0")
+    return Modes(*struct.unpack("<IIB", payload))
+
+
+def event_id(message: Any) -> int:
+    (number,) = struct.unpack_from("<I", bytes(message.get_msgbuf()), 10)
+    return int(number)
+
+
+def attitude_target(
+    roll_deg: float = 0.0, thrust: float = HOVER_THRUST, pitch_deg: float = 0.0, yaw: float = 0.0
+) -> Any:
+    cr, sr = math.cos(math.radians(roll_deg) / 2), math.sin(math.radians(roll_deg) / 2)
+    cp, sp = math.cos(math.radians(pitch_deg) / 2), math.sin(math.radians(pitch_deg) / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    q = [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]
+    return mav.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, thrust)
+
+
+def rate_target(
+    roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0, thrust: float = HOVER_THRUST
+) -> Any:
+    """Rates in deg/s."""
+    rates = [math.radians(v) for v in (roll, pitch, yaw)]
+    return mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], *rates, thrust)
+
+
+def velocity_target(
+    vx: float = 0.0, vy: float = 0.0, vz: float = 0.0, yaw_rate_deg: float = 0.0, frame: int = 1
+) -> Any:
+    return mav.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, frame, VELOCITY_AND_YAW_RATE, 0, 0, 0, vx, vy, vz, 0, 0, 0, 0,
+        math.radians(yaw_rate_deg),
+    )  # fmt: skip
+
+
+class Px4Companion(Companion):
+    """As `Companion`, for PX4; sends a ground station's heartbeat once a second."""
+
+    def __init__(self, peer: Peer, *, is_gcs: bool = True) -> None:
+        super().__init__(peer)
+        self._is_gcs = is_gcs
+        self._heartbeat_due_ns = peer.now_ns()
+        self._changed: dict[str, tuple[int, float]] = {}
+        self.seen: list[Any] = []
+        """Everything that came since it was last cleared."""
+
+    def advance(self, seconds: float) -> list[Any]:
+        if self._is_gcs and self.peer.now_ns() >= self._heartbeat_due_ns:
+            self._heartbeat_due_ns = self.peer.now_ns() + NS_PER_S
+            self.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3))
+        messages = super().advance(seconds)
+        self.seen += messages
+        return messages
+
+    def set_mode(self, mode: tuple[int, int]) -> int:
+        return self.command(mav.MAV_CMD_DO_SET_MODE, 1, *mode)
+
+    def sticks(self, sticks: tuple[int, int, int, int], *, system_id: int = GCS) -> None:
+        """MANUAL_CONTROL: x, y, z, r."""
+        self.send(mav.MAVLink_manual_control_message(1, *sticks, 0), system_id=system_id)
+
+    def repeat(
+        self, send: Callable[[float], None], seconds: float, hz: float = STICK_HZ
+    ) -> list[Any]:
+        """Call ``send`` with the time since now at this rate; what came meanwhile."""
+        start_ns = self.peer.now_ns()
+        messages: list[Any] = []
+        count = 0
+        while (elapsed_ns := self.peer.now_ns() - start_ns) < seconds * NS_PER_S:
+            if elapsed_ns * hz >= count * NS_PER_S:
+                count += 1
+                send(elapsed_ns / NS_PER_S)
+            messages += self.advance(TICK_NS / NS_PER_S)
+        return messages
+
+    def fly(self, seconds: float, sticks: tuple[int, int, int, int] = MID) -> list[Any]:
+        return self.repeat(lambda _: self.sticks(sticks), seconds)
+
+    def stream_setpoint(self, message: Any, seconds: float, hz: float = STICK_HZ) -> list[Any]:
+        return self.repeat(lambda _: self.send(message), seconds, hz)
+
+    def until(
+        self,
+        is_over: Callable[[list[Any]], bool],
+        within_s: float,
+        send: Callable[[float], None] = lambda _: None,
+    ) -> tuple[float, list[Any]]:
+        """Go on until the messages since now satisfy a condition: how long that took."""
+        start_ns, messages = self.peer.now_ns(), list[Any]()
+        while self.peer.now_ns() - start_ns < within_s * NS_PER_S:
+            messages += self.repeat(send, 0.02)
+            if is_over(messages):
+                return (self.peer.now_ns() - start_ns) / NS_PER_S, messages
+        raise AssertionError(f"not within {within_s} s")
+
+    def mode(self) -> int:
+        """The mode that flies, by CURRENT_MODE."""
+        self.command(mav.MAV_CMD_REQUEST_MESSAGE, CURRENT_MODE)
+        return decode_current_mode(self.wait(f"UNKNOWN_{CURRENT_MODE}")).custom_mode
+
+    def track(self, hz: float = 50) -> None:
+        """Stream modes, attitude, position and landed state fast."""
+        for message_id in (
+            mav.MAVLINK_MSG_ID_ATTITUDE,
+            mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+            mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
+            CURRENT_MODE,
+        ):
+            assert self.stream(message_id, hz) == ACCEPTED
+
+    def get_ready(self, mode: tuple[int, int]) -> None:  # type: ignore[override]
+        """Wait until the vehicle may be armed in a mode, with sticks centred; do not arm."""
+        self.fly(0.2)
+        assert self.set_mode(mode) == ACCEPTED
+        for _ in range(60):
+            messages = self.fly(1.0)
+            heartbeats = named(messages, "HEARTBEAT")
+            if any(m.system_status == mav.MAV_STATE_STANDBY for m in heartbeats):
+                return
+        raise AssertionError("the vehicle does not get ready to arm")
+
+    def take_off(self, mode: tuple[int, int] = ALTCTL) -> None:
+        """Some metres up, level and still; then the mode."""
+        self.track()
+        self.get_ready(ALTCTL)
+        assert self.arm() == ACCEPTED
+        self.until(
+            lambda m: any(p.z < -6.0 for p in named(m, "LOCAL_POSITION_NED")),
+            15.0,
+            lambda _: self.sticks((0, 0, 1000, 0)),
+        )
+        self.fly(3.0)
+        assert self.set_mode(mode) == ACCEPTED
+        self.seen.clear()
+
+    def texts(self) -> list[str]:
+        """Status texts since the last call, without the tab at their end."""
+        texts = [m.text.rstrip("\t") for m in named(self.seen, "STATUSTEXT")]
+        self.seen.clear()
+        return texts
+
+    def get_int(self, name: str) -> int:
+        self.send(mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
+        message = self.wait("PARAM_VALUE", where=lambda m: m.param_id == name)
+        assert message.param_type == mav.MAV_PARAM_TYPE_INT32
+        return int(struct.unpack("<i", struct.pack("<f", message.param_value))[0])
+
+    def change(self, name: str, value: float) -> None:
+        """Set a parameter of either type until the end of the test."""
+        self.send(mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
+        old = self.wait("PARAM_VALUE", where=lambda m: m.param_id == name)
+        self._changed.setdefault(name, (old.param_type, old.param_value))
+        packed = value
+        if old.param_type == mav.MAV_PARAM_TYPE_INT32:
+            (packed,) = struct.unpack("<f", struct.pack("<i", int(value)))
+        self._write(name, old.param_type, packed)
+
+    def restore(self) -> None:
+        """Leave the vehicle disarmed on the ground with the parameters that it had."""
+        self.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196)
+        for name, (kind, packed) in self._changed.items():
+            self._write(name, kind, packed)
+        self.set_mode(LOITER)
+        for _ in range(20):
+            self.command(mav.MAV_CMD_REQUEST_MESSAGE, mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE)
+            if self.wait("EXTENDED_SYS_STATE").landed_state == mav.MAV_LANDED_STATE_ON_GROUND:
+                break
+            self.advance(0.5)
+        self.advance(2.0)
+
+    def _write(self, name: str, kind: int, packed: float) -> None:
+        self.send(mav.MAVLink_param_set_message(1, 1, name.encode(), packed, kind))
+        self.wait("PARAM_VALUE", where=lambda m: m.param_id == name)

@@ -1,0 +1,126 @@
+"""Any policy's sticks on any vehicle: the same motion, both ways, without a jump backwards."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.stick_curves import PX4_DEFAULTS, copter_values, policy_motion, px4_motion
+from mavbridge.core.vehicle import StickGains, Sticks
+from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
+from mavbridge.mavlink.profiles.px4_sticks import px4_curves
+from mavbridge.mavlink.profiles.sticks import StickCurves
+
+dead_zones = st.integers(0, 50).map(lambda hundredths: hundredths / 100.0)
+gains = st.builds(
+    StickGains,
+    lean_deg=st.floats(5.0, 60.0),
+    yaw_rate_degps=st.floats(20.0, 400.0),
+    climb_mps=st.floats(0.5, 8.0),
+    descent_mps=st.floats(0.5, 8.0),
+    lean_dead_zone=dead_zones,
+    yaw_dead_zone=dead_zones,
+    throttle_dead_zone=dead_zones,
+)
+positions = st.integers(-1000, 1000).map(lambda thousandths: thousandths / 1000.0)
+sticks = st.builds(Sticks, throttle=positions, yaw=positions, pitch=positions, roll=positions)
+px4_values = st.fixed_dictionaries(
+    {
+        "MPC_MAN_TILT_MAX": st.floats(5.0, 80.0),
+        "MAN_DEADZONE": dead_zones,
+        "MPC_MAN_Y_MAX": st.floats(20.0, 400.0),
+        "MPC_Z_VEL_MAX_UP": st.floats(0.5, 8.0),
+        "MPC_Z_VEL_MAX_DN": st.floats(0.5, 8.0),
+        "MPC_YAW_EXPO": dead_zones,
+        "MPC_Z_MAN_EXPO": st.sampled_from((0.0, 0.6, 1.0)),
+    }
+)
+copters = st.builds(
+    copter_values,
+    ANGLE_MAX=st.floats(1000.0, 8000.0),
+    PILOT_Y_RATE=st.floats(20.0, 400.0),
+    PILOT_Y_EXPO=st.floats(-0.5, 1.0),
+    PILOT_SPEED_UP=st.floats(50.0, 800.0),
+    PILOT_SPEED_DN=st.integers(0, 800).map(float),
+    THR_DZ=st.floats(0.0, 300.0),
+    RC3_DZ=st.floats(0.0, 200.0),
+    RC4_DZ=st.floats(0.0, 200.0),
+    RC1_DZ=st.floats(0.0, 200.0),
+    RC2_DZ=st.floats(0.0, 200.0),
+)
+curves = st.one_of(
+    st.builds(px4_curves, px4_values, st.sampled_from(("ALTCTL", "STABILIZED")), gains),
+    st.builds(ardupilot_curves, copters, st.sampled_from(("ALT_HOLD", "STABILIZE")), gains),
+)
+
+
+@given(px4_values, gains, sticks)
+def test_the_motion_is_the_policys_unless_it_saturates(
+    values: dict[str, float], meant_by: StickGains, given_sticks: Sticks
+) -> None:
+    found = px4_curves(values, "ALTCTL", meant_by)
+    saturated = found.saturated(given_sticks)
+    moved = px4_motion(found.to_vehicle(given_sticks), values).numbers()
+    meant = policy_motion(given_sticks, meant_by).numbers()
+    maps = (found.throttle, found.yaw, found.lean, found.lean)
+    for name, by, got, wanted in zip(Sticks._fields, maps, moved, meant, strict=True):
+        if name in saturated:
+            assert abs(got) <= abs(wanted) + 1e-6
+        elif by is not None:
+            assert got == pytest.approx(wanted, rel=1e-6, abs=1e-6)
+
+
+@given(curves, sticks)
+def test_every_stick_stays_within_its_travel_and_on_its_side(
+    found: StickCurves, given_sticks: Sticks
+) -> None:
+    for moved in (found.to_vehicle(given_sticks), found.to_policy(given_sticks)):
+        for before, after in zip(given_sticks, moved, strict=True):
+            assert abs(after) <= 1.0 + 1e-9
+            assert before * after >= 0.0
+
+
+@given(curves, sticks)
+def test_the_other_way_round_leads_back(found: StickCurves, given_sticks: Sticks) -> None:
+    moved = found.to_vehicle(given_sticks)
+    again = found.to_vehicle(found.to_policy(moved))
+    assert again == pytest.approx(moved, abs=1e-6)
+    back, saturated = found.to_policy(moved), found.saturated(given_sticks)
+    for axis, name in ((found.throttle, "throttle"), (found.yaw, "yaw")):
+        if axis is not None and name not in saturated and getattr(moved, name) != 0.0:
+            assert getattr(back, name) == pytest.approx(getattr(given_sticks, name), abs=1e-6)
+    lean = found.lean
+    if lean is not None and "pitch" not in saturated and "roll" not in saturated:
+        within = math.hypot(*map(lean.policy.motion, given_sticks[2:])) <= lean.policy.above.full
+        for before, after, there in zip(given_sticks[2:], back[2:], moved[2:], strict=True):
+            if within and there != 0.0:
+                assert after == pytest.approx(before, abs=1e-6)
+
+
+@given(curves, positions, positions, st.sampled_from(Sticks._fields))
+def test_more_stick_is_never_less_motion(
+    found: StickCurves, one: float, other: float, name: str
+) -> None:
+    low, high = sorted((one, other))
+    centre = Sticks(0.0, 0.0, 0.0, 0.0)
+    for move in (found.to_vehicle, found.to_policy):
+        moved = [getattr(move(centre._replace(**{name: at})), name) for at in (low, high)]
+        assert moved[0] <= moved[1] + 1e-12
+
+
+@given(px4_values, gains, sticks)
+def test_left_mirrors_right(
+    values: dict[str, float], meant_by: StickGains, given_sticks: Sticks
+) -> None:
+    found = px4_curves(values, "ALTCTL", meant_by)
+    right = found.to_vehicle(given_sticks)
+    left = found.to_vehicle(Sticks(*(-stick for stick in given_sticks)))
+    assert [-stick for stick in left[1:]] == list(right[1:])
+
+
+def test_the_policys_dead_zone_is_the_centre() -> None:
+    px4 = px4_curves(PX4_DEFAULTS, "ALTCTL", StickGains())
+    assert px4.to_vehicle(Sticks(0.199, -0.0399, 0.0399, -0.0399)) == (0.0, 0.0, 0.0, 0.0)
+    copter = ardupilot_curves(copter_values(ANGLE_MAX=4500.0), "ALT_HOLD", StickGains())
+    assert copter.to_vehicle(Sticks(0.5, 0.5, 0.0399, -0.0399)) == (0.5, 0.5, 0.0, 0.0)

@@ -1,0 +1,118 @@
+"""Ways into a flight: a takeoff by the autopilot, and modes that need setpoints first."""
+
+from dataclasses import replace
+
+from helpers.gate_facts import AIRBORNE, COPTER_MODES, ON_GROUND, PX4_MODES, Stepped, flying
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.facts import Hand, Move
+
+GROUND = replace(ON_GROUND, mode="STABILIZE", modes=COPTER_MODES, echo_confirmed=True)
+PX4_GROUND = replace(GROUND, mode="AUTO.LOITER", modes=PX4_MODES)
+
+
+def requests(moves: list[Move]) -> list[str]:
+    """Everything that was asked for, in order."""
+    asked: list[str] = []
+    for move in moves:
+        asked += [f"mode {move.mode}"] if move.mode else []
+        asked += ["arm"] if move.arm else []
+        asked += [f"climb {move.takeoff_m:g}"] if move.takeoff_m else []
+    return asked
+
+
+def test_the_autopilot_takes_off_before_sticks_fly() -> None:
+    stepped = Stepped(GROUND, arm=True, takeoff_m=8.0)
+    assert requests(stepped.run(0.5)) == ["mode GUIDED"]
+    assert requests(stepped.run(1.0, mode="GUIDED")) == ["arm"]
+    assert {move.hand for move in stepped.moves} == {Hand.IDLE}
+    climbing = stepped.run(2.5, armed=True)
+    assert requests(climbing) == ["climb 8"] * 2
+    assert {move.hand for move in climbing} == {Hand.NEUTRAL}
+    assert requests(stepped.run(2.0, is_landed=False, height_m=4.0)) == []
+    assert stepped.reason == "taking off to 8 m"
+    assert requests(stepped.run(0.5, height_m=7.3)) == ["mode ALT_HOLD"]
+    stepped.step(mode="ALT_HOLD")
+    assert stepped.phase is Phase.FLYING
+
+
+def test_the_height_counts_from_the_place_of_arming() -> None:
+    stepped = Stepped(replace(GROUND, mode="GUIDED", height_m=-3.0), arm=True, takeoff_m=8.0)
+    stepped.run(0.1)
+    stepped.run(0.1, armed=True, is_landed=False, height_m=4.0)
+    assert stepped.reason == "taking off to 8 m"
+    stepped.run(1.1, height_m=4.3)
+    assert stepped.reason == "waiting for ALT_HOLD"
+
+
+def test_a_takeoff_waits_for_a_position() -> None:
+    stepped = Stepped(replace(GROUND, height_m=None), arm=True, takeoff_m=8.0)
+    stepped.run(0.1)
+    assert "waiting for a position" in stepped.reason
+
+
+def test_setpoints_would_end_a_takeoff_so_none_is_sent() -> None:
+    stepped = Stepped(
+        replace(GROUND, mode="GUIDED"), arm=True, takeoff_m=8.0, is_setpoint=True, modes=("GUIDED",)
+    )
+    moves = [*stepped.run(0.1), *stepped.run(1.1, armed=True), *stepped.run(1.0, height_m=5.0)]
+    assert {move.hand for move in moves} == {None}
+    stepped.step(height_m=7.9)
+    assert stepped.phase is Phase.FLYING
+
+
+def test_px4_takes_off_through_its_own_modes_and_gets_setpoints_before_offboard() -> None:
+    stepped = Stepped(
+        PX4_GROUND, arm=True, takeoff_m=5.0, is_setpoint=True, modes=("GUIDED", "OFFBOARD")
+    )
+    assert requests(stepped.run(0.1)) == ["arm"]
+    assert requests(stepped.run(1.0, armed=True)) == ["climb 5"]
+    stepped.run(2.0, mode="AUTO.TAKEOFF", is_landed=False, height_m=3.0)
+    stepped.step(height_m=4.9)
+    entering = stepped.run(0.3, mode="AUTO.LOITER")
+    assert requests(stepped.moves[-31:]) == ["mode OFFBOARD"]
+    assert {move.hand for move in entering} == {Hand.NEUTRAL}
+    stepped.step(mode="OFFBOARD")
+    assert stepped.phase is Phase.FLYING
+
+
+def test_another_mode_during_the_takeoff_is_the_pilots() -> None:
+    stepped = Stepped(replace(GROUND, mode="GUIDED"), arm=True, takeoff_m=8.0)
+    stepped.run(0.1)
+    stepped.run(1.0, armed=True, is_landed=False, height_m=2.0)
+    move = stepped.step(mode="LOITER")
+    assert (stepped.phase, move.hand, move.mode) == (Phase.RELEASING, Hand.RELEASE, None)
+
+
+def test_on_the_ground_idle_setpoints_flow_before_offboard_and_arming() -> None:
+    stepped = Stepped(PX4_GROUND, arm=True, is_setpoint=True, modes=("OFFBOARD",))
+    moves = [*stepped.run(0.1), *stepped.run(1.0, mode="OFFBOARD")]
+    assert {move.hand for move in moves} == {Hand.IDLE}
+    assert requests(moves) == ["mode OFFBOARD", "arm"]
+
+
+def test_in_the_air_an_act_asks_for_the_mode_that_only_our_setpoints_can_enter() -> None:
+    facts = replace(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
+    stepped = Stepped(facts, is_setpoint=True, modes=("OFFBOARD",))
+    stepped.step()
+    move = stepped.step("engage")
+    assert (move.hand, move.mode) == (Hand.NEUTRAL, "OFFBOARD")
+    stepped.step(mode="OFFBOARD")
+    assert stepped.phase is Phase.FLYING
+
+
+def test_in_the_air_nothing_flows_where_the_mode_needs_nothing() -> None:
+    facts = replace(AIRBORNE, mode="LOITER")
+    stepped = Stepped(facts, is_setpoint=True, modes=("GUIDED",), mode="GUIDED")
+    stepped.step()
+    move = stepped.step("engage")
+    assert (move.hand, move.mode) == (None, "GUIDED")
+
+
+def test_a_policy_of_setpoints_is_not_engaged_in_a_mode_of_sticks() -> None:
+    stepped = Stepped(AIRBORNE, is_setpoint=True, modes=("GUIDED",))
+    stepped.step()
+    stepped.step("engage")
+    refusal = stepped.engagement.refusal
+    assert refusal is not None
+    assert "only in GUIDED: change the mode, or use --mode" in refusal
+    assert flying().phase is Phase.FLYING

@@ -1,0 +1,197 @@
+"""A policy's sticks on an ArduCopter with other gains than those of its training."""
+
+from collections.abc import Callable
+
+import pytest
+
+from helpers.stick_curves import copter_motion, copter_values, policy_motion
+from mavbridge.core.vehicle import NEUTRAL, StickGains, Sticks
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
+from mavbridge.mavlink.profiles.sticks import IDENTITY
+from mavbridge.mavlink.session.params.checks import calibration
+from sitl.ardupilot.params import Params
+from sitl.vehicle.conditions import Conditions
+
+GAINS = StickGains()
+HALF = Conditions(angle_max_cdeg=1500.0, pilot_yaw_rate_degps=101.25, pilot_speed_up_cmps=125.0)
+TWICE = Conditions(angle_max_cdeg=6000.0, pilot_yaw_rate_degps=405.0, pilot_speed_up_cmps=500.0)
+
+
+def values_of(conditions: Conditions) -> dict[str, float]:
+    params = Params(conditions)
+    return {name: params[name] for name in params.names}
+
+
+def test_the_vehicle_of_the_training_gets_the_same_sticks() -> None:
+    curves = ardupilot_curves(copter_values(), "ALT_HOLD", GAINS)
+    sticks = Sticks(throttle=0.123456789, yaw=-0.03, pitch=1.0, roll=-1.0)
+    assert curves.is_identity
+    assert curves.notes == ()
+    assert curves.to_vehicle(sticks) is sticks
+    assert curves.to_policy(sticks) is sticks
+
+
+def test_a_radio_that_was_never_calibrated_changes_nothing_either() -> None:
+    changed = {f"RC{number}_MIN": 1100.0 for number in range(1, 5)}
+    changed |= {f"RC{number}_MAX": 1900.0 for number in range(1, 5)}
+    assert ardupilot_curves(copter_values(**changed), "ALT_HOLD", GAINS).is_identity
+
+
+@pytest.mark.parametrize(
+    ("channel", "pwm_us", "measure", "seen", "error"),
+    [
+        (1, 1700, lambda motion: motion.roll_deg, 11.26, 0.05),
+        (2, 1300, lambda motion: motion.pitch_deg, 11.27, 0.05),
+        (4, 1700, lambda motion: motion.yaw_degps, 77.8, 2.5),
+        (3, 1700, lambda motion: motion.climb_mps, 0.64, 0.02),
+    ],
+)
+def test_a_policy_of_other_gains_gets_what_was_measured(
+    channel: int, pwm_us: int, measure: Callable[..., float], seen: float, error: float
+) -> None:
+    """On the firmware with its defaults these PWM values gave these leans and rates."""
+    gains = StickGains(
+        lean_deg=50.0,
+        yaw_rate_degps=300.0,
+        climb_mps=4.0,
+        lean_dead_zone=0.0,
+        yaw_dead_zone=0.1,
+        throttle_dead_zone=0.05,
+    )
+    values = copter_values()
+    curves = ardupilot_curves(values, "ALT_HOLD", gains)
+    rc = calibration(values)
+    pwm = dict(zip((3, 4, 2, 1), rc.to_pwm_us(NEUTRAL), strict=True)) | {channel: pwm_us}
+    sticks = curves.to_policy(rc.to_sticks((pwm[3], pwm[4], pwm[2], pwm[1])))
+    assert measure(policy_motion(sticks, gains)) == pytest.approx(seen, abs=error)
+    assert rc.to_pwm_us(curves.to_vehicle(sticks)) == (pwm[3], pwm[4], pwm[2], pwm[1])
+
+
+@pytest.mark.parametrize("conditions", [HALF, TWICE], ids=["half", "twice"])
+def test_other_gains_give_the_motion_of_the_training(conditions: Conditions) -> None:
+    curves = ardupilot_curves(values_of(conditions), "ALT_HOLD", GAINS)
+    for sticks in (
+        NEUTRAL,
+        Sticks(throttle=0.5, yaw=0.4, pitch=0.3, roll=-0.2),
+        Sticks(throttle=-0.5, yaw=-0.4, pitch=-0.3, roll=0.2),
+        Sticks(throttle=0.19, yaw=0.03, pitch=0.03, roll=-0.03),
+    ):
+        moved = copter_motion(curves.to_vehicle(sticks), conditions).numbers()
+        # A microsecond of PWM is up to 1 degree/s, 0.14 degrees and 0.014 m/s.
+        for got, meant, error in zip(
+            moved, policy_motion(sticks, GAINS).numbers(), (0.02, 1.0, 0.2, 0.2), strict=True
+        ):
+            assert got == pytest.approx(meant, abs=error)
+        assert curves.saturated(sticks) == ()
+
+
+def test_what_the_vehicle_cannot_do_is_said_at_once_and_named_stick_by_stick() -> None:
+    curves = ardupilot_curves(values_of(HALF), "ALT_HOLD", GAINS)
+    assert curves.notes == (
+        "full climb of the policy is 2.5 m/s and this vehicle climbs 1.25 m/s at most "
+        "(PILOT_SPEED_UP): beyond 0.60 of the stick it does less",
+        "full descent of the policy is 2.5 m/s and this vehicle descends 1.25 m/s at most "
+        "(PILOT_SPEED_UP): beyond 0.60 of the stick it does less",
+        "full yaw rate of the policy is 202 deg/s and this vehicle turns 101 deg/s at most "
+        "(PILOT_Y_RATE): beyond 0.52 of the stick it does less",
+        "full lean of the policy is 30 deg and this vehicle leans 15 deg at most "
+        "(ANGLE_MAX): beyond 0.52 of the stick it does less",
+    )
+    assert curves.saturated(Sticks(throttle=0.61, yaw=0.5, pitch=0.0, roll=0.0)) == ("throttle",)
+    assert curves.saturated(Sticks(throttle=-0.61, yaw=0.53, pitch=0.0, roll=-0.53)) == (
+        *("throttle", "yaw", "roll"),
+    )
+    both = Sticks(throttle=0.0, yaw=0.0, pitch=0.4, roll=0.4)
+    assert curves.saturated(both) == ("pitch", "roll")  # neither would be alone
+    moved = curves.to_vehicle(both)
+    assert moved.pitch == moved.roll == pytest.approx(0.04 + 0.96 * 0.5**0.5)
+    assert ardupilot_curves(values_of(TWICE), "ALT_HOLD", GAINS).notes == ()
+
+
+def test_full_sticks_on_both_axes_lean_no_further_than_in_the_training() -> None:
+    curves = ardupilot_curves(values_of(TWICE), "ALT_HOLD", GAINS)
+    corner = curves.to_vehicle(Sticks(throttle=0.0, yaw=0.0, pitch=1.0, roll=1.0))
+    moved = copter_motion(corner, TWICE)
+    assert moved.pitch_deg == pytest.approx(30.0 * 0.5**0.5, abs=0.1)
+    assert moved.roll_deg == pytest.approx(30.0 * 0.5**0.5, abs=0.1)
+
+
+def test_the_profile_has_read_all_that_the_curves_need() -> None:
+    values = values_of(TWICE)
+    first = {name: values[name] for name in ARDUPILOT.params if name in values}
+    read = first | {name: values[name] for name in ARDUPILOT.more_params(first)}
+    curves = ARDUPILOT.stick_curves(read, "ALT_HOLD", GAINS)
+    assert curves == ardupilot_curves(values, "ALT_HOLD", GAINS)
+    assert not curves.is_identity
+
+
+def test_the_newer_names_and_units_mean_the_same() -> None:
+    old = copter_values(ANGLE_MAX=4500.0, PILOT_SPEED_UP=400.0, PILOT_SPEED_DN=150.0)
+    new = dict(old)
+    for name in ("ANGLE_MAX", "PILOT_SPEED_UP", "PILOT_SPEED_DN"):
+        del new[name]
+    new |= {"ATC_ANGLE_MAX": 45.0, "PILOT_SPD_UP": 4.0, "PILOT_SPD_DN": 1.5}
+    sticks = Sticks(throttle=-0.4, yaw=0.4, pitch=0.3, roll=-0.2)
+    moved = [ardupilot_curves(v, "ALT_HOLD", GAINS).to_vehicle(sticks) for v in (old, new)]
+    assert moved[0] == pytest.approx(moved[1])
+    assert moved[0].throttle < -0.4
+
+
+def test_a_yaw_stick_with_an_expo_is_straightened() -> None:
+    conditions = Conditions(pilot_yaw_expo=0.4)
+    curves = ardupilot_curves(values_of(conditions), "ALT_HOLD", GAINS)
+    assert curves.throttle is None
+    assert curves.lean is None
+    for yaw in (-1.0, -0.5, 0.1, 0.7):
+        sticks = NEUTRAL._replace(yaw=yaw)
+        moved = copter_motion(curves.to_vehicle(sticks), conditions)
+        assert moved.yaw_degps == pytest.approx(policy_motion(sticks, GAINS).yaw_degps, abs=0.7)
+
+
+def test_an_expo_that_the_firmware_ignores_is_none() -> None:
+    assert ardupilot_curves(copter_values(PILOT_Y_EXPO=1.0), "ALT_HOLD", GAINS).is_identity
+
+
+def test_the_throttle_is_left_alone_in_stabilize_where_it_is_thrust() -> None:
+    curves = ardupilot_curves(values_of(TWICE), "STABILIZE", GAINS)
+    sticks = Sticks(throttle=0.7, yaw=0.4, pitch=0.3, roll=-0.2)
+    moved = curves.to_vehicle(sticks)
+    assert moved.throttle == 0.7
+    assert moved.yaw < 0.25
+    assert moved.pitch < 0.2
+    assert curves.notes == ()
+
+
+@pytest.mark.parametrize("mode", ["LOITER", "POSHOLD", "ACRO", "SPORT", "DRIFT", "GUIDED", "17"])
+def test_in_other_modes_every_stick_is_left_alone(mode: str) -> None:
+    assert ardupilot_curves(values_of(TWICE), mode, GAINS) == IDENTITY
+
+
+def test_raw_sticks_are_left_alone() -> None:
+    assert ardupilot_curves(values_of(TWICE), "ALT_HOLD", None) == IDENTITY
+
+
+def test_parameters_that_are_missing_or_zero_leave_all_sticks_alone_and_are_named() -> None:
+    values = values_of(TWICE)
+    del values["ANGLE_MAX"], values["RC4_DZ"]
+    curves = ardupilot_curves(values, "ALT_HOLD", GAINS)
+    assert curves.is_identity
+    assert curves.notes == (
+        "the policy's sticks go to the vehicle as they are, whatever they mean to it: it did not "
+        "send ATC_ANGLE_MAX, RC4_DZ",
+    )
+    (note,) = ardupilot_curves(values_of(TWICE) | {"PILOT_Y_RATE": 0.0}, "ALT_HOLD", GAINS).notes
+    assert note.endswith("whatever they mean to it: PILOT_Y_RATE is 0")
+    (note,) = ardupilot_curves({}, "ALT_HOLD", GAINS).notes
+    assert "RCMAP_ROLL" in note
+
+
+def test_dead_zones_follow_a_trim_off_the_middle_and_a_reversed_channel() -> None:
+    values = copter_values(RC1_TRIM=1600.0, RC1_REVERSED=1.0, RC1_DZ=40.0)
+    curves = ardupilot_curves(values, "ALT_HOLD", GAINS)
+    rc = calibration(values)
+    for roll, dead_us in ((0.04001, -40), (-0.04001, 40)):
+        pwm = rc.to_pwm_us(curves.to_vehicle(NEUTRAL._replace(roll=roll)))
+        assert pwm[3] == 1600 + dead_us
+    assert rc.to_pwm_us(curves.to_vehicle(NEUTRAL._replace(roll=1.0)))[3] == 1000

@@ -1,0 +1,292 @@
+"""GUIDED on the simulated body: response times, the ground, what ends it; no wire."""
+
+import math
+
+import pytest
+
+from sitl.ardupilot.flight_modes import Mode
+from sitl.ardupilot.guided import AttitudeSetpoint, VelocitySetpoint
+from sitl.clock import NS_PER_S
+from sitl.rotation import from_euler, to_euler
+from sitl.vehicle.config import MID_RECEIVER_US, STEP_NS, VehicleConfig
+
+ZERO = (0.0, 0.0, 0.0)
+LEVEL = from_euler(0.0, 0.0, 0.0)
+BOTH = (Mode.GUIDED, Mode.GUIDED_NOGPS)
+
+
+def lean(roll_deg=0.0, thrust=0.5, rate=ZERO):
+    return AttitudeSetpoint(from_euler(math.radians(roll_deg), 0.0, 0.0), rate, thrust)
+
+
+def turn(x_degps=0.0, z_degps=0.0, thrust=0.5):
+    return AttitudeSetpoint(None, (math.radians(x_degps), 0.0, math.radians(z_degps)), thrust)
+
+
+def move(north=0.0, up=0.0, yaw_degps=0.0):
+    return VelocitySetpoint((north, 0.0, -up), math.radians(yaw_degps))
+
+
+def send(pilot, setpoint):
+    ap = pilot.ap
+    if isinstance(setpoint, AttitudeSetpoint):
+        ap.guided.follow_attitude(setpoint, ap.sensed, ap.now_ns)
+    else:
+        ap.guided.follow_velocity(setpoint, ap.sensed, ap.now_ns)
+
+
+def stream(pilot, seconds, setpoint, watch=lambda ap: None):
+    """The setpoint at 50 Hz."""
+    for index in range(round(seconds * NS_PER_S / STEP_NS)):
+        if index % 8 == 0:
+            send(pilot, setpoint)
+        pilot.ap.step()
+        watch(pilot.ap)
+
+
+def step_ms(pilot, seconds, setpoint, read, final):
+    """Times to 10, 50, 63 and 90 % of a step in ms, and its peak over its height."""
+    start_ns, before, samples = pilot.ap.now_ns, read(pilot.ap), []
+    stream(pilot, seconds, setpoint, lambda ap: samples.append((ap.now_ns, read(ap) - before)))
+    times = [
+        next((stamp - start_ns) / 1e6 for stamp, value in samples if value >= part * final)
+        for part in (0.1, 0.5, 0.63, 0.9)
+    ]
+    return times, max(value for _, value in samples) / final
+
+
+def roll_deg(ap):
+    return math.degrees(to_euler(ap.truth.ned_from_body_wxyz)[0])
+
+
+def rate_degps(axis):
+    return lambda ap: math.degrees(ap.truth.rate_body_radps[axis])
+
+
+def speed(axis, sign=1.0):
+    return lambda ap: sign * ap.truth.velocity_ned_mps[axis]
+
+
+@pytest.fixture
+def pilot(pilot):
+    """With a receiver whose sticks stay centred: overrides would only get in the way."""
+    return type(pilot)(VehicleConfig(receiver_us=MID_RECEIVER_US))
+
+
+def armed(pilot, mode):
+    pilot.silence(6.0)
+    assert pilot.ap.set_mode(mode)
+    assert pilot.ap.arm(force=False), pilot.texts()
+
+
+def in_the_air(pilot, mode=Mode.GUIDED):
+    armed(pilot, Mode.GUIDED)
+    assert pilot.ap.take_off(6.0)
+    pilot.silence(12.0)
+    assert pilot.ap.set_mode(mode)
+    pilot.texts()
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_attitude_steps_take_the_measured_times(pilot, mode):
+    in_the_air(pilot, mode)
+    stream(pilot, 1.0, lean())
+
+    times, peak = step_ms(pilot, 1.5, lean(10.0), roll_deg, 10.0)
+
+    assert times == pytest.approx([60, 155, 195, 360], abs=20)
+    assert peak < 1.03
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "axis", "measured_ms", "measured_peak"),
+    [
+        (turn(x_degps=40.0), 0, [33, 48, 53, 85], 1.04),
+        (turn(z_degps=40.0), 2, [145, 272, 307, 392], 1.22),
+    ],
+)
+def test_rate_steps_take_the_measured_times(pilot, setpoint, axis, measured_ms, measured_peak):
+    in_the_air(pilot, Mode.GUIDED_NOGPS)
+    stream(pilot, 1.0, lean())
+
+    times, peak = step_ms(pilot, 1.0, setpoint, rate_degps(axis), 40.0)
+
+    assert times == pytest.approx(measured_ms, abs=20)
+    assert peak == pytest.approx(measured_peak, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "read", "final", "measured_ms"),
+    [
+        (move(north=2.0), speed(0), 2.0, [385, 750, 865, 1340]),
+        (move(up=1.0), speed(2, -1.0), 1.0, [285, 685, 805, 1044]),
+        (move(yaw_degps=30.0), rate_degps(2), 30.0, [140, 261, 300, 380]),
+    ],
+)
+def test_velocity_steps_take_the_measured_times(pilot, setpoint, read, final, measured_ms):
+    in_the_air(pilot)
+    stream(pilot, 1.0, move())
+
+    times, _ = step_ms(pilot, 3.0, setpoint, read, final)
+
+    assert times == pytest.approx(measured_ms, rel=0.09, abs=45)
+
+
+def test_a_velocity_that_stopped_fades_after_the_timeout(pilot):
+    in_the_air(pilot)
+    stream(pilot, 4.0, move(north=2.0))
+
+    pilot.silence(3.3)
+    held_mps = pilot.ap.truth.velocity_ned_mps[0]
+    pilot.silence(1.2)
+
+    assert held_mps > 1.8
+    assert abs(pilot.ap.truth.velocity_ned_mps[0]) < 0.2
+
+
+def test_rates_go_on_until_the_timeout_then_it_is_level_at_its_height(pilot):
+    in_the_air(pilot, Mode.GUIDED_NOGPS)
+    pilot.ap.params.set("GUID_OPTIONS", 8.0)
+    stream(pilot, 0.5, turn(x_degps=5.0, thrust=pilot.ap.params["MOT_THST_HOVER"]))
+
+    pilot.silence(2.9)
+    assert roll_deg(pilot.ap) > 14.0
+    pilot.silence(1.5)
+    height_m = pilot.height_m
+    pilot.silence(3.0)
+
+    assert abs(roll_deg(pilot.ap)) < 0.5
+    assert pilot.height_m == pytest.approx(height_m, abs=0.3)
+
+
+def test_an_attitude_with_rates_turns_on_between_messages(pilot):
+    in_the_air(pilot, Mode.GUIDED_NOGPS)
+    stream(pilot, 1.0, lean())
+
+    send(pilot, lean(rate=(math.radians(10.0), 0.0, 0.0)))
+    pilot.silence(1.5)
+
+    assert roll_deg(pilot.ap) == pytest.approx(15.0, abs=1.0)
+
+
+def test_angle_boost_keeps_the_thrust_of_a_leaning_vehicle_vertical(pilot):
+    def climb_mps(boost):
+        in_the_air(other := type(pilot)(pilot.ap.config), Mode.GUIDED_NOGPS)
+        other.ap.params.set("GUID_OPTIONS", 8.0)
+        other.ap.params.set("ATC_ANGLE_BOOST", boost)
+        hover = other.ap.params["MOT_THST_HOVER"]
+        stream(other, 1.5, lean(25.0, thrust=hover))
+        assert other.ap.control.thrust == pytest.approx(hover)
+        return -other.ap.truth.velocity_ned_mps[2]
+
+    assert climb_mps(1.0) == pytest.approx(0.0, abs=0.2)
+    assert climb_mps(0.0) < -0.5
+
+
+def test_entering_from_a_lean_without_a_stream_levels_or_brakes(pilot):
+    for mode, stops in ((Mode.GUIDED_NOGPS, False), (Mode.GUIDED, True)):
+        in_the_air(other := type(pilot)(pilot.ap.config), Mode.ALT_HOLD)
+        other.hold(1.5, roll=1750)
+        assert other.ap.set_mode(mode)
+        other.silence(0.4)
+        assert stops or abs(roll_deg(other.ap)) < 2.0
+        other.silence(4.0)
+
+        assert (math.hypot(*other.ap.truth.velocity_ned_mps[:2]) < 0.3) == stops
+
+
+@pytest.mark.parametrize(
+    ("options", "thrust", "seconds"),
+    [(8, 0.55, 3.06), (0, 0.8, 4.0), (8, 0.25, None), (0, 0.5, None)],
+)
+def test_what_lifts_off_and_when(pilot, options, thrust, seconds):
+    pilot.ap.params.set("GUID_OPTIONS", float(options))
+    armed(pilot, Mode.GUIDED_NOGPS)
+    armed_ns, lifted_ns = pilot.ap.now_ns, []
+
+    def watch(ap):
+        if pilot.height_m > 0.5:
+            lifted_ns.append(ap.now_ns)
+
+    stream(pilot, 6.0, lean(thrust=thrust), watch)
+
+    if seconds is None:
+        assert not lifted_ns
+    else:
+        assert (lifted_ns[0] - armed_ns) / NS_PER_S == pytest.approx(seconds, abs=0.3)
+
+
+def test_a_vehicle_landed_by_thrust_stays_armed(pilot):
+    in_the_air(pilot, Mode.GUIDED_NOGPS)
+    stream(pilot, 10.0, lean(thrust=0.0))
+    assert pilot.ap.landed
+
+    stream(pilot, 15.0, lean(thrust=0.0))
+
+    assert pilot.ap.armed
+
+
+def test_on_the_ground_an_idle_throttle_disarms_after_the_delay(pilot):
+    pilot = type(pilot)(VehicleConfig())
+    armed(pilot, Mode.GUIDED_NOGPS)
+
+    pilot.silence(9.5)
+    assert pilot.ap.armed
+    pilot.silence(1.0)
+
+    assert not pilot.ap.armed
+
+
+def test_a_takeoff_does_not_survive_disarming(pilot):
+    armed(pilot, Mode.GUIDED)
+    assert pilot.ap.take_off(6.0)
+    assert pilot.ap.disarm(force=False)
+    assert pilot.ap.arm(force=False)
+
+    pilot.silence(6.0)
+
+    assert pilot.ap.landed
+
+
+def test_guided_nogps_accepts_a_takeoff_and_stays(pilot):
+    armed(pilot, Mode.GUIDED_NOGPS)
+    assert pilot.ap.take_off(6.0)
+
+    pilot.silence(6.0)
+
+    assert pilot.ap.landed
+
+
+@pytest.mark.parametrize(("mode", "height_m"), [(Mode.ALT_HOLD, 5.0), (Mode.GUIDED, -1.0)])
+def test_no_takeoff_in_other_modes_or_downwards(pilot, mode, height_m):
+    armed(pilot, mode)
+
+    assert not pilot.ap.take_off(height_m)
+
+
+def test_without_gps_guided_is_taken_on_the_ground_but_arms_only_in_nogps(pilot):
+    pilot = type(pilot)(VehicleConfig(receiver_us=MID_RECEIVER_US, position_ready_s=math.inf))
+    pilot.silence(6.0)
+    assert pilot.ap.set_mode(Mode.GUIDED)
+    assert not pilot.ap.arm(force=False)
+    assert pilot.texts() == ["Arm: GPS 1: Bad fix"]
+
+    assert pilot.ap.set_mode(Mode.GUIDED_NOGPS)
+    assert pilot.ap.arm(force=False)
+    stream(pilot, 6.0, lean(thrust=0.8))
+    pilot.texts()
+
+    assert not pilot.ap.set_mode(Mode.GUIDED)
+    assert pilot.texts() == ["Mode change to GUIDED failed: requires position"]
+    assert pilot.ap.set_mode(Mode.LAND)
+    assert pilot.ap.set_mode(Mode.GUIDED_NOGPS)
+
+
+def test_the_thrust_of_a_climb_rate_is_that_of_the_height_controller(pilot):
+    in_the_air(pilot, Mode.GUIDED_NOGPS)
+    stream(pilot, 2.0, lean(thrust=0.5))
+
+    assert pilot.ap.control.thrust == pytest.approx(pilot.ap.params["MOT_THST_HOVER"], abs=0.02)
+    attitude, rate_radps = pilot.ap.control.target
+    assert attitude == pytest.approx(LEVEL, abs=0.01)
+    assert rate_radps == pytest.approx(ZERO, abs=0.01)
