@@ -19,6 +19,7 @@ from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.export import ExportConfig
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
+from mavbridge.config.identify import IdentifyConfig
 from mavbridge.config.imagine import EvaluateImaginationConfig, ImagineConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.realtime import require_supported_system
@@ -56,6 +57,17 @@ def fly(config: FlyConfig | None = None) -> int:
     from mavbridge.flight.app import fly as run_flight
 
     return run_flight(config)
+
+
+@cli.command
+def identify(config: IdentifyConfig | None = None) -> int:
+    """Fly steps on each axis, and compare the vehicle's gains and lags with a policy's training."""
+    if config is None or not config.flight.link.connect:
+        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
+    require_supported_system()
+    from mavbridge.commands.identify.run import identify as run_identification
+
+    return run_identification(config)
 
 
 @cli.command

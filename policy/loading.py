@@ -10,7 +10,6 @@
 torch is imported only where a policy needs it.
 """
 
-import importlib
 import inspect
 import sys
 from collections.abc import Callable
@@ -33,6 +32,7 @@ from policy.engines.executable import EngineName, ExecutionSettings, make_numpy_
 from policy.errors import PolicyError, user_code
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 from policy.scripted.spec import IN_AIR, make_scripted
+from policy.user_class import FORMS, load_user_class, user_class_name
 
 if TYPE_CHECKING:
     from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
@@ -40,10 +40,6 @@ if TYPE_CHECKING:
 SHIPPED = Path(__file__).parent / "weights" / "toge.safetensors"
 """Flown by ``toge`` where no other weights are named; its card is beside it."""
 BUILTIN_KINDS = ("toge", "resnet-unet")
-_FORMS = (
-    "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air] or "
-    "package.module:Class"
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,17 +98,30 @@ def check_request(request: PolicyRequest) -> None:
         _parse_builtin(kind, options)
         _contract(request.image_size)
         checkpoint = _checkpoint(request)
-        contract = None if checkpoint is None else read_contract(checkpoint)
-        if contract is not None:
+        if checkpoint is not None and (contract := read_contract(checkpoint)) is not None:
             _require_image_size(contract, request.image_size)
         _require_devices(request)
     else:
-        package = _user_class_name(request.spec)[0].partition(".")[0]
+        package = user_class_name(request.spec)[0].partition(".")[0]
         if package not in sys.modules and find_spec(package) is None:
             raise PolicyError(
                 f"--policy {request.spec}: there is no module {package}; put its folder on "
-                f"PYTHONPATH or install it, or write {_FORMS}"
+                f"PYTHONPATH or install it, or write {FORMS}"
             )
+
+
+def read_policy_contract(request: PolicyRequest) -> Contract:
+    """Contract of a policy; a network of ours is not loaded for it.
+
+    Raises:
+        PolicyError: as ``check_request``; or a user's class cannot be made.
+    """
+    check_request(request)
+    if request.spec.partition(":")[0] not in BUILTIN_KINDS:
+        return _find(request, lambda: 0.0)[0].contract
+    checkpoint = _checkpoint(request)
+    contract = None if checkpoint is None else read_contract(checkpoint)
+    return contract or _contract(request.image_size)
 
 
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
@@ -170,7 +179,9 @@ def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRat
         note = f"{request.spec}: flies a fixed program, the camera is not looked at"
         return _scripted(options, request, now_s), [note]
     if kind not in BUILTIN_KINDS:
-        return _user_class(request.spec, request.checkpoint), [f"{request.spec}: a class of yours"]
+        return load_user_class(request.spec, request.checkpoint), [
+            f"{request.spec}: a class of yours"
+        ]
     config, checkpoint = _config(kind, options, request.image_size), _checkpoint(request)
     if checkpoint is None:
         return _untrained(config, request.seed)
@@ -224,7 +235,7 @@ def _parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | 
     rest: list[Any] = list(options)
     size: Size = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
     if len(rest) > (1 if kind == "toge" else 0):
-        raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {_FORMS}")
+        raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {FORMS}")
     if rest and rest[0] not in BACKBONE_NAMES:
         raise PolicyError(
             f"--policy toge:{':'.join(options)}: {rest[0]!r} is neither a size "
@@ -280,55 +291,6 @@ def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", lis
     policy.seed_noise(seed)
     note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
     return policy, [note]
-
-
-def _user_class_name(spec: str) -> tuple[str, str]:
-    """(package.module, Class)."""
-    module_name, _, class_name = spec.partition(":")
-    if not all(name.isidentifier() for name in (*module_name.split("."), class_name)):
-        raise PolicyError(f"policy {spec!r} is unknown; write {_FORMS}")
-    return module_name, class_name
-
-
-def _user_class(spec: str, checkpoint: Path | None) -> SingleRatePolicy:
-    module_name, class_name = _user_class_name(spec)
-    try:
-        with user_code(f"importing {module_name} failed"):
-            module = importlib.import_module(module_name)
-    except PolicyError as error:
-        raise PolicyError(
-            f"--policy {spec}: {error}; put its folder on PYTHONPATH or install it, or write "
-            f"{_FORMS}"
-        ) from error
-    found = getattr(module, class_name, None)
-    if not isinstance(found, type):
-        classes = sorted(name for name, value in vars(module).items() if isinstance(value, type))
-        raise PolicyError(f"--policy {spec}: no class {class_name} there; it has {classes}")
-    return _instance(spec, found, checkpoint)
-
-
-def _instance(spec: str, found: type, checkpoint: Path | None) -> SingleRatePolicy:
-    arguments: dict[str, Path] = {} if checkpoint is None else {"checkpoint": checkpoint}
-    try:
-        inspect.signature(found).bind(**arguments)
-    except (TypeError, ValueError) as error:
-        call = "Class()" if checkpoint is None else "Class(checkpoint=path)"
-        raise PolicyError(f"--policy {spec}: cannot be made with {call}: {error}") from error
-    with user_code(f"--policy {spec}: making it failed"):
-        policy: object = found(**arguments)
-    contract = getattr(policy, "contract", None)
-    lacking = [] if isinstance(contract, Contract) else ["contract"]
-    lacking += [] if hasattr(policy, "predict") else ["predict"]
-    if not isinstance(policy, SingleRatePolicy) or not isinstance(contract, Contract):
-        raise PolicyError(
-            f"--policy {spec}: a policy needs a member contract (a policy.contract.Contract) and "
-            "predict(image, state, action_history, num_diffusion_steps); for the dual-rate mode "
-            "also encode_visual(image) and predict_fast(feature, state, action_history, "
-            f"num_diffusion_steps). Missing or wrong here: {lacking}"
-        )
-    if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
-        raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")
-    return policy
 
 
 def _reset(policy: SingleRatePolicy, spec: str) -> Callable[[], None]:

@@ -96,10 +96,10 @@ class Tick:
         if self.release_reason is not None:
             return f"{self.holder}: {self.release_reason}"
         if self.trace is None:
-            return "PREPARING: sticks idle"
+            return "PREPARING: not in control yet"
         if self.sent is None:
             return "READ-ONLY: the policy runs, nothing is sent"
-        return "FLYING: the policy has the sticks"
+        return "FLYING: the policy has control"
 
     @property
     def holder(self) -> str:

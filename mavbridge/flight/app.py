@@ -68,13 +68,7 @@ def fly(config: FlyConfig) -> int:
         MavbridgeError: anything that the user, the vehicle or the policy got wrong.
     """
     clock = MonotonicClock()
-    # First what takes no time to check: weights take seconds to load.
-    make_transport(config.link.connect, clock)
-    check_camera(config.camera.source, latency_ms=config.camera.camera_latency)
-    check_configured_policy(config.policy)
-    require_writable(config.report, "--report")
-    if config.record is not None:
-        prepare_folder(config.record)
+    check_flight(config, clock)
     console = flight_console()
     with ExitStack() as stack:
         gate = start_gate(config, clock, stack)  # finds the vehicle while the weights load
@@ -85,6 +79,20 @@ def fly(config: FlyConfig) -> int:
             console.print(Text(note, style="yellow"))
         fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
     return 0
+
+
+def check_flight(config: FlyConfig, clock: Clock) -> None:
+    """Refuse what takes no time to check: weights take seconds to load.
+
+    Raises:
+        MavbridgeError: a flag names something that cannot be opened, written or loaded.
+    """
+    make_transport(config.link.connect, clock)
+    check_camera(config.camera.source, latency_ms=config.camera.camera_latency)
+    check_configured_policy(config.policy)
+    require_writable(config.report, "--report")
+    if config.record is not None:
+        prepare_folder(config.record)
 
 
 def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate:
@@ -290,7 +298,7 @@ class _Flight:
             height = "" if view.height_m is None else f" at {view.height_m:.0f} m"
             left = f"still armed in {view.status.mode}{height}"
             if summary is not None:
-                screen.show_message(f"sticks given back, {left}")
+                screen.show_message(f"control given back, {left}")
             elif view.phase is Phase.HOLDING:
                 holder = f"the gate (process {self._gate.pid})"
                 screen.show_message(f"{left}: {holder} goes on sending neutral sticks")

@@ -7,7 +7,14 @@ from pathlib import Path
 
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
-from policy.loading import LoadedPolicy, PolicyRequest, check_request, load_policy
+from policy.contract import Contract
+from policy.loading import (
+    LoadedPolicy,
+    PolicyRequest,
+    check_request,
+    load_policy,
+    read_policy_contract,
+)
 
 BUILT_IN = ("toge", "resnet-unet")
 
@@ -26,6 +33,11 @@ def load_configured_policy(
 def check_configured_policy(wanted: PolicyConfig) -> None:
     """Refuse in milliseconds, by PolicyError, what ``load_configured_policy`` cannot load."""
     check_request(_request(wanted))
+
+
+def configured_contract(wanted: PolicyConfig) -> Contract:
+    """Contract of the policy that the flags name, its weights left alone; raises PolicyError."""
+    return read_policy_contract(_request(wanted))
 
 
 def _request(wanted: PolicyConfig) -> PolicyRequest:

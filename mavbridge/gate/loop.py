@@ -267,12 +267,12 @@ class GateLoop:
         text: str | None = None
         match self._phase:
             case Phase.FLYING:
-                text = "the policy has the sticks"
+                text = "the policy has control"
             case Phase.LEAVING:
-                text = f"neutral sticks: {output.reason}"
+                text = f"neutral: {output.reason}"
             case Phase.HOLDING:
                 text = "neutral sticks go on until you disarm or change the mode"
             case Phase.RELEASING | Phase.RELEASED if before in _HELD:
-                text = f"sticks given back: {output.reason}"
+                text = f"control given back: {output.reason}"
         if text is not None:
             self._link.announce(f"mavbridge: {text}")

@@ -124,6 +124,7 @@ class MavlinkLink:
             telemetry=self._telemetry.snapshot(),
             status=vehicle.status(now_ns),
             problem=(_DOWN if is_down else vehicle.problem(now_ns))
+            or vehicle.output_problem(now_ns)
             or overruled
             or (output.unheard(now_ns) if output else "no policy is loaded yet"),
             is_overruled=overruled is not None,
@@ -132,7 +133,7 @@ class MavlinkLink:
             is_released=output is None or output.echo.is_released,
             shows_last=output is None or output.echo.shows_last,
             interruption=self._interruption,
-            modes=vehicle.condition.modes.roles,
+            modes=vehicle.profile.modes.roles,
             refused_mode=self._commands.refused_mode,
             texts=texts,
         )
@@ -219,7 +220,7 @@ class MavlinkLink:
         """Autopilot and version, for the report."""
         if self._vehicle is None:
             return "none"
-        return f"{self._vehicle.identity.autopilot} {self._vehicle.version or ''}".strip()
+        return f"{self._vehicle.profile.name} {self._vehicle.version or ''}".strip()
 
     @property
     def is_release_owed(self) -> bool:
@@ -257,7 +258,8 @@ class MavlinkLink:
             return
         if now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = now_ns + period_ns(_HEARTBEAT_HZ)
-            self._connection.send(self._codec.encode_heartbeat())
+            kind = self._vehicle.profile.heartbeat_type if self._vehicle else None
+            self._connection.send(self._codec.encode_heartbeat(kind))
         if (vehicle := self._vehicle) is None:
             return
         for request in vehicle.step(now_ns):
@@ -284,9 +286,10 @@ class MavlinkLink:
         """Start a new session: at first sight, after a reboot and after a change of address."""
         self._vehicle = VehicleSession(identity, self._config, report=self._report)
         if self._output is None:
-            self._choose_output(identity)
+            self._choose_output(self._vehicle)
         else:
             self._output.restart()
+            self._vehicle.use_output(self._output.name)
         self._telemetry = TelemetryCollector()
         self._timesync.restart()
         self._commands = ModeAndArm()
@@ -302,14 +305,15 @@ class MavlinkLink:
         """
         self._flight = meaning, output
         if self._vehicle is not None:
-            self._choose_output(self._vehicle.identity)
+            self._choose_output(self._vehicle)
 
-    def _choose_output(self, identity: VehicleIdentity) -> None:
+    def _choose_output(self, vehicle: VehicleSession) -> None:
         if self._flight is not None:
             meaning, wanted = self._flight
             self._output = choose_output(
-                meaning, wanted, autopilot=identity.autopilot, codec=self._codec
+                meaning, wanted, profile=vehicle.profile, codec=self._codec
             )
+            vehicle.use_output(self._output.name)
 
     def _report(self, text: str) -> None:
         self._connection.texts.append(text)
@@ -320,7 +324,7 @@ class MavlinkLink:
         Raises UserError if the vehicle has no mode of this name.
         """
         if (vehicle := self._vehicle) is not None:
-            numbers = vehicle.condition.modes.command(mode)
+            numbers = vehicle.profile.modes.command(mode)
             self._command(self._commands.set_mode(mode, numbers, self._clock.now_ns()))
 
     def arm(self) -> None:
@@ -334,6 +338,9 @@ class MavlinkLink:
 
     def takeoff(self, height_m: float) -> None:
         """Ask the autopilot to climb to this height above the ground by its own means."""
+        if (vehicle := self._vehicle) is not None:
+            amsl_m = vehicle.condition.amsl_m(self._clock.now_ns())
+            self._command(vehicle.profile.takeoff(height_m, amsl_m))
 
     def announce(self, text: str, *, is_warning: bool = False) -> None:
         """Send a STATUSTEXT, for a pilot who sees only a ground station; read-only, say nothing."""

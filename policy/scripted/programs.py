@@ -34,7 +34,7 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoubletStep:
-    """One push to one side and then as long to the other, with the time in which it settles."""
+    """One axis pushed to one side, then as far and as long to the other."""
 
     axis: Axis
     share: float
@@ -42,35 +42,62 @@ class DoubletStep:
     """Since the program began."""
     half_s: float
     """Length of the push to each side."""
+    rest_s: float
+    """Between the two, with a push of nothing."""
     settle_s: float
+    """After them, with feedback."""
 
     @property
-    def middle_s(self) -> float:
-        """Moment at which the push changes sides."""
-        return self.begin_s + self.half_s
+    def back_s(self) -> float:
+        """Begin of the push to the other side."""
+        return self.begin_s + self.half_s + self.rest_s
 
     @property
     def end_s(self) -> float:
         """End of the push to the other side."""
-        return self.begin_s + 2 * self.half_s
+        return self.back_s + self.half_s
+
+    def push_at(self, time_s: float) -> Push | None:
+        """The push at a time since the program began; None while it settles, and at other steps."""
+        if not self.begin_s <= time_s < self.end_s:
+            return None
+        if time_s >= self.back_s:
+            return Push(self.axis, -self.share)
+        return Push(self.axis, self.share if time_s < self.begin_s + self.half_s else 0.0)
 
 
-_PLAN: tuple[tuple[Axis, tuple[float, float], float, float], ...] = (
-    # Leans end without a speed, a climb above where it began. Yaw and climb reach full range; a
-    # lean does not, since it may be twice of what is expected.
-    ("roll", (0.3, 0.6), 1.2, 3.0),
-    ("pitch", (0.3, 0.6), 1.2, 3.0),
-    ("yaw", (0.5, 1.0), 1.5, 2.0),
-    ("climb", (0.6, 1.0), 2.0, 3.0),
+class _Plan(NamedTuple):
+    axis: Axis
+    shares: tuple[float, float]
+    half_s: float
+    rest_s: float
+    settle_s: float
+
+
+_PLANS = (
+    # A lean leaves no speed behind, a climb no height. Yaw and climb reach full range; a lean does
+    # not, since it may be twice of what is expected.
+    _Plan("roll", (0.3, 0.6), 1.2, 0.0, 3.0),
+    _Plan("pitch", (0.3, 0.6), 1.2, 0.0, 3.0),
+    _Plan("yaw", (0.5, 1.0), 2.2, 1.8, 3.5),
+    _Plan("climb", (0.6, 1.0), 2.8, 1.7, 3.5),
 )
 
 
 def _doublet_steps() -> tuple[DoubletStep, ...]:
-    planned = [(axis, share, half, rest) for axis, two, half, rest in _PLAN for share in two]
-    begins = accumulate((2 * half + rest for _, _, half, rest in planned), initial=0.0)
+    planned = [(plan, share) for plan in _PLANS for share in plan.shares]
+    lengths = (2 * plan.half_s + plan.rest_s + plan.settle_s for plan, _ in planned)
+    begins = accumulate(lengths, initial=0.0)
     return tuple(
-        DoubletStep(axis=axis, share=share, begin_s=begin_s, half_s=half_s, settle_s=settle_s)
-        for (axis, share, half_s, settle_s), begin_s in zip(planned, begins, strict=False)
+        DoubletStep(
+            axis=plan.axis,
+            share=share,
+            begin_s=begin_s,
+            half_s=plan.half_s,
+            rest_s=plan.rest_s,
+            settle_s=plan.settle_s,
+        )
+        for (plan, share), begin_s in zip(planned, begins, strict=False)
     )
 
 
@@ -81,12 +108,8 @@ DOUBLET_S = DOUBLET_STEPS[-1].end_s + DOUBLET_STEPS[-1].settle_s
 
 
 def _doublet(time_s: float) -> Motion:
-    time_s %= DOUBLET_S
-    for step in DOUBLET_STEPS:
-        if step.begin_s <= time_s < step.end_s:
-            share = step.share if time_s < step.middle_s else -step.share
-            return Motion(push=Push(step.axis, share))
-    return Motion()
+    pushes = (step.push_at(time_s % DOUBLET_S) for step in DOUBLET_STEPS)
+    return Motion(push=next(filter(None, pushes), None))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

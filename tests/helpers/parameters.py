@@ -7,11 +7,11 @@ from typing import Any
 
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import VehicleStatus
-from mavbridge.mavlink.codec.messages import Endpoint, ParamRequest, ParamValue, ParamWrite
-from mavbridge.mavlink.session.discovery import VehicleIdentity
+from mavbridge.core.vehicle import Output, VehicleStatus
+from mavbridge.mavlink.codec.messages import ParamRequest, ParamValue, ParamWrite
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
-from mavbridge.mavlink.session.streams import telemetry_streams
 from mavbridge.mavlink.settings import LinkSettings
 
 STEP_NS = 10 * NS_PER_MS
@@ -25,6 +25,8 @@ SAFE: dict[str, float] = {
     "RC_FS_TIMEOUT": 1.0,
     "FS_THR_ENABLE": 1.0,
     "FS_OPTIONS": 16.0,
+    "GUID_OPTIONS": 0.0,
+    "GUID_TIMEOUT": 3.0,
     "RC7_OPTION": 0.0,
     "RC8_OPTION": 0.0,
 }
@@ -51,7 +53,8 @@ class ParamVehicle:
         self,
         changes: dict[str, float | None] | None = None,
         *,
-        autopilot: str = "ardupilot",
+        profile: Profile = ARDUPILOT,
+        output: Output | None = "rc-override",
         folder: Path | None = None,
         loses: Callable[[int], bool] = lambda _: False,
         values: dict[str, float] | None = None,
@@ -64,17 +67,20 @@ class ParamVehicle:
         self.folder = folder if folder is not None else Path("unused")
         self.texts: list[str] = []
         self.params = VehicleParams(
-            VehicleIdentity(
-                source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot=autopilot
-            ),
+            profile,
+            1,
             LinkSettings(state_folder=folder, **settings),
-            streams=telemetry_streams(state_hz=100.0, is_px4=autopilot == "px4"),
+            streams=profile.streams(state_hz=100.0),
             report=self.texts.append,
         )
+        if output is not None:
+            self.params.use_output(output)
         self.now_ns = 0
         self.armed = False
         self.has_receiver: bool | None = None
         self.requests: list[ParamRequest | ParamWrite] = []
+        self.integers: set[str] = set()
+        """Parameters that stand byte for byte in the float."""
         self.refuses: set[str] = set()
         """Parameters that keep their value."""
         self.unique_id: str | None = "ab12"
@@ -87,7 +93,8 @@ class ParamVehicle:
         return [(r.name, r.value) for r in self.requests if isinstance(r, ParamWrite)]
 
     def problem(self) -> str | None:
-        return self.params.problem(status(self.armed, self.has_receiver))
+        report = status(self.armed, self.has_receiver)
+        return self.params.problem() or self.params.output_problem(report)
 
     def set_by_pilot(self, name: str, value: float) -> None:
         """A ground station sets a parameter; everybody hears of it."""
@@ -120,8 +127,13 @@ class ParamVehicle:
         return not self._loses(self._packets)
 
     def _answer(self, request: ParamRequest | ParamWrite) -> Iterator[ParamValue]:
-        if request.name not in self.values:
+        name = request.name
+        if name not in self.values:
             return
-        if isinstance(request, ParamWrite) and request.name not in self.refuses:
-            self.values[request.name] = request.value
-        yield ParamValue(request.name, self.values[request.name])
+        kind = 6 if name in self.integers else 9
+        if isinstance(request, ParamWrite) and name not in self.refuses:
+            if request.kind != kind:
+                return
+            read = ParamValue(name, request.value, kind)
+            self.values[name] = read.from_bytes().value
+        yield ParamValue(name, ParamWrite(name, self.values[name], kind).as_bytes().value, kind)

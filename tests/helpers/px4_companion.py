@@ -138,15 +138,23 @@ class Px4Companion(Companion):
         """Go on until the messages since now satisfy a condition: how long that took."""
         start_ns, messages = self.peer.now_ns(), list[Any]()
         while self.peer.now_ns() - start_ns < within_s * NS_PER_S:
-            messages += self.repeat(send, 0.02)
+            send((self.peer.now_ns() - start_ns) / NS_PER_S)
+            messages += self.advance(1.0 / STICK_HZ)
             if is_over(messages):
                 return (self.peer.now_ns() - start_ns) / NS_PER_S, messages
         raise AssertionError(f"not within {within_s} s")
 
+    def request(self, message_id: int, name: str) -> Any:
+        """A message by MAV_CMD_REQUEST_MESSAGE."""
+        params = (message_id, *[0.0] * 6)
+        number = mav.MAV_CMD_REQUEST_MESSAGE
+        self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *params))
+        return self.wait(name)
+
     def mode(self) -> int:
         """The mode that flies, by CURRENT_MODE."""
-        self.command(mav.MAV_CMD_REQUEST_MESSAGE, CURRENT_MODE)
-        return decode_current_mode(self.wait(f"UNKNOWN_{CURRENT_MODE}")).custom_mode
+        name = f"UNKNOWN_{CURRENT_MODE}"
+        return decode_current_mode(self.request(CURRENT_MODE, name)).custom_mode
 
     def track(self, hz: float = 50) -> None:
         """Stream modes, attitude, position and landed state fast."""
@@ -185,9 +193,14 @@ class Px4Companion(Companion):
 
     def texts(self) -> list[str]:
         """Status texts since the last call, without the tab at their end."""
-        texts = [m.text.rstrip("\t") for m in named(self.seen, "STATUSTEXT")]
+        texts: list[str] = []
+        for message in named(self.seen, "STATUSTEXT"):
+            if message.chunk_seq:
+                texts[-1] += message.text
+            else:
+                texts.append(message.text)
         self.seen.clear()
-        return texts
+        return [text.rstrip("\t") for text in texts]
 
     def get_int(self, name: str) -> int:
         self.send(mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
@@ -212,8 +225,9 @@ class Px4Companion(Companion):
             self._write(name, kind, packed)
         self.set_mode(LOITER)
         for _ in range(20):
-            self.command(mav.MAV_CMD_REQUEST_MESSAGE, mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE)
-            if self.wait("EXTENDED_SYS_STATE").landed_state == mav.MAV_LANDED_STATE_ON_GROUND:
+            message_id = mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE
+            state = self.request(message_id, "EXTENDED_SYS_STATE")
+            if state.landed_state == mav.MAV_LANDED_STATE_ON_GROUND:
                 break
             self.advance(0.5)
         self.advance(2.0)

@@ -213,9 +213,9 @@ def test_engagement_and_release_are_told_to_every_ground_station() -> None:
     flight.run(0.5)
 
     texts = [m.text for _, m in flight.left() if m.get_type() == "STATUSTEXT"]
-    assert texts[0] == "mavbridge: the policy has the sticks"
+    assert texts[0] == "mavbridge: the policy has control"
     said = "".join(texts[1:])
-    assert said == "mavbridge: sticks given back: mode changed from ALT_HOLD to LOITER"
+    assert said == "mavbridge: control given back: mode changed from ALT_HOLD to LOITER"
 
 
 def test_a_flag_that_contradicts_itself_is_refused() -> None:

@@ -101,9 +101,11 @@ class Codec:
         self._mav.seq = (self._mav.seq + 1) % 256
         return data
 
-    def encode_heartbeat(self) -> bytes:
-        """HEARTBEAT of an onboard controller, which no vehicle mistakes for a ground station."""
-        kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
+    def encode_heartbeat(self, kind: int | None = None) -> bytes:
+        """HEARTBEAT of a MAV_TYPE; None: an onboard controller, which no vehicle mistakes for a
+        ground station."""
+        kind = dialect.MAV_TYPE_ONBOARD_CONTROLLER if kind is None else kind
+        autopilot = dialect.MAV_AUTOPILOT_INVALID
         state = dialect.MAV_STATE_ACTIVE
         return self._pack(self._mav.heartbeat_encode(kind, autopilot, 0, 0, state))
 

@@ -6,20 +6,18 @@ from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.outputs.manual_control import ManualControlOutput
 from mavbridge.mavlink.outputs.output import ActionOutput
 from mavbridge.mavlink.outputs.override import OverrideOutput
+from mavbridge.mavlink.profiles.profile import Profile
 
 
 def choose_output(
-    meaning: ActionMeaning, wanted: Output | None, *, autopilot: str, codec: Codec
+    meaning: ActionMeaning, wanted: Output | None, *, profile: Profile, codec: Codec
 ) -> ActionOutput:
     """The output that was asked for, or the usual one of such actions and this vehicle.
 
     Raises:
         PeerError: this vehicle cannot be flown with it.
     """
-    is_px4 = autopilot == "px4"
-    name = wanted or ("manual-control" if is_px4 else "rc-override")
-    if name == "rc-override" and is_px4:
-        raise PeerError("PX4 cannot release an RC_CHANNELS_OVERRIDE: use --output manual-control")
-    if name == "manual-control" and not is_px4:
-        raise PeerError("ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override")
-    return ManualControlOutput(codec) if is_px4 else OverrideOutput(codec)
+    name = wanted or profile.outputs[meaning.kind]
+    if (refusal := profile.refusals.get(name)) is not None:
+        raise PeerError(refusal)
+    return ManualControlOutput(codec) if name == "manual-control" else OverrideOutput(codec)

@@ -85,7 +85,7 @@ class ArduPilot(Profile):
         if output in ("attitude", "rates"):
             return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
         if output == "velocity":
-            return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, is_steady=False)
+            return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, least_hz=0.0)
         legacy = dialect.MAV_DATA_STREAM_RC_CHANNELS
         return StreamGroup(("RC_CHANNELS",), legacy, RC_CHANNELS_HZ)
 
@@ -96,7 +96,8 @@ class ArduPilot(Profile):
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
         """Calibration, and what decides how safe a flight is."""
-        return (*ardupilot_params.calibration_names(values), *ardupilot_params.RISK_NAMES)
+        names = ardupilot_params.calibration_names(values)
+        return (*names, *ardupilot_params.RISK_NAMES, "GUID_OPTIONS")
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration:
         """RCMAP_* and RCn_*."""

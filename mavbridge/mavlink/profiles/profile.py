@@ -23,13 +23,24 @@ class StreamGroup(NamedTuple):
     rate_hz: float
     is_optional: bool = False
     """Nothing waits for it: a vehicle that does not grant it is flown without."""
-    is_steady: bool = True
-    """It comes all the time; False: only when something is new, so that silence says nothing."""
+    least_hz: float | None = None
+    """It comes only when something is new, and at least so often; below this it is asked for again.
+    None: it comes all the time, and a share of ``rate_hz`` decides."""
 
 
-def optional_stream(message: str, rate_hz: float, *, is_steady: bool = True) -> StreamGroup:
+def optional_stream(message: str, rate_hz: float, *, least_hz: float | None = None) -> StreamGroup:
     """Group of one message that no flight waits for."""
-    return StreamGroup((message,), None, rate_hz, is_optional=True, is_steady=is_steady)
+    return StreamGroup((message,), None, rate_hz, is_optional=True, least_hz=least_hz)
+
+
+class EventMeaning(NamedTuple):
+    """What an EVENT says about the vehicle."""
+
+    is_armed: bool | None = None
+    """None: it does not say."""
+    is_failsafe: bool = False
+    text: str | None = None
+    """For the user, where no STATUSTEXT says it."""
 
 
 class Danger(NamedTuple):
@@ -71,6 +82,10 @@ class Profile(ABC):
     """An integer parameter stands byte for byte in the float of PARAM_VALUE and PARAM_SET."""
     sends_invalid_estimates: ClassVar[bool] = False
     """LOCAL_POSITION_NED comes without a valid estimate too: the estimator's flags decide."""
+    has_rc_channels_always: ClassVar[bool] = True
+    """RC_CHANNELS comes without a receiver too."""
+    events: ClassVar[Mapping[int, EventMeaning]] = {}
+    """Meaning of those EVENTs that matter."""
     params: ClassVar[tuple[str, ...]]
     """Parameters to read first, those of other versions of the firmware included."""
 
@@ -104,6 +119,10 @@ class Profile(ABC):
     def override_switch(self, values: Mapping[str, float]) -> int | None:
         """Number of the radio channel that enables overrides, or None."""
         return None
+
+    def ignores_receiver(self, values: Mapping[str, float]) -> bool:
+        """The sticks of a receiver move nothing, even if there is one."""
+        return False
 
     @abstractmethod
     def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:

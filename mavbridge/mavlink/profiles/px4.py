@@ -11,6 +11,7 @@ from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.modes import ModeTable
 from mavbridge.mavlink.profiles.profile import (
     Danger,
+    EventMeaning,
     ParamContext,
     Profile,
     StreamGroup,
@@ -64,6 +65,28 @@ _MODES = ModeTable(
 )
 
 
+def event_id(name: str) -> int:
+    """Number of an EVENT of the autopilot: 1 in the highest byte, then the low 24 bits of the
+    32-bit FNV-1a hash of its name (PX4's guide to its events interface)."""
+    number = 0x811C9DC5
+    for byte in name.encode():
+        number = (number ^ byte) * 0x01000193 & 0xFFFFFFFF
+    return 1 << 24 | number & 0xFFFFFF
+
+
+_EVENTS = {
+    "commander_armed_by": EventMeaning(is_armed=True),
+    "commander_disarmed_by": EventMeaning(is_armed=False),
+    "commander_failsafe_enter": EventMeaning(is_failsafe=True),
+    "commander_failsafe_enter_hold": EventMeaning(is_failsafe=True),
+    "commander_failsafe_enter_generic": EventMeaning(is_failsafe=True),
+    "commander_failsafe_enter_generic_hold": EventMeaning(is_failsafe=True),
+    "commander_failsafe_enter_autopilot_disengaged": EventMeaning(is_failsafe=True),
+    "commander_rc_lost": EventMeaning(text="manual control lost"),
+    "commander_rc_regained": EventMeaning(text="manual control regained"),
+}
+
+
 class Px4(Profile):
     """PX4 as measured: sticks as MANUAL_CONTROL, setpoints in OFFBOARD."""
 
@@ -81,14 +104,18 @@ class Px4(Profile):
     heartbeat_type = dialect.MAV_TYPE_GCS
     """It sends STATUSTEXT only on links on which it hears a ground station."""
     is_bytewise = True
+    has_rc_channels_always = False
+    events: ClassVar[Mapping[int, EventMeaning]] = {
+        event_id(name): meaning for name, meaning in _EVENTS.items()
+    }
     sends_invalid_estimates = True
     params = (
         *("COM_RC_IN_MODE", "COM_RC_LOSS_T", "COM_RCL_EXCEPT", "NAV_RCL_ACT", "COM_FAIL_ACT_T"),
         *("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_DISARM_PRFLT", "COM_DISARM_LAND"),
-        *("MAN_ARM_GESTURE", "MAN_DEADZONE", "MAN_OVERRIDE_SPD", "NAV_DLL_ACT"),
+        *("MAN_ARM_GESTURE", "MAN_OVERRIDE_SPD", "NAV_DLL_ACT", "MPC_THR_HOVER"),
+        *("MIS_TAKEOFF_ALT", "MPC_XY_MAN_EXPO", "MPC_VEL_MANUAL"),
         *("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_YAW_EXPO", "MPC_Z_MAN_EXPO"),
-        *("MPC_XY_MAN_EXPO", "MPC_HOLD_DZ", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN"),
-        *("MPC_VEL_MANUAL", "MPC_THR_HOVER", "MIS_TAKEOFF_ALT"),
+        *("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_DEADZONE", "MPC_HOLD_DZ"),
     )
 
     def streams(self, *, state_hz: float) -> tuple[StreamGroup, ...]:
@@ -99,12 +126,12 @@ class Px4(Profile):
             StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), None, fast_hz),
             StreamGroup(("LOCAL_POSITION_NED",), None, slow_hz),
             StreamGroup(("HIGHRES_IMU", "SCALED_IMU"), None, fast_hz),
-            optional_stream("CURRENT_MODE", CURRENT_MODE_HZ, is_steady=False),
-            optional_stream("RC_CHANNELS", 20.0, is_steady=False),
+            optional_stream("CURRENT_MODE", CURRENT_MODE_HZ, least_hz=1.0),
+            optional_stream("RC_CHANNELS", 20.0, least_hz=0.0),
             optional_stream("SYS_STATUS", 2.0),
             optional_stream("EXTENDED_SYS_STATE", 5.0),
             optional_stream("ESTIMATOR_STATUS", 5.0),
-            optional_stream("GLOBAL_POSITION_INT", 2.0, is_steady=False),
+            optional_stream("GLOBAL_POSITION_INT", 2.0, least_hz=0.0),
         )
 
     def echo(self, output: Output) -> StreamGroup:
@@ -112,8 +139,16 @@ class Px4(Profile):
         if output in ("attitude", "rates"):
             return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
         if output == "velocity":
-            return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, is_steady=False)
-        return optional_stream("MANUAL_CONTROL", FAST_HZ, is_steady=False)
+            return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, least_hz=0.0)
+        return optional_stream("MANUAL_CONTROL", FAST_HZ, least_hz=0.0)
+
+    def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """What decides whether it hears our sticks at all."""
+        return ("COM_RC_IN_MODE",)
+
+    def ignores_receiver(self, values: Mapping[str, float]) -> bool:
+        """COM_RC_IN_MODE 1 takes sticks from MAVLink alone, 4 from nowhere."""
+        return values.get("COM_RC_IN_MODE") in (1.0, 4.0)
 
     def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
         """COM_RC_IN_MODE without MAVLink's sticks."""

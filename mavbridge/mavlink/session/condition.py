@@ -7,18 +7,32 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
+    Altitude,
+    CurrentMode,
     EstimatorFlags,
+    Event,
     Heartbeat,
     LandedState,
     LocalVelocity,
     RcChannels,
     SystemStatus,
 )
-from mavbridge.mavlink.session.modes import ModeTable
+from mavbridge.mavlink.profiles.profile import Profile
 
 ConditionMessage: TypeAlias = (
-    Heartbeat | LocalVelocity | SystemStatus | LandedState | EstimatorFlags
+    Heartbeat
+    | CurrentMode
+    | Event
+    | LocalVelocity
+    | Altitude
+    | SystemStatus
+    | LandedState
+    | EstimatorFlags
 )
+
+SETTLE_NS = 100 * NS_PER_MS
+"""A HEARTBEAT this soon after a change that CURRENT_MODE or an EVENT has told may be older than the
+change: the autopilot tells it before its heartbeats know, and a network may swap packets."""
 
 POSITION_FRESH_NS = 500 * NS_PER_MS
 SLOW_FRESH_NS = 2 * NS_PER_S
@@ -31,11 +45,16 @@ _HORIZONTAL_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_H
 class VehicleCondition:
     """Joins the slow messages of one vehicle into one ``VehicleStatus``."""
 
-    def __init__(self, *, autopilot: str, min_battery_percent: float) -> None:
-        self._is_px4 = autopilot == "px4"
+    def __init__(self, profile: Profile, *, min_battery_percent: float) -> None:
+        self._profile = profile
         self._min_battery_percent = min_battery_percent
-        self.modes = ModeTable(autopilot=autopilot)
         self.heartbeat: tuple[int, Heartbeat] | None = None
+        self._custom_mode = 0
+        self._is_armed = False
+        self._is_failsafe = False
+        self._changed_ns: int | None = None
+        """When CURRENT_MODE or an EVENT has last told a change."""
+        self._altitude: tuple[int, float] | None = None
         self.rc: tuple[int, RcChannels] | None = None
         self._rc_sticks: Sticks | None = None
         self._pilot_sticks: Sticks | None = None
@@ -52,7 +71,13 @@ class VehicleCondition:
         """Take a message; ``may_be_ours``: an override was sent, and hides the receiver."""
         match body:
             case Heartbeat():
-                self.heartbeat = (arrived_ns, body)
+                self._receive_heartbeat(body, arrived_ns)
+            case CurrentMode():
+                self._receive_mode(body, arrived_ns)
+            case Event(event_id):
+                self._receive_event(event_id, arrived_ns)
+            case Altitude(amsl_m):
+                self._altitude = (arrived_ns, amsl_m)
             case LocalVelocity():
                 self._position = (arrived_ns, body)
             case LandedState():
@@ -64,6 +89,38 @@ class VehicleCondition:
                 bit = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
                 if not may_be_ours and body.present & bit:
                     self._is_rc_healthy = bool(body.healthy & bit)
+
+    def _receive_heartbeat(self, body: Heartbeat, arrived_ns: int) -> None:
+        is_first, self.heartbeat = self.heartbeat is None, (arrived_ns, body)
+        changed_ns = self._changed_ns
+        if changed_ns is not None and arrived_ns - changed_ns < SETTLE_NS and not is_first:
+            return
+        self._custom_mode = body.custom_mode
+        self._is_armed = bool(body.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+        self._is_failsafe = body.system_status >= dialect.MAV_STATE_CRITICAL
+
+    def _receive_mode(self, body: CurrentMode, arrived_ns: int) -> None:
+        """Take CURRENT_MODE, which also tells that the vehicle has left the mode by itself."""
+        if self.heartbeat is None:
+            return
+        if body.custom_mode != self._custom_mode:
+            self._custom_mode, self._changed_ns = body.custom_mode, arrived_ns
+        intended = body.intended_custom_mode
+        if self._is_armed and intended and intended != body.custom_mode:
+            self._note_failsafe(arrived_ns)
+
+    def _receive_event(self, event_id: int, arrived_ns: int) -> None:
+        meaning = self._profile.events.get(event_id)
+        if meaning is None or self.heartbeat is None:
+            return
+        if meaning.is_armed is not None:
+            self._is_armed, self._changed_ns = meaning.is_armed, arrived_ns
+        if meaning.is_failsafe:
+            self._note_failsafe(arrived_ns)
+
+    def _note_failsafe(self, arrived_ns: int) -> None:
+        if not self._is_failsafe:
+            self._is_failsafe, self._changed_ns = True, arrived_ns
 
     def receive_rc(
         self,
@@ -97,10 +154,16 @@ class VehicleCondition:
         return self.rc is not None and self._system is not None
 
     def is_velocity_usable(self, now_ns: int) -> bool:
-        """False for the velocity that PX4 goes on sending without a valid estimate."""
+        """False for a velocity that the firmware goes on sending without a valid estimate."""
         flags = self._flags(now_ns)
         is_valid = flags is None or bool(flags & dialect.ESTIMATOR_VELOCITY_HORIZ)
-        return is_valid or not self._is_px4
+        return is_valid or not self._profile.sends_invalid_estimates
+
+    def amsl_m(self, now_ns: int) -> float | None:
+        """Height above mean sea level; None without a fresh one."""
+        if self._altitude is None or now_ns - self._altitude[0] > SLOW_FRESH_NS:
+            return None
+        return self._altitude[1]
 
     def _flags(self, now_ns: int) -> int | None:
         if self._estimator is None or now_ns - self._estimator[0] > SLOW_FRESH_NS:
@@ -111,16 +174,15 @@ class VehicleCondition:
         """The vehicle's own report; None before its first heartbeat."""
         if self.heartbeat is None:
             return None
-        heartbeat = self.heartbeat[1]
         rc_ns, rc = self.rc or (None, RcChannels(()))
         is_valid = self._is_position_valid(now_ns)
         return VehicleStatus(
-            mode=self.modes.name(heartbeat.custom_mode),
-            armed=bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED),
+            mode=self._profile.modes.name(self._custom_mode),
+            armed=self._is_armed,
             rc_sticks=self._rc_sticks,
             rc_channels_us=rc.channels_us,
             rc_arrived_ns=rc_ns,
-            is_failsafe=heartbeat.system_status >= dialect.MAV_STATE_CRITICAL,
+            is_failsafe=self._is_failsafe,
             is_landed=self._is_landed(now_ns),
             has_receiver=self.has_receiver,
             pilot_sticks=self._pilot_sticks,
@@ -139,8 +201,9 @@ class VehicleCondition:
     def _position_ned_m(
         self, now_ns: int, is_valid: bool | None
     ) -> tuple[float, float, float] | None:
-        """The position; PX4 sends one without an estimate too, ArduPilot does not."""
-        is_good = is_valid is True or (is_valid is None and not self._is_px4)
+        """The position, if it is one: some firmware sends it without a valid estimate too."""
+        is_trusted = is_valid is None and not self._profile.sends_invalid_estimates
+        is_good = is_valid is True or is_trusted
         if self._position is None or not is_good:
             return None
         arrived_ns, body = self._position

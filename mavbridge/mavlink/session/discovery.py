@@ -19,10 +19,6 @@ _NOT_VEHICLES = (
     *(dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_TYPE_GIMBAL),
     *(dialect.MAV_TYPE_ADSB, dialect.MAV_TYPE_CAMERA, dialect.MAV_TYPE_ANTENNA_TRACKER),
 )
-_AUTOPILOTS = {
-    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
-    dialect.MAV_AUTOPILOT_PX4: "px4",
-}
 _CAPACITY = 64
 _NAMESAKES = 16
 _NAMESAKE_ADVICE = "give it another system id, or keep it off this port"
@@ -35,7 +31,8 @@ class VehicleIdentity:
     source: Endpoint
     address: Address | None
     vehicle_type: int
-    autopilot: str
+    autopilot: int
+    """MAV_AUTOPILOT."""
 
     @property
     def place(self) -> str:
@@ -71,7 +68,7 @@ class VehicleDiscovery:
             source=source,
             address=address,
             vehicle_type=heartbeat.vehicle_type,
-            autopilot=_AUTOPILOTS.get(heartbeat.autopilot, "generic"),
+            autopilot=heartbeat.autopilot,
         )
         if vehicle in self._heard_ns or len(self._heard_ns) < _CAPACITY:
             self._heard_ns[vehicle] = now_ns

@@ -1,11 +1,14 @@
 """Requests telemetry at the rate of the action loop, and again whenever it slows down."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from enum import Enum, auto
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.mavlink.codec.fast_path import MISSING_IDS
 from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Request, StreamRequest
+from mavbridge.mavlink.profiles.profile import StreamGroup
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
 _ATTEMPTS = 4
@@ -14,46 +17,25 @@ _WATCH_NS = 2 * NS_PER_S
 _UNDECIDED = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_IN_PROGRESS)
 _ENOUGH = 0.7
 """Share of the granted rate below which another station is assumed to have changed it."""
+_ALIKE = 0.2
+"""Streams whose shares differ by less than this part of their mean have one cause."""
+_SCALED_WINDOWS = 2
+"""So many windows in a row at one share are a link that is full; one may be a hiccup."""
+_LOSSY = 0.1
+"""Share of lost packets above which loss explains low rates."""
+_HEADROOM = 0.9
+"""Of what a full link was seen to carry, as much is asked for again."""
+_FAST_HZ = 10.0
+"""Slower streams cost little, and stay as they are."""
 
 
-class StreamGroup(NamedTuple):
-    """One quantity: the messages that carry it, best first, and its legacy stream."""
+class _Fit(Enum):
+    """What has been done about a link that is full."""
 
-    messages: tuple[str, ...]
-    stream: int
-    rate_hz: float
-    is_optional: bool = False
-    """Nothing waits for it: a vehicle that does not grant it is flown without."""
-
-
-RC_CHANNELS_HZ = 1000 / 17
-"""RC_CHANNELS for the echo check, which needs 20 Hz or more: every 17 ms (ArduPilot counts in whole
-ms), so that no usual rate of a joystick (10, 20, 25, 50 Hz) is in step with it and stays unseen
-between two samples. Costs 3.2 kB/s."""
-LANDED_HZ, ESTIMATOR_HZ, SYSTEM_HZ = 5.0, 5.0, 2.0
-HEARTBEAT_HZ = 10.0
-"""Shows arming and a change of mode within 100 ms where one packet is lost (at 1 Hz within 1 s).
-ArduPilot grants it, PX4 does not."""
-
-
-def telemetry_streams(*, state_hz: float, is_px4: bool) -> tuple[StreamGroup, ...]:
-    """The telemetry that the bridge needs, then what it also watches."""
-    attitude, imu = ("ATTITUDE_QUATERNION", "ATTITUDE"), ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
-    return (
-        StreamGroup(attitude, dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
-        StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
-        StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
-        StreamGroup(("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, RC_CHANNELS_HZ),
-        _optional("SYS_STATUS", SYSTEM_HZ),
-        _optional("EXTENDED_SYS_STATE", LANDED_HZ),
-        _optional("ESTIMATOR_STATUS" if is_px4 else "EKF_STATUS_REPORT", ESTIMATOR_HZ),
-        *(() if is_px4 else (_optional("HEARTBEAT", HEARTBEAT_HZ),)),
-    )
-
-
-def _optional(message: str, rate_hz: float) -> StreamGroup:
-    """Group of one message; its legacy stream, which would also set other messages, is not used."""
-    return StreamGroup((message,), 0, rate_hz, is_optional=True)
+    UNTRIED = auto()
+    LOWERED = auto()
+    GIVEN_UP = auto()
+    """Others fill the link: what we ask for less, they get."""
 
 
 class _Stream:
@@ -72,9 +54,9 @@ class _Stream:
     def request(self) -> Request:
         """The next request to send: REQUEST_DATA_STREAM once no message interval was accepted."""
         self.attempts += 1
-        if self._choice >= len(self.group.messages):
-            return StreamRequest(self.group.stream, round(self.group.rate_hz))
-        number = message_id(self.group.messages[self._choice])
+        if self._choice >= len(self.group.messages) and self.group.stream is not None:
+            return StreamRequest(self.group.stream, max(round(self.rate_hz), 1))
+        number = message_id(self.group.messages[self._choice % len(self.group.messages)])
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
     def accept(self) -> None:
@@ -102,34 +84,67 @@ class _Stream:
     def _give_up(self) -> None:
         self.is_settled = self.is_given_up = True
 
+    def share(self, span_s: float) -> float:
+        """Part of the granted rate at which it came."""
+        return self.received / (self.rate_hz * span_s)
+
+    def is_slow(self, span_s: float) -> bool:
+        least_hz = self.group.least_hz
+        least_hz = _ENOUGH * self.rate_hz if least_hz is None else least_hz
+        return not self.is_given_up and self.received < least_hz * span_s
+
 
 def message_id(name: str) -> int:
     """Number of a MAVLink message."""
-    number: int = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
+    number: int = MISSING_IDS.get(name) or getattr(dialect, f"MAVLINK_MSG_ID_{name}")
     return number
 
 
 class StreamRequester:
-    """Keeps all groups coming; one request is open at a time, since acks carry no message id."""
+    """Keeps all groups coming; one request is open at a time, since acks carry no message id.
 
-    def __init__(self, wanted: tuple[StreamGroup, ...]) -> None:
-        self._streams = [_Stream(group) for group in wanted]
-        self._by_message = {
-            name: stream for stream in self._streams for name in stream.group.messages
-        }
+    A vehicle slows all streams of a link that is too slow for them down alike, and says nothing:
+    they are then asked for at a rate that fits, once, and ``report`` gets a text for the user. If
+    that does not help, they are asked for as before, and what comes has to do.
+    """
+
+    def __init__(
+        self, wanted: tuple[StreamGroup, ...], *, report: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self._report = report
+        self._streams: list[_Stream] = []
+        self._by_message: dict[str, _Stream] = {}
         self._pending: _Stream | None = None
         self._requested_ns = 0
         self._window_ns: int | None = None
         """Start of the window in which messages are counted; None while requests are open."""
+        self._sequence: int | None = None
+        self._received = self._lost = 0
+        """Packets of any kind in this window."""
+        self._scaled_windows = 0
+        self._fit = _Fit.UNTRIED
         self.renewals = 0
+        for group in wanted:
+            self.add(group)
+
+    def add(self, group: StreamGroup) -> None:
+        """Keep this group coming too, unless its message is kept coming already."""
+        if group.messages[0] not in self._by_message:
+            stream = _Stream(group)
+            self._streams.append(stream)
+            self._by_message |= dict.fromkeys(group.messages, stream)
 
     @property
     def is_settled(self) -> bool:
         """Every group that is needed is granted."""
         return all(stream.is_settled or stream.group.is_optional for stream in self._streams)
 
-    def receive(self, name: str) -> None:
+    def receive(self, name: str, sequence: int) -> None:
         """Count one message."""
+        if self._sequence is not None:
+            self._lost += (sequence - self._sequence - 1) % 256
+        self._sequence = sequence
+        self._received += 1
         if (stream := self._by_message.get(name)) is not None:
             stream.received += 1
 
@@ -170,12 +185,50 @@ class StreamRequester:
         if self._window_ns is not None:
             if now_ns - self._window_ns < _WATCH_NS:
                 return
-            span_s = (now_ns - self._window_ns) / NS_PER_S
-            for stream in self._streams:
-                is_slow = stream.received < _ENOUGH * stream.rate_hz * span_s
-                if is_slow and not stream.is_given_up:
-                    stream.is_settled = False
-                    self.renewals += not stream.group.is_optional
+            self._judge((now_ns - self._window_ns) / NS_PER_S)
         self._window_ns = now_ns
+        self._received = self._lost = 0
         for stream in self._streams:
             stream.received = 0
+
+    def _judge(self, span_s: float) -> None:
+        """Ask again for what came too slowly in a window."""
+        share = self._common_share(span_s)
+        self._scaled_windows = self._scaled_windows + 1 if share is not None else 0
+        if share is not None and self._fit is _Fit.GIVEN_UP:
+            return
+        if share is not None and self._scaled_windows >= _SCALED_WINDOWS:
+            self._fit_rates(share)
+            return
+        for stream in self._streams:
+            if stream.is_slow(span_s):
+                stream.is_settled = False
+                self.renewals += not stream.group.is_optional
+
+    def _common_share(self, span_s: float) -> float | None:
+        """The part of their rates at which all needed streams came, if a full link explains it."""
+        needed = [stream.share(span_s) for stream in self._streams if not stream.group.is_optional]
+        shares = [share for share in needed if share > 0]  # one without an estimate stays silent
+        if len(shares) < 2 or self._lost > _LOSSY * (self._lost + self._received):
+            return None
+        mean = sum(shares) / len(shares)
+        is_alike = max(shares) - min(shares) <= _ALIKE * mean
+        return mean if is_alike and mean < _ENOUGH else None
+
+    def _fit_rates(self, share: float) -> None:
+        """Ask for as much as the link carries; for all again, if that was tried before."""
+        self._scaled_windows = 0
+        is_first = self._fit is _Fit.UNTRIED
+        self._fit = _Fit.LOWERED if is_first else _Fit.GIVEN_UP
+        factor = share * _HEADROOM
+        for stream in self._streams:
+            if stream.group.rate_hz > _FAST_HZ:
+                stream.rate_hz = stream.rate_hz * factor if is_first else stream.group.rate_hz
+                stream.is_settled = stream.is_given_up
+        if is_first:
+            wanted_hz, now_hz = self._streams[0].group.rate_hz, self._streams[0].rate_hz
+            self._report(
+                f"the link carries only {share:.0%} of the telemetry that was asked for, which now "
+                f"is asked for at {now_hz:.3g} Hz instead of {wanted_hz:.3g} Hz: use a faster link "
+                "(a higher baud rate; MAV_n_RATE on PX4), or a lower --action-rate"
+            )

@@ -10,34 +10,32 @@ from dataclasses import replace
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import PeerError
-from mavbridge.core.vehicle import VehicleStatus
+from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
     Attitude,
     AutopilotVersion,
     CommandAck,
     CommandRequest,
-    EstimatorFlags,
-    Heartbeat,
-    LandedState,
-    LocalVelocity,
+    Event,
+    ParamAbsent,
     ParamValue,
     RcChannels,
     ReceivedMessage,
     Request,
     StatusText,
-    SystemStatus,
 )
+from mavbridge.mavlink.profiles.choice import require_profile
 from mavbridge.mavlink.session.condition import ConditionMessage, VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
-from mavbridge.mavlink.session.streams import StreamRequester, message_id, telemetry_streams
+from mavbridge.mavlink.session.streams import StreamRequester, message_id
+from mavbridge.mavlink.session.texts import TextJoiner
 from mavbridge.mavlink.settings import LinkSettings
 
 RECEIVER_WAIT_NS = 2 * NS_PER_S
 """Longest wait, once streams are granted, for RC_CHANNELS and SYS_STATUS to show a receiver:
-SYS_STATUS comes at 2 Hz, and PX4 sends RC_CHANNELS only if it has one."""
+SYS_STATUS comes at 2 Hz, and some firmware sends RC_CHANNELS only if it has one."""
 HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
 """Heartbeats come at 1 Hz: a vehicle that loses three in a row is lost."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
@@ -48,11 +46,6 @@ _REBOOT_STAMPS = 2
 """One old stamp may be a delayed datagram; two in a row are a clock that has restarted."""
 _SWITCH_ON_US, _SWITCH_OFF_US = 1800, 1200
 """ArduPilot's thresholds of a high and a low auxiliary switch; between them nothing changes."""
-_MULTIROTORS = (
-    *(dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_HEXAROTOR, dialect.MAV_TYPE_OCTOROTOR),
-    *(dialect.MAV_TYPE_TRICOPTER, dialect.MAV_TYPE_COAXIAL),
-    *(dialect.MAV_TYPE_DECAROTOR, dialect.MAV_TYPE_DODECAROTOR),
-)
 
 
 class VehicleSession:
@@ -72,13 +65,13 @@ class VehicleSession:
         *,
         report: Callable[[str], None],
     ) -> None:
-        _require_multirotor(identity.vehicle_type)
-        self._is_px4 = identity.autopilot == "px4"
+        self.profile = require_profile(identity.autopilot, identity.vehicle_type)
         self.identity = identity
         self._report = report
         self.condition = VehicleCondition(
-            autopilot=identity.autopilot, min_battery_percent=config.min_battery_percent
+            self.profile, min_battery_percent=config.min_battery_percent
         )
+        self._texts = TextJoiner()
         self.is_receiver_hidden = False
         """Our sticks may stand in RC_CHANNELS in place of the receiver's."""
         self.is_released = True
@@ -87,15 +80,22 @@ class VehicleSession:
         self._unique_id = ""
         self._version_attempts = 0
         self._version_due_ns = 0
-        streams = telemetry_streams(state_hz=config.state_hz, is_px4=self._is_px4)
-        self._streams = StreamRequester(streams)
-        self._params = VehicleParams(identity, config, streams=streams, report=report)
+        streams = self.profile.streams(state_hz=config.state_hz)
+        self._streams = StreamRequester(streams, report=report)
+        self._params = VehicleParams(
+            self.profile, identity.source.system, config, streams=streams, report=report
+        )
         self._receiver_due_ns: int | None = None
         """End of the wait for a receiver to show; None until the streams are granted."""
         self._is_switch_on = False
         """Override switch; between high and low it stays as it was, as in the vehicle."""
         self._boot_ms = 0
         self._old_stamps = 0
+
+    def use_output(self, output: Output) -> None:
+        """Fly with this output from now on: its echo is asked for, its demands are checked."""
+        self._params.use_output(output)
+        self._streams.add(self.profile.echo(output))
 
     @property
     def has_rebooted(self) -> bool:
@@ -104,29 +104,31 @@ class VehicleSession:
 
     def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
         """Take one message from this vehicle."""
-        self._streams.receive(message.name)
-        match message.body:
-            case Attitude() as body:
+        self._streams.receive(message.name, message.sequence)
+        body = message.body
+        if isinstance(body, ConditionMessage):
+            self.condition.receive(body, arrived_ns, may_be_ours=self.is_receiver_hidden)
+        match body:
+            case Attitude():
                 self._watch_boot(body.boot_us // 1000)
-            case (
-                Heartbeat() | SystemStatus() | LandedState() | EstimatorFlags() | LocalVelocity()
-            ) as body:
-                self._receive_condition(body, arrived_ns)
-            case RcChannels() as body:
+            case RcChannels():
                 self._receive_rc(body, arrived_ns)
-            case CommandAck() as body:
+            case CommandAck():
                 self._streams.receive_ack(body)
-            case ParamValue() as body:
+            case ParamValue():
                 self._params.receive(body, self.status(arrived_ns))
+            case ParamAbsent(name):
+                self._params.absent(name)
             case AutopilotVersion(version, unique_id):
                 self.version, self._unique_id = version, unique_id
-            case StatusText(text):
-                self._report(f"vehicle: {text}")
-            case _:
-                pass  # handled by the link, or not used
+            case StatusText():
+                self._show(*self._texts.receive(body, arrived_ns))
+            case Event(event_id) if (meaning := self.profile.events.get(event_id)) is not None:
+                self._show(*([meaning.text] if meaning.text else []))
 
-    def _receive_condition(self, body: ConditionMessage, arrived_ns: int) -> None:
-        self.condition.receive(body, arrived_ns, may_be_ours=self.is_receiver_hidden)
+    def _show(self, *texts: str) -> None:
+        for text in texts:
+            self._report(f"vehicle: {text}")
 
     def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
         calibration = self.calibration
@@ -134,7 +136,7 @@ class VehicleSession:
         self.condition.receive_rc(
             rc,
             arrived_ns,
-            # Without a calibration (PX4) the sticks are among the first four by custom.
+            # Without a calibration the sticks are among the first four by custom.
             channels_us=rc.channels_us[:4] if pwm_us is None else pwm_us,
             sticks=calibration.to_sticks(pwm_us)
             if calibration and pwm_us and all(pwm_us)
@@ -156,6 +158,7 @@ class VehicleSession:
 
     def step(self, now_ns: int) -> Iterator[Request]:
         """Requests that are due."""
+        self._show(*self._texts.step(now_ns))
         is_version_open = self.version is None and self._version_attempts < _VERSION_ATTEMPTS
         if is_version_open and now_ns >= self._version_due_ns:
             self._version_due_ns = now_ns + _VERSION_TIMEOUT_NS
@@ -216,20 +219,26 @@ class VehicleSession:
     def status(self, now_ns: int) -> VehicleStatus | None:
         """The vehicle's own report; None before its first heartbeat."""
         status = self.condition.status(now_ns)
-        is_absent = status is not None and status.has_receiver is None and self._is_px4
-        if status is not None and is_absent and self._is_receiver_settled(now_ns):
+        if status is None or not self._is_receiver_settled(now_ns):
+            return status
+        is_absent = status.has_receiver is None and not self.profile.has_rc_channels_always
+        if is_absent or (status.has_receiver and self._params.ignores_receiver):
             return replace(status, has_receiver=False)
         return status
 
     def problem(self, now_ns: int) -> str | None:
-        """The reason why it cannot be flown now, or None."""
+        """The reason why it cannot be flown now, whatever the output, or None."""
         if self.condition.heartbeat is None:
             return "waiting for the vehicle's heartbeat"
         if now_ns - self.condition.heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
             return "the vehicle's heartbeat is lost"
         if (unfinished := self._unfinished(now_ns)) is not None:
             return unfinished
-        if (forbidden := self._params.problem(self.status(now_ns))) is not None:
+        return self._params.problem()
+
+    def output_problem(self, now_ns: int) -> str | None:
+        """The reason why it cannot be flown with the output now, or None."""
+        if (forbidden := self._params.output_problem(self.status(now_ns))) is not None:
             return forbidden
         switch = self._params.override_switch
         if switch is not None and not self._is_switch_on:
@@ -246,12 +255,3 @@ class VehicleSession:
         """The pilot's override switch is low: the vehicle ignores our sticks."""
         switch = self._params.override_switch
         return switch is not None and 0 < self._switch_us(switch) < _SWITCH_OFF_US
-
-
-def _require_multirotor(vehicle_type: int) -> None:
-    if vehicle_type not in _MULTIROTORS:
-        kind = dialect.enums["MAV_TYPE"].get(vehicle_type)
-        name = kind.name.removeprefix("MAV_TYPE_") if kind else "unknown"
-        raise PeerError(
-            f"the vehicle is a {name} (MAV_TYPE {vehicle_type}), and only multirotors are flown"
-        )

@@ -11,13 +11,14 @@ from mavbridge.mavlink.codec.messages import Endpoint
 from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
 from mavbridge.mavlink.transport.sockets import Address
 
-MAX_DATAGRAMS = 32
-"""From the ground station at one look; the rest waits for the next."""
+MAX_DATAGRAMS, MAX_PACKETS = 32, 100
+"""From the ground station at one look, whichever comes first; the rest waits for the next."""
 MAX_QUEUED_BYTES = 64 * 1024
 """For the ground station between two sends."""
 MAX_PACKED = 1200
 """Bytes in one datagram, below any usual MTU; what arrived larger leaves larger."""
-_MAX_DATAGRAM = 65535
+_MAX_DATAGRAM = 2048
+"""Of the ground station: what is longer than any usual MTU is cut off, and is not MAVLink."""
 _FORMS = "udp:HOST:PORT to send there, or udpin:HOST:PORT to listen"
 
 
@@ -95,8 +96,10 @@ class Forwarding:
             vehicle: who a refused command seems to be answered by; None: it is not answered.
             is_engaged: our sticks are in use, or being given back.
         """
-        now_ns = self._clock.now_ns()
+        now_ns, packets = self._clock.now_ns(), 0
         for _ in range(MAX_DATAGRAMS):
+            if packets >= MAX_PACKETS:
+                return
             try:
                 data, sender = self._socket.recvfrom(_MAX_DATAGRAM)
             except BlockingIOError:
@@ -106,6 +109,7 @@ class Forwarding:
             if not self._is_heard(sender):
                 continue
             frames, has_rest = split_frames(data)
+            packets += len(frames)
             self.rules.dropped += has_rest
             for frame in frames:
                 verdict = self.rules.judge(frame, now_ns, is_engaged=is_engaged)

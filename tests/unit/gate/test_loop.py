@@ -315,10 +315,10 @@ def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
     rig.link.change(mode="LOITER")
     rig.run(0.5)
     assert rig.link.announced == [
-        "mavbridge: the policy has the sticks",
-        "mavbridge: neutral sticks: the policy has failed",
+        "mavbridge: the policy has control",
+        "mavbridge: neutral: the policy has failed",
         "mavbridge: neutral sticks go on until you disarm or change the mode",
-        "mavbridge: sticks given back: the policy has failed; then mode changed from BRAKE to "
+        "mavbridge: control given back: the policy has failed; then mode changed from BRAKE to "
         "LOITER",
     ]
 

@@ -342,6 +342,15 @@ def test_a_flood_is_read_in_parts(forwarding_to: Any, station: socket.socket) ->
     assert len(received(forwarding)) == 5
 
 
+def test_long_datagrams_are_read_in_parts_too(forwarding_to: Any, station: socket.socket) -> None:
+    forwarding = forwarding_to("udp")
+    packet = bytes(GCS.heartbeat_encode(6, 8, 0, 0, 4).pack(GCS))
+    for _ in range(10):
+        station.sendto(packet * 40, ours(forwarding))
+
+    assert [len(received(forwarding)) for _ in range(5)] == [120, 120, 120, 40, 0]
+
+
 def test_what_does_not_fit_is_dropped_and_counted(forwarding_to: Any) -> None:
     forwarding = forwarding_to("udp")
     for _ in range(MAX_QUEUED_BYTES // 1000 + 10):

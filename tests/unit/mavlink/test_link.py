@@ -39,6 +39,7 @@ PARAMS = CALIBRATION | {
     "RC_OVERRIDE_TIME": 3.0,
     "RC_OPTIONS": 0.0,
     "FS_THR_ENABLE": 1.0,
+    "GUID_OPTIONS": 0.0,
 }
 
 
@@ -420,7 +421,7 @@ def test_readonly_sends_no_stick() -> None:
     rig.run(8.0)
     rig.run(1.0, Command(action=IDLE))
     assert rig.overrides() == []
-    rig.link.announce("mavbridge: the policy has the sticks")
+    rig.link.announce("mavbridge: the policy has control")
     rig.run(0.1)
     assert "STATUSTEXT" not in {message.get_type() for message in rig.vehicle.received}
 

@@ -1,20 +1,20 @@
 """Parameters: read, judged before a flight, watched in flight."""
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 
 from helpers.parameters import NAMES, ParamVehicle, lossy, status
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.errors import PeerError
-from mavbridge.core.vehicle import Risk
-from mavbridge.mavlink.codec.messages import Endpoint, ParamValue
-from mavbridge.mavlink.session.discovery import VehicleIdentity
-from mavbridge.mavlink.session.params import checks
+from mavbridge.core.vehicle import Output, Risk
+from mavbridge.mavlink.codec.messages import ParamValue, ParamWrite
+from mavbridge.mavlink.profiles import ardupilot_params
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.params.bandwidth import baud_danger
 from mavbridge.mavlink.session.params.reader import ParamReader
-from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
-from mavbridge.mavlink.session.streams import telemetry_streams
-from mavbridge.mavlink.settings import LinkSettings
 
 S = NS_PER_S
 
@@ -55,7 +55,7 @@ def test_a_parameter_that_nobody_needs_is_not_kept() -> None:
 
 
 def test_calibration_comes_from_the_vehicle() -> None:
-    ours = checks.calibration(
+    ours = ardupilot_params.calibration(
         CALIBRATION | {"RC2_REVERSED": 1.0, "RC2_TRIM": 1510.0, "RC1_DZ": 30.0}
     )
     assert ours.pitch.number == 2
@@ -113,7 +113,7 @@ def test_a_calibration_that_the_codec_would_refuse_later_cannot_be_accepted(
 def test_obstacles_are_read_from_parameters(
     values: dict[str, float], source_system: int, expected: str | None
 ) -> None:
-    found = list(checks.override_obstacles(values, source_system))
+    found = list(ardupilot_params.override_obstacles(values, source_system))
     if expected is None:
         assert found == []
     else:
@@ -122,8 +122,8 @@ def test_obstacles_are_read_from_parameters(
 
 
 def test_the_override_switch_is_found() -> None:
-    assert checks.override_switch({"RC7_OPTION": 46.0, "RC8_OPTION": 31.0}) == 7
-    assert checks.override_switch({"RC7_OPTION": 0.0}) is None
+    assert ardupilot_params.override_switch({"RC7_OPTION": 46.0, "RC8_OPTION": 31.0}) == 7
+    assert ardupilot_params.override_switch({"RC7_OPTION": 0.0}) is None
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_a_long_override_time_is_a_warning(time_s: float, is_advised: bool) -> N
 def test_a_serial_port_must_carry_states_and_sticks(
     baud: int | None, rate_hz: float, expected: str | None
 ) -> None:
-    streams = telemetry_streams(state_hz=rate_hz, is_px4=False)
+    streams = ARDUPILOT.streams(state_hz=rate_hz)
     found = baud_danger(baud, streams=streams, stick_hz=rate_hz)
     if expected is None:
         assert found is None
@@ -194,7 +194,7 @@ def test_a_serial_port_must_carry_states_and_sticks(
 
 
 def test_many_sticks_fill_a_port_that_carries_few_states() -> None:
-    streams = telemetry_streams(state_hz=10, is_px4=False)
+    streams = ARDUPILOT.streams(state_hz=10)
     assert baud_danger(115200, streams=streams, stick_hz=250) is None
     assert "230400" in (baud_danger(115200, streams=streams, stick_hz=400) or "")
 
@@ -204,24 +204,19 @@ def test_a_slow_serial_port_is_refused_for_both_autopilots(connect: str) -> None
     vehicle = ParamVehicle(connect=connect)
     vehicle.run(6.0)
     assert "or --accept-risk slow-serial" in (vehicle.problem() or "")
-    px4 = ParamVehicle(autopilot="px4", connect=connect)
+    px4 = px4_vehicle(connect=connect)
+    px4.run(6.0)
     assert "or --accept-risk slow-serial" in (px4.problem() or "")
-    fine = ParamVehicle(
-        autopilot="px4",
-        connect=connect,
-        accepted_risks=("slow-serial",),
-    )
+    fine = px4_vehicle(connect=connect, accepted_risks=("slow-serial",))
+    fine.run(6.0)
     assert fine.problem() is None
 
 
-def test_parameters_of_px4_are_neither_read_nor_set() -> None:
-    vehicle = ParamVehicle(autopilot="px4")
-    vehicle.run(3.0)
-    assert (vehicle.requests, vehicle.problem()) == ([], None)
-    identity = VehicleIdentity(source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot="px4")
-    settings = LinkSettings(set_params=(("A", 1.0),), state_folder=vehicle.folder)
-    with pytest.raises(PeerError, match="this is px4"):
-        VehicleParams(identity, settings, streams=(), report=vehicle.texts.append)
+def px4_vehicle(changes: dict[str, float | None] | None = None, **settings: Any) -> ParamVehicle:
+    values = {"COM_RC_IN_MODE": 1.0, "COM_RC_LOSS_T": 0.5, "NAV_RCL_ACT": 2.0}
+    values |= {name: value for name, value in (changes or {}).items() if value is not None}
+    output: Output = settings.pop("output", "manual-control")
+    return ParamVehicle(profile=PX4, output=output, values=values, **settings)
 
 
 def test_what_is_known_can_be_listed() -> None:
@@ -353,3 +348,75 @@ def test_a_vehicle_that_is_met_in_flight_is_read_as_well() -> None:
     assert vehicle.problem() is None
     assert vehicle.params.calibration is not None
     assert status(vehicle.armed, None).armed
+
+
+# --- outputs
+
+
+def test_all_is_read_before_the_output_is_known_and_nothing_is_read_twice() -> None:
+    vehicle = ParamVehicle({"RC_OVERRIDE_TIME": 3.0}, output=None)
+    vehicle.run(6.0)
+    assert vehicle.problem() is None
+    assert vehicle.texts == []  # nobody is advised about an output that may not be used
+    count = len(vehicle.requests)
+    vehicle.params.use_output("rates")
+    problem = vehicle.problem() or ""
+    assert "--set GUID_OPTIONS=8" in problem
+    assert problem.startswith("the vehicle would not fly by our setpoints")
+    vehicle.set_by_pilot("GUID_OPTIONS", 8.0)
+    assert vehicle.problem() is None
+    vehicle.run(3.0)
+    assert len(vehicle.requests) == count
+    assert [text for text in vehicle.texts if "--set GUID_TIMEOUT=0.5" in text]
+    assert not [text for text in vehicle.texts if "RC_OVERRIDE_TIME" in text]
+
+
+def test_what_only_another_output_needs_does_not_matter() -> None:
+    bad_for_sticks: dict[str, float | None] = {
+        "RC_OPTIONS": 2.0,
+        "RC_OVERRIDE_TIME": -1.0,
+        "RC1_MIN": None,
+        "RC7_OPTION": 46.0,
+        "FS_THR_ENABLE": 0.0,
+    }
+    vehicle = ParamVehicle(bad_for_sticks, output="velocity")
+    vehicle.run(6.0)
+    assert vehicle.problem() is None
+    assert vehicle.params.override_switch is None
+
+
+@pytest.mark.parametrize("mode", [0.0, 4.0])
+def test_a_px4_that_does_not_listen_to_mavlinks_sticks_is_refused(mode: float) -> None:
+    vehicle = px4_vehicle({"COM_RC_IN_MODE": mode})
+    vehicle.run(6.0)
+    assert "--set COM_RC_IN_MODE=1" in (vehicle.problem() or "")
+    setpoints = px4_vehicle({"COM_RC_IN_MODE": mode}, output="velocity")
+    setpoints.run(6.0)
+    assert setpoints.problem() is None
+
+
+def test_px4s_parameters_are_set_with_their_type_and_put_back(tmp_path: Path) -> None:
+    vehicle = px4_vehicle(
+        {"COM_RC_IN_MODE": 0.0},
+        folder=tmp_path,
+        set_params=(("COM_RC_IN_MODE", 1.0), ("COM_RC_LOSS_T", 0.3)),
+    )
+    vehicle.integers = {"COM_RC_IN_MODE"}
+    vehicle.run(6.0)
+    assert vehicle.problem() is None
+    assert (vehicle.values["COM_RC_IN_MODE"], vehicle.values["COM_RC_LOSS_T"]) == (1.0, 0.3)
+    kinds = {r.name: r.kind for r in vehicle.requests if isinstance(r, ParamWrite)}
+    assert kinds == {"COM_RC_IN_MODE": 6, "COM_RC_LOSS_T": 9}
+    vehicle.params.begin_restore()
+    vehicle.run(3.0)
+    assert vehicle.params.is_restored
+    assert (vehicle.values["COM_RC_IN_MODE"], vehicle.values["COM_RC_LOSS_T"]) == (0.0, 0.5)
+
+
+def test_a_name_that_the_vehicle_says_it_lacks_is_not_waited_for() -> None:
+    reader = ParamReader(("ANGLE_MAX", "ATC_ANGLE_MAX"))
+    assert len(list(reader.step(0))) == 2
+    reader.absent("ANGLE_MAX")
+    reader.receive(ParamValue("ATC_ANGLE_MAX", 30.0))
+    assert reader.is_done
+    assert reader.values == {"ATC_ANGLE_MAX": 30.0}

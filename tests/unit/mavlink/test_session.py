@@ -4,21 +4,16 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.errors import PeerError
 from mavbridge.mavlink.codec.messages import (
     Attitude,
-    CommandAck,
-    CommandRequest,
     Endpoint,
     Heartbeat,
     LocalVelocity,
     SpecificForce,
-    StreamRequest,
     Timesync,
 )
-from mavbridge.mavlink.session import streams
 from mavbridge.mavlink.session.discovery import VehicleDiscovery
-from mavbridge.mavlink.session.modes import ModeTable
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import GOOD_EXCHANGES, TimesyncFilter
@@ -42,7 +37,7 @@ def test_one_vehicle_is_chosen_once_a_second_one_would_have_been_heard() -> None
     assert discovery.choose(11 * S) is None
     peer = discovery.choose(12 * S)
     assert peer is not None
-    assert (peer.source, peer.address, peer.autopilot) == (Endpoint(1, 1), ("host", 5), "ardupilot")
+    assert (peer.source, peer.address, peer.autopilot) == (Endpoint(1, 1), ("host", 5), 3)
 
 
 def test_two_vehicles_need_a_choice() -> None:
@@ -58,7 +53,7 @@ def test_two_vehicles_need_a_choice() -> None:
     chosen.receive(Endpoint(7, 1), heartbeat(autopilot=12), None, S)
     peer = chosen.choose(3 * S)
     assert peer is not None
-    assert peer.autopilot == "px4"
+    assert peer.autopilot == 12
 
 
 def test_two_vehicles_of_one_id_cannot_be_told_apart() -> None:
@@ -98,162 +93,6 @@ def test_other_senders_are_described(
         discovery.receive(source, heartbeat, None, 0)
     assert discovery.choose(10 * S) is None
     assert expected in discovery.describe()
-
-
-# --- modes
-
-
-def test_mode_names_of_both_autopilots() -> None:
-    copter = ModeTable(autopilot="ardupilot")
-    assert copter.name(2) == "ALT_HOLD"
-    assert copter.command("alt_hold") == (2, 0)
-    assert copter.name(99) == "99"
-    with pytest.raises(UserError, match="no mode 'HOVER'; it has ACRO"):
-        copter.command("HOVER")
-
-
-@pytest.mark.parametrize(
-    ("name", "main", "sub"),
-    [
-        *(("MANUAL", 1, 0), ("ALTCTL", 2, 0), ("POSCTL", 3, 0), ("ACRO", 5, 0)),
-        *(("OFFBOARD", 6, 0), ("STABILIZED", 7, 0), ("AUTO.TAKEOFF", 4, 2), ("AUTO.LOITER", 4, 3)),
-        *(("AUTO.MISSION", 4, 4), ("AUTO.RTL", 4, 5), ("AUTO.LAND", 4, 6)),
-    ],
-)
-def test_modes_of_px4_and_their_sub_modes(name: str, main: int, sub: int) -> None:
-    px4 = ModeTable(autopilot="px4")
-    assert px4.name(main << 16 | sub << 24) == name
-    assert px4.command(name.lower()) == (main, sub)
-
-
-def test_modes_of_px4_without_a_name_of_their_own() -> None:
-    px4 = ModeTable(autopilot="px4")
-    assert px4.name(3 << 16 | 2 << 24) == "POSCTL"  # slow: flown with sticks all the same
-    assert px4.name(4 << 16 | 8 << 24) == "AUTO.8"
-    assert px4.name(10 << 16) == "10"
-    for name in ("AUTO", "AUTO.8", "LOITER"):
-        with pytest.raises(UserError, match=r"AUTO\.LOITER"):
-            px4.command(name)
-
-
-# --- streams
-
-
-def ack(result: int, command: int = dialect.MAV_CMD_SET_MESSAGE_INTERVAL) -> CommandAck:
-    return CommandAck(command=command, result=result, target=Endpoint(0, 0))
-
-
-def ids(request: object) -> tuple[float, float]:
-    assert isinstance(request, CommandRequest)
-    return request.params[0], round(request.params[1])
-
-
-def one_group() -> streams.StreamRequester:
-    return streams.StreamRequester(streams.telemetry_streams(state_hz=100, is_px4=False)[:1])
-
-
-@pytest.mark.parametrize(
-    ("is_px4", "watched"),
-    [
-        (False, [(1, 500_000), (245, 200_000), (193, 200_000), (0, 100_000)]),
-        (True, [(1, 500_000), (245, 200_000), (230, 200_000)]),
-    ],
-)
-def test_streams_are_requested_one_after_the_other_what_is_needed_first(
-    is_px4: bool, watched: list[tuple[int, int]]
-) -> None:
-    requester = streams.StreamRequester(streams.telemetry_streams(state_hz=100, is_px4=is_px4))
-    requested = []
-    while (request := requester.step(len(requested))) is not None:
-        assert requester.is_settled == (len(requested) >= 4)
-        requested.append(ids(request))
-        assert requester.step(len(requested)) is None  # acks carry no id: one at a time
-        requester.receive_ack(ack(0, command=400))  # an ack of another command
-        assert requester.step(len(requested)) is None
-        requester.receive_ack(ack(0))
-    assert requested == [(31, 10000), (32, 10000), (105, 10000), (65, 17000), *watched]
-
-
-@pytest.mark.parametrize("answer", [None, dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_FAILED])
-def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
-    requester = streams.StreamRequester(streams.telemetry_streams(state_hz=100, is_px4=False))
-    requested = []
-    for tick in range(3000):
-        for message in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU"):
-            requester.receive(message)
-        if tick % 2:
-            requester.receive("RC_CHANNELS")
-        if (request := requester.step(tick * 10 * NS_PER_MS)) is None:
-            continue
-        requested.append(request)
-        is_needed = ids(request)[0] in (31, 32, 105, 65)
-        if is_needed:
-            requester.receive_ack(ack(0))
-        elif answer is not None:
-            requester.receive_ack(ack(answer))
-        assert requester.is_settled == (len(requested) >= 4)
-    # never the legacy request, which would change the rates of other messages as well
-    attempts = 4 if answer is None else 1
-    assert [ids(request)[0] for request in requested[4:]] == [
-        number for number in (1, 245, 193, 0) for _ in range(attempts)
-    ]
-    assert requester.renewals == 0
-
-
-def test_a_watched_stream_that_stops_is_asked_for_again_and_not_lost() -> None:
-    wanted = streams.telemetry_streams(state_hz=100, is_px4=False)[4:5]
-    requester, requested_s = streams.StreamRequester(wanted), []
-    for tick in range(1000):
-        if tick < 300 and tick % 50 == 0:
-            requester.receive("SYS_STATUS")
-        if requester.step(tick * 10 * NS_PER_MS) is not None:
-            requested_s.append(tick // 100)
-            requester.receive_ack(ack(0))
-    assert requested_s == [0, 4, 6, 8]
-    assert requester.renewals == 0
-    assert requester.is_settled
-
-
-def test_denied_means_slower_then_another_message_then_the_legacy_stream() -> None:
-    requester, requested = one_group(), []
-    for k in range(6):
-        requested.append(ids(requester.step(k)))
-        requester.receive_ack(ack(dialect.MAV_RESULT_DENIED))
-    assert requested == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
-    assert requester.step(9) == StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
-    assert requester.is_settled
-
-
-def test_a_request_that_is_undecided_is_repeated_without_haste() -> None:
-    requester, requested_s = one_group(), []
-    for tick in range(300):
-        if requester.step(tick * 10 * NS_PER_MS) is not None:
-            requested_s.append(tick / 100)
-            requester.receive_ack(ack(dialect.MAV_RESULT_TEMPORARILY_REJECTED))
-    assert requested_s == [0.0, 0.5, 1.0, 1.5, 2.0]  # the last is the legacy stream
-
-
-def test_an_unanswered_request_is_repeated_and_then_the_legacy_stream_used() -> None:
-    requester = one_group()
-    requests = [requester.step(k * S) for k in range(5)]
-    assert [type(request) for request in requests] == [CommandRequest] * 4 + [StreamRequest]
-
-
-def test_a_stream_that_slows_down_is_requested_again() -> None:
-    requester = one_group()
-    requester.step(0)
-    requester.receive_ack(ack(0))
-    now_ns, renewed = 0, []
-    for tick in range(1000):
-        now_ns = tick * 10 * NS_PER_MS
-        # a ground station sets 4 Hz after three seconds
-        if tick < 300 or tick % 25 == 0:
-            requester.receive("ATTITUDE_QUATERNION")
-        if requester.step(now_ns) is not None:
-            renewed.append(now_ns // S)
-            requester.receive_ack(ack(0))
-    assert renewed == [4, 6, 8]
-    assert requester.renewals == 3
 
 
 # --- timesync

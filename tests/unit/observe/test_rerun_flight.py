@@ -140,7 +140,7 @@ def test_events_are_transitions_across_batches(rrd: Path) -> None:
         "RELEASED: no feature yet",
         "mode ALT_HOLD",
         "disarmed",
-        "FLYING: the policy has the sticks",
+        "FLYING: the policy has control",
         "armed",
         "RELEASED: feature too old",
         "mode LAND",

@@ -129,7 +129,7 @@ def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
         for _ in range(2 * round(PLAIN_PERIOD_S * STATUS_HZ)):
             screen.refresh()
     message, *lines = out.getvalue().splitlines()
-    assert message == "FLYING: the policy has the sticks"
+    assert message == "FLYING: the policy has control"
     assert len(lines) == 2
     assert lines[0].startswith("FLYING  ALT_HOLD armed")
     assert lines[0].endswith("missed 0")  # not cut at 80 columns: it goes to a file
@@ -149,8 +149,8 @@ def test_messages_are_printed_once_in_order() -> None:
     assert out.getvalue().splitlines() == [
         "vehicle: Arming motors",
         "RELEASED: no [bold] state",
-        "PREPARING: sticks idle",
-        "FLYING: the policy has the sticks",
+        "PREPARING: not in control yet",
+        "FLYING: the policy has control",
         "RELEASED: mode",
         "READ-ONLY: the policy runs, nothing is sent",
     ]

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.mavlink.session.streams import StreamGroup
+from mavbridge.mavlink.profiles.profile import StreamGroup
 
 _FRAME_BYTES = 12
 """Header and checksum of MAVLink 2."""
@@ -18,9 +18,11 @@ _STANDARD_BAUDS = (57600, 115200, 230400, 460800, 921600, 1500000, 3000000)
 
 
 def received_bytes_per_s(streams: Iterable[StreamGroup]) -> float:
-    """Need of these streams, in their longest form."""
+    """Need of these streams, in their longest form, without those that seldom come."""
     return _OTHERS_BYTES_PER_S + sum(
-        stream.rate_hz * (_FRAME_BYTES + _payload_bytes(stream.messages[0])) for stream in streams
+        stream.rate_hz * (_FRAME_BYTES + _payload_bytes(stream.messages[0]))
+        for stream in streams
+        if stream.least_hz is None
     )
 
 

@@ -1,53 +1,14 @@
-"""Reads parameters by name, and knows which ones the bridge needs."""
+"""Reads parameters by name."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.mavlink.codec.messages import ParamRequest, ParamValue
-
-STICKS = ("THROTTLE", "YAW", "PITCH", "ROLL")
-"""RCMAP_* suffixes in the order of ``Sticks``."""
-OPTION_CHANNELS = range(5, 17)
-"""Channels whose RCn_OPTION may hold the override switch."""
-
-FIRST_NAMES = (
-    *(f"RCMAP_{stick}" for stick in STICKS),
-    "RC_OVERRIDE_TIME",
-    "RC_OPTIONS",
-    "RC_FS_TIMEOUT",
-    "FS_THR_ENABLE",
-    "FS_THR_VALUE",
-    "FS_OPTIONS",
-    "THR_DZ",
-    "MAV_GCS_SYSID",
-    "MAV_GCS_SYSID_HI",
-    "SYSID_MYGCS",
-    *(f"RC{number}_OPTION" for number in OPTION_CHANNELS),
-)
-"""Read first; RCMAP_* then tells which RCn_MIN ... to read."""
-
-RISK_NAMES = ("RC_OVERRIDE_TIME", "RC_OPTIONS", "FS_THR_ENABLE")
-"""Those that decide how safe a flight is: asked for again if the first requests get lost."""
-
-_CALIBRATION_PARTS = ("MIN", "TRIM", "MAX", "REVERSED")
 
 _WINDOW = 16
 """Requests in flight at once; ArduPilot queues twenty."""
 _TIMEOUT_NS = 300 * NS_PER_MS
 _ATTEMPTS = 4
-
-
-def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """Parameters without which sticks cannot be mapped to channels, as far as RCMAP_* is known."""
-    names = tuple(f"RCMAP_{stick}" for stick in STICKS)
-    numbers = sorted({int(values[name]) for name in names if name in values})
-    return names + tuple(f"RC{number}_{part}" for number in numbers for part in _CALIBRATION_PARTS)
-
-
-def dead_zone_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """RCn_DZ of the stick channels, as far as RCMAP_* is known."""
-    known = (values.get(f"RCMAP_{stick}") for stick in STICKS)
-    return tuple(f"RC{int(number)}_DZ" for number in known if number is not None)
 
 
 class ParamReader:
@@ -76,6 +37,10 @@ class ParamReader:
         self._open.pop(param.name, None)
         if param.name in self._names:
             self.values[param.name] = param.value
+
+    def absent(self, name: str) -> None:
+        """Give up on a parameter that the vehicle does not have."""
+        self._open.pop(name, None)
 
     def step(self, now_ns: int) -> Iterator[ParamRequest]:
         """Requests that are due: repeated ones first, then new ones up to the window."""

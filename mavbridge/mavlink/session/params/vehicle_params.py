@@ -1,24 +1,17 @@
 """All that the bridge knows, demands and changes of one vehicle's parameters."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.errors import PeerError
-from mavbridge.core.vehicle import VehicleStatus
+from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import ParamRequest, ParamValue, ParamWrite
-from mavbridge.mavlink.session.discovery import VehicleIdentity
+from mavbridge.mavlink.profiles.profile import Danger, ParamContext, Profile, StreamGroup
 from mavbridge.mavlink.session.params.bandwidth import baud_danger
-from mavbridge.mavlink.session.params.checks import Assessment, Danger, advice, assess
-from mavbridge.mavlink.session.params.reader import (
-    FIRST_NAMES,
-    RISK_NAMES,
-    ParamReader,
-    calibration_names,
-    dead_zone_names,
-)
+from mavbridge.mavlink.session.params.checks import Assessment, assess
+from mavbridge.mavlink.session.params.reader import ParamReader
 from mavbridge.mavlink.session.params.temporary import TemporaryParams
-from mavbridge.mavlink.session.streams import StreamGroup
 from mavbridge.mavlink.settings import LinkSettings
 from mavbridge.mavlink.transport.sockets import serial_baud
 
@@ -29,47 +22,44 @@ _AGAIN_NS = 2 * NS_PER_S
 class VehicleParams:
     """Reads the parameters, sets some for the flight, and says why they forbid one.
 
-    Values heard later, whoever has changed them, count at once for ``problem``. The calibration
-    follows while the vehicle is disarmed; a change in flight that matters is an interruption.
-
-    Raises:
-        PeerError: parameters are to be set on a vehicle that is not ArduPilot.
+    All that may matter are read at once, whatever the output will be. Values heard later, whoever
+    has changed them, count at once for the problems. The calibration follows while the vehicle is
+    disarmed; a change in flight that matters is an interruption.
     """
 
     def __init__(
         self,
-        identity: VehicleIdentity,
+        profile: Profile,
+        system: int,
         config: LinkSettings,
         *,
         streams: tuple[StreamGroup, ...],
         report: Callable[[str], None],
     ) -> None:
-        self._is_override = identity.autopilot == "ardupilot"
-        changes_any = bool(config.set_params or config.restore_params)
-        if changes_any and identity.autopilot != "ardupilot":
-            raise PeerError(
-                f"--set and --restore-params are for ArduPilot, and this is {identity.autopilot}: "
-                "set its parameters with your ground station"
-            )
+        self._profile = profile
+        self._system = system
         self._config = config
         self._report = report
-        self._system = identity.source.system
+        self._output: Output | None = None
         self._serial = baud_danger(
             serial_baud(config.connect), streams=streams, stick_hz=config.stick_hz
         )
-        self._reader = ParamReader(FIRST_NAMES if self._is_override else ())
-        self._has_asked_channels = False
+        self._reader = ParamReader(profile.params)
+        self._kinds: dict[str, int] = {}
+        """MAV_PARAM_TYPE of each parameter that was heard."""
+        self._has_asked_more = False
         self._again_ns = 0
         self._changes = TemporaryParams(
             config.set_params,
             restores_leftovers=config.restore_params,
-            folder=config.state_folder if self._is_override else None,
+            folder=config.state_folder,
             report=report,
         )
-        self._has_advised = False
-        self._assessed: tuple[bool | None, Assessment] | None = None
-        """The receiver, if any, and what follows from that and all values."""
-        self.is_read = not self._is_override
+        self._advised: Output | None = None
+        """Output that the user was advised about."""
+        self._assessed: tuple[ParamContext, Assessment] | None = None
+        """What follows from all values, and for whom."""
+        self.is_read = False
         """Every parameter has come or was given up."""
         self.calibration: RcCalibration | None = None
         """The calibration to fly with; None before it is read, or if it cannot be used."""
@@ -83,11 +73,25 @@ class VehicleParams:
 
     @property
     def override_switch(self) -> int | None:
-        """Number of the channel that enables overrides, or None."""
+        """Number of the channel that enables the output, or None."""
         return self._assessed[1].override_switch if self._assessed else None
+
+    @property
+    def ignores_receiver(self) -> bool:
+        """The sticks of a receiver move nothing."""
+        return self._profile.ignores_receiver(self._reader.values)
+
+    def use_output(self, output: Output) -> None:
+        """Judge the parameters for this output from now on."""
+        self._output = output
 
     def receive(self, param: ParamValue, status: VehicleStatus | None) -> None:
         """Take a PARAM_VALUE, requested or not."""
+        if self._profile.is_bytewise:
+            param = param.from_bytes()
+        if not math.isfinite(param.value):
+            return
+        self._kinds[param.name] = param.kind
         old = self._reader.values.get(param.name)
         self._reader.receive(param)
         self._changes.receive(param)
@@ -102,14 +106,18 @@ class VehicleParams:
                 f"{param.name} was changed from {old:g} to {param.value:g} in flight"
             )
 
-    def _assess(self, status: VehicleStatus | None) -> Assessment:
+    def absent(self, name: str) -> None:
+        """The vehicle says that it has no parameter of this name."""
+        self._reader.absent(name)
+
+    def _context(self, status: VehicleStatus | None) -> ParamContext:
         has_receiver = None if status is None else status.has_receiver
-        assessment = assess(
-            self._reader.values,
-            source_system=self._config.source_system,
-            has_receiver=has_receiver,
-        )
-        self._assessed = (has_receiver, assessment)
+        return ParamContext(self._output, self._config.source_system, has_receiver)
+
+    def _assess(self, status: VehicleStatus | None) -> Assessment:
+        context = self._context(status)
+        assessment = assess(self._profile, self._reader.values, context)
+        self._assessed = (context, assessment)
         return assessment
 
     def step(
@@ -123,35 +131,41 @@ class VehicleParams:
             name = f"vehicle-{self._system}-{unique_id}" if unique_id else f"vehicle-{self._system}"
             self._reader.request(self._changes.open(name))
         yield from self._reader.step(now_ns)
-        if self._is_override and self._reader.is_done:
+        if self._reader.is_done:
             self._ask_for_missing(now_ns, status)
         if self._reader.is_done:
             self._take_in(status)
-            self._advise()
+            self._advise(status)
         if self.is_read:
-            yield from self._changes.step(
+            for request in self._changes.step(
                 now_ns,
                 self._reader.values,
                 is_complete=self._reader.is_done,
                 is_disarmed=status is not None and not status.armed,
-            )
+            ):
+                yield self._as_written(request)
+
+    def _as_written(self, request: ParamRequest | ParamWrite) -> ParamRequest | ParamWrite:
+        """A write with the type that the firmware demands, if it does."""
+        if isinstance(request, ParamRequest) or not self._profile.is_bytewise:
+            return request
+        return request._replace(kind=self._kinds.get(request.name, request.kind)).as_bytes()
 
     def _ask_for_missing(self, now_ns: int, status: VehicleStatus | None) -> None:
-        """Ask for the stick channels once RCMAP_* is known, and on the ground for what got lost."""
-        is_flying = self.calibration is not None and status is not None and status.armed
+        """Ask for what depends on other values, and on the ground for what got lost."""
+        is_usable = self._assessed is not None and self._assessed[1].unusable is None
+        is_flying = self.is_read and is_usable and status is not None and status.armed
         if now_ns < self._again_ns or is_flying:
             return
         self._again_ns = now_ns + _AGAIN_NS
         values = self._reader.values
-        names = (*calibration_names(values), *RISK_NAMES)
-        if not self._has_asked_channels or any(name not in values for name in names):
-            self._has_asked_channels = True
-            self._reader.request((*names, *dead_zone_names(values)))
+        needed = self._profile.needed_params(values)
+        if not self._has_asked_more or any(name not in values for name in needed):
+            self._has_asked_more = True
+            self._reader.request((*needed, *self._profile.more_params(values)))
 
     def _take_in(self, status: VehicleStatus | None) -> None:
         """Fly with what was read, from the beginning or from the next time on the ground."""
-        if not self._is_override:
-            return
         self.is_read = True
         assessment = self._assessed[1] if self._assessed else self._assess(status)
         if assessment.calibration == self.calibration:
@@ -162,47 +176,47 @@ class VehicleParams:
                 self._report("the vehicle's radio calibration has changed: the new one counts")
             self.calibration = assessment.calibration
 
-    def _advise(self) -> None:
-        if self._has_advised or not self.is_read or not self._changes.is_settled:
+    def _advise(self, status: VehicleStatus | None) -> None:
+        if self._output in (None, self._advised) or not self._changes.is_settled:
             return
-        self._has_advised = True
-        for text in advice(self._reader.values) if self._is_override else ():
+        self._advised = self._output
+        for text in self._profile.advice(self._reader.values, self._context(status)):
             self._report(text)
-        for danger in self._dangers():
+        for danger in self._dangers(self._current(status)):
             if danger.risk in self._config.accepted_risks:
                 self._report(f"risk {danger.risk} is accepted: {danger.text}")
 
-    def _dangers(self) -> Iterator[Danger]:
+    def _dangers(self, assessment: Assessment) -> Iterator[Danger]:
         if self._serial is not None:
             yield Danger("slow-serial", self._serial)
-        if self._assessed is not None:
-            yield from self._assessed[1].dangers
+        yield from assessment.dangers
 
-    def problem(self, status: VehicleStatus | None) -> str | None:
-        """Why a flight may not begin or go on with these parameters, or None."""
-        if not self.is_read:
-            return "reading the vehicle's parameters"
-        if (waiting := self._changes.problem()) is not None:
-            return waiting
-        if self._is_override and (forbidden := self._forbidden(status)) is not None:
-            return forbidden
-        accepted = self._config.accepted_risks
-        return next((d.refusal for d in self._dangers() if d.risk not in accepted), None)
+    def problem(self) -> str | None:
+        """Why nothing may begin yet, whatever the output, or None."""
+        return self._changes.problem() if self.is_read else "reading the vehicle's parameters"
 
-    def _forbidden(self, status: VehicleStatus | None) -> str | None:
-        """Problems that nobody can accept: sticks that would not arrive, or mean something else."""
-        has_receiver = None if status is None else status.has_receiver
-        if self._assessed is None or self._assessed[0] != has_receiver:
-            self._assess(status)
-        assert self._assessed is not None
-        assessment = self._assessed[1]
+    def output_problem(self, status: VehicleStatus | None) -> str | None:
+        """Why a flight with the output may not begin or go on with these parameters, or None."""
+        if not self.is_read or self._output is None:
+            return None
+        assessment = self._current(status)
         if assessment.obstacles:
-            return f"the vehicle would ignore our sticks: {'; '.join(assessment.obstacles)}"
+            is_sticks = self._output in ("rc-override", "manual-control")
+            what = "ignore our sticks" if is_sticks else "not fly by our setpoints"
+            return f"the vehicle would {what}: {'; '.join(assessment.obstacles)}"
         if assessment.unusable is not None:
             return assessment.unusable
-        if assessment.calibration != self.calibration:
+        if self._output == "rc-override" and assessment.calibration != self.calibration:
             return "the vehicle's radio calibration was changed in flight: disarm to take it in"
-        return None
+        accepted = self._config.accepted_risks
+        dangers = self._dangers(assessment)
+        return next((d.refusal for d in dangers if d.risk not in accepted), None)
+
+    def _current(self, status: VehicleStatus | None) -> Assessment:
+        """The assessment for the present output and receiver."""
+        if self._assessed is None or self._assessed[0] != self._context(status):
+            return self._assess(status)
+        return self._assessed[1]
 
     def begin_restore(self) -> None:
         """Put back what was set for the flight; ``is_restored`` tells when that is done."""

@@ -14,7 +14,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Sticks
 from mavbridge.mavlink.outputs.echo import NUDGE_STEP_NS, EchoCheck
 from mavbridge.mavlink.outputs.override import OVERRIDE_ECHO
-from mavbridge.mavlink.session.params.checks import calibration
+from mavbridge.mavlink.profiles.ardupilot_params import calibration
 
 NUDGE_LEVELS = 3
 

@@ -7,9 +7,9 @@ import pytest
 from helpers.stick_curves import copter_motion, copter_values, policy_motion
 from mavbridge.core.vehicle import NEUTRAL, StickGains, Sticks
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.ardupilot_params import calibration
 from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
 from mavbridge.mavlink.profiles.sticks import IDENTITY
-from mavbridge.mavlink.session.params.checks import calibration
 from sitl.ardupilot.params import Params
 from sitl.vehicle.conditions import Conditions
 

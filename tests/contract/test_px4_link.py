@@ -1,0 +1,243 @@
+"""PX4's side of a link as measured on the firmware: identity, streams, parameters, clock, texts."""
+
+import struct
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from helpers.px4_companion import (
+    ACCEPTED,
+    ALTCTL,
+    CURRENT_MODE,
+    EVENT,
+    LOITER,
+    POSCTL,
+    REJECTED,
+    Px4Companion,
+    custom,
+    event_id,
+    modes_in,
+    named,
+)
+
+FAILED, UNSUPPORTED = mav.MAV_RESULT_FAILED, mav.MAV_RESULT_UNSUPPORTED
+SET_INTERVAL = mav.MAV_CMD_SET_MESSAGE_INTERVAL
+
+
+def test_heartbeat_names_a_quadrotor_with_px4(px4):
+    heartbeat = px4.wait("HEARTBEAT")
+
+    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
+    assert heartbeat.type == mav.MAV_TYPE_QUADROTOR
+    assert heartbeat.autopilot == mav.MAV_AUTOPILOT_PX4
+    assert heartbeat.get_msgbuf()[0] == 0xFD
+
+
+def test_heartbeats_stay_at_one_hertz_whatever_is_asked_or_changes(px4):
+    assert px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_HEARTBEAT, 100_000) == FAILED
+
+    def change_modes(elapsed_s: float) -> None:
+        mode = ALTCTL if int(elapsed_s * 5.0) % 2 else LOITER
+        params = (1, *mode, 0, 0, 0, 0)
+        px4.send(mav.MAVLink_command_long_message(1, 1, mav.MAV_CMD_DO_SET_MODE, 0, *params))
+
+    messages = px4.repeat(change_modes, 5.0, hz=5)
+
+    assert len(named(messages, "HEARTBEAT")) == pytest.approx(5, abs=1)
+
+
+def test_current_mode_tells_a_change_at_once_and_twice_a_second_otherwise(px4):
+    px4.set_mode(LOITER)
+    assert px4.stream(CURRENT_MODE, 50) == ACCEPTED
+    px4.advance(1.0)
+
+    quiet = modes_in(px4.advance(3.0))
+    px4.seen.clear()
+    px4.set_mode(ALTCTL)
+    px4.advance(0.15)
+
+    assert 5 <= len(quiet) <= 8
+    assert custom(ALTCTL) in [m.custom_mode for m in modes_in(px4.seen)]
+    assert modes_in(px4.advance(1.0))[-1].intended_custom_mode == custom(ALTCTL)
+
+
+def test_the_version_comes_on_request(px4):
+    version = px4.request(mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, "AUTOPILOT_VERSION")
+
+    assert version.flight_sw_version >> 16 == 1 << 8 | 18
+    assert version.capabilities & mav.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
+    assert px4.command(mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1) == UNSUPPORTED
+
+
+@pytest.mark.parametrize(
+    ("message_id", "asked_hz", "low_hz", "high_hz"),
+    [
+        (mav.MAVLINK_MSG_ID_ATTITUDE, 50, 49, 51),
+        (mav.MAVLINK_MSG_ID_ATTITUDE, 100, 98, 102),
+        (mav.MAVLINK_MSG_ID_ATTITUDE, 125, 120, 127),
+        (mav.MAVLINK_MSG_ID_ATTITUDE, 200, 115, 130),
+        (mav.MAVLINK_MSG_ID_HIGHRES_IMU, 250, 200, 251),
+        (mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 250, 110, 126),
+        (mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 50, 48, 52),
+    ],
+)
+def test_state_comes_at_the_rate_asked_for_up_to_its_topics(
+    px4, message_id, asked_hz, low_hz, high_hz
+):
+    assert px4.stream(message_id, asked_hz) == ACCEPTED
+    px4.advance(1.0)
+    name = mav.mavlink_map[message_id].msgname
+    messages = named(px4.repeat(lambda _: None, 3.0), name)
+
+    if hasattr(messages[0], "time_usec"):
+        span_s = (messages[-1].time_usec - messages[0].time_usec) / 1e6
+    elif hasattr(messages[0], "time_boot_ms"):
+        span_s = (messages[-1].time_boot_ms - messages[0].time_boot_ms) / 1e3
+    else:
+        span_s = 3.0
+
+    assert low_hz <= (len(messages) - 1) / span_s <= high_hz
+
+
+@pytest.mark.parametrize("message_id", [0, 27, 35, 60_000])
+def test_what_cannot_be_streamed_fails(px4, message_id):
+    assert px4.stream(message_id, 10) == FAILED
+
+
+def test_an_interval_with_a_third_or_seventh_parameter_fails(px4):
+    attitude = mav.MAVLINK_MSG_ID_ATTITUDE
+    assert px4.command(SET_INTERVAL, attitude, 10_000, 1.0) == FAILED
+    assert px4.command(SET_INTERVAL, attitude, 10_000, 0, 0, 0, 0, 1.0) == FAILED
+
+
+def test_minus_one_stops_a_stream(px4):
+    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+    px4.wait("ATTITUDE")
+
+    assert px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, -1) == ACCEPTED
+    px4.advance(0.1)
+
+    assert not named(px4.advance(0.5), "ATTITUDE")
+
+
+def test_data_streams_are_ignored(px4):
+    px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, -1)
+    px4.send(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 25, 1))
+    px4.advance(0.1)
+
+    assert not named(px4.advance(0.5), "ATTITUDE")
+
+
+def test_the_interval_is_told(px4):
+    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 50)
+    px4.send(
+        mav.MAVLink_command_long_message(
+            1, 1, mav.MAV_CMD_GET_MESSAGE_INTERVAL, 0, mav.MAVLINK_MSG_ID_ATTITUDE, *[0] * 6
+        )
+    )
+    interval = px4.wait("MESSAGE_INTERVAL")
+
+    assert (interval.message_id, interval.interval_us) == (mav.MAVLINK_MSG_ID_ATTITUDE, 20_000)
+
+
+@pytest.mark.parametrize("system_id", [255, 42, 1])
+def test_commands_are_taken_from_any_system(px4, system_id):
+    result = px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, 10_000, system_id=system_id)
+    assert result == ACCEPTED
+
+
+@pytest.mark.parametrize(("system", "component"), [(1, 190), (2, 1)])
+def test_what_is_addressed_to_others_gets_no_answer(px4, system, component):
+    params = (mav.MAVLINK_MSG_ID_ATTITUDE, 10_000, *[0] * 5)
+    px4.send(mav.MAVLink_command_long_message(system, component, SET_INTERVAL, 0, *params))
+
+    assert not named(px4.advance(0.5), "COMMAND_ACK")
+
+
+def test_an_integer_travels_as_its_bytes(px4):
+    assert px4.get_int("COM_RC_IN_MODE") == 1
+    px4.change("COM_RC_IN_MODE", 3)
+    assert px4.get_int("COM_RC_IN_MODE") == 3
+
+
+def test_a_float_parameter_is_read_and_written(px4):
+    px4.change("COM_RC_LOSS_T", 2.0)
+    assert px4.get_param("COM_RC_LOSS_T") == 2.0
+
+
+def test_an_unknown_parameter_gets_no_reply(px4):
+    px4.send(mav.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_PARAM", -1))
+    assert not named(px4.advance(0.5), "PARAM_VALUE")
+
+
+@pytest.mark.parametrize("system_id", [255, 42])
+def test_timesync_echoes_the_request_in_the_clock_of_the_telemetry(px4, system_id):
+    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+    px4.send(mav.MAVLink_timesync_message(0, 123_456_789_012), system_id=system_id)
+    answer = px4.wait("TIMESYNC", where=lambda m: m.tc1 != 0 and m.ts1 == 123_456_789_012)
+    attitude = px4.wait("ATTITUDE")
+
+    assert answer.tc1 % 1000 == 0
+    assert attitude.time_boot_ms - answer.tc1 / 1e6 == pytest.approx(10.0, abs=50.0)
+
+
+def test_local_position_streams_and_the_estimator_tells_whether_it_is_one(px4):
+    px4.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 50)
+    px4.stream(mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS, 5)
+    px4.get_ready(POSCTL)
+    messages = px4.advance(1.0)
+
+    assert named(messages, "LOCAL_POSITION_NED")
+    horizontal = mav.ESTIMATOR_POS_HORIZ_REL | mav.ESTIMATOR_VELOCITY_HORIZ
+    flags = named(messages, "ESTIMATOR_STATUS")[-1].flags
+    assert flags & horizontal == horizontal
+
+
+def test_arming_is_an_event_and_to_a_ground_station_a_text(px4):
+    px4.get_ready(ALTCTL)
+    px4.seen.clear()
+    assert px4.arm() == ACCEPTED
+    px4.fly(1.5)
+    seen = list(px4.seen)
+
+    assert named(seen, f"UNKNOWN_{EVENT}")
+    assert "Armed by external command" in px4.texts()
+    assert all(event_id(m) >> 24 == 1 for m in named(seen, f"UNKNOWN_{EVENT}"))
+
+
+def test_refused_modes_say_so(px4):
+    assert px4.command(mav.MAV_CMD_DO_SET_MODE, 1, 9, 0) == REJECTED
+    assert px4.command(mav.MAV_CMD_DO_SET_MODE, 1, 4, 99) == REJECTED
+    assert px4.command(mav.MAV_CMD_DO_SET_MODE, 0, *ALTCTL) == REJECTED
+
+
+def test_the_old_set_mode_message_works_without_an_ack(px4):
+    px4.set_mode(LOITER)
+    px4.send(mav.MAVLink_set_mode_message(1, 1, custom(ALTCTL)))
+    messages = px4.advance(0.5)
+
+    assert not named(messages, "COMMAND_ACK")
+    assert px4.mode() == custom(ALTCTL)
+
+
+def test_texts_need_a_ground_station(px4):
+    # A link that had a heartbeat keeps its ground station: only a fresh one can show this.
+    if not hasattr(px4.peer, "vehicle"):
+        pytest.skip("an external vehicle has heard ground stations already")
+    silent = Px4Companion(px4.peer, is_gcs=False)
+    px4.peer.vehicle.reboot()
+    silent.advance(6.0)
+    silent.set_mode(ALTCTL)
+    silent.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+    messages = silent.advance(0.5)
+
+    assert not named(messages, "STATUSTEXT")
+    assert named(silent.seen, f"UNKNOWN_{EVENT}")
+
+
+def test_the_raw_bytes_of_an_integer_are_a_denormal(px4):
+    px4.send(mav.MAVLink_param_request_read_message(1, 1, b"MAV_SYS_ID", -1))
+    value = px4.wait("PARAM_VALUE", where=lambda m: m.param_id == "MAV_SYS_ID")
+
+    assert value.param_type == mav.MAV_PARAM_TYPE_INT32
+    assert struct.pack("<f", value.param_value) == struct.pack("<i", 1)

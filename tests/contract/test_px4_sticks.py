@@ -1,0 +1,257 @@
+"""MANUAL_CONTROL as PX4's stick input: echo, ranges, arming gates, gestures, and what sticks do."""
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from helpers.px4_companion import (
+    ACCEPTED,
+    ACRO,
+    ALTCTL,
+    LAND,
+    LOITER,
+    MID,
+    POSCTL,
+    REJECTED,
+    RTL,
+    STAB,
+    named,
+)
+
+ARM = mav.MAV_CMD_COMPONENT_ARM_DISARM
+
+
+def echoes(messages):
+    return [(m.x, m.y, m.z, m.r) for m in named(messages, "MANUAL_CONTROL")]
+
+
+@pytest.mark.parametrize(
+    ("sent", "used"),
+    [
+        ((100, -200, 700, 300), (100, -200, 700, 300)),
+        ((0, 0, -1, 0), (0, 0, 500, 0)),
+        ((0, 0, 1001, 0), (0, 0, 500, 0)),
+        ((0, 0, 32767, 0), (0, 0, 500, 0)),
+        ((1001, 500, 500, 0), (0, 500, 500, 0)),
+        ((32767, -1001, 500, 32767), (0, 0, 500, 0)),
+    ],
+)
+def test_a_field_out_of_range_is_centred(px4, sent, used):
+    px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
+
+    echo = echoes(px4.fly(0.5, sent))[-1]
+
+    assert echo == pytest.approx(used, abs=1)
+
+
+@pytest.mark.parametrize("system_id", [255, 254, 42, 1])
+def test_sticks_are_taken_from_any_system(px4, system_id):
+    px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
+
+    messages = px4.repeat(lambda _: px4.sticks((300, 0, 500, 0), system_id=system_id), 0.5)
+
+    assert echoes(messages)[-1][0] == pytest.approx(300, abs=1)
+
+
+def test_sticks_for_another_system_are_ignored(px4):
+    px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
+    px4.advance(1.0)
+
+    other = mav.MAVLink_manual_control_message(2, 300, 0, 500, 0, 0)
+    messages = px4.repeat(lambda _: px4.send(other), 0.5)
+
+    assert not echoes(messages)
+
+
+def test_the_echo_comes_at_the_senders_rate_and_stops_when_the_sticks_are_lost(px4):
+    px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 250)
+    px4.fly(0.5)
+    sent = echoes(px4.fly(2.0))
+    px4.advance(1.0)
+
+    assert len(sent) == pytest.approx(100, abs=6)
+    assert not echoes(px4.advance(1.0))
+
+
+@pytest.mark.parametrize("in_mode", [0, 4])
+def test_some_input_modes_ignore_mavlinks_sticks(px4, in_mode):
+    px4.change("COM_RC_IN_MODE", in_mode)
+    px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
+    px4.advance(1.0)
+
+    assert not echoes(px4.fly(0.5))
+
+
+def test_overrides_are_no_sticks(px4):
+    px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
+    px4.advance(1.0)
+    message = mav.MAVLink_rc_channels_override_message(1, 1, 1600, 1500, 1500, 1500, *[1500] * 4)
+
+    messages = px4.repeat(lambda _: px4.send(message), 0.5)
+
+    assert not echoes(messages)
+
+
+@pytest.mark.parametrize("mode", [STAB, ACRO, ALTCTL, POSCTL])
+def test_without_sticks_their_modes_do_not_arm(px4, mode):
+    px4.get_ready(LOITER)
+    px4.advance(1.0)
+    assert px4.set_mode(mode) == ACCEPTED, "disarmed, every mode is taken"
+    px4.seen.clear()
+
+    assert px4.arm() == REJECTED
+    px4.advance(0.3)
+    assert "Arming denied: Resolve system health failures first" in px4.texts()
+
+
+def test_hold_arms_without_sticks_and_return_does_not(px4):
+    px4.get_ready(LOITER)
+    px4.advance(1.0)
+
+    assert px4.arm() == ACCEPTED
+    assert px4.command(ARM, 1) == ACCEPTED, "arming twice"
+    assert px4.command(ARM, 0) == ACCEPTED
+    px4.set_mode(RTL)
+    assert px4.arm() == REJECTED
+
+
+@pytest.mark.parametrize(
+    ("mode", "z", "result"),
+    [
+        (STAB, 0, ACCEPTED),
+        (STAB, 50, ACCEPTED),
+        (STAB, 150, REJECTED),
+        (ACRO, 500, REJECTED),
+        (ALTCTL, 0, ACCEPTED),
+        (ALTCTL, 500, ACCEPTED),
+        (ALTCTL, 1000, REJECTED),
+        (POSCTL, 500, ACCEPTED),
+        (POSCTL, 700, REJECTED),
+    ],
+)
+def test_arming_needs_a_low_throttle(px4, mode, z, result):
+    px4.get_ready(mode)
+    sticks = (500, -500, z, 0)  # the others may be anywhere
+    px4.fly(0.3, sticks)
+    px4.seen.clear()
+
+    assert px4.arm() == result
+    px4.fly(0.3, sticks)
+    denied = "Arming denied: throttle not in safe position"
+    assert (denied in px4.texts()) == (result == REJECTED)
+
+
+def test_throttle_down_and_full_yaw_arms_and_disarms(px4):
+    px4.get_ready(POSCTL)
+    px4.seen.clear()
+    px4.fly(0.8, (0, 0, 0, 1000))
+    assert "Armed by stick gesture" not in px4.texts()
+
+    px4.fly(0.6, (0, 0, 0, 1000))
+    assert "Armed by stick gesture" in px4.texts()
+    px4.fly(1.5, (0, 0, 0, -1000))
+
+    assert "Disarmed by stick gesture" in px4.texts()
+
+
+def test_who_does_not_take_off_is_disarmed(px4):
+    px4.get_ready(ALTCTL)
+    assert px4.arm() == ACCEPTED
+
+    took_s, _ = px4.until(
+        lambda m: any("Disarmed" in x.text for x in named(m, "STATUSTEXT")),
+        14.0,
+        lambda _: px4.sticks(MID),
+    )
+
+    assert 9.8 <= took_s <= 10.8
+
+
+def test_in_flight_only_a_forced_disarm_works(px4):
+    px4.take_off()
+
+    assert px4.command(ARM, 0) == REJECTED
+    px4.fly(0.2)
+    assert "Disarming denied: not landed" in px4.texts()
+    assert px4.command(ARM, 0, 21196, system_id=42) == ACCEPTED
+
+
+def test_an_odd_arm_value_is_not_answered(px4):
+    px4.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 2, *[0] * 6))
+    assert not named(px4.advance(0.5), "COMMAND_ACK")
+
+
+@pytest.mark.parametrize(
+    ("sticks", "axis", "expected_deg"),
+    [
+        ((0, 500, 500, 0), "roll", 19.3),
+        ((0, 1000, 500, 0), "roll", 35.0),
+        ((0, 100, 500, 0), "roll", 4.0),
+        ((500, 0, 500, 0), "pitch", -19.3),
+    ],
+)
+def test_altctl_leans_by_the_tangent(px4, sticks, axis, expected_deg):
+    px4.take_off()
+
+    attitude = named(px4.fly(1.5, sticks), "ATTITUDE")[-1]
+
+    assert math.degrees(getattr(attitude, axis)) == pytest.approx(expected_deg, abs=1.0)
+
+
+@pytest.mark.parametrize(("r", "expected_degps"), [(100, 0.0), (500, 34.5), (1000, 146.0)])
+def test_yaw_has_a_dead_zone_and_an_expo(px4, r, expected_degps):
+    px4.take_off()
+    px4.fly(1.5, (0, 0, 500, r))
+
+    attitudes = named(px4.fly(0.5, (0, 0, 500, r)), "ATTITUDE")
+    turned = math.remainder(attitudes[-1].yaw - attitudes[0].yaw, 2 * math.pi)
+    span_s = (attitudes[-1].time_boot_ms - attitudes[0].time_boot_ms) / 1e3
+
+    assert math.degrees(turned) / span_s == pytest.approx(expected_degps, abs=3.0 + 0.03 * r / 10)
+
+
+@pytest.mark.parametrize(("z", "low_mps", "high_mps"), [(550, -0.1, 0.1), (750, 0.5, 0.9)])
+def test_throttle_is_a_climb_rate_with_a_dead_zone(px4, z, low_mps, high_mps):
+    px4.take_off()
+
+    messages = px4.fly(2.5, (0, 0, z, 0))
+
+    positions = named(messages, "LOCAL_POSITION_NED")[-25:]
+    climb_mps = -sum(m.vz for m in positions) / len(positions)
+    assert low_mps <= climb_mps <= high_mps
+
+
+def test_a_lean_comes_an_eighth_of_a_second_after_the_stick(px4):
+    px4.take_off()
+    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 250)
+    px4.fly(1.0)
+    lags_ms = []
+    for _ in range(3):
+        begin_ms = named(px4.seen, "ATTITUDE")[-1].time_boot_ms
+        attitudes = named(px4.fly(1.0, (0, 500, 500, 0)), "ATTITUDE")
+        lags_ms.append(next(m.time_boot_ms for m in attitudes if m.roll > math.radians(2.0)))
+        lags_ms[-1] -= begin_ms
+        px4.fly(2.0)
+
+    assert sorted(lags_ms)[1] == pytest.approx(143, abs=25)
+
+
+def test_landing_disarms_two_seconds_after_the_touchdown(px4):
+    px4.take_off()
+    px4.set_mode(LAND)
+    px4.until(
+        lambda m: any("Landing detected" in x.text for x in named(m, "STATUSTEXT")),
+        60.0,
+        lambda _: px4.sticks(MID),
+    )
+
+    took_s, _ = px4.until(
+        lambda m: any("Disarmed by landing" in x.text for x in named(m, "STATUSTEXT")),
+        4.0,
+        lambda _: px4.sticks(MID),
+    )
+
+    assert 1.7 <= took_s <= 2.4
+    px4.fly(0.5)
+    assert px4.mode() == POSCTL[0] << 16, "the last one that can arm"

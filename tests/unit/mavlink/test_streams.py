@@ -1,0 +1,284 @@
+"""Telemetry that is asked for, kept coming, and fitted to a link that is too slow for it."""
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.mavlink.codec.messages import (
+    CommandAck,
+    CommandRequest,
+    Endpoint,
+    Request,
+    StreamRequest,
+)
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.profile import Profile, StreamGroup
+from mavbridge.mavlink.profiles.px4 import PX4
+from mavbridge.mavlink.session.streams import StreamRequester, message_id
+
+S = NS_PER_S
+
+
+def ack(result: int, command: int = dialect.MAV_CMD_SET_MESSAGE_INTERVAL) -> CommandAck:
+    return CommandAck(command=command, result=result, target=Endpoint(0, 0))
+
+
+def ids(request: object) -> tuple[float, float]:
+    assert isinstance(request, CommandRequest)
+    return request.params[0], round(request.params[1])
+
+
+def one_group() -> StreamRequester:
+    return StreamRequester(ARDUPILOT.streams(state_hz=100)[:1])
+
+
+STATE = [(31, 10000), (32, 10000), (105, 10000)]
+
+
+@pytest.mark.parametrize(
+    ("profile", "expected"),
+    [
+        (
+            ARDUPILOT,
+            [
+                *(*STATE, (65, 17000)),
+                *((1, 500_000), (245, 200_000), (193, 200_000), (0, 100_000)),
+            ],
+        ),
+        (
+            PX4,
+            [
+                *(*STATE, (436, 20000), (65, 50000)),
+                *((1, 500_000), (245, 200_000), (230, 200_000), (33, 500_000)),
+            ],
+        ),
+    ],
+)
+def test_streams_are_requested_one_after_the_other_what_is_needed_first(
+    profile: Profile, expected: list[tuple[int, int]]
+) -> None:
+    groups = profile.streams(state_hz=100)
+    needed = sum(not group.is_optional for group in groups)
+    requester = StreamRequester(groups)
+    requested = []
+    while (request := requester.step(len(requested))) is not None:
+        assert requester.is_settled == (len(requested) >= needed)
+        requested.append(ids(request))
+        assert requester.step(len(requested)) is None  # acks carry no id: one at a time
+        requester.receive_ack(ack(0, command=400))  # an ack of another command
+        assert requester.step(len(requested)) is None
+        requester.receive_ack(ack(0))
+    assert requested == expected
+
+
+@pytest.mark.parametrize("answer", [None, dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_FAILED])
+def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
+    requester = StreamRequester(ARDUPILOT.streams(state_hz=100))
+    requested = []
+    for tick in range(3000):
+        for message in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU"):
+            requester.receive(message, 0)
+        if tick % 2:
+            requester.receive("RC_CHANNELS", 0)
+        if (request := requester.step(tick * 10 * NS_PER_MS)) is None:
+            continue
+        requested.append(request)
+        is_needed = ids(request)[0] in (31, 32, 105, 65)
+        if is_needed:
+            requester.receive_ack(ack(0))
+        elif answer is not None:
+            requester.receive_ack(ack(answer))
+        assert requester.is_settled == (len(requested) >= 4)
+    # never the legacy request, which would change the rates of other messages as well
+    attempts = 4 if answer is None else 1
+    assert [ids(request)[0] for request in requested[4:]] == [
+        number for number in (1, 245, 193, 0) for _ in range(attempts)
+    ]
+    assert requester.renewals == 0
+
+
+def test_a_watched_stream_that_stops_is_asked_for_again_and_not_lost() -> None:
+    wanted = ARDUPILOT.streams(state_hz=100)[4:5]
+    requester, requested_s = StreamRequester(wanted), []
+    for tick in range(1000):
+        if tick < 300 and tick % 50 == 0:
+            requester.receive("SYS_STATUS", 0)
+        if requester.step(tick * 10 * NS_PER_MS) is not None:
+            requested_s.append(tick // 100)
+            requester.receive_ack(ack(0))
+    assert requested_s == [0, 4, 6, 8]
+    assert requester.renewals == 0
+    assert requester.is_settled
+
+
+def test_denied_means_slower_then_another_message_then_the_legacy_stream() -> None:
+    requester, requested = one_group(), []
+    for k in range(6):
+        requested.append(ids(requester.step(k)))
+        requester.receive_ack(ack(dialect.MAV_RESULT_DENIED))
+    assert requested == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
+    assert requester.step(9) == StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
+    assert requester.is_settled
+
+
+def test_a_request_that_is_undecided_is_repeated_without_haste() -> None:
+    requester, requested_s = one_group(), []
+    for tick in range(300):
+        if requester.step(tick * 10 * NS_PER_MS) is not None:
+            requested_s.append(tick / 100)
+            requester.receive_ack(ack(dialect.MAV_RESULT_TEMPORARILY_REJECTED))
+    assert requested_s == [0.0, 0.5, 1.0, 1.5, 2.0]  # the last is the legacy stream
+
+
+def test_an_unanswered_request_is_repeated_and_then_the_legacy_stream_used() -> None:
+    requester = one_group()
+    requests = [requester.step(k * S) for k in range(5)]
+    assert [type(request) for request in requests] == [CommandRequest] * 4 + [StreamRequest]
+
+
+def test_a_stream_that_slows_down_is_requested_again() -> None:
+    requester = one_group()
+    requester.step(0)
+    requester.receive_ack(ack(0))
+    now_ns, renewed = 0, []
+    for tick in range(1000):
+        now_ns = tick * 10 * NS_PER_MS
+        # a ground station sets 4 Hz after three seconds
+        if tick < 300 or tick % 25 == 0:
+            requester.receive("ATTITUDE_QUATERNION", 0)
+        if requester.step(now_ns) is not None:
+            renewed.append(now_ns // S)
+            requester.receive_ack(ack(0))
+    assert renewed == [4, 6, 8]
+    assert requester.renewals == 3
+
+
+def test_where_there_is_no_legacy_stream_the_interval_is_asked_for_for_ever() -> None:
+    requester = StreamRequester(PX4.streams(state_hz=100)[:1])
+    requests = [requester.step(k * S) for k in range(12)]
+    assert {ids(request)[0] for request in requests} == {31}
+
+
+def test_an_echo_is_asked_for_once_it_is_known_which() -> None:
+    requester = StreamRequester(PX4.streams(state_hz=100))
+    asked = settle(requester)
+    requester.add(PX4.echo("manual-control"))
+    requester.add(PX4.echo("manual-control"))
+    assert [ids(request) for request in settle(requester)] == [(69, 4000)]
+    assert (69, 4000) not in [ids(request) for request in asked]
+    ardupilot = StreamRequester(ARDUPILOT.streams(state_hz=100))
+    settle(ardupilot)
+    ardupilot.add(ARDUPILOT.echo("rc-override"))  # comes anyway
+    assert settle(ardupilot) == []
+
+
+def settle(requester: StreamRequester) -> list[Request]:
+    requests = []
+    while (request := requester.step(0)) is not None:
+        requests.append(request)
+        requester.receive_ack(ack(0))
+    return requests
+
+
+class Link:
+    """A vehicle that grants every interval, behind a link that carries ``capacity`` messages a
+    second: it then slows all streams down alike, as PX4 was seen to do, and says nothing.
+    ``others_hz`` is what it streams without having been asked by us."""
+
+    def __init__(
+        self, groups: tuple[StreamGroup, ...], capacity_hz: float, *, others_hz: float = 0.0
+    ) -> None:
+        self.others_hz = others_hz
+        self.texts: list[str] = []
+        self.requester = StreamRequester(groups, report=self.texts.append)
+        self.capacity_hz = capacity_hz
+        self.asked: list[tuple[int, float]] = []
+        """Message and rate in Hz."""
+        self.rates_hz: dict[int, float] = {}
+        self.share = 1.0
+        self._due: dict[int, float] = {}
+        self._sequence = 0
+        self._names = {message_id(name): name for group in groups for name in group.messages}
+        self._now_ns = 0
+
+    def run(self, duration_s: float, *, loses_every: int | None = None) -> None:
+        for _ in range(round(duration_s * 1000)):
+            self._now_ns += NS_PER_MS
+            if (request := self.requester.step(self._now_ns)) is not None:
+                assert isinstance(request, CommandRequest)
+                self.asked.append((int(request.params[0]), 1e6 / request.params[1]))
+                self.rates_hz[int(request.params[0])] = 1e6 / request.params[1]
+                self.requester.receive_ack(ack(0))
+            self.share = min(
+                1.0, self.capacity_hz / max(sum(self.rates_hz.values()) + self.others_hz, 1.0)
+            )
+            for number, rate_hz in self.rates_hz.items():
+                self._due[number] = self._due.get(number, 0.0) + rate_hz * self.share / 1000
+                if self._due[number] >= 1.0:
+                    self._due[number] -= 1.0
+                    self._sequence += 1
+                    if loses_every is None or self._sequence % loses_every:
+                        self.requester.receive(self._names[number], self._sequence % 256)
+
+
+def test_a_link_that_slows_all_streams_down_is_asked_for_what_it_carries_once() -> None:
+    link = Link(PX4.streams(state_hz=100), capacity_hz=45.0)
+    link.run(30.0)
+    (text,) = link.texts
+    assert text.startswith("the link carries only 1")
+    assert "instead of 100 Hz" in text
+    assert link.share > 0.8
+    assert 8 < link.rates_hz[31] < 13
+    assert link.rates_hz[245] == 5.0
+    count = len(link.asked)
+    link.run(30.0)
+    assert len(link.asked) == count
+    assert len(link.texts) == 1
+
+
+def test_a_link_that_others_fill_is_left_to_them_as_before() -> None:
+    link = Link(PX4.streams(state_hz=100), capacity_hz=45.0, others_hz=400.0)
+    link.run(60.0)
+    assert len(link.texts) == 1
+    assert link.rates_hz[31] == 100.0
+    count = len(link.asked)
+    link.run(30.0)
+    assert len(link.asked) == count
+    link.capacity_hz = 10_000.0
+    link.run(10.0)
+    link.rates_hz[31] = 4.0
+    link.run(5.0)
+    assert link.rates_hz[31] == 100.0  # one that is slow alone is still asked for again
+
+
+def test_packets_that_get_lost_are_no_reason_to_ask_for_less() -> None:
+    link = Link(PX4.streams(state_hz=100), capacity_hz=10_000.0)
+    link.run(30.0, loses_every=2)
+    assert link.texts == []
+    assert link.rates_hz[31] == 100.0
+
+
+def test_one_stream_that_is_slow_alone_is_no_full_link() -> None:
+    link = Link(PX4.streams(state_hz=100), capacity_hz=10_000.0)
+    link.run(3.0)
+    for _ in range(10):
+        link.rates_hz[31] = 4.0  # a ground station on the same link
+        link.run(4.5)
+    assert link.texts == []
+    assert link.rates_hz[31] == 100.0
+
+
+@pytest.mark.parametrize(
+    ("state_hz", "attitude_hz", "position_hz"),
+    [(50, 50, 50), (100, 100, 100), (125, 125, 125), (200, 250, 125), (400, 250, 125)],
+)
+def test_px4_is_asked_for_rates_that_it_keeps(
+    state_hz: float, attitude_hz: float, position_hz: float
+) -> None:
+    """Measured: 200 Hz asked for come as 125; beyond, attitude and IMU come at 205 to 250 Hz, the
+    estimator's position at 125."""
+    attitude, position, imu = PX4.streams(state_hz=state_hz)[:3]
+    assert (attitude.rate_hz, position.rate_hz, imu.rate_hz) == (
+        *(attitude_hz, position_hz),
+        attitude_hz,
+    )
