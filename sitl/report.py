@@ -45,7 +45,8 @@ class FlightLog:
         self._course = course or Course(seed=0, gates=())
         self._has_course = course is not None
         self._gates = GateCounter(self._course)
-        self._overrides = _OverrideStats()
+        self._overrides = _ArrivalStats()
+        self._setpoints = _ArrivalStats()
         self._release_times_s: list[float] = []
         self._releases = 0
         self._sticks = _StickRecord()
@@ -111,6 +112,10 @@ class FlightLog:
         """Count an RC_CHANNELS_OVERRIDE that drives at least one stick."""
         self._overrides.add(arrived_ns)
 
+    def on_setpoint(self, arrived_ns: int) -> None:
+        """Count a setpoint of an attitude, rates or a velocity that the vehicle follows."""
+        self._setpoints.add(arrived_ns)
+
     def on_release(self, arrived_ns: int) -> None:
         """Count an RC_CHANNELS_OVERRIDE that only releases sticks."""
         self._overrides.interrupt(arrived_ns)
@@ -171,6 +176,7 @@ class FlightLog:
             "overrides": self._overrides.summary(self._start_ns),
             "releases": {"count": self._releases, "t_s": self._release_times_s},
             "manual_control": {"count": self.manual_controls},
+            "setpoints": self._setpoints.summary(self._start_ns),
             "refused_messages": self.refused_messages,
             "bad_frames": bad_frames,
             "armed_s": self._armed_ns / NS_PER_S,
@@ -245,7 +251,7 @@ class _StickRecord:
         ]
 
 
-class _OverrideStats:
+class _ArrivalStats:
     """Arrival times of overrides; gaps are kept as float32, so an hour at 100 Hz is 1.4 MB."""
 
     def __init__(self) -> None:

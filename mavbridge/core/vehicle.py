@@ -196,6 +196,9 @@ class ModeRoles:
     """A mode of ``setpoint`` is entered only while setpoints flow already."""
     is_silence_failsafe: bool = False
     """Sticks that end are a failsafe, even where a receiver has the next ones."""
+    stick_rest_ns: int = 0
+    """For that long after a stick has moved, a mode that flies by itself takes the movement for the
+    pilot's hand, and is left at once."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,8 +29,8 @@ from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.policies import (
     check_configured_policy,
-    is_scripted,
     load_configured_policy,
+    looks_at_images,
 )
 from mavbridge.flight.settings import effective_freshness, flight_settings, gate_settings
 from mavbridge.gate.departure import Ending
@@ -190,7 +190,7 @@ class _Flight:
             send=self._gate.send,
             camera=camera,
             sinks=(*self._observers.sinks, *sinks),
-            watches_images=not is_scripted(config.policy),
+            watches_images=looks_at_images(config),
         )
 
     def run(self, stop: StopRequest) -> None:

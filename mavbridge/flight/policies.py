@@ -5,6 +5,8 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+from mavbridge.camera.open import NO_CAMERA
+from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from policy.contract import Contract
@@ -63,6 +65,15 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
 def is_scripted(policy: PolicyConfig) -> bool:
     """Return whether the policy flies by no image."""
     return policy.policy.partition(":")[0] == "scripted"
+
+
+def looks_at_images(config: FlyConfig) -> bool:
+    """Return whether a frozen or a black image tells of a fault.
+
+    Without a camera a user's class is taken at its user's word; the built-in nets need images.
+    """
+    is_blind = config.camera.source == NO_CAMERA and not is_stateless(config.policy)
+    return not is_blind and not is_scripted(config.policy)
 
 
 def is_stateless(policy: PolicyConfig) -> bool:

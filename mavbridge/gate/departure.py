@@ -59,6 +59,8 @@ class Departure:
     def begin(self, facts: Facts, ending: Ending) -> None:
         """Choose the safe mode for the vehicle as it is now."""
         self._began_ns = self._request_due_ns = facts.now_ns
+        if not self._settings.is_setpoint:
+            self._request_due_ns += facts.modes.stick_rest_ns
         self._is_thrust_mode = facts.mode in facts.modes.thrust
         has_receiver = facts.has_receiver is True
         is_setpoint = self._settings.is_setpoint

@@ -1,10 +1,11 @@
 """The vehicle as the gate sees it. One thread owns socket and codec."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
+from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import (
     Action,
@@ -13,9 +14,8 @@ from mavbridge.core.vehicle import (
     ForwardedPacket,
     LinkSnapshot,
     LinkStats,
+    ModeRoles,
     Output,
-    Release,
-    Telemetry,
 )
 from mavbridge.mavlink.codec.messages import (
     Attitude,
@@ -28,9 +28,7 @@ from mavbridge.mavlink.codec.messages import (
     Timesync,
 )
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.outputs.choice import choose_output
-from mavbridge.mavlink.outputs.output import ActionOutput
-from mavbridge.mavlink.outputs.release import ReleasePlan
+from mavbridge.mavlink.outputs.sender import ActionSender
 from mavbridge.mavlink.session.commands import ModeAndArm
 from mavbridge.mavlink.session.discovery import Namesakes, VehicleDiscovery, VehicleIdentity
 from mavbridge.mavlink.session.stats import LinkCounters
@@ -45,9 +43,6 @@ from mavbridge.mavlink.transport.sockets import Address, Transport
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _HEARTBEAT_HZ = 1.0
 """MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
-_SILENT_NS = 500 * NS_PER_MS
-"""Silence after which a vehicle that is heard elsewhere is taken to have moved there."""
-_DOWN = "the connection to the vehicle is lost: reconnecting"
 
 
 class MavlinkLink:
@@ -55,8 +50,7 @@ class MavlinkLink:
 
     ``forward`` gets every packet of the chosen vehicle, in order, while ``poll`` runs; it must
     neither wait nor raise. Problems of the transport are never raised once it has been opened:
-    they stand in the snapshot, and it is opened again once a second. ``ground_station`` shares the
-    link; its owner flushes and closes it.
+    they stand in the snapshot, and it is opened again once a second.
 
     Raises from ``service`` and ``begin_flight``:
         PeerError: no vehicle within the timeout, two vehicles, or one that cannot be flown.
@@ -84,17 +78,11 @@ class MavlinkLink:
         self._timesync = TimesyncFilter()
         self._telemetry = TelemetryCollector()
         self._commands = ModeAndArm()
-        self._release = ReleasePlan()
+        self._sender = ActionSender(self._connection, self._codec, clock)
         self.is_engaged = False
         """We hold the vehicle's sticks, or are giving them back: no other address is followed."""
-        self._started_ns = clock.now_ns()
-        self._heartbeat_due_ns = self._started_ns
+        self._started_ns = self._heartbeat_due_ns = clock.now_ns()
         self._vehicle: VehicleSession | None = None
-        self._flight: tuple[ActionMeaning, Output | None] | None = None
-        """The policy's actions, and the output that was asked for; None = no policy is loaded."""
-        self._output: ActionOutput | None = None
-        """None until both the vehicle and the policy are known."""
-        self._was_confirmed = False
         self._interruption: str | None = None
         self._interruptions = 0
         self._namesakes = Namesakes()
@@ -114,38 +102,51 @@ class MavlinkLink:
         now_ns = self._clock.now_ns()
         overruled = self._share_with(self._station, now_ns) if self._station else None
         texts = self._connection.take_texts()
-        is_down, vehicle = self._connection.is_down, self._vehicle
-        if vehicle is None:
-            problem = _DOWN if is_down else "waiting for the vehicle's heartbeat"
-            return LinkSnapshot(telemetry=Telemetry(), status=None, problem=problem, texts=texts)
-        output = self._output
-        overruled = overruled or (output.overruled(now_ns) if output else None)
+        vehicle, output = self._vehicle, self._sender.output
+        status = vehicle.status(now_ns) if vehicle else None
+        modes = vehicle.profile.modes.roles if vehicle else ModeRoles()
+        problem = self._problem(now_ns)
+        if vehicle is None or output is None:
+            return LinkSnapshot(
+                telemetry=self._telemetry.snapshot(),
+                status=status,
+                problem=problem or "no policy is loaded yet",
+                interruption=self._interruption,
+                modes=modes,
+                refused_mode=self._commands.refused_mode,
+                texts=texts,
+            )
+        overruled = overruled or output.overruled(now_ns)
         return LinkSnapshot(
             telemetry=self._telemetry.snapshot(),
-            status=vehicle.status(now_ns),
-            problem=(_DOWN if is_down else vehicle.problem(now_ns))
-            or vehicle.output_problem(now_ns)
-            or overruled
-            or (output.unheard(now_ns) if output else "no policy is loaded yet"),
+            status=output.in_policy_terms(status, vehicle, now_ns),
+            problem=problem or overruled or output.unheard(now_ns),
             is_overruled=overruled is not None,
-            is_switched_off=vehicle.is_switched_off,
-            echo_confirmed=output is not None and output.echo_confirmed,
-            is_released=output is None or output.echo.is_released,
-            shows_last=output is None or output.echo.shows_last,
+            is_switched_off=output.is_sticks and vehicle.is_switched_off,
+            echo_confirmed=output.echo_confirmed,
+            is_released=output.is_released(vehicle, now_ns),
+            shows_last=output.shows_last,
             interruption=self._interruption,
-            modes=vehicle.profile.modes.roles,
+            modes=modes if output.is_sticks else replace(modes, is_silence_failsafe=False),
             refused_mode=self._commands.refused_mode,
-            texts=texts,
+            texts=(*texts, *output.take_notes()),
         )
+
+    def _problem(self, now_ns: int) -> str | None:
+        """Why this vehicle cannot be flown now, whatever its echo shows, or None."""
+        if self._connection.is_down:
+            return "the connection to the vehicle is lost: reconnecting"
+        if (vehicle := self._vehicle) is None:
+            return "waiting for the vehicle's heartbeat"
+        return vehicle.problem(now_ns) or vehicle.output_problem(now_ns)
 
     def _share_with(self, station: Forwarding, now_ns: int) -> str | None:
         """Pass the ground station's packets on; why its sticks rule out ours, or None."""
         vehicle = self._vehicle.identity.source if self._vehicle else None
         for packet in station.receive(vehicle, is_engaged=self.is_engaged):
-            if station.rules.has_won and self._release.left and self._output is not None:
-                self._send_release(self._output)  # once, before its sticks, which it would undo
-                self._release.left = 0
-            self._transmit(packet)
+            if station.rules.has_won:
+                self._sender.release_once()  # before its sticks, which it would undo
+            self._sender.transmit(packet)
         self._connection.texts.extend(station.take_texts())
         return station.rules.overruled(now_ns, is_engaged=self.is_engaged)
 
@@ -181,7 +182,7 @@ class MavlinkLink:
                     self._report(refusal)
         if is_for_us:
             before = vehicle.param_interruption
-            if (output := self._output) is not None:
+            if (output := self._sender.output) is not None:
                 output.receive(message.body, vehicle, arrived_ns)
             vehicle.receive(message, arrived_ns)
             if (changed := vehicle.param_interruption) is not None and changed != before:
@@ -191,11 +192,10 @@ class MavlinkLink:
 
     def _notice_other(self, identity: VehicleIdentity, sender: Address | None, now_ns: int) -> None:
         """Another address uses the vehicle's system id: its packets are ignored while we fly."""
-        if not self.is_engaged or now_ns - self._counters.heard_ns < _SILENT_NS:
-            if (text := self._namesakes.heard(identity, sender)) is not None:
-                self._report(text)
-        elif (text := self._namesakes.took_over(identity, sender, now_ns)) is not None:
-            self._interrupt(text)
+        heard_ns = self._counters.heard_ns if self.is_engaged else now_ns
+        text, has_replaced = self._namesakes.notice(identity, sender, now_ns, heard_ns)
+        if text is not None:
+            (self._interrupt if has_replaced else self._report)(text)
 
     def _interrupt(self, text: str) -> None:
         """Note why every engagement so far is over; no two such texts are the same."""
@@ -206,12 +206,10 @@ class MavlinkLink:
 
     def stats(self) -> LinkStats:
         """Counters for the report."""
-        output = self._output
-        has_echo = output is not None and output.name == "rc-override"
-        is_confirmed = output is not None and output.echo_confirmed
+        output = self._sender.output
         return self._counters.stats(
             self._timesync,
-            echo_confirmed=(self._was_confirmed or is_confirmed) if has_echo else None,
+            echo_confirmed=output is not None and output.was_confirmed,
             unusable_packets=self._codec.bad_data_count,
         )
 
@@ -225,7 +223,7 @@ class MavlinkLink:
     @property
     def is_release_owed(self) -> bool:
         """A release could not be sent: ``service`` sends it before everything else."""
-        return self._release.is_owed
+        return self._sender.is_release_owed
 
     # --- the vehicle's parameters
 
@@ -254,7 +252,7 @@ class MavlinkLink:
             self._find_vehicle(now_ns)
         elif not self.is_engaged:
             self._follow_vehicle(self._vehicle.identity, now_ns)
-        if self._release.is_owed and not self._try_release():
+        if self._sender.is_release_owed and not self._sender.try_release():
             return
         if now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = now_ns + period_ns(_HEARTBEAT_HZ)
@@ -285,11 +283,7 @@ class MavlinkLink:
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""
         self._vehicle = VehicleSession(identity, self._config, report=self._report)
-        if self._output is None:
-            self._choose_output(self._vehicle)
-        else:
-            self._output.restart()
-            self._vehicle.use_output(self._output.name)
+        self._sender.equip(self._vehicle)
         self._telemetry = TelemetryCollector()
         self._timesync.restart()
         self._commands = ModeAndArm()
@@ -303,17 +297,7 @@ class MavlinkLink:
 
         ``output`` None: the usual one of such actions and this vehicle.
         """
-        self._flight = meaning, output
-        if self._vehicle is not None:
-            self._choose_output(self._vehicle)
-
-    def _choose_output(self, vehicle: VehicleSession) -> None:
-        if self._flight is not None:
-            meaning, wanted = self._flight
-            self._output = choose_output(
-                meaning, wanted, profile=vehicle.profile, codec=self._codec
-            )
-            vehicle.use_output(self._output.name)
+        self._sender.begin_flight(meaning, output)
 
     def _report(self, text: str) -> None:
         self._connection.texts.append(text)
@@ -331,16 +315,22 @@ class MavlinkLink:
         """Request arming, at most once a second."""
         self._command(self._commands.arm(self._clock.now_ns()))
 
+    def takeoff(self, height_m: float) -> None:
+        """Ask the autopilot to climb to this height above the ground by its own means, at most once
+        a second."""
+        if (vehicle := self._vehicle) is None:
+            return
+        now_ns = self._clock.now_ns()
+        request = vehicle.profile.takeoff(height_m, vehicle.condition.amsl_m(now_ns))
+        if request is not None:
+            self._command(self._commands.takeoff(request, now_ns))
+        elif self._commands.is_time_to_explain(now_ns):
+            self._report("no takeoff yet: the vehicle does not tell its height above the sea")
+
     def _command(self, request: CommandRequest | None) -> None:
         if request is None or self._vehicle is None or self._config.readonly:
             return
-        self._transmit(self._codec.encode_request(self._vehicle.identity.source, request))
-
-    def takeoff(self, height_m: float) -> None:
-        """Ask the autopilot to climb to this height above the ground by its own means."""
-        if (vehicle := self._vehicle) is not None:
-            amsl_m = vehicle.condition.amsl_m(self._clock.now_ns())
-            self._command(vehicle.profile.takeoff(height_m, amsl_m))
+        self._sender.transmit(self._codec.encode_request(self._vehicle.identity.source, request))
 
     def announce(self, text: str, *, is_warning: bool = False) -> None:
         """Send a STATUSTEXT, for a pilot who sees only a ground station; read-only, say nothing."""
@@ -348,13 +338,7 @@ class MavlinkLink:
             return
         severity = dialect.MAV_SEVERITY_WARNING if is_warning else dialect.MAV_SEVERITY_NOTICE
         for packet in self._codec.encode_statustext(severity, text):
-            self._transmit(packet)
-
-    def _transmit(self, data: bytes) -> bool:
-        """Send a packet, after a release that could not be sent; False: it was not sent."""
-        if self._release.is_owed and not self._try_release():
-            return False
-        return self._connection.send(data)
+            self._sender.transmit(packet)
 
     # --- actions
 
@@ -367,39 +351,12 @@ class MavlinkLink:
         Raises:
             CommandRefusedError: an action that this output must not send.
         """
-        vehicle, output = self._vehicle, self._output
-        if self._config.readonly or vehicle is None or output is None:
-            return None
-        if isinstance(decision, Release):
-            self._send_release(output)
-            return None
-        encoded = output.encode(decision.action, vehicle, self._clock.now_ns())
-        if encoded is None or (self._release.is_owed and not self._try_release()):
-            return None
-        self._release.acted(output.releases)
-        if not self._connection.send(encoded.packet):
-            return None
-        output.sent(encoded, self._clock.now_ns())
-        if self._station is not None:
-            self._station.rules.on_our_sticks(self._clock.now_ns())
-        self._counters.sent += 1
-        return encoded.action
-
-    def _send_release(self, output: ActionOutput) -> None:
-        self._was_confirmed |= output.echo_confirmed
-        output.echo.released()
-        if self._release.is_due(self._clock.now_ns()):
-            self._try_release()
-
-    def _try_release(self) -> bool:
-        """Send a release; False: it was not sent, and goes before all other packets."""
-        vehicle, output = self._vehicle, self._output
-        packet = output.release_packet(vehicle) if output and vehicle else None
-        if packet is None:
-            return True  # nothing was ever sent
-        is_sent = self._connection.send(packet)
-        self._release.tried(self._clock.now_ns(), is_sent=is_sent)
-        return is_sent
+        action = None if self._config.readonly else self._sender.send(decision)
+        if action is not None:
+            self._counters.sent += 1
+            if self._station is not None:
+                self._station.rules.on_our_sticks(self._clock.now_ns())
+        return action
 
     def close(self) -> None:
         """Free the socket or port."""

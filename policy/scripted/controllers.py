@@ -151,7 +151,7 @@ def velocity(wanted: Motion, measured: Measured, climb: Climb) -> Four:
 
 
 def attitude(wanted: Motion, measured: Measured, climb: Climb) -> Four:
-    """Thrust, roll, pitch (+ nose up) and yaw rate; a push of the climb is not flown."""
+    """Thrust, roll, pitch (+ nose up) and yaw rate."""
     forward_lean, right_lean = _leans(wanted, measured)
     yaw_rate = _yaw_rate(wanted, measured)
     if (push := wanted.push) is not None:

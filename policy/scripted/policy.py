@@ -8,7 +8,7 @@ import numpy as np
 from policy.contract import ACTION_DIM, STATE_DIM, ActionKind, Contract, FloatArray
 from policy.errors import PolicyError
 from policy.scripted.controllers import CONTROLS, Climb, Measured, ThrustLoop, clip, measure
-from policy.scripted.programs import PROGRAM_NAMES, PROGRAMS, Motion
+from policy.scripted.programs import Motion, make_program
 
 FEATURE_DIM = 8
 DEFAULT_CONTRACT = Contract()
@@ -57,10 +57,6 @@ class ScriptedPolicy:
             starts_in_air: keep the altitude of the start; else climb to the program's own.
             contract: image and chunk; frames, kind and modes are the policy's own.
         """
-        if program not in PROGRAMS:
-            raise PolicyError(
-                f"scripted program {program!r} is unknown; use one of {list(PROGRAM_NAMES)}"
-            )
         if action not in CONTROLS:
             raise PolicyError(
                 f"scripted programs do not put out {action!r}; use one of {list(CONTROLS)}"
@@ -74,7 +70,7 @@ class ScriptedPolicy:
             modes=(),  # the usual ones of that kind
             velocity_frame="heading",
         )
-        self._program = PROGRAMS[program]
+        self._program = make_program(program, action)
         self._control = CONTROLS[action]
         self._now_s = now_s
         self._starts_in_air = starts_in_air

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Literal, NamedTuple
 
+from policy.contract import ActionKind
+from policy.errors import PolicyError
+
 TAKEOFF_ALTITUDE_M, DOUBLET_ALTITUDE_M = 3.0, 8.0
 LEG_S, LEG_MPS = 4.0, 1.5
 YAW_RATE_RADPS = math.radians(30.0)
@@ -74,18 +77,26 @@ class _Plan(NamedTuple):
     settle_s: float
 
 
-_PLANS = (
-    # A lean leaves no speed behind, a climb no height. Yaw and climb reach full range; a lean does
-    # not, since it may be twice of what is expected.
-    _Plan("roll", (0.3, 0.6), 1.2, 0.0, 3.0),
-    _Plan("pitch", (0.3, 0.6), 1.2, 0.0, 3.0),
-    _Plan("yaw", (0.5, 1.0), 2.2, 1.8, 3.5),
-    _Plan("climb", (0.6, 1.0), 2.8, 1.7, 3.5),
-)
+# A lean leaves no speed behind, a climb no height. Yaw and climb reach full range; a lean does not,
+# since it may be twice of what is expected. All but a lean also wait until an overshoot is over.
+_LEANS = (_Plan("roll", (0.3, 0.6), 1.2, 0.0, 3.0), _Plan("pitch", (0.3, 0.6), 1.2, 0.0, 3.0))
+_SPEEDS = (_Plan("roll", (0.3, 0.6), 3.0, 0.0, 3.0), _Plan("pitch", (0.3, 0.6), 3.0, 0.0, 3.0))
+_YAW = _Plan("yaw", (0.5, 1.0), 3.0, 2.0, 3.5)
+_CLIMB = _Plan("climb", (0.6, 1.0), 3.2, 1.7, 3.5)
+_PLANS: dict[ActionKind, tuple[_Plan, ...]] = {
+    "sticks": (*_LEANS, _YAW, _CLIMB),
+    "attitude": (*_LEANS, _YAW),
+    "rates": (*_LEANS, _YAW),
+    "velocity": (*_SPEEDS, _YAW, _CLIMB),
+}
 
 
-def _doublet_steps() -> tuple[DoubletStep, ...]:
-    planned = [(plan, share) for plan in _PLANS for share in plan.shares]
+def doublet_steps(action: ActionKind) -> tuple[DoubletStep, ...]:
+    """Each axis that a kind of action can push, at two amplitudes, to both sides.
+
+    Thrust has no gain to be found: it is balanced by the height, and only its mean is told.
+    """
+    planned = [(plan, share) for plan in _PLANS[action] for share in plan.shares]
     lengths = (2 * plan.half_s + plan.rest_s + plan.settle_s for plan, _ in planned)
     begins = accumulate(lengths, initial=0.0)
     return tuple(
@@ -101,15 +112,20 @@ def _doublet_steps() -> tuple[DoubletStep, ...]:
     )
 
 
-DOUBLET_STEPS = _doublet_steps()
-"""Each axis at two amplitudes, to both sides."""
-DOUBLET_S = DOUBLET_STEPS[-1].end_s + DOUBLET_STEPS[-1].settle_s
-"""After that time it begins again."""
+def doublet_length_s(action: ActionKind) -> float:
+    """Time after which the doublet begins again."""
+    last = doublet_steps(action)[-1]
+    return last.end_s + last.settle_s
 
 
-def _doublet(time_s: float) -> Motion:
-    pushes = (step.push_at(time_s % DOUBLET_S) for step in DOUBLET_STEPS)
-    return Motion(push=next(filter(None, pushes), None))
+def _doublet(action: ActionKind) -> Callable[[float], Motion]:
+    steps, length_s = doublet_steps(action), doublet_length_s(action)
+
+    def motion(time_s: float) -> Motion:
+        pushes = (step.push_at(time_s % length_s) for step in steps)
+        return Motion(push=next(filter(None, pushes), None))
+
+    return motion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,11 +139,24 @@ class Program:
 
 
 _LEGS = (Motion(LEG_MPS), Motion(0.0, LEG_MPS), Motion(-LEG_MPS), Motion(0.0, -LEG_MPS))
-PROGRAMS: dict[str, Program] = {
-    "hover": Program(motion=lambda _: Motion()),
-    "square": Program(motion=lambda time_s: _LEGS[int(time_s / LEG_S) % len(_LEGS)]),
-    "circle": Program(motion=lambda _: Motion(forward_mps=LEG_MPS, yaw_rate_radps=YAW_RATE_RADPS)),
-    "yaw": Program(motion=lambda _: Motion(yaw_rate_radps=YAW_RATE_RADPS)),
-    "doublet": Program(motion=_doublet, altitude_m=DOUBLET_ALTITUDE_M),
+_MOTIONS: dict[str, Callable[[float], Motion]] = {
+    "hover": lambda _: Motion(),
+    "square": lambda time_s: _LEGS[int(time_s / LEG_S) % len(_LEGS)],
+    "circle": lambda _: Motion(forward_mps=LEG_MPS, yaw_rate_radps=YAW_RATE_RADPS),
+    "yaw": lambda _: Motion(yaw_rate_radps=YAW_RATE_RADPS),
 }
-PROGRAM_NAMES = tuple(PROGRAMS)
+DOUBLET = "doublet"
+PROGRAM_NAMES = (*_MOTIONS, DOUBLET)
+
+
+def make_program(name: str, action: ActionKind) -> Program:
+    """A program of ``PROGRAM_NAMES`` for a policy that puts out this kind of action.
+
+    Raises:
+        PolicyError: there is none of that name.
+    """
+    if name == DOUBLET:
+        return Program(motion=_doublet(action), altitude_m=DOUBLET_ALTITUDE_M)
+    if name not in _MOTIONS:
+        raise PolicyError(f"scripted program {name!r} is unknown; use one of {list(PROGRAM_NAMES)}")
+    return Program(motion=_MOTIONS[name])

@@ -132,10 +132,12 @@ class MavlinkServer:
         )
 
     def _attitude_target(self, _link: MavlinkEndpoint, message: Message, arrived_ns: int) -> None:
-        set_attitude_target(message, self._ap, arrived_ns)
+        if set_attitude_target(message, self._ap, arrived_ns):
+            self._log.on_setpoint(arrived_ns)
 
     def _position_target(self, _link: MavlinkEndpoint, message: Message, arrived_ns: int) -> None:
-        set_position_target(message, self._ap, arrived_ns)
+        if set_position_target(message, self._ap, arrived_ns):
+            self._log.on_setpoint(arrived_ns)
 
     def _command(self, link: MavlinkEndpoint, message: Message, _arrived_ns: int) -> None:
         fields = _COMMAND_FIELDS[message.get_type()]

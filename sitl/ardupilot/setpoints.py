@@ -35,26 +35,28 @@ _NED_AXES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_OFFSET_NED)
 _BODY_AXES = (mav.MAV_FRAME_BODY_NED, mav.MAV_FRAME_BODY_OFFSET_NED)
 
 
-def set_attitude_target(message: Message, ap: Autopilot, now_ns: int) -> None:
-    """Act on a SET_ATTITUDE_TARGET."""
+def set_attitude_target(message: Message, ap: Autopilot, now_ns: int) -> bool:
+    """Act on a SET_ATTITUDE_TARGET; True if it is followed from now on."""
     if ap.guided is None:
-        return
+        return False
     setpoint = _attitude_setpoint(message)
     if setpoint is not None:
         ap.guided.follow_attitude(setpoint, ap.sensed, now_ns)
     elif ap.mode is Mode.GUIDED:
         ap.guided.brake(ap.sensed)
+    return setpoint is not None
 
 
-def set_position_target(message: Message, ap: Autopilot, now_ns: int) -> None:
-    """Act on a SET_POSITION_TARGET_LOCAL_NED; GUIDED_NOGPS ignores it."""
+def set_position_target(message: Message, ap: Autopilot, now_ns: int) -> bool:
+    """Act on a SET_POSITION_TARGET_LOCAL_NED, which GUIDED_NOGPS ignores; as above."""
     if ap.guided is None or ap.mode is not Mode.GUIDED:
-        return
+        return False
     setpoint = _velocity_setpoint(message, to_euler(ap.sensed.ned_from_body_wxyz)[2])
     if setpoint is None:
         ap.guided.brake(ap.sensed)
     else:
         ap.guided.follow_velocity(setpoint, ap.sensed, now_ns)
+    return setpoint is not None
 
 
 def _attitude_setpoint(message: Message) -> AttitudeSetpoint | None:

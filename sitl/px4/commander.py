@@ -26,6 +26,7 @@ class Commander:
         self._sticks = sticks
         self._boot_ns = self.now_ns = boot_ns
         self.mode = self.intended = Mode.AUTO_LOITER
+        self._last_armable = Mode.AUTO_LOITER
         self.armed = False
         self.terminated = False
         self.landed = True
@@ -38,6 +39,7 @@ class Commander:
         self.events: list[Event] = []
         self._fallback = False
         self._sticks_missed = True  # lost, and that is known
+        self._lost_ns: int | None = None
         self._ignores_sticks = False  # they were absent at arming
         self.armed_ns = boot_ns
         self._landed_ns = boot_ns
@@ -63,9 +65,9 @@ class Commander:
 
     def arm(self, reason: int = ev.ARM_REASON_COMMAND) -> bool:
         """Start the motors; a refusal becomes a text. True if armed afterwards."""
-        if self.armed or self.terminated:
-            return self.armed
-        if not self.can_arm():
+        if self.armed:
+            return True
+        if self.terminated or not self.can_arm():
             self._deny(
                 "Arming denied: Resolve system health failures first",
                 "commander_arm_denied_resolve_failures",
@@ -84,7 +86,7 @@ class Commander:
             return False
         self.start(ignores_sticks=not self._sticks.valid)
         self._say(ev.SEVERITY_INFO, f"Armed by {ev.REASON_NAMES[reason]}")
-        self._emit("commander_armed_by", ev.LOG_EXTERNAL_INFO, ev.pack("B", reason))
+        self._emit("commander_armed_by", ev.LEVELS_INFO, ev.pack("B", reason))
         return True
 
     def start(self, *, ignores_sticks: bool) -> None:
@@ -104,9 +106,9 @@ class Commander:
         self.armed = self._fallback = False
         self.lost_sticks.clear()
         self._say(ev.SEVERITY_INFO, f"Disarmed by {ev.REASON_NAMES[reason]}")
-        self._emit("commander_disarmed_by", ev.LOG_EXTERNAL_INFO, ev.pack("B", reason))
+        self._emit("commander_disarmed_by", ev.LEVELS_INFO, ev.pack("B", reason))
         if not self.intended.armable and not self.terminated:
-            self.intended = Mode.POSCTL if self._sticks.valid else Mode.AUTO_LOITER
+            self.intended = self._last_armable
         self.mode = self.intended
         return True
 
@@ -124,8 +126,12 @@ class Commander:
 
     def terminate(self) -> None:
         """Stop the motors for good; the vehicle stays armed until it is forced to disarm."""
+        mode = self.mode.custom_mode
         self.terminated = True
         self._intend(Mode.TERMINATION)
+        self._say(ev.SEVERITY_CRITICAL, "Failsafe activated")
+        arguments = ev.pack("IB", mode, ev.ACTION_TERMINATE)
+        self._emit("commander_failsafe_enter_generic", ev.LEVELS_FAILSAFE, arguments)
 
     def refuse_frame(self, frame: int) -> None:
         """A velocity setpoint came in axes that PX4 does not take."""
@@ -148,7 +154,7 @@ class Commander:
         self._has_flown = self._has_flown or not landed
         what = "landing" if landed else "takeoff"
         self._say(ev.SEVERITY_INFO, f"{what.capitalize()} detected")
-        self._emit(f"commander_{what}_detected", ev.LOG_EXTERNAL_INFO)
+        self._emit(f"commander_{what}_detected", ev.LEVELS_INFO)
 
     def update(self, now_ns: int) -> None:
         """Look at sticks, setpoints and time; decide on the mode."""
@@ -176,11 +182,15 @@ class Commander:
     def _watch_sticks(self) -> None:
         """Start the failsafe when sticks are lost in flight; absence at arming is ignored."""
         if self._sticks.valid:
+            if self._sticks_missed and self._lost_ns is not None:
+                gap_s = (self.now_ns - self._lost_ns) / NS_PER_S
+                self._emit("commander_rc_regained", ev.LEVELS_INFO, ev.pack("f", gap_s))
             self._sticks_missed = self._ignores_sticks = False
             return
         if self._sticks_missed:
             return
-        self._sticks_missed = True
+        self._sticks_missed, self._lost_ns = True, self.now_ns
+        self._emit("commander_rc_lost", ev.LEVELS_INFO)
         is_excepted = self.lost_sticks.is_excepted(self.intended)
         if not self.armed or self._ignores_sticks or is_excepted or self.lost_sticks.active:
             return
@@ -199,7 +209,7 @@ class Commander:
         if self._sticks.moved_fast and is_autonomous and not is_held and not self.landed:
             self._intend(Mode.POSCTL if self.position_ready else Mode.ALTCTL)
             self._say(ev.SEVERITY_INFO, "Pilot took over using sticks")
-            self._emit("commander_rc_override", ev.LOG_EXTERNAL_INFO)
+            self._emit("commander_rc_override", ev.LEVELS_INFO)
 
     def _disarm_by_time(self) -> None:
         if not self.landed:
@@ -235,6 +245,8 @@ class Commander:
         return Mode.ALTCTL if is_stick_flown else Mode.AUTO_LAND
 
     def _intend(self, mode: Mode) -> None:
+        if self.intended.armable:
+            self._last_armable = self.intended
         self.intended = self.mode = mode
         self._fallback = False
         self.lost_sticks.clear()
@@ -244,22 +256,22 @@ class Commander:
         if hold_s is None:
             self._say(ev.SEVERITY_CRITICAL, "Failsafe activated")
             arguments = ev.pack("IBB", mode, action, ev.CAUSE_STICKS_LOST)
-            self._emit("commander_failsafe_enter", ev.LOG_EXTERNAL_CRITICAL, arguments)
+            self._emit("commander_failsafe_enter", ev.LEVELS_FAILSAFE, arguments)
             return
         seconds = int(hold_s)
         text = f"Failsafe activated: entering Hold for {seconds} seconds"
         self._say(ev.SEVERITY_CRITICAL, text)
         arguments = ev.pack("IBHB", mode, action, seconds, ev.CAUSE_STICKS_LOST)
-        self._emit("commander_failsafe_enter_hold", ev.LOG_EXTERNAL_CRITICAL, arguments)
+        self._emit("commander_failsafe_enter_hold", ev.LEVELS_FAILSAFE, arguments)
 
     def _deny(self, text: str, event: str, arguments: bytes = b"") -> None:
         self._say(ev.SEVERITY_CRITICAL, text)
-        self._emit(event, ev.LOG_EXTERNAL_CRITICAL, arguments)
+        self._emit(event, ev.LEVELS_DENIED, arguments)
 
     def _say(self, severity: int, text: str) -> None:
         # The tab marks a text that exists as an event as well; ground stations hide it.
         self.texts.append(StatusText(severity, text + "\t"))
 
-    def _emit(self, name: str, level: int, arguments: bytes = b"") -> None:
+    def _emit(self, name: str, levels: int, arguments: bytes = b"") -> None:
         uptime_ms = (self.now_ns - self._boot_ns) // NS_PER_MS
-        self.events.append(Event(name, level, arguments, uptime_ms))
+        self.events.append(Event(name, levels, arguments, uptime_ms))

@@ -26,6 +26,7 @@ SIH_QUAD = Airframe(
     max_motor_thrust_n=GRAVITY_MPS2 / 4.0 / 0.484,  # hovers at 0.484
     motor_lag_s=0.05,
     rotor_drag_nspm=1.0,  # 6.8 m/s at a lean of 35 degrees
+    air_density_kgpm3=0.0,
     step_ns=1_000_000,
 )
 HOVER_THRUST = 0.484
@@ -96,9 +97,9 @@ class VelocityController:
         self._last_mps: tuple[float, float] | None = None
         self._accel = [0.0, 0.0]
 
-    def reset(self) -> None:
-        """Forget what was learned of wind and drag."""
-        self._integral = [0.0, 0.0]
+    def reset(self, accel_ne_mps2: tuple[float, float]) -> None:
+        """Begin with this acceleration, as if it were what wind and drag need."""
+        self._integral = list(accel_ne_mps2)
         self._last_mps = None
         self._accel = [0.0, 0.0]
 

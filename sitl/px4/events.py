@@ -10,7 +10,8 @@ from typing import NamedTuple
 from sitl.px4.modes import Mode
 
 SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
-LOG_EXTERNAL_CRITICAL, LOG_EXTERNAL_INFO = 2, 6
+LEVELS_INFO, LEVELS_DENIED, LEVELS_FAILSAFE = 0x66, 0x62, 0x42
+"""Levels for the outside and, in the upper half, for the vehicle's own log: 2 critical, 6 info."""
 _AUTOPILOT_COMPONENT = 1 << 24
 _FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
 
@@ -50,7 +51,7 @@ class Event(NamedTuple):
     """One EVENT; ``uptime_ms`` is its time since boot."""
 
     name: str
-    level: int  # 0 emergency .. 7 debug
+    levels: int
     arguments: bytes
     uptime_ms: int
 

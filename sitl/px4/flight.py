@@ -7,10 +7,10 @@ from sitl.px4.control import (
     HOVER_THRUST,
     SIH_QUAD,
     RateController,
-    VelocityController,
     attitude_for,
     yaw_of,
 )
+from sitl.px4.horizontal import STILL, Horizontal, NorthEast
 from sitl.px4.modes import Mode
 from sitl.px4.params import Params
 from sitl.px4.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint, VelocitySetpoint
@@ -23,8 +23,6 @@ STOPPED = (0.0, 0.0, 0.0, 0.0)
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
 STILL_YAW_RADPS = 0.01  # a slower yaw stick holds the heading
 TAKEOFF_CLIMB_MPS = 0.3  # a climb stick beyond this lifts a landed vehicle off
-HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the place of that moment is held
-BRAKING_PER_S = 0.6  # of POSCTL with centred sticks, on top of MPC_ACC_HOR / MPC_VEL_MANUAL
 ARRIVED_M = 1.0
 
 
@@ -34,13 +32,14 @@ class FlightControl:
     def __init__(self, params: Params) -> None:
         self._params = params
         self._rates = RateController(params)
-        self._velocity = VelocityController(params)
+        self._horizontal = Horizontal(params)
         self._height = HeightController()
         self._yaw_rate_radps = 0.0
         self._yaw_hold_rad: float | None = None
-        self._hold_ne_m: tuple[float, float] | None = None
-        self._speed_ne_mps = self._accel_ne_mps2 = (0.0, 0.0)
+        self._accel_mps2 = STILL  # north and east, asked for last
+        self._target_m: NorthEast | None = None
         self._home_reached = False
+        self._returns_to_m: float | None = None
         self.takeoff_to_m = 0.0
         """Height at which AUTO.TAKEOFF ends."""
         self.most_climb_mps = math.inf
@@ -60,20 +59,20 @@ class FlightControl:
     def reset(self, body: BodyState) -> None:
         """Forget the targets: before flight and at each mode change."""
         self._rates.reset()
-        self._velocity.reset()
+        self._horizontal.reset(body, self._accel_mps2)
         self._height.reset(body)
         self._yaw_rate_radps = 0.0
         self._yaw_hold_rad = None
-        self._hold_ne_m = None
-        self._speed_ne_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])
-        self._accel_ne_mps2 = (0.0, 0.0)
         self._home_reached = False
+        self._returns_to_m = None
+        self._target_m = None
         self.attitude = body.ned_from_body_wxyz
         self.velocity_ned_mps = (0.0, 0.0, 0.0)
         self.thrust = 0.0
 
     def idle(self, body: BodyState) -> tuple[float, ...]:
         """Motors of an armed vehicle that stays on the ground."""
+        self._accel_mps2 = STILL
         self.reset(body)
         return IDLE
 
@@ -129,11 +128,14 @@ class FlightControl:
         if mode is Mode.ALTCTL:
             forward, right = curves.lean_accel_mps2(sticks, self._params)
             accel = _to_north_east(forward, right, yaw)
-        elif has_position:
-            wanted = self._wanted_velocity(mode, sticks, body, dt_s)
-            accel = self._velocity.update(body, wanted, dt_s, self._accel_ne_mps2)
+        elif not has_position:
+            accel = STILL
+        elif mode is Mode.POSCTL:
+            speed = curves.speed_mps(sticks, self._params)
+            accel = self._horizontal.steer(_to_north_east(*speed, yaw), body, dt_s)
         else:
-            accel = (0.0, 0.0)
+            accel = self._horizontal.fly_to(self._destination(mode, body), body, dt_s)
+        self._accel_mps2 = accel
         thrust = self._climb(self._climb_mps(mode, sticks, body), body, dt_s)
         return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
 
@@ -149,17 +151,14 @@ class FlightControl:
             gain = self._params["MPC_XY_P"]
             north += gain * (setpoint.position_ned_m[0] - body.position_ned_m[0])
             east += gain * (setpoint.position_ned_m[1] - body.position_ned_m[1])
-        north, east = _shorten(north, east, self._params["MPC_XY_VEL_MAX"])
-        accel = self._velocity.update(body, (north, east), dt_s)
+        accel = self._accel_mps2 = self._horizontal.track((north, east), body, dt_s)
         climb = self._offboard_climb_mps(setpoint, body)
-        self.velocity_ned_mps = (north, east, -climb)
         if setpoint.yaw_rad is not None:
             self._yaw_hold_rad, yaw_rate = setpoint.yaw_rad, setpoint.yaw_rate_radps
         else:
             yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
         yaw = yaw_of(body) if self._yaw_hold_rad is None else self._yaw_hold_rad
-        # The firmware does not limit the acceleration of what a companion asks for.
-        thrust = self._climb(climb, body, dt_s, max_accel_mps2=math.inf)
+        thrust = self._climb(climb, body, dt_s)
         return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
 
     def _offboard_climb_mps(self, setpoint: VelocitySetpoint, body: BodyState) -> float:
@@ -196,16 +195,13 @@ class FlightControl:
             self._yaw_hold_rad = yaw_of(body)
         return 0.0
 
-    def _climb(
-        self, climb_mps: float, body: BodyState, dt_s: float, max_accel_mps2: float | None = None
-    ) -> float:
+    def _climb(self, climb_mps: float, body: BodyState, dt_s: float) -> float:
         """Collective that brings about a climb rate."""
         climb_mps = min(climb_mps, self.most_climb_mps)
-        if max_accel_mps2 is None:
-            max_accel_mps2 = self._params["MPC_ACC_UP_MAX" if climb_mps > 0 else "MPC_ACC_DOWN_MAX"]
+        max_accel_mps2 = self._params["MPC_ACC_UP_MAX" if climb_mps > 0 else "MPC_ACC_DOWN_MAX"]
         accel = self._height.update(body, climb_mps, max_accel_mps2, dt_s)
         thrust = thrust_for(accel, cos_tilt(body.ned_from_body_wxyz), HOVER_THRUST)
-        self.velocity_ned_mps = (*self.velocity_ned_mps[:2], -climb_mps)
+        self.velocity_ned_mps = (*self._horizontal.speed_mps, -climb_mps)
         return max(self._params["MPC_THR_MIN"], min(self._params["MPC_THR_MAX"], thrust))
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
@@ -222,68 +218,31 @@ class FlightControl:
         if mode is Mode.AUTO_TAKEOFF:
             return max(0.0, min(params["MPC_TKO_SPEED"], 1.5 * (self.takeoff_to_m + 0.1 - height)))
         if mode is Mode.AUTO_RTL and not self._home_reached:
-            up = params["RTL_RETURN_ALT"] - height
+            up = self._return_height_m(body) - height
             return max(-params["MPC_Z_V_AUTO_DN"], min(params["MPC_Z_V_AUTO_UP"], up))
         if mode not in (Mode.AUTO_RTL, Mode.AUTO_LAND):
             return 0.0
         return -(slow + share * (fast - slow))
 
-    def _wanted_velocity(
-        self, mode: Mode, sticks: Sticks, body: BodyState, dt_s: float
-    ) -> tuple[float, float]:
-        """Velocity north and east of the modes that hold a place or fly to one."""
-        if mode is Mode.AUTO_RTL and self._rtl_moves(body):
-            north, east = (-self._params["MPC_XY_P"] * p for p in body.position_ned_m[:2])
-            north, east = _shorten(north, east, self._params["MPC_XY_CRUISE"])
-            self._hold_ne_m = None
-        else:
-            forward, right = (0.0, 0.0)
-            if mode is Mode.POSCTL:
-                forward, right = curves.speed_mps(sticks, self._params)
-            north, east = _to_north_east(forward, right, yaw_of(body))
-        self._speed_ne_mps = self._shaped(north, east, dt_s)
-        is_asked = north != 0.0 or east != 0.0
-        if is_asked:
-            self._hold_ne_m = None
-        elif self._hold_ne_m is None and math.hypot(*self._speed_ne_mps) < HOLD_BELOW_MPS:
-            self._hold_ne_m = (body.position_ned_m[0], body.position_ned_m[1])
-            self._speed_ne_mps = (0.0, 0.0)
-        if self._hold_ne_m is not None:
-            self._accel_ne_mps2 = (0.0, 0.0)
-            gain = self._params["MPC_XY_P"]
-            offsets = zip(self._hold_ne_m, body.position_ned_m, strict=False)
-            north, east = (gain * (there - here) for there, here in offsets)
-            return _shorten(north, east, self._params["MPC_XY_CRUISE"])
-        self.velocity_ned_mps = (*self._speed_ne_mps, self.velocity_ned_mps[2])
-        return self._speed_ne_mps
-
-    def _shaped(self, north: float, east: float, dt_s: float) -> tuple[float, float]:
-        """The demanded speed, which approaches the wanted one as in drag: fast at full stick."""
-        per_s = self._params["MPC_ACC_HOR"] / self._params["MPC_VEL_MANUAL"]
-        if north == east == 0.0:
-            per_s += BRAKING_PER_S
-        now_n, now_e = self._speed_ne_mps
-        self._accel_ne_mps2 = _shorten(
-            per_s * (north - now_n), per_s * (east - now_e), self._params["MPC_ACC_HOR"]
-        )
-        accel_n, accel_e = self._accel_ne_mps2
-        return now_n + accel_n * dt_s, now_e + accel_e * dt_s
-
-    def _rtl_moves(self, body: BodyState) -> bool:
-        """RTL is high enough to fly home, and has not arrived."""
+    def _destination(self, mode: Mode, body: BodyState) -> NorthEast | None:
+        """Where an AUTO mode flies to; None: it stays where it comes to rest."""
+        if mode is not Mode.AUTO_RTL or self._home_reached:
+            return self._target_m
         north, east, down = body.position_ned_m
-        if not self._home_reached and -down > self._params["RTL_RETURN_ALT"] - ARRIVED_M:
-            if math.hypot(north, east) > ARRIVED_M:
-                return True
-            self._home_reached = True
-        return False
+        if -down > self._return_height_m(body) - ARRIVED_M:
+            self._target_m = STILL  # home
+            self._home_reached = math.hypot(north, east) < ARRIVED_M
+        return self._target_m
+
+    def _return_height_m(self, body: BodyState) -> float:
+        """RTL_RETURN_ALT, or near home the height at which RTL began."""
+        if self._returns_to_m is None:
+            north, east, down = body.position_ned_m
+            is_near = math.hypot(north, east) < self._params["RTL_MIN_DIST"]
+            self._returns_to_m = -down if is_near else self._params["RTL_RETURN_ALT"]
+        return self._returns_to_m
 
 
-def _to_north_east(forward: float, right: float, yaw_rad: float) -> tuple[float, float]:
+def _to_north_east(forward: float, right: float, yaw_rad: float) -> NorthEast:
     cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
     return forward * cy - right * sy, forward * sy + right * cy
-
-
-def _shorten(north: float, east: float, limit: float) -> tuple[float, float]:
-    scale = limit / max(limit, math.hypot(north, east))
-    return north * scale, east * scale

@@ -36,17 +36,9 @@ TEMPERATURE_C = 25.0
 FIRMWARE_VERSION = 0x01120080  # 1.18.0 beta
 CAPABILITIES = 0xE8FF
 
-_SENSORS = (
-    mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    | mav.MAV_SYS_STATUS_SENSOR_3D_MAG
-    | mav.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
-    | mav.MAV_SYS_STATUS_SENSOR_GPS
-    | mav.MAV_SYS_STATUS_AHRS
-    | mav.MAV_SYS_STATUS_SENSOR_BATTERY
-)
+_SENSORS_PRESENT, _SENSORS_ENABLED, _SENSORS_HEALTHY = 0x200C02F, 0x201C02F, 0x320C83F
 _ESTIMATOR_WITHOUT_POSITION = 0xE5
-_ESTIMATOR_WITH_POSITION = 0x37F
+_ESTIMATOR_WITH_POSITION, _ESTIMATOR_ON_GROUND = 0x37F, 0x3FF
 _STANDARD_MODES = {
     Mode.POSCTL: 1,
     Mode.ALTCTL: 4,
@@ -80,8 +72,7 @@ class HandPacked(mav.MAVLink_message):  # type: ignore[misc]  # the library has 
 def event_message(event: Event, sequence: int) -> Message:
     """EVENT to everybody."""
     arguments = event.arguments.ljust(EVENT_ARGUMENT_BYTES, b"\0")
-    levels = event.level | event.level << 4  # the upper half is the level of the vehicle's own log
-    payload = _EVENT.pack(event.number, event.uptime_ms, sequence, 0, 0, levels, arguments)
+    payload = _EVENT.pack(event.number, event.uptime_ms, sequence, 0, 0, event.levels, arguments)
     return HandPacked(EVENT, "EVENT", payload, EVENT_CRC_EXTRA)
 
 
@@ -144,19 +135,16 @@ def _heartbeat(ap: Autopilot) -> Message:
 
 
 def _sys_status(ap: Autopilot) -> Message:
-    """PREARM_CHECK is healthy where arming in the intended mode would not be refused."""
-    present = _SENSORS | mav.MAV_SYS_STATUS_PREARM_CHECK
-    present |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.stick_input.count else 0
-    faults = 0
-    if not ap.armed and not ap.commander.can_arm():
-        faults |= mav.MAV_SYS_STATUS_PREARM_CHECK
-    if not ap.stick_input.valid:
-        faults |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+    """PREARM_CHECK, never present, is healthy where arming would not be refused for health."""
+    sticks = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.stick_input.valid else 0
+    healthy = _SENSORS_HEALTHY | sticks
+    if ap.armed or ap.commander.can_arm():
+        healthy |= mav.MAV_SYS_STATUS_PREARM_CHECK
     if ap.battery.is_low:
-        faults |= mav.MAV_SYS_STATUS_SENSOR_BATTERY
+        healthy &= ~mav.MAV_SYS_STATUS_SENSOR_BATTERY
     battery = (*_battery_mv_ca(ap), ap.battery.remaining_percent)
     return mav.MAVLink_sys_status_message(
-        present, present, present & ~faults, 100, *battery, 0, 0, 0, 0, 0, 0
+        _SENSORS_PRESENT | sticks, _SENSORS_ENABLED, healthy, 100, *battery, 0, 0, 0, 0, 0, 0
     )
 
 
@@ -318,7 +306,9 @@ def _battery_status(ap: Autopilot) -> Message:
 
 def _estimator_status(ap: Autopilot) -> Message:
     """The one message that says whether there is a horizontal position."""
-    flags = _ESTIMATOR_WITH_POSITION if ap.position_ready else _ESTIMATOR_WITHOUT_POSITION
+    flags = _ESTIMATOR_ON_GROUND if ap.landed else _ESTIMATOR_WITH_POSITION
+    if not ap.position_ready:
+        flags = _ESTIMATOR_WITHOUT_POSITION
     if not ap.estimator_ready:
         flags = 0
     return mav.MAVLink_estimator_status_message(

@@ -85,6 +85,7 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "MPC_VEL_MANUAL": 10.0,
         "MPC_XY_CRUISE": 5.0,
         "MPC_XY_P": 0.95,
+        "MPC_XY_TRAJ_P": 0.5,
         "MPC_XY_VEL_D_ACC": 0.2,
         "MPC_XY_VEL_I_ACC": 0.4,
         "MPC_XY_VEL_MAX": 12.0,

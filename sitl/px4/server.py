@@ -12,7 +12,7 @@ from sitl.link.framing import Message
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.commands import change_mode, execute
 from sitl.px4.endpoint import MavlinkEndpoint
-from sitl.px4.setpoints import AttitudeSetpoint, RateSetpoint, VelocitySetpoint
+from sitl.px4.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint, VelocitySetpoint
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
 from sitl.rotation import Vec3, to_euler
@@ -159,9 +159,9 @@ class MavlinkServer:
                 return
             attitude = (w / length, x / length, y / length, z / length)
             setpoint = AttitudeSetpoint(attitude, yaw_rate, _thrust(message))
-            self._ap.set_setpoint(setpoint, arrived_ns)
+            self._follow(setpoint, arrived_ns)
         elif not mask & _IGNORE_RATES and all(map(math.isfinite, rates)):
-            self._ap.set_setpoint(RateSetpoint(rates, _thrust(message)), arrived_ns)
+            self._follow(RateSetpoint(rates, _thrust(message)), arrived_ns)
 
     def _set_position_target(self, link_id: int, message: Message, arrived_ns: int) -> None:
         frame, mask = message.coordinate_frame, message.type_mask
@@ -185,7 +185,12 @@ class MavlinkServer:
         if not all(map(math.isfinite, numbers)):
             self._log.refused_messages += 1
             return
-        self._ap.set_setpoint(VelocitySetpoint(position, velocity, yaw, yaw_rate), arrived_ns)
+        self._follow(VelocitySetpoint(position, velocity, yaw, yaw_rate), arrived_ns)
+
+    def _follow(self, setpoint: Setpoint, arrived_ns: int) -> None:
+        self._ap.set_setpoint(setpoint, arrived_ns)
+        if self._ap.mode_name == "OFFBOARD":
+            self._log.on_setpoint(arrived_ns)
 
     def _from_heading(self, velocity: Vec3) -> Vec3:
         """A velocity forward, right and down, in NED."""

@@ -15,7 +15,7 @@ RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
 """Sticks are looked at when they come, and this long after that, again and again."""
 GESTURE_NS = NS_PER_S
-GESTURE_LOW_THROTTLE, GESTURE_FULL_YAW = -0.9, 0.9
+GESTURE_LOW_THROTTLE, GESTURE_FULL_YAW, GESTURE_MOST_LEAN = -0.9, 0.9, 0.3
 FAST_SAMPLES = 3  # in a row that must move fast to count as the pilot's will
 
 _ANY_SOURCE_MODES = (2, 3, 5, 6, 7, 8)
@@ -91,7 +91,7 @@ class StickInput:
             self._gesture = self._fast_samples = 0
 
     def gesture(self, now_ns: int) -> int:
-        """1: throttle down and full right yaw were held for a second, -1: full left; else 0.
+        """1: throttle down with full right yaw and no lean for a second, -1: full left; else 0.
 
         Each is reported once.
         """
@@ -136,7 +136,9 @@ class StickInput:
         self._never_ages = False
         self.count += 1
         gesture = 0
-        if sticks.throttle < GESTURE_LOW_THROTTLE and abs(sticks.yaw) > GESTURE_FULL_YAW:
+        is_level = max(abs(sticks.forward), abs(sticks.right)) < GESTURE_MOST_LEAN
+        is_turned = abs(sticks.yaw) > GESTURE_FULL_YAW
+        if is_level and is_turned and sticks.throttle < GESTURE_LOW_THROTTLE:
             gesture = 1 if sticks.yaw > 0.0 else -1
         if gesture != self._gesture:
             self._gesture, self._gesture_since_ns, self._gesture_done = gesture, now_ns, False

@@ -20,7 +20,6 @@ GRAVITY_MPS2 = 9.80665
 INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
 MOTOR_ARM_M = 0.12  # motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase
 YAW_TORQUE_PER_THRUST_M = 0.016
-AIR_DENSITY_KGPM3 = 1.225
 REST_HEIGHT_M = 0.06
 
 
@@ -35,6 +34,8 @@ class Airframe:
     rotor_drag_nspm: float = 0.15
     """Linear drag of spinning rotors, about 0.1 1/s of mass at this size; body drag is MuJoCo's own
     quadratic model on the equivalent inertia box."""
+    air_density_kgpm3: float = 1.225
+    """0 leaves the rotors' drag alone."""
     step_ns: int = 1_250_000
     """Of the physics; a firmware's control period is a whole number of them."""
 
@@ -51,7 +52,7 @@ def _model_xml(airframe: Airframe, conditions: Conditions) -> str:
     Motor order and directions are ArduCopter's quad X: front right and rear left turn anticlockwise
     seen from above, so they push the nose to the right.
     """
-    density = AIR_DENSITY_KGPM3 * conditions.drag_factor
+    density = airframe.air_density_kgpm3 * conditions.drag_factor
     thrust_n = airframe.max_motor_thrust_n * conditions.thrust_factor
     inertia_kgm2 = [conditions.mass_factor * moment for moment in INERTIA_KGM2]
     return f"""

@@ -155,6 +155,15 @@ def test_throttle_down_and_full_yaw_arms_and_disarms(px4):
     assert "Disarmed by stick gesture" in px4.texts()
 
 
+def test_a_lean_is_no_gesture(px4):
+    px4.get_ready(POSCTL)
+    px4.seen.clear()
+
+    px4.fly(1.6, (500, 500, 0, 1000))
+
+    assert "Armed by stick gesture" not in px4.texts()
+
+
 def test_who_does_not_take_off_is_disarmed(px4):
     px4.get_ready(ALTCTL)
     assert px4.arm() == ACCEPTED
@@ -254,4 +263,4 @@ def test_landing_disarms_two_seconds_after_the_touchdown(px4):
 
     assert 1.7 <= took_s <= 2.4
     px4.fly(0.5)
-    assert px4.mode() == POSCTL[0] << 16, "the last one that can arm"
+    assert px4.mode() == ALTCTL[0] << 16, "the last one that can arm"

@@ -32,6 +32,7 @@ PX4_MODES = ModeRoles(
     setpoint=("OFFBOARD",),
     needs_setpoints_first=True,
     is_silence_failsafe=True,
+    stick_rest_ns=300 * NS_PER_MS,
 )
 STEP_NS = 10 * NS_PER_MS
 

@@ -10,8 +10,8 @@ import numpy as np
 from mavbridge.commands.identify.axes import CHANNELS, AxisChannel, trained_motion
 from mavbridge.commands.identify.fit import Array, fit_response
 from mavbridge.commands.identify.recording import ResponseRecording
-from policy.contract import Contract
-from policy.scripted.programs import DOUBLET_STEPS, Axis, DoubletStep
+from policy.contract import ActionKind, Contract
+from policy.scripted.programs import Axis, DoubletStep, doublet_steps
 
 BEFORE_S = 0.1
 """Of the motion before a push that is looked at."""
@@ -21,8 +21,8 @@ ahead by the lag of the smoothing."""
 LONGEST_GAP_S = 0.25
 """Between two actions; a longer one means that the policy did not fly all the time."""
 LEAST_R_SQUARED = 0.7
-SETTLED = 0.06
-"""Most change within the last quarter of a push, of the whole, after which it counts as settled."""
+SETTLED = 0.1
+"""Most change between the last two eighths of a push, of the whole, at which it has settled."""
 STILL_S = 1.0
 """Of the end of each pause: by then the vehicle hovers."""
 
@@ -84,9 +84,7 @@ def identify_pushes(
     pushes: list[PushResult] = []
     missing: list[str] = []
     channels = {channel.axis: channel for channel in CHANNELS[contract.action]}
-    for step in DOUBLET_STEPS:
-        if step.axis not in channels:
-            continue
+    for step in doublet_steps(contract.action):
         found = _fit_push(recording, channels[step.axis], step, contract, program_start_s)
         if isinstance(found, PushResult):
             pushes.append(found)
@@ -94,7 +92,7 @@ def identify_pushes(
             missing.append(f"{step.axis} at {step.share:.0%}: {found}")
     thrust = None
     if contract.action in ("rates", "attitude"):
-        thrust = _hover_thrust(recording, program_start_s)
+        thrust = _hover_thrust(recording, contract.action, program_start_s)
     return Identification(pushes=tuple(pushes), missing=tuple(missing), hover_thrust=thrust)
 
 
@@ -140,7 +138,7 @@ def _fit_push(
 def _settled_gain(
     input_s: Array, inputs: Array, output_s: Array, outputs: Array, end_s: float, half_s: float
 ) -> float | None:
-    """Motion for each unit of a push, from its last quarter; None where one of them still moves."""
+    """Motion for each unit of a push, from its last eighth; None where one of them still moves."""
     edges_s = end_s - EARLY_S - half_s * np.array([0.25, 0.125, 0.0])
     pushed = inputs[(input_s >= edges_s[0]) & (input_s < edges_s[-1])]
     moved = [
@@ -149,10 +147,10 @@ def _settled_gain(
     if len(pushed) < 2 or min(map(len, moved)) < 2:
         return None
     earlier, later = (float(np.median(values)) for values in moved)
-    push, motion = float(np.median(pushed)), float(np.median(np.concatenate(moved)))
-    if np.ptp(pushed) > SETTLED * abs(push) or abs(later - earlier) > SETTLED * abs(motion):
+    push = float(np.median(pushed))
+    if np.ptp(pushed) > SETTLED * abs(push) or abs(later - earlier) > SETTLED * abs(later):
         return None
-    return motion / push
+    return later / push
 
 
 def _side(contract: Contract, axis: Axis, amount: float, gain: float) -> Side:
@@ -166,11 +164,13 @@ def _is_covered(times_s: Array, begin_s: float, end_s: float) -> bool:
     return bool(np.diff(moments).max() <= LONGEST_GAP_S)
 
 
-def _hover_thrust(recording: ResponseRecording, program_start_s: float) -> float | None:
+def _hover_thrust(
+    recording: ResponseRecording, action: ActionKind, program_start_s: float
+) -> float | None:
     """Median thrust at the end of the pauses."""
     input_s, thrust = recording.inputs(0)
     still = np.zeros(len(input_s), bool)
-    for step in DOUBLET_STEPS:
+    for step in doublet_steps(action):
         end_s = program_start_s + step.end_s + step.settle_s
         still |= (input_s >= end_s - STILL_S) & (input_s < end_s)
     return float(np.median(thrust[still])) if still.any() else None

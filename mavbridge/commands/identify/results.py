@@ -74,7 +74,7 @@ def _gain(sides: Sequence[Side], pushes: Sequence[PushResult], contract: Contrac
     if contract.action == "sticks" and full is not None:
         text += (
             f"; full stick {abs(full.reached):.1f} of {abs(full.trained):.1f} {pushes[0].unit}, "
-            f"dead zone {full.dead_zone:.0%}"
+            f"as if dead below {full.dead_zone:.0%}"
         )
     return text
 

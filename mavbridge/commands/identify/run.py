@@ -18,7 +18,7 @@ from mavbridge.observe.output import flight_console
 from policy.contract import Contract, Executable
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.scripted import ScriptedPolicy
-from policy.scripted.programs import DOUBLET_S
+from policy.scripted.programs import doublet_length_s
 
 CLIMB_S = 20.0
 """From the first action to the begin of the doublet, takeoff included."""
@@ -66,7 +66,7 @@ def doublet_flight(config: IdentifyConfig, trained: Contract) -> FlyConfig:
         policy=PolicyConfig(policy=f"scripted:doublet:{trained.action}", dual_rate=True),
         camera=replace(flight.camera, camera="none", window_name=None, camera_latency=0.0),
         link=replace(flight.link, raw_sticks=not config.mapped_sticks),
-        duration=flight.duration or CLIMB_S + DOUBLET_S,
+        duration=flight.duration or CLIMB_S + doublet_length_s(trained.action),
     )
 
 

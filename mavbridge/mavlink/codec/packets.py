@@ -1,15 +1,18 @@
 """Bytes <-> records, without socket or clock; the wire's sentinels and the last range checks."""
 
+import math
 from collections.abc import Iterator, Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.vehicle import Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
 from mavbridge.mavlink.codec.fast_path import decode_state_packet, pack_override
 from mavbridge.mavlink.codec.messages import (
     CommandRequest,
     Endpoint,
+    ManualControl,
     ParamRequest,
     ParamWrite,
     ReceivedMessage,
@@ -17,6 +20,7 @@ from mavbridge.mavlink.codec.messages import (
     StreamRequest,
 )
 from mavbridge.mavlink.codec.readers import READERS, UnusableError
+from mavbridge.mavlink.codec.rotation import Quaternion, tilt_rad
 
 RELEASE_US = 0
 """RC_CHANNELS_OVERRIDE ch 1-8: give the channel back to the receiver."""
@@ -29,6 +33,28 @@ _TEXT_CHUNKS = 4
 
 _PACKET_STARTS = (b"\xfd", b"\xfe")
 """MAVLink 2 and 1."""
+
+
+STICK_END = 1000
+"""MANUAL_CONTROL: x forward, y right and r, nose right, in -1000..1000, z up in 0..1000."""
+GESTURE_Z, MOST_LOW_R = 150, 800
+"""PX4 arms and disarms by z < 100 with |r| > 900 for a second: both bounds with a margin."""
+MOST_LEAN_RAD = math.radians(85.0)
+"""Hard limits of the wire, beyond what a flight may be configured to: a bug upstream, if exceeded.
+Neither autopilot limits the lean of a setpoint by itself. Also the next three."""
+MOST_RATE_RADPS = 40.0
+MOST_SPEED_MPS = 150.0
+MOST_NORM_ERROR = 1e-4
+"""ArduPilot drops quaternions that are off by 5e-4, and brakes."""
+_ATTITUDE_MASK = (
+    dialect.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
+    | dialect.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
+    | dialect.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
+)
+"""7; a mask that ignores only some rates is dropped by ArduPilot."""
+_RATES_MASK = dialect.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
+_VELOCITY_MASK = 0x5C7
+"""Position, acceleration and yaw are ignored."""
 
 
 class CommandRefusedError(Exception):
@@ -136,16 +162,92 @@ class Codec:
         self._mav.seq = (self._mav.seq + 1) % 256
         return data
 
-    def encode_manual_control(self, target_system: int, sticks: Sticks) -> bytes:
-        """MANUAL_CONTROL: x forward, y right, r nose right in -1000..1000, z up in 0..1000.
+    def encode_manual_control(self, target_system: int, sticks: ManualControl) -> bytes:
+        """MANUAL_CONTROL.
 
         Raises:
-            CommandRefusedError: a stick that is not finite or not in [-1, 1].
+            CommandRefusedError: a value out of range, which PX4 takes for the centre, or sticks
+                that arm or disarm if they are held for a second.
         """
-        _refuse_bad_sticks(sticks)
-        x, y, r = (round(1000 * value) for value in (sticks.pitch, sticks.roll, sticks.yaw))
-        z = round(500 * (sticks.throttle + 1))
+        x, y, z, r = sticks
+        if not (all(abs(value) <= STICK_END for value in (x, y, r)) and 0 <= z <= STICK_END):
+            raise CommandRefusedError(f"MANUAL_CONTROL {tuple(sticks)} is out of range")
+        if z <= GESTURE_Z and abs(r) > MOST_LOW_R:
+            raise CommandRefusedError(f"MANUAL_CONTROL {tuple(sticks)} may arm or disarm")
         return self._pack(self._mav.manual_control_encode(target_system, x, y, z, r, 0))
+
+    def encode_attitude(
+        self, target: Endpoint, ned_from_body_wxyz: Quaternion, thrust: float, *, now_ns: int
+    ) -> bytes:
+        """SET_ATTITUDE_TARGET with an attitude and a collective thrust in 0..1.
+
+        Raises:
+            CommandRefusedError: no unit quaternion, a lean that no policy flies, or a bad thrust.
+        """
+        _refuse_bad_thrust(thrust)
+        if not abs(math.hypot(*ned_from_body_wxyz) - 1) <= MOST_NORM_ERROR:
+            raise CommandRefusedError(f"{ned_from_body_wxyz} is no unit quaternion")
+        if not tilt_rad(ned_from_body_wxyz) <= MOST_LEAN_RAD:
+            raise CommandRefusedError(f"{ned_from_body_wxyz} leans too far")
+        return self._encode_attitude_target(
+            target, _ATTITUDE_MASK, ned_from_body_wxyz, (0.0, 0.0, 0.0), thrust, now_ns
+        )
+
+    def encode_rates(
+        self,
+        target: Endpoint,
+        rate_body_radps: tuple[float, float, float],
+        thrust: float,
+        *,
+        now_ns: int,
+    ) -> bytes:
+        """SET_ATTITUDE_TARGET with body rates and a collective thrust in 0..1.
+
+        Raises:
+            CommandRefusedError: a rate that no multirotor has, or a bad thrust.
+        """
+        _refuse_bad_thrust(thrust)
+        if not all(abs(rate) <= MOST_RATE_RADPS for rate in rate_body_radps):
+            raise CommandRefusedError(f"body rates {rate_body_radps} rad/s")
+        level = (1.0, 0.0, 0.0, 0.0)
+        return self._encode_attitude_target(
+            target, _RATES_MASK, level, rate_body_radps, thrust, now_ns
+        )
+
+    def _encode_attitude_target(
+        self,
+        target: Endpoint,
+        mask: int,
+        quaternion: Quaternion,
+        rate_radps: tuple[float, float, float],
+        thrust: float,
+        now_ns: int,
+    ) -> bytes:
+        message = self._mav.set_attitude_target_encode(
+            _stamp_ms(now_ns), *target, mask, quaternion, *rate_radps, thrust
+        )
+        return self._pack(message)
+
+    def encode_velocity(
+        self, target: Endpoint, velocity: Velocity, *, is_heading_frame: bool, now_ns: int
+    ) -> bytes:
+        """SET_POSITION_TARGET_LOCAL_NED with a velocity and a yaw rate alone.
+
+        Raises:
+            CommandRefusedError: a speed or a yaw rate that no multirotor has.
+        """
+        x, y, z, yaw_rate = velocity
+        if not (math.hypot(x, y, z) <= MOST_SPEED_MPS and abs(yaw_rate) <= MOST_RATE_RADPS):
+            raise CommandRefusedError(f"velocity {tuple(velocity)}")
+        frame = dialect.MAV_FRAME_BODY_NED if is_heading_frame else dialect.MAV_FRAME_LOCAL_NED
+        nothing = (0.0, 0.0, 0.0)
+        message = self._mav.set_position_target_local_ned_encode(
+            _stamp_ms(now_ns),
+            *(*target, frame, _VELOCITY_MASK),
+            *(*nothing, x, y, z, *nothing),
+            *(0.0, yaw_rate),
+        )
+        return self._pack(message)
 
     def encode_request(self, target: Endpoint, request: Request) -> bytes:
         """COMMAND_LONG, PARAM_REQUEST_READ, PARAM_SET or REQUEST_DATA_STREAM."""
@@ -183,15 +285,41 @@ class Codec:
 
 
 def pwm_of(sticks: Sticks, calibration: RcCalibration) -> Pwm:
-    """PWM of throttle, yaw, pitch, roll in us; refuses sticks as ``encode_manual_control`` does."""
+    """PWM of throttle, yaw, pitch, roll in us.
+
+    Raises:
+        CommandRefusedError: a stick that is not finite or not in [-1, 1].
+    """
     _refuse_bad_sticks(sticks)
     return calibration.to_pwm_us(sticks)
 
 
-def manual_control_sticks(sticks: Sticks) -> Sticks:
-    """Sticks as MANUAL_CONTROL's integers can express them."""
-    throttle = round(500 * (sticks.throttle + 1)) / 500 - 1
-    return Sticks(throttle, *(round(1000 * value) / 1000 for value in sticks[1:]))
+def manual_control_of(sticks: Sticks) -> ManualControl:
+    """Sticks as MANUAL_CONTROL's integers; refuses them as ``pwm_of`` does.
+
+    With the throttle at the bottom, yaw stays short of what arms or disarms.
+    """
+    _refuse_bad_sticks(sticks)
+    x, y, r = (round(STICK_END * value) for value in (sticks.pitch, sticks.roll, sticks.yaw))
+    z = round(STICK_END / 2 * (sticks.throttle + 1))
+    if z <= GESTURE_Z:
+        r = min(max(r, -MOST_LOW_R), MOST_LOW_R)
+    return ManualControl(x, y, z, r)
+
+
+def manual_control_sticks(values: ManualControl) -> Sticks:
+    """Inverse of ``manual_control_of``."""
+    x, y, z, r = values
+    return Sticks(2 * z / STICK_END - 1, r / STICK_END, x / STICK_END, y / STICK_END)
+
+
+def _stamp_ms(now_ns: int) -> int:
+    return now_ns // NS_PER_MS % 2**32
+
+
+def _refuse_bad_thrust(thrust: float) -> None:
+    if not 0.0 <= thrust <= 1.0:  # also false for NaN
+        raise CommandRefusedError(f"thrust {thrust!r} is not in [0, 1]")
 
 
 def _refuse_bad_sticks(sticks: Sticks) -> None:

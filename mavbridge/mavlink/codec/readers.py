@@ -29,6 +29,7 @@ from mavbridge.mavlink.codec.messages import (
     Timesync,
     VelocityTarget,
 )
+from mavbridge.mavlink.codec.rotation import quaternion_from_euler
 
 MG_TO_MPS2 = 9.80665e-3
 """Milli-g to m/s^2, standard gravity."""
@@ -64,23 +65,8 @@ def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body
 def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
     rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
     _require_finite(m.roll, m.pitch, m.yaw, *rate)
-    quaternion = _quaternion_from_euler(m.roll, m.pitch, m.yaw)
+    quaternion = quaternion_from_euler(m.roll, m.pitch, m.yaw)
     return Attitude(False, 1000 * m.time_boot_ms, quaternion, rate)
-
-
-def _quaternion_from_euler(
-    roll_rad: float, pitch_rad: float, yaw_rad: float
-) -> tuple[float, float, float, float]:
-    """ned_from_body quaternion (w, x, y, z) of MAVLink's intrinsic Z-Y-X Euler angles."""
-    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
-    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
-    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
 
 
 def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:

@@ -26,7 +26,7 @@ SILENT_US = 400_000
 SILENT_SAMPLES = 8
 """Fewest messages in that time, as many as come at 20 Hz: where some are lost, a few of them may be
 equal by chance."""
-RETURNED_US = 500_000
+OFTEN_US = 500_000
 RETURNED_SAMPLES = 2
 """So many messages within this time with the values of before us: one is a stray release of
 another station; a joystick at 50 Hz has a quarter to a half of 29 RC_CHANNELS. Sticks that nobody
@@ -57,6 +57,11 @@ class EchoRules:
     """Its step until then: more than ``tolerance``, lest a source at rest is taken for us."""
     centre: int
     """The nudge goes towards this value, never away from it."""
+    foreign_samples: int = 1
+    """So many values of nobody's within half a second are a fault. More than one where the vehicle
+    shows others for a moment as soon as its mode changes, which is told a little later."""
+    longest_pause_ns: int = NS_PER_S
+    """After so long without a message that shows them, our commands are taken for lost."""
 
 
 class EchoCheck:
@@ -83,6 +88,7 @@ class EchoCheck:
         self._held_since_us = 0
         self._held_samples = 0
         self._returned_us: deque[int] = deque(maxlen=RETURNED_SAMPLES)
+        self._foreign_us: deque[int] = deque(maxlen=rules.foreign_samples)
         self._fault: EchoFault | None = None
         self._fault_ns = 0
         self.is_released = True
@@ -103,8 +109,9 @@ class EchoCheck:
         return self._since_ns is not None
 
     def is_unshown(self, now_ns: int) -> bool:
-        """No message that could show an echo has come for a second."""
-        return self._arrived_ns is None or now_ns - self._arrived_ns > NS_PER_S
+        """No message that could show an echo has come for too long."""
+        pause_ns = self._rules.longest_pause_ns
+        return self._arrived_ns is None or now_ns - self._arrived_ns > pause_ns
 
     def with_nudge(self, wanted: Shown, now_ns: int) -> Shown:
         """The values to send: one walks by up to two steps towards its centre, never outwards.
@@ -134,6 +141,7 @@ class EchoCheck:
         self.shows_last &= not self.is_sending
         self._since_ns = self._matched_ns = self._held = None
         self._returned_us.clear()
+        self._foreign_us.clear()
 
     def received(self, values: Shown, shown_us: int, now_ns: int) -> None:
         """Compare the values of one message, stamped ``shown_us`` by the vehicle.
@@ -156,12 +164,10 @@ class EchoCheck:
         elif is_ours:
             self._matched_ns = now_ns
         elif self._baseline is None or not self._is_near(values, self._baseline):
-            self._fail("foreign", now_ns)
-        else:
-            self._returned_us.append(shown_us)
-            is_often = len(self._returned_us) == RETURNED_SAMPLES
-            if is_often and shown_us - self._returned_us[0] <= RETURNED_US:
-                self._fail("returned", now_ns)
+            if _is_often(self._foreign_us, shown_us):
+                self._fail("foreign", now_ns)
+        elif _is_often(self._returned_us, shown_us):
+            self._fail("returned", now_ns)
         if self.confirmed:
             self._watch_change(values, shown_us, now_ns)
 
@@ -173,6 +179,7 @@ class EchoCheck:
         if self.is_sending:
             self._since_ns, self._matched_ns, self._held = now_ns, None, None
             self._returned_us.clear()
+            self._foreign_us.clear()
         if self._fault == "unseen":
             self._fault = None
 
@@ -200,10 +207,19 @@ class EchoCheck:
 
     def fault(self, now_ns: int) -> EchoFault | None:
         """The way in which it does not act on our commands; kept for 3 s after it ends."""
-        newest_ns = max(self._since_ns or 0, self._matched_ns or 0)
-        if self.is_sending and now_ns - newest_ns > CONFIRM_NS:
-            self._fail("unseen", now_ns)
+        if self._since_ns is not None:
+            since_ns, longest_ns = self._since_ns, CONFIRM_NS
+            if self._matched_ns is not None:
+                since_ns, longest_ns = self._matched_ns, self._rules.longest_pause_ns
+            if now_ns - since_ns > longest_ns:
+                self._fail("unseen", now_ns)
         return self._fault if now_ns - self._fault_ns < _RETRY_NS else None
+
+
+def _is_often(times_us: deque[int], shown_us: int) -> bool:
+    """Note a value that should not be shown; True once there are too many."""
+    times_us.append(shown_us)
+    return len(times_us) == times_us.maxlen and shown_us - times_us[0] <= OFTEN_US
 
 
 def _is_within(tolerance: int, one: Shown, other: Shown) -> bool:

@@ -1,43 +1,92 @@
-"""Sticks by MANUAL_CONTROL: PX4."""
+"""Sticks by MANUAL_CONTROL, with their echo in the vehicle's own MANUAL_CONTROL: PX4."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
-from mavbridge.core.vehicle import Action, Output, Sticks
-from mavbridge.mavlink.codec.messages import Body
-from mavbridge.mavlink.codec.packets import CommandRefusedError, manual_control_sticks
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.vehicle import Action, Output, StickGains
+from mavbridge.mavlink.codec.messages import Body, ManualControl
+from mavbridge.mavlink.codec.packets import (
+    STICK_END,
+    Codec,
+    manual_control_of,
+    manual_control_sticks,
+)
 from mavbridge.mavlink.outputs.echo import EchoFault, EchoRules
-from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
+from mavbridge.mavlink.outputs.output import Encoded
+from mavbridge.mavlink.outputs.sticks import StickOutput
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
+MANUAL_ECHO = EchoRules(
+    tolerance=1,
+    release_tolerance=1,
+    nudged=3,
+    nudge=2,
+    seek_nudge=4,
+    centre=0,
+    longest_pause_ns=450 * NS_PER_MS,
+)
+"""x, y, z, r. PX4 shows the sticks as they came, or one less (rounded down), at the rate at which
+they came: it shows nothing when it hears nothing.
 
-class ManualControlOutput(ActionOutput):
-    """MANUAL_CONTROL; silence is the release."""
+The nudge is on r, whose dead zone is a tenth; outside it 4 are half a degree a second.
+"""
+_HELD_NS = 700 * NS_PER_MS
+"""PX4 holds the last sticks for 0.5 s and a poll of 0.2 s (COM_RC_LOSS_T); echoes end with them."""
 
-    name: ClassVar[Output] = "manual-control"
-    is_sticks = True
-    releases = 0
-    _rules = EchoRules(tolerance=1, nudged=1, nudge=2, seek_nudge=4, centre=0)
+
+class ManualControlOutput(StickOutput):
+    """MANUAL_CONTROL. There is no release: one neutral packet where nobody else has sticks, then
+    silence, which PX4 takes for lost sticks where it had only ours."""
+
+    name: Output = "manual-control"
+    releases = 1
     _echo_message = "MANUAL_CONTROL"
-    _causes: ClassVar[dict[EchoFault, str]] = {}
+    _causes: ClassVar[Mapping[EchoFault, str]] = {
+        "unseen": "it has other sticks (a receiver, or a joystick on another link) and keeps them "
+        "(COM_RC_IN_MODE)",
+        "foreign": "another station sends sticks, or the receiver's have priority (COM_RC_IN_MODE)",
+        "returned": "it also acts on the sticks that it had before us (COM_RC_IN_MODE)",
+        "silent": "its sticks have stood still for 0.4 s while ours moved",
+    }
+
+    def __init__(self, codec: Codec, gains: StickGains | None) -> None:
+        super().__init__(codec, MANUAL_ECHO, gains)
+        self._last = ManualControl(0, 0, STICK_END // 2, 0)
+        self._sent_ns = 0
+
+    def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
+        """Note what has left."""
+        super().sent(encoded, vehicle, now_ns)
+        self._sent_ns = now_ns
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """The four sticks, rounded."""
-        if not isinstance(action, Sticks):
-            raise CommandRefusedError(f"{type(action).__name__} are not sticks")
-        packet = self._codec.encode_manual_control(vehicle.identity.source.system, action)
-        return Encoded(packet, manual_control_sticks(action), ())
-
-    def sent(self, encoded: Encoded, now_ns: int) -> None:
-        """Nothing is checked."""
+        sticks, curves = self._wanted(action, vehicle, now_ns)
+        shown = self.echo.with_nudge(manual_control_of(sticks), now_ns)
+        x, y, z, r = shown
+        values = ManualControl(x, y, z, r)
+        packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)
+        self._last = values
+        return Encoded(packet, curves.to_policy(manual_control_sticks(values)), shown)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Nothing is checked."""
+        """Compare the sticks that the vehicle acts on; they carry no stamp of its own."""
+        if isinstance(body, ManualControl):
+            self.echo.received(tuple(body), arrived_ns // 1000, arrived_ns)
 
-    def release_packet(self, vehicle: VehicleSession) -> bytes | None:
-        """Silence is the release."""
-        return None
+    def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """Level once more, unless a receiver has sticks of its own; in a mode where the throttle is
+        thrust, with the last one."""
+        status = vehicle.status(now_ns)
+        if status is None or status.has_receiver:
+            return None
+        z = self._last.z if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2
+        return self._codec.encode_manual_control(
+            vehicle.identity.source.system, ManualControl(0, 0, z, 0)
+        )
 
-    @property
-    def echo_confirmed(self) -> bool:
-        """Nothing is checked."""
-        return True
+    def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
+        """It shows other sticks, or none any more."""
+        is_over = now_ns - self._sent_ns > _HELD_NS and self.echo.is_unshown(now_ns)
+        return self.echo.is_released or (is_over and not self.echo.is_sending)

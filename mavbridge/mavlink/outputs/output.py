@@ -1,9 +1,10 @@
 """What an output is: how an action becomes a packet, and how the vehicle shows that it took it."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
-from mavbridge.core.vehicle import Action, Output
+from mavbridge.core.vehicle import Action, Output, VehicleStatus
 from mavbridge.mavlink.codec.messages import Body
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.outputs.echo import EchoCheck, EchoFault, EchoRules, Shown
@@ -16,8 +17,8 @@ class Encoded(NamedTuple):
     packet: bytes
     action: Action
     """The action as the packet expresses it, in the policy's own terms."""
-    shown: Shown
-    """What the vehicle will show of it."""
+    shown: Shown | None
+    """What the vehicle will show of it; None: nothing that could be checked."""
 
 
 class ActionOutput(ABC):
@@ -27,26 +28,33 @@ class ActionOutput(ABC):
     the present one.
     """
 
-    name: ClassVar[Output]
+    name: Output
     is_sticks: ClassVar[bool]
     """Its actions are stick positions, and not setpoints."""
     hides_receiver: ClassVar[bool] = False
     """RC_CHANNELS shows our sticks in place of the receiver's."""
     releases: ClassVar[int]
     """Packets that take the last action back; 0: silence alone does."""
-    _rules: ClassVar[EchoRules]
     _echo_message: ClassVar[str]
     """Message in which the vehicle shows what it acts on."""
-    _causes: ClassVar[dict[EchoFault, str]]
+    _causes: ClassVar[Mapping[EchoFault, str]]
     """Likely reason of each fault, for the user."""
 
-    def __init__(self, codec: Codec) -> None:
+    def __init__(self, codec: Codec, rules: EchoRules) -> None:
         self._codec = codec
-        self.echo = EchoCheck(self._rules)
+        self._rules = rules
+        self.echo = EchoCheck(rules)
+        self._was_confirmed = False
 
     def restart(self) -> None:
         """A new session of the vehicle begins: nothing was sent in it, or seen."""
+        self._was_confirmed |= self.echo.confirmed
         self.echo = EchoCheck(self._rules)
+
+    @property
+    def was_confirmed(self) -> bool:
+        """The vehicle was seen to act on our packets at some time."""
+        return self._was_confirmed or self.echo.confirmed
 
     @abstractmethod
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
@@ -56,9 +64,10 @@ class ActionOutput(ABC):
             CommandRefusedError: an action that must not be sent.
         """
 
-    def sent(self, encoded: Encoded, now_ns: int) -> None:
+    def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note what has left."""
-        self.echo.sent(encoded.shown, now_ns)
+        if encoded.shown is not None:
+            self.echo.sent(encoded.shown, now_ns)
 
     def receive(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Take a message of the vehicle, which may show an echo, before the session does."""
@@ -71,13 +80,37 @@ class ActionOutput(ABC):
         """Take an echo, if this is one."""
 
     @abstractmethod
-    def release_packet(self, vehicle: VehicleSession) -> bytes | None:
+    def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """One of ``releases``; None: there is nothing to take back."""
+
+    def released(self) -> None:
+        """Nothing more is sent until the next action."""
+        self._was_confirmed |= self.echo.confirmed
+        self.echo.released()
 
     @property
     def echo_confirmed(self) -> bool:
-        """The vehicle was seen to act on our packets."""
+        """The vehicle was seen to act on our packets, or shows nothing of them now."""
         return self.echo.confirmed
+
+    def take_notes(self) -> tuple[str, ...]:
+        """What the user should know, each once."""
+        return ()
+
+    def in_policy_terms(
+        self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
+    ) -> VehicleStatus | None:
+        """The status with its sticks as the policy would mean them."""
+        return status
+
+    def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
+        """It acts on something else than our last packets, or was sent none."""
+        return self.echo.is_released
+
+    @property
+    def shows_last(self) -> bool:
+        """What it shows since the release is, or cannot be told from, our last."""
+        return self.echo.shows_last
 
     def overruled(self, now_ns: int) -> str | None:
         """The likely reason why it acts on something else than what we send, or None."""

@@ -1,13 +1,15 @@
 """Sticks by RC_CHANNELS_OVERRIDE, with their echo in RC_CHANNELS: ArduPilot."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
-from mavbridge.core.vehicle import Action, Output, Sticks
+from mavbridge.core.vehicle import Action, Output, StickGains
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import Body, RcChannels
-from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError, pwm_of
+from mavbridge.mavlink.codec.packets import Codec, pwm_of
 from mavbridge.mavlink.outputs.echo import EchoFault, EchoRules
-from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
+from mavbridge.mavlink.outputs.output import Encoded
+from mavbridge.mavlink.outputs.sticks import StickOutput
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
 OVERRIDE_ECHO = EchoRules(tolerance=2, nudged=3, nudge=1, seek_nudge=4, centre=1500)
@@ -19,18 +21,16 @@ inside the dead zone.
 """
 
 
-class OverrideOutput(ActionOutput):
+class OverrideOutput(StickOutput):
     """RC_CHANNELS_OVERRIDE; a release gives the channels back to the receiver."""
 
-    name: ClassVar[Output] = "rc-override"
-    is_sticks = True
+    name: Output = "rc-override"
     hides_receiver = True
     releases = 80
     """Over the four seconds for which they are asked for at most; then silence, so that another
     station may override."""
-    _rules = OVERRIDE_ECHO
     _echo_message = "RC_CHANNELS"
-    _causes: ClassVar[dict[EchoFault, str]] = {
+    _causes: ClassVar[Mapping[EchoFault, str]] = {
         "unseen": "another station may be overriding them, or the receiver has priority",
         "foreign": "another station is overriding them (a joystick on our system id?)",
         "returned": "it also acts on the sticks that it had before us: another station is "
@@ -38,24 +38,23 @@ class OverrideOutput(ActionOutput):
         "silent": "its sticks have stood still for 0.4 s while ours moved",
     }
 
-    def __init__(self, codec: Codec) -> None:
-        super().__init__(codec)
+    def __init__(self, codec: Codec, gains: StickGains | None) -> None:
+        super().__init__(codec, OVERRIDE_ECHO, gains)
         self._calibration: RcCalibration | None = None
         """Calibration of the last override, for its release even after a reboot of the vehicle."""
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """The override of the four sticks; None without a calibration."""
-        if not isinstance(action, Sticks):
-            raise CommandRefusedError(f"{type(action).__name__} are not sticks")
+        sticks, curves = self._wanted(action, vehicle, now_ns)
         calibration = vehicle.calibration
         if calibration is None:
             return None
-        shown = self.echo.with_nudge(pwm_of(action, calibration), now_ns)
+        shown = self.echo.with_nudge(pwm_of(sticks, calibration), now_ns)
         throttle, yaw, pitch, roll = shown
         pwm_us = (throttle, yaw, pitch, roll)
         packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
         self._calibration = calibration
-        return Encoded(packet, calibration.to_sticks(pwm_us), shown)
+        return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), shown)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare RC_CHANNELS with what was sent."""
@@ -64,7 +63,7 @@ class OverrideOutput(ActionOutput):
             if pwm_us is not None:
                 self.echo.received(pwm_us, body.boot_us, arrived_ns)
 
-    def release_packet(self, vehicle: VehicleSession) -> bytes | None:
+    def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """Give the four channels back."""
         if self._calibration is None:
             return None

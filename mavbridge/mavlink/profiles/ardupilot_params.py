@@ -56,12 +56,6 @@ def current_names(values: Mapping[str, float]) -> dict[str, float]:
     return renamed | dict(values)
 
 
-def sent_name(values: Mapping[str, float], name: str) -> str:
-    """The name by which this vehicle has sent what 4.7 calls ``name``; that if it has not."""
-    old, _ = _OLD_NAMES.get(name, (name, 1.0))
-    return old if old in values and name not in values else name
-
-
 def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
     """Parameters without which sticks cannot be mapped to channels, as far as RCMAP_* is known."""
     names = tuple(f"RCMAP_{stick}" for stick in STICKS)

@@ -10,12 +10,6 @@ from typing import NamedTuple
 
 from mavbridge.core.vehicle import StickGains
 from mavbridge.mavlink.codec.calibration import PWM_SIGN
-from mavbridge.mavlink.profiles.ardupilot_params import (
-    calibration_names,
-    current_names,
-    dead_zone_names,
-    sent_name,
-)
 from mavbridge.mavlink.profiles.sticks import (
     IDENTITY,
     MAX_DEAD_ZONE,
@@ -28,11 +22,16 @@ from mavbridge.mavlink.profiles.sticks import (
     unusable,
 )
 
+ARDUPILOT_CURVE_NAMES = (
+    *("ANGLE_MAX", "ATC_ANGLE_MAX"),
+    *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
+    *("PILOT_SPEED_UP", "PILOT_SPEED_DN", "PILOT_SPD_UP", "PILOT_SPD_DN"),
+    "THR_DZ",
+)
+"""Parameters to read besides the radio calibration (RCMAP_*, RCn_*); the second name of a pair is
+that of 4.7. A vehicle has one of the two, and before 4.3 no PILOT_Y_EXPO."""
 _LEAN_MODES = ("ALT_HOLD", "STABILIZE")
 """The sticks are a lean and a yaw rate."""
-_POSITIVE = ("ATC_ANGLE_MAX", "PILOT_Y_RATE", "PILOT_SPD_UP")
-_NEEDED = (*_POSITIVE, "PILOT_SPD_DN", "THR_DZ")
-"""4.7's names; PILOT_Y_EXPO came with 4.3."""
 _CLIMB_MODE = "ALT_HOLD"
 _MAX_LEAN_DEG = 85.0
 """The firmware's own limit; also the next three."""
@@ -66,27 +65,48 @@ def ardupilot_curves(
     """
     if gains is None or mode not in _LEAN_MODES:
         return IDENTITY
-    needed = (*_NEEDED, *calibration_names(values), *dead_zone_names(values))
-    known = current_names(values)
-    if (nothing := unusable(known, needed=needed, positive=_POSITIVE)) is not None:
+    lean = _present(values, "ATC_ANGLE_MAX", "ANGLE_MAX")
+    up = _present(values, "PILOT_SPD_UP", "PILOT_SPEED_UP")
+    down = _present(values, "PILOT_SPD_DN", "PILOT_SPEED_DN")
+    needed = (lean, "PILOT_Y_RATE", up, down, "THR_DZ", *_calibration_names(values))
+    if (
+        nothing := unusable(values, needed=needed, positive=(lean, "PILOT_Y_RATE", up))
+    ) is not None:
         return nothing
-    full_deg, expo = min(known["ATC_ANGLE_MAX"], _MAX_LEAN_DEG), known.get("PILOT_Y_EXPO", 0.0)
+    full_deg = min(values[lean] * (0.01 if lean == "ANGLE_MAX" else 1.0), _MAX_LEAN_DEG)
+    expo = values.get("PILOT_Y_EXPO", 0.0)
     bend = YawExpo(max(expo, _MIN_EXPO)) if expo and expo < _MAX_EXPO else None
-    yaw = Half(known["PILOT_Y_RATE"], bend=bend, parameter="PILOT_Y_RATE")
+    yaw = Half(values["PILOT_Y_RATE"], bend=bend, parameter="PILOT_Y_RATE")
     return curves_between(
         gains,
         VehicleCurves(
-            throttle=_throttle(values) if mode == _CLIMB_MODE else None,
+            throttle=_throttle(values, up, down) if mode == _CLIMB_MODE else None,
             yaw=_centred(values, "YAW", yaw, PWM_SIGN.yaw),
             lean=VehicleLean(
                 pitch=_centred(values, "PITCH", Half(full_deg), PWM_SIGN.pitch),
                 roll=_centred(values, "ROLL", Half(full_deg), PWM_SIGN.roll),
                 full=full_deg,
                 is_tangent=False,
-                parameter=sent_name(values, "ATC_ANGLE_MAX"),
+                parameter=lean,
             ),
         ),
     )
+
+
+def _present(values: Mapping[str, float], new: str, old: str) -> str:
+    """The name that this firmware knows; the older one if it knows neither."""
+    return new if new in values else old
+
+
+def _calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
+    """Parameters that place the dead zones, as far as RCMAP_* is known."""
+    names: tuple[str, ...] = ()
+    for stick in ("THROTTLE", "YAW", "PITCH", "ROLL"):
+        names += (f"RCMAP_{stick}",)
+        if (number := values.get(f"RCMAP_{stick}")) is not None:
+            parts = ("MIN", "MAX", "DZ", *(() if stick == "THROTTLE" else ("TRIM", "REVERSED")))
+            names += tuple(f"RC{int(number)}_{part}" for part in parts)
+    return names
 
 
 def _centred(values: Mapping[str, float], stick: str, half: Half, sign: float) -> Axis:
@@ -103,7 +123,7 @@ def _centred(values: Mapping[str, float], stick: str, half: Half, sign: float) -
     return Axis(high, low) if is_high else Axis(low, high)
 
 
-def _throttle(values: Mapping[str, float]) -> Axis:
+def _throttle(values: Mapping[str, float], up: str, down: str) -> Axis:
     """Climb rate: none within THR_DZ (permille) of the middle; RC3_DZ us at the bottom are lost."""
     name = f"RC{int(values['RCMAP_THROTTLE'])}_"
     range_us = values[name + "MAX"] - values[name + "MIN"]
@@ -112,9 +132,9 @@ def _throttle(values: Mapping[str, float]) -> Axis:
     # The firmware counts from the end of the lost part to the top; the stick from the middle.
     start, end = 2.0 * (1.0 - lost) * dead_zone, 1.0 - 2.0 * lost
     start = min(start, MAX_DEAD_ZONE * end)
-    known, up = current_names(values), "PILOT_SPD_UP"
-    down = "PILOT_SPD_DN" if known["PILOT_SPD_DN"] else up
+    climb_mps = values[up] * (0.01 if up == "PILOT_SPEED_UP" else 1.0)
+    descent_mps = abs(values[down]) * (0.01 if down == "PILOT_SPEED_DN" else 1.0)
     return Axis(
-        Half(known[up], start, parameter=sent_name(values, up)),
-        Half(abs(known[down]), start, end, parameter=sent_name(values, down)),
+        Half(climb_mps, start, parameter=up),
+        Half(descent_mps or climb_mps, start, end, parameter=down if descent_mps else up),
     )

@@ -1,5 +1,6 @@
 """The shape of a profile: all that the bridge has to know of one firmware."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from typing import ClassVar, NamedTuple
@@ -82,6 +83,8 @@ class Profile(ABC):
     """An integer parameter stands byte for byte in the float of PARAM_VALUE and PARAM_SET."""
     sends_invalid_estimates: ClassVar[bool] = False
     """LOCAL_POSITION_NED comes without a valid estimate too: the estimator's flags decide."""
+    shows_rates: ClassVar[bool] = False
+    """ATTITUDE_TARGET shows the body rates of a setpoint as they were sent, but not its thrust."""
     has_rc_channels_always: ClassVar[bool] = True
     """RC_CHANNELS comes without a receiver too."""
     events: ClassVar[Mapping[int, EventMeaning]] = {}
@@ -151,6 +154,10 @@ class Profile(ABC):
     @abstractmethod
     def hover_thrust(self, values: Mapping[str, float]) -> float | None:
         """Collective thrust in 0..1 that hovers, by the vehicle's own estimate; None: not known."""
+
+    def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
+        """Climb and descent in m/s to which it cuts velocity setpoints, as its echo shows them."""
+        return math.inf, math.inf
 
     @abstractmethod
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.modes import ModeTable
@@ -39,6 +40,11 @@ _FATAL_OFFBOARD_ACTIONS = {6: "terminate the flight", 7: "disarm"}
 _LONGEST_S = 1.0
 _SHORTEST_S = 0.3
 """A gate on a busy computer may be late by a tenth of this; a link loses a few packets in a row."""
+_STICK_REST_NS = 300 * NS_PER_MS
+"""Sticks that jump to neutral from a movement the same way were taken for the pilot's hand 25 ms
+after AUTO.LOITER had followed 10 ms later: POSCTL, "Pilot took over using sticks". Their speed is
+low-passed with 50 ms, so a jump over the whole range is above MAN_OVERRIDE_SPD, 1 a second, for
+200 ms."""
 
 _FIRST_MODES = ("MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED")
 _AUTO_MODES = ("TAKEOFF", "LOITER", "MISSION", "RTL", "LAND")
@@ -57,6 +63,7 @@ _MODES = ModeTable(
         setpoint=("OFFBOARD",),
         needs_setpoints_first=True,
         is_silence_failsafe=True,
+        stick_rest_ns=_STICK_REST_NS,
     ),
     shift=16,
     sub_shift=24,
@@ -109,6 +116,7 @@ class Px4(Profile):
         event_id(name): meaning for name, meaning in _EVENTS.items()
     }
     sends_invalid_estimates = True
+    shows_rates = True
     params = (
         *("COM_RC_IN_MODE", "COM_RC_LOSS_T", "COM_RCL_EXCEPT", "NAV_RCL_ACT", "COM_FAIL_ACT_T"),
         *("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_DISARM_PRFLT", "COM_DISARM_LAND"),
@@ -193,6 +201,10 @@ class Px4(Profile):
     def hover_thrust(self, values: Mapping[str, float]) -> float | None:
         """MPC_THR_HOVER."""
         return values.get("MPC_THR_HOVER")
+
+    def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
+        """MPC_Z_VEL_MAX_UP and _DN."""
+        return values.get("MPC_Z_VEL_MAX_UP", 3.0), values.get("MPC_Z_VEL_MAX_DN", 1.5)
 
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:
         """NAV_TAKEOFF, which is AUTO.TAKEOFF with a height above mean sea level.

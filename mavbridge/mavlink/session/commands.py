@@ -22,6 +22,7 @@ class ModeAndArm:
     def __init__(self) -> None:
         self._sent: dict[int, tuple[int, CommandRequest]] = {}
         self._mode: str | None = None
+        self._explained_ns: int | None = None
         self.refused_mode: str | None = None
         """Mode that was asked for last and that the vehicle has refused, or None."""
 
@@ -36,6 +37,17 @@ class ModeAndArm:
     def arm(self, now_ns: int) -> CommandRequest | None:
         """The request to arm, unless it was sent just now."""
         return self._request(CommandRequest(_ARM, (1,)), now_ns, _ARM_SPACING_NS)
+
+    def takeoff(self, request: CommandRequest, now_ns: int) -> CommandRequest | None:
+        """The request to take off, unless it was sent just now."""
+        return self._request(request, now_ns, _ARM_SPACING_NS)
+
+    def is_time_to_explain(self, now_ns: int) -> bool:
+        """Why nothing can be asked for is said again, every three seconds."""
+        if self._explained_ns is not None and now_ns - self._explained_ns < _FORGET_NS:
+            return False
+        self._explained_ns = now_ns
+        return True
 
     def _request(
         self, request: CommandRequest, now_ns: int, spacing_ns: int

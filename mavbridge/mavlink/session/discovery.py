@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.mavlink.codec.messages import Endpoint, Heartbeat
 from mavbridge.mavlink.transport.sockets import Address
@@ -20,6 +20,8 @@ _NOT_VEHICLES = (
     *(dialect.MAV_TYPE_ADSB, dialect.MAV_TYPE_CAMERA, dialect.MAV_TYPE_ANTENNA_TRACKER),
 )
 _CAPACITY = 64
+_SILENT_NS = 500 * NS_PER_MS
+"""Silence after which a vehicle that is heard elsewhere is taken to have moved there."""
 _NAMESAKES = 16
 _NAMESAKE_ADVICE = "give it another system id, or keep it off this port"
 
@@ -137,31 +139,33 @@ class Namesakes:
 
     def __init__(self) -> None:
         self._reported: set[Address | None] = set()
-        self._took_over_ns: int | None = None
+        self._replaced_ns: int | None = None
 
-    def heard(self, vehicle: VehicleIdentity, sender: Address | None) -> str | None:
-        """Warning about one that is heard beside the vehicle; None after its first."""
+    def notice(
+        self, vehicle: VehicleIdentity, sender: Address | None, now_ns: int, heard_ns: int
+    ) -> tuple[str | None, bool]:
+        """Take a heartbeat of another sender; ``heard_ns`` is when the vehicle was heard last.
+
+        Returns:
+            What to tell, or None; and whether the vehicle is silent meanwhile, so that the flight
+            is over. The first is told once a sender, the second once a second.
+        """
+        if now_ns - heard_ns >= _SILENT_NS:
+            if self._replaced_ns is not None and now_ns - self._replaced_ns <= NS_PER_S:
+                return None, True
+            self._replaced_ns = now_ns
+            return (
+                f"the vehicle at {vehicle.place} is silent, and system {vehicle.source.system} is "
+                f"now heard from {_place(sender)}, which is not followed in flight: if it is "
+                f"another vehicle, {_NAMESAKE_ADVICE}; if this one has moved, engage again"
+            ), True
         if sender in self._reported or len(self._reported) >= _NAMESAKES:
-            return None
+            return None, False
         self._reported.add(sender)
         return (
             f"system {vehicle.source.system} is also heard from {_place(sender)}, which is "
             f"ignored: the vehicle is at {vehicle.place}; {_NAMESAKE_ADVICE}"
-        )
-
-    def took_over(
-        self, vehicle: VehicleIdentity, sender: Address | None, now_ns: int
-    ) -> str | None:
-        """Why the flight is over where the vehicle itself is silent; at most once a second."""
-        if self._took_over_ns is not None and now_ns - self._took_over_ns <= NS_PER_S:
-            return None
-        self._took_over_ns = now_ns
-        return (
-            f"the vehicle at {vehicle.place} is silent, and system "
-            f"{vehicle.source.system} is now heard from {_place(sender)}, which is not followed "
-            f"in flight: if it is another vehicle, {_NAMESAKE_ADVICE}; if this one has moved, "
-            "engage again"
-        )
+        ), False
 
 
 def _place(address: Address | None) -> str:

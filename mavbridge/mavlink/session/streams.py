@@ -1,7 +1,6 @@
 """Requests telemetry at the rate of the action loop, and again whenever it slows down."""
 
 from collections.abc import Callable
-from enum import Enum, auto
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -23,19 +22,6 @@ _SCALED_WINDOWS = 2
 """So many windows in a row at one share are a link that is full; one may be a hiccup."""
 _LOSSY = 0.1
 """Share of lost packets above which loss explains low rates."""
-_HEADROOM = 0.9
-"""Of what a full link was seen to carry, as much is asked for again."""
-_FAST_HZ = 10.0
-"""Slower streams cost little, and stay as they are."""
-
-
-class _Fit(Enum):
-    """What has been done about a link that is full."""
-
-    UNTRIED = auto()
-    LOWERED = auto()
-    GIVEN_UP = auto()
-    """Others fill the link: what we ask for less, they get."""
 
 
 class _Stream:
@@ -48,7 +34,8 @@ class _Stream:
         self.is_settled = False
         self.is_given_up = False
         """An optional group that the vehicle does not grant."""
-        self.received = 0
+        self.received: dict[str, int] = {}
+        """By message: a vehicle may send a second one of the group unasked."""
         self._choice = 0
 
     def request(self) -> Request:
@@ -86,12 +73,16 @@ class _Stream:
 
     def share(self, span_s: float) -> float:
         """Part of the granted rate at which it came."""
-        return self.received / (self.rate_hz * span_s)
+        return self._count / (self.rate_hz * span_s)
+
+    @property
+    def _count(self) -> int:
+        return max(self.received.values(), default=0)
 
     def is_slow(self, span_s: float) -> bool:
         least_hz = self.group.least_hz
         least_hz = _ENOUGH * self.rate_hz if least_hz is None else least_hz
-        return not self.is_given_up and self.received < least_hz * span_s
+        return not self.is_given_up and self._count < least_hz * span_s
 
 
 def message_id(name: str) -> int:
@@ -104,8 +95,9 @@ class StreamRequester:
     """Keeps all groups coming; one request is open at a time, since acks carry no message id.
 
     A vehicle slows all streams of a link that is too slow for them down alike, and says nothing:
-    they are then asked for at a rate that fits, once, and ``report`` gets a text for the user. If
-    that does not help, they are asked for as before, and what comes has to do.
+    ``report`` then gets a text for the user, once, and what comes has to do. To ask for less would
+    not help: PX4 gives what we give up to the streams that it sends unasked (on a link of 4 kB/s,
+    7.5 Hz of 100 became 1.6 Hz when 6.7 were asked for).
     """
 
     def __init__(
@@ -122,7 +114,7 @@ class StreamRequester:
         self._received = self._lost = 0
         """Packets of any kind in this window."""
         self._scaled_windows = 0
-        self._fit = _Fit.UNTRIED
+        self._has_told = False
         self.renewals = 0
         for group in wanted:
             self.add(group)
@@ -146,7 +138,7 @@ class StreamRequester:
         self._sequence = sequence
         self._received += 1
         if (stream := self._by_message.get(name)) is not None:
-            stream.received += 1
+            stream.received[name] = stream.received.get(name, 0) + 1
 
     def receive_ack(self, ack: CommandAck) -> None:
         """Take the vehicle's answer to the open request."""
@@ -189,16 +181,14 @@ class StreamRequester:
         self._window_ns = now_ns
         self._received = self._lost = 0
         for stream in self._streams:
-            stream.received = 0
+            stream.received.clear()
 
     def _judge(self, span_s: float) -> None:
         """Ask again for what came too slowly in a window."""
         share = self._common_share(span_s)
         self._scaled_windows = self._scaled_windows + 1 if share is not None else 0
-        if share is not None and self._fit is _Fit.GIVEN_UP:
-            return
         if share is not None and self._scaled_windows >= _SCALED_WINDOWS:
-            self._fit_rates(share)
+            self._tell(share)
             return
         for stream in self._streams:
             if stream.is_slow(span_s):
@@ -215,20 +205,14 @@ class StreamRequester:
         is_alike = max(shares) - min(shares) <= _ALIKE * mean
         return mean if is_alike and mean < _ENOUGH else None
 
-    def _fit_rates(self, share: float) -> None:
-        """Ask for as much as the link carries; for all again, if that was tried before."""
-        self._scaled_windows = 0
-        is_first = self._fit is _Fit.UNTRIED
-        self._fit = _Fit.LOWERED if is_first else _Fit.GIVEN_UP
-        factor = share * _HEADROOM
-        for stream in self._streams:
-            if stream.group.rate_hz > _FAST_HZ:
-                stream.rate_hz = stream.rate_hz * factor if is_first else stream.group.rate_hz
-                stream.is_settled = stream.is_given_up
-        if is_first:
-            wanted_hz, now_hz = self._streams[0].group.rate_hz, self._streams[0].rate_hz
-            self._report(
-                f"the link carries only {share:.0%} of the telemetry that was asked for, which now "
-                f"is asked for at {now_hz:.3g} Hz instead of {wanted_hz:.3g} Hz: use a faster link "
-                "(a higher baud rate; MAV_n_RATE on PX4), or a lower --action-rate"
-            )
+    def _tell(self, share: float) -> None:
+        if self._has_told:
+            return
+        self._has_told = True
+        wanted_hz = self._streams[0].rate_hz
+        self._report(
+            f"the link carries only {share:.0%} of the telemetry that was asked for: states come "
+            f"at {share * wanted_hz:.3g} Hz instead of {wanted_hz:.3g} Hz; use a faster link (a "
+            "higher baud rate; on PX4 also MAV_n_RATE, or a MAV_n_MODE with fewer streams of its "
+            "own), or a lower --action-rate"
+        )

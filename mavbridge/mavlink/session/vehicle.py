@@ -183,6 +183,11 @@ class VehicleSession:
         return self._params.calibration
 
     @property
+    def are_params_read(self) -> bool:
+        """Every parameter has come or was given up."""
+        return self._params.is_read
+
+    @property
     def known_params(self) -> Mapping[str, float]:
         """All parameters that matter and that the vehicle has sent, by name."""
         return self._params.values

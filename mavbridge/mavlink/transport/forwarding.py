@@ -25,6 +25,8 @@ _FORMS = "udp:HOST:PORT to send there, or udpin:HOST:PORT to listen"
 class Forwarding:
     """The ground station's end; used by one thread, and never waits.
 
+    The link takes and gives packets; whoever opened it here flushes and closes it.
+
     It sends to the given address, or to the first that talks where it listens, and hears no other.
 
     Raises:

@@ -3,9 +3,14 @@ from pathlib import Path
 
 import pytest
 
+from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import MonotonicClock
-from mavbridge.flight.policies import check_configured_policy, load_configured_policy
+from mavbridge.flight.policies import (
+    check_configured_policy,
+    load_configured_policy,
+    looks_at_images,
+)
 
 MINE = """
 import numpy as np
@@ -30,3 +35,19 @@ def test_a_users_class_is_found_in_the_working_directory_by_check_and_loading(
     wanted = PolicyConfig(policy="still_module:Still")
     check_configured_policy(wanted)
     assert load_configured_policy(wanted, MonotonicClock()).executable.name == wanted.policy
+
+
+@pytest.mark.parametrize(
+    ("policy", "camera", "looks"),
+    [
+        ("mine:Still", "shm:fpv", True),
+        ("mine:Still", "none", False),
+        ("toge", "none", True),
+        ("scripted:square", "shm:fpv", False),
+    ],
+)
+def test_black_frames_are_no_fault_of_a_policy_that_is_flown_without_a_camera(
+    policy: str, camera: str, looks: bool
+) -> None:
+    config = FlyConfig(policy=PolicyConfig(policy=policy), camera=CameraConfig(camera=camera))
+    assert looks_at_images(config) is looks

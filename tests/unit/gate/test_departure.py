@@ -29,14 +29,23 @@ FAULT = {"chunk_fault": "no chunk"}
         (MIDDLE, "land", "LAND"),
         (MIDDLE, "rtl", "RTL"),
         (NO_RECEIVER, "release", None),
-        (PX4, "auto", "AUTO.LOITER"),
-        (PX4, "land", "AUTO.LAND"),
-        (PX4, "rtl", "AUTO.RTL"),
     ],
 )
 def test_the_mode_after_a_fault(facts: Any, choice: Any, mode: str | None) -> None:
     stepped = flying(facts, departure=DepartureSettings(on_fault=choice))
     assert stepped.step(**FAULT) == Move(hand=Hand.NEUTRAL, mode=mode)
+
+
+@pytest.mark.parametrize(
+    ("choice", "mode"), [("auto", "AUTO.LOITER"), ("land", "AUTO.LAND"), ("rtl", "AUTO.RTL")]
+)
+def test_where_moving_sticks_would_leave_the_mode_it_is_asked_for_once_they_rest(
+    choice: Any, mode: str
+) -> None:
+    stepped = flying(PX4, departure=DepartureSettings(on_fault=choice))
+    moves = [stepped.step(**FAULT), *stepped.run(0.29)]
+    assert {(move.hand, move.mode) for move in moves} == {(Hand.NEUTRAL, None)}
+    assert stepped.step() == Move(hand=Hand.NEUTRAL, mode=mode)
 
 
 @pytest.mark.parametrize(

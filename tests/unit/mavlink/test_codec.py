@@ -1,5 +1,5 @@
 import struct
-from math import nan, pi, sqrt
+from math import inf, nan, pi, sqrt
 from typing import Any
 
 import pytest
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.wire import ARDUPILOT, WireEnd
-from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks
+from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks, Velocity
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Attitude,
@@ -35,9 +35,11 @@ from mavbridge.mavlink.codec.messages import (
 from mavbridge.mavlink.codec.packets import (
     Codec,
     CommandRefusedError,
+    manual_control_of,
     manual_control_sticks,
     pwm_of,
 )
+from mavbridge.mavlink.codec.rotation import heading_rad, quaternion_from_euler, tilt_rad
 
 TARGET = Endpoint(1, 1)
 m = dialect.MAVLink(None)
@@ -309,9 +311,94 @@ def test_release_is_zero_on_the_stick_channels_alone() -> None:
     ],
 )
 def test_manual_control(sticks: Sticks, xyzr: tuple[int, ...]) -> None:
-    message = sent(codec().encode_manual_control(1, sticks))
+    values = manual_control_of(sticks)
+    message = sent(codec().encode_manual_control(1, values))
     assert (message.x, message.y, message.z, message.r) == xyzr
-    assert manual_control_sticks(sticks) == sticks
+    assert manual_control_sticks(values) == sticks
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *((1001, 0, 500, 0), (0, -1001, 500, 0), (0, 0, 1001, 0), (0, 0, -1, 0), (0, 0, 500, 1001)),
+        *((0, 0, 500, nan), (0, 0, nan, 0)),
+        *((0, 0, 0, 901), (0, 0, 99, -901), (0, 0, 150, 1000)),
+    ],
+)
+def test_what_px4_takes_for_centred_or_for_a_gesture_never_leaves(values: tuple[int, ...]) -> None:
+    with pytest.raises(CommandRefusedError, match="MANUAL_CONTROL"):
+        codec().encode_manual_control(1, ManualControl(*values))
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1))
+def test_no_throttle_and_yaw_of_a_policy_are_a_gesture(throttle: float, yaw: float) -> None:
+    values = manual_control_of(Sticks(throttle, yaw, 0.0, 0.0))
+    assert not (values.z < 100 and abs(values.r) > 900)
+    codec().encode_manual_control(1, values)
+    assert values.r == round(1000 * yaw) or values.z <= 150
+
+
+def test_an_attitude_is_a_quaternion_and_a_thrust() -> None:
+    quaternion = quaternion_from_euler(0.2, -0.1, 3.0)
+    message = sent(codec().encode_attitude(TARGET, quaternion, 0.25, now_ns=7_000_000))
+    assert message.get_type() == "SET_ATTITUDE_TARGET"
+    assert (message.target_system, message.target_component) == TARGET
+    assert (message.type_mask, message.thrust, message.time_boot_ms) == (7, 0.25, 7)
+    assert tuple(message.q) == pytest.approx(quaternion, abs=1e-7)
+    assert heading_rad(tuple(message.q)) == pytest.approx(3.0, abs=1e-6)
+    assert tilt_rad(quaternion) == pytest.approx(0.2232, abs=1e-3)
+
+
+def test_body_rates_stand_beside_an_attitude_that_is_ignored() -> None:
+    message = sent(codec().encode_rates(TARGET, (1.0, -2.0, 0.5), 0.5, now_ns=2**32 * 1_000_000))
+    assert (message.type_mask, message.thrust, message.time_boot_ms) == (128, 0.5, 0)
+    rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
+    assert rates == (1.0, -2.0, 0.5)
+
+
+@pytest.mark.parametrize(("is_heading_frame", "frame"), [(False, 1), (True, 8)])
+def test_a_velocity_and_a_yaw_rate_alone(is_heading_frame: bool, frame: int) -> None:
+    velocity = Velocity(1.5, -2.0, 0.25, 0.5)
+    message = sent(
+        codec().encode_velocity(TARGET, velocity, is_heading_frame=is_heading_frame, now_ns=0)
+    )
+    assert (message.coordinate_frame, message.type_mask) == (frame, 1479)
+    assert (message.vx, message.vy, message.vz, message.yaw_rate) == velocity
+    assert (message.target_system, message.target_component) == TARGET
+
+
+@pytest.mark.parametrize("thrust", [nan, -0.01, 1.01, inf])
+def test_a_thrust_out_of_range_never_leaves(thrust: float) -> None:
+    with pytest.raises(CommandRefusedError, match="thrust"):
+        codec().encode_attitude(TARGET, (1.0, 0.0, 0.0, 0.0), thrust, now_ns=0)
+    with pytest.raises(CommandRefusedError, match="thrust"):
+        codec().encode_rates(TARGET, (0.0, 0.0, 0.0), thrust, now_ns=0)
+
+
+@pytest.mark.parametrize(
+    "quaternion",
+    [
+        *((1.0002, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (nan, 0.0, 0.0, 0.0)),
+        *(quaternion_from_euler(1.5, 0.0, 0.0), quaternion_from_euler(0.0, pi, 0.0)),
+    ],
+)
+def test_no_quaternion_that_the_autopilot_drops_or_that_turns_it_over_leaves(
+    quaternion: tuple[float, float, float, float],
+) -> None:
+    with pytest.raises(CommandRefusedError):
+        codec().encode_attitude(TARGET, quaternion, 0.5, now_ns=0)
+
+
+@pytest.mark.parametrize("bad", [nan, inf, 41.0, -41.0])
+@pytest.mark.parametrize("axis", range(3))
+def test_no_rate_or_velocity_that_no_multirotor_has_leaves(bad: float, axis: int) -> None:
+    values = [0.0] * 3
+    values[axis] = bad
+    with pytest.raises(CommandRefusedError):
+        codec().encode_rates(TARGET, (values[0], values[1], values[2]), 0.5, now_ns=0)
+    for velocity in (Velocity(*[4 * v for v in values], 0.0), Velocity(0.0, 0.0, 0.0, bad)):
+        with pytest.raises(CommandRefusedError):
+            codec().encode_velocity(TARGET, velocity, is_heading_frame=False, now_ns=0)
 
 
 @pytest.mark.parametrize("bad", [nan, 1.0001, -1.0001, float("inf")])
@@ -322,7 +409,7 @@ def test_a_stick_out_of_range_never_becomes_a_message(bad: float, axis: int) -> 
     with pytest.raises(CommandRefusedError, match="not in"):
         pwm_of(Sticks(*values), ARDUPILOT)
     with pytest.raises(CommandRefusedError, match="not in"):
-        codec().encode_manual_control(1, Sticks(*values))
+        manual_control_of(Sticks(*values))
 
 
 @pytest.mark.parametrize(

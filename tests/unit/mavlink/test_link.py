@@ -129,6 +129,9 @@ class Vehicle:
             case "TIMESYNC":
                 tc1 = self.clock.now_ns() - self.boot_ns
                 self.put(mav.timesync_encode(tc1, message.ts1))
+            case "MANUAL_CONTROL" if self.follows_overrides:
+                x, y, z, r = message.x, message.y, message.z, message.r
+                self.put(mav.manual_control_encode(1, x, y, z, r, 0))
             case "RC_CHANNELS_OVERRIDE" if self.follows_overrides:
                 for k in range(8):
                     value = getattr(message, f"chan{k + 1}_raw")
@@ -728,13 +731,48 @@ def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
     rig = px4_rig()
     snapshot = rig.run(8.0)
     assert snapshot.problem is None
-    assert snapshot.echo_confirmed
     assert snapshot.status is not None
     assert snapshot.status.mode == "ALTCTL"
-    rig.run(0.1, Command(action=IDLE))
-    rig.run(0.1, Release("pilot"))
-    assert rig.vehicle.names().count("MANUAL_CONTROL") == 10
+    snapshot = rig.run(0.1, Command(action=IDLE))
+    assert snapshot.echo_confirmed
+    assert not snapshot.is_released
+    assert rig.run(0.5, Release("pilot")).is_released is False
+    assert rig.run(0.3, Release("pilot")).is_released
+    sticks = [m for m in rig.vehicle.received if m.get_type() == "MANUAL_CONTROL"]
+    assert len(sticks) == 10
     assert rig.overrides() == []
+
+
+def test_where_nobody_else_has_sticks_px4_gets_neutral_ones_before_the_silence() -> None:
+    rig = px4_rig()
+    rig.vehicle.channels = [0] * 8
+    rig.run(8.0)
+    rig.run(0.1, Command(action=IDLE))
+    rig.run(0.5, Release("pilot"))
+    sticks = [m for m in rig.vehicle.received if m.get_type() == "MANUAL_CONTROL"]
+    assert [(m.x, m.y, m.z, m.r) for m in sticks[10:]] == [(0, 0, 500, 0)]
+
+
+def test_px4_that_does_not_hear_our_sticks_is_noticed() -> None:
+    rig = px4_rig()
+    rig.run(8.0)
+    rig.run(0.5, Command(action=IDLE))
+    rig.vehicle.follows_overrides = False
+    assert rig.run(0.4, Command(action=IDLE)).problem is None
+    snapshot = rig.run(0.1, Command(action=IDLE))
+    assert snapshot.problem == "no MANUAL_CONTROL arrive to check our sticks against"
+    assert not snapshot.is_overruled
+
+
+def test_other_sticks_that_px4_follows_are_noticed() -> None:
+    rig = px4_rig()
+    rig.run(8.0)
+    rig.run(0.5, Command(action=IDLE))
+    rig.vehicle.put(rig.vehicle.end.mav.manual_control_encode(1, 300, -200, 700, 0, 0))
+    rig.vehicle.follows_overrides = False
+    snapshot = rig.run(0.02, Command(action=IDLE))
+    assert "another station sends sticks" in (snapshot.problem or "")
+    assert snapshot.is_overruled
 
 
 def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -> None:
@@ -746,6 +784,59 @@ def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -
     assert all(packet.data[7] != 32 for packet in rig.forwarded[count:])
     rig.vehicle.put(rig.vehicle.end.mav.estimator_status_encode(0, 831, *[0.0] * 8))
     assert rig.run(0.2).telemetry.velocity_ned_mps != before
+
+
+def test_other_peoples_sticks_that_px4_passes_on_are_not_its_own() -> None:
+    """PX4's links pass the packets of other senders on, under their own ids."""
+    rig = px4_rig()
+    rig.run(8.0)
+    count = len(rig.forwarded)
+    for system, component in ((42, 191), (255, 190), (1, 191)):
+        sender = WireEnd(system=system, component=component)
+        rig.vehicle.put_bytes(sender.pack(sender.mav.manual_control_encode(1, 900, 0, 500, 0, 0)))
+    rig.run(0.1)
+    assert all(packet.data[7] != 69 for packet in rig.forwarded[count:])
+    rig.vehicle.put(rig.vehicle.end.mav.manual_control_encode(1, 900, 0, 500, 0, 0))
+    rig.run(0.1)
+    assert [packet.data[5:8] for packet in rig.forwarded if packet.data[7] == 69] == [b"\1\1\x45"]
+
+
+@pytest.mark.parametrize(
+    ("is_px4", "kinds"),
+    [
+        (False, {dialect.MAV_TYPE_ONBOARD_CONTROLLER}),
+        (True, {dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_TYPE_GCS}),
+    ],
+)
+def test_only_px4_is_told_that_we_are_a_ground_station(is_px4: bool, kinds: set[int]) -> None:
+    """It sends texts to nobody else; until the vehicle is known we are an onboard computer."""
+    rig = px4_rig() if is_px4 else Rig()
+    rig.run(8.0)
+    beats = [m.type for m in rig.vehicle.received if m.get_type() == "HEARTBEAT"]
+    assert set(beats) == kinds
+    assert (beats[-1] == dialect.MAV_TYPE_GCS) is is_px4
+
+
+def test_a_takeoff_is_asked_for_as_the_firmware_wants_it() -> None:
+    def heights(rig: Rig) -> list[float]:
+        return [
+            round(m.param7, 1)
+            for m in rig.vehicle.received
+            if m.get_type() == "COMMAND_LONG" and m.command == dialect.MAV_CMD_NAV_TAKEOFF
+        ]
+
+    copter = Rig()
+    copter.run(8.0)
+    copter.link.takeoff(5.0)
+    assert heights(copter) == [5.0]
+    px4 = px4_rig()
+    px4.run(8.0)
+    px4.link.takeoff(5.0)  # its height is not known yet
+    assert heights(px4) == []
+    px4.vehicle.put(px4.vehicle.end.mav.global_position_int_encode(7, 0, 0, 489400, *[0] * 5))
+    px4.run(0.1)
+    px4.link.takeoff(5.0)
+    assert heights(px4) == [494.4]
 
 
 def test_ardupilot_with_manual_control_is_refused() -> None:

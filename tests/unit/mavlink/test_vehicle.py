@@ -10,12 +10,15 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import ActionMeaning, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
+    Altitude,
     Attitude,
     Body,
     CommandAck,
     CommandRequest,
+    CurrentMode,
     Endpoint,
     EstimatorFlags,
+    Event,
     Heartbeat,
     LandedState,
     LocalVelocity,
@@ -23,6 +26,7 @@ from mavbridge.mavlink.codec.messages import (
     ParamValue,
     RcChannels,
     ReceivedMessage,
+    StatusText,
     SystemStatus,
 )
 from mavbridge.mavlink.codec.packets import Codec
@@ -171,6 +175,111 @@ def test_the_battery(system: SystemStatus, expected: str | None) -> None:
     assert session.status.battery_problem == expected
     session.now_ns += 3 * S
     assert session.status.battery_problem is None
+
+
+# --- PX4: CURRENT_MODE and EVENT are faster than HEARTBEAT
+
+ALTCTL, POSCTL, RTL = 2 << 16, 3 << 16, 4 << 16 | 5 << 24
+LOITER, LAND = 4 << 16 | 3 << 24, 4 << 16 | 6 << 24
+ARMED_BY, DISARMED_BY, FAILSAFE_HOLD = 0x190CAF3, 0x1F46777, 0x1D11DF6
+
+
+def test_px4s_mode_is_the_newest_of_two_messages() -> None:
+    session = Session("px4")
+    assert session.status.mode == "ALTCTL"
+    session.put(CurrentMode(POSCTL, POSCTL))
+    assert session.status.mode == "POSCTL"
+    session.now_ns += 90 * MS
+    session.heartbeat(mode=ALTCTL)  # sent before the change, or overtaken by it
+    assert session.status.mode == "POSCTL"
+    session.now_ns += S
+    session.heartbeat(mode=LAND)  # CURRENT_MODE got lost
+    assert session.status.mode == "AUTO.LAND"
+    session.put(CurrentMode(LAND, LAND))  # no news
+    session.now_ns += 10 * MS
+    session.heartbeat(mode=RTL)
+    assert session.status.mode == "AUTO.RTL"
+    assert not session.status.is_failsafe
+
+
+def test_px4s_arming_is_told_by_an_event_at_once() -> None:
+    session = Session("px4")
+    assert not session.status.armed
+    session.put(Event(ARMED_BY))
+    assert session.status.armed
+    session.now_ns += 50 * MS
+    session.heartbeat(armed=False)
+    assert session.status.armed
+    session.now_ns += S
+    session.heartbeat(armed=True)
+    session.put(Event(DISARMED_BY))
+    assert not session.status.armed
+    session.now_ns += S
+    session.heartbeat(armed=True)  # the event was another's, or it was armed again
+    assert session.status.armed
+
+
+def test_a_mode_that_px4_has_left_by_itself_is_a_failsafe() -> None:
+    session = Session("px4")
+    session.put(CurrentMode(LOITER, POSCTL))
+    assert not session.status.is_failsafe  # disarmed, it falls back to what could arm
+    session.now_ns += S
+    session.heartbeat(armed=True, mode=POSCTL)
+    session.put(CurrentMode(POSCTL, 0))  # it does not say
+    assert not session.status.is_failsafe
+    session.put(CurrentMode(LOITER, POSCTL))
+    assert (session.status.mode, session.status.is_failsafe) == ("AUTO.LOITER", True)
+    session.now_ns += 50 * MS
+    session.heartbeat(armed=True, mode=POSCTL)
+    assert (session.status.mode, session.status.is_failsafe) == ("AUTO.LOITER", True)
+    session.now_ns += S
+    session.heartbeat(armed=True, mode=LOITER, state=5)
+    assert session.status.is_failsafe
+    session.put(CurrentMode(LAND, LAND))
+    session.now_ns += S
+    session.heartbeat(armed=True, mode=LAND)
+    assert (session.status.mode, session.status.is_failsafe) == ("AUTO.LAND", False)
+
+
+def test_a_failsafe_is_told_by_an_event_too() -> None:
+    session = Session("px4")
+    session.heartbeat(armed=True)
+    session.put(Event(FAILSAFE_HOLD))
+    assert session.status.is_failsafe
+    ardupilot = Session()
+    ardupilot.heartbeat(armed=True)
+    ardupilot.put(Event(FAILSAFE_HOLD))  # a number of PX4's means nothing there
+    assert not ardupilot.status.is_failsafe
+
+
+def test_px4s_events_without_a_text_are_shown_and_its_long_texts_put_together() -> None:
+    session = Session("px4")
+    session.put(Event(0x155CD44))
+    for sequence, piece in enumerate(("RTL: start return at 495 m (5 m above destination)", "\t")):
+        session.put(StatusText(piece, 5, sequence, is_full=len(piece) == 50))
+    assert session.texts[-2:] == [
+        "vehicle: manual control lost",
+        "vehicle: RTL: start return at 495 m (5 m above destination)",
+    ]
+
+
+def test_the_height_above_the_sea_is_known_while_it_comes() -> None:
+    session = Session("px4")
+    assert session.session.condition.amsl_m(session.now_ns) is None
+    session.put(Altitude(489.4))
+    assert session.session.condition.amsl_m(session.now_ns) == 489.4
+    assert session.session.condition.amsl_m(session.now_ns + 3 * S) is None
+
+
+def test_a_receiver_that_px4_does_not_listen_to_is_none() -> None:
+    session = Session("px4", is_ready=False)
+    session.params = {"COM_RC_IN_MODE": 3.0}
+    session.rc(RECEIVER)
+    session.put(SystemStatus(RC_BIT, RC_BIT, -1))
+    session.shake_hands()
+    assert session.status.has_receiver is True
+    session.put(ParamValue("COM_RC_IN_MODE", 1.0))
+    assert session.status.has_receiver is False
 
 
 # --- position

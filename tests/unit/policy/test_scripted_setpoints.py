@@ -10,7 +10,7 @@ import pytest
 from policy.contract import ActionKind
 from policy.errors import PolicyError
 from policy.scripted import PROGRAM_NAMES, ScriptedPolicy
-from policy.scripted.programs import DOUBLET_S, DOUBLET_STEPS
+from policy.scripted.programs import doublet_length_s, doublet_steps
 
 STEP_S = 0.01
 DELAY_STEPS = 4
@@ -130,11 +130,9 @@ def test_flies_its_square(action: ActionKind) -> None:
     policy, flown = fly("square", 30.0, Multirotor(action, yaw_rad=0.7))
     start_s = policy.program_start_s
     assert start_s is not None
-    cos, sin = math.cos(0.7), math.sin(0.7)
-    for leg, (forward, right) in enumerate([(1.5, 0.0), (0.0, 1.5), (-1.5, 0.0), (0.0, -1.5)]):
+    for leg, wanted in enumerate([(1.5, 0.0), (0.0, 1.5), (-1.5, 0.0), (0.0, -1.5)]):
         end = at(flown, start_s + 4.0 * (leg + 1) - 0.1)
-        assert cos * end.north_mps + sin * end.east_mps == pytest.approx(forward, abs=0.35)
-        assert cos * end.east_mps - sin * end.north_mps == pytest.approx(right, abs=0.35)
+        assert (forward(end), right(end)) == pytest.approx(wanted, abs=0.35)
     begin, back = at(flown, start_s), at(flown, start_s + 16.0)
     assert math.hypot(back.north_m - begin.north_m, back.east_m - begin.east_m) < 1.5
     assert all(2.5 < v.up_m < 3.5 for v in flown[round(start_s / STEP_S) :])
@@ -168,26 +166,41 @@ def test_a_drift_at_the_start_is_stopped(action: ActionKind) -> None:
     assert math.hypot(flown[-1].north_mps, flown[-1].east_mps) < 0.1
 
 
+def forward(vehicle: Multirotor) -> float:
+    """Speed in m/s along the nose."""
+    cos, sin = math.cos(vehicle.yaw_rad), math.sin(vehicle.yaw_rad)
+    return cos * vehicle.north_mps + sin * vehicle.east_mps
+
+
+def right(vehicle: Multirotor) -> float:
+    """Speed in m/s to the right of the nose."""
+    cos, sin = math.cos(vehicle.yaw_rad), math.sin(vehicle.yaw_rad)
+    return cos * vehicle.east_mps - sin * vehicle.north_mps
+
+
 @pytest.mark.parametrize("action", SETPOINTS)
 def test_the_doublet_pushes_every_axis_to_both_sides_and_comes_back(action: ActionKind) -> None:
-    policy, flown = fly("doublet", 15.0 + DOUBLET_S, Multirotor(action))
+    policy, flown = fly("doublet", 15.0 + doublet_length_s(action), Multirotor(action))
     start_s = policy.program_start_s
     assert start_s is not None
-    for step in DOUBLET_STEPS:
-        one, other = (at(flown, start_s + s - 0.02) for s in (step.middle_s, step.end_s))
+    for step in doublet_steps(action):
+        middle_s = step.begin_s + step.half_s
+        one, other = (at(flown, start_s + s - 0.02) for s in (middle_s, step.end_s))
         match step.axis:
             case "yaw":
                 values = one.rates[2], other.rates[2]
             case "climb":
                 values = one.climb_mps, other.climb_mps
+            case "roll" if action == "velocity":
+                values = right(one), right(other)
             case "roll":
                 values = one.roll_rad, other.roll_rad
+            case "pitch" if action == "velocity":
+                values = forward(one), forward(other)
             case "pitch":
                 values = -one.pitch_rad, -other.pitch_rad
-        is_flown = step.axis == "yaw" or (step.axis == "climb") == (action == "velocity")
-        if is_flown:
-            assert values[0] > 0.15 * step.share, step
-            assert values[1] < -0.15 * step.share, step
+        assert values[0] > 0.15 * step.share, step
+        assert values[1] < -0.15 * step.share, step
         settled = at(flown, start_s + step.end_s + step.settle_s - 0.02)
         assert math.hypot(settled.north_mps, settled.east_mps) < 0.6, step
     assert all(v.up_m > 4.0 for v in flown[round(start_s / STEP_S) :])
@@ -200,7 +213,7 @@ def test_a_push_down_ends_before_the_ground() -> None:
         def _follow_velocity(self, forward: float, right: float, down: float, yaw: float) -> None:
             super()._follow_velocity(forward, right, down * (2.5 if down > 0 else 1.0), yaw)
 
-    _, flown = fly("doublet", 15.0 + DOUBLET_S, Sinking("velocity"))
+    _, flown = fly("doublet", 15.0 + doublet_length_s("velocity"), Sinking("velocity"))
     assert min(v.up_m for v in flown[1000:]) > 3.0
 
 

@@ -18,7 +18,7 @@ from mavbridge.commands.identify.results import print_identification, to_json, v
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import ACTION_CLASSES
 from policy.contract import ActionKind, Contract
-from policy.scripted.programs import DOUBLET_S, DOUBLET_STEPS
+from policy.scripted.programs import doublet_length_s, doublet_steps
 
 START_S = 100.0
 STEP_S = 0.01
@@ -48,11 +48,11 @@ def recorded(
     channels = {channel.axis: channel for channel in CHANNELS[kind]}
     motions = dict.fromkeys(channels, 0.0)
     waiting: dict[str, list[float]] = {axis: [0.0] * DEAD_STEPS for axis in channels}
-    for index in range(round((DOUBLET_S + 2 * MARGIN_S) / STEP_S)):
+    for index in range(round((doublet_length_s(kind) + 2 * MARGIN_S) / STEP_S)):
         time_s = index * STEP_S - MARGIN_S
         at_ns = round((START_S + time_s) * NS_PER_S)
         state = _state(motions, kind, at_ns)
-        pushes = [push for step in DOUBLET_STEPS if (push := step.push_at(time_s))]
+        pushes = [push for step in doublet_steps(kind) if (push := step.push_at(time_s))]
         action = [0.0] * 4
         if kind in ("attitude", "rates"):
             action[0] = hover
@@ -98,7 +98,7 @@ def usual() -> Identification:
 
 def test_a_vehicle_as_in_training_has_every_ratio_at_one(usual: Identification) -> None:
     assert usual.missing == ()
-    assert [push.axis for push in usual.pushes] == [step.axis for step in DOUBLET_STEPS]
+    assert [push.axis for push in usual.pushes] == [step.axis for step in doublet_steps("sticks")]
     for push in usual.pushes:
         assert push.up.ratio == pytest.approx(1.0, abs=0.02), push
         assert push.down.ratio == pytest.approx(1.0, abs=0.02), push
@@ -106,7 +106,7 @@ def test_a_vehicle_as_in_training_has_every_ratio_at_one(usual: Identification) 
         assert push.time_63_s == pytest.approx(DEAD_STEPS * STEP_S + LAG_S, abs=0.02), push
     lines = list(verdicts(usual, Contract()))
     assert lines[0] == (
-        "roll: as the policy was trained with; full stick 29.9 of 30.0 deg, dead zone 4%"
+        "roll: as the policy was trained with; full stick 29.9 of 30.0 deg, as if dead below 4%"
     )
     assert any(line.startswith("descent: as the policy was trained with") for line in lines)
     assert lines[1].endswith("of them dead; the bundled simulator's 160 ms are about the same")
@@ -147,7 +147,7 @@ def test_setpoints_are_compared_with_what_was_commanded(kind: ActionKind) -> Non
 
 
 def test_what_the_policy_did_not_fly_is_missing_with_its_reason() -> None:
-    yaw = next(step for step in DOUBLET_STEPS if step.axis == "yaw")
+    yaw = next(step for step in doublet_steps("sticks") if step.axis == "yaw")
     recording = recorded(is_flown=lambda time_s: time_s < yaw.begin_s + 1.0)
     found, contract = identified(recording)
     assert {push.axis for push in found.pushes} == {"roll", "pitch"}

@@ -8,7 +8,7 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.flight.policies import configured_contract
 from policy.contract import Contract
-from policy.scripted.programs import DOUBLET_S
+from policy.scripted.programs import doublet_length_s
 
 
 def test_the_flight_is_the_users_with_the_doublet_in_place_of_the_policy() -> None:
@@ -20,7 +20,7 @@ def test_the_flight_is_the_users_with_the_doublet_in_place_of_the_policy() -> No
     assert flight.link.raw_sticks
     assert flight.takeoff == 10.0
     assert flight.duration is not None
-    assert flight.duration > DOUBLET_S + 8.0
+    assert flight.duration > doublet_length_s("velocity") + 8.0
     mapped = doublet_flight(IdentifyConfig(flight=asked, mapped_sticks=True), Contract())
     assert not mapped.link.raw_sticks
 

@@ -179,7 +179,7 @@ def test_parameters_that_are_missing_or_zero_leave_all_sticks_alone_and_are_name
     assert curves.is_identity
     assert curves.notes == (
         "the policy's sticks go to the vehicle as they are, whatever they mean to it: it did not "
-        "send ATC_ANGLE_MAX, RC4_DZ",
+        "send ANGLE_MAX, RC4_DZ",
     )
     (note,) = ardupilot_curves(values_of(TWICE) | {"PILOT_Y_RATE": 0.0}, "ALT_HOLD", GAINS).notes
     assert note.endswith("whatever they mean to it: PILOT_Y_RATE is 0")

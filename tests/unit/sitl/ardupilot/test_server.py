@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.messages import BUILDERS
 from sitl.ardupilot.streams import Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
@@ -383,3 +384,18 @@ def test_vehicle_faults_follow_their_script(station):
 
     assert (frozen_s[0], frozen_s[-1]) == pytest.approx((1.05, 2.0), abs=0.06)
     assert uptime_s[-1] == pytest.approx(1.0, abs=0.06)
+
+
+def test_the_report_counts_the_setpoints_that_were_followed(station):
+    station.run(6.0)
+    message = mav.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1, 0, 0, 0], 0, 0, 0, 0.5)
+    for mode in (Mode.ALT_HOLD, Mode.GUIDED_NOGPS):
+        station.command(mav.MAV_CMD_DO_SET_MODE, 1, mode)
+        for _ in range(5):
+            station.send(message)
+            station.run(0.02)
+
+    vehicle = station.vehicle
+    setpoints = vehicle.log.summary(vehicle.ap, 0)["setpoints"]
+    assert setpoints["count"] == 5
+    assert setpoints["rate_hz"] == pytest.approx(50.0, rel=0.01)

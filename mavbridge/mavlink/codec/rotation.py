@@ -1,0 +1,32 @@
+"""Euler angles, by MAVLink's intrinsic Z-Y-X convention, and the quaternion ned_from_body."""
+
+import math
+from typing import TypeAlias
+
+Quaternion: TypeAlias = tuple[float, float, float, float]
+"""w, x, y, z."""
+
+
+def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
+    """The unit quaternion of these angles."""
+    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def heading_rad(ned_from_body_wxyz: Quaternion) -> float:
+    """The yaw angle, clockwise from north."""
+    w, x, y, z = ned_from_body_wxyz
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def tilt_rad(ned_from_body_wxyz: Quaternion) -> float:
+    """Angle between the vehicle's down and the world's."""
+    _, x, y, _ = ned_from_body_wxyz
+    return math.acos(max(-1.0, 1 - 2 * (x * x + y * y)))

@@ -1,0 +1,178 @@
+"""Attitudes and body rates by SET_ATTITUDE_TARGET, with their echo in ATTITUDE_TARGET."""
+
+import math
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import Action, ActionMeaning, AttitudeThrust, BodyRates, Output
+from mavbridge.mavlink.codec.messages import Attitude, AttitudeTarget, Body, SpecificForce
+from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
+from mavbridge.mavlink.codec.rotation import heading_rad, quaternion_from_euler, tilt_rad
+from mavbridge.mavlink.outputs.echo import EchoRules, Shown
+from mavbridge.mavlink.outputs.hover import PLAUSIBLE_THRUST, HoverThrust
+from mavbridge.mavlink.outputs.output import Encoded
+from mavbridge.mavlink.outputs.setpoints import FOREIGN_SAMPLES, SetpointOutput
+from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.session.vehicle import VehicleSession
+
+THRUST_UNITS = 1_000_000
+THRUST_ECHO = EchoRules(
+    tolerance=1,
+    nudged=0,
+    nudge=20,
+    seek_nudge=20,
+    centre=THRUST_UNITS // 2,
+    foreign_samples=FOREIGN_SAMPLES,
+)
+"""Thrust in millionths; both autopilots show it as it was sent. Its nudge of two times 20 is a
+climb of a millimetre per second after a second."""
+RATE_UNITS = 10_000
+RATE_ECHO = EchoRules(
+    tolerance=1, nudged=2, nudge=10, seek_nudge=10, centre=0, foreign_samples=FOREIGN_SAMPLES
+)
+"""Body rates in 1e-4 rad/s: what PX4 shows of a rate setpoint, from half a second after the last
+attitude setpoint on. The nudge is 0.06 degrees/s of yaw rate."""
+MOST_LEAD_RAD = math.radians(45.0)
+"""Largest angle between the heading that is asked for and the vehicle's own. It follows with a lag
+of 0.3 to 0.4 s, so that yaw rates up to 110 degrees/s are followed in full."""
+_PAUSE_NS = 500 * NS_PER_MS
+"""After this long without a setpoint, heading and thrust start afresh."""
+_LEVEL_RAD = math.radians(15.0)
+
+
+class HeadingTarget:
+    """Heading to ask for, since an attitude setpoint has no usable yaw rate.
+
+    It starts at the vehicle's own, is integrated from the yaw rate, and never runs far ahead.
+    """
+
+    def __init__(self) -> None:
+        self._asked_rad: float | None = None
+        self._at_ns = 0
+
+    def restart(self) -> None:
+        """Start from the vehicle's own heading."""
+        self._asked_rad = None
+
+    def step(self, measured_rad: float, yaw_rate_radps: float, now_ns: int) -> float:
+        """Heading to ask for now, in [-pi, pi]."""
+        lead_rad, elapsed_ns = 0.0, now_ns - self._at_ns
+        if self._asked_rad is not None and elapsed_ns <= _PAUSE_NS:
+            lead_rad = self._asked_rad - measured_rad + yaw_rate_radps * elapsed_ns / NS_PER_S
+            lead_rad = math.remainder(lead_rad, math.tau)
+            lead_rad = min(max(lead_rad, -MOST_LEAD_RAD), MOST_LEAD_RAD)
+        self._asked_rad = math.remainder(measured_rad + lead_rad, math.tau)
+        self._at_ns = now_ns
+        return self._asked_rad
+
+
+class AttitudeOutput(SetpointOutput):
+    """SET_ATTITUDE_TARGET; either kind of action is sent as what it is.
+
+    Thrust is scaled so that the thrust that hovered in training hovers here.
+    """
+
+    _echo_message = "ATTITUDE_TARGET"
+
+    def __init__(
+        self, codec: Codec, meaning: ActionMeaning, profile: Profile, name: Output
+    ) -> None:
+        self._shows_rates = name == "rates" and profile.shows_rates
+        super().__init__(codec, RATE_ECHO if self._shows_rates else THRUST_ECHO)
+        self.name = name
+        self._trained_hover = meaning.hover_thrust
+        self._hover = HoverThrust()
+        self._scale: float | None = None
+        """The vehicle's thrust for the policy's; constant during a stream."""
+        self._heading = HeadingTarget()
+        self._measured_rad: float | None = None
+        self._is_level = False
+
+    def restart(self) -> None:
+        """A new session: another battery, perhaps another vehicle."""
+        super().restart()
+        self._hover, self._scale, self._measured_rad = HoverThrust(), None, None
+        self._heading.restart()
+
+    def released(self) -> None:
+        """Silence; the next stream starts afresh."""
+        super().released()
+        self._heading.restart()
+        self._scale = None
+
+    def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
+        """The setpoint; None for an attitude before the vehicle's own heading is known."""
+        if not isinstance(action, AttitudeThrust | BodyRates):
+            raise CommandRefusedError(f"{type(action).__name__} has neither attitude nor rates")
+        if not (all(map(math.isfinite, action)) and 0.0 <= action.thrust <= 1.0):
+            raise CommandRefusedError(f"{action} is not finite, or its thrust not in [0, 1]")
+        if self._scale is None or self._sent_ns is None or now_ns - self._sent_ns > _PAUSE_NS:
+            self._scale = self._thrust_scale(vehicle)
+        shown: Shown = (round(min(self._scale * action.thrust, 1.0) * THRUST_UNITS),)
+        is_checked = shown[0] > 0  # idle motors are left idle
+        if is_checked and not self._shows_rates:
+            shown = self.echo.with_nudge(shown, now_ns)
+        thrust = shown[0] / THRUST_UNITS
+        policy_thrust = thrust / self._scale
+        if isinstance(action, BodyRates):
+            return self._encode_rates(
+                action, vehicle, thrust, shown if is_checked else None, now_ns
+            )
+        if self._measured_rad is None:
+            return None
+        if not self._follows(vehicle, now_ns):
+            self._heading.restart()
+        heading = self._heading.step(self._measured_rad, action.yaw_rate_radps, now_ns)
+        quaternion = quaternion_from_euler(action.roll_rad, action.pitch_rad, heading)
+        packet = self._codec.encode_attitude(
+            vehicle.identity.source, quaternion, thrust, now_ns=now_ns
+        )
+        is_checked = is_checked and not self._shows_rates
+        return Encoded(packet, action._replace(thrust=policy_thrust), shown if is_checked else None)
+
+    def _encode_rates(
+        self,
+        action: BodyRates,
+        vehicle: VehicleSession,
+        thrust: float,
+        shown: Shown | None,
+        now_ns: int,
+    ) -> Encoded:
+        assert self._scale is not None
+        self._heading.restart()
+        rates = tuple(round(rate * RATE_UNITS) for rate in action[1:])
+        if self._shows_rates:
+            shown = rates = self.echo.with_nudge(rates, now_ns)
+        roll, pitch, yaw = (rate / RATE_UNITS for rate in rates)
+        packet = self._codec.encode_rates(
+            vehicle.identity.source, (roll, pitch, yaw), thrust, now_ns=now_ns
+        )
+        return Encoded(packet, BodyRates(thrust / self._scale, roll, pitch, yaw), shown)
+
+    def _thrust_scale(self, vehicle: VehicleSession) -> float:
+        hover = self._hover.value or vehicle.profile.hover_thrust(vehicle.known_params)
+        if hover is None or not PLAUSIBLE_THRUST[0] < hover < PLAUSIBLE_THRUST[1]:
+            return 1.0
+        return hover / self._trained_hover
+
+    def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
+        """Take the vehicle's own attitude and thrust, and the echo; PX4's carries an old stamp."""
+        match body:
+            case Attitude():
+                self._measured_rad = heading_rad(body.ned_from_body_wxyz)
+                self._is_level = tilt_rad(body.ned_from_body_wxyz) < _LEVEL_RAD
+            case SpecificForce():
+                self._hover.receive_force(-body.specific_force_body_mps2[2], arrived_ns)
+            case AttitudeTarget():
+                shown: Shown = (round(body.thrust * THRUST_UNITS),)
+                if self._shows_rates:
+                    shown = tuple(round(rate * RATE_UNITS) for rate in body.rate_body_radps)
+                self.echo.received(shown, arrived_ns // 1000, arrived_ns)
+                is_own = self._sent_ns is None or arrived_ns - self._sent_ns > _PAUSE_NS
+                if is_own and self._is_level and self._is_flying(vehicle, arrived_ns):
+                    self._hover.receive_thrust(body.thrust, arrived_ns)
+            case _:
+                pass
+
+    def _is_flying(self, vehicle: VehicleSession, now_ns: int) -> bool:
+        status = vehicle.status(now_ns)
+        return status is not None and status.armed and status.is_landed is False

@@ -1,0 +1,92 @@
+"""What both outputs for sticks have in common: the policy's sticks and the vehicle's."""
+
+from collections import Counter
+from dataclasses import replace
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.vehicle import Action, StickGains, Sticks, VehicleStatus
+from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
+from mavbridge.mavlink.outputs.echo import EchoRules
+from mavbridge.mavlink.outputs.output import ActionOutput
+from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
+from mavbridge.mavlink.session.vehicle import VehicleSession
+
+_CURVES_NS = 500 * NS_PER_MS
+"""Parameters that the curves depend on count after this time at the latest; a mode at once."""
+
+
+class StickOutput(ActionOutput):
+    """Sticks, mapped so that they mean to the vehicle what they meant in the policy's training."""
+
+    is_sticks = True
+
+    def __init__(self, codec: Codec, rules: EchoRules, gains: StickGains | None) -> None:
+        super().__init__(codec, rules)
+        self._gains = gains
+        """None: sticks go to the vehicle as they are."""
+        self._curves = IDENTITY
+        self._curves_mode = ""
+        self._curves_due_ns = 0
+        self._new_notes: list[str] = []
+        self._told: set[str] = set()
+        self.saturated: Counter[str] = Counter()
+        """How often each stick asked for more than the vehicle can do, by name."""
+
+    def restart(self) -> None:
+        """A new session: its parameters and its mode count."""
+        super().restart()
+        self._curves_mode, self._curves_due_ns = "", 0
+
+    def take_notes(self) -> tuple[str, ...]:
+        """What this vehicle cannot do that the policy may ask for, for the user; each once."""
+        notes, self._new_notes = tuple(self._new_notes), []
+        return notes
+
+    def in_policy_terms(
+        self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
+    ) -> VehicleStatus | None:
+        """The status with its sticks as the policy would mean them."""
+        if self._gains is None or status is None:
+            return status
+        curves = self._curves_of(vehicle, status.mode, now_ns)
+        if curves.is_identity or (status.rc_sticks is None and status.pilot_sticks is None):
+            return status
+        rc, pilot = status.rc_sticks, status.pilot_sticks
+        return replace(
+            status,
+            rc_sticks=None if rc is None else curves.to_policy(rc),
+            pilot_sticks=None if pilot is None else curves.to_policy(pilot),
+        )
+
+    def released(self) -> None:
+        """Nothing more is sent until the next action; what could not be done is told."""
+        super().released()
+        if self.saturated:
+            counts = ", ".join(f"{stick} {count}" for stick, count in self.saturated.items())
+            self._new_notes.append(f"sticks that asked for more than the vehicle does: {counts}")
+            self.saturated.clear()
+
+    def _wanted(
+        self, action: Action, vehicle: VehicleSession, now_ns: int
+    ) -> tuple[Sticks, StickCurves]:
+        """The vehicle's sticks for an action, and the curves that lead back."""
+        if not isinstance(action, Sticks):
+            raise CommandRefusedError(f"{type(action).__name__} are not sticks")
+        if self._gains is None:
+            return action, IDENTITY
+        status = vehicle.status(now_ns)
+        curves = self._curves_of(vehicle, status.mode if status else "", now_ns)
+        if curves.is_identity:
+            return action, curves
+        self.saturated.update(curves.saturated(action))
+        return curves.to_vehicle(action), curves
+
+    def _curves_of(self, vehicle: VehicleSession, mode: str, now_ns: int) -> StickCurves:
+        if mode != self._curves_mode or now_ns >= self._curves_due_ns:
+            self._curves_mode, self._curves_due_ns = mode, now_ns + _CURVES_NS
+            self._curves = vehicle.profile.stick_curves(vehicle.known_params, mode, self._gains)
+            for note in self._curves.notes:
+                if note not in self._told and vehicle.are_params_read:
+                    self._told.add(note)
+                    self._new_notes.append(note)
+        return self._curves

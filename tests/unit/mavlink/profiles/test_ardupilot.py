@@ -1,0 +1,103 @@
+"""What ArduCopter's parameters mean for a flight, against the facts measured on 4.7."""
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.vehicle import Output
+from mavbridge.mavlink.codec.messages import CommandRequest
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.ardupilot_params import current_names
+from mavbridge.mavlink.profiles.profile import ParamContext
+
+
+def context(output: Output | None, *, has_receiver: bool | None = True) -> ParamContext:
+    return ParamContext(output, 255, has_receiver)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (None, "has not sent GUID_OPTIONS"),
+        (0.0, "GUID_OPTIONS is 0.*climb rate.*--set GUID_OPTIONS=8"),
+        (1.0, "--set GUID_OPTIONS=9"),
+        (8.0, None),
+        (9.0, None),
+    ],
+)
+def test_thrust_must_be_thrust(options: float | None, expected: str | None) -> None:
+    values = {} if options is None else {"GUID_OPTIONS": options}
+    for output in ("attitude", "rates"):
+        found = "; ".join(ARDUPILOT.obstacles(values, context(output)))
+        if expected is None:
+            assert found == ""
+        else:
+            with pytest.raises(AssertionError, match=expected):
+                assert found == ""
+    assert list(ARDUPILOT.obstacles(values, context("velocity"))) == []
+    assert list(ARDUPILOT.obstacles(values, context("rc-override"))) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "output", "has_receiver", "expected"),
+    [
+        ({"GUID_TIMEOUT": 3.0}, "velocity", True, ["--set GUID_TIMEOUT=0.5"]),
+        ({"GUID_TIMEOUT": 0.5}, "velocity", True, []),
+        ({"FS_THR_ENABLE": 1.0}, "velocity", False, ["--set FS_THR_ENABLE=0"]),
+        ({"FS_THR_ENABLE": 0.0}, "velocity", False, []),
+        ({"ATC_ANGLE_BOOST": 0.0}, "rates", True, ["ATC_ANGLE_BOOST is 0"]),
+        ({"ATC_ANGLE_BOOST": 0.0}, "velocity", True, []),
+        ({"ATC_ANGLE_BOOST": 1.0}, "attitude", True, []),
+        ({"GUID_TIMEOUT": 3.0, "ATC_ANGLE_BOOST": 0.0}, None, False, []),
+    ],
+)
+def test_advice_for_setpoints(
+    values: dict[str, float], output: Output | None, has_receiver: bool, expected: list[str]
+) -> None:
+    texts = list(ARDUPILOT.advice(values, context(output, has_receiver=has_receiver)))
+    assert len(texts) == len(expected)
+    for text, part in zip(texts, expected, strict=True):
+        assert part in text
+
+
+def test_setpoints_that_stop_are_never_held_for_ever() -> None:
+    values = {"RC_OVERRIDE_TIME": -1.0, "FS_THR_ENABLE": 0.0}
+    assert list(ARDUPILOT.dangers(values, context("velocity", has_receiver=False))) == []
+    assert len(list(ARDUPILOT.dangers(values, context("rc-override", has_receiver=False)))) == 2
+
+
+def test_old_names_are_read_too_and_mean_the_same() -> None:
+    old = {
+        "SYSID_MYGCS": 255.0,
+        "ANGLE_MAX": 3000.0,
+        "PILOT_SPEED_UP": 250.0,
+        "PILOT_SPEED_DN": 150.0,
+    }
+    new = {
+        "MAV_GCS_SYSID": 255.0,
+        "ATC_ANGLE_MAX": 30.0,
+        "PILOT_SPD_UP": 2.5,
+        "PILOT_SPD_DN": 1.5,
+    }
+    assert current_names(old) == old | new
+    assert current_names(new) == new
+    assert set(old) | set(new) <= set(ARDUPILOT.params)
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        ("rc-override", "RC_CHANNELS"),
+        ("attitude", "ATTITUDE_TARGET"),
+        ("rates", "ATTITUDE_TARGET"),
+        ("velocity", "POSITION_TARGET_LOCAL_NED"),
+    ],
+)
+def test_where_each_output_is_shown(output: Output, message: str) -> None:
+    assert ARDUPILOT.echo(output).messages == (message,)
+
+
+def test_a_takeoff_is_asked_for_by_height_above_home() -> None:
+    command = CommandRequest(dialect.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, 8.0))
+    assert ARDUPILOT.takeoff(8.0, None) == ARDUPILOT.takeoff(8.0, 489.0) == command
+    assert ARDUPILOT.hover_thrust({"MOT_THST_HOVER": 0.39}) == 0.39
+    assert ARDUPILOT.hover_thrust({}) is None

@@ -1,0 +1,95 @@
+"""What PX4's parameters, events and streams mean, against the facts measured on 1.18."""
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.vehicle import Output
+from mavbridge.mavlink.profiles.profile import ParamContext
+from mavbridge.mavlink.profiles.px4 import PX4, event_id
+
+
+def context(output: Output | None) -> ParamContext:
+    return ParamContext(output, 255, None)
+
+
+@pytest.mark.parametrize("mode", range(9))
+def test_sticks_of_mavlink_must_be_taken(mode: int) -> None:
+    found = list(PX4.obstacles({"COM_RC_IN_MODE": float(mode)}, context("manual-control")))
+    assert bool(found) == (mode in (0, 4))
+    assert all("--set COM_RC_IN_MODE=1" in text for text in found)
+    assert list(PX4.obstacles({"COM_RC_IN_MODE": float(mode)}, context("rates"))) == []
+    assert PX4.ignores_receiver({"COM_RC_IN_MODE": float(mode)}) == (mode in (1, 4))
+
+
+@pytest.mark.parametrize(
+    ("values", "output", "expected"),
+    [
+        ({}, "manual-control", []),
+        ({"COM_RC_LOSS_T": 0.5, "NAV_RCL_ACT": 2.0}, "manual-control", []),
+        ({"COM_RC_LOSS_T": 2.0}, "manual-control", ["--set COM_RC_LOSS_T=0.5"]),
+        ({"COM_RC_LOSS_T": 0.1}, "manual-control", ["as short as that is a failsafe"]),
+        ({"NAV_RCL_ACT": 6.0}, "manual-control", ["NAV_RCL_ACT is 6: it would disarm"]),
+        ({"NAV_RCL_ACT": 5.0}, "manual-control", ["terminate the flight"]),
+        ({"COM_RC_LOSS_T": 2.0, "NAV_RCL_ACT": 6.0}, "velocity", []),
+        ({"COM_OF_LOSS_T": 5.0}, "velocity", ["--set COM_OF_LOSS_T=0.5"]),
+        ({"COM_OBL_RC_ACT": 7.0}, "rates", ["COM_OBL_RC_ACT is 7: it would disarm"]),
+        ({"COM_OF_LOSS_T": 5.0, "COM_RC_LOSS_T": 2.0}, None, []),
+    ],
+)
+def test_advice(values: dict[str, float], output: Output | None, expected: list[str]) -> None:
+    texts = list(PX4.advice(values, context(output)))
+    assert len(texts) == len(expected)
+    for text, part in zip(texts, expected, strict=True):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("commander_armed_by", 0x190CAF3),
+        ("commander_disarmed_by", 0x1F46777),
+        ("commander_failsafe_enter_hold", 0x1D11DF6),
+        ("commander_failsafe_enter", 0x194CA8A),
+        ("commander_rc_lost", 0x155CD44),
+    ],
+)
+def test_numbers_of_events_are_those_that_the_firmware_sent(name: str, number: int) -> None:
+    assert event_id(name) == number
+    assert number in PX4.events
+
+
+def test_what_events_say() -> None:
+    assert PX4.events[0x190CAF3].is_armed is True
+    assert PX4.events[0x1F46777].is_armed is False
+    assert PX4.events[0x1D11DF6].is_failsafe
+    assert PX4.events[0x155CD44].text == "manual control lost"
+    assert 0x1A893E0 not in PX4.events  # arming checks, every two seconds
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        ("manual-control", "MANUAL_CONTROL"),
+        ("attitude", "ATTITUDE_TARGET"),
+        ("rates", "ATTITUDE_TARGET"),
+        ("velocity", "POSITION_TARGET_LOCAL_NED"),
+    ],
+)
+def test_where_each_output_is_shown(output: Output, message: str) -> None:
+    assert PX4.echo(output).messages == (message,)
+
+
+def test_a_takeoff_is_asked_for_by_height_above_the_sea() -> None:
+    command = PX4.takeoff(5.0, 489.4)
+    assert command is not None
+    assert command.command == dialect.MAV_CMD_NAV_TAKEOFF
+    assert command.params[6] == pytest.approx(494.4)
+    assert all(math.isnan(command.params[k]) for k in (3, 4, 5))  # looking as now, here
+    assert PX4.takeoff(5.0, None) is None
+
+
+def test_our_heartbeat_is_a_ground_stations_for_the_sake_of_its_texts() -> None:
+    assert PX4.heartbeat_type == dialect.MAV_TYPE_GCS
+    assert PX4.hover_thrust({"MPC_THR_HOVER": 0.5}) == 0.5

@@ -1,0 +1,160 @@
+"""Which sender's sticks PX4 takes, when it counts them as lost, what it reads from them."""
+
+import pytest
+
+from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.px4.params import Params
+from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks, from_manual_control
+
+PERIOD_NS = 20 * NS_PER_MS
+GCS, ONBOARD = 0, 1
+
+
+class Senders:
+    """Sends sticks of several sources at 50 Hz; a source's throttle tells it apart."""
+
+    def __init__(self, in_mode=1):
+        self.params = Params()
+        self.params.set("COM_RC_IN_MODE", in_mode)
+        self.input = StickInput(self.params)
+        self.now_ns = 0
+
+    def send(self, seconds, *sources, sticks=None):
+        for _ in range(round(seconds * NS_PER_S / PERIOD_NS)):
+            self.now_ns += PERIOD_NS
+            for source in sources:
+                self.input.on_sticks(source, sticks or Sticks(), self.now_ns)
+            self.input.update(self.now_ns)
+        return self.input.source
+
+
+@pytest.mark.parametrize(
+    ("fields", "sticks"),
+    [
+        ((0, 0, 500, 0), Sticks()),
+        ((1000, -1000, 1000, 500), Sticks(1.0, -1.0, 1.0, 0.5)),
+        ((1001, -1001, 1001, 32767), Sticks()),
+        ((0, 0, -1, 0), Sticks()),
+        ((0, 0, 0, 0), Sticks(throttle=-1.0)),
+    ],
+)
+def test_a_field_beyond_its_range_is_centred(fields, sticks):
+    assert from_manual_control(*fields) == sticks
+
+
+@pytest.mark.parametrize(
+    ("in_mode", "with_both"),
+    [(1, GCS), (2, GCS), (3, GCS), (5, GCS), (6, GCS), (7, ONBOARD), (8, ONBOARD)],
+)
+def test_of_two_links_the_mode_says_which_wins(in_mode, with_both):
+    senders = Senders(in_mode)
+    senders.send(0.1, GCS)
+
+    assert senders.send(0.1, GCS, ONBOARD) == with_both
+
+
+@pytest.mark.parametrize(
+    ("in_mode", "after"), [(1, ONBOARD), (2, ONBOARD), (3, None), (8, ONBOARD)]
+)
+def test_another_link_takes_over_when_the_first_has_stopped(in_mode, after):
+    senders = Senders(in_mode)
+    senders.send(0.1, GCS)
+
+    if in_mode != 8:
+        assert senders.send(0.56, ONBOARD) == GCS
+    assert senders.send(0.1, ONBOARD) == after
+
+
+def test_a_link_of_lower_rank_does_not_come_back_to_a_winner():
+    senders = Senders(6)
+    senders.send(0.1, ONBOARD)
+
+    assert senders.send(0.1, ONBOARD, GCS) == GCS
+    assert senders.send(0.1, ONBOARD, GCS) == GCS
+
+
+@pytest.mark.parametrize(
+    ("in_mode", "source"),
+    [(0, RC_SOURCE), (1, GCS), (4, None), (5, RC_SOURCE), (6, GCS), (7, RC_SOURCE), (8, GCS)],
+)
+def test_a_receiver_counts_where_the_mode_says_so(in_mode, source):
+    assert Senders(in_mode).send(0.2, RC_SOURCE, GCS) == source
+
+
+@pytest.mark.parametrize(("loss_s", "lost_s"), [(0.5, 0.6), (2.0, 2.0), (0.1, 0.2)])
+def test_a_loss_is_noticed_at_the_next_fifth_of_a_second(loss_s, lost_s):
+    senders = Senders()
+    senders.params.set("COM_RC_LOSS_T", loss_s)
+    senders.send(0.1, GCS, sticks=Sticks(right=0.7))
+
+    senders.send(lost_s - 0.02)
+    assert senders.input.valid
+    senders.send(0.02)
+
+    assert not senders.input.valid
+    assert senders.input.sticks.right == 0.7, "the last one is held"
+
+
+@pytest.mark.parametrize(("ramp_s", "is_fast"), [(0.9, True), (1.2, False)])
+def test_the_pilots_will_is_a_ramp_faster_than_full_stick_a_second(ramp_s, is_fast):
+    senders = Senders()
+    senders.send(0.2, GCS)
+    seen = False
+    for step in range(1, round(ramp_s / 0.02)):
+        senders.send(0.02, GCS, sticks=Sticks(right=step * 0.02 / ramp_s))
+        seen = seen or senders.input.moved_fast
+
+    assert seen == is_fast
+
+
+def test_a_jump_is_not_the_pilots_will():
+    senders = Senders()
+    senders.send(0.2, GCS)
+    senders.send(0.02, GCS, sticks=Sticks(right=1.0))
+    fast = [senders.input.moved_fast]
+    for _ in range(10):
+        senders.send(0.02, GCS, sticks=Sticks(right=1.0))
+        fast.append(senders.input.moved_fast)
+
+    assert not any(fast)
+
+
+def test_override_speed_minus_one_switches_it_off():
+    senders = Senders()
+    senders.params.set("MAN_OVERRIDE_SPD", -1.0)
+    for step in range(10):
+        senders.send(0.02, GCS, sticks=Sticks(right=step * 0.1))
+
+    assert not senders.input.moved_fast
+
+
+@pytest.mark.parametrize(
+    ("sticks", "gesture"),
+    [
+        (Sticks(throttle=-1.0, yaw=1.0), 1),
+        (Sticks(throttle=-1.0, yaw=-1.0), -1),
+        (Sticks(throttle=-0.5, yaw=1.0), 0),
+        (Sticks(throttle=-1.0, yaw=1.0, right=0.5), 0),
+    ],
+)
+def test_a_gesture_is_held_for_a_second_and_told_once(sticks, gesture):
+    senders = Senders()
+    senders.send(0.98, GCS, sticks=sticks)
+    assert senders.input.gesture(senders.now_ns) == 0
+
+    senders.send(0.1, GCS, sticks=sticks)
+
+    assert senders.input.gesture(senders.now_ns) == gesture
+    assert senders.input.gesture(senders.now_ns) == 0
+
+
+def test_pretended_sticks_stay_until_real_ones_come():
+    senders = Senders()
+    senders.input.pretend_centred(0)
+    senders.send(5.0)
+    assert senders.input.valid
+
+    senders.send(0.1, ONBOARD)
+    senders.send(0.7)
+
+    assert not senders.input.valid
