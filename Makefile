@@ -7,6 +7,8 @@ PORT ?= 14550
 COURSE ?= 1000007
 DURATION ?= 60
 POLICY ?= toge
+# Firmware of the simulated vehicle: ardupilot or px4.
+AUTOPILOT ?= ardupilot
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist loadfile
@@ -29,11 +31,11 @@ $(VENV)/installed: pyproject.toml constraints.txt
 
 fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy flying it over UDP
 	@mkdir -p out
-	@$(BIN)/python -m sitl --connect udpout:127.0.0.1:$(PORT) --camera shm:fpv-$(PORT) \
-		--course $(COURSE) --report out/fc.json & sitl=$$!; \
+	@$(BIN)/python -m sitl --autopilot $(AUTOPILOT) --connect udpout:127.0.0.1:$(PORT) \
+		--camera shm:fpv-$(PORT) --course $(COURSE) --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --dual-rate --policy $(POLICY) $(WARM) \
-		--camera shm:fpv-$(PORT) --mode ALT_HOLD --arm --duration $(DURATION) \
+		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) \
 		--rerun out/flight.rrd --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
 	echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \

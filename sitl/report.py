@@ -37,7 +37,6 @@ class FlightLog:
 
     def __init__(self, start_ns: int, course: Course | None) -> None:
         self.refused_messages = 0
-        self.manual_controls = 0
         self.texts: list[LogEntry] = []
         self.crash: Crash | None = None
         self.distance_m = 0.0
@@ -46,6 +45,7 @@ class FlightLog:
         self._has_course = course is not None
         self._gates = GateCounter(self._course)
         self._overrides = _ArrivalStats()
+        self._manual_controls = _ArrivalStats()
         self._setpoints = _ArrivalStats()
         self._release_times_s: list[float] = []
         self._releases = 0
@@ -112,6 +112,10 @@ class FlightLog:
         """Count an RC_CHANNELS_OVERRIDE that drives at least one stick."""
         self._overrides.add(arrived_ns)
 
+    def on_manual_control(self, arrived_ns: int) -> None:
+        """Count a MANUAL_CONTROL from a sender that the vehicle listens to."""
+        self._manual_controls.add(arrived_ns)
+
     def on_setpoint(self, arrived_ns: int) -> None:
         """Count a setpoint of an attitude, rates or a velocity that the vehicle follows."""
         self._setpoints.add(arrived_ns)
@@ -175,7 +179,7 @@ class FlightLog:
             "duration_s": self._t_s(ap.now_ns),
             "overrides": self._overrides.summary(self._start_ns),
             "releases": {"count": self._releases, "t_s": self._release_times_s},
-            "manual_control": {"count": self.manual_controls},
+            "manual_control": self._manual_controls.summary(self._start_ns),
             "setpoints": self._setpoints.summary(self._start_ns),
             "refused_messages": self.refused_messages,
             "bad_frames": bad_frames,

@@ -22,8 +22,10 @@ from mavbridge.config.groups import (
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import OnFault, Output, Risk
+from mavbridge.core.vehicle import OnFault, Risk
 
+OutputChoice = Literal["auto", "rc-override", "manual-control", "attitude", "rates", "velocity"]
+"""``core.vehicle.Output``, or the usual one."""
 _FLOAT32_MAX = 3.4e38
 """Largest value of a MAVLink parameter."""
 
@@ -141,7 +143,7 @@ class LinkConfig:
     """System id of the vehicle to fly; 0 = the only one on the link."""
     connect_timeout: Annotated[float, Parameter(group=RARE)] = 30.0
     """Seconds to wait for the vehicle's first heartbeat."""
-    output: Output | Literal["auto"] = "auto"
+    output: OutputChoice = "auto"
     """Message that carries the actions: rc-override or manual-control (sticks), attitude, rates,
     velocity. auto: by the policy's actions and the firmware."""
     raw_sticks: Annotated[bool, Parameter(negative="", group=RARE)] = False
@@ -154,7 +156,7 @@ class LinkConfig:
     gcs_sticks_win: Annotated[bool, Parameter(negative="")] = False
     """The sticks of the ground station of --forward take over for good once they are moved."""
     set: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
-    """NAME=VALUE: set a parameter of ArduPilot before arming, put the old value back at the end;
+    """NAME=VALUE: set a parameter of the vehicle before arming, put the old value back at the end;
     may be given more than once."""
     restore_params: Annotated[bool, Parameter(negative="", group=RARE)] = False
     """Put back the parameters that a flight which did not end in order has left set."""
@@ -257,7 +259,8 @@ class FlyConfig:
     """Engage when the vehicle is armed for the first time."""
     on_fault: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
     """After a fault of ours, first neutral sticks, then: release, hold (BRAKE, AUTO.LOITER), land
-    or rtl. auto: release to a receiver whose throttle is near the middle, else hold."""
+    or rtl. auto: release to a receiver whose throttle is near the middle, else hold; setpoints are
+    not released but hold."""
     then: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
     """The same at a normal end. auto: release to a receiver, land without one."""
     duration: Annotated[float | None, Parameter(group=ENGAGING)] = None

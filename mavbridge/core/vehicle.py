@@ -15,7 +15,9 @@ ActionKind: TypeAlias = Literal["sticks", "rates", "attitude", "velocity"]
 OnFault: TypeAlias = Literal["auto", "release", "hold", "land", "rtl"]
 """Action that follows the neutral sticks when a flight ends by our own doing."""
 
-Risk: TypeAlias = Literal["endless-override", "no-throttle-failsafe", "slow-serial"]
+Risk: TypeAlias = Literal[
+    "endless-override", "no-throttle-failsafe", "long-setpoint", "slow-serial"
+]
 """A setting of the vehicle or of the link with which a flight is begun only if it is accepted."""
 
 
@@ -91,7 +93,7 @@ class StickGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionMeaning:
-    """What a policy means by the four numbers of an action."""
+    """Meaning of the four numbers of a policy's actions."""
 
     kind: ActionKind = "sticks"
     stick_gains: StickGains | None = None

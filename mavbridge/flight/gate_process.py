@@ -73,8 +73,9 @@ class GateProcess:
             raise self.error
         if self.summary is None and not stop.is_set():
             raise GateDiedError(
-                "the gate process has died: the vehicle keeps the last sticks until its own "
-                "timeout (ArduPilot's RC_OVERRIDE_TIME)"
+                "the gate process has died: the vehicle keeps the last sticks or setpoint until "
+                "its own timeout (ArduPilot: RC_OVERRIDE_TIME, GUID_TIMEOUT; PX4: COM_RC_LOSS_T, "
+                "COM_OF_LOSS_T)"
             )
         if self.summary is not None and self.summary.failure is not None:
             raise PeerError(self.summary.failure)

@@ -150,7 +150,7 @@ def link_settings(
 
 
 def action_meaning(contract: Contract, config: LinkConfig) -> ActionMeaning:
-    """What the policy means by its actions; ``--raw-sticks`` keeps silent about its sticks."""
+    """Meaning of the policy's actions; with ``--raw-sticks`` its sticks have none."""
     gains = StickGains(
         lean_deg=contract.full_lean_deg,
         yaw_rate_degps=contract.full_yaw_rate_degps,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import Action
+from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind
 
 LEAST_GRACE_NS = 100 * NS_PER_MS
 GRACE_PERIODS = 3
@@ -82,8 +82,9 @@ class ChunkBuffer:
     overdue, else coasting. ``fault`` says when even that must end.
     """
 
-    def __init__(self, limits: FreshnessLimits, *, period_ns: int) -> None:
-        """``period_ns`` is the time between the policy's chunks."""
+    def __init__(self, limits: FreshnessLimits, *, period_ns: int, kind: ActionKind) -> None:
+        """``period_ns`` is the time between the policy's chunks, ``kind`` that of their actions."""
+        self._class = ACTION_CLASSES[kind]
         self._limits = limits
         self._period_ns = period_ns
         self.grace_ns = max(LEAST_GRACE_NS, GRACE_PERIODS * period_ns)
@@ -103,7 +104,7 @@ class ChunkBuffer:
         """Take a chunk if it may be flown; returns whether it was taken."""
         if self.newest is not None and chunk.serial <= self.newest.serial:
             return False
-        self._refusal = _malformed(chunk)
+        self._refusal = self._malformed(chunk)
         if self._refusal is not None:
             self._refused_ns.append(now_ns)
             return False
@@ -185,10 +186,11 @@ class ChunkBuffer:
                 return f"the {name} is {age_ms} ms old, beyond {limit_ns // NS_PER_MS} ms"
         return None
 
-
-def _malformed(chunk: Chunk) -> str | None:
-    if not chunk.actions or chunk.step_ns <= 0:
-        return "the policy returned a chunk without actions"
-    if not all(math.isfinite(sum(action)) for action in chunk.actions):
-        return "the policy returned a value that is not finite"
-    return None
+    def _malformed(self, chunk: Chunk) -> str | None:
+        if not chunk.actions or chunk.step_ns <= 0:
+            return "the policy returned a chunk without actions"
+        if not all(type(action) is self._class for action in chunk.actions):
+            return "the policy returned actions of another kind than its contract names"
+        if not all(math.isfinite(sum(action)) for action in chunk.actions):
+            return "the policy returned a value that is not finite"
+        return None

@@ -12,6 +12,10 @@ MODE_SPACING_NS = 100 * NS_PER_MS
 """Between two requests for the safe mode; ArduPilot answers within 10 ms."""
 MODE_TIMEOUT_NS = 3 * NS_PER_S
 """Longest wait for the safe mode; HEARTBEAT, which confirms it, may come at 1 Hz."""
+SETPOINT_NS = 500 * NS_PER_MS
+"""Longest stream of neutral setpoints that waits for the mode on PX4. A vehicle that has not
+answered by then does not hear us, and it goes back to OFFBOARD within 30 ms when it hears a
+setpoint after its own failsafe (COM_OF_LOSS_T, 1 s)."""
 MIDDLE_STICK = 0.2
 """A receiver's throttle this near to the middle holds height or nearly so (ArduPilot's THR_DZ is
 0.2 of the stick's travel to each side)."""
@@ -75,7 +79,9 @@ class Departure:
                 choice = "release" if has_receiver and is_middle else "hold"
             else:
                 choice = "release" if has_receiver else "land"
-        if choice == "release" and is_setpoint:
+        # In a mode of setpoints or of the autopilot's takeoff a pilot's sticks would do nothing.
+        is_deaf = facts.mode in (*facts.modes.setpoint, *facts.modes.takeoff)
+        if choice == "release" and (is_setpoint or is_deaf):
             choice = "hold"
         if choice == "hold" and not facts.is_position_valid:
             choice = "land"  # BRAKE and LOITER are refused without a position
@@ -84,7 +90,7 @@ class Departure:
         self.mode = by_choice.get(choice) or None
 
     def step(self, facts: Facts) -> Move:
-        """Neutral sticks, and the mode until it is confirmed or refused."""
+        """Neutral, and the mode until it is confirmed or refused."""
         is_confirmed = self.mode is None or facts.mode == self.mode
         is_refused = self.mode is not None and facts.refused_mode == self.mode
         # No vehicle refuses to land: an answer that says so is a late one, to the mode before.
@@ -96,7 +102,12 @@ class Departure:
         )
         # Where the throttle is thrust, neutral would climb or fall: the mode goes first.
         is_level_only = self._is_thrust_mode and not (self.mode and is_confirmed)
-        hand = Hand.LEVEL if is_level_only else Hand.NEUTRAL
+        hand: Hand | None = Hand.LEVEL if is_level_only else Hand.NEUTRAL
+        if self._settings.is_setpoint and facts.is_landed:
+            hand = Hand.IDLE  # the thrust that hovers would lift it
+        may_pull_back = self._settings.is_setpoint and facts.modes.needs_setpoints_first
+        if may_pull_back and elapsed_ns > SETPOINT_NS:
+            hand = None
         if is_confirmed or self.is_done or facts.now_ns < self._request_due_ns:
             return Move(hand=hand)
         self._request_due_ns = facts.now_ns + MODE_SPACING_NS

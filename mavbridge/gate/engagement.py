@@ -14,6 +14,8 @@ from mavbridge.gate.preparation import Preparation, PreparationSettings
 
 PREPARE_TIMEOUT_NS = 90 * NS_PER_S
 """For mode change and arming; a cold autopilot needs some 40 s for its estimator."""
+SLOWEST_CLIMB_MPS = 1.0
+"""Of a takeoff by the autopilot, for which the above is prolonged; 1.5 m/s and more are usual."""
 ACT_TIMEOUT_NS = 3 * NS_PER_S
 """For the change of mode that an act asks for while armed: no act comes true much later."""
 RELEASE_TIMEOUT_NS = NS_PER_S
@@ -80,6 +82,7 @@ class Engagement:
         self._own_mode: str | None = None
         """The mode that we fly in, or asked for and got; any change of it is a takeover."""
         self._preparation = Preparation(settings.preparation)
+        self._is_setpoint = settings.preparation.is_setpoint
         self._prepare_timeout_ns = self._prepare_until_ns = 0
         self._released_ns = 0
         self._heard_ns = 0
@@ -180,7 +183,8 @@ class Engagement:
             self.reason = self._waiting_reason(facts)
         if self._wants_arm and facts.link_problem is None:
             self._wants_arm = False
-            return self._begin_preparing(facts, PREPARE_TIMEOUT_NS)
+            climb_s = (self._settings.preparation.takeoff_m or 0.0) / SLOWEST_CLIMB_MPS
+            return self._begin_preparing(facts, PREPARE_TIMEOUT_NS + round(climb_s * NS_PER_S))
         if act != "engage":
             return Move()
         if not facts.armed:
@@ -219,7 +223,7 @@ class Engagement:
         if taken is None and self._was_ready and not facts.armed:
             taken = "the vehicle has been disarmed"
         if taken is not None:
-            return self._give_back(facts, taken)
+            return self._yield(facts, taken)
         self._was_ready = facts.armed
         is_late = facts.now_ns > self._prepare_until_ns
         if is_late or self._preparation.impossibility(facts) is not None:
@@ -239,7 +243,7 @@ class Engagement:
         )
         if self._prepare_timeout_ns == ACT_TIMEOUT_NS:  # the act may be repeated
             self.refusal = f"not engaged: {problem}"
-            return self._give_back(facts, self.refusal)
+            return self._depart(facts, Ending(reason=self.refusal, is_fault=True))
         self.failure = problem
         ending = Ending(reason=problem, is_fault=True)
         self.stop(ending)
@@ -257,7 +261,7 @@ class Engagement:
 
     def _fly(self, facts: Facts, act: Act | None) -> Move:
         if (taken := self._takeover(facts)) is not None:
-            return self._give_back(facts, taken)
+            return self._yield(facts, taken)
         if self._stop_reason is not None:
             return self._depart(facts, self._stop_reason)
         if act == "release":
@@ -297,8 +301,27 @@ class Engagement:
             return f"mode changed from {self._own_mode} to {facts.mode}"
         return None
 
+    def _follows_us(self, facts: Facts) -> bool:
+        """It goes on with our last setpoint, in a mode of ours, and does nothing else."""
+        is_left_alone = facts.overruled is None and not facts.is_failsafe
+        if not (self._is_setpoint and facts.armed and is_left_alone):
+            return False
+        is_preparing = self.phase is Phase.PREPARING
+        is_own = self._preparation.is_own_mode(facts) or not is_preparing
+        return is_own and facts.mode == self._own_mode and facts.mode in facts.modes.setpoint
+
+    def _yield(self, facts: Facts, reason: str) -> Move:
+        """Somebody took over: sticks are given back, and a mode that follows setpoints is left.
+
+        There silence would be the policy's last lean or body rate for one to three seconds.
+        """
+        if not self._follows_us(facts):
+            return self._give_back(facts, reason)
+        self._seen_interruption = facts.interruption
+        return self._depart(facts, Ending(reason=reason, is_fault=True))
+
     def _give_back(self, facts: Facts, reason: str) -> Move:
-        """Somebody took over: release in this same step, and no mode command."""
+        """Release in this same step, and no mode command."""
         had_sticks = self.phase is not Phase.PREPARING or self._preparation.arms
         self.phase = Phase.RELEASING
         self.reason = reason
@@ -308,7 +331,8 @@ class Engagement:
 
     def _depart(self, facts: Facts, ending: Ending) -> Move:
         """Our own fault or end: neutral, a safe mode, then the release."""
-        if self.phase is Phase.PREPARING and not (self._preparation.arms and facts.armed):
+        is_ours = (self._preparation.arms and facts.armed) or self._follows_us(facts)
+        if self.phase is Phase.PREPARING and not is_ours:
             return self._give_back(facts, ending.reason)  # we never had the sticks in the air
         self.phase = Phase.LEAVING
         self.reason = ending.reason

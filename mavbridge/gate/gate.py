@@ -87,7 +87,9 @@ class Gate:
     """Decides at each moment whether sticks leave, and which."""
 
     def __init__(self, settings: FlightSettings, now_ns: int) -> None:
-        self._chunks = ChunkBuffer(settings.freshness, period_ns=settings.chunk_period_ns)
+        self._chunks = ChunkBuffer(
+            settings.freshness, period_ns=settings.chunk_period_ns, kind=settings.meaning.kind
+        )
         self._meaning = settings.meaning
         self._neutral, self._idle = neutral_action(self._meaning), idle_action(self._meaning)
         self._smoother = ActionSmoother(settings.smoothing, self._neutral)
@@ -115,6 +117,11 @@ class Gate:
     def failure(self) -> str | None:
         """Why there was no flight, or None."""
         return self._engagement.failure
+
+    @property
+    def last_setpoint(self) -> Action | None:
+        """A setpoint at rest; None where the policy's actions are sticks, which can be released."""
+        return None if isinstance(self._neutral, Sticks) else self._neutral
 
     def step(self, now_ns: int, given: GateInput) -> GateOutput:
         """Advance to this moment."""
@@ -184,8 +191,12 @@ class Gate:
         )
 
     def _change_hand(self, hand: Hand | None, now_ns: int, link: LinkSnapshot) -> None:
-        """When the policy takes the sticks, start from where they are."""
+        """When the policy or neutral takes the sticks, start from where they are."""
         before, self._hand = self._hand, hand
+        if hand is Hand.NEUTRAL and before not in (Hand.POLICY, Hand.NEUTRAL):
+            on_ground = before is Hand.IDLE
+            start = self._idle if on_ground else first_action(self._meaning, link.telemetry, None)
+            self._smoother.reset(start)  # what an earlier flight left in it counts no longer
         if hand is not Hand.POLICY or before is Hand.POLICY:
             return
         self._envelope.reset()
@@ -225,12 +236,11 @@ class Gate:
                 raw = self._chunks.action_at(now_ns + self._lead_ns)
                 # Beyond the horizon level sticks bridge the rest of the grace.
                 level = self._level(is_thrust=is_thrust)
-                if raw is None and self._meaning.kind == "rates":
-                    return Command(
-                        action=level
-                    ), None  # an attitude, which has no place among rates
-                trace = self._smoother.step(raw or level, now_ns)
-                self._last = trace.smoothed
+                if raw is None and self._meaning.kind == "rates":  # an attitude: not filtered
+                    trace = ActionTrace(raw=level, clipped=level, slewed=level, smoothed=level)
+                else:
+                    trace = self._smoother.step(raw or level, now_ns)
+                    self._last = trace.smoothed
                 return Command(action=trace.smoothed), trace
         self._last = action
         return Command(action=action), None

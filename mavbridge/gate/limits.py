@@ -19,6 +19,10 @@ from mavbridge.core.vehicle import (
 
 Four: TypeAlias = tuple[float, float, float, float]
 
+MOST_FIRST_LEAN_RAD = math.radians(80.0)
+"""Largest lean that a flight begins with, roll and pitch together: as far as limits go, and within
+what the codec sends (85 degrees)."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionLimits:
@@ -46,7 +50,7 @@ class ActionLimits:
         if self.pair is not None:
             wanted = [b - a for a, b in zip(now, goal, strict=True)]
             self._shorten(moves, wanted, reach[self.pair[0]])
-        return type(now)(
+        return type(goal)(  # the idle action of body rates is an attitude
             *[
                 b if most == math.inf else a + move
                 for a, b, move, most in zip(now, goal, moves, reach, strict=True)
@@ -134,7 +138,7 @@ def idle_action(meaning: ActionMeaning) -> Action:
 
 
 def first_action(meaning: ActionMeaning, telemetry: Telemetry, pilot: Sticks | None) -> Action:
-    """What the vehicle does in the air when the policy takes over, so that nothing jumps.
+    """Action that continues what the vehicle does as the policy takes over, so that nothing jumps.
 
     ``pilot`` are the sticks that the vehicle follows now; None = not known.
     """
@@ -148,7 +152,8 @@ def first_action(meaning: ActionMeaning, telemetry: Telemetry, pilot: Sticks | N
         case "attitude":
             roll_rad = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
             pitch_rad = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
-            return AttitudeThrust(meaning.hover_thrust, roll_rad, pitch_rad, 0.0)
+            share = MOST_FIRST_LEAN_RAD / max(math.hypot(roll_rad, pitch_rad), MOST_FIRST_LEAN_RAD)
+            return AttitudeThrust(meaning.hover_thrust, share * roll_rad, share * pitch_rad, 0.0)
         case "velocity":
             north, east, down = velocity.values if velocity else (0.0, 0.0, 0.0)
             if meaning.is_heading_frame:

@@ -8,9 +8,11 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
+    Command,
     Decision,
     ForwardedPacket,
     LinkSnapshot,
+    ModeRoles,
     Output,
     Release,
 )
@@ -117,6 +119,8 @@ class GateLoop:
         self._stop: Ending | None = None
         self._finish_until_ns: int | None = None
         self._is_clean = False
+        self._is_setpoint = False
+        self._modes = ModeRoles()
         self.is_done = False
         """The sticks are given back, and nobody wants more flights."""
 
@@ -136,9 +140,18 @@ class GateLoop:
     def abandon(self) -> None:
         """Give the sticks back without any state machine: the gate ends by a bug of its own.
 
-        Ten times over half a second, as any packet may be lost; not where none was ever held.
+        Ten times over half a second, as any packet may be lost; not where none was ever held. The
+        last setpoint would be followed until the vehicle's own timeout, so one at rest goes before,
+        and the vehicle is asked to hold unless somebody has taken it over.
         """
+        last = self._gate.last_setpoint if self._gate is not None else None
+        if last is not None and self._phase is Phase.FLYING:
+            with suppress(Exception):
+                self._link.send(Command(action=last))
         for _ in range(ABANDON_RELEASES if self._phase is not Phase.WAITING else 0):
+            if self._is_setpoint and self._modes.hold and self._phase in _HELD:
+                with suppress(Exception):
+                    self._link.set_mode(self._modes.hold)
             with suppress(Exception):
                 self._link.send(Release("the gate has failed"))
             self._clock.sleep_until_ns(self._clock.now_ns() + ABANDON_SPACING_NS)
@@ -151,6 +164,7 @@ class GateLoop:
         """
         woke_ns = self._clock.now_ns()
         snapshot = self._link.poll()
+        self._modes = snapshot.modes
         self._report_vehicle(snapshot)
         given = self._receive(snapshot)
         if self._gate is None:
@@ -231,6 +245,7 @@ class GateLoop:
                     pass
                 case FlightSettings() as settings if self._gate is None:
                     self._gate = Gate(settings, self._clock.now_ns())
+                    self._is_setpoint = settings.meaning.kind != "sticks"
                     self._link.begin_flight(settings.meaning, settings.output)
                 case Ending() as ending:
                     self.stop(ending)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.gate.facts import Facts, Hand, Move
 
 REQUEST_SPACING_NS = NS_PER_S
@@ -26,6 +26,11 @@ class PreparationSettings:
     """The policy's actions are setpoints, and not sticks."""
 
 
+FLOW_NS = 100 * NS_PER_MS
+"""Setpoints flow for so long before a mode is asked for that needs them: PX4 took OFFBOARD 20 ms
+after the first, and refused it when asked together with it."""
+
+
 class Preparing(NamedTuple):
     """One step of preparing."""
 
@@ -43,6 +48,8 @@ class Preparation:
         self._ground_m: float | None = None
         self._is_up = False
         self._asked_mode: str | None = None
+        self._flows_from_ns: int | None = None
+        """First setpoint of those that a mode needs before it is entered."""
         self.arms = False
         """It was disarmed when this began: we keep it idle on the ground, and arm it."""
 
@@ -50,7 +57,7 @@ class Preparation:
         """Start with the vehicle as it is now."""
         self.arms = not facts.armed
         self._is_up = self._settings.takeoff_m is None or not self.arms
-        self._asked_mode = self._ground_m = None
+        self._asked_mode = self._ground_m = self._flows_from_ns = None
 
     @property
     def is_taking_off(self) -> bool:
@@ -98,6 +105,11 @@ class Preparation:
         is_heard = facts.armed or facts.echo_confirmed
         if objection is not None or not is_heard or facts.now_ns < self._request_due_ns:
             return Preparing(Move(hand=hand), waits_for)
+        if hand is Hand.NEUTRAL and self._settings.is_setpoint:
+            if self._flows_from_ns is None:
+                self._flows_from_ns = facts.now_ns
+            if facts.now_ns - self._flows_from_ns < FLOW_NS:
+                return Preparing(Move(hand=hand), waits_for)
         if climb_m is not None and facts.is_landed is False:
             return Preparing(Move(hand=hand), waits_for)
         self._request_due_ns = facts.now_ns + REQUEST_SPACING_NS
@@ -127,15 +139,18 @@ class Preparation:
         Somebody who has armed it keeps the sticks until the policy takes them. Setpoints end a
         takeoff, but some modes are only entered while they flow.
         """
+        is_climbing = self.arms and facts.armed and self._settings.takeoff_m is not None
         if facts.link_problem is not None:
-            return None
+            # Sticks that end are a failsafe where there is no receiver, also if we hear nothing.
+            return Hand.NEUTRAL if is_climbing and not self._settings.is_setpoint else None
         if self._settings.is_setpoint:
             if self.is_taking_off:
                 return None
             if self.arms and self._settings.takeoff_m is None:
                 return Hand.IDLE
-            needs_flow = facts.modes.needs_setpoints_first and wanted in facts.modes.setpoint
+            mode = wanted or facts.mode  # and once entered, it is kept only by them
+            needs_flow = facts.modes.needs_setpoints_first and mode in facts.modes.setpoint
             return Hand.NEUTRAL if needs_flow else None
         if not self.arms:
             return None
-        return Hand.NEUTRAL if self._settings.takeoff_m and facts.armed else Hand.IDLE
+        return Hand.NEUTRAL if is_climbing else Hand.IDLE

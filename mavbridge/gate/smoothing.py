@@ -61,7 +61,7 @@ class ActionSmoother:
         if tau_s == 0:
             return u1
         if dt_s == 0:
-            return self._smoothed
+            return type(u1)(*self._smoothed)
         decay = math.exp(-dt_s / tau_s)
         lag = tau_s / dt_s
         return type(u1)(

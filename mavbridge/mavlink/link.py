@@ -100,7 +100,7 @@ class MavlinkLink:
             self._interrupt("the vehicle has rebooted: its session starts over")
             self._adopt(self._vehicle.identity)
         now_ns = self._clock.now_ns()
-        overruled = self._share_with(self._station, now_ns) if self._station else None
+        shared = self._share_with(self._station, now_ns) if self._station else None
         texts = self._connection.take_texts()
         vehicle, output = self._vehicle, self._sender.output
         status = vehicle.status(now_ns) if vehicle else None
@@ -116,12 +116,14 @@ class MavlinkLink:
                 refused_mode=self._commands.refused_mode,
                 texts=texts,
             )
-        overruled = overruled or output.overruled(now_ns)
+        others = output.overruled(now_ns)
+        # Sticks that move do nothing in a mode of setpoints, which goes on with our last one.
+        is_overruled = others is not None or (output.is_sticks and shared is not None)
         return LinkSnapshot(
             telemetry=self._telemetry.snapshot(),
             status=output.in_policy_terms(status, vehicle, now_ns),
-            problem=problem or overruled or output.unheard(now_ns),
-            is_overruled=overruled is not None,
+            problem=problem or shared or others or output.unheard(now_ns),
+            is_overruled=is_overruled,
             is_switched_off=output.is_sticks and vehicle.is_switched_off,
             echo_confirmed=output.echo_confirmed,
             is_released=output.is_released(vehicle, now_ns),
@@ -211,6 +213,7 @@ class MavlinkLink:
             self._timesync,
             echo_confirmed=output is not None and output.was_confirmed,
             unusable_packets=self._codec.bad_data_count,
+            saturated={} if output is None else output.saturated,
         )
 
     @property
@@ -339,6 +342,8 @@ class MavlinkLink:
         severity = dialect.MAV_SEVERITY_WARNING if is_warning else dialect.MAV_SEVERITY_NOTICE
         for packet in self._codec.encode_statustext(severity, text):
             self._sender.transmit(packet)
+            if self._station is not None:  # no autopilot sends it back to where it came from
+                self._station.pass_on(packet)
 
     # --- actions
 

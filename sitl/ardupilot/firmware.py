@@ -1,8 +1,8 @@
 """ArduCopter as a whole: parameters, flight controller and links of one vehicle."""
 
 from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.link.server import MavlinkServer
 from sitl.ardupilot.params import Params
-from sitl.ardupilot.server import MavlinkServer
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig
 

@@ -112,14 +112,15 @@ class Commander:
         self.mode = self.intended
         return True
 
-    def set_mode(self, mode: Mode) -> bool:
-        """Take a commanded mode; a refusal becomes a text. True if it is intended then."""
+    def set_mode(self, mode: Mode, *, says_why: bool = True) -> bool:
+        """Take a commanded mode; a refusal may become a text. True if it is intended then."""
         if self.terminated:
             return False
         if self.armed and mode is not Mode.AUTO_LAND and not self.can_fly(mode):
             arguments = ev.pack("IB", self.mode.custom_mode, ev.NAVIGATION_MODES[mode])
             text = f"Switching to {SPOKEN_NAMES[mode]} is currently not available"
-            self._deny(text, "commander_modeswitch_not_avail", arguments)
+            if says_why:
+                self._deny(text, "commander_modeswitch_not_avail", arguments)
             return False
         self._intend(mode)
         return True
@@ -207,9 +208,13 @@ class Commander:
         is_held = self.lost_sticks.phase is Phase.HOLDING
         is_autonomous = self.mode.is_auto or self.mode is Mode.OFFBOARD
         if self._sticks.moved_fast and is_autonomous and not is_held and not self.landed:
+            was_failsafe = self.in_failsafe
             self._intend(Mode.POSCTL if self.position_ready else Mode.ALTCTL)
-            self._say(ev.SEVERITY_INFO, "Pilot took over using sticks")
-            self._emit("commander_rc_override", ev.LEVELS_INFO)
+            if was_failsafe:
+                self._emit("failsafe_rc_override", ev.LEVELS_INFO)
+            else:
+                self._say(ev.SEVERITY_INFO, "Pilot took over using sticks")
+                self._emit("commander_rc_override", ev.LEVELS_INFO)
 
     def _disarm_by_time(self) -> None:
         if not self.landed:

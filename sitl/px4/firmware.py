@@ -1,8 +1,8 @@
 """PX4 as a whole: parameters, flight controller and links of one vehicle."""
 
 from sitl.px4.autopilot import Autopilot
+from sitl.px4.link.server import MavlinkServer
 from sitl.px4.params import Params
-from sitl.px4.server import MavlinkServer
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig
 

@@ -50,6 +50,8 @@ class FlightControl:
         """Demanded attitude, as ATTITUDE_TARGET reports it."""
         self.velocity_ned_mps: Vec3 = (0.0, 0.0, 0.0)
         """Demanded velocity, as POSITION_TARGET_LOCAL_NED reports it."""
+        self.yaw_rate_radps = 0.0
+        """Demanded yaw rate, in the same message."""
 
     @property
     def rates_radps(self) -> Vec3:
@@ -170,7 +172,7 @@ class FlightControl:
     def _lean_to(
         self, target: Quat, yaw_rate_radps: float, thrust: float, body: BodyState, dt_s: float
     ) -> tuple[float, ...]:
-        self.attitude, self.thrust = target, thrust
+        self.attitude, self.thrust, self.yaw_rate_radps = target, thrust, yaw_rate_radps
         return mix(thrust, self._rates.attitude(body, target, yaw_rate_radps, dt_s), SIH_QUAD)
 
     def _turn_at(

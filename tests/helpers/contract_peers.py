@@ -68,7 +68,15 @@ class UdpPeer:
             self._socket.sendto(data, self._peer)
 
     def advance(self, duration_ns: int) -> bytes:
-        self._clock.sleep_until_ns(self._clock.now_ns() + duration_ns)
+        """Reads every few milliseconds: a second of telemetry is more than a socket holds."""
+        end_ns = self._clock.now_ns() + duration_ns
+        taken = b""
+        while (now_ns := self._clock.now_ns()) < end_ns:
+            self._clock.sleep_until_ns(min(end_ns, now_ns + TICK_NS))
+            taken += self._read()
+        return taken
+
+    def _read(self) -> bytes:
         taken = b""
         while True:
             try:

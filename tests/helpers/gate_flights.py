@@ -45,8 +45,7 @@ NAN = (math.nan,) * 4
 HOVER = (0.0, 0.0, 0.0, 0.0)
 CONTRACT = Contract(feature_dim=1, arrays="numpy")
 Policy = Callable[[float], tuple[float, float, float, float]]
-"""Seconds since the first flight began (negative before it) -> sticks (throttle, yaw, pitch,
-roll)."""
+"""Seconds since the first flight began (negative before it) -> throttle, yaw, pitch, roll."""
 
 
 def hovering(_: float) -> tuple[float, float, float, float]:
@@ -128,14 +127,7 @@ class GateFlight:
         self.gate = GateLoop(self.clock, self.link, self.gate_port)
         self.features = FreshFeatures(self.clock)
         self.sink = ListSink()
-        executable = Executable(
-            contract=contract,
-            name="test",
-            engine="numpy",
-            dual_rate=True,
-            encode=lambda rgb: np.zeros((1, 1), np.float32),
-            act=self._act,
-        )
+        executable = self._executable(contract)
         self._horizon = contract.horizon
         self._policy_clock = AheadClock(self.clock)
         bridge = build_bridge(
@@ -160,6 +152,16 @@ class GateFlight:
         self._wake = stepper.step
 
     # --- the flight process
+
+    def _executable(self, contract: Contract) -> Executable:
+        return Executable(
+            contract=contract,
+            name="test",
+            engine="numpy",
+            dual_rate=True,
+            encode=lambda rgb: np.zeros((1, 1), np.float32),
+            act=self._act,
+        )
 
     def _act(
         self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
@@ -332,8 +334,7 @@ class GateFlight:
 
     def modes_asked(self, since_ns: int = 0) -> list[int]:
         """Numbers of the modes that were requested."""
-        asked = self.commands(dialect.MAV_CMD_DO_SET_MODE, since_ns)
-        return [int(mode) for _, mode in asked]
+        return [int(mode) for _, mode in self.commands(dialect.MAV_CMD_DO_SET_MODE, since_ns)]
 
     def sticks_sent(self, since_ns: int = 0) -> list[tuple[int, Sticks]]:
         """Overrides that left, as sticks; releases left out."""

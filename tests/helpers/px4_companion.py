@@ -102,8 +102,13 @@ class Px4Companion(Companion):
         self.seen += messages
         return messages
 
-    def set_mode(self, mode: tuple[int, int]) -> int:
-        return self.command(mav.MAV_CMD_DO_SET_MODE, 1, *mode)
+    def set_mode(
+        self, mode: tuple[int, int], *, component_id: int = mav.MAV_COMP_ID_ONBOARD_COMPUTER
+    ) -> int:
+        self._mav.srcComponent = component_id
+        result = self.command(mav.MAV_CMD_DO_SET_MODE, 1, *mode)
+        self._mav.srcComponent = mav.MAV_COMP_ID_ONBOARD_COMPUTER
+        return result
 
     def sticks(self, sticks: tuple[int, int, int, int], *, system_id: int = GCS) -> None:
         """MANUAL_CONTROL: x, y, z, r."""
@@ -184,12 +189,24 @@ class Px4Companion(Companion):
         assert self.arm() == ACCEPTED
         self.until(
             lambda m: any(p.z < -6.0 for p in named(m, "LOCAL_POSITION_NED")),
-            15.0,
+            25.0,
             lambda _: self.sticks((0, 0, 1000, 0)),
         )
         self.fly(3.0)
         assert self.set_mode(mode) == ACCEPTED
         self.seen.clear()
+
+    def hears(
+        self, text: str, within_s: float = 2.0, send: Callable[[float], None] = lambda _: None
+    ) -> bool:
+        """True once a status text that begins so has come, since ``seen`` was cleared."""
+        end_ns = self.peer.now_ns() + round(within_s * NS_PER_S)
+        while self.peer.now_ns() < end_ns:
+            if any(m.text.startswith(text[:50]) for m in named(self.seen, "STATUSTEXT")):
+                return True
+            send(0.0)
+            self.advance(1.0 / STICK_HZ)
+        return False
 
     def texts(self) -> list[str]:
         """Status texts since the last call, without the tab at their end."""

@@ -13,15 +13,16 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.records import Tick
+from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.network import MemoryTransport
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult
-from mavbridge.simulation.world import Exposure
+from mavbridge.simulation.world import Exposure, make_vehicle
 from policy.contract import Executable, FloatArray
 from policy.errors import PolicyError
-from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 
 MS = NS_PER_MS
 HOP_NS = MS // 10
@@ -300,3 +301,35 @@ def test_no_result_without_a_whole_flight(
 ) -> None:
     with pytest.raises(error, match=message):
         fly()
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "action"),
+    [
+        ("px4", "attitude"),
+        ("px4", "rates"),
+        ("px4", "velocity"),
+        ("ardupilot", "attitude"),
+        ("ardupilot", "rates"),
+    ],
+)
+def test_a_scripted_square_flies_in_every_setpoint_that_takes_off(
+    autopilot: AutopilotName, action: str
+) -> None:
+    """A velocity does not lift an ArduPilot off: that takes --takeoff."""
+    one = SimulatedFlight(
+        course_seed=3, seed=0, settings=BLIND, vehicle=make_vehicle(autopilot=autopilot)
+    )
+    if autopilot == "ardupilot":
+        one.vehicle.params.set("GUID_OPTIONS", 8)  # thrust, not a climb rate
+    wanted = PolicyConfig(policy=f"scripted:square:{action}", dual_rate=True)
+    executable: Executable = load_configured_policy(wanted, one.clock).executable
+    sink = ListSink()
+    result = one.fly(executable, max_time_s=15.0, sinks=(sink,))
+    assert result.outcome == "timed out"
+    body = one.vehicle.ap.truth
+    assert -body.position_ned_m[2] == pytest.approx(3.0, abs=0.5)
+    assert result.distance_m > 8.0
+    assert {type(tick.trace.smoothed) for tick in flown(sink) if tick.trace} == {
+        ACTION_CLASSES[executable.contract.action]
+    }

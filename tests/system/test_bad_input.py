@@ -53,6 +53,11 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         (["--connect", "udp:127.0.0.1:1", "--policy", "nowhere.at_all:Policy"], "nowhere"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "pathlib:Path"], "predict"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "scripted:loop"], "square"),
+        (["--connect", "udp:127.0.0.1:1", "--policy", "scripted:yaw:position"], "velocity"),
+        (["identify", "--arm"], "--connect"),
+        (["identify", "--connect", "udp:127.0.0.1:1", "--readonly"], "--readonly"),
+        (["identify", "--connect", "udp:127.0.0.1:1", "--policy", "tog"], "tog"),
+        (["identify", "--connect", "udp:127.0.0.1:1", "--json", "/proc/none/x.json"], "--json"),
         (["--connect", "udp:127.0.0.1:1", "--checkpoint", "no.safetensors"], "no.safetensors"),
         (
             ["--connect", "udp:127.0.0.1:1", "--policy", "toge:huge", "--allow-untrained"],

@@ -1,4 +1,4 @@
-"""Which number of an action moves what: the axes of each kind of action, and what was trained."""
+"""The axes of each kind of action: the number that moves each, and its meaning in training."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What a flight sent, and how the vehicle moved: kept in memory, with a limit."""
+"""Actions sent in a flight and the motion of the vehicle, kept in memory up to a limit."""
 
 from collections import deque
 from collections.abc import Callable

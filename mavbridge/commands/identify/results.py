@@ -1,4 +1,4 @@
-"""What was measured, beside what the policy was trained with: table, words, JSON."""
+"""Measured gains and lags beside those of training: table, words, JSON."""
 
 import json
 import math
@@ -18,6 +18,7 @@ ALIKE = 0.1
 """Gains that differ by less, of the trained one, are called the same."""
 SLOWER = 1.5
 """A response that takes so many times as long as the simulator's is called slower."""
+TRAINED, COMMANDED = "the policy was trained with", "was commanded"
 AXES: tuple[Axis, ...] = ("roll", "pitch", "yaw", "climb")
 
 
@@ -25,7 +26,8 @@ def print_identification(found: Identification, contract: Contract, console: Con
     """Print every push, a verdict for each axis, and what could not be measured."""
     is_sticks = contract.action == "sticks"
     header = (
-        *("axis", "stick" if is_sticks else "commanded", "motion", "measured", "trained with"),
+        *("axis", "stick" if is_sticks else "commanded", "motion", "measured"),
+        "trained with" if is_sticks else "expected",
         *("ratio", "dead time", "63 %"),
     )
     rows = [_row(push, is_sticks=is_sticks) for push in found.pushes]
@@ -61,21 +63,21 @@ def verdicts(found: Identification, contract: Contract) -> Iterator[str]:
         yield f"{axis}: {_lag(pushes[-1], contract)}"
     if found.hover_thrust is not None:
         ratio = found.hover_thrust / contract.hover_thrust
-        yield f"thrust: hovers at {found.hover_thrust:.3f}, {_compared(ratio)}"
+        yield f"thrust: hovers at {found.hover_thrust:.3f}, {_compared(ratio, TRAINED)}"
 
 
 def _gain(sides: Sequence[Side], pushes: Sequence[PushResult], contract: Contract) -> str:
     """Words for the larger push, and for the smaller one where that is another story."""
     large = sides[-1].ratio
-    text = _compared(large)
-    if len(sides) > 1 and abs(math.log(max(sides[0].ratio, 1e-3) / max(large, 1e-3))) > ALIKE:
+    text = _compared(large, TRAINED if contract.action == "sticks" else COMMANDED)
+    is_curved = abs(math.log(max(sides[0].ratio, 1e-3) / max(large, 1e-3))) > ALIKE
+    if is_curved:
         text += f" (at {_amount(sides[0], contract)} {sides[0].ratio:.1f} times)"
     full = full_stick(pushes, contract, is_up=sides[-1].amount > 0.0)
     if contract.action == "sticks" and full is not None:
-        text += (
-            f"; full stick {abs(full.reached):.1f} of {abs(full.trained):.1f} {pushes[0].unit}, "
-            f"as if dead below {full.dead_zone:.0%}"
-        )
+        text += f"; full stick {abs(full.reached):.1f} of {abs(full.trained):.1f} {pushes[0].unit}"
+        if not is_curved:
+            text += f", dead zone {full.dead_zone:.0%}"
     return text
 
 
@@ -83,10 +85,8 @@ def _amount(side: Side, contract: Contract) -> str:
     return f"{abs(side.amount):.0%}" if contract.action == "sticks" else f"{abs(side.amount):.2f}"
 
 
-def _compared(ratio: float) -> str:
-    if abs(ratio - 1.0) < ALIKE:
-        return "as the policy was trained with"
-    return f"{ratio:.1f} times what the policy was trained with"
+def _compared(ratio: float, expected: str) -> str:
+    return f"as {expected}" if abs(ratio - 1.0) < ALIKE else f"{ratio:.1f} times what {expected}"
 
 
 def _lag(push: PushResult, contract: Contract) -> str:
@@ -104,7 +104,7 @@ def _lag(push: PushResult, contract: Contract) -> str:
 def to_json(found: Identification, contract: Contract, *, policy: str, is_mapped: bool) -> str:
     """Everything as JSON."""
     pushes = [
-        asdict(push) | {"ratio_up": push.up.ratio, "ratio_down": push.down.ratio}
+        asdict(push) | {"ratio_up": _finite(push.up.ratio), "ratio_down": _finite(push.down.ratio)}
         for push in found.pushes
     ]
     document = {
@@ -117,4 +117,9 @@ def to_json(found: Identification, contract: Contract, *, policy: str, is_mapped
         "missing": list(found.missing),
         "verdicts": list(verdicts(found, contract)),
     }
-    return json.dumps(document, indent=2) + "\n"
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def _finite(ratio: float) -> float | None:
+    """The ratio; None where the policy expected no motion at all."""
+    return ratio if math.isfinite(ratio) else None

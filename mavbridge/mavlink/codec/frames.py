@@ -9,7 +9,7 @@ _V1_HEADER, _V2_HEADER, _CHECKSUM, _SIGNATURE = 6, 10, 2, 13
 _SIGNED = 0x01
 
 
-class Frame(NamedTuple):
+class RawPacket(NamedTuple):
     """One packet; its checksum and signature are left to whoever receives it."""
 
     data: bytes
@@ -19,9 +19,9 @@ class Frame(NamedTuple):
     """Without the zeros that MAVLink 2 cuts off its end."""
 
 
-def split_frames(data: bytes) -> tuple[list[Frame], bool]:
+def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
     """The packets of a datagram, and whether bytes were left over that are none."""
-    frames: list[Frame] = []
+    frames: list[RawPacket] = []
     at = 0
     while at < len(data):
         frame = _frame_at(data, at)
@@ -32,7 +32,7 @@ def split_frames(data: bytes) -> tuple[list[Frame], bool]:
     return frames, False
 
 
-def _frame_at(data: bytes, at: int) -> Frame | None:
+def _frame_at(data: bytes, at: int) -> RawPacket | None:
     marker = data[at]
     header = _V1_HEADER if marker == _V1 else _V2_HEADER
     if marker not in (_V1, _V2) or len(data) - at < header:
@@ -48,4 +48,4 @@ def _frame_at(data: bytes, at: int) -> Frame | None:
     if end > len(data):
         return None
     payload = data[at + header : at + header + length]
-    return Frame(data[at:end], Endpoint(system, component), message_id, payload)
+    return RawPacket(data[at:end], Endpoint(system, component), message_id, payload)

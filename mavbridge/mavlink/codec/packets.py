@@ -61,6 +61,13 @@ class CommandRefusedError(Exception):
     """A stick command that must not be sent. Always a bug upstream of the codec."""
 
 
+def _unread(name: str, packet: bytes) -> ReceivedMessage:
+    """A packet that the dialect has no name for: its sequence number counts all the same."""
+    at = 4 if packet[0] == dialect.PROTOCOL_MARKER_V2 else 2
+    sequence, system, component = packet[at : at + 3]
+    return ReceivedMessage(Endpoint(system, component), sequence, name, None, packet)
+
+
 class Codec:
     """One MAVLink 2 endpoint without I/O: owns the parser state and the sending sequence."""
 
@@ -109,9 +116,8 @@ class Codec:
     def _read(self, message: dialect.MAVLink_message) -> ReceivedMessage:
         name = message.get_type()
         if isinstance(message, dialect.MAVLink_unknown):
-            missing = decode_state_packet(bytes(message.data))
-            if missing is not None:
-                return missing
+            data = bytes(message.data)
+            return decode_state_packet(data) or _unread(name, data)
         reader = READERS.get(name)
         try:
             body = None if reader is None else reader(message)

@@ -83,6 +83,8 @@ class AttitudeOutput(SetpointOutput):
         self._hover = HoverThrust()
         self._scale: float | None = None
         """The vehicle's thrust for the policy's; constant during a stream."""
+        self._has_guessed = self._has_told = False
+        """Nothing tells the thrust at which the vehicle hovers; the user knows."""
         self._heading = HeadingTarget()
         self._measured_rad: float | None = None
         self._is_level = False
@@ -92,6 +94,16 @@ class AttitudeOutput(SetpointOutput):
         super().restart()
         self._hover, self._scale, self._measured_rad = HoverThrust(), None, None
         self._heading.restart()
+
+    def take_notes(self) -> tuple[str, ...]:
+        """A thrust that is not matched to the vehicle."""
+        if not self._has_guessed or self._has_told:
+            return ()
+        self._has_told = True
+        return (
+            "the thrust at which this vehicle hovers is not known (MOT_THST_HOVER, MPC_THR_HOVER): "
+            f"the policy's thrust goes out as it is, with which {self._trained_hover:g} hovers",
+        )
 
     def released(self) -> None:
         """Silence; the next stream starts afresh."""
@@ -151,6 +163,7 @@ class AttitudeOutput(SetpointOutput):
     def _thrust_scale(self, vehicle: VehicleSession) -> float:
         hover = self._hover.value or vehicle.profile.hover_thrust(vehicle.known_params)
         if hover is None or not PLAUSIBLE_THRUST[0] < hover < PLAUSIBLE_THRUST[1]:
+            self._has_guessed = True
             return 1.0
         return hover / self._trained_hover
 

@@ -1,4 +1,4 @@
-"""Which output carries the actions of a policy to a vehicle."""
+"""Choice of the output that carries the actions of a policy to a vehicle."""
 
 from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import ActionKind, ActionMeaning, Output

@@ -43,7 +43,7 @@ _RETRY_NS = 3 * NS_PER_S
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoRules:
-    """How one message shows what was sent."""
+    """Rules by which one message shows what was sent."""
 
     tolerance: int
     """Largest difference from what was sent, and movement of another source at rest."""
@@ -150,7 +150,7 @@ class EchoCheck:
         """
         if self._shown_us is not None and shown_us <= self._shown_us:
             return
-        if self._arrived_ns is not None and now_ns - self._arrived_ns > CONFIRM_NS:
+        if self.is_unshown(now_ns) and self._arrived_ns is not None:
             self._restart(now_ns)
         self._shown_us, self._arrived_ns = shown_us, now_ns
         is_ours = any(self._is_near(values, past) for _, past in reversed(self._sent))

@@ -1,10 +1,11 @@
 """Sticks by MANUAL_CONTROL, with their echo in the vehicle's own MANUAL_CONTROL: PX4."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import Action, Output, StickGains
+from mavbridge.core.vehicle import Action, Output, StickGains, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import Body, ManualControl
 from mavbridge.mavlink.codec.packets import (
     STICK_END,
@@ -31,6 +32,9 @@ they came: it shows nothing when it hears nothing.
 
 The nudge is on r, whose dead zone is a tenth; outside it 4 are half a degree a second.
 """
+_MODES = ("ALTCTL", "POSCTL", "MANUAL", "STABILIZED", "ACRO")
+"""In all others the last sticks do nothing, but one that jumps may be taken for the pilot's hand,
+which ends the mode."""
 _HELD_NS = 700 * NS_PER_MS
 """PX4 holds the last sticks for 0.5 s and a poll of 0.2 s (COM_RC_LOSS_T); echoes end with them."""
 
@@ -54,6 +58,10 @@ class ManualControlOutput(StickOutput):
         super().__init__(codec, MANUAL_ECHO, gains)
         self._last = ManualControl(0, 0, STICK_END // 2, 0)
         self._sent_ns = 0
+        self._shown: tuple[int, Sticks] | None = None
+        """Arrival of the sticks that it acts on, and these."""
+        self._pilot: Sticks | None = None
+        """The same while it acted on none of ours."""
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note what has left."""
@@ -72,14 +80,29 @@ class ManualControlOutput(StickOutput):
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare the sticks that the vehicle acts on; they carry no stamp of its own."""
-        if isinstance(body, ManualControl):
-            self.echo.received(tuple(body), arrived_ns // 1000, arrived_ns)
+        if not isinstance(body, ManualControl):
+            return
+        self.echo.received(tuple(body), arrived_ns // 1000, arrived_ns)
+        self._shown = (arrived_ns, manual_control_sticks(body))
+        if self.echo.is_released and not self.echo.is_sending:
+            self._pilot = self._shown[1]
+
+    def in_policy_terms(
+        self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
+    ) -> VehicleStatus | None:
+        """The status with the sticks that are shown by MANUAL_CONTROL, and never by RC_CHANNELS."""
+        if status is not None and self._shown is not None:
+            arrived_ns, sticks = self._shown
+            status = replace(
+                status, rc_sticks=sticks, pilot_sticks=self._pilot, rc_arrived_ns=arrived_ns
+            )
+        return super().in_policy_terms(status, vehicle, now_ns)
 
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """Level once more, unless a receiver has sticks of its own; in a mode where the throttle is
-        thrust, with the last one."""
+        """Level once more in a mode that follows sticks, unless a receiver has some of its own;
+        where the throttle is thrust, with the last one."""
         status = vehicle.status(now_ns)
-        if status is None or status.has_receiver:
+        if status is None or status.has_receiver or status.mode not in _MODES:
             return None
         z = self._last.z if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2
         return self._codec.encode_manual_control(

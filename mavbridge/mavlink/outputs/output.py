@@ -1,6 +1,7 @@
-"""What an output is: how an action becomes a packet, and how the vehicle shows that it took it."""
+"""Shape of an output: an action becomes a packet, and the vehicle shows that it took it."""
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
@@ -44,6 +45,8 @@ class ActionOutput(ABC):
         self._codec = codec
         self._rules = rules
         self.echo = EchoCheck(rules)
+        self.saturated: Counter[str] = Counter()
+        """How often each stick, by name, asked for more than the vehicle can do."""
         self._was_confirmed = False
 
     def restart(self) -> None:
@@ -72,8 +75,9 @@ class ActionOutput(ABC):
     def receive(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Take a message of the vehicle, which may show an echo, before the session does."""
         self._compare(body, vehicle, arrived_ns)
-        vehicle.is_receiver_hidden = self.hides_receiver and self.echo.has_sent
-        vehicle.is_released = self.echo.is_released and not self.echo.is_sending
+        if self.hides_receiver:
+            vehicle.is_receiver_hidden = self.echo.has_sent
+            vehicle.is_released = self.echo.is_released and not self.echo.is_sending
 
     @abstractmethod
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""What the outputs for setpoints have in common: modes that follow them, and release by silence."""
+"""Common part of the outputs for setpoints: modes that follow them, and release by silence."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -27,6 +27,8 @@ class SetpointOutput(ActionOutput):
 
     is_sticks = False
     releases = 0
+    takeoff_ns: ClassVar[int] = 0
+    """So long after the ground it may rightly show something else."""
     _causes: ClassVar[Mapping[EchoFault, str]] = {
         "unseen": "another station may be commanding it",
         "foreign": "another station commands it as well, or it limits or refuses them",
@@ -37,12 +39,14 @@ class SetpointOutput(ActionOutput):
     def __init__(self, codec: Codec, rules: EchoRules) -> None:
         super().__init__(codec, rules)
         self._sent_ns: int | None = None
+        self._ground_ns: int | None = None
+        """When it last stood on the ground, as far as we have sent anything there."""
         self._is_checked = False
 
     def restart(self) -> None:
         """A new session: nothing was sent in it."""
         super().restart()
-        self._sent_ns, self._is_checked = None, False
+        self._sent_ns, self._ground_ns, self._is_checked = None, None, False
 
     def _follows(self, vehicle: VehicleSession, now_ns: int) -> bool:
         """The vehicle is armed and in a mode that follows setpoints."""
@@ -50,22 +54,24 @@ class SetpointOutput(ActionOutput):
         roles = vehicle.profile.modes.roles
         return status is not None and status.armed and status.mode in roles.setpoint
 
-    def _is_landed(self, vehicle: VehicleSession, now_ns: int) -> bool:
+    def _is_taking_off(self, vehicle: VehicleSession, now_ns: int) -> bool:
+        """The vehicle is on the ground, or has only just left it."""
         status = vehicle.status(now_ns)
-        return status is not None and status.is_landed is True
+        if status is not None and status.is_landed is True:
+            self._ground_ns = now_ns
+        return self._ground_ns is not None and now_ns - self._ground_ns <= self.takeoff_ns
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note what has left, for the echo where there is one to expect."""
         self._sent_ns = now_ns
+        is_taking_off = self._is_taking_off(vehicle, now_ns)
         self._is_checked = (
-            encoded.shown is not None
-            and self._follows(vehicle, now_ns)
-            and not self._is_landed(vehicle, now_ns)
+            encoded.shown is not None and self._follows(vehicle, now_ns) and not is_taking_off
         )
         if self._is_checked and encoded.shown is not None:
             self.echo.sent(encoded.shown, now_ns)
         else:
-            self.echo.released()
+            super().released()
 
     def released(self) -> None:
         """Silence."""

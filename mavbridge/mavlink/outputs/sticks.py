@@ -1,10 +1,9 @@
-"""What both outputs for sticks have in common: the policy's sticks and the vehicle's."""
+"""Common part of both outputs for sticks: the policy's sticks and the vehicle's."""
 
-from collections import Counter
 from dataclasses import replace
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import Action, StickGains, Sticks, VehicleStatus
+from mavbridge.core.vehicle import IDLE, Action, StickGains, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
 from mavbridge.mavlink.outputs.echo import EchoRules
 from mavbridge.mavlink.outputs.output import ActionOutput
@@ -29,8 +28,6 @@ class StickOutput(ActionOutput):
         self._curves_due_ns = 0
         self._new_notes: list[str] = []
         self._told: set[str] = set()
-        self.saturated: Counter[str] = Counter()
-        """How often each stick asked for more than the vehicle can do, by name."""
 
     def restart(self) -> None:
         """A new session: its parameters and its mode count."""
@@ -58,21 +55,16 @@ class StickOutput(ActionOutput):
             pilot_sticks=None if pilot is None else curves.to_policy(pilot),
         )
 
-    def released(self) -> None:
-        """Nothing more is sent until the next action; what could not be done is told."""
-        super().released()
-        if self.saturated:
-            counts = ", ".join(f"{stick} {count}" for stick, count in self.saturated.items())
-            self._new_notes.append(f"sticks that asked for more than the vehicle does: {counts}")
-            self.saturated.clear()
-
     def _wanted(
         self, action: Action, vehicle: VehicleSession, now_ns: int
     ) -> tuple[Sticks, StickCurves]:
-        """The vehicle's sticks for an action, and the curves that lead back."""
+        """The vehicle's sticks for an action, and the curves that lead back.
+
+        ``IDLE`` is no motion that the policy means, but the stop at the bottom, for arming.
+        """
         if not isinstance(action, Sticks):
             raise CommandRefusedError(f"{type(action).__name__} are not sticks")
-        if self._gains is None:
+        if self._gains is None or action is IDLE:
             return action, IDENTITY
         status = vehicle.status(now_ns)
         curves = self._curves_of(vehicle, status.mode if status else "", now_ns)

@@ -4,6 +4,7 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import Action, ActionMeaning, Output, Velocity
 from mavbridge.mavlink.codec.messages import Body, VelocityTarget
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
@@ -24,6 +25,9 @@ class VelocityOutput(SetpointOutput):
     """SET_POSITION_TARGET_LOCAL_NED with a velocity and a yaw rate."""
 
     name: Output = "velocity"
+    takeoff_ns = 3 * NS_PER_S
+    """PX4 brings the climb in over MPC_TKO_RAMP_T, 3 s by default, and shows that: the speed down
+    went from +2.2 to the -1.5 m/s that were sent in 2.0 s, of which 0.8 on the ground."""
     _echo_message = "POSITION_TARGET_LOCAL_NED"
 
     def __init__(self, codec: Codec, meaning: ActionMeaning) -> None:

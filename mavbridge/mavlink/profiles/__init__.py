@@ -1,1 +1,1 @@
-"""What the bridge knows of each firmware: nothing else in the tree asks which one it is."""
+"""One profile a firmware: nothing else in the tree asks which one it is."""

@@ -17,6 +17,7 @@ from mavbridge.mavlink.profiles.profile import (
     Profile,
     StreamGroup,
     optional_stream,
+    setpoint_danger,
 )
 from mavbridge.mavlink.profiles.sticks import StickCurves
 
@@ -97,7 +98,7 @@ class ArduPilot(Profile):
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
         """Calibration, and what decides how safe a flight is."""
         names = ardupilot_params.calibration_names(values)
-        return (*names, *ardupilot_params.RISK_NAMES, "GUID_OPTIONS")
+        return (*names, *ardupilot_params.RISK_NAMES, "GUID_OPTIONS", "MOT_THST_HOVER")
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration:
         """RCMAP_* and RCn_*."""
@@ -115,9 +116,11 @@ class ArduPilot(Profile):
             yield from ardupilot_params.thrust_obstacles(values)
 
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """Sticks that would stay for good; setpoints never do (GUID_TIMEOUT)."""
+        """Sticks that would stay for good, setpoints that would stay for long."""
         if context.output == "rc-override":
             yield from ardupilot_params.override_dangers(values, has_receiver=context.has_receiver)
+        elif context.output is not None:
+            yield from setpoint_danger(values, "GUID_TIMEOUT")
 
     def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
         """Time-outs that are long, and what keeps it from arming."""

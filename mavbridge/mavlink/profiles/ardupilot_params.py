@@ -180,7 +180,7 @@ def setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Itera
             f"GUID_TIMEOUT is {timeout_s:g}: if this computer died, the vehicle would hold its "
             "last setpoint for that many seconds: use --set GUID_TIMEOUT=0.5"
         )
-    if context.has_receiver is not True and values.get("FS_THR_ENABLE", 0.0) != 0:
+    if context.has_receiver is False and values.get("FS_THR_ENABLE", 0.0) != 0:
         yield (
             "no receiver was seen: the vehicle will not arm without one while its throttle "
             "failsafe is on; setpoints do not need it: --set FS_THR_ENABLE=0"

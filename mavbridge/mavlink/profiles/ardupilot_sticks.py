@@ -1,4 +1,4 @@
-"""What ArduCopter makes of its sticks, from its own parameters.
+"""Motion that ArduCopter makes of its sticks, by its own parameters.
 
 Formulas: ArduPilot's ``RC_Channel::norm_input_dz``, ``rc_input_to_roll_pitch``, ``input_expo`` and
 Copter's ``get_pilot_desired_yaw_rate`` and ``get_pilot_desired_climb_rate``; the tests hold them

@@ -1,4 +1,4 @@
-"""Which firmware and which vehicles can be flown."""
+"""Firmware and vehicles that can be flown."""
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 

@@ -56,8 +56,24 @@ class Danger(NamedTuple):
         return f"{self.text}, or --accept-risk {self.risk} to fly all the same"
 
 
+LONGEST_SETPOINT_S = 3.0
+"""Longest time for which a vehicle may go on with the last setpoint of a gate that has died;
+ArduPilot's default."""
+
+
+def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
+    """The danger of a vehicle whose timeout of setpoints, parameter ``name`` in s, is long."""
+    time_s = values.get(name, 0.0)
+    if time_s > LONGEST_SETPOINT_S:
+        yield Danger(
+            "long-setpoint",
+            "if this computer died, the vehicle would fly on with its last setpoint for "
+            f"{time_s:g} s ({name}): use --set {name}=0.5",
+        )
+
+
 class ParamContext(NamedTuple):
-    """What one judges parameters with."""
+    """Circumstances in which parameters are judged."""
 
     output: Output | None
     """None: not chosen yet, so that only what holds for every output is judged."""

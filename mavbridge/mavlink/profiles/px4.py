@@ -17,6 +17,7 @@ from mavbridge.mavlink.profiles.profile import (
     Profile,
     StreamGroup,
     optional_stream,
+    setpoint_danger,
 )
 from mavbridge.mavlink.profiles.px4_sticks import px4_curves
 from mavbridge.mavlink.profiles.sticks import StickCurves
@@ -151,8 +152,8 @@ class Px4(Profile):
         return optional_stream("MANUAL_CONTROL", FAST_HZ, least_hz=0.0)
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """What decides whether it hears our sticks at all."""
-        return ("COM_RC_IN_MODE",)
+        """The source of its sticks, and the thrust at which it hovers."""
+        return ("COM_RC_IN_MODE", "MPC_THR_HOVER")
 
     def ignores_receiver(self, values: Mapping[str, float]) -> bool:
         """COM_RC_IN_MODE 1 takes sticks from MAVLink alone, 4 from nowhere."""
@@ -164,12 +165,13 @@ class Px4(Profile):
         if context.output == "manual-control" and mode in _NO_MAVLINK_STICKS:
             yield (
                 f"COM_RC_IN_MODE is {mode:g} ({_NO_MAVLINK_STICKS[int(mode)]}): use "
-                "--set COM_RC_IN_MODE=1 (MAVLink only), or 7 with a receiver (receiver first)"
+                "--set COM_RC_IN_MODE=1 (MAVLink only), or 6 with a receiver (MAVLink first)"
             )
 
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """None: sticks and setpoints that end are always a failsafe."""
-        return iter(())
+        """Setpoints that would stay for long; sticks that end are always a failsafe."""
+        if context.output not in (None, "manual-control"):
+            yield from setpoint_danger(values, "COM_OF_LOSS_T")
 
     def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
         """What the end of our packets would do, where that is not what one expects."""

@@ -1,4 +1,4 @@
-"""What PX4's multicopters make of their sticks, from their own parameters.
+"""Motion that PX4's multicopters make of their sticks, by their own parameters.
 
 Formulas: PX4's ``Sticks``, ``StickTiltXY``, ``StickYaw``, ``FlightTaskManualAltitude`` and, for
 STABILIZED, ``mc_att_control``; the tests hold them against leans and rates measured on the

@@ -257,7 +257,7 @@ IDENTITY = StickCurves()
 
 
 class VehicleCurves(NamedTuple):
-    """What one vehicle makes of its sticks in one flight mode."""
+    """Motion that one vehicle makes of its sticks in one flight mode."""
 
     throttle: Axis | None
     """Climb rate in m/s, + up; None where the stick means something else."""

@@ -39,8 +39,12 @@ class ModeAndArm:
         return self._request(CommandRequest(_ARM, (1,)), now_ns, _ARM_SPACING_NS)
 
     def takeoff(self, request: CommandRequest, now_ns: int) -> CommandRequest | None:
-        """The request to take off, unless it was sent just now."""
-        return self._request(request, now_ns, _ARM_SPACING_NS)
+        """The request to take off, unless one was sent just now, to whatever height."""
+        last_ns, _ = self._sent.get(request.command, (None, None))
+        if last_ns is not None and now_ns - last_ns < _ARM_SPACING_NS:
+            return None
+        self._sent[request.command] = now_ns, request
+        return request
 
     def is_time_to_explain(self, now_ns: int) -> bool:
         """Why nothing can be asked for is said again, every three seconds."""

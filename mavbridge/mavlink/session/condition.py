@@ -195,8 +195,9 @@ class VehicleCondition:
         flags = self._flags(now_ns)
         if flags is None:
             return None
-        is_constant = bool(flags & dialect.ESTIMATOR_CONST_POS_MODE)
-        return bool(flags & _HORIZONTAL_POSITION) and not is_constant
+        # The bit for a constant position says nothing: PX4 sets it too while it stands still on
+        # the ground with a good position, and without one neither autopilot sets these.
+        return bool(flags & _HORIZONTAL_POSITION)
 
     def _position_ned_m(
         self, now_ns: int, is_valid: bool | None

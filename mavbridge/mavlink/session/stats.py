@@ -1,6 +1,7 @@
 """Counters of the link over one flight."""
 
 from collections import Counter
+from collections.abc import Mapping
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import LinkStats
@@ -17,8 +18,6 @@ class LinkCounters:
         self._first_ns: int | None = None
         self._last_ns = 0
         self.sent = 0
-        self.saturated: Counter[str] = Counter()
-        """Sent messages in which a stick, by name, asked for more than the vehicle can do."""
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
         """Count one message; a gap in its 8-bit sequence is that many lost (modulo 256)."""
@@ -39,9 +38,14 @@ class LinkCounters:
         self._last_sequence = None
 
     def stats(
-        self, timesync: TimesyncFilter, *, echo_confirmed: bool | None, unusable_packets: int
+        self,
+        timesync: TimesyncFilter,
+        *,
+        echo_confirmed: bool | None,
+        unusable_packets: int,
+        saturated: Mapping[str, int],
     ) -> LinkStats:
-        """The totals so far."""
+        """The totals so far; ``saturated`` is how often each stick asked for too much."""
         received = self._by_name.total()
         span_ns = self._last_ns - (self._first_ns or 0)
         error_ns = timesync.error_ns(self._last_ns)
@@ -56,7 +60,7 @@ class LinkCounters:
             sent_overrides=self.sent,
             echo_confirmed=echo_confirmed if self.sent else None,
             unusable_packets=unusable_packets,
-            saturated=tuple((name, n / self.sent) for name, n in sorted(self.saturated.items())),
+            saturated=tuple((name, n / self.sent) for name, n in sorted(saturated.items())),
             vehicle_clock_offset_ns=timesync.offset_ns,
             is_timesync_good=timesync.is_good,
             timesync_error_ms=None if error_ns is None else error_ns / NS_PER_MS,

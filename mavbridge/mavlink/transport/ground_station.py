@@ -1,4 +1,4 @@
-"""What a ground station that shares our link may do: all but stream rates, sticks and setpoints.
+"""Rights of a ground station that shares our link: all but stream rates, sticks and setpoints.
 
 Stream rates belong to the link, not to who asks for them: a request of the ground station would
 slow our state down. Its sticks and setpoints would mix with ours in the vehicle.
@@ -11,7 +11,7 @@ from typing import NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.mavlink.codec.frames import Frame
+from mavbridge.mavlink.codec.frames import RawPacket
 from mavbridge.mavlink.codec.messages import Endpoint
 
 HELD_NS = 500 * NS_PER_MS
@@ -74,7 +74,7 @@ class GroundStationRules:
         """Note that sticks of ours were sent."""
         self._held_ns = now_ns
 
-    def judge(self, frame: Frame, now_ns: int, *, is_engaged: bool) -> Verdict:
+    def judge(self, frame: RawPacket, now_ns: int, *, is_engaged: bool) -> Verdict:
         """Decide on a packet; ``is_engaged`` while our sticks are in use or being given back."""
         verdict = self._judge(frame, now_ns, is_engaged=is_engaged)
         self.dropped += verdict is not Verdict.PASS
@@ -89,7 +89,7 @@ class GroundStationRules:
             return "the ground station's sticks are in use: let go of them"
         return None
 
-    def _judge(self, frame: Frame, now_ns: int, *, is_engaged: bool) -> Verdict:
+    def _judge(self, frame: RawPacket, now_ns: int, *, is_engaged: bool) -> Verdict:
         if frame.message_id in _COMMANDS:
             command, _, _ = _command(frame)
             if command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -153,7 +153,7 @@ class GroundStationRules:
             self.texts.append(text)
 
 
-def denial(frame: Frame, vehicle: Endpoint) -> bytes:
+def denial(frame: RawPacket, vehicle: Endpoint) -> bytes:
     """COMMAND_ACK with which the vehicle would refuse the command in this packet."""
     command, system, component = _command(frame)
     codec = dialect.MAVLink(
@@ -166,12 +166,12 @@ def denial(frame: Frame, vehicle: Endpoint) -> bytes:
     return ack
 
 
-def _command(frame: Frame) -> tuple[int, int, int]:
+def _command(frame: RawPacket) -> tuple[int, int, int]:
     command, system, component = _COMMAND.unpack(_padded(frame.payload, _COMMAND.size))
     return command, system, component
 
 
-def _sticks(frame: Frame) -> _Sticks | None:
+def _sticks(frame: RawPacket) -> _Sticks | None:
     """Sticks of RC_CHANNELS_OVERRIDE, on ArduPilot's default channels, or of MANUAL_CONTROL."""
     if frame.message_id == dialect.MAVLINK_MSG_ID_RC_CHANNELS_OVERRIDE:
         channels_us = _OVERRIDE.unpack(_padded(frame.payload, _OVERRIDE.size))

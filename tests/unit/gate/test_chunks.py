@@ -30,7 +30,7 @@ def chunk(serial: int, computed_ms: int, **changes: object) -> Chunk:
 
 
 def buffer(period_ms: int = 10, limits: FreshnessLimits = LIMITS) -> ChunkBuffer:
-    return ChunkBuffer(limits, period_ns=period_ms * MS)
+    return ChunkBuffer(limits, period_ns=period_ms * MS, kind="sticks")
 
 
 def test_actions_are_linear_between_their_times_and_held_at_the_ends() -> None:

@@ -216,9 +216,78 @@ def test_setpoints_end_in_a_mode_that_holds_and_then_in_silence(
     assert ended.step().mode == (hold if has_receiver else land)
 
 
+def test_a_vehicle_that_does_not_answer_gets_no_more_setpoints_which_might_take_it_back() -> None:
+    facts = replace(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
+    stepped = flying(facts, departure=SETPOINTS, modes=("OFFBOARD",), is_setpoint=True)
+    moves = [stepped.step(**FAULT), *stepped.run(0.5)]
+    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    unheard = stepped.run(2.4)
+    assert {move.hand for move in unheard} == {None}
+    assert sum(move.mode == "AUTO.LOITER" for move in unheard) == 24
+    failed = stepped.step(mode="AUTO.RTL", is_failsafe=True)
+    assert failed == Move(hand=Hand.RELEASE)
+
+
 def test_a_refused_hold_of_setpoints_becomes_a_landing() -> None:
     facts = replace(AIRBORNE, mode="GUIDED")
     stepped = flying(facts, departure=SETPOINTS, modes=("GUIDED",), is_setpoint=True)
     stepped.step(**FAULT)
     moves = stepped.run(0.3, refused_mode="BRAKE")
     assert "LAND" in {move.mode for move in moves}
+
+
+GUIDED = replace(AIRBORNE, mode="GUIDED")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"interruption": "GUID_OPTIONS was changed from 8 to 0 in flight"},
+        {"rc_channels_us": (1500,) * 6 + (1000,) + (1500,)},
+    ],
+)
+def test_a_takeover_that_leaves_the_mode_does_not_leave_the_last_setpoint(change: Any) -> None:
+    """Silence alone would be the last body rates for as long as GUID_TIMEOUT or COM_OF_LOSS_T."""
+    stepped = flying(
+        GUIDED, is_setpoint=True, modes=("GUIDED",), departure=SETPOINTS, engage_channel=7
+    )
+    assert stepped.step(**change) == Move(hand=Hand.NEUTRAL, mode="BRAKE")
+    moves = stepped.run(0.1)
+    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    stepped.step(mode="BRAKE")
+    assert (stepped.phase, stepped.run(0.1)[-1].hand) == (Phase.RELEASING, Hand.RELEASE)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"mode": "LOITER"},
+        {"armed": False},
+        {"is_failsafe": True},
+        {"overruled": "another station commands it as well"},
+    ],
+)
+def test_setpoints_end_at_once_where_somebody_else_chose_what_it_does(change: Any) -> None:
+    stepped = flying(GUIDED, is_setpoint=True, modes=("GUIDED",), departure=SETPOINTS)
+    assert stepped.step(**change) == Move(hand=Hand.RELEASE)
+
+
+@pytest.mark.parametrize(("is_landed", "hand"), [(True, Hand.IDLE), (False, Hand.NEUTRAL)])
+def test_on_the_ground_setpoints_end_idle_since_the_thrust_that_hovers_lifts(
+    is_landed: bool, hand: Hand
+) -> None:
+    facts = replace(GUIDED, is_landed=is_landed)
+    stepped = flying(facts, is_setpoint=True, modes=("GUIDED",), departure=SETPOINTS)
+    assert stepped.step("release").hand is hand
+
+
+@pytest.mark.parametrize(
+    ("facts", "last"),
+    [(GUIDED, Hand.NEUTRAL), (replace(GUIDED, mode="OFFBOARD", modes=PX4_MODES), None)],
+)
+def test_neutral_goes_on_unanswered_where_it_cannot_bring_the_mode_back(
+    facts: Any, last: Hand | None
+) -> None:
+    stepped = flying(facts, is_setpoint=True, modes=(facts.mode,), departure=SETPOINTS)
+    stepped.step(**FAULT)
+    assert stepped.run(2.0)[-1].hand is last

@@ -6,24 +6,30 @@ from typing import Any
 import pytest
 
 from helpers.fakes import AIRBORNE_STATUS, START_NS
-from helpers.gate_facts import COPTER_MODES, engagement_settings, stick_smoothing
+from helpers.gate_facts import COPTER_MODES, PX4_MODES, engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
+    Action,
     ActionMeaning,
+    AttitudeThrust,
+    BodyRates,
     Command,
     Decision,
     LinkSnapshot,
+    ModeRoles,
     Release,
     Sticks,
     Telemetry,
+    Velocity,
 )
 from mavbridge.gate.chunks import Chunk, FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import Act, Phase
 from mavbridge.gate.envelope import EnvelopeLimits
 from mavbridge.gate.gate import FlightSettings, Gate, GateInput, GateOutput
+from mavbridge.gate.limits import LimitSettings
 from mavbridge.gate.smoothing import Smoothing
 
 MS = NS_PER_MS
@@ -40,14 +46,16 @@ class Stepped:
         self,
         *,
         smoothing: Smoothing | None = None,
+        meaning: ActionMeaning | None = None,
         status: dict[str, Any] | None = None,
+        roles: ModeRoles = COPTER_MODES,
         **rules: Any,
     ) -> None:
         engagement = engagement_settings(
             **({"modes": ("ALT_HOLD",), "departure": DepartureSettings()} | rules)
         )
         settings = FlightSettings(
-            meaning=ActionMeaning(),
+            meaning=meaning or ActionMeaning(),
             stick_period_ns=10 * MS,
             chunk_period_ns=10 * MS,
             freshness=AGES,
@@ -57,11 +65,12 @@ class Stepped:
         )
         self.gate = Gate(settings, START_NS)
         self.status = replace(AIRBORNE_STATUS, **(status or {}))
+        self.roles = roles
         self.is_released = True
         self.serial = 0
         self.outputs: list[GateOutput] = []
 
-    def chunk(self, at_ms: float, sticks: Sticks = WANTED, *, actions: int = 16) -> Chunk:
+    def chunk(self, at_ms: float, sticks: Action = WANTED, *, actions: int = 16) -> Chunk:
         self.serial += 1
         now_ns = START_NS + round(at_ms * MS)
         stamps = {"attitude_ns": now_ns - 3 * MS, "velocity_ns": now_ns - 3 * MS}
@@ -92,7 +101,7 @@ class Stepped:
             problem=None,
             echo_confirmed=True,
             is_released=self.is_released,
-            modes=COPTER_MODES,
+            modes=self.roles,
         )
         output = self.gate.step(now_ns, GateInput(link=link, chunk=chunk, act=act, stop=stop))
         if output.decision is not None:
@@ -339,3 +348,51 @@ def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     ended = gate.step(START_NS + MS, GateInput(link=link, stop=Ending(reason="enough")))
     assert (ended.phase, ended.decision) == (Phase.ENDED, None)
     assert gate.failure is None
+
+
+def test_body_rates_are_bridged_by_a_level_attitude() -> None:
+    turn = BodyRates(0.5, 1.0, 0.0, 0.0)
+    rates = Smoothing(limits=LimitSettings().of("rates"), tau_s=0.0)
+    gate = Stepped(meaning=ActionMeaning(kind="rates", hover_thrust=0.4), smoothing=rates)
+    for k in range(3):
+        gate.step(10 * k, gate.chunk(10 * k, turn))
+    engaged = gate.step(30, gate.chunk(30, turn, actions=1), act="engage")
+    assert engaged.decision == Command(action=turn)
+    beyond = gate.step(50)
+    assert beyond.decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    assert beyond.trace is not None
+    assert gate.step(60, gate.chunk(60, turn)).decision == Command(action=turn)
+
+
+def test_a_chunk_of_another_kind_of_action_is_not_flown() -> None:
+    gate = Stepped().engaged()
+    gate.step(40, gate.chunk(40, BodyRates(0.5, 1.0, 0.0, 0.0)))
+    assert gate.step(50).decision == Command(action=WANTED)
+    for k in range(6, 12):
+        gate.step(10 * k, gate.chunk(10 * k, BodyRates(0.5, 1.0, 0.0, 0.0)))
+    assert gate.gate.phase is Phase.LEAVING
+    assert "unusable chunks" in gate.outputs[-1].reason
+
+
+def test_neutral_velocities_on_the_way_in_are_not_those_of_an_earlier_flight() -> None:
+    limits = LimitSettings(accel_mps2=5.0).of("velocity")
+    gate = Stepped(
+        meaning=ActionMeaning(kind="velocity"),
+        smoothing=Smoothing(limits=limits, tau_s=0.0),
+        status={"mode": "OFFBOARD"},
+        roles=PX4_MODES,
+        modes=("OFFBOARD",),
+        is_setpoint=True,
+        departure=DepartureSettings(is_setpoint=True),
+    )
+    fast = Velocity(3.0, 0.0, 0.0, 0.0)
+    gate.engaged(sticks=fast)
+    for at_ms in range(40, 1000, 10):
+        gate.step(at_ms, gate.chunk(at_ms, fast))
+    assert gate.decisions[-1] == Command(action=fast)
+    gate.step(1000, gate.chunk(1000, fast), mode="ALTCTL")
+    gate.is_released = True
+    gate.step(1010, gate.chunk(1010, fast))
+    entering = gate.step(1020, gate.chunk(1020, fast), act="engage")
+    assert gate.gate.phase is Phase.PREPARING
+    assert entering.decision == Command(action=Velocity(0.0, 0.0, 0.0, 0.0))

@@ -22,6 +22,9 @@ from mavbridge.core.vehicle import (
     Velocity,
 )
 from mavbridge.gate.limits import LimitSettings, first_action, idle_action, neutral_action
+from mavbridge.gate.smoothing import ActionSmoother, Smoothing
+from mavbridge.mavlink.codec.packets import MOST_LEAN_RAD
+from mavbridge.mavlink.codec.rotation import quaternion_from_euler, tilt_rad
 
 SETTINGS = LimitSettings(
     lean_rad=0.5, rate_radps=3.0, yaw_rate_radps=1.0, thrust=0.8, speed_mps=5.0, climb_mps=2.0
@@ -114,3 +117,29 @@ def test_a_flight_begins_with_what_the_vehicle_does() -> None:
     lean = Telemetry(ned_from_body_wxyz=Reading(0, (math.cos(0.1), math.sin(0.1), 0.0, 0.0)))
     attitude = first_action(ActionMeaning(kind="attitude"), lean, None)
     assert attitude == pytest.approx((0.39, 0.2, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("roll_rad", "pitch_rad"), [(1.54, 0.0), (3.0, -1.2), (0.1, 1.55)])
+def test_an_attitude_that_begins_on_its_side_can_be_sent(roll_rad: float, pitch_rad: float) -> None:
+    """The codec ends the gate where it is given more."""
+    side = Reading(0, quaternion_from_euler(roll_rad, pitch_rad, 0.7))
+    first = first_action(ActionMeaning(kind="attitude"), Telemetry(ned_from_body_wxyz=side), None)
+    assert isinstance(first, AttitudeThrust)
+    sent = quaternion_from_euler(first.roll_rad, first.pitch_rad, 0.7)
+    assert 0.5 < tilt_rad(sent) < MOST_LEAN_RAD
+    assert math.copysign(1, first.roll_rad) == math.copysign(1, roll_rad)
+
+
+@pytest.mark.parametrize("tau_s", [0.0, 0.05])
+def test_body_rates_stay_body_rates_although_they_start_from_an_idle_attitude(
+    tau_s: float,
+) -> None:
+    """Their numbers under the name of an attitude would be a lean."""
+    limits = LimitSettings().of("rates")
+    smoother = ActionSmoother(
+        Smoothing(limits=limits, tau_s=tau_s), idle_action(ActionMeaning(kind="rates"))
+    )
+    for tick in range(4):
+        trace = smoother.step(BodyRates(0.4, 1.5, -1.0, 0.5), tick * 10_000_000)
+        stages = (trace.raw, trace.clipped, trace.slewed, trace.smoothed)
+        assert {type(action) for action in stages} == {BodyRates}

@@ -8,14 +8,27 @@ import pytest
 from helpers.fakes import START_NS, FakeClock, FakeLink
 from helpers.gate_facts import engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import IDLE, NEUTRAL, ActionMeaning, Command, Release, Sticks
+from mavbridge.core.vehicle import (
+    IDLE,
+    NEUTRAL,
+    Action,
+    ActionMeaning,
+    AttitudeThrust,
+    BodyRates,
+    Command,
+    Release,
+    Sticks,
+    Velocity,
+)
 from mavbridge.gate.chunks import Chunk, FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.envelope import EnvelopeLimits
 from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.limits import LimitSettings
 from mavbridge.gate.loop import FINISH_NS, IDLE_PERIOD_NS, GateLoop
 from mavbridge.gate.settings import GateSettings
+from mavbridge.gate.smoothing import Smoothing
 from mavbridge.gate.wire import (
     Absence,
     FromGate,
@@ -78,6 +91,7 @@ class Rig:
         self.loop = GateLoop(self.clock, self.link, self.port, received=received, lead_ns=lead_ns)
         self.link.forward = self.loop.forward
         self.solves = True
+        self.wanted: Action = WANTED
         self.serial = 0
 
     def tell(self, *messages: ToGate) -> None:
@@ -94,7 +108,7 @@ class Rig:
             computed_ns=now_ns,
             first_ns=now_ns,
             step_ns=50 * MS,
-            actions=(WANTED,) * 4,
+            actions=(self.wanted,) * 4,
         )
         return chunk._replace(**changes)
 
@@ -109,8 +123,8 @@ class Rig:
                 self.clock.sleep_until_ns(due_ns)
         return self
 
-    def flying(self) -> "Rig":
-        self.tell(FLIGHT)
+    def flying(self, flight: FlightSettings = FLIGHT) -> "Rig":
+        self.tell(flight)
         self.run(0.1)
         self.tell("engage")
         self.run(0.1)
@@ -449,6 +463,44 @@ def test_a_gate_that_fails_gives_the_sticks_back_whatever_it_knows() -> None:
 
     rig.link.on_send = explode
     rig.loop.abandon()  # and hides no first error behind a second one
+
+
+def test_a_gate_that_fails_leaves_no_body_rates_behind() -> None:
+    rig = Rig()
+    rig.wanted = BodyRates(0.5, 3.0, 0.0, 0.0)
+    limits = LimitSettings().of("rates")
+    meaning = ActionMeaning(kind="rates", hover_thrust=0.4)
+    rig.flying(replace(FLIGHT, meaning=meaning, smoothing=Smoothing(limits=limits, tau_s=0.0)))
+    assert rig.link.decisions[-1][1] == Command(action=rig.wanted)
+    rig.loop.abandon()
+    level, *releases = [decision for _, decision in rig.link.decisions[-11:]]
+    assert level == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    assert releases == [Release("the gate has failed")] * 10
+
+
+def test_a_gate_that_fails_in_a_flight_by_setpoints_asks_the_vehicle_to_hold() -> None:
+    rig = Rig(mode="GUIDED")
+    rig.wanted = Velocity(1.0, 0.0, 0.0, 0.0)
+    setpoints = engagement_settings(modes=("GUIDED",), is_setpoint=True)
+    rig.tell(replace(FLIGHT, meaning=ActionMeaning(kind="velocity"), engagement=setpoints))
+    rig.run(0.3)
+    rig.tell("engage")
+    rig.run(0.1)
+    assert rig.link.announced == ["mavbridge: the policy has control"]
+    rig.link.obeys = False
+    rig.loop.abandon()
+    assert rig.link.requests == ["mode BRAKE"] * 10
+
+
+def test_a_gate_that_fails_after_a_takeover_leaves_the_pilots_mode_alone() -> None:
+    rig = Rig(mode="GUIDED")
+    rig.wanted = Velocity(1.0, 0.0, 0.0, 0.0)
+    setpoints = engagement_settings(modes=("GUIDED",), is_setpoint=True)
+    rig.flying(replace(FLIGHT, meaning=ActionMeaning(kind="velocity"), engagement=setpoints))
+    rig.link.status = replace(rig.link.status, mode="LOITER")
+    rig.run(0.1)
+    rig.loop.abandon()
+    assert rig.link.requests == []
 
 
 def test_the_reason_for_no_flight_is_known_at_the_end() -> None:

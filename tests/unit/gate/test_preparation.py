@@ -2,7 +2,11 @@
 
 from dataclasses import replace
 
+import pytest
+
 from helpers.gate_facts import AIRBORNE, COPTER_MODES, ON_GROUND, PX4_MODES, Stepped, flying
+from mavbridge.core.vehicle import OnFault
+from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.facts import Hand, Move
 
@@ -94,7 +98,9 @@ def test_in_the_air_an_act_asks_for_the_mode_that_only_our_setpoints_can_enter()
     facts = replace(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
     stepped = Stepped(facts, is_setpoint=True, modes=("OFFBOARD",))
     stepped.step()
-    move = stepped.step("engage")
+    flow = [stepped.step("engage"), *stepped.run(0.09)]
+    assert {(move.hand, move.mode) for move in flow} == {(Hand.NEUTRAL, None)}
+    move = stepped.step()
     assert (move.hand, move.mode) == (Hand.NEUTRAL, "OFFBOARD")
     stepped.step(mode="OFFBOARD")
     assert stepped.phase is Phase.FLYING
@@ -116,3 +122,88 @@ def test_a_policy_of_setpoints_is_not_engaged_in_a_mode_of_sticks() -> None:
     assert refusal is not None
     assert "only in GUIDED: change the mode, or use --mode" in refusal
     assert flying().phase is Phase.FLYING
+
+
+@pytest.mark.parametrize("choice", ["auto", "release"])
+def test_a_takeoff_that_is_broken_off_does_not_climb_on(choice: OnFault) -> None:
+    """The receiver's sticks, which a release would give it, do nothing in GUIDED."""
+    stepped = Stepped(
+        replace(GROUND, mode="GUIDED"),
+        arm=True,
+        takeoff_m=8.0,
+        departure=DepartureSettings(then=choice),
+    )
+    stepped.run(0.1)
+    stepped.run(1.0, armed=True, is_landed=False, height_m=2.0)
+    assert stepped.step("release") == Move(hand=Hand.NEUTRAL, mode="BRAKE")
+
+
+def entering_offboard() -> Stepped:
+    """By an act in the air; the mode has come, and the policy is late."""
+    facts = replace(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
+    stepped = Stepped(
+        facts,
+        is_setpoint=True,
+        modes=("OFFBOARD",),
+        departure=DepartureSettings(is_setpoint=True),
+    )
+    stepped.step()
+    stepped.step("engage")
+    stepped.run(0.12)
+    assert "OFFBOARD" in [move.mode for move in stepped.moves]
+    stepped.step(mode="OFFBOARD", chunk_problem="the chunk is old")
+    assert stepped.phase is Phase.PREPARING
+    return stepped
+
+
+def test_offboard_once_entered_is_kept_by_neutral_until_the_policy_is_ready() -> None:
+    stepped = entering_offboard()
+    assert {move.hand for move in stepped.run(2.0)} == {Hand.NEUTRAL}
+    stepped.step(chunk_problem=None)
+    assert stepped.phase is Phase.FLYING
+
+
+@pytest.mark.parametrize("is_late", [True, False])
+def test_a_mode_of_setpoints_that_we_have_entered_is_left_again(is_late: bool) -> None:
+    stepped = entering_offboard()
+    if is_late:
+        stepped.run(3.0)
+        assert "not engaged" in stepped.reason
+    else:
+        stepped.step("release")
+    assert stepped.phase is Phase.LEAVING
+    assert "AUTO.LOITER" in [move.mode for move in stepped.moves]
+    stepped.run(0.1, mode="AUTO.LOITER")
+    assert stepped.phase is Phase.RELEASING
+
+
+def test_a_mode_of_setpoints_that_the_pilot_chose_is_not_left() -> None:
+    facts = replace(AIRBORNE, mode="GUIDED", chunk_problem=None)
+    modes = ("GUIDED_NOGPS",)
+    stepped = Stepped(facts, is_setpoint=True, modes=modes, mode="GUIDED_NOGPS")
+    stepped.facts = replace(
+        facts, modes=replace(COPTER_MODES, names=(*COPTER_MODES.names, "GUIDED_NOGPS"))
+    )
+    stepped.step()
+    stepped.step("engage")
+    move = stepped.step("release")
+    assert (stepped.phase, move.mode) == (Phase.RELEASING, None)
+
+
+def test_a_high_takeoff_has_the_time_that_its_climb_takes() -> None:
+    stepped = Stepped(replace(GROUND, mode="GUIDED"), arm=True, takeoff_m=100.0)
+    stepped.run(60.0)
+    stepped.run(67.0, armed=True, is_landed=False, height_m=80.0)
+    assert stepped.phase is Phase.PREPARING
+    stepped.run(64.0)
+    assert stepped.phase is Phase.LEAVING
+
+
+def test_neutral_goes_on_in_a_climb_whose_echo_is_lost() -> None:
+    """Without a receiver silence would be its radio failsafe; on the ground nothing is sent."""
+    stepped = Stepped(replace(GROUND, mode="GUIDED", has_receiver=False), arm=True, takeoff_m=8.0)
+    stepped.run(0.1)
+    assert {move.hand for move in stepped.run(0.1, link_problem="no RC_CHANNELS arrive")} == {None}
+    stepped.run(1.0, armed=True, is_landed=False, height_m=2.0, link_problem=None)
+    moves = stepped.run(1.0, link_problem="no RC_CHANNELS arrive")
+    assert {move.hand for move in moves} == {Hand.NEUTRAL}

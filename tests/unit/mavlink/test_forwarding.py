@@ -12,7 +12,7 @@ from helpers.fakes import FakeClock
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.processes import free_port
-from mavbridge.mavlink.codec.frames import Frame, split_frames
+from mavbridge.mavlink.codec.frames import RawPacket, split_frames
 from mavbridge.mavlink.codec.messages import Endpoint
 from mavbridge.mavlink.transport.forwarding import MAX_DATAGRAMS, MAX_QUEUED_BYTES, Forwarding
 from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
@@ -23,7 +23,7 @@ ATTITUDE = dialect.MAVLINK_MSG_ID_ATTITUDE
 NEUTRAL = (0, 0, 500, 0)
 
 
-def frame_of(message: Any, codec: Any = GCS) -> Frame:
+def frame_of(message: Any, codec: Any = GCS) -> RawPacket:
     (frame,), has_rest = split_frames(bytes(message.pack(codec)))
     assert not has_rest
     return frame

@@ -15,6 +15,7 @@ from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.vehicle import (
     IDLE,
     ActionMeaning,
+    AttitudeThrust,
     Command,
     ForwardedPacket,
     LinkSnapshot,
@@ -40,6 +41,7 @@ PARAMS = CALIBRATION | {
     "RC_OPTIONS": 0.0,
     "FS_THR_ENABLE": 1.0,
     "GUID_OPTIONS": 0.0,
+    "MOT_THST_HOVER": 0.39,
 }
 
 
@@ -817,6 +819,39 @@ def test_only_px4_is_told_that_we_are_a_ground_station(is_px4: bool, kinds: set[
     assert (beats[-1] == dialect.MAV_TYPE_GCS) is is_px4
 
 
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_setpoints_are_sent_as_such_and_their_silence_is_no_failsafe(autopilot: str) -> None:
+    meaning = ActionMeaning(kind="attitude", hover_thrust=0.4)
+    rig = px4_rig(meaning=meaning) if autopilot == "px4" else Rig(meaning=meaning)
+    rig.vehicle.params["GUID_OPTIONS"] = 8.0
+    snapshot = rig.run(9.0)
+    assert snapshot.problem is None
+    assert snapshot.echo_confirmed
+    assert not snapshot.modes.is_silence_failsafe
+    snapshot = rig.run(2.0, Command(action=AttitudeThrust(0.4, 0.1, 0.0, 0.0)))
+    assert (snapshot.problem, snapshot.echo_confirmed) == (None, True)  # in a mode with sticks
+    names = rig.vehicle.names()
+    assert names.count("SET_ATTITUDE_TARGET") == 200
+    assert rig.run(0.5, Release("end")).is_released
+    assert rig.vehicle.names().count("SET_ATTITUDE_TARGET") == 200
+    assert not {"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"} & {*rig.vehicle.names()}
+
+
+def test_a_takeoff_is_asked_for_once_a_second_and_its_refusal_is_told() -> None:
+    for rig in (Rig(), px4_rig()):
+        rig.run(8.0)
+        mav = rig.vehicle.end.mav
+        for tick in range(150):
+            rig.vehicle.put(mav.global_position_int_encode(0, 0, 0, 584_000 + tick, 0, 0, 0, 0, 0))
+            rig.link.takeoff(5.0)
+            rig.run(0.01)
+        asked = [m for m in rig.vehicle.received if getattr(m, "command", 0) == 22]
+        assert len(asked) == 2
+        rig.vehicle.put(mav.command_ack_encode(22, dialect.MAV_RESULT_FAILED))
+        rig.run(0.01)
+        assert "the vehicle answered NAV_TAKEOFF with FAILED" in rig.texts
+
+
 def test_a_takeoff_is_asked_for_as_the_firmware_wants_it() -> None:
     def heights(rig: Rig) -> list[float]:
         return [
@@ -909,11 +944,26 @@ def test_a_ground_station_gets_the_vehicle_s_bytes_and_its_commands_get_there() 
     rig.run(8.0)
 
     station.inbox.append(station.end.command_long_encode(1, 1, 176, 0, 1, 5, 0, 0, 0, 0, 0))
+    rig.link.announce("the policy has control")
     rig.run(0.1)
 
     names = [m.get_type() for m in WireEnd().read(station.heard)]
     assert names.count("ATTITUDE_QUATERNION") == rig.ticks
+    assert names.count("STATUSTEXT") == 1
     assert [m.param2 for m in rig.vehicle.received if m.get_type() == "COMMAND_LONG"][-1] == 5
+
+
+def test_its_sticks_are_a_problem_but_no_takeover_where_they_move_nothing() -> None:
+    """It goes on with our last setpoint: a fault ends that by a mode, silence would not."""
+    station = Station(sticks_win=True)
+    rig = Rig(station=station, meaning=ActionMeaning(kind="velocity"))
+    rig.run(8.0)
+    rig.link.is_engaged = True
+
+    station.inbox.append(station.end.manual_control_encode(1, 800, 0, 500, 0, 0))
+    snapshot = rig.link.poll()
+    assert "the ground station's sticks" in (snapshot.problem or "")
+    assert not snapshot.is_overruled
 
 
 def test_its_sticks_are_dropped_or_end_the_flight_with_one_release_before_them() -> None:

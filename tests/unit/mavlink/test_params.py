@@ -160,6 +160,16 @@ def test_a_receiver_makes_up_for_a_disabled_throttle_failsafe() -> None:
     assert vehicle.problem() is None
 
 
+def test_advice_is_given_once_and_waits_for_what_it_needs_to_know() -> None:
+    vehicle = ParamVehicle({"GUID_TIMEOUT": 3.0}, output="velocity")
+    vehicle.run(6.0)
+    assert len(vehicle.texts) == 1
+    vehicle.has_receiver = False
+    vehicle.run(1.0)
+    assert ["GUID_TIMEOUT" in text for text in vehicle.texts] == [True, False]
+    assert "no receiver was seen" in vehicle.texts[1]
+
+
 @pytest.mark.parametrize(("time_s", "is_advised"), [(3.0, True), (1.0, False)])
 def test_a_long_override_time_is_a_warning(time_s: float, is_advised: bool) -> None:
     vehicle = ParamVehicle({"RC_OVERRIDE_TIME": time_s})

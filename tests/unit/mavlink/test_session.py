@@ -290,15 +290,16 @@ def test_a_newer_reading_never_happened_before_an_older_one() -> None:
 def test_sticks_that_ask_for_too_much_are_a_share_of_those_sent() -> None:
     counters = LinkCounters()
     counters.sent = 8
-    for names in (("yaw",), (), ("pitch", "yaw")):
-        counters.saturated.update(names)
-    stats = counters.stats(TimesyncFilter(), echo_confirmed=True, unusable_packets=0)
+    saturated = {"yaw": 2, "pitch": 1}
+    stats = counters.stats(
+        TimesyncFilter(), echo_confirmed=True, unusable_packets=0, saturated=saturated
+    )
     assert stats.saturated == (("pitch", 0.125), ("yaw", 0.25))
 
 
 def test_losses_are_gaps_in_the_sequence() -> None:
     counters, sync = LinkCounters(), TimesyncFilter()
-    nothing = counters.stats(sync, echo_confirmed=None, unusable_packets=0)
+    nothing = counters.stats(sync, echo_confirmed=None, unusable_packets=0, saturated={})
     assert (nothing.lost_fraction, nothing.rtt_ms, nothing.vehicle_clock_offset_ns) == (None,) * 3
     for k, sequence in enumerate((254, 255, 0, 2, 3)):  # one lost, and a wrap that is none
         counters.receive("ATTITUDE", sequence, k * S)
@@ -307,7 +308,7 @@ def test_losses_are_gaps_in_the_sequence() -> None:
     ts1 = sync.request(S)
     assert ts1 is not None
     sync.receive(Timesync(tc1=S, ts1=ts1), ts1 + 2 * NS_PER_MS)
-    stats = counters.stats(sync, echo_confirmed=True, unusable_packets=3)
+    stats = counters.stats(sync, echo_confirmed=True, unusable_packets=3, saturated={})
     assert stats.lost_fraction == pytest.approx(1 / 7)
     assert stats.messages_per_s == (("ATTITUDE", 0.5), ("HEARTBEAT", 0.1))
     assert stats.rtt_ms is not None

@@ -284,6 +284,9 @@ def test_a_receiver_that_px4_does_not_listen_to_is_none() -> None:
 
 # --- position
 
+PX4_ON_GROUND = 0x3FF
+"""With GPS, CONST_POS_MODE among them; in the air 0x37F."""
+
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 @pytest.mark.parametrize(
@@ -292,7 +295,9 @@ def test_a_receiver_that_px4_does_not_listen_to_is_none() -> None:
         (GOOD_FLAGS, True),
         (PX4_WITHOUT_GPS, False),
         (dialect.ESTIMATOR_POS_HORIZ_REL, True),
-        (dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_CONST_POS_MODE, False),
+        (dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_CONST_POS_MODE, True),
+        (dialect.ESTIMATOR_CONST_POS_MODE, False),
+        (PX4_ON_GROUND, True),
         (0, False),
     ],
 )

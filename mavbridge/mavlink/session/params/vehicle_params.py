@@ -55,7 +55,9 @@ class VehicleParams:
             folder=config.state_folder,
             report=report,
         )
-        self._advised: Output | None = None
+        self._advised: ParamContext | None = None
+        self._told: set[str] = set()
+        """Advice, each text once: whether there is a receiver is learnt later than the rest."""
         """Output that the user was advised about."""
         self._assessed: tuple[ParamContext, Assessment] | None = None
         """What follows from all values, and for whom."""
@@ -177,14 +179,18 @@ class VehicleParams:
             self.calibration = assessment.calibration
 
     def _advise(self, status: VehicleStatus | None) -> None:
-        if self._output in (None, self._advised) or not self._changes.is_settled:
+        context = self._context(status)
+        if context.output is None or context == self._advised or not self._changes.is_settled:
             return
-        self._advised = self._output
-        for text in self._profile.advice(self._reader.values, self._context(status)):
-            self._report(text)
+        self._advised = context
+        texts = list(self._profile.advice(self._reader.values, context))
         for danger in self._dangers(self._current(status)):
             if danger.risk in self._config.accepted_risks:
-                self._report(f"risk {danger.risk} is accepted: {danger.text}")
+                texts.append(f"risk {danger.risk} is accepted: {danger.text}")
+        for text in texts:
+            if text not in self._told:
+                self._told.add(text)
+                self._report(text)
 
     def _dangers(self, assessment: Assessment) -> Iterator[Danger]:
         if self._serial is not None:

@@ -106,7 +106,7 @@ def test_a_vehicle_as_in_training_has_every_ratio_at_one(usual: Identification) 
         assert push.time_63_s == pytest.approx(DEAD_STEPS * STEP_S + LAG_S, abs=0.02), push
     lines = list(verdicts(usual, Contract()))
     assert lines[0] == (
-        "roll: as the policy was trained with; full stick 29.9 of 30.0 deg, as if dead below 4%"
+        "roll: as the policy was trained with; full stick 29.9 of 30.0 deg, dead zone 4%"
     )
     assert any(line.startswith("descent: as the policy was trained with") for line in lines)
     assert lines[1].endswith("of them dead; the bundled simulator's 160 ms are about the same")
@@ -125,7 +125,10 @@ def test_other_gains_are_said_in_words() -> None:
     lines = list(verdicts(found, contract))
     assert "roll: 1.2 times what the policy was trained with; full stick 34.9 of 30.0" in lines[0]
     yaw = next(line for line in lines if line.startswith("yaw"))
-    assert "yaw: 0.7 times what the policy was trained with (at 50% 0.3 times)" in yaw
+    assert yaw == (
+        "yaw: 0.7 times what the policy was trained with (at 50% 0.3 times); "
+        "full stick 144.0 of 202.5 deg/s"  # a curve has no dead zone that a line could tell
+    )
     assert any("descent: 0.5 times" in line for line in lines)
     assert any("climb: 1.2 times" in line for line in lines)
 
@@ -139,7 +142,7 @@ def test_setpoints_are_compared_with_what_was_commanded(kind: ActionKind) -> Non
         assert push.up.ratio == pytest.approx(0.8, abs=0.02), push
         assert push.down.ratio == pytest.approx(0.8, abs=0.02), push
     lines = list(verdicts(found, contract))
-    assert lines[0] == "roll: 0.8 times what the policy was trained with"
+    assert lines[0] == "roll: 0.8 times what was commanded"
     is_thrust = kind != "velocity"
     assert (found.hover_thrust == pytest.approx(0.45)) if is_thrust else found.hover_thrust is None
     said = "thrust: hovers at 0.450, 1.2 times what the policy was trained with"

@@ -43,6 +43,7 @@ def test_thrust_must_be_thrust(options: float | None, expected: str | None) -> N
         ({"GUID_TIMEOUT": 3.0}, "velocity", True, ["--set GUID_TIMEOUT=0.5"]),
         ({"GUID_TIMEOUT": 0.5}, "velocity", True, []),
         ({"FS_THR_ENABLE": 1.0}, "velocity", False, ["--set FS_THR_ENABLE=0"]),
+        ({"FS_THR_ENABLE": 1.0}, "velocity", None, []),  # not known yet
         ({"FS_THR_ENABLE": 0.0}, "velocity", False, []),
         ({"ATC_ANGLE_BOOST": 0.0}, "rates", True, ["ATC_ANGLE_BOOST is 0"]),
         ({"ATC_ANGLE_BOOST": 0.0}, "velocity", True, []),
@@ -51,7 +52,7 @@ def test_thrust_must_be_thrust(options: float | None, expected: str | None) -> N
     ],
 )
 def test_advice_for_setpoints(
-    values: dict[str, float], output: Output | None, has_receiver: bool, expected: list[str]
+    values: dict[str, float], output: Output | None, has_receiver: bool | None, expected: list[str]
 ) -> None:
     texts = list(ARDUPILOT.advice(values, context(output, has_receiver=has_receiver)))
     assert len(texts) == len(expected)

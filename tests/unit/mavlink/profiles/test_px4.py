@@ -6,7 +6,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.vehicle import Output
-from mavbridge.mavlink.profiles.profile import ParamContext
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.profile import ParamContext, Profile
 from mavbridge.mavlink.profiles.px4 import PX4, event_id
 
 
@@ -93,3 +94,17 @@ def test_a_takeoff_is_asked_for_by_height_above_the_sea() -> None:
 def test_our_heartbeat_is_a_ground_stations_for_the_sake_of_its_texts() -> None:
     assert PX4.heartbeat_type == dialect.MAV_TYPE_GCS
     assert PX4.hover_thrust({"MPC_THR_HOVER": 0.5}) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("profile", "name", "sticks"),
+    [(PX4, "COM_OF_LOSS_T", "manual-control"), (ARDUPILOT, "GUID_TIMEOUT", "rc-override")],
+)
+def test_a_last_setpoint_that_stays_for_long_has_to_be_accepted(
+    profile: Profile, name: str, sticks: Output
+) -> None:
+    for output in ("attitude", "rates", "velocity"):
+        assert list(profile.dangers({name: 3.0}, context(output))) == []
+        (danger,) = profile.dangers({name: 3.5}, context(output))
+        assert (danger.risk, f"--set {name}=0.5" in danger.text) == ("long-setpoint", True)
+    assert list(profile.dangers({name: 3.5}, context(sticks))) == []

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.messages import BUILDERS
-from sitl.ardupilot.streams import Streams
+from sitl.ardupilot.link.messages import BUILDERS
+from sitl.ardupilot.link.streams import Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.faults import FaultyLink, LinkFaults, Reboot, SensorFreeze, VehicleFaults
 from sitl.simulated_vehicle import SimulatedVehicle

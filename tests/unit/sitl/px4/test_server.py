@@ -8,9 +8,9 @@ from pymavlink.dialects.v20 import development
 
 from sitl.clock import NS_PER_S
 from sitl.px4.events import Event
-from sitl.px4.messages import event_message
+from sitl.px4.link.messages import event_message
+from sitl.px4.link.streams import CURRENT_MODE
 from sitl.px4.modes import Mode
-from sitl.px4.streams import CURRENT_MODE
 
 MID = (0, 0, 500, 0)
 FULL_RIGHT = (0, 1000, 500, 0)

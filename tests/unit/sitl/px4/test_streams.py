@@ -4,7 +4,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
-from sitl.px4.streams import CURRENT_MODE, GCS_HZ, ONBOARD_HZ, Streams
+from sitl.px4.link.streams import CURRENT_MODE, GCS_HZ, ONBOARD_HZ, Streams
 
 ATTITUDE = mav.MAVLINK_MSG_ID_ATTITUDE
 PLENTY = 1e9

@@ -8,8 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.course_flights import fly_course, pwm_us
+from sitl.ardupilot.link.streams import Streams
 from sitl.ardupilot.params import Params
-from sitl.ardupilot.streams import Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import AirborneStart, make_course
 from sitl.expert.demonstrator import Expert

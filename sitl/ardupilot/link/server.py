@@ -9,8 +9,8 @@ import math
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.autopilot import Autopilot
-from sitl.ardupilot.commands import DENIED, execute, mode_by_number
-from sitl.ardupilot.endpoint import MavlinkEndpoint
+from sitl.ardupilot.link.commands import DENIED, execute, mode_by_number
+from sitl.ardupilot.link.endpoint import MavlinkEndpoint
 from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
 from sitl.ardupilot.setpoints import set_attitude_target, set_position_target
 from sitl.link.framing import Message
@@ -126,7 +126,7 @@ class MavlinkServer:
         if not is_for_us or not self._is_from_gcs(message):
             return
         self._ap.gcs_failsafe.on_contact(arrived_ns)
-        self._log.manual_controls += 1
+        self._log.on_manual_control(arrived_ns)
         self._ap.rc.manual_control(
             x=message.x, y=message.y, z=message.z, r=message.r, now_ns=arrived_ns
         )

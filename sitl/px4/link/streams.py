@@ -86,6 +86,8 @@ class Streams:
         self._default_us = {key: round(1e6 / rate) for key, rate in default_hz.items()}
         self._bandwidth = bandwidth_bytes_ps
         self._streams: dict[int, _Stream] = {}
+        self.scale = 1.0
+        """Factor on all rates that fits them into the link's bandwidth; nobody is told."""
         for message_id, interval_us in self._default_us.items():
             self.set_interval(message_id, interval_us, now_ns)
 
@@ -95,22 +97,18 @@ class Streams:
             interval_us = self._default_us.get(message_id, -1)
         if interval_us < 0:
             self._streams.pop(message_id, None)
-            return
-        sent_us = now_ns // NS_PER_US
-        self._streams[message_id] = _Stream(interval_us=interval_us, sent_us=sent_us)
+        else:
+            sent_us = now_ns // NS_PER_US
+            self._streams[message_id] = _Stream(interval_us=interval_us, sent_us=sent_us)
+        wanted = float(OTHER_STREAMS_BYTES_PS)
+        for number, stream in self._streams.items():
+            wanted += payload_bytes(number) * 1e6 / max(1, stream.interval_us)
+        self.scale = max(LOWEST_SCALE, min(1.0, self._bandwidth / wanted))
 
     def interval_us(self, message_id: int) -> int:
         """The interval that MESSAGE_INTERVAL reports; -1: not streamed."""
         stream = self._streams.get(message_id)
         return -1 if stream is None else stream.interval_us
-
-    @property
-    def scale(self) -> float:
-        """Factor on all rates that fits them into the link's bandwidth; nobody is told."""
-        wanted = float(OTHER_STREAMS_BYTES_PS)
-        for message_id, stream in self._streams.items():
-            wanted += payload_bytes(message_id) * 1e6 / max(1, stream.interval_us)
-        return max(LOWEST_SCALE, min(1.0, self._bandwidth / wanted))
 
     def due(self, now_ns: int, version_of: Callable[[int], Hashable]) -> list[int]:
         """Ids of the messages to send now; ``version_of`` tells a new topic from an old one."""

@@ -14,9 +14,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.link.framing import Message
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.events import Event
+from sitl.px4.link.streams import CURRENT_MODE, at_rate
 from sitl.px4.modes import Mode
 from sitl.px4.setpoints import VelocitySetpoint
-from sitl.px4.streams import CURRENT_MODE, at_rate
 from sitl.rotation import Vec3, conjugate, rotate, to_euler
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 
@@ -280,9 +280,10 @@ def _attitude_target(ap: Autopilot) -> Message:
 
 
 def _position_target(ap: Autopilot) -> Message:
-    none = [math.nan] * 3
+    none, flight = [math.nan] * 3, ap.flight
+    turn = (math.nan, flight.yaw_rate_radps)
     return mav.MAVLink_position_target_local_ned_message(
-        _ms(ap), mav.MAV_FRAME_LOCAL_NED, 0, *none, *ap.flight.velocity_ned_mps, *none, *none[:2]
+        _ms(ap), mav.MAV_FRAME_LOCAL_NED, 0, *none, *flight.velocity_ned_mps, *none, *turn
     )
 
 

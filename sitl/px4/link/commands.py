@@ -7,8 +7,8 @@ from typing import TypeAlias
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.px4.autopilot import Autopilot
-from sitl.px4.endpoint import MavlinkEndpoint
-from sitl.px4.messages import HOME_ALT_M
+from sitl.px4.link.endpoint import MavlinkEndpoint
+from sitl.px4.link.messages import HOME_ALT_M
 from sitl.px4.modes import Mode, mode_of
 
 ACCEPTED: int = mav.MAV_RESULT_ACCEPTED
@@ -28,20 +28,23 @@ def execute(number: int, params: Params7, ap: Autopilot, link: MavlinkEndpoint) 
     return UNSUPPORTED if handler is None else handler(params, ap, link)
 
 
-def change_mode(base_mode: float, main: float, sub: float, ap: Autopilot) -> int:
-    """Change to a custom mode; returns the MAV_RESULT."""
+def change_mode(base_mode: float, main: float, sub: float, ap: Autopilot, *, says_why: bool) -> int:
+    """Change to a custom mode; returns the MAV_RESULT.
+
+    A refusal becomes a text only if ``says_why``: PX4 explains itself to ground stations alone.
+    """
     if not all(map(math.isfinite, (base_mode, main, sub))):
         return REJECTED
     mode = mode_of(int(main), int(sub))
     if not int(base_mode) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or mode is None:
         return REJECTED
-    return _to_mode(mode, ap)
+    return _to_mode(mode, ap, says_why=says_why)
 
 
-def _to_mode(mode: Mode, ap: Autopilot) -> int:
+def _to_mode(mode: Mode, ap: Autopilot, *, says_why: bool = True) -> int:
     if mode is Mode.AUTO_TAKEOFF:
         ap.prepare_takeoff(None)
-    return ACCEPTED if ap.commander.set_mode(mode) else REJECTED
+    return ACCEPTED if ap.commander.set_mode(mode, says_why=says_why) else REJECTED
 
 
 def _arm_disarm(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int | None:
@@ -92,7 +95,6 @@ _HANDLERS: dict[int, Handler] = {
     mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: _go(Mode.AUTO_RTL),
     mav.MAV_CMD_NAV_LAND: _go(Mode.AUTO_LAND),
     mav.MAV_CMD_NAV_TAKEOFF: _takeoff,
-    mav.MAV_CMD_DO_SET_MODE: lambda p, ap, _link: change_mode(p[0], p[1], p[2], ap),
     mav.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: lambda _params, _ap, _link: DENIED,  # as PX4 in SITL
     mav.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,

@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.link.framing import Message
 from sitl.px4.autopilot import Autopilot
-from sitl.px4.commands import change_mode, execute
-from sitl.px4.endpoint import MavlinkEndpoint
+from sitl.px4.link.commands import change_mode, execute
+from sitl.px4.link.endpoint import MavlinkEndpoint
 from sitl.px4.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint, VelocitySetpoint
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
@@ -124,7 +124,7 @@ class MavlinkServer:
             self.links[link_id].has_gcs = True
 
     def _manual_control(self, link_id: int, message: Message, arrived_ns: int) -> None:
-        self._log.manual_controls += 1
+        self._log.on_manual_control(arrived_ns)
         sticks = from_manual_control(message.x, message.y, message.z, message.r)
         self._ap.stick_input.on_sticks(link_id, sticks, arrived_ns)
 
@@ -138,14 +138,22 @@ class MavlinkServer:
         link = self.links[link_id]
         fields = _COMMAND_FIELDS[message.get_type()]
         params = tuple(float(getattr(message, name)) for name in fields)
-        result = execute(message.command, params, self._ap, link)
+        result: int | None
+        if message.command == mav.MAV_CMD_DO_SET_MODE:
+            base_mode, main, sub = params[:3]
+            says_why = _is_ground_station(message)
+            result = change_mode(base_mode, main, sub, self._ap, says_why=says_why)
+        else:
+            result = execute(message.command, params, self._ap, link)
         if result is not None:
-            ack = mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))
-            link.send(ack)
+            link.send(_ack(message, message.command, result))
 
-    def _set_mode(self, _link_id: int, message: Message, _arrived_ns: int) -> None:
+    def _set_mode(self, link_id: int, message: Message, _arrived_ns: int) -> None:
+        """The old message: acknowledged as the command that replaced it."""
         main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
-        change_mode(message.base_mode, main, sub, self._ap)
+        says_why = _is_ground_station(message)
+        result = change_mode(message.base_mode, main, sub, self._ap, says_why=says_why)
+        self.links[link_id].send(_ack(message, mav.MAV_CMD_DO_SET_MODE, result))
 
     def _set_attitude_target(self, _link_id: int, message: Message, arrived_ns: int) -> None:
         mask = message.type_mask
@@ -233,6 +241,14 @@ class MavlinkServer:
 
 def _sender(message: Message) -> tuple[int, int]:
     return message.get_srcSystem(), message.get_srcComponent()
+
+
+def _is_ground_station(message: Message) -> bool:
+    return bool(message.get_srcComponent() == mav.MAV_COMP_ID_MISSIONPLANNER)
+
+
+def _ack(message: Message, number: int, result: int) -> Message:
+    return mav.MAVLink_command_ack_message(number, result, 0, 0, *_sender(message))
 
 
 def _thrust(message: Message) -> float:

@@ -5,8 +5,8 @@ from collections import deque
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.autopilot import Autopilot
-from sitl.ardupilot.messages import BUILDERS
-from sitl.ardupilot.streams import PARAM_SLOWDOWN, Streams
+from sitl.ardupilot.link.messages import BUILDERS
+from sitl.ardupilot.link.streams import PARAM_SLOWDOWN, Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.link.framing import Framing, Message
 

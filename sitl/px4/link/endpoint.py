@@ -8,8 +8,8 @@ from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.link.framing import Framing, Message
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.events import Event
-from sitl.px4.messages import BUILDERS, event_message, topic_version
-from sitl.px4.streams import GCS_HZ, ONBOARD_HZ, Streams
+from sitl.px4.link.messages import BUILDERS, event_message, topic_version
+from sitl.px4.link.streams import GCS_HZ, ONBOARD_HZ, Streams
 
 PARAM_PERIOD_NS = 4 * NS_PER_MS
 MAX_STATUSTEXT = 50

@@ -7,8 +7,8 @@ from typing import TypeAlias
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.autopilot import Autopilot
-from sitl.ardupilot.endpoint import MavlinkEndpoint
 from sitl.ardupilot.flight_modes import Mode
+from sitl.ardupilot.link.endpoint import MavlinkEndpoint
 
 ACCEPTED: int = mav.MAV_RESULT_ACCEPTED
 DENIED: int = mav.MAV_RESULT_DENIED

@@ -1,0 +1,1 @@
+"""ArduCopter's side of MAVLink: who is obeyed, what is sent, how often."""

@@ -1,0 +1,1 @@
+"""PX4's side of MAVLink: who is obeyed, what is sent, how often."""

@@ -1,0 +1,95 @@
+"""The session of a vehicle as an output sees it, set by hand."""
+
+from typing import cast
+
+from helpers.wire import WireEnd
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import Action, VehicleStatus
+from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.messages import Body, Endpoint
+from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
+from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.session.discovery import VehicleIdentity
+from mavbridge.mavlink.session.vehicle import VehicleSession
+
+
+class FlownVehicle:
+    """Whatever an output asks of a ``VehicleSession``; in the air and in a mode for setpoints."""
+
+    def __init__(self, profile: Profile, calibration: RcCalibration | None = None) -> None:
+        self.profile = profile
+        self.calibration = calibration
+        self.identity = VehicleIdentity(
+            source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot=3
+        )
+        self.known_params: dict[str, float] = {}
+        self.are_params_read = True
+        self.is_receiver_hidden = False
+        self.is_released = True
+        self.mode = profile.modes.roles.setpoint[0]
+        self.armed = True
+        self.is_landed: bool | None = False
+        self.has_receiver: bool | None = False
+
+    def status(self, _now_ns: int) -> VehicleStatus:
+        """The status that was set."""
+        return VehicleStatus(
+            mode=self.mode,
+            armed=self.armed,
+            is_landed=self.is_landed,
+            has_receiver=self.has_receiver,
+        )
+
+
+class Flight:
+    """An output and its vehicle, whose clock is set by hand."""
+
+    def __init__(self, output: ActionOutput, vehicle: FlownVehicle) -> None:
+        self.output = output
+        self.vehicle = vehicle
+        self.session = cast(VehicleSession, vehicle)
+        self.now_ns = 100 * NS_PER_S
+        self.end = WireEnd()
+
+    def send(self, action: Action) -> Encoded:
+        """Encode an action and note it as sent, 10 ms after the last."""
+        self.now_ns += 10 * NS_PER_MS
+        encoded = self.output.encode(action, self.session, self.now_ns)
+        assert encoded is not None
+        self.output.sent(encoded, self.session, self.now_ns)
+        return encoded
+
+    def receive(self, body: Body) -> None:
+        """A message of the vehicle arrives a millisecond later."""
+        self.now_ns += NS_PER_MS
+        self.output.receive(body, self.session, self.now_ns)
+
+    def message(self, encoded: Encoded) -> object:
+        """The packet as pymavlink reads it."""
+        (message,) = self.end.read(encoded.packet)
+        return message
+
+    @property
+    def status(self) -> VehicleStatus:
+        """The vehicle's status as the gate gets it."""
+        status = self.output.in_policy_terms(
+            self.vehicle.status(self.now_ns), self.session, self.now_ns
+        )
+        assert status is not None
+        return status
+
+    @property
+    def problem(self) -> str | None:
+        """What the echo tells now."""
+        return self.output.overruled(self.now_ns) or self.output.unheard(self.now_ns)
+
+    @property
+    def is_released(self) -> bool:
+        """It acts on something else than our last packets."""
+        return self.output.is_released(self.session, self.now_ns)
+
+
+def codec() -> Codec:
+    """Our own end of the wire."""
+    return Codec(source_system=255, source_component=191)

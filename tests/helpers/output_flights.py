@@ -1,0 +1,323 @@
+"""Flights in simulated time with any kind of action on any firmware, and the vehicle's own record.
+
+The policy is a scripted one, so that every kind of action flies the same programs.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from helpers.gate_flights import HEIGHT_M, GateFlight
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.gate.engagement import Phase
+from mavbridge.simulation.world import NOMINAL_VEHICLE
+from policy.contract import ActionKind, Contract, Executable, FloatArray
+from policy.scripted.policy import ScriptedPolicy
+from policy.scripted.programs import LEG_MPS, LEG_S, Motion, Program, Push, make_program
+from sitl.ardupilot.autopilot import Autopilot as ArduPilot
+from sitl.ardupilot.flight_modes import Mode as ArduMode
+from sitl.ardupilot.guided import Submode
+from sitl.course.layout import AirborneStart
+from sitl.px4.autopilot import Autopilot as Px4
+from sitl.px4.modes import Mode as Px4Mode
+from sitl.px4.setpoints import AttitudeSetpoint, VelocitySetpoint
+from sitl.rotation import Quat, cos_tilt
+from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName
+
+LEANING = Program(motion=lambda _: Motion(push=Push("roll", 0.5)))
+"""Lean 15 degrees to the right, or 2 m/s to the right: far from neutral in every record."""
+HOVERING = make_program("hover", "sticks")
+SQUARE = make_program("square", "sticks")
+SQUARE_S = 4 * LEG_S
+LEG_M = LEG_MPS * LEG_S
+
+FLIGHT_MODES: dict[tuple[AutopilotName, ActionKind], str] = {
+    ("ardupilot", "sticks"): "ALT_HOLD",
+    ("ardupilot", "attitude"): "GUIDED_NOGPS",
+    ("ardupilot", "rates"): "GUIDED_NOGPS",
+    ("ardupilot", "velocity"): "GUIDED",
+    ("px4", "sticks"): "ALTCTL",
+    ("px4", "attitude"): "OFFBOARD",
+    ("px4", "rates"): "OFFBOARD",
+    ("px4", "velocity"): "OFFBOARD",
+}
+"""The mode that each kind of action is flown in by default."""
+COMBINATIONS = tuple(FLIGHT_MODES)
+CENTRED_US = 12
+"""Sticks this near to the middle are neutral: the walk of the echo check is less."""
+NEUTRAL_TILT_RAD, NEUTRAL_RATE_RADPS = math.radians(1.0), math.radians(1.5)
+NEUTRAL_MPS = 0.1
+
+
+class Sample(NamedTuple):
+    """The vehicle after one of its own control steps."""
+
+    t_s: float
+    """Since boot."""
+    mode: str
+    armed: bool
+    failsafe: bool
+    is_neutral: bool
+    """What it was last told is level or at rest."""
+    lean_deg: float
+    speed_mps: float
+    """Horizontal."""
+    position_ned_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aftermath:
+    """What the vehicle did after a moment, in ms from then; None: never."""
+
+    neutral_ms: float | None
+    """Until it was told to be level or at rest, or another mode took over, or it was disarmed."""
+    mode_ms: float | None
+    mode: str | None
+    """The first other mode than that of the flight."""
+    lean_held_ms: float
+    """Longest that it kept nine tenths of the lean that it had then."""
+    level_ms: float | None
+    """Until it leaned by less than 2 degrees."""
+    rest_ms: float | None
+    """Until it was slower than 0.3 m/s, and stayed so."""
+    flew_again: bool
+    """After it was neutral, it was told otherwise in the mode of the flight."""
+    final_mode: str
+    final_armed: bool
+
+
+class OutputFlight(GateFlight):
+    """One flight of one kind of action on one firmware."""
+
+    def __init__(
+        self,
+        autopilot: AutopilotName,
+        kind: ActionKind,
+        program: Program = LEANING,
+        *,
+        in_air: bool = True,
+        receiver_us: tuple[int, ...] | None = None,
+        params: dict[str, float] | None = None,
+        **config: Any,
+    ) -> None:
+        """``config`` as in ``GateFlight``; ``receiver_us`` None is MID for ArduPilot."""
+        self.autopilot, self.kind, self.is_px4 = autopilot, kind, autopilot == "px4"
+        self.mode = FLIGHT_MODES[autopilot, kind]
+        self.samples: list[Sample] = []
+        self._in_air = in_air
+        self._program = program
+        self._nan_from_ns: int | None = None
+        self._boot_ns = 0
+        if not self.is_px4:
+            params = {"GUID_OPTIONS": 8.0, **(params or {})}
+            receiver_us = receiver_us or MID_RECEIVER_US
+        super().__init__(
+            receiver_us=receiver_us,
+            params=params,
+            vehicle=replace(NOMINAL_VEHICLE, autopilot=autopilot),
+            **config,
+        )
+        self._boot_ns = self.vehicle.ap.now_ns
+
+    # --- the policy
+
+    def _executable(self, contract: Contract) -> Executable:
+        self.scripted = ScriptedPolicy(
+            "hover",
+            lambda: self.clock.now_ns() / NS_PER_S,
+            action=self.kind,
+            starts_in_air=self._in_air,
+        )
+        self.scripted._program = self._program
+        act = super()._executable(contract)
+        return replace(act, contract=self.scripted.contract, reset=self.scripted.reset)
+
+    def _act(
+        self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        self._policy_clock.ahead_ns += self.solve_ns
+        chunk = self.scripted.predict_fast(encoded, state, history, 1)
+        if self._nan_from_ns is not None and self.clock.now_ns() >= self._nan_from_ns:
+            chunk[:, :, 1] = np.nan
+        return chunk
+
+    def return_nan(self) -> None:
+        """The policy computes nonsense from now on."""
+        self._nan_from_ns = self.clock.now_ns()
+
+    # --- into the air
+
+    def launch(self, mode: Any = None) -> "OutputFlight":
+        """Hover armed under the pilot, with the link ready and the policy fresh."""
+        self.vehicle.launch(
+            AirborneStart(
+                position_ned_m=(0.0, 0.0, -HEIGHT_M),
+                velocity_ned_mps=(0.0, 0.0, 0.0),
+                ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
+                next_gate=0,
+            )
+        )
+        self.run(0.6)  # its estimator has a position then
+        if not self.is_px4:
+            assert self.ardupilot.set_mode(ArduMode[self.mode])
+        elif self.kind != "sticks":
+            self._forget_sticks()
+        self.until(lambda: self.reason.startswith("not engaged"), within_s=10)
+        return self
+
+    def _forget_sticks(self) -> None:
+        """As if the vehicle had been armed without sticks: nobody has ever moved any."""
+        self.px4.commander.set_mode(Px4Mode.AUTO_LOITER)
+        self.px4.stick_input.valid = self.px4.stick_input._never_ages = False
+        self.px4.commander.start(ignores_sticks=True)
+
+    def fly(self, seconds: float = 1.5) -> "OutputFlight":
+        """Launch, engage by the key, and let the policy fly its program, at once."""
+        self.launch()
+        self.act("engage")
+        self.until(lambda: self.phase is Phase.FLYING, within_s=1.5)
+        self.run(0.05)  # the policy is reset when a flight begins
+        self.scripted.program_start_s = 0.0
+        self.run(seconds)
+        assert self.phase is Phase.FLYING, self.describe()
+        return self
+
+    # --- the vehicle
+
+    @property
+    def ardupilot(self) -> ArduPilot:
+        assert isinstance(self.vehicle.ap, ArduPilot)
+        return self.vehicle.ap
+
+    @property
+    def px4(self) -> Px4:
+        assert isinstance(self.vehicle.ap, Px4)
+        return self.vehicle.ap
+
+    @property
+    def now_s(self) -> float:
+        """Time of the policy."""
+        return self.clock.now_ns() / NS_PER_S
+
+    @property
+    def position_ned_m(self) -> tuple[float, float, float]:
+        return self.vehicle.ap.truth.position_ned_m
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The vehicle's report."""
+        return self.vehicle.log.summary(self.vehicle.ap, 0)
+
+    def describe(self) -> str:
+        ap = self.vehicle.ap
+        return (
+            f"{self.autopilot} {self.kind}: {self.phase} ({self.reason}); {ap.mode_name}, armed "
+            f"{ap.armed}, height {self.height_m:.1f} m, {self.messages}"
+        )
+
+    def command(self, number: int, *params: float, system: int = 42) -> None:
+        """Another station's COMMAND_LONG."""
+        values = [*params, *[0.0] * (7 - len(params))]
+        self.station(lambda mav: mav.command_long_encode(1, 1, number, 0, *values), system=system)
+
+    def pilot_changes_mode(self) -> str:
+        """The pilot takes over by a ground station, with a mode that holds; its name."""
+        main, sub = (4, 3) if self.is_px4 else (ArduMode.LOITER.value, 0)
+        self.command(dialect.MAV_CMD_DO_SET_MODE, 1, main, sub)
+        return "AUTO.LOITER" if self.is_px4 else "LOITER"
+
+    def lose_position(self) -> None:
+        """The estimator has no horizontal position any more."""
+        (self.px4 if self.is_px4 else self.ardupilot).position_lost = True
+
+    # --- the record
+
+    @property
+    def t_s(self) -> float:
+        """Seconds since boot: the time of the record."""
+        return self.samples[-1].t_s
+
+    def _step_vehicle(self) -> None:
+        before_ns = self.vehicle.ap.now_ns
+        super()._step_vehicle()
+        if self.vehicle.ap.now_ns != before_ns:
+            self.samples.append(self._sample())
+
+    def _sample(self) -> Sample:
+        ap = self.vehicle.ap
+        body = ap.truth
+        north, east, _ = body.velocity_ned_mps
+        return Sample(
+            t_s=(ap.now_ns - self._boot_ns) / NS_PER_S,
+            mode=ap.mode_name,
+            armed=ap.armed,
+            failsafe=ap.in_failsafe,
+            is_neutral=self._is_neutral(),
+            lean_deg=math.degrees(_tilt_rad(body.ned_from_body_wxyz)),
+            speed_mps=math.hypot(north, east),
+            position_ned_m=body.position_ned_m,
+        )
+
+    def _is_neutral(self) -> bool:
+        if self.kind == "sticks":
+            return all(abs(us - 1500) <= CENTRED_US for us in self.vehicle.ap.sticks_us)
+        return self._is_setpoint_neutral()
+
+    def _is_setpoint_neutral(self) -> bool:
+        if self.is_px4:
+            setpoint: Any = self.px4.setpoint
+            if isinstance(setpoint, VelocitySetpoint):
+                return math.hypot(*(setpoint.velocity_ned_mps or ())) < NEUTRAL_MPS
+            if isinstance(setpoint, AttitudeSetpoint):
+                return _tilt_rad(setpoint.ned_from_body_wxyz) < NEUTRAL_TILT_RAD
+            return False
+        guided = self.ardupilot.guided
+        if guided is None or guided.submode is not Submode.ATTITUDE:
+            return guided is None or math.hypot(*guided.velocity[0]) < NEUTRAL_MPS
+        setpoint = guided._setpoint
+        if setpoint is None:
+            return True
+        attitude, rates = setpoint.ned_from_body_wxyz, setpoint.rate_body_radps
+        return (
+            attitude is not None
+            and _tilt_rad(attitude) < NEUTRAL_TILT_RAD
+            and math.hypot(*rates) < NEUTRAL_RATE_RADPS
+        )
+
+    def aftermath(self, since_s: float) -> Aftermath:
+        """Read the record from a moment on, at which the policy flew."""
+        before = [s for s in self.samples if s.t_s <= since_s][-1]
+        after = [s for s in self.samples if s.t_s > since_s]
+        assert before.mode == self.mode, before
+
+        def first_ms(matches: Any) -> float | None:
+            return next(((s.t_s - since_s) * 1e3 for s in after if matches(s)), None)
+
+        neutral_ms = first_ms(lambda s: s.is_neutral or s.mode != self.mode or not s.armed)
+        moving = [s.t_s for s in after if s.speed_mps >= 0.3]
+        flew_again = neutral_ms is not None and any(
+            s.mode == self.mode and s.armed and not s.is_neutral
+            for s in after
+            if (s.t_s - since_s) * 1e3 > neutral_ms
+        )
+        lean_ms = first_ms(lambda s: s.lean_deg < 0.9 * before.lean_deg)
+        other = next((s.mode for s in after if s.mode != self.mode), None)
+        is_at_rest = after[-1].speed_mps < 0.3
+        return Aftermath(
+            neutral_ms=neutral_ms,
+            mode_ms=first_ms(lambda s: s.mode != self.mode),
+            mode=other,
+            lean_held_ms=(after[-1].t_s - since_s) * 1e3 if lean_ms is None else lean_ms,
+            level_ms=first_ms(lambda s: s.lean_deg < 2.0),
+            rest_ms=((moving[-1] if moving else since_s) - since_s) * 1e3 if is_at_rest else None,
+            flew_again=flew_again,
+            final_mode=after[-1].mode,
+            final_armed=after[-1].armed,
+        )
+
+
+def _tilt_rad(ned_from_body_wxyz: Quat) -> float:
+    return math.acos(max(-1.0, min(1.0, cos_tilt(ned_from_body_wxyz))))

@@ -1,0 +1,132 @@
+"""Ways in which a flight ends, each done to a flight that leans under its policy."""
+
+from collections.abc import Callable
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from helpers.output_flights import OutputFlight
+from mavbridge.core.clock import NS_PER_S
+from sitl.ardupilot.flight_modes import Mode as ArduMode
+from sitl.px4.failsafe import Phase as LostPhase
+
+FORCE = 21196
+"""Parameter 2 of a disarming that is not refused in flight."""
+RAMP_S = 0.3
+
+
+def later(flight: OutputFlight, seconds: float, act: Callable[[], object]) -> None:
+    """Do something so many seconds from now."""
+    flight.clock.schedule(flight.clock.now_ns() + round(seconds * NS_PER_S), act)
+
+
+def death(flight: OutputFlight) -> None:
+    flight.die()
+
+
+def hang(flight: OutputFlight) -> None:
+    """The flight process stops for a second, and then goes on as if nothing had been."""
+    flight.is_flight_process_stopped = True
+
+    def go_on() -> None:
+        flight.is_flight_process_stopped = False
+
+    later(flight, 1.0, go_on)
+
+
+def not_a_number(flight: OutputFlight) -> None:
+    flight.return_nan()
+
+
+def pilots_mode(flight: OutputFlight) -> None:
+    flight.pilot_changes_mode()
+
+
+def stick_ramp(flight: OutputFlight) -> None:
+    """A pilot moves a joystick of his own: centred for half a second, then a fast ramp."""
+    period_s = 0.02
+    for step in range(200):
+        share = min(max(step * period_s - 0.5, 0.0) / RAMP_S, 1.0)
+        x = round(800 * share)
+        later(flight, step * period_s, lambda x=x: joystick(flight, x))  # type: ignore[misc]
+
+
+def joystick(flight: OutputFlight, x: int) -> None:
+    """One MANUAL_CONTROL of another station, on a link of its own."""
+    flight.station(lambda mav: mav.manual_control_encode(1, x, 0, 500, 0, 0), system=42)
+
+
+def disarming(flight: OutputFlight) -> None:
+    flight.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
+
+
+def deaf_gate(flight: OutputFlight) -> None:
+    """For two seconds nothing of the vehicle reaches us."""
+    _silence(flight, up_s=0.0, down_s=2.0)
+
+
+def deaf_vehicle_short(flight: OutputFlight) -> None:
+    """For 0.3 s nothing of ours reaches the vehicle."""
+    _silence(flight, up_s=0.3, down_s=0.0)
+
+
+def deaf_vehicle(flight: OutputFlight) -> None:
+    """For 1.5 s nothing of ours reaches the vehicle."""
+    _silence(flight, up_s=1.5, down_s=0.0)
+
+
+def cut_link(flight: OutputFlight) -> None:
+    """For 1.5 s nothing passes either way."""
+    _silence(flight, up_s=1.5, down_s=1.5)
+
+
+def _silence(flight: OutputFlight, *, up_s: float, down_s: float) -> None:
+    for direction, seconds in ((flight.up, up_s), (flight.down, down_s)):
+        direction.is_silent = seconds > 0
+
+        def speak(direction=direction) -> None:  # type: ignore[no-untyped-def]
+            direction.is_silent = False
+
+        later(flight, seconds, speak)
+
+
+def end(flight: OutputFlight) -> None:
+    """SIGTERM or Ctrl-C."""
+    flight.stop()
+
+
+def key(flight: OutputFlight) -> None:
+    """q at the terminal."""
+    flight.act("release")
+
+
+def failsafe(flight: OutputFlight) -> None:
+    """A failsafe of the vehicle's own changes its mode."""
+    if flight.is_px4:
+        flight.px4.commander.lost_sticks.phase = LostPhase.ACTING
+    else:
+        flight.ardupilot.gcs_failsafe.active = True
+        flight.ardupilot.set_mode(ArduMode.RTL)
+
+
+def death_without_position(flight: OutputFlight) -> None:
+    """The flight process dies while the modes that hold a place are refused."""
+    flight.lose_position()
+    later(flight, 0.05, flight.die)
+
+
+PATHS: dict[str, Callable[[OutputFlight], None]] = {
+    "death of the flight process": death,
+    "hang of 1 s": hang,
+    "NaN": not_a_number,
+    "pilot's mode": pilots_mode,
+    "pilot's stick ramp": stick_ramp,
+    "disarmed": disarming,
+    "vehicle not heard 2 s": deaf_gate,
+    "we are not heard 0.3 s": deaf_vehicle_short,
+    "we are not heard 1.5 s": deaf_vehicle,
+    "link cut 1.5 s": cut_link,
+    "end": end,
+    "key q": key,
+    "failsafe of the vehicle": failsafe,
+    "death without a position": death_without_position,
+}

@@ -1,0 +1,224 @@
+"""Every way out of a flight, for each kind of action on each firmware, by the vehicle's record.
+
+Limits are those of docs/SAFETY.md; the vehicle leans 15 degrees or flies 2 m/s when it happens.
+"""
+
+from collections.abc import Callable
+
+import pytest
+
+from helpers import release_paths as paths
+from helpers.output_flights import COMBINATIONS, Aftermath, OutputFlight
+from mavbridge.gate.engagement import Phase
+from policy.contract import ActionKind
+from sitl.vehicle.config import AutopilotName
+
+GRACE_MS = 120
+"""Three chunk periods or 100 ms, and 20 ms."""
+DEATH_MS = 60
+PX4_STREAM_LOST_MS = 1050
+"""COM_OF_LOSS_T, and a step; sticks are lost after 0.6 s."""
+UNLIKE: tuple[tuple[AutopilotName, ActionKind], ...] = (
+    ("ardupilot", "attitude"),
+    ("ardupilot", "velocity"),
+    ("px4", "sticks"),
+    ("px4", "rates"),
+)
+"""Where the gate alone decides, these stand for the others; ArduPilot's sticks have tests of their
+own (``test_gate_faults``)."""
+
+
+def after(
+    flight: OutputFlight, path: Callable[[OutputFlight], None], seconds: float = 3.0
+) -> Aftermath:
+    """What the vehicle does in the seconds after a fault."""
+    flight.fly(1.2)
+    at_s = flight.t_s
+    path(flight)
+    flight.run(seconds)
+    return flight.aftermath(at_s)
+
+
+def hold(flight: OutputFlight) -> str:
+    """Mode after a fault of ours: ArduPilot's receiver gets its sticks back instead."""
+    if flight.is_px4:
+        return "AUTO.LOITER"
+    return "ALT_HOLD" if flight.kind == "sticks" else "BRAKE"
+
+
+def assert_safe(flight: OutputFlight, found: Aftermath, *, mode: str, neutral_ms: float) -> None:
+    assert found.neutral_ms is not None, found
+    assert found.neutral_ms <= neutral_ms, found
+    assert not found.flew_again, found
+    assert found.final_mode == mode, (found, flight.describe())
+    assert flight.phase is not Phase.FLYING
+    assert found.lean_held_ms <= neutral_ms + 250, found
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+def test_death_of_the_flight_process(autopilot: AutopilotName, kind: ActionKind) -> None:
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, paths.death)
+    assert_safe(flight, found, mode=hold(flight), neutral_ms=DEATH_MS)
+    # PX4 would take the end of its only sticks for a failsafe.
+    is_held = flight.is_px4 and kind == "sticks"
+    assert flight.phase is (Phase.HOLDING if is_held else Phase.ENDED)
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
+def test_a_hang_whose_chunks_come_again_is_over_for_good(
+    autopilot: AutopilotName, kind: ActionKind
+) -> None:
+    """So is OFFBOARD: PX4 would go back to it by itself if the stream came again."""
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, paths.hang)
+    assert_safe(flight, found, mode=hold(flight), neutral_ms=GRACE_MS)
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
+def test_chunks_that_are_not_numbers(autopilot: AutopilotName, kind: ActionKind) -> None:
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, paths.not_a_number)
+    assert_safe(flight, found, mode=hold(flight), neutral_ms=GRACE_MS)
+    assert "unusable chunks" in flight.reason
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+def test_the_pilots_mode_by_a_ground_station(autopilot: AutopilotName, kind: ActionKind) -> None:
+    flight = OutputFlight(autopilot, kind).fly(1.2)
+    at_s, at_ns = flight.t_s, flight.clock.now_ns()
+    mode = flight.pilot_changes_mode()
+    flight.until(lambda: flight.phase is Phase.RELEASING, within_s=0.06)
+    heard_ns = flight.clock.now_ns()
+    flight.run(3)
+    found = flight.aftermath(at_s)
+    assert found.mode == mode
+    assert found.mode_ms is not None
+    assert found.mode_ms < 10
+    assert not found.flew_again
+    assert flight.phase is Phase.RELEASED
+    assert not flight.modes_asked(at_ns), "the gate never changes the pilot's mode"
+    if kind != "sticks":
+        names = {m.get_type() for _, m in flight.left(heard_ns + 1)}
+        assert not names & {"SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED"}, "silence"
+
+
+@pytest.mark.parametrize("kind", ["attitude", "rates", "velocity"])
+def test_a_pilots_stick_ramp_takes_px4_out_of_offboard(kind: ActionKind) -> None:
+    flight = OutputFlight("px4", kind)
+    found = after(flight, paths.stick_ramp, 2.0)
+    assert found.mode == found.final_mode == "POSCTL"
+    assert not found.flew_again
+    assert flight.reason == "mode changed from OFFBOARD to POSCTL"
+    assert flight.phase is Phase.RELEASED
+    assert not flight.modes_asked()[1:], "only OFFBOARD itself was asked for"
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
+def test_a_disarming_in_flight(autopilot: AutopilotName, kind: ActionKind) -> None:
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, paths.disarming, 1.0)
+    assert not found.final_armed
+    assert flight.reason == "the vehicle has been disarmed"
+    assert flight.phase in (Phase.RELEASING, Phase.RELEASED)
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+def test_a_vehicle_that_is_not_heard_gets_neutral_and_a_mode_all_the_same(
+    autopilot: AutopilotName, kind: ActionKind
+) -> None:
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, paths.deaf_gate)
+    assert_safe(flight, found, mode=hold(flight), neutral_ms=GRACE_MS)
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+def test_a_vehicle_that_does_not_hear_us_for_a_moment_flies_on_and_for_longer_never_again(
+    autopilot: AutopilotName, kind: ActionKind
+) -> None:
+    flight = OutputFlight(autopilot, kind).fly(1.2)
+    paths.deaf_vehicle_short(flight)
+    flight.run(1.0)
+    assert flight.phase is Phase.FLYING, flight.describe()
+    assert not any(s.failsafe for s in flight.samples)
+    at_s = flight.t_s
+    paths.deaf_vehicle(flight)
+    flight.run(4)
+
+    found = flight.aftermath(at_s)
+    assert flight.phase is Phase.RELEASED, flight.describe()
+    assert not found.flew_again, found
+    assert found.neutral_ms is not None, found
+    if flight.is_px4:
+        assert found.neutral_ms < PX4_STREAM_LOST_MS, "its own failsafe"
+        assert found.final_mode == ("AUTO.LOITER" if kind == "sticks" else "AUTO.RTL")
+    else:
+        # It hears neutral sticks at once, and for setpoints the next request of the mode.
+        assert found.neutral_ms < 1500 + (60 if kind == "sticks" else 160)
+        assert found.final_mode == hold(flight)
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
+def test_a_link_that_is_cut_both_ways_is_no_way_back(
+    autopilot: AutopilotName, kind: ActionKind
+) -> None:
+    """The first setpoints of ours after it bring PX4 back into OFFBOARD: they are neutral."""
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, paths.cut_link, 4.0)
+    assert not found.flew_again, found
+    assert found.final_mode == hold(flight), flight.describe()
+    assert flight.phase is not Phase.FLYING
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+def test_an_end(autopilot: AutopilotName, kind: ActionKind) -> None:
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, paths.end, 2.0)
+    mode = "AUTO.LAND" if flight.is_px4 else hold(flight)
+    assert_safe(flight, found, mode=mode, neutral_ms=DEATH_MS)
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+def test_a_failsafe_of_the_vehicle_is_left_alone(
+    autopilot: AutopilotName, kind: ActionKind
+) -> None:
+    flight = OutputFlight(autopilot, kind).fly(1.2)
+    at_s, at_ns = flight.t_s, flight.clock.now_ns()
+    paths.failsafe(flight)
+    flight.run(2)
+    found = flight.aftermath(at_s)
+    assert found.final_mode == ("AUTO.RTL" if flight.is_px4 else "RTL")
+    assert "a failsafe of the vehicle is active" in flight.reason
+    assert not flight.modes_asked(at_ns)
+    assert flight.phase is Phase.RELEASED
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
+def test_where_the_mode_that_holds_is_refused_it_lands(
+    autopilot: AutopilotName, kind: ActionKind
+) -> None:
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, paths.death_without_position)
+    assert_safe(
+        flight,
+        found,
+        mode="AUTO.LAND" if flight.is_px4 else "LAND",
+        neutral_ms=50 + DEATH_MS + 100,
+    )
+
+
+@pytest.mark.parametrize("gap_s", [0.3, 0.6, 0.9, 1.5])
+@pytest.mark.parametrize("is_held", [False, True])
+def test_px4s_sticks_shown_again_after_a_gap_are_no_takeover(gap_s: float, is_held: bool) -> None:
+    """Whoever takes them for one falls silent, which is a failsafe of PX4 that ends in RTL."""
+    flight = OutputFlight("px4", "sticks").fly(1.2)
+    if is_held:
+        flight.die()
+        flight.run(1)
+    flight.down.is_silent = True
+    flight.run(gap_s)
+    flight.down.is_silent = False
+    flight.run(3)
+    assert flight.phase is Phase.HOLDING, flight.describe()
+    assert flight.samples[-1].mode == "AUTO.LOITER"
+    assert not any(s.failsafe for s in flight.samples)

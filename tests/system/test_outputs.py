@@ -1,0 +1,110 @@
+"""Faults of the flight process under PX4's sticks and under setpoints, by real processes."""
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from helpers.relay import Sent
+from helpers.stand import Flight, flight
+
+pytestmark = pytest.mark.system
+
+DEATH_LIMIT_MS = 150
+"""The aim on a machine of its own is 60 ms."""
+HANG_LIMIT_MS = 250
+"""The aim is 120 ms."""
+MODE_LIMIT_MS = 400
+LEAST_STICK = 120
+"""Of 1000: a leg of the square begins."""
+LEAST_MPS = 1.0
+TIMEOUT_S = 60.0
+TAKEOFF = ("--takeoff", "2", "--policy", "scripted:square:velocity:air")
+
+
+def is_flown(sent: Sent) -> bool:
+    """The message tells the vehicle to move sideways or ahead."""
+    message = sent.message
+    if sent.name == "MANUAL_CONTROL":
+        return max(abs(message.x), abs(message.y)) > LEAST_STICK
+    if sent.name == "SET_POSITION_TARGET_LOCAL_NED":
+        return max(abs(message.vx), abs(message.vy)) > LEAST_MPS
+    return False
+
+
+def wait_for_a_leg(flying: Flight) -> None:
+    """The square has begun."""
+    sent = flying.relay.sent
+    assert flying.relay.wait_until(lambda: bool(sent), TIMEOUT_S)
+    assert flying.gate.pid
+    assert flying.relay.wait_until(lambda: is_flown(sent[-1]), TIMEOUT_S)
+
+
+def sent_last(flying: Flight) -> Sent:
+    """The newest action that left the gate."""
+    names = ("MANUAL_CONTROL", "SET_POSITION_TARGET_LOCAL_NED")
+    return next(sent for sent in reversed(flying.relay.sent) if sent.name in names)
+
+
+def mode_ms(report: Any, at_ns: int, mode: str) -> float:
+    """From a moment until the vehicle was in a mode, in which it stayed."""
+    at_s = (at_ns - report["start_ns"]) / 1e9
+    changes = [entry for entry in report["modes"] if entry["t_s"] >= at_s]
+    assert [entry["mode"] for entry in changes] == [mode], report["modes"]
+    return float((changes[0]["t_s"] - at_s) * 1e3)
+
+
+def last_flown_ms(flying: Flight, at_ns: int) -> float:
+    """Until the last message that told the vehicle to move; negative: before the moment."""
+    flown = [sent.at_ns for sent in flying.relay.sent if is_flown(sent)]
+    return (flown[-1] - at_ns) / 1e6
+
+
+def test_px4s_sticks_when_the_flight_process_is_killed(tmp_path: Path) -> None:
+    with flight(tmp_path, "--autopilot", "px4", renders=False) as flying:
+        flying.start("--dual-rate", "--arm", "--policy", "scripted:square")
+        wait_for_a_leg(flying)
+        at_ns = flying.kill(signal.SIGKILL)
+        assert not flying.gate.has_ended(1.5), "the end of the only sticks would be a failsafe"
+        message = sent_last(flying).message
+        flying.relay.disarm()
+        assert flying.gate.has_ended(15)
+        flying.end()
+    report = flying.vehicle_report()
+    assert last_flown_ms(flying, at_ns) <= DEATH_LIMIT_MS
+    assert (message.x, message.y) == (0, 0)
+    assert message.z == 500
+    assert mode_ms(report, at_ns, "AUTO.LOITER") <= MODE_LIMIT_MS
+    assert not any(entry["failsafe"] for entry in report["sticks"])
+
+
+def test_px4s_offboard_when_the_flight_process_is_stopped(tmp_path: Path) -> None:
+    with flight(tmp_path, "--autopilot", "px4", renders=False) as flying:
+        flying.start("--dual-rate", "--arm", *TAKEOFF)
+        wait_for_a_leg(flying)
+        at_ns = flying.kill(signal.SIGSTOP)
+        flying.observe(1.0)
+        flying.kill(signal.SIGCONT)
+        flying.observe(1.0)
+        flying.kill(signal.SIGINT)
+        status, output = flying.end()
+    assert status == 0, output
+    report = flying.vehicle_report()
+    assert last_flown_ms(flying, at_ns) <= HANG_LIMIT_MS
+    assert mode_ms(report, at_ns, "AUTO.LOITER") <= HANG_LIMIT_MS + MODE_LIMIT_MS
+    assert sent_last(flying).at_ns < at_ns + 1e9, "the stream does not come back"
+    assert not any(entry["failsafe"] for entry in report["sticks"])
+
+
+def test_ardupilots_guided_when_the_flight_process_is_killed(tmp_path: Path) -> None:
+    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+        flying.start("--dual-rate", "--arm", *TAKEOFF)
+        wait_for_a_leg(flying)
+        at_ns = flying.kill(signal.SIGKILL)
+        assert flying.gate.has_ended(15)
+        flying.end()
+    report = flying.vehicle_report()
+    assert last_flown_ms(flying, at_ns) <= DEATH_LIMIT_MS
+    assert mode_ms(report, at_ns, "BRAKE") <= MODE_LIMIT_MS
+    assert report["refused_messages"] == 0

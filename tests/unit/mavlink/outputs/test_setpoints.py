@@ -1,0 +1,335 @@
+"""Attitudes, body rates and velocities: what leaves, what the echo tells, how they are released."""
+
+import math
+from typing import Any
+
+import pytest
+
+from helpers.flown_vehicle import Flight, FlownVehicle, codec
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import NEUTRAL, ActionMeaning, AttitudeThrust, BodyRates, Velocity
+from mavbridge.mavlink.codec.messages import (
+    Attitude,
+    AttitudeTarget,
+    SpecificForce,
+    VelocityTarget,
+)
+from mavbridge.mavlink.codec.packets import CommandRefusedError
+from mavbridge.mavlink.codec.rotation import heading_rad, quaternion_from_euler
+from mavbridge.mavlink.outputs.attitude import MOST_LEAD_RAD, AttitudeOutput, HeadingTarget
+from mavbridge.mavlink.outputs.setpoints import HELD_NS
+from mavbridge.mavlink.outputs.velocity import VelocityOutput
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.profiles.px4 import PX4
+
+MS, S = NS_PER_MS, NS_PER_S
+BOTH = pytest.mark.parametrize("profile", [ARDUPILOT, PX4], ids=lambda profile: profile.name)
+LEVEL = AttitudeThrust(0.39, 0.0, 0.0, 0.0)
+
+
+def attitude_flight(
+    profile: Profile, *, is_rates: bool = False, hover: float = 0.39, yaw_rad: float = 1.0
+) -> Flight:
+    meaning = ActionMeaning(kind="rates" if is_rates else "attitude", hover_thrust=hover)
+    name = "rates" if is_rates else "attitude"
+    flight = Flight(AttitudeOutput(codec(), meaning, profile, name), FlownVehicle(profile))
+    turn_to(flight, yaw_rad)
+    return flight
+
+
+def velocity_flight(profile: Profile, *, is_heading_frame: bool = False) -> Flight:
+    meaning = ActionMeaning(kind="velocity", is_heading_frame=is_heading_frame)
+    return Flight(VelocityOutput(codec(), meaning), FlownVehicle(profile))
+
+
+def turn_to(flight: Flight, yaw_rad: float) -> None:
+    quaternion = quaternion_from_euler(0.0, 0.0, yaw_rad)
+    flight.receive(Attitude(True, 0, quaternion, (0.0, 0.0, 0.0)))
+
+
+def target(thrust: float, rates: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> AttitudeTarget:
+    return AttitudeTarget(0, 0, (1.0, 0.0, 0.0, 0.0), rates, thrust)
+
+
+# --- attitude and rates
+
+
+def test_an_attitude_keeps_the_vehicles_own_heading_until_it_turns() -> None:
+    flight = attitude_flight(PX4, yaw_rad=1.0)
+    message: Any = flight.message(flight.send(AttitudeThrust(0.5, 0.2, -0.1, 0.0)))
+    assert tuple(message.q) == pytest.approx(quaternion_from_euler(0.2, -0.1, 1.0), abs=1e-6)
+    assert message.type_mask == 7
+    for _ in range(50):
+        message = flight.message(flight.send(AttitudeThrust(0.5, 0.2, -0.1, 0.4)))
+    assert heading_rad(tuple(message.q)) == pytest.approx(1.0 + 0.4 * 0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("yaw_rate", [4.0, -4.0])
+def test_the_heading_that_is_asked_for_never_runs_far_ahead(yaw_rate: float) -> None:
+    heading = HeadingTarget()
+    for k in range(200):
+        asked = heading.step(3.0, yaw_rate, k * 10 * MS)
+    ahead = math.remainder(asked - 3.0, math.tau)
+    assert ahead == pytest.approx(math.copysign(MOST_LEAD_RAD, yaw_rate))
+    assert heading.step(3.0, 0.0, 2 * S + 600 * MS) == 3.0  # after a pause: afresh
+
+
+def test_before_another_mode_is_left_the_heading_follows_the_vehicles() -> None:
+    flight = attitude_flight(PX4)
+    flight.vehicle.mode = "ALTCTL"
+    flight.send(LEVEL)
+    turn_to(flight, 3.0)
+    message: Any = flight.message(flight.send(LEVEL))
+    assert heading_rad(tuple(message.q)) == pytest.approx(3.0, abs=1e-6)
+
+
+def test_without_the_vehicles_own_heading_no_attitude_leaves() -> None:
+    output = AttitudeOutput(codec(), ActionMeaning(kind="attitude"), PX4, "attitude")
+    flight = Flight(output, FlownVehicle(PX4))
+    assert output.encode(LEVEL, flight.session, flight.now_ns) is None
+
+
+@BOTH
+def test_thrust_that_hovered_in_training_hovers_here(profile: Profile) -> None:
+    flight = attitude_flight(profile, hover=0.4)
+    name = "MOT_THST_HOVER" if profile is ARDUPILOT else "MPC_THR_HOVER"
+    flight.vehicle.known_params = {name: 0.5}
+    encoded = flight.send(AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    message: Any = flight.message(encoded)
+    assert message.thrust == pytest.approx(0.5, abs=1e-4)
+    assert isinstance(encoded.action, AttitudeThrust)
+    assert encoded.action.thrust == pytest.approx(0.4, abs=1e-4)
+    message = flight.message(flight.send(AttitudeThrust(1.0, 0.0, 0.0, 0.0)))
+    assert 0.999 < message.thrust <= 1.0
+
+
+def fly_by_itself(flight: Flight, thrust: float, up_mps2: float, seconds: float = 2.0) -> None:
+    for _ in range(round(seconds * 50)):
+        flight.now_ns += 18 * MS
+        flight.receive(SpecificForce("RAW_IMU", 0, (0.0, 0.0, -up_mps2)))
+        flight.receive(target(thrust))
+
+
+def test_the_hover_that_was_seen_counts_more_than_the_parameter() -> None:
+    for up_mps2 in (9.80665, 11.0):  # climbing faster and faster, at more thrust
+        flight = attitude_flight(ARDUPILOT, hover=0.4)
+        flight.vehicle.known_params = {"MOT_THST_HOVER": 0.39}
+        fly_by_itself(flight, 0.364 * up_mps2 / 9.80665, up_mps2)
+        message: Any = flight.message(flight.send(AttitudeThrust(0.4, 0.0, 0.0, 0.0)))
+        assert message.thrust == pytest.approx(0.364, abs=1e-3)
+
+
+@pytest.mark.parametrize("why", ["on the ground", "too short", "leaning", "falling"])
+def test_thrust_that_is_no_hover_is_not_learnt(why: str) -> None:
+    flight = attitude_flight(ARDUPILOT, hover=0.4)
+    flight.vehicle.known_params = {"MOT_THST_HOVER": 0.4}
+    flight.vehicle.is_landed = why == "on the ground"
+    if why == "leaning":
+        quaternion = quaternion_from_euler(0.5, 0.0, 0.0)
+        flight.receive(Attitude(True, 0, quaternion, (0.0, 0.0, 0.0)))
+    seconds, up_mps2 = (0.5 if why == "too short" else 2.0), (3.0 if why == "falling" else 9.8)
+    fly_by_itself(flight, 0.2, up_mps2, seconds)
+    message: Any = flight.message(flight.send(AttitudeThrust(0.4, 0.0, 0.0, 0.0)))
+    assert message.thrust == pytest.approx(0.4, abs=1e-3)
+
+
+@BOTH
+def test_rates_leave_as_rates_and_their_neutral_as_an_attitude(profile: Profile) -> None:
+    flight = attitude_flight(profile, is_rates=True)
+    encoded = flight.send(BodyRates(0.39, 0.5, -0.25, 0.1))
+    message: Any = flight.message(encoded)
+    assert message.type_mask == 128
+    rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
+    assert rates == pytest.approx((0.5, -0.25, 0.1), abs=0.003)
+    assert encoded.action == pytest.approx(BodyRates(0.39, 0.5, -0.25, 0.1), abs=0.003)
+    message = flight.message(flight.send(LEVEL))
+    assert message.type_mask == 7
+
+
+@BOTH
+@pytest.mark.parametrize("is_rates", [False, True])
+def test_the_echo_of_our_setpoints_confirms_them(profile: Profile, is_rates: bool) -> None:
+    flight = attitude_flight(profile, is_rates=is_rates)
+    action = BodyRates(0.39, 0.2, 0.0, 0.1) if is_rates else LEVEL
+    shown = target(0.41, (0.3, 0.2, 0.1))
+    for k in range(200):
+        message: Any = flight.message(flight.send(action))
+        if k == 10:
+            assert not flight.output.echo_confirmed
+        if k > 10:
+            rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
+            # ArduPilot's rates are shaped; PX4's thrust is of an older attitude.
+            is_px4 = profile is PX4 and is_rates
+            shown = target(0.2 if is_px4 else message.thrust, rates if is_px4 else (9, 9, 9))
+        flight.receive(shown)
+        assert flight.problem is None
+    assert flight.output.echo_confirmed
+    assert flight.output.was_confirmed
+
+
+@BOTH
+def test_setpoints_of_another_station_are_noticed_but_not_a_change_of_mode(
+    profile: Profile,
+) -> None:
+    flight = attitude_flight(profile)
+    for _ in range(50):
+        message: Any = flight.message(flight.send(LEVEL))
+        flight.receive(target(message.thrust))
+    for _ in range(4):  # the mode has changed, and is told after 30 ms
+        flight.send(LEVEL)
+        flight.receive(target(0.45))
+    assert flight.problem is None
+    flight.send(LEVEL)
+    flight.receive(target(0.45))
+    assert "another station commands it" in (flight.output.overruled(flight.now_ns) or "")
+
+
+def test_a_vehicle_that_hears_no_setpoint_any_more_is_noticed() -> None:
+    flight = attitude_flight(ARDUPILOT)
+    for _ in range(50):
+        message: Any = flight.message(flight.send(LEVEL))
+        flight.receive(target(message.thrust))
+    deaf_ns = flight.now_ns
+    while flight.problem is None:
+        flight.send(LEVEL)
+        flight.receive(target(message.thrust))
+    assert 0.35 * S < flight.now_ns - deaf_ns < 0.5 * S
+    assert "does not hear our setpoints" in (flight.output.unheard(flight.now_ns) or "")
+    assert flight.output.overruled(flight.now_ns) is None
+
+
+@pytest.mark.parametrize("state", ["disarmed", "another mode", "landed", "idle"])
+def test_where_no_echo_is_to_be_expected_none_is_missed(state: str) -> None:
+    flight = attitude_flight(PX4)
+    flight.vehicle.armed = state != "disarmed"
+    flight.vehicle.is_landed = state == "landed"
+    if state == "another mode":
+        flight.vehicle.mode = "ALTCTL"
+    action = LEVEL._replace(thrust=0.0) if state == "idle" else LEVEL
+    for _ in range(300):
+        message: Any = flight.message(flight.send(action))
+        flight.receive(target(0.45))
+        assert flight.problem is None
+        assert flight.output.echo_confirmed
+    if state == "idle":
+        assert message.thrust == 0.0  # not nudged: the motors stay idle
+
+
+def test_the_receiver_is_seen_beside_our_setpoints() -> None:
+    flight = attitude_flight(ARDUPILOT)
+    for _ in range(20):
+        message: Any = flight.message(flight.send(LEVEL))
+        flight.receive(target(message.thrust))
+    assert flight.output.echo_confirmed
+    assert flight.vehicle.is_released
+    assert not flight.vehicle.is_receiver_hidden
+
+
+# --- velocity
+
+
+def test_while_the_climb_from_the_ground_is_brought_in_another_velocity_is_shown() -> None:
+    flight = velocity_flight(PX4)
+    for k in range(500):  # every 11 ms
+        flight.vehicle.is_landed = k < 50
+        message: Any = flight.message(flight.send(Velocity(0.0, 0.0, -1.5, 0.0)))
+        ramp_mps = max(message.vz, 2.2 - 2 * 0.011 * k)
+        flight.receive(VelocityTarget(0, 7, (0.0, 0.0, ramp_mps), 0.0))
+        assert flight.problem is None
+    assert flight.output.echo.confirmed
+
+
+@BOTH
+def test_a_velocity_and_its_echo(profile: Profile) -> None:
+    flight = velocity_flight(profile, is_heading_frame=True)
+    for _ in range(200):
+        encoded = flight.send(Velocity(1.0, 0.5, -0.25, 0.2))
+        message: Any = flight.message(encoded)
+        assert (message.coordinate_frame, message.type_mask) == (8, 1479)
+        assert (message.vx, message.vy) == (1.0, 0.5)
+        assert encoded.action == pytest.approx((1.0, 0.5, -0.25, 0.2), abs=0.003)
+        flight.receive(VelocityTarget(0, 3079, (0.3, 1.1, message.vz), 0.0))
+        assert flight.problem is None
+    assert flight.output.echo_confirmed
+    for _ in range(5):
+        flight.send(Velocity(1.0, 0.5, -0.25, 0.2))
+        flight.receive(VelocityTarget(0, 3079, (0.0, 0.0, 0.0), 0.0))
+    assert "limits or refuses them" in (flight.output.overruled(flight.now_ns) or "")
+
+
+def test_a_target_without_a_velocity_is_no_echo() -> None:
+    flight = velocity_flight(ARDUPILOT)
+    for _ in range(30):
+        flight.send(Velocity(0.0, 0.0, 0.0, 0.0))
+        flight.receive(VelocityTarget(0, 3576, (0.0, 0.0, 0.0), 0.0))  # a takeoff
+    assert not flight.output.echo_confirmed
+
+
+def test_px4_is_asked_for_no_climb_that_it_would_cut() -> None:
+    flight = velocity_flight(PX4)
+    flight.vehicle.known_params = {"MPC_Z_VEL_MAX_UP": 2.0, "MPC_Z_VEL_MAX_DN": 1.0}
+    for asked, sent in ((-5.0, -2.0), (5.0, 1.0), (0.5, 0.5)):
+        encoded = flight.send(Velocity(0.0, 0.0, asked, 0.0))
+        message: Any = flight.message(encoded)
+        assert message.vz == pytest.approx(sent, abs=0.003)
+        assert encoded.action[2] == pytest.approx(sent, abs=0.003)
+
+
+# --- release and refusals
+
+
+@BOTH
+def test_silence_is_the_release_and_ends_with_another_mode_or_by_itself(profile: Profile) -> None:
+    for ends_by_mode in (True, False):
+        flight = velocity_flight(profile)
+        assert flight.is_released
+        flight.send(Velocity(1.0, 0.0, 0.0, 0.0))
+        assert not flight.is_released
+        flight.output.released()
+        assert flight.output.release_packet(flight.session, flight.now_ns) is None
+        assert not flight.is_released
+        assert not flight.output.shows_last
+        if ends_by_mode:
+            flight.vehicle.mode = profile.modes.roles.hold
+        else:
+            flight.now_ns += HELD_NS + 1
+        assert flight.is_released
+
+
+def test_what_is_no_such_action_never_leaves() -> None:
+    nan, attitude, velocity = float("nan"), attitude_flight(PX4), velocity_flight(PX4)
+    for flight, action in (
+        (attitude, NEUTRAL),
+        (attitude, Velocity(0.0, 0.0, 0.0, 0.0)),
+        (attitude, LEVEL._replace(roll_rad=nan)),
+        (attitude, LEVEL._replace(thrust=1.2)),
+        (attitude, LEVEL._replace(roll_rad=1.55)),
+        (attitude, BodyRates(0.5, nan, 0.0, 0.0)),
+        (velocity, LEVEL),
+        (velocity, Velocity(0.0, 0.0, nan, 0.0)),
+        (velocity, Velocity(500.0, 0.0, 0.0, 0.0)),
+    ):
+        with pytest.raises(CommandRefusedError):
+            flight.send(action)
+
+
+def test_an_echo_that_was_seen_stays_seen_once_the_flight_has_left_the_mode() -> None:
+    flight = velocity_flight(PX4)
+    for _ in range(50):
+        message: Any = flight.message(flight.send(Velocity(0.0, 0.0, -0.5, 0.0)))
+        flight.receive(VelocityTarget(0, 7, (0.0, 0.0, message.vz), 0.0))
+    flight.vehicle.mode = "AUTO.LOITER"
+    flight.send(Velocity(0.0, 0.0, 0.0, 0.0))
+    assert flight.output.was_confirmed
+
+
+@BOTH
+def test_a_thrust_that_cannot_be_matched_to_the_vehicle_is_told_once(profile: Profile) -> None:
+    flight = attitude_flight(profile)
+    assert flight.vehicle.profile.hover_thrust(flight.vehicle.known_params) is None
+    flight.send(LEVEL)
+    (note,) = flight.output.take_notes()
+    assert "hovers is not known" in note
+    flight.send(LEVEL)
+    assert flight.output.take_notes() == ()

@@ -1,0 +1,260 @@
+"""Sticks by MANUAL_CONTROL and by overrides: the vehicle's curves, the echo, the release."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from helpers.flown_vehicle import Flight, FlownVehicle, codec
+from helpers.wire import ARDUPILOT as CALIBRATION
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.errors import PeerError
+from mavbridge.core.vehicle import (
+    IDLE,
+    NEUTRAL,
+    ActionKind,
+    ActionMeaning,
+    AttitudeThrust,
+    Output,
+    StickGains,
+    Sticks,
+)
+from mavbridge.mavlink.codec.messages import ManualControl, RcChannels
+from mavbridge.mavlink.codec.packets import CommandRefusedError
+from mavbridge.mavlink.outputs.choice import choose_output
+from mavbridge.mavlink.outputs.manual_control import ManualControlOutput
+from mavbridge.mavlink.outputs.override import OverrideOutput
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.profiles.px4 import PX4
+
+MS = NS_PER_MS
+PX4_VALUES = {
+    "MPC_MAN_TILT_MAX": 35.0,
+    "MPC_MAN_Y_MAX": 150.0,
+    "MPC_Z_VEL_MAX_UP": 3.0,
+    "MPC_Z_VEL_MAX_DN": 1.5,
+    "MAN_DEADZONE": 0.1,
+}
+WANTED = Sticks(throttle=0.5, yaw=0.2, pitch=0.1, roll=-0.3)
+
+
+def px4_flight(gains: StickGains | None = None) -> Flight:
+    vehicle = FlownVehicle(PX4)
+    vehicle.mode, vehicle.known_params = "ALTCTL", dict(PX4_VALUES)
+    return Flight(ManualControlOutput(codec(), gains), vehicle)
+
+
+def copter_flight(gains: StickGains | None = None) -> Flight:
+    vehicle = FlownVehicle(ARDUPILOT, CALIBRATION)
+    vehicle.mode = "ALT_HOLD"
+    return Flight(OverrideOutput(codec(), gains), vehicle)
+
+
+def echo(flight: Flight, action: Sticks, *, lost: int = 0) -> None:
+    """Send sticks, which the vehicle shows, rounded down by so much."""
+    message: Any = flight.message(flight.send(action))
+    flight.receive(ManualControl(message.x - lost, message.y, message.z - lost, message.r))
+
+
+# --- curves
+
+
+def test_sticks_mean_to_the_vehicle_what_they_meant_in_training() -> None:
+    raw, mapped = px4_flight(), px4_flight(StickGains())
+    message: Any = raw.message(raw.send(WANTED))
+    assert (message.x, message.y, message.z) == (100, -300, 750)
+    encoded = mapped.send(WANTED)
+    message = mapped.message(encoded)
+    curves = PX4.stick_curves(PX4_VALUES, "ALTCTL", StickGains())
+    throttle, yaw, pitch, roll = curves.to_vehicle(WANTED)
+    assert abs(message.r - 1000 * yaw) <= 9  # and the nudge
+    expected = (1000 * pitch, 1000 * roll, 500 * (throttle + 1))
+    assert (message.x, message.y, message.z) == pytest.approx(expected, abs=0.51)
+    assert yaw > 2 * WANTED.yaw
+    assert encoded.action == pytest.approx(WANTED, abs=0.01)
+
+
+def test_the_curves_follow_the_mode_at_once_and_the_parameters_soon() -> None:
+    flight = px4_flight(StickGains())
+    before = flight.send(WANTED).shown
+    flight.vehicle.mode = "POSCTL"  # where sticks are something else
+    assert flight.send(WANTED).shown[:3] == (100, -300, 750)  # type: ignore[index]
+    flight.vehicle.mode = "ALTCTL"
+    assert flight.send(WANTED).shown[:3] == before[:3]  # type: ignore[index]
+    flight.vehicle.known_params["MPC_MAN_TILT_MAX"] = 20.0
+    flight.now_ns += 500 * MS
+    assert flight.send(WANTED).shown[1] < before[1]  # type: ignore[index]
+
+
+def test_the_pilots_sticks_are_told_as_the_policy_would_mean_them() -> None:
+    flight = px4_flight(StickGains())
+    curves = PX4.stick_curves(PX4_VALUES, "ALTCTL", StickGains())
+    status = flight.vehicle.status(0)
+    theirs = replace(status, rc_sticks=curves.to_vehicle(WANTED), pilot_sticks=NEUTRAL)
+    told = flight.output.in_policy_terms(theirs, flight.session, flight.now_ns)
+    assert told is not None
+    assert told.rc_sticks == pytest.approx(WANTED, abs=1e-6)
+    assert told.pilot_sticks == pytest.approx(NEUTRAL)
+    assert px4_flight().output.in_policy_terms(theirs, flight.session, flight.now_ns) is theirs
+
+
+def test_what_the_vehicle_cannot_do_is_told_once_and_counted() -> None:
+    flight = px4_flight(StickGains(climb_mps=6.0))
+    for _ in range(100):
+        flight.send(Sticks(1.0, 0.0, 0.0, 0.0))
+    (note, *others) = flight.output.take_notes()
+    assert "climbs 3 m/s at most" in " ".join((note, *others))
+    assert flight.output.take_notes() == ()
+    assert flight.output.saturated == {"throttle": 100}
+
+
+# --- MANUAL_CONTROL
+
+
+def test_px4_shows_our_sticks_rounded_down() -> None:
+    flight = px4_flight()
+    for k in range(200):
+        echo(flight, Sticks(0.3, 0.2, -0.1, k / 1000), lost=k % 2)
+        assert flight.problem is None
+    assert flight.output.echo_confirmed
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (ManualControl(300, 0, 700, 0), "another station sends sticks"),
+        (ManualControl(0, 0, 500, 0), "does not hear our sticks"),
+        (None, "no MANUAL_CONTROL arrive"),
+    ],
+)
+def test_what_px4_acts_on_instead_of_our_sticks_is_told(
+    shown: ManualControl | None, expected: str
+) -> None:
+    flight = px4_flight()
+    for _ in range(50):
+        echo(flight, NEUTRAL)
+    since_ns = flight.now_ns
+    while flight.problem is None and flight.now_ns - since_ns < 2000 * MS:
+        flight.send(NEUTRAL)
+        if shown is not None:
+            flight.receive(shown)
+    assert expected in (flight.problem or "")
+    assert flight.now_ns - since_ns < 500 * MS
+
+
+@pytest.mark.parametrize(
+    ("mode", "has_receiver", "last"),
+    [
+        ("ALTCTL", False, (0, 0, 500, 0)),
+        ("STABILIZED", False, (0, 0, 650, 0)),  # where the middle of the throttle is thrust
+        ("ALTCTL", True, None),
+        ("AUTO.LOITER", False, None),  # which would take them for a pilot's hand
+        ("OFFBOARD", False, None),
+    ],
+)
+def test_the_last_sticks_are_neutral_ones_where_nobody_elses_are_flown(
+    mode: str, has_receiver: bool, last: tuple[int, ...] | None
+) -> None:
+    flight = px4_flight()
+    flight.vehicle.mode, flight.vehicle.has_receiver = mode, has_receiver
+    flight.send(Sticks(0.3, 0.2, 0.5, -0.5))
+    packet = flight.output.release_packet(flight.session, flight.now_ns)
+    if last is None:
+        assert packet is None
+        return
+    assert packet is not None
+    ((message),) = flight.end.read(packet)
+    assert (message.x, message.y, message.z, message.r) == last
+
+
+def test_the_pilots_sticks_are_those_that_px4_shows_without_ours() -> None:
+    flight = px4_flight()
+    assert flight.status.rc_sticks is None
+    flight.receive(ManualControl(100, -200, 750, 300))
+    pilot = Sticks(throttle=0.5, yaw=0.3, pitch=0.1, roll=-0.2)
+    assert flight.status.rc_sticks == flight.status.pilot_sticks == pilot
+    assert flight.status.rc_arrived_ns == flight.now_ns
+    echo(flight, NEUTRAL)
+    assert flight.status.rc_sticks == pytest.approx(NEUTRAL, abs=0.01)
+    assert flight.status.pilot_sticks == pilot
+
+
+def test_sticks_are_released_once_others_are_shown_or_none() -> None:
+    for shown in (ManualControl(200, 0, 400, 0), None):
+        flight = px4_flight()
+        for _ in range(20):
+            echo(flight, NEUTRAL)
+        flight.output.released()
+        flight.now_ns += 600 * MS
+        assert not flight.is_released
+        if shown is not None:
+            flight.receive(shown)
+        else:
+            flight.now_ns += 150 * MS
+        assert flight.is_released
+
+
+# --- overrides
+
+
+def test_overrides_hide_the_receiver_from_the_first_one_on() -> None:
+    flight = copter_flight()
+    rest = RcChannels((1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500), 1)
+    flight.receive(rest)
+    assert not flight.vehicle.is_receiver_hidden
+    flight.send(NEUTRAL)
+    flight.receive(rest._replace(boot_us=2))
+    assert flight.vehicle.is_receiver_hidden
+    assert not flight.vehicle.is_released
+
+
+def test_other_actions_than_sticks_are_refused() -> None:
+    for flight in (px4_flight(), copter_flight()):
+        with pytest.raises(CommandRefusedError, match="not sticks"):
+            flight.send(AttitudeThrust(0.5, 0.0, 0.0, 0.0))
+
+
+def test_idle_sticks_leave_by_both() -> None:
+    message: Any = px4_flight().message(px4_flight().send(IDLE))
+    assert message.z == 0
+    message = copter_flight().message(copter_flight().send(IDLE))
+    assert message.chan3_raw == 1100
+    descends_fast = px4_flight(StickGains(descent_mps=0.5))
+    message = descends_fast.message(descends_fast.send(IDLE))
+    assert message.z == 0  # the stop, and not half a metre a second
+
+
+# --- the choice
+
+USUAL: dict[tuple[str, ActionKind], Output] = {
+    ("ardupilot", "sticks"): "rc-override",
+    ("px4", "sticks"): "manual-control",
+}
+
+
+@pytest.mark.parametrize("profile", [ARDUPILOT, PX4], ids=lambda profile: profile.name)
+@pytest.mark.parametrize("kind", ["sticks", "attitude", "rates", "velocity"])
+def test_the_usual_output_follows_from_action_and_firmware(
+    profile: Profile, kind: ActionKind
+) -> None:
+    chosen = choose_output(ActionMeaning(kind=kind), None, profile, codec())
+    assert chosen.name == USUAL.get((profile.name, kind), kind)
+    assert chosen.is_sticks == (kind == "sticks")
+
+
+@pytest.mark.parametrize(
+    ("profile", "kind", "output", "advice"),
+    [
+        (PX4, "sticks", "rc-override", "--output manual-control"),
+        (ARDUPILOT, "sticks", "manual-control", "--output rc-override"),
+        (ARDUPILOT, "sticks", "velocity", "--output auto, which is rc-override here"),
+        (PX4, "velocity", "manual-control", "--output auto, which is velocity here"),
+        (PX4, "rates", "attitude", "--output auto, which is rates here"),
+    ],
+)
+def test_an_output_that_makes_no_sense_is_refused(
+    profile: Profile, kind: ActionKind, output: Output, advice: str
+) -> None:
+    with pytest.raises(PeerError, match=advice):
+        choose_output(ActionMeaning(kind=kind), output, profile, codec())
