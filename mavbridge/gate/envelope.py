@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.rotation import tilt_rad
 from mavbridge.core.vehicle import Reading, Telemetry, VehicleStatus
 
 READING_PERSIST_NS = 50 * NS_PER_MS
@@ -115,7 +116,9 @@ class Envelope:
     def _findings(self, vehicle: EnvelopeInput) -> Iterator[_Finding]:
         limits, telemetry, now_ns = self._limits, vehicle.telemetry, vehicle.now_ns
         if reading := self._fresh("tilt", limits.tilt_deg, telemetry.ned_from_body_wxyz, now_ns):
-            problem = _beyond("tilt", _tilt_deg(reading.values), limits.tilt_deg, "deg")
+            problem = _beyond(
+                "tilt", math.degrees(tilt_rad(reading.values)), limits.tilt_deg, "deg"
+            )
             yield _Finding("tilt", problem, reading.arrived_ns, READING_PERSIST_NS)
         if reading := self._fresh("speed", limits.speed_mps, telemetry.velocity_ned_mps, now_ns):
             problem = _beyond("speed", math.hypot(*reading.values), limits.speed_mps, "m/s")
@@ -183,9 +186,3 @@ def _beyond(name: str, value: float, limit: float, unit: str) -> str | None:
     if value <= limit:
         return None
     return f"{name} {value:.1f} {unit} is beyond {limit:g} {unit} (--max-{name})"
-
-
-def _tilt_deg(ned_from_body_wxyz: tuple[float, ...]) -> float:
-    """Angle between body down and world down: 0 upright, 180 upside down."""
-    _, x, y, _ = ned_from_body_wxyz
-    return math.degrees(2 * math.asin(min(math.hypot(x, y), 1.0)))

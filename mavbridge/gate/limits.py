@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from mavbridge.core.rotation import heading_rad, roll_pitch_rad
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
@@ -143,21 +144,20 @@ def first_action(meaning: ActionMeaning, telemetry: Telemetry, pilot: Sticks | N
     ``pilot`` are the sticks that the vehicle follows now; None = not known.
     """
     attitude, velocity = telemetry.ned_from_body_wxyz, telemetry.velocity_ned_mps
-    w, x, y, z = attitude.values if attitude else (1.0, 0.0, 0.0, 0.0)
+    ned_from_body_wxyz = attitude.values if attitude else (1.0, 0.0, 0.0, 0.0)
     match meaning.kind:
         case "sticks":
             return pilot or NEUTRAL
         case "rates":
             return BodyRates(meaning.hover_thrust, 0.0, 0.0, 0.0)
         case "attitude":
-            roll_rad = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-            pitch_rad = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
+            roll_rad, pitch_rad = roll_pitch_rad(ned_from_body_wxyz)
             share = MOST_FIRST_LEAN_RAD / max(math.hypot(roll_rad, pitch_rad), MOST_FIRST_LEAN_RAD)
             return AttitudeThrust(meaning.hover_thrust, share * roll_rad, share * pitch_rad, 0.0)
         case "velocity":
             north, east, down = velocity.values if velocity else (0.0, 0.0, 0.0)
             if meaning.is_heading_frame:
-                heading_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-                cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+                yaw_rad = heading_rad(ned_from_body_wxyz)
+                cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
                 north, east = cos * north + sin * east, cos * east - sin * north
             return Velocity(north, east, down, 0.0)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.rotation import Quaternion, tilt_rad
 from mavbridge.core.vehicle import Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
 from mavbridge.mavlink.codec.fast_path import decode_state_packet, pack_override
@@ -20,7 +21,6 @@ from mavbridge.mavlink.codec.messages import (
     StreamRequest,
 )
 from mavbridge.mavlink.codec.readers import READERS, UnusableError
-from mavbridge.mavlink.codec.rotation import Quaternion, tilt_rad
 
 RELEASE_US = 0
 """RC_CHANNELS_OVERRIDE ch 1-8: give the channel back to the receiver."""

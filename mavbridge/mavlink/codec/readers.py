@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.rotation import quaternion_from_euler
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Attitude,
@@ -29,7 +30,6 @@ from mavbridge.mavlink.codec.messages import (
     Timesync,
     VelocityTarget,
 )
-from mavbridge.mavlink.codec.rotation import quaternion_from_euler
 
 MG_TO_MPS2 = 9.80665e-3
 """Milli-g to m/s^2, standard gravity."""

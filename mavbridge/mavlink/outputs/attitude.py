@@ -3,10 +3,10 @@
 import math
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.rotation import heading_rad, quaternion_from_euler, tilt_rad
 from mavbridge.core.vehicle import Action, ActionMeaning, AttitudeThrust, BodyRates, Output
 from mavbridge.mavlink.codec.messages import Attitude, AttitudeTarget, Body, SpecificForce
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
-from mavbridge.mavlink.codec.rotation import heading_rad, quaternion_from_euler, tilt_rad
 from mavbridge.mavlink.outputs.echo import EchoRules, Shown
 from mavbridge.mavlink.outputs.hover import PLAUSIBLE_THRUST, HoverThrust
 from mavbridge.mavlink.outputs.output import Encoded

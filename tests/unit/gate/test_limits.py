@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mavbridge.core.rotation import quaternion_from_euler, tilt_rad
 from mavbridge.core.vehicle import (
     ACTION_CLASSES,
     IDLE,
@@ -24,7 +25,6 @@ from mavbridge.core.vehicle import (
 from mavbridge.gate.limits import LimitSettings, first_action, idle_action, neutral_action
 from mavbridge.gate.smoothing import ActionSmoother, Smoothing
 from mavbridge.mavlink.codec.packets import MOST_LEAN_RAD
-from mavbridge.mavlink.codec.rotation import quaternion_from_euler, tilt_rad
 
 SETTINGS = LimitSettings(
     lean_rad=0.5, rate_radps=3.0, yaw_rate_radps=1.0, thrust=0.8, speed_mps=5.0, climb_mps=2.0

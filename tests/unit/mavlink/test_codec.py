@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.wire import ARDUPILOT, WireEnd
+from mavbridge.core.rotation import heading_rad, quaternion_from_euler, tilt_rad
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks, Velocity
 from mavbridge.mavlink.codec.messages import (
     Altitude,
@@ -39,7 +40,6 @@ from mavbridge.mavlink.codec.packets import (
     manual_control_sticks,
     pwm_of,
 )
-from mavbridge.mavlink.codec.rotation import heading_rad, quaternion_from_euler, tilt_rad
 
 TARGET = Endpoint(1, 1)
 m = dialect.MAVLink(None)

@@ -7,6 +7,7 @@ import pytest
 
 from helpers.flown_vehicle import Flight, FlownVehicle, codec
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.rotation import heading_rad, quaternion_from_euler
 from mavbridge.core.vehicle import NEUTRAL, ActionMeaning, AttitudeThrust, BodyRates, Velocity
 from mavbridge.mavlink.codec.messages import (
     Attitude,
@@ -15,7 +16,6 @@ from mavbridge.mavlink.codec.messages import (
     VelocityTarget,
 )
 from mavbridge.mavlink.codec.packets import CommandRefusedError
-from mavbridge.mavlink.codec.rotation import heading_rad, quaternion_from_euler
 from mavbridge.mavlink.outputs.attitude import MOST_LEAD_RAD, AttitudeOutput, HeadingTarget
 from mavbridge.mavlink.outputs.setpoints import HELD_NS
 from mavbridge.mavlink.outputs.velocity import VelocityOutput
