@@ -6,7 +6,7 @@ withheld until the estimator has one.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
@@ -14,14 +14,22 @@ from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
 from sitl.link.framing import Message
-from sitl.rotation import Vec3, conjugate, rotate, to_euler
+from sitl.link.telemetry import (
+    INT16,
+    Home,
+    boot_ms,
+    boot_us,
+    heading,
+    int16,
+    servo_output_raw,
+    yaw_rad,
+)
+from sitl.rotation import Vec3, to_euler
 from sitl.vehicle.config import ArduPilotRelease
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 
-HOME_LAT_DEG, HOME_LON_DEG, HOME_ALT_M = -35.3632621, 149.1652374, 584.0
+HOME = Home(-35.3632621, 149.1652374, 584.0, field_ned_gauss=(0.2322, 0.0520, -0.5280))
 """ArduPilot SITL's default home."""
-METRES_PER_DEGREE = 111_319.5
-EARTH_FIELD_GAUSS: Vec3 = (0.2322, 0.0520, -0.5280)
 GYRO_BIAS_RADPS: Vec3 = (0.003, -0.002, 0.001)
 """Subtracted by the estimator; raw IMU messages still carry it."""
 GROUND_PRESSURE_HPA = 945.0
@@ -63,45 +71,12 @@ _EKF_HORIZONTAL = (
 _VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: all but velocity and acceleration
 _POSITION_ONLY = 3576  # all but the position
 _IMU_FIELDS_UPDATED = 8191
-_INT16 = 32767
-
-
-def _ms(ap: Autopilot) -> int:
-    return ap.uptime_ns // 1_000_000
-
-
-def _us(ap: Autopilot) -> int:
-    return ap.uptime_ns // 1_000
-
-
-def _int16(values: Iterable[float], scale: float) -> list[int]:
-    return [max(-_INT16, min(_INT16, round(scale * value))) for value in values]
-
-
-def _heading(angle_rad: float, units_per_degree: float = 1.0) -> int:
-    """From 0 to below a full turn."""
-    full_turn = round(360 * units_per_degree)
-    return round(math.degrees(angle_rad) % 360.0 * units_per_degree) % full_turn
-
-
-def _yaw_rad(ap: Autopilot) -> float:
-    return to_euler(ap.sensed.ned_from_body_wxyz)[2]
 
 
 def _raw_gyro(ap: Autopilot) -> tuple[float, ...]:
     return tuple(
         rate + bias for rate, bias in zip(ap.sensed.rate_body_radps, GYRO_BIAS_RADPS, strict=True)
     )
-
-
-def _mag_gauss(ap: Autopilot) -> Vec3:
-    return rotate(conjugate(ap.sensed.ned_from_body_wxyz), EARTH_FIELD_GAUSS)
-
-
-def _lat_lon_e7(north_m: float, east_m: float) -> tuple[int, int]:
-    lat = HOME_LAT_DEG + north_m / METRES_PER_DEGREE
-    lon = HOME_LON_DEG + east_m / (METRES_PER_DEGREE * math.cos(math.radians(HOME_LAT_DEG)))
-    return round(lat * 1e7), round(lon * 1e7)
 
 
 def _heartbeat(ap: Autopilot) -> Message:
@@ -123,25 +98,10 @@ def _heartbeat(ap: Autopilot) -> Message:
     )
 
 
-def _global_position_int(ap: Autopilot) -> Message | None:
-    """Relative altitude counts from the same home."""
-    if not ap.position_ready:
-        return None
-    north, east, down = ap.sensed.position_ned_m
-    return mav.MAVLink_global_position_int_message(
-        _ms(ap),
-        *_lat_lon_e7(north, east),
-        round(1000.0 * (HOME_ALT_M - down)),
-        round(-1000.0 * down),
-        *_int16(ap.sensed.velocity_ned_mps, 100.0),
-        _heading(_yaw_rad(ap), 100.0),
-    )
-
-
 def _scaled_imu_fields(ap: Autopilot) -> tuple[int, ...]:
     """Acceleration in milli-g, gyro in mrad/s, field in mGauss."""
     accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
-    return (*_int16(accel, 1.0), *_int16(_raw_gyro(ap), 1000.0), *_int16(_mag_gauss(ap), 1000.0))
+    return (*int16(accel, 1.0), *int16(_raw_gyro(ap), 1000.0), *int16(HOME.mag_gauss(ap), 1000.0))
 
 
 def _highres_imu(ap: Autopilot) -> Message:
@@ -149,32 +109,26 @@ def _highres_imu(ap: Autopilot) -> Message:
     height = -ap.sensed.position_ned_m[2]
     pressure = GROUND_PRESSURE_HPA * math.exp(-height / 8434.0)
     return mav.MAVLink_highres_imu_message(
-        _us(ap),
+        boot_us(ap),
         *ap.sensed.specific_force_body_mps2,
         *_raw_gyro(ap),
-        *(1e6 * b for b in _mag_gauss(ap)),
+        *(1e6 * b for b in HOME.mag_gauss(ap)),
         pressure,
         pressure - GROUND_PRESSURE_HPA,
-        HOME_ALT_M + height,
+        HOME.alt_m + height,
         TEMPERATURE_CDEG / 100.0,
         _IMU_FIELDS_UPDATED,
         0,
     )
 
 
-def _servo_output_raw(ap: Autopilot) -> Message:
-    """Motors at 1000..2000 us."""
-    motors = (round(1000.0 + 1000.0 * m) for m in ap.motor_commands)
-    return mav.MAVLink_servo_output_raw_message(_us(ap) & 0xFFFFFFFF, 0, *motors, 0, 0, 0, 0)
-
-
 def _vfr_hud(ap: Autopilot) -> Message:
     north, east, down = ap.sensed.velocity_ned_mps
     speed = math.hypot(north, east)
     throttle = round(100.0 * sum(ap.motor_commands) / len(ap.motor_commands))
-    altitude = HOME_ALT_M - ap.sensed.position_ned_m[2] if ap.has_gps else 0.0
+    altitude = HOME.alt_m - ap.sensed.position_ned_m[2] if ap.has_gps else 0.0
     return mav.MAVLink_vfr_hud_message(
-        speed, speed, _heading(_yaw_rad(ap)), throttle, altitude, -down
+        speed, speed, heading(yaw_rad(ap)), throttle, altitude, -down
     )
 
 
@@ -214,14 +168,14 @@ def _gps_raw_int(ap: Autopilot) -> Message:
     north, east, down = ap.gps.position_ned_m
     vn, ve, _ = ap.gps.velocity_ned_mps
     return mav.MAVLink_gps_raw_int_message(
-        _us(ap),
+        boot_us(ap),
         mav.GPS_FIX_TYPE_3D_FIX,
-        *_lat_lon_e7(north, east),
-        round(1000.0 * (HOME_ALT_M - down)),
+        *HOME.lat_lon_e7(north, east),
+        round(1000.0 * (HOME.alt_m - down)),
         121,
         200,
         round(100.0 * math.hypot(vn, ve)),
-        _heading(math.atan2(ve, vn), 100.0),
+        heading(math.atan2(ve, vn), 100.0),
         10,
     )
 
@@ -235,7 +189,7 @@ def _battery_status(ap: Autopilot) -> Message:
         0,
         function,
         chemistry,
-        _INT16,
+        INT16,
         [pack_mv] + [65535] * 9,
         current_ca,
         0,
@@ -256,15 +210,6 @@ def _extended_sys_state(ap: Autopilot) -> Message:
     return mav.MAVLink_extended_sys_state_message(mav.MAV_VTOL_STATE_UNDEFINED, state)
 
 
-def _home_position(ap: Autopilot) -> Message | None:
-    if not ap.position_ready:
-        return None
-    altitude_mm, level = round(HOME_ALT_M * 1000.0), [1.0, 0.0, 0.0, 0.0]
-    return mav.MAVLink_home_position_message(
-        *_lat_lon_e7(0.0, 0.0), altitude_mm, 0.0, 0.0, 0.0, level, 0.0, 0.0, 0.0
-    )
-
-
 def _autopilot_version(ap: Autopilot) -> Message:
     unique = ap.params.integer("MAV_SYSID")
     no_hash = [0] * 8
@@ -277,7 +222,9 @@ def _autopilot_version(ap: Autopilot) -> Message:
 def _attitude_target(ap: Autopilot) -> Message:
     """The controller's shaped target, whatever was sent; thrust before the boost for a lean."""
     attitude, rate_radps = ap.control.target
-    return mav.MAVLink_attitude_target_message(_ms(ap), 0, attitude, *rate_radps, ap.control.thrust)
+    return mav.MAVLink_attitude_target_message(
+        boot_ms(ap), 0, attitude, *rate_radps, ap.control.thrust
+    )
 
 
 def _position_target(ap: Autopilot) -> Message | None:
@@ -287,7 +234,7 @@ def _position_target(ap: Autopilot) -> Message | None:
         return None
     is_takeoff = guided.submode is Submode.TAKEOFF
     return mav.MAVLink_position_target_local_ned_message(
-        _ms(ap),
+        boot_ms(ap),
         mav.MAV_FRAME_LOCAL_NED,
         _POSITION_ONLY if is_takeoff else _VELOCITY_ONLY,
         *(0.0, 0.0, 0.0),  # also during a takeoff, as the firmware has it
@@ -300,48 +247,48 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
     # No date: the vehicle has no wall clock.
-    mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(0, _ms(ap)),
+    mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(0, boot_ms(ap)),
     mav.MAVLINK_MSG_ID_GPS_RAW_INT: _gps_raw_int,
     mav.MAVLINK_MSG_ID_SCALED_IMU: lambda ap: mav.MAVLink_scaled_imu_message(
-        _ms(ap), *_scaled_imu_fields(ap), TEMPERATURE_CDEG
+        boot_ms(ap), *_scaled_imu_fields(ap), TEMPERATURE_CDEG
     ),
     # Scaled integers in spite of its name.
     mav.MAVLINK_MSG_ID_RAW_IMU: lambda ap: mav.MAVLink_raw_imu_message(
-        _us(ap), *_scaled_imu_fields(ap), 0, TEMPERATURE_CDEG
+        boot_us(ap), *_scaled_imu_fields(ap), 0, TEMPERATURE_CDEG
     ),
     mav.MAVLINK_MSG_ID_ATTITUDE: lambda ap: mav.MAVLink_attitude_message(
-        _ms(ap), *to_euler(ap.sensed.ned_from_body_wxyz), *ap.sensed.rate_body_radps
+        boot_ms(ap), *to_euler(ap.sensed.ned_from_body_wxyz), *ap.sensed.rate_body_radps
     ),
     mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: lambda ap: mav.MAVLink_attitude_quaternion_message(
-        _ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
+        boot_ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
     ),
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: lambda ap: (
         mav.MAVLink_local_position_ned_message(
-            _ms(ap), *ap.sensed.position_ned_m, *ap.sensed.velocity_ned_mps
+            boot_ms(ap), *ap.sensed.position_ned_m, *ap.sensed.velocity_ned_mps
         )
         if ap.position_ready
         else None
     ),
-    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _global_position_int,
+    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: HOME.global_position_int,
     mav.MAVLINK_MSG_ID_RC_CHANNELS_RAW: lambda _: None,  # accepted by the firmware, never sent
-    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: _servo_output_raw,
+    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: servo_output_raw,
     # The values after overrides.
     mav.MAVLINK_MSG_ID_RC_CHANNELS: lambda ap: mav.MAVLink_rc_channels_message(
-        _ms(ap), ap.rc.channel_count, *ap.rc.channels_us, 0, 0, 255
+        boot_ms(ap), ap.rc.channel_count, *ap.rc.channels_us, 0, 0, 255
     ),
     mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
     mav.MAVLINK_MSG_ID_OPTICAL_FLOW: lambda _: None,  # accepted by the firmware, never sent
     mav.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
     # The second IMU agrees with the first.
     mav.MAVLINK_MSG_ID_SCALED_IMU2: lambda ap: mav.MAVLink_scaled_imu2_message(
-        _ms(ap), *_scaled_imu_fields(ap), TEMPERATURE_CDEG
+        boot_ms(ap), *_scaled_imu_fields(ap), TEMPERATURE_CDEG
     ),
     mav.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
     mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
-    mav.MAVLINK_MSG_ID_HOME_POSITION: _home_position,
+    mav.MAVLINK_MSG_ID_HOME_POSITION: HOME.home_position,
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended_sys_state,
 }
 """Every message that can be streamed or requested; None where there is nothing to report yet."""

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.link.endpoint import MavlinkEndpoint
-from sitl.px4.link.messages import HOME_ALT_M
+from sitl.px4.link.messages import HOME
 from sitl.px4.modes import Mode, mode_of
 
 ACCEPTED: int = mav.MAV_RESULT_ACCEPTED
@@ -57,7 +57,7 @@ def _arm_disarm(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int |
 
 def _takeoff(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int:
     """Param 7 is an altitude above sea level; NaN: MIS_TAKEOFF_ALT above here."""
-    height_m = params[6] - HOME_ALT_M
+    height_m = params[6] - HOME.alt_m
     ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
     return ACCEPTED if ap.commander.set_mode(Mode.AUTO_TAKEOFF) else REJECTED
 

@@ -6,18 +6,28 @@ here by their definitions in MAVLink's common and development sets.
 
 import math
 import struct
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.link.framing import Message
+from sitl.link.telemetry import (
+    INT16,
+    Home,
+    boot_ms,
+    boot_us,
+    heading,
+    int16,
+    servo_output_raw,
+    yaw_rad,
+)
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.events import Event
 from sitl.px4.link.streams import CURRENT_MODE, at_rate
 from sitl.px4.modes import Mode
 from sitl.px4.setpoints import VelocitySetpoint
-from sitl.rotation import Vec3, conjugate, rotate, to_euler
+from sitl.rotation import conjugate, rotate, to_euler
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 
 EVENT = 410
@@ -26,10 +36,8 @@ _EVENT = struct.Struct("<IIHBBB40s")
 _CURRENT_MODE = struct.Struct("<IIB")
 EVENT_ARGUMENT_BYTES = 40
 
-HOME_LAT_DEG, HOME_LON_DEG, HOME_ALT_M = 47.397743, 8.545594, 489.4
+HOME = Home(47.397743, 8.545594, 489.4, field_ned_gauss=(0.215, 0.0118, 0.4307))
 """PX4 SIH's default home."""
-METRES_PER_DEGREE = 111_319.5
-EARTH_FIELD_GAUSS: Vec3 = (0.215, 0.0118, 0.4307)
 GROUND_PRESSURE_HPA = 955.6
 TEMPERATURE_C = 25.0
 
@@ -51,7 +59,6 @@ _STANDARD_MODES = {
 _STATE_UNINIT, _STATE_STANDBY, _STATE_ACTIVE = 0, 3, 4
 _STATE_CRITICAL, _STATE_TERMINATED = 5, 8
 _IMU_FIELDS_UPDATED = 0x1FFF
-_INT16 = 32767
 _ODOMETRY_COVARIANCE = [math.nan, *[0.0] * 20]
 
 
@@ -81,37 +88,6 @@ def _current_mode(ap: Autopilot) -> Message:
     standard = _STANDARD_MODES.get(ap.mode, 0)
     payload = _CURRENT_MODE.pack(ap.mode.custom_mode, intended.custom_mode, standard)
     return HandPacked(CURRENT_MODE, "CURRENT_MODE", payload, CURRENT_MODE_CRC_EXTRA)
-
-
-def _ms(ap: Autopilot) -> int:
-    return ap.uptime_ns // 1_000_000
-
-
-def _us(ap: Autopilot) -> int:
-    return ap.uptime_ns // 1_000
-
-
-def _int16(values: Iterable[float], scale: float) -> list[int]:
-    return [max(-_INT16, min(_INT16, round(scale * value))) for value in values]
-
-
-def _yaw_rad(ap: Autopilot) -> float:
-    return to_euler(ap.sensed.ned_from_body_wxyz)[2]
-
-
-def _heading(angle_rad: float, units_per_degree: float = 1.0) -> int:
-    full_turn = round(360 * units_per_degree)
-    return round(math.degrees(angle_rad) % 360.0 * units_per_degree) % full_turn
-
-
-def _mag_gauss(ap: Autopilot) -> Vec3:
-    return rotate(conjugate(ap.sensed.ned_from_body_wxyz), EARTH_FIELD_GAUSS)
-
-
-def _lat_lon_e7(north_m: float, east_m: float) -> tuple[int, int]:
-    lat = HOME_LAT_DEG + north_m / METRES_PER_DEGREE
-    lon = HOME_LON_DEG + east_m / (METRES_PER_DEGREE * math.cos(math.radians(HOME_LAT_DEG)))
-    return round(lat * 1e7), round(lon * 1e7)
 
 
 def _heartbeat(ap: Autopilot) -> Message:
@@ -157,14 +133,14 @@ def _gps_raw_int(ap: Autopilot) -> Message:
     north, east, down = ap.gps.position_ned_m
     vn, ve, _ = ap.gps.velocity_ned_mps
     return mav.MAVLink_gps_raw_int_message(
-        _us(ap),
+        boot_us(ap),
         mav.GPS_FIX_TYPE_NO_FIX if ap.position_lost else mav.GPS_FIX_TYPE_3D_FIX,
-        *_lat_lon_e7(north, east),
-        round(1000.0 * (HOME_ALT_M - down)),
+        *HOME.lat_lon_e7(north, east),
+        round(1000.0 * (HOME.alt_m - down)),
         70,
         110,
         round(100.0 * math.hypot(vn, ve)),
-        _heading(math.atan2(ve, vn), 100.0),
+        heading(math.atan2(ve, vn), 100.0),
         10,
     )
 
@@ -173,13 +149,13 @@ def _highres_imu(ap: Autopilot) -> Message:
     height = -ap.sensed.position_ned_m[2]
     pressure = GROUND_PRESSURE_HPA * math.exp(-height / 8434.0)
     return mav.MAVLink_highres_imu_message(
-        _us(ap),
+        boot_us(ap),
         *ap.sensed.specific_force_body_mps2,
         *ap.sensed.rate_body_radps,
-        *_mag_gauss(ap),
+        *HOME.mag_gauss(ap),
         pressure,
         0.0,
-        HOME_ALT_M + height,
+        HOME.alt_m + height,
         TEMPERATURE_C,
         _IMU_FIELDS_UPDATED,
         0,
@@ -188,23 +164,9 @@ def _highres_imu(ap: Autopilot) -> Message:
 
 def _scaled_imu(ap: Autopilot) -> Message:
     accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
-    gyro, field = _int16(ap.sensed.rate_body_radps, 1000.0), _int16(_mag_gauss(ap), 1000.0)
+    gyro, field = int16(ap.sensed.rate_body_radps, 1000.0), int16(HOME.mag_gauss(ap), 1000.0)
     return mav.MAVLink_scaled_imu_message(
-        _ms(ap), *_int16(accel, 1.0), *gyro, *field, round(100.0 * TEMPERATURE_C)
-    )
-
-
-def _global_position_int(ap: Autopilot) -> Message | None:
-    if not ap.position_ready:
-        return None
-    north, east, down = ap.sensed.position_ned_m
-    return mav.MAVLink_global_position_int_message(
-        _ms(ap),
-        *_lat_lon_e7(north, east),
-        round(1000.0 * (HOME_ALT_M - down)),
-        round(-1000.0 * down),
-        *_int16(ap.sensed.velocity_ned_mps, 100.0),
-        _heading(_yaw_rad(ap), 100.0),
+        boot_ms(ap), *int16(accel, 1.0), *gyro, *field, round(100.0 * TEMPERATURE_C)
     )
 
 
@@ -213,7 +175,7 @@ def _local_position_ned(ap: Autopilot) -> Message:
     (north, east, down), (vn, ve, vd) = ap.sensed.position_ned_m, ap.sensed.velocity_ned_mps
     if not ap.position_ready:
         north = east = vn = ve = 0.0
-    return mav.MAVLink_local_position_ned_message(_ms(ap), north, east, down, vn, ve, vd)
+    return mav.MAVLink_local_position_ned_message(boot_ms(ap), north, east, down, vn, ve, vd)
 
 
 def _odometry(ap: Autopilot) -> Message:
@@ -221,7 +183,7 @@ def _odometry(ap: Autopilot) -> Message:
     body = ap.sensed
     velocity = rotate(conjugate(body.ned_from_body_wxyz), body.velocity_ned_mps)
     return mav.MAVLink_odometry_message(
-        _us(ap),
+        boot_us(ap),
         mav.MAV_FRAME_LOCAL_NED,
         mav.MAV_FRAME_BODY_FRD,
         *body.position_ned_m,
@@ -236,18 +198,12 @@ def _odometry(ap: Autopilot) -> Message:
     )
 
 
-def _servo_output_raw(ap: Autopilot) -> Message:
-    """Motors at 1000..2000 us."""
-    motors = (round(1000.0 + 1000.0 * m) for m in ap.motor_commands)
-    return mav.MAVLink_servo_output_raw_message(_us(ap) & 0xFFFFFFFF, 0, *motors, 0, 0, 0, 0)
-
-
 def _rc_channels(ap: Autopilot) -> Message | None:
     """A receiver's channels; MANUAL_CONTROL never shows here."""
     if ap.receiver_us is None:
         return None
     channels = (*ap.receiver_us, *[65535] * 18)[:18]
-    return mav.MAVLink_rc_channels_message(_ms(ap), len(ap.receiver_us), *channels, 100)
+    return mav.MAVLink_rc_channels_message(boot_ms(ap), len(ap.receiver_us), *channels, 100)
 
 
 def _manual_control(ap: Autopilot) -> Message | None:
@@ -264,10 +220,10 @@ def _manual_control(ap: Autopilot) -> Message | None:
 def _vfr_hud(ap: Autopilot) -> Message:
     north, east, down = ap.sensed.velocity_ned_mps
     speed = math.hypot(north, east)
-    altitude = HOME_ALT_M - ap.sensed.position_ned_m[2]
+    altitude = HOME.alt_m - ap.sensed.position_ned_m[2]
     throttle = round(100.0 * ap.flight.thrust) if ap.armed else 0
     return mav.MAVLink_vfr_hud_message(
-        speed, speed, _heading(_yaw_rad(ap)), throttle, altitude, -down
+        speed, speed, heading(yaw_rad(ap)), throttle, altitude, -down
     )
 
 
@@ -275,7 +231,7 @@ def _attitude_target(ap: Autopilot) -> Message:
     """What the rate and attitude loops are asked for, in any mode."""
     flight = ap.flight
     return mav.MAVLink_attitude_target_message(
-        _ms(ap), 0, list(flight.attitude), *flight.rates_radps, flight.thrust
+        boot_ms(ap), 0, list(flight.attitude), *flight.rates_radps, flight.thrust
     )
 
 
@@ -283,7 +239,7 @@ def _position_target(ap: Autopilot) -> Message:
     none, flight = [math.nan] * 3, ap.flight
     turn = (math.nan, flight.yaw_rate_radps)
     return mav.MAVLink_position_target_local_ned_message(
-        _ms(ap), mav.MAV_FRAME_LOCAL_NED, 0, *none, *flight.velocity_ned_mps, *none, *turn
+        boot_ms(ap), mav.MAV_FRAME_LOCAL_NED, 0, *none, *flight.velocity_ned_mps, *none, *turn
     )
 
 
@@ -294,7 +250,7 @@ def _battery_status(ap: Autopilot) -> Message:
         0,
         mav.MAV_BATTERY_FUNCTION_ALL,
         mav.MAV_BATTERY_TYPE_LIPO,
-        _INT16,
+        INT16,
         [pack_mv] + [65535] * 9,
         current_ca,
         0,
@@ -313,16 +269,7 @@ def _estimator_status(ap: Autopilot) -> Message:
     if not ap.estimator_ready:
         flags = 0
     return mav.MAVLink_estimator_status_message(
-        _us(ap), flags, 0.02, 0.02, 0.02, 0.02, 0.0, 0.0, 0.2, 0.2
-    )
-
-
-def _home_position(ap: Autopilot) -> Message | None:
-    if not ap.position_ready:
-        return None
-    altitude_mm, level = round(HOME_ALT_M * 1000.0), [1.0, 0.0, 0.0, 0.0]
-    return mav.MAVLink_home_position_message(
-        *_lat_lon_e7(0.0, 0.0), altitude_mm, 0.0, 0.0, 0.0, level, 0.0, 0.0, 0.0
+        boot_us(ap), flags, 0.02, 0.02, 0.02, 0.02, 0.0, 0.0, 0.2, 0.2
     )
 
 
@@ -337,18 +284,18 @@ def _autopilot_version(ap: Autopilot) -> Message:
 BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
-    mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(0, _ms(ap)),
+    mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(0, boot_ms(ap)),
     mav.MAVLINK_MSG_ID_GPS_RAW_INT: _gps_raw_int,
     mav.MAVLINK_MSG_ID_SCALED_IMU: _scaled_imu,
     mav.MAVLINK_MSG_ID_ATTITUDE: lambda ap: mav.MAVLink_attitude_message(
-        _ms(ap), *to_euler(ap.sensed.ned_from_body_wxyz), *ap.sensed.rate_body_radps
+        boot_ms(ap), *to_euler(ap.sensed.ned_from_body_wxyz), *ap.sensed.rate_body_radps
     ),
     mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: lambda ap: mav.MAVLink_attitude_quaternion_message(
-        _ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
+        boot_ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
     ),
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position_ned,
-    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _global_position_int,
-    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: _servo_output_raw,
+    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: HOME.global_position_int,
+    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: servo_output_raw,
     mav.MAVLINK_MSG_ID_RC_CHANNELS: _rc_channels,
     mav.MAVLINK_MSG_ID_MANUAL_CONTROL: _manual_control,
     mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
@@ -360,7 +307,7 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     mav.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,
-    mav.MAVLINK_MSG_ID_HOME_POSITION: _home_position,
+    mav.MAVLINK_MSG_ID_HOME_POSITION: HOME.home_position,
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: lambda ap: mav.MAVLink_extended_sys_state_message(
         mav.MAV_VTOL_STATE_MC, ap.landed_state.value
     ),
