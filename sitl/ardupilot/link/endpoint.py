@@ -1,21 +1,17 @@
 """One MAVLink link of the vehicle, without I/O: bytes in, messages out, messages in, bytes out."""
 
-from collections import deque
-
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.link.messages import BUILDERS
 from sitl.ardupilot.link.streams import PARAM_SLOWDOWN, Streams
-from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.link.framing import Framing, Message
+from sitl.clock import NS_PER_S
+from sitl.link.endpoint import MAX_STATUSTEXT, VehicleEndpoint
 
 TIMESYNC_PERIOD_NS = 10 * NS_PER_S
-PARAM_PERIOD_NS = 4 * NS_PER_MS
-MAX_STATUSTEXT = 50
 
 
-class MavlinkEndpoint(Framing):
+class MavlinkEndpoint(VehicleEndpoint[Autopilot]):
     """Message intervals and the parameter list of one link.
 
     Intervals belong to the link, not to the sender that requested them; two ground stations on one
@@ -23,29 +19,21 @@ class MavlinkEndpoint(Framing):
     """
 
     def __init__(self, ap: Autopilot) -> None:
-        super().__init__()
+        super().__init__(BUILDERS, "MAV_SYSID")
         self.reboot_requested = False
         self.restart(ap)
 
     def restart(self, ap: Autopilot) -> None:
         """Begin again with a vehicle that has just booted; framing and sequence numbers go on."""
         self.reboot_requested = False
-        self._ap = ap
+        self._serve(ap)
         self._streams = Streams(BUILDERS, ap.now_ns, ap.config.conditions)
-        self._queued_params: deque[int] = deque()
-        self._param_due_ns = ap.now_ns
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
-
-    def send(self, message: Message) -> None:
-        """Queue a message."""
-        self.pack(message, self._ap.params.integer("MAV_SYSID"))
 
     def step(self) -> None:
         """Queue what is due by the vehicle's clock."""
         now_ns = self._ap.now_ns
-        if self._queued_params and now_ns >= self._param_due_ns:
-            self._param_due_ns = now_ns + PARAM_PERIOD_NS
-            self.send_param(self._queued_params.popleft())
+        self._send_next_param(now_ns)
         for message_id in self._streams.due(now_ns, PARAM_SLOWDOWN if self._queued_params else 1):
             self.send_now(message_id)
         if now_ns >= self._timesync_due_ns:
@@ -70,34 +58,8 @@ class MavlinkEndpoint(Framing):
         interval_us = self._streams.interval_us(message_id)
         self.send(mav.MAVLink_message_interval_message(message_id, interval_us))
 
-    def send_now(self, message_id: int) -> bool:
-        """Send one message, unless it has nothing to report yet; False if it is unknown."""
-        build = BUILDERS.get(message_id)
-        message = build(self._ap) if build else None
-        if message is not None:
-            self.send(message)
-        return build is not None
-
     def send_text(self, severity: int, text: str) -> None:
         """Send STATUSTEXT, in as many messages as the text needs."""
         for start in range(0, len(text), MAX_STATUSTEXT):
             chunk = text[start : start + MAX_STATUSTEXT].encode("ascii", "replace")
             self.send(mav.MAVLink_statustext_message(severity, chunk))
-
-    def send_all_params(self) -> None:
-        """Send every parameter from the first, a few hundred a second."""
-        self._queued_params = deque(range(len(self._ap.params.names)))
-
-    def send_param(self, index: int) -> None:
-        """Send PARAM_VALUE; ``index`` must exist."""
-        params = self._ap.params
-        name = params.names[index]
-        self.send(
-            mav.MAVLink_param_value_message(
-                name.encode(),
-                params.on_wire(name),
-                mav.MAV_PARAM_TYPE_REAL32,
-                len(params.names),
-                index,
-            )
-        )

@@ -1,26 +1,22 @@
 """One MAVLink link of a PX4 vehicle, without I/O: streams, texts, events and parameters."""
 
-from collections import deque
-
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.link.framing import Framing, Message
+from sitl.clock import NS_PER_S
+from sitl.link.endpoint import MAX_STATUSTEXT, VehicleEndpoint
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.events import Event
 from sitl.px4.link.messages import BUILDERS, event_message, topic_version
 from sitl.px4.link.streams import GCS_HZ, ONBOARD_HZ, Streams
 
-PARAM_PERIOD_NS = 4 * NS_PER_MS
-MAX_STATUSTEXT = 50
 _NEVER_STREAMED = (mav.MAVLINK_MSG_ID_HEARTBEAT,)
 
 
-class MavlinkEndpoint(Framing):
+class MavlinkEndpoint(VehicleEndpoint[Autopilot]):
     """A link to a ground station, or to a companion computer, which gets other streams."""
 
     def __init__(self, ap: Autopilot, *, is_onboard: bool) -> None:
-        super().__init__()
+        super().__init__(BUILDERS, "MAV_SYS_ID")
         self.heard: set[tuple[int, int]] = set()
         """Systems and components that have sent on this link."""
         self._is_onboard = is_onboard
@@ -29,25 +25,18 @@ class MavlinkEndpoint(Framing):
 
     def restart(self, ap: Autopilot) -> None:
         """Begin again with a vehicle that has just booted; framing and sequence numbers go on."""
-        self._ap = ap
+        self._serve(ap)
         self.has_gcs = False
         """A ground station's heartbeat has come; without one no text is sent."""
         defaults = ONBOARD_HZ if self._is_onboard else GCS_HZ
         self._streams = Streams(defaults, ap.config.link_bytes_ps, ap.now_ns)
-        self._queued_params: deque[int] = deque()
-        self._param_due_ns = self._heartbeat_due_ns = ap.now_ns
+        self._heartbeat_due_ns = ap.now_ns
         self._looked_ns = ap.now_ns
-
-    def send(self, message: Message) -> None:
-        """Queue a message."""
-        self.pack(message, self._ap.params.integer("MAV_SYS_ID"))
 
     def step(self, now_ns: int) -> None:
         """Queue what is due; streams are looked at once a control step, sticks at every call."""
         ap = self._ap
-        if self._queued_params and now_ns >= self._param_due_ns:
-            self._param_due_ns = now_ns + PARAM_PERIOD_NS
-            self.send_param(self._queued_params.popleft())
+        self._send_next_param(now_ns)
         if ap.now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns += NS_PER_S
             self.send_now(mav.MAVLINK_MSG_ID_HEARTBEAT)
@@ -68,14 +57,6 @@ class MavlinkEndpoint(Framing):
         interval_us = self._streams.interval_us(message_id)
         self.send(mav.MAVLink_message_interval_message(message_id, interval_us))
 
-    def send_now(self, message_id: int) -> bool:
-        """Send one message, unless it has nothing to report yet; False if it is unknown."""
-        build = BUILDERS.get(message_id)
-        message = build(self._ap) if build else None
-        if message is not None:
-            self.send(message)
-        return build is not None
-
     def send_text(self, severity: int, text: str) -> None:
         """Send STATUSTEXT once a ground station is known, a long one in numbered chunks."""
         if not self.has_gcs:
@@ -94,16 +75,6 @@ class MavlinkEndpoint(Framing):
         self._event_sequence = (self._event_sequence + 1) % 65536
         self.send(event_message(event, self._event_sequence))
 
-    def send_all_params(self) -> None:
-        """Send every parameter from the first, a few hundred a second."""
-        self._queued_params = deque(range(len(self._ap.params.names)))
-
-    def send_param(self, index: int) -> None:
-        """Send PARAM_VALUE; ``index`` must exist."""
-        params = self._ap.params
-        name = params.names[index]
-        self.send(
-            mav.MAVLink_param_value_message(
-                name.encode(), params.on_wire(name), params.kind(name), len(params.names), index
-            )
-        )
+    def _kind(self, name: str) -> int:
+        """INT32 or REAL32."""
+        return self._ap.params.kind(name)
