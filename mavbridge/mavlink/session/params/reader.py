@@ -19,6 +19,7 @@ class ParamReader:
         """Time of the last request and number of requests."""
         self._names: set[str] = set()
         self.values: dict[str, float] = {}
+        """In the order of their names."""
         self.request(names)
 
     def request(self, names: tuple[str, ...]) -> None:
@@ -36,7 +37,10 @@ class ParamReader:
         """Take a PARAM_VALUE, whoever asked for it; of a parameter in the list, it is kept."""
         self._open.pop(param.name, None)
         if param.name in self._names:
+            is_new = param.name not in self.values
             self.values[param.name] = param.value
+            if is_new:  # sorted here, once a name, and not at every look at them
+                self.values = dict(sorted(self.values.items()))
 
     def absent(self, name: str) -> None:
         """Give up on a parameter that the vehicle does not have."""

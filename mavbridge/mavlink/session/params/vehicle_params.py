@@ -71,7 +71,7 @@ class VehicleParams:
     @property
     def values(self) -> Mapping[str, float]:
         """All parameters that matter and that the vehicle has sent, by name."""
-        return dict(sorted(self._reader.values.items()))
+        return self._reader.values
 
     @property
     def override_switch(self) -> int | None:
