@@ -119,7 +119,6 @@ class GateLoop:
         self._stop: Ending | None = None
         self._finish_until_ns: int | None = None
         self._is_clean = False
-        self._is_setpoint = False
         self._modes = ModeRoles()
         self.is_done = False
         """The sticks are given back, and nobody wants more flights."""
@@ -149,7 +148,7 @@ class GateLoop:
             with suppress(Exception):
                 self._link.send(Command(action=last))
         for _ in range(ABANDON_RELEASES if self._phase is not Phase.WAITING else 0):
-            if self._is_setpoint and self._modes.hold and self._phase in _HELD:
+            if last is not None and self._modes.hold and self._phase in _HELD:
                 with suppress(Exception):
                     self._link.set_mode(self._modes.hold)
             with suppress(Exception):
@@ -245,7 +244,6 @@ class GateLoop:
                     pass
                 case FlightSettings() as settings if self._gate is None:
                     self._gate = Gate(settings, self._clock.now_ns())
-                    self._is_setpoint = settings.meaning.kind != "sticks"
                     self._link.begin_flight(settings.meaning, settings.output)
                 case Ending() as ending:
                     self.stop(ending)
