@@ -29,7 +29,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from policy.checkpoints.policy_file import build_policy, load_checkpoint
 from policy.contract import ACTION_DIM
-from policy.loading import SHIPPED
+from policy.loading.builtin import SHIPPED
 from policy.nets.toge import Toge, TogeConfig
 from policy.preprocess import image_to_input
 

@@ -19,7 +19,8 @@ from mavbridge.commands.bench.flight import FlightJob
 from mavbridge.commands.bench.flight_process import measure_flight
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.workers import Worker
-from policy.contract import Executable, FloatArray
+from policy.contract import FloatArray
+from policy.protocol import Executable
 
 Load: TypeAlias = Literal["none", "slow", "busy"]
 SLOW_EVERY = 10

@@ -28,7 +28,7 @@ from mavbridge.commands.output import (
     require_outputs,
     table_console,
 )
-from policy.loading import SHIPPED
+from policy.loading.builtin import SHIPPED
 
 DUAL = "--dual-rate --head-steps 2"
 DELAYS_MS = (0, 30, 60, 100, 150)

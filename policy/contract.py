@@ -6,17 +6,17 @@ carries its ``Contract`` in the header, and the bridge refuses one that it canno
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from policy.errors import ContractError
 
-CONTRACT_VERSION = 3
-READABLE_VERSIONS = (1, 2, 3)
+CONTRACT_VERSION = 4
+READABLE_VERSIONS = (1, 2, 3, 4)
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -40,6 +40,15 @@ Time between them, a little below zero where the image is newer than the attitud
 rotation vector; the change of its velocity. Both vectors in the body's axes at the exposure.
 """
 SINCE_EXPOSURE_DIM = len(SINCE_EXPOSURE_NAMES)
+StateExtra = Literal["goal", "height", "altitude"]
+EXTRA_NAMES: dict[StateExtra, tuple[str, ...]] = {
+    "goal": ("goal_x_m", "goal_y_m", "goal_z_m"),
+    "height": ("height_above_home_m",),
+    "altitude": ("altitude_m",),
+}
+"""Behind all that, where a contract asks for it: from the vehicle to the goal of the flight, in the
+world's axes of ``Contract.state_frame``; height above the home position; height above the
+estimator's origin. Heights are positive upwards in both frames."""
 AGE, ROTATION, VELOCITY_CHANGE = slice(13, 14), slice(14, 17), slice(17, 20)
 
 ACTION_NAMES = ("throttle", "yaw", "pitch", "roll")
@@ -63,6 +72,10 @@ IMAGENET_MEAN_RGB = (0.485, 0.456, 0.406)
 IMAGENET_STD_RGB = (0.229, 0.224, 0.225)
 
 FloatArray = NDArray[np.float32]
+ImageFit = Literal["stretch", "crop", "pad"]
+"""How an image takes the shape that a policy wants: by other proportions, by cutting its longer
+sides off evenly, or by black bars."""
+ImageChannels = Literal["rgb", "bgr"]
 StateFrame = Literal["ned_frd", "enu_flu"]
 Arrays = Literal["numpy", "torch"]
 STICK_MODES = (
@@ -94,6 +107,11 @@ ACTION_TERMS = (
     *("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
 )
 """Fields that came with version 3: what an action meant in training; read likewise."""
+OBSERVATION_TERMS = (
+    *("observation_steps", "observation_dt_s", "cameras", "camera_rates_hz"),
+    *("image_crop", "image_fit", "image_channels", "state_extras", "play_s"),
+)
+"""Fields that came with version 4: what a policy sees, and how long it plays one chunk."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,8 +132,22 @@ class Contract:
     image_width: int = 224
     image_mean_rgb: tuple[float, float, float] = IMAGENET_MEAN_RGB
     image_std_rgb: tuple[float, float, float] = IMAGENET_STD_RGB
+    image_crop: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    """Part of the camera's image that is used: top, left, bottom, right, as shares of its height
+    and width. It is cut out before the image is resized."""
+    image_fit: ImageFit = "stretch"
+    image_channels: ImageChannels = "rgb"
+    """Order of the three channels; the mean and deviation are by colour, whatever the order."""
+    cameras: tuple[str, ...] = ("front",)
+    """Names of the cameras, in the order of their features; all images are of one size."""
+    camera_rates_hz: tuple[float, ...] = ()
+    """Most images a second of each camera; empty: the visual rate of the flight for all."""
     feature_dim: int = 0
-    """F of encode_visual's [B, F]; 0 where there is no fast path."""
+    """F of encode_visual's [B, F], for one camera; 0 where there is no fast path."""
+    observation_steps: int = 1
+    """T states and T images of each camera, oldest first, the last ones the newest."""
+    observation_dt_s: float = 0.1
+    """Time between them."""
     horizon: int = 16
     chunk_dt_s: float = 0.05
     """Time between the actions of a chunk; action 0 acts at the time of the state."""
@@ -126,6 +158,11 @@ class Contract:
     arrays: Arrays = "torch"
     since_exposure: bool = False
     """The state is followed by ``SINCE_EXPOSURE_NAMES``."""
+    state_extras: tuple[StateExtra, ...] = ()
+    """Further inputs behind the state, in this order: ``EXTRA_NAMES``."""
+    play_s: float = 0.0
+    """Longest time for which the policy was meant to play one chunk before the next one; the four
+    age limits below count from its beginning. 0: a new chunk from every new state."""
     action: ActionKind = "sticks"
     velocity_frame: VelocityFrame = "world"
     hover_thrust: float = 0.39
@@ -172,10 +209,12 @@ class Contract:
             ("state_frame", StateFrame),
             ("arrays", Arrays),
             ("velocity_frame", VelocityFrame),
+            ("image_fit", ImageFit),
+            ("image_channels", ImageChannels),
         ):
             if (value := getattr(self, name)) not in get_args(known):
-                one, other = get_args(known)
-                raise ContractError(f"{name} {value!r} is unknown; use {one!r} or {other!r}")
+                choices = " or ".join(map(repr, get_args(known)))
+                raise ContractError(f"{name} {value!r} is unknown; use {choices}")
         if not isinstance(self.since_exposure, bool):
             raise ContractError(
                 f"since_exposure must be true or false, got {self.since_exposure!r}"
@@ -186,15 +225,17 @@ class Contract:
             ("feature_dim", 0, 65536),
             ("horizon", 1, 1024),
             ("history_len", 1, 1024),
+            ("observation_steps", 1, 16),
         ):
             value = getattr(self, name)
             if not isinstance(value, int) or not low <= value <= high:
                 raise ContractError(f"{name} must be an integer in {low}..{high}, got {value!r}")
-        for name in ("chunk_dt_s", "history_dt_s"):
+        for name in ("chunk_dt_s", "history_dt_s", "observation_dt_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and 0 < value <= 1):
                 raise ContractError(f"{name} must be in (0, 1] seconds, got {value!r}")
         self._require_image_statistics()
+        self._require_observation()
         self._require_flight_terms()
 
     def _require_image_statistics(self) -> None:
@@ -202,6 +243,31 @@ class Contract:
             raise ContractError("image_mean_rgb and image_std_rgb must be finite numbers")
         if min(self.image_std_rgb) <= 0:
             raise ContractError(f"image_std_rgb must be positive, got {self.image_std_rgb}")
+
+    def _require_observation(self) -> None:
+        top, left, bottom, right = self.image_crop
+        if not (0 <= top < bottom <= 1 and 0 <= left < right <= 1):
+            raise ContractError(
+                f"image_crop must be top, left, bottom, right within [0, 1], got {self.image_crop}"
+            )
+        names = self.cameras
+        if not names or len(set(names)) < len(names) or not all(n.isidentifier() for n in names):
+            raise ContractError(f"cameras must be one or more different names, got {names!r}")
+        rates_hz = self.camera_rates_hz
+        if len(rates_hz) not in (0, len(names)) or not all(0 < hz <= 240 for hz in rates_hz):
+            raise ContractError(
+                f"camera_rates_hz must be a rate in (0, 240] Hz for each of {names}, got {rates_hz}"
+            )
+        extras = self.state_extras
+        if len(set(extras)) < len(extras) or not set(extras) <= set(EXTRA_NAMES):
+            raise ContractError(
+                f"state_extras must be some of {', '.join(EXTRA_NAMES)}, each once, got {extras!r}"
+            )
+        if not 0 <= self.play_s <= self.horizon * self.chunk_dt_s:
+            raise ContractError(
+                f"play_s must be at most the {self.horizon * self.chunk_dt_s:g} s of a chunk, got "
+                f"{self.play_s!r}"
+            )
 
     def _require_flight_terms(self) -> None:
         if self.action not in ACTION_MODES:
@@ -241,9 +307,38 @@ class Contract:
                 raise ContractError(f"{name} must be in [0, 0.9) of the travel, got {share!r}")
 
     @property
+    def state_names(self) -> tuple[str, ...]:
+        """Numbers of the state that the policy takes, in their order."""
+        extras = [name for extra in self.state_extras for name in EXTRA_NAMES[extra]]
+        return STATE_NAMES + (SINCE_EXPOSURE_NAMES if self.since_exposure else ()) + (*extras,)
+
+    @property
     def state_dim(self) -> int:
-        """Width of the state that the policy takes: 13, or 20 with ``since_exposure``."""
-        return STATE_DIM + (SINCE_EXPOSURE_DIM if self.since_exposure else 0)
+        """Width of the state that the policy takes: 13, 20 with ``since_exposure``, and extras."""
+        return len(self.state_names)
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """Shape of the state without the batch: [S], or [T, S] with several observations."""
+        return self._stacked(self.state_dim)
+
+    @property
+    def feature_shape(self) -> tuple[int, ...]:
+        """Shape of what ``predict_fast`` takes, without the batch: [F] or [T, F].
+
+        F is that of all cameras, one behind the other.
+        """
+        return self._stacked(self.feature_dim * len(self.cameras))
+
+    @property
+    def image_shape(self) -> tuple[int, ...]:
+        """Shape of what ``predict`` takes, without the batch: [3, H, W], [N, 3, H, W] with several
+        cameras, and a T before that with several observations."""
+        each = (3, self.image_height, self.image_width)
+        return self._stacked(*(each if len(self.cameras) == 1 else (len(self.cameras), *each)))
+
+    def _stacked(self, *shape: int) -> tuple[int, ...]:
+        return shape if self.observation_steps == 1 else (self.observation_steps, *shape)
 
     def to_json(self) -> str:
         """Header form of a checkpoint."""
@@ -271,12 +366,14 @@ class Contract:
         known = {each.name for each in fields(cls) if each.init}
         known -= set(FLIGHT_TERMS) if version < 2 else set()
         known -= set(ACTION_TERMS) if version < 3 else set()
+        known -= set(OBSERVATION_TERMS) if version < 4 else set()
         if unknown := sorted(set(data) - known):
             raise ContractError(
                 f"unknown contract keys {unknown}; those of version {version} are {sorted(known)}"
             )
-        if isinstance(data.get("modes"), list):
-            data["modes"] = tuple(data["modes"])
+        for name in ("modes", "cameras", "camera_rates_hz", "image_crop", "state_extras"):
+            if isinstance(data.get(name), list):
+                data[name] = tuple(data[name])
         for name in ("image_mean_rgb", "image_std_rgb"):
             if name in data:
                 data[name] = _rgb(name, data[name])
@@ -302,96 +399,3 @@ def history_ages_ns(length: int, dt_s: float) -> Sequence[int]:
     """
     dt_ns = round(dt_s * NS_PER_S)
     return range(length * dt_ns, 0, -dt_ns)
-
-
-@runtime_checkable
-class SingleRatePolicy(Protocol):
-    """The minimum that flies: image, state and history in, a chunk out.
-
-    Shapes, float32: image [B, 3, H, W] normalised by the contract, state [B, state_dim] in SI
-    units, action_history [B, K, 4]; returns [B, horizon, 4] actions of ``contract.action``. Arrays
-    are numpy or torch, as ``contract.arrays`` says. Any class with these members will do; nothing
-    is inherited.
-
-    A policy that keeps something from one chunk to the next may also have ``reset()``, without
-    arguments: it is called once after loading, and whenever a flight begins. The vision thread
-    calls ``encode_visual``; the policy thread calls the other methods and ``reset``, so what
-    ``encode_visual`` keeps is not for ``reset`` to change without a lock.
-    """
-
-    contract: Contract
-
-    def predict(self, image: Any, state: Any, action_history: Any, num_diffusion_steps: int) -> Any:
-        """Encode the image and sample one chunk."""
-
-
-@runtime_checkable
-class DualRatePolicy(SingleRatePolicy, Protocol):
-    """A policy whose image path can run slower than its action path."""
-
-    def encode_visual(self, image: Any) -> Any:
-        """Image [B, 3, H, W] -> feature [B, F]."""
-
-    def predict_fast(
-        self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
-    ) -> Any:
-        """Cached feature [B, F], newest state and history -> chunk [B, horizon, 4]."""
-
-
-class NoiseModel(Protocol):
-    """The noise that a diffusion solve starts from."""
-
-    @property
-    def initial_noise(self) -> Any:
-        """[1, horizon, 4]; the same for a whole flight."""
-
-    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-
-
-@runtime_checkable
-class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
-    """A policy whose solve can be entered before any of its steps, and left after any.
-
-    ``predict_fast`` is ``denoise_fast`` by all steps from ``initial_noise``.
-    """
-
-    def denoise_fast(
-        self,
-        feature: Any,
-        state: Any,
-        action_history: Any,
-        noisy: Any,
-        num_diffusion_steps: int,
-        first: int,
-        count: int,
-    ) -> Any:
-        """``count`` steps of a solve: ``noisy`` [B, horizon, 4] as step ``first`` starts with it
-        -> as the next step would; after the last step, the chunk."""
-
-
-def keep_nothing() -> None:
-    """Reset a policy that keeps nothing between chunks."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Executable:
-    """A policy ready to run on one engine, numpy in and numpy out, as the loops call it.
-
-    ``encode`` runs in the vision thread, ``act`` and ``reset`` in the policy thread. Without a fast
-    path ``encode`` only preprocesses and ``act`` does the rest.
-    """
-
-    contract: Contract
-    name: str
-    engine: str
-    dual_rate: bool
-    encode: Callable[[NDArray[np.uint8]], FloatArray]
-    """RGB [any height, any width, 3] -> what ``act`` of the same executable takes: opaque to the
-    loops, float32, of a shape that each engine knows."""
-    act: Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
-    """(encode's value, state [1, state_dim], history [1, K, 4], seconds from the state of the last
-    chunk to this one or None to start afresh) -> chunk [1, horizon, 4]."""
-    reset: Callable[[], None] = keep_nothing
-    """Forgets earlier flights; called when a flight begins. A warm start needs no reset: ``act``
-    starts it afresh where no time is given."""

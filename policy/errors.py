@@ -27,6 +27,14 @@ class CheckpointError(PolicyError):
     """A checkpoint that cannot be read, or does not fit; the message says what to do."""
 
 
+class NoChunkError(PolicyError):
+    """A policy that has no chunk for this state, and may have one for the next.
+
+    The flight goes on by the last chunk for as long as its limits permit. The message is the reason
+    that the user is shown.
+    """
+
+
 @contextmanager
 def user_code(doing: str) -> Iterator[None]:
     """Turn any exception of a user's policy into a ``PolicyError`` with its file and line.

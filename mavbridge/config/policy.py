@@ -23,6 +23,9 @@ class PolicyConfig:
     vehicle flies already, so do not climb first."""
     checkpoint: Path | None = None
     """Weights: .safetensors with the contract in its header, or .pt; toge has shipped ones."""
+    contract: Path | None = None
+    """TOML file that says what the files of a policy trained elsewhere do not: rate, names, units,
+    camera; mavbridge contract writes a first draft."""
     dual_rate: bool = False
     """Encode images in their own thread and sample actions faster from the cached feature."""
     num_diffusion_steps: int = 10

@@ -40,7 +40,7 @@ from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
-from policy.contract import Executable
+from policy.protocol import Executable
 
 JOIN_S = 2.0
 LEAST_HANG_NS = NS_PER_S

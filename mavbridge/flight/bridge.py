@@ -19,7 +19,7 @@ from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.flight.vision_rate import AdaptiveRate
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.wire import Absence
-from policy.contract import Executable
+from policy.protocol import Executable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,7 +19,7 @@ from mavbridge.observe.rerun_flight import RerunView
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
 from mavbridge.recording.tlog import TlogPipe
-from policy.contract import Executable
+from policy.protocol import Executable
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
     from mavbridge.recording.recorder import Recorder

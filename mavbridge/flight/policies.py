@@ -10,13 +10,8 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from policy.contract import Contract
-from policy.loading import (
-    LoadedPolicy,
-    PolicyRequest,
-    check_request,
-    load_policy,
-    read_policy_contract,
-)
+from policy.loading.load import check_request, load_policy, read_policy_contract
+from policy.loading.request import LoadedPolicy, PolicyRequest
 
 BUILT_IN = ("toge", "resnet-unet")
 
@@ -49,6 +44,7 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
     return PolicyRequest(
         spec=wanted.policy,
         checkpoint=wanted.checkpoint,
+        contract_file=wanted.contract,
         allow_untrained=wanted.allow_untrained,
         engine=wanted.engine,
         device=wanted.device,

@@ -17,6 +17,7 @@ from mavbridge.flight.state import Freshness, FrozenStateCheck, StateFrame, buil
 from mavbridge.flight.vehicle_view import SolveInputs, VehicleView
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.wire import Absence
+from policy.errors import NoChunkError
 
 Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
 """(encoded image, state [1, 13 or 20], history [1, K, 4], seconds since the state of the last chunk
@@ -149,7 +150,11 @@ class PolicyLoop:
         values = state.values[None]
         if self._ego_motion is not None:
             values = self._ego_motion.append_to(state, feature.captured_ns)
-        array = self._act(feature.value, values, history, elapsed_s)
+        try:
+            array = self._act(feature.value, values, history, elapsed_s)
+        except NoChunkError as error:
+            self._refuse(str(error))
+            return
         done_ns = self._clock.now_ns()
         is_chunk = array.ndim == 3 and array.shape[0] == 1 and array.shape[2] == 4
         if not is_chunk or not 0 < array.shape[1] <= MAX_HORIZON:

@@ -19,7 +19,8 @@ from mavbridge.gate.preparation import PreparationSettings
 from mavbridge.gate.settings import GateSettings
 from mavbridge.gate.smoothing import Smoothing
 from mavbridge.mavlink.settings import LinkSettings
-from policy.contract import Contract, Executable
+from policy.contract import Contract
+from policy.protocol import Executable
 
 LEAST = 1e-9
 """A limit that widens nothing."""

@@ -32,7 +32,8 @@ from mavbridge.simulation.world import (
     VehicleStepper,
     VisionStepper,
 )
-from policy.contract import Executable, FloatArray
+from policy.contract import FloatArray
+from policy.protocol import Executable
 from sitl.camera.fpv import FpvRenderer
 from sitl.course.layout import make_course
 from sitl.simulated_vehicle import SimulatedVehicle

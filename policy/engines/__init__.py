@@ -1,4 +1,4 @@
-"""Engines that execute a policy; each makes a ``contract.Executable``."""
+"""Engines that execute a policy; each makes a ``protocol.Executable``."""
 
 import sys
 

@@ -13,13 +13,14 @@ import numpy as np
 import torch
 from torch import nn
 
-from policy.contract import Executable, FloatArray, SingleRatePolicy
+from policy.contract import FloatArray
 from policy.engines.executable import EngineName, ExecutionSettings
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
+from policy.protocol import Executable, SingleRatePolicy
 
 SAMPLE_ELAPSED_S = 0.02
 """Time between the two chunks of a sample: with a warm start, the second is a refinement."""

@@ -17,9 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.contract import Executable, FloatArray, SingleRatePolicy
+from policy.contract import FloatArray
 from policy.engines.executable import ExecutionSettings, Shape, make_executable
 from policy.errors import PolicyError
+from policy.protocol import Executable, SingleRatePolicy
 
 NAME = "cuda-graph"
 WARM_UP_CALLS = 3

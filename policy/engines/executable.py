@@ -7,18 +7,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import (
-    ACTION_DIM,
-    Contract,
-    DualRatePolicy,
-    Executable,
-    FloatArray,
-    SingleRatePolicy,
-    WarmStartPolicy,
-)
+from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.engines.warm_start import Segment, WarmStart, make_solve
 from policy.errors import PolicyError, user_code
 from policy.preprocess import image_to_input
+from policy.protocol import DualRatePolicy, Executable, SingleRatePolicy, WarmStartPolicy
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
@@ -65,17 +58,20 @@ def make_executable(
         PolicyError: no fast path where one was asked for, or the policy failed on the sample.
     """
     contract, steps = action.contract, settings.num_diffusion_steps
-    image = (1, 3, contract.image_height, contract.image_width)
-    rest = ((1, contract.state_dim), (1, contract.history_len, ACTION_DIM))
+    rest = ((1, *contract.state_shape), (1, contract.history_len, ACTION_DIM))
     if not settings.dual_rate:
-        predict = compile_action(lambda i, s, h: action.predict(i, s, h, steps), (image, *rest))
+        predict = compile_action(
+            lambda i, s, h: action.predict(i, s, h, steps), ((1, *contract.image_shape), *rest)
+        )
         return assemble(contract, lambda array: array, always_full(predict), engine, settings)
     if not isinstance(vision, DualRatePolicy) or not isinstance(action, DualRatePolicy):
         raise PolicyError(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
         )
-    encode = compile_vision(vision.encode_visual, (image,))
-    fast = ((1, contract.feature_dim), *rest)
+    encode = compile_vision(
+        vision.encode_visual, ((1, 3, contract.image_height, contract.image_width),)
+    )
+    fast = ((1, *contract.feature_shape), *rest)
     if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
         act = _warm_started(action, fast, compile_action, settings, settings.head_steps)
     else:

@@ -14,7 +14,7 @@ import openvino as ov
 import torch
 from torch import nn
 
-from policy.contract import Executable, FloatArray, SingleRatePolicy
+from policy.contract import FloatArray
 from policy.engines.compile_cache import CompileCache, user_cache_folder
 from policy.engines.executable import (
     Act,
@@ -32,6 +32,7 @@ from policy.errors import PolicyError
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.preprocess import egocentric
+from policy.protocol import Executable, SingleRatePolicy
 
 NAME = "openvino"
 DEVICE = "CPU"

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.contract import Executable, FloatArray, SingleRatePolicy
+from policy.contract import FloatArray
 from policy.engines.executable import (
     ArrayFunction,
     Compile,
@@ -17,6 +17,7 @@ from policy.engines.executable import (
     make_executable,
 )
 from policy.errors import PolicyError
+from policy.protocol import Executable, SingleRatePolicy
 
 NAME = "torch"
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from policy.contract import FloatArray, NoiseModel
+from policy.contract import FloatArray
 from policy.errors import PolicyError
+from policy.protocol import NoiseModel
 
 FULL_EVERY_S = 1.0
 """Time between the starts of full solves, and the age at which a guess is dropped; measured between

@@ -38,7 +38,7 @@ class ResnetUnetConfig:
 
 
 class ResnetUnet(nn.Module):
-    """The policy protocol of ``contract.SingleRatePolicy``, on torch tensors."""
+    """The policy protocol of ``protocol.SingleRatePolicy``, on torch tensors."""
 
     def __init__(self, config: ResnetUnetConfig) -> None:
         super().__init__()

@@ -53,7 +53,7 @@ class TogeConfig:
 
 
 class Toge(nn.Module):
-    """The policy protocol of ``contract.DualRatePolicy``, on torch tensors.
+    """The policy protocol of ``protocol.DualRatePolicy``, on torch tensors.
 
     Images are normalised by ``preprocess.image_to_input``, states are in SI units. A shape that is
     not the contract's, or steps that the schedule does not have, raise a ``PolicyError``.

@@ -32,7 +32,8 @@ from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper
 from mavbridge.simulation.network import DelayedChannel
 from mavbridge.simulation.world import NOMINAL_VEHICLE
-from policy.contract import Contract, Executable, FloatArray
+from policy.contract import Contract, FloatArray
+from policy.protocol import Executable
 from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course.layout import AirborneStart

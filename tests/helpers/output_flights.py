@@ -14,7 +14,8 @@ from helpers.gate_flights import HEIGHT_M, GateFlight
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.gate.engagement import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
-from policy.contract import ActionKind, Contract, Executable, FloatArray
+from policy.contract import ActionKind, Contract, FloatArray
+from policy.protocol import Executable
 from policy.scripted.policy import ScriptedPolicy
 from policy.scripted.programs import LEG_MPS, LEG_S, Motion, Program, Push, make_program
 from sitl.ardupilot.autopilot import Autopilot as ArduPilot

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from mavbridge.simulation.flight import SimulatedFlight
-from policy.contract import Contract, Executable, FloatArray
+from policy.contract import Contract, FloatArray
+from policy.protocol import Executable
 from policy.scripted.controllers import LEAN_PER_MPS, LEAN_PER_WANTED_MPS, THROTTLE_DEADZONE
 
 SPEED_MPS = 3.0

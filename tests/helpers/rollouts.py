@@ -23,7 +23,8 @@ from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
-from policy.contract import Contract, Executable
+from policy.contract import Contract
+from policy.protocol import Executable
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
 

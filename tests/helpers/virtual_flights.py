@@ -21,7 +21,8 @@ from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper, sender
 from mavbridge.simulation.network import DelayedChannel
 from mavbridge.simulation.world import DelayedFeatureCache, DelayedSink, VisionStepper
-from policy.contract import Contract, Executable
+from policy.contract import Contract
+from policy.protocol import Executable
 
 MS = NS_PER_MS
 FRAME_NS = NS_PER_S // 30

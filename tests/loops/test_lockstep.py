@@ -20,8 +20,9 @@ from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.network import MemoryTransport
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult
 from mavbridge.simulation.world import Exposure, make_vehicle
-from policy.contract import Executable, FloatArray
+from policy.contract import FloatArray
 from policy.errors import PolicyError
+from policy.protocol import Executable
 from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 
 MS = NS_PER_MS

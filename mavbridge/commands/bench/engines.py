@@ -12,8 +12,9 @@ from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.flight.policies import load_configured_policy
-from policy.contract import ACTION_DIM, QUATERNION, Executable
+from policy.contract import ACTION_DIM, QUATERNION
 from policy.errors import PolicyError
+from policy.protocol import Executable
 
 EAGER: Engine = "torch"
 ENCODE, CHUNK, BOTH = "encode one image", "sample one chunk", "one image to one chunk"

@@ -25,7 +25,8 @@ from mavbridge.flight.policies import load_configured_policy
 from mavbridge.gate.departure import Ending
 from mavbridge.observe.output import flight_console
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
-from policy.contract import Executable, FloatArray
+from policy.contract import FloatArray
+from policy.protocol import Executable
 
 CLIMB_STICK = 0.3
 """0.3 m/s up in ALT_HOLD: beyond its dead zone, some 20 m in a minute."""

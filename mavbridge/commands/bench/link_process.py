@@ -29,7 +29,8 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.settings import flight_settings, gate_settings
 from mavbridge.gate.departure import Ending
-from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract, Executable
+from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract
+from policy.protocol import Executable
 
 ROLL = ACTION_NAMES.index("roll")
 MOST_CHUNKS_HZ = 200.0

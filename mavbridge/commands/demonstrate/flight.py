@@ -19,7 +19,8 @@ from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.rows import FrameTruth, TickLabels
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import NOMINAL_VEHICLE, Exposure
-from policy.contract import Contract, Executable
+from policy.contract import Contract
+from policy.protocol import Executable
 from sitl.course.layout import gate_truth
 
 TRUTHS_KEPT = 64

@@ -11,7 +11,8 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Sticks
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight
-from policy.contract import Contract, Executable, FloatArray
+from policy.contract import Contract, FloatArray
+from policy.protocol import Executable
 from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import StickDisturbance, random_start
 from sitl.expert.stick_response import StickPositions

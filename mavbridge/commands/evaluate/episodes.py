@@ -30,7 +30,7 @@ from mavbridge.simulation.delays import Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult, Outcome, StickMeter
 from mavbridge.simulation.world import make_vehicle
-from policy.contract import Executable
+from policy.protocol import Executable
 
 STARTUP_S = 90.0
 """Limit on a flight's time beyond its own: imports, compiling an engine, arming."""

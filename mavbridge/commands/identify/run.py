@@ -15,8 +15,9 @@ from mavbridge.core.files import require_writable
 from mavbridge.flight.app import check_flight, fly_executable
 from mavbridge.flight.policies import configured_contract
 from mavbridge.observe.output import flight_console
-from policy.contract import Contract, Executable
+from policy.contract import Contract
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.protocol import Executable
 from policy.scripted import ScriptedPolicy
 from policy.scripted.programs import doublet_length_s
 

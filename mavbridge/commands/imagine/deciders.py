@@ -14,7 +14,8 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
-from policy.contract import SINCE_EXPOSURE_DIM, Contract, Executable
+from policy.contract import SINCE_EXPOSURE_DIM, Contract
+from policy.protocol import Executable
 
 SAMPLES_PER_STEP = 8
 """An action of the world model is the mean stick of a step: the mean of so many samples."""

@@ -19,7 +19,7 @@ from policy.contract import Contract
 from policy.data.flight_data import FlightData, common_frame
 from policy.data.flight_folders import find_flights, is_exemplary, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
-from policy.loading import builtin_config
+from policy.loading.builtin import builtin_config
 from policy.training.policy_run import Check, Network, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import TrainingStoppedError

@@ -14,7 +14,8 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
-from policy.contract import Contract, Executable
+from policy.contract import Contract
+from policy.protocol import Executable
 
 
 def test_every_tenth_solve_is_slow_and_all_are_the_policys() -> None:

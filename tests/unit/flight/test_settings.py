@@ -14,7 +14,8 @@ from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import EngagementSettings
 from mavbridge.gate.gate import FlightSettings
 from mavbridge.gate.preparation import PreparationSettings
-from policy.contract import Contract, Executable
+from policy.contract import Contract
+from policy.protocol import Executable
 
 LINK = LinkConfig(connect="udp:127.0.0.1:14550")
 

@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from policy.checkpoints.policy_file import BuiltinPolicy, load_checkpoint
-from policy.contract import Contract, Executable, FloatArray
-from policy.loading import SHIPPED
+from policy.contract import Contract, FloatArray
+from policy.loading.builtin import SHIPPED
 from policy.nets.toge import Toge, TogeConfig
+from policy.protocol import Executable
 
 
 @pytest.fixture(scope="module")

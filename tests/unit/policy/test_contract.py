@@ -16,7 +16,7 @@ from policy.contract import (
     Contract,
 )
 from policy.errors import ContractError
-from policy.loading import SHIPPED
+from policy.loading.builtin import SHIPPED
 
 
 def test_round_trips_through_its_header_form() -> None:
@@ -37,7 +37,7 @@ def test_round_trips_through_its_header_form() -> None:
         max_distance_m=5000.0,
     )
     assert Contract.from_json(contract.to_json()) == contract
-    assert json.loads(contract.to_json())["version"] == 3
+    assert json.loads(contract.to_json())["version"] == 4
 
 
 def header_of_version_1(**changes: object) -> dict[str, Any]:

@@ -10,7 +10,8 @@ import torch
 from policy.checkpoints.policy_file import build_policy, save_checkpoint
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.loading import LoadedPolicy, PolicyRequest, check_request, load_policy
+from policy.loading.load import check_request, load_policy
+from policy.loading.request import LoadedPolicy, PolicyRequest
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge
 
@@ -76,7 +77,8 @@ def test_a_scripted_program_climbs_unless_it_starts_in_the_air(
 
 def test_torch_is_imported_by_neither_scripted_policies_nor_cheap_checks() -> None:
     program = (
-        "import sys; from policy.loading import PolicyRequest, check_request, load_policy; "
+        "import sys; from policy.loading.request import PolicyRequest; "
+        "from policy.loading.load import check_request, load_policy; "
         "check_request(PolicyRequest(spec='toge')); "
         "load_policy(PolicyRequest(spec='scripted:square'), now_s=lambda: 0.0); "
         "sys.exit('torch' in sys.modules)"

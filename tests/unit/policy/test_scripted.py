@@ -4,8 +4,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from policy.contract import DualRatePolicy
 from policy.errors import PolicyError
+from policy.protocol import DualRatePolicy
 from policy.scripted import PROGRAM_NAMES, ScriptedPolicy
 
 STEP_S = 0.01

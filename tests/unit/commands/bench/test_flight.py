@@ -9,7 +9,8 @@ from mavbridge.commands.bench.flight import FlightJob, to_flags
 from mavbridge.commands.bench.flight_process import CLIMB_STICK, ReleaseWatch, level_climb
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
-from policy.contract import Contract, Executable
+from policy.contract import Contract
+from policy.protocol import Executable
 
 
 @pytest.mark.parametrize(

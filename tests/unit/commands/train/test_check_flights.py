@@ -17,9 +17,10 @@ from mavbridge.core.clock import Clock
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.referee import EpisodeResult
 from policy.checkpoints.policy_file import save_checkpoint
-from policy.contract import Contract, Executable, FloatArray
-from policy.loading import LoadedPolicy
+from policy.contract import Contract, FloatArray
+from policy.loading.request import LoadedPolicy
 from policy.nets.toge import Toge, TogeConfig
+from policy.protocol import Executable
 
 
 def save(path: Path, seed: int) -> Path:

@@ -15,7 +15,8 @@ from mavbridge.core.stopping import INTERRUPTED
 from policy.checkpoints.world_model_file import load_world_model
 from policy.contract import Contract
 from policy.data.flight_folders import read_flight
-from policy.loading import PolicyRequest, load_policy
+from policy.loading.load import load_policy
+from policy.loading.request import PolicyRequest
 from policy.nets.toge import TogeConfig
 from policy.training.report import TrainingProgress
 from policy.training.settings import TrainSettings

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy.contract import Contract, Executable, FloatArray
+from policy.contract import Contract, FloatArray
 from policy.engines.choose import Candidate, choose_executable, chunks_of_samples, first_that_agrees
 from policy.engines.executable import EngineName, ExecutionSettings
 from policy.engines.openvino_cpu import make_openvino_executable, precisions
@@ -17,6 +17,7 @@ from policy.engines.parity import MAX_STICK_ERROR, make_parity_samples, parity_f
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
+from policy.protocol import Executable
 
 SETTINGS = ExecutionSettings(name="toge", num_diffusion_steps=2, head_steps=1)
 

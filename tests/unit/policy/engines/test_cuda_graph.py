@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from policy.checkpoints.policy_file import BuiltinConfig, build_policy
-from policy.contract import Contract, Executable, FloatArray
+from policy.contract import Contract, FloatArray
 from policy.engines.choose import choose_executable, chunks_of_samples
 from policy.engines.cuda_graph import make_cuda_graph_executable
 from policy.engines.executable import ExecutionSettings
@@ -18,6 +18,7 @@ from policy.engines.torch_eager import make_torch_executable
 from policy.nets.names import Size
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
+from policy.protocol import Executable
 
 pytestmark = [
     pytest.mark.gpu,

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from policy.contract import Contract, Executable, SingleRatePolicy
+from policy.contract import Contract
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
 from policy.preprocess import image_to_input
+from policy.protocol import Executable, SingleRatePolicy
 from policy.scripted import ScriptedPolicy
 
 RGB = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy, build_policy
-from policy.contract import Contract, Executable, FloatArray
+from policy.contract import Contract, FloatArray
 from policy.engines import openvino_cpu
 from policy.engines.choose import choose_executable, chunks_of_samples
 from policy.engines.executable import ExecutionSettings, Precision
@@ -29,6 +29,7 @@ from policy.nets.diffusion import NoiseSchedule, Prediction
 from policy.nets.names import BACKBONE_NAMES, BackboneName
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
+from policy.protocol import Executable
 
 Fly = Callable[[Executable, float | None], FloatArray]
 SMALL = Contract(image_height=32, image_width=32)

@@ -5,7 +5,8 @@ import pytest
 
 SCRIPT = """
 import ctypes, gc, os, signal
-from policy.loading import PolicyRequest, load_policy
+from policy.loading.request import PolicyRequest
+from policy.loading.load import load_policy
 
 request = PolicyRequest(
     spec="toge:small:resnet8", allow_untrained=True, engine="openvino", num_diffusion_steps=1,

@@ -7,12 +7,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policy.contract import Contract, Executable, FloatArray
+from policy.contract import Contract, FloatArray
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.engines.torch_eager import make_torch_executable
 from policy.engines.warm_start import FULL_EVERY_S, Solve, WarmStart, shift_chunk
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
+from policy.protocol import Executable
 
 Fly = Callable[[Executable, float | None], FloatArray]
 CHUNK = np.random.default_rng(0).uniform(-1, 1, (1, 16, 4)).astype(np.float32)

@@ -3,12 +3,13 @@ import torch
 from torch import Tensor
 
 from policy.checkpoints.policy_file import BuiltinPolicy
-from policy.contract import Contract, DualRatePolicy, SingleRatePolicy, WarmStartPolicy
+from policy.contract import Contract
 from policy.errors import ContractError, PolicyError
 from policy.nets.action_head import DiffusionHead
 from policy.nets.diffusion import NoiseSchedule, Prediction
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
+from policy.protocol import DualRatePolicy, SingleRatePolicy, WarmStartPolicy
 
 
 def sample(batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:

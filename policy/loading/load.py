@@ -5,7 +5,7 @@
     scripted[:PROGRAM][:ACTION][:air]
                              a fixed program in any kind of action, e.g. scripted:square:velocity;
                              air: begin in the air, without the climb
-    package.module:Class     any class that keeps contract.SingleRatePolicy or DualRatePolicy
+    package.module:Class     any class that keeps protocol.SingleRatePolicy or DualRatePolicy
 
 torch is imported only where a policy needs it.
 """
@@ -14,72 +14,28 @@ import inspect
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from policy.checkpoints.header import read_contract
-from policy.contract import (
-    Contract,
+from policy.contract import Contract
+from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.errors import PolicyError, user_code
+from policy.foreign.user_class import FORMS, load_user_class, user_class_name
+from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
+from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
+from policy.protocol import (
     DualRatePolicy,
     Executable,
     SingleRatePolicy,
     WarmStartPolicy,
     keep_nothing,
 )
-from policy.engines.executable import EngineName, ExecutionSettings, make_numpy_executable
-from policy.errors import PolicyError, user_code
-from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 from policy.scripted.spec import IN_AIR, make_scripted
-from policy.user_class import FORMS, load_user_class, user_class_name
 
 if TYPE_CHECKING:
-    from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
-
-SHIPPED = Path(__file__).parent / "weights" / "toge.safetensors"
-"""Flown by ``toge`` where no other weights are named; its card is beside it."""
-BUILTIN_KINDS = ("toge", "resnet-unet")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolicyRequest:
-    """The policy that a user asked for, and how it is to run."""
-
-    spec: str
-    """One of the forms in the module's docstring."""
-    checkpoint: Path | None = None
-    """Weights; a user's class gets them as ``Class(checkpoint=path)``. Without any, ``toge`` takes
-    the shipped ones."""
-    allow_untrained: bool = False
-    """Accept seeded random weights where there is no checkpoint."""
-    engine: EngineName = "auto"
-    """Engine that runs the network; auto = the fastest that passes the parity gate."""
-    device: str = "cpu"
-    """torch's name of where to run: cpu, cuda, cuda:0, mps."""
-    vision_device: str | None = None
-    """Where to encode images, if that is another one."""
-    action_device: str | None = None
-    """Where to sample chunks, if that is another one."""
-    dual_rate: bool = True
-    """A policy without a fast path is made single-rate, with a note."""
-    num_diffusion_steps: int = 10
-    head_steps: int | None = None
-    """Denoising steps of a solve from the last chunk; None = all solves are full."""
-    image_size: int | None = None
-    """Height and width that the policy takes; None leaves it to the contract."""
-    seed: int = 0
-    """Seed of untrained weights and of the flight's initial noise."""
-    starts_in_air: bool = False
-    """The vehicle flies already when the policy takes over: a scripted program does not climb."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoadedPolicy:
-    """A policy that may fly, and notes about it for the user."""
-
-    executable: Executable
-    notes: tuple[str, ...]
+    pass
 
 
 def check_request(request: PolicyRequest) -> None:
@@ -95,9 +51,9 @@ def check_request(request: PolicyRequest) -> None:
     if kind == "scripted":
         _scripted(options, request, lambda: 0.0)
     elif kind in BUILTIN_KINDS:
-        _parse_builtin(kind, options)
-        _contract(request.image_size)
-        checkpoint = _checkpoint(request)
+        parse_builtin(kind, options)
+        default_contract(request.image_size)
+        checkpoint = builtin_checkpoint(request)
         if checkpoint is not None and (contract := read_contract(checkpoint)) is not None:
             _require_image_size(contract, request.image_size)
         _require_devices(request)
@@ -119,9 +75,9 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
     check_request(request)
     if request.spec.partition(":")[0] not in BUILTIN_KINDS:
         return _find(request, lambda: 0.0)[0].contract
-    checkpoint = _checkpoint(request)
+    checkpoint = builtin_checkpoint(request)
     contract = None if checkpoint is None else read_contract(checkpoint)
-    return contract or _contract(request.image_size)
+    return contract or default_contract(request.image_size)
 
 
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
@@ -158,21 +114,6 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     return LoadedPolicy(executable=replace(executable, reset=reset), notes=(*notes, *engine_notes))
 
 
-def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
-    """The built-in network that ``spec`` names, with the default contract at that image size.
-
-    Raises:
-        PolicyError: it names none.
-    """
-    kind, *options = spec.split(":")
-    if kind not in BUILTIN_KINDS:
-        raise PolicyError(
-            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
-            "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
-        )
-    return _config(kind, options, image_size)
-
-
 def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:
     kind, *options = request.spec.split(":")
     if kind == "scripted":
@@ -182,22 +123,7 @@ def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRat
         return load_user_class(request.spec, request.checkpoint), [
             f"{request.spec}: a class of yours"
         ]
-    config, checkpoint = _config(kind, options, request.image_size), _checkpoint(request)
-    if checkpoint is None:
-        return _untrained(config, request.seed)
-    return _trained(config, options, checkpoint, request.seed)
-
-
-def _checkpoint(request: PolicyRequest) -> Path | None:
-    """The weights of a network of ours; None where random ones will do."""
-    if request.checkpoint is not None or request.allow_untrained:
-        return request.checkpoint
-    if request.spec == "toge" and SHIPPED.is_file():
-        return SHIPPED
-    raise PolicyError(
-        f"{request.spec} needs trained weights: give --checkpoint FILE, or --allow-untrained for "
-        "seeded random ones (timing and bring-up), or fly --policy scripted"
-    )
+    return load_builtin(request)
 
 
 def _executable(
@@ -224,73 +150,10 @@ def _scripted(
         raise PolicyError(
             f"scripted policies have no weights: leave out --checkpoint {request.checkpoint}"
         )
-    contract = _contract(request.image_size)
+    contract = default_contract(request.image_size)
     if request.starts_in_air and options[-1:] != [IN_AIR]:
         options = [*(options or ["hover"]), IN_AIR]
     return make_scripted(options, now_s, contract=contract)
-
-
-def _parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | None]:
-    """Size and backbone that a spec asks for; a checkpoint that says more overrules them."""
-    rest: list[Any] = list(options)
-    size: Size = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
-    if len(rest) > (1 if kind == "toge" else 0):
-        raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {FORMS}")
-    if rest and rest[0] not in BACKBONE_NAMES:
-        raise PolicyError(
-            f"--policy toge:{':'.join(options)}: {rest[0]!r} is neither a size "
-            f"({', '.join(SIZE_NAMES)}) nor an encoder ({', '.join(BACKBONE_NAMES)})"
-        )
-    return size, rest[0] if rest else None
-
-
-def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinConfig":
-    from policy.nets.resnet_unet import ResnetUnetConfig
-    from policy.nets.toge import TogeConfig
-
-    size, backbone = _parse_builtin(kind, options)
-    contract = _contract(image_size)
-    if kind == "toge":
-        return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
-    return ResnetUnetConfig(size=size, contract=contract)
-
-
-def _trained(
-    config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
-) -> tuple["BuiltinPolicy", list[str]]:
-    from policy.checkpoints.policy_file import load_checkpoint
-
-    policy = load_checkpoint(checkpoint, fallback=config)
-    parts = (policy.config.size, getattr(policy.config, "backbone", "resnet18"))
-    if contradicted := [option for option in options if option not in parts]:
-        raise PolicyError(
-            f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
-        )
-    policy.seed_noise(seed)
-    notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
-    if checkpoint.suffix != ".safetensors":
-        contract, schedule = policy.contract, policy.config.schedule
-        notes.append(
-            f"warning: {checkpoint} may hold no contract; it is flown with frame "
-            f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
-            f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
-            f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
-            f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
-        )
-    return policy, notes
-
-
-def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
-    import torch
-
-    from policy.checkpoints.policy_file import build_policy
-
-    with torch.random.fork_rng(devices=[]):  # the process's own random stream stays as it was
-        torch.manual_seed(seed)
-        policy = build_policy(config).eval()
-    policy.seed_noise(seed)
-    note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
-    return policy, [note]
 
 
 def _reset(policy: SingleRatePolicy, spec: str) -> Callable[[], None]:
@@ -323,12 +186,6 @@ def _reset(policy: SingleRatePolicy, spec: str) -> Callable[[], None]:
             method()
 
     return reset
-
-
-def _contract(image_size: int | None) -> Contract:
-    if image_size is None:
-        return Contract()
-    return Contract(image_height=image_size, image_width=image_size)
 
 
 def _require_image_size(contract: Contract, image_size: int | None) -> None:

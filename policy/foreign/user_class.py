@@ -4,8 +4,9 @@ import importlib
 import inspect
 from pathlib import Path
 
-from policy.contract import Contract, DualRatePolicy, SingleRatePolicy
+from policy.contract import Contract
 from policy.errors import PolicyError, user_code
+from policy.protocol import DualRatePolicy, SingleRatePolicy
 
 FORMS = (
     "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air] or "

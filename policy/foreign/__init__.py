@@ -1,0 +1,1 @@
+"""Policies that were written or trained elsewhere."""

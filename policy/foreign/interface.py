@@ -1,0 +1,159 @@
+"""What the files of a policy that was trained elsewhere do not say: a TOML file of the user's.
+
+    [contract]                   # fields of policy.contract.Contract
+    action = "sticks"
+    chunk_dt_s = 0.0333
+
+    [state]                      # the state vector that it was trained on
+    key = "observation.state"
+    names = ["vx_mps", "vy_mps", "vz_mps", "qw", "qx", "qy", "qz"]
+
+    [action]                     # its action vector; scaled and shifted it is the contract's
+    key = "action"
+    names = ["throttle", "yaw", "pitch", "roll"]
+    scale = [1.0, 1.0, 1.0, 1.0]
+    offset = [0.0, 0.0, 0.0, 0.0]
+
+    [images]                     # its name of each camera of the contract
+    front = "observation.images.front"
+
+    [task]
+    prompt = "fly through the gates"
+
+All of it is optional but what the kind of policy asks for.
+"""
+
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from policy.contract import ACTION_DIM, ACTION_NAMES, Contract, FloatArray
+from policy.errors import ContractError
+
+ACTION_FIELDS: dict[str, tuple[str, ...]] = {
+    "sticks": ACTION_NAMES,
+    "rates": ("thrust", "roll_rate_radps", "pitch_rate_radps", "yaw_rate_radps"),
+    "attitude": ("thrust", "roll_rad", "pitch_rad", "yaw_rate_radps"),
+    "velocity": ("vx_mps", "vy_mps", "vz_mps", "yaw_rate_radps"),
+}
+"""Names of the four numbers of each kind of action, in the contract's order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interface:
+    """How a policy names and orders what it takes and gives.
+
+    Raises:
+        ContractError: a name that is unknown, or a number that is missing.
+    """
+
+    contract: Contract
+    state_names: tuple[str, ...] = ()
+    """Its state vector, as names of ``contract.state_names``; empty: the same as the contract's."""
+    action_names: tuple[str, ...] = ()
+    """Its action vector, as names of ``ACTION_FIELDS``; empty: the same as the contract's."""
+    action_scale: tuple[float, ...] = ()
+    """Factor of each action as the policy orders them; empty: ones."""
+    action_offset: tuple[float, ...] = ()
+    """Added after the factor; empty: zeros."""
+    state_key: str = "observation.state"
+    action_key: str = "action"
+    image_keys: tuple[str, ...] = ()
+    """Its name of each camera, in the contract's order; empty: observation.images.NAME."""
+    prompt: str = ""
+    """The task in words, for policies that are given one."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be mapped."""
+        known = self.contract.state_names
+        if unknown := [name for name in self.state_names if name not in known]:
+            raise ContractError(f"[state] names {unknown} are unknown; known are {list(known)}")
+        wanted = ACTION_FIELDS[self.contract.action]
+        if self.action_names and sorted(self.action_names) != sorted(wanted):
+            raise ContractError(
+                f"[action] names must be {list(wanted)} in some order for action "
+                f"{self.contract.action!r}, got {list(self.action_names)}"
+            )
+        for name, values in (("scale", self.action_scale), ("offset", self.action_offset)):
+            if values and len(values) != ACTION_DIM:
+                raise ContractError(f"[action] {name} must be {ACTION_DIM} numbers, got {values}")
+        if self.image_keys and len(self.image_keys) != len(self.contract.cameras):
+            raise ContractError(
+                f"[images] must name each of the cameras {list(self.contract.cameras)}"
+            )
+
+    @property
+    def state_columns(self) -> list[int]:
+        """Column of ``contract.state_names`` of each number of the policy's state."""
+        names = self.state_names or self.contract.state_names
+        return [self.contract.state_names.index(name) for name in names]
+
+    @property
+    def action_columns(self) -> list[int]:
+        """Column of the policy's action of each number of the contract's."""
+        wanted = ACTION_FIELDS[self.contract.action]
+        return [(self.action_names or wanted).index(name) for name in wanted]
+
+    @property
+    def camera_keys(self) -> tuple[str, ...]:
+        """The policy's name of each camera, in the contract's order."""
+        return self.image_keys or tuple(f"observation.images.{n}" for n in self.contract.cameras)
+
+    def to_actions(self, actions: FloatArray) -> FloatArray:
+        """The policy's actions [..., 4] -> the contract's [..., 4]."""
+        scale = np.array(self.action_scale or (1.0,) * ACTION_DIM, np.float32)
+        offset = np.array(self.action_offset or (0.0,) * ACTION_DIM, np.float32)
+        return np.ascontiguousarray((actions * scale + offset)[..., self.action_columns])
+
+
+def read_interface(path: Path) -> Interface:
+    """Read a contract file.
+
+    Raises:
+        ContractError: it cannot be read, is not TOML, or says something unknown or malformed.
+    """
+    try:
+        data: dict[str, Any] = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ContractError(f"--contract {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ContractError(f"--contract {path} is not TOML: {error}") from error
+    try:
+        return _interface(data)
+    except (ContractError, TypeError, ValueError) as error:
+        raise ContractError(f"--contract {path}: {error}") from error
+
+
+def _interface(data: dict[str, Any]) -> Interface:
+    tables = {name: dict(data.pop(name, {})) for name in ("contract", "state", "action", "images")}
+    task = dict(data.pop("task", {}))
+    known = {field.name for field in fields(Contract) if field.init}
+    if unknown := sorted(set(tables["contract"]) - known):
+        raise ContractError(f"[contract] has unknown fields {unknown}; known are {sorted(known)}")
+    contract = Contract(**{name: _frozen(value) for name, value in tables["contract"].items()})
+    state, action, images = tables["state"], tables["action"], tables["images"]
+    if images and sorted(images) != sorted(contract.cameras):
+        raise ContractError(
+            f"[images] names {sorted(images)}, the contract's cameras are {list(contract.cameras)}"
+        )
+    interface = Interface(
+        contract=contract,
+        state_names=tuple(state.pop("names", ())),
+        state_key=str(state.pop("key", Interface.state_key)),
+        action_names=tuple(action.pop("names", ())),
+        action_key=str(action.pop("key", Interface.action_key)),
+        action_scale=tuple(float(value) for value in action.pop("scale", ())),
+        action_offset=tuple(float(value) for value in action.pop("offset", ())),
+        image_keys=tuple(str(images[name]) for name in contract.cameras) if images else (),
+        prompt=str(task.pop("prompt", "")),
+    )
+    if rest := sorted((*data, *state, *action, *task)):
+        raise ContractError(f"unknown entries {rest}")
+    return interface
+
+
+def _frozen(value: object) -> Any:
+    return tuple(value) if isinstance(value, list) else value

@@ -1,0 +1,115 @@
+"""The networks of this project: TOGE and ResNet-UNet, trained or with random weights."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from policy.errors import PolicyError
+from policy.foreign.user_class import FORMS
+from policy.loading.request import PolicyRequest, default_contract
+from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
+
+if TYPE_CHECKING:
+    from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
+
+SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
+"""Flown by ``toge`` where no other weights are named; its card is beside it."""
+BUILTIN_KINDS = ("toge", "resnet-unet")
+
+
+def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
+    """The built-in network that ``spec`` names, with the default contract at that image size.
+
+    Raises:
+        PolicyError: it names none.
+    """
+    kind, *options = spec.split(":")
+    if kind not in BUILTIN_KINDS:
+        raise PolicyError(
+            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
+            "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
+        )
+    return _config(kind, options, image_size)
+
+
+def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:
+    """Build a network and load its weights, or seeded random ones; with notes for the user."""
+    kind, *options = request.spec.split(":")
+    config, checkpoint = _config(kind, options, request.image_size), builtin_checkpoint(request)
+    if checkpoint is None:
+        return _untrained(config, request.seed)
+    return _trained(config, options, checkpoint, request.seed)
+
+
+def builtin_checkpoint(request: PolicyRequest) -> Path | None:
+    """The weights of a network of ours; None where random ones will do."""
+    if request.checkpoint is not None or request.allow_untrained:
+        return request.checkpoint
+    if request.spec == "toge" and SHIPPED.is_file():
+        return SHIPPED
+    raise PolicyError(
+        f"{request.spec} needs trained weights: give --checkpoint FILE, or --allow-untrained for "
+        "seeded random ones (timing and bring-up), or fly --policy scripted"
+    )
+
+
+def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | None]:
+    """Size and backbone that a spec asks for; a checkpoint that says more overrules them."""
+    rest: list[Any] = list(options)
+    size: Size = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
+    if len(rest) > (1 if kind == "toge" else 0):
+        raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {FORMS}")
+    if rest and rest[0] not in BACKBONE_NAMES:
+        raise PolicyError(
+            f"--policy toge:{':'.join(options)}: {rest[0]!r} is neither a size "
+            f"({', '.join(SIZE_NAMES)}) nor an encoder ({', '.join(BACKBONE_NAMES)})"
+        )
+    return size, rest[0] if rest else None
+
+
+def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinConfig":
+    from policy.nets.resnet_unet import ResnetUnetConfig
+    from policy.nets.toge import TogeConfig
+
+    size, backbone = parse_builtin(kind, options)
+    contract = default_contract(image_size)
+    if kind == "toge":
+        return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
+    return ResnetUnetConfig(size=size, contract=contract)
+
+
+def _trained(
+    config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
+) -> tuple["BuiltinPolicy", list[str]]:
+    from policy.checkpoints.policy_file import load_checkpoint
+
+    policy = load_checkpoint(checkpoint, fallback=config)
+    parts = (policy.config.size, getattr(policy.config, "backbone", "resnet18"))
+    if contradicted := [option for option in options if option not in parts]:
+        raise PolicyError(
+            f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
+        )
+    policy.seed_noise(seed)
+    notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
+    if checkpoint.suffix != ".safetensors":
+        contract, schedule = policy.contract, policy.config.schedule
+        notes.append(
+            f"warning: {checkpoint} may hold no contract; it is flown with frame "
+            f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
+            f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
+            f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
+            f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
+        )
+    return policy, notes
+
+
+def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
+    import torch
+
+    from policy.checkpoints.policy_file import build_policy
+
+    with torch.random.fork_rng(devices=[]):  # the process's own random stream stays as it was
+        torch.manual_seed(seed)
+        policy = build_policy(config).eval()
+    policy.seed_noise(seed)
+    note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
+    return policy, [note]

@@ -1,0 +1,111 @@
+"""The methods of a policy, and a policy that is ready to run on one engine."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policy.contract import Contract, FloatArray
+
+
+@runtime_checkable
+class SingleRatePolicy(Protocol):
+    """The minimum that flies: image, state and history in, a chunk out.
+
+    Shapes, float32: image [B, *contract.image_shape] normalised by the contract, state
+    [B, *contract.state_shape] in SI units, action_history [B, K, 4]; returns [B, horizon, 4]
+    actions of ``contract.action``. Arrays are numpy or torch, as ``contract.arrays`` says. Any
+    class with these members will do; nothing is inherited.
+
+    Two more methods, without arguments, are optional. ``reset()`` is called once after loading, and
+    whenever a flight begins; ``close()`` once, when no method will be called again. The vision
+    thread calls ``encode_visual``; the policy thread calls the other methods and ``reset``, so what
+    ``encode_visual`` keeps is not for ``reset`` to change without a lock. A method that has no
+    chunk to give for now raises ``policy.errors.NoChunkError``; any other exception ends the
+    flight.
+    """
+
+    contract: Contract
+
+    def predict(self, image: Any, state: Any, action_history: Any, num_diffusion_steps: int) -> Any:
+        """Encode the image and sample one chunk."""
+
+
+@runtime_checkable
+class DualRatePolicy(SingleRatePolicy, Protocol):
+    """A policy whose image path can run slower than its action path.
+
+    With several cameras ``encode_visual(image, camera)`` gets the camera's place in
+    ``contract.cameras`` as well, and is called for each at its own rate.
+    """
+
+    def encode_visual(self, image: Any) -> Any:
+        """Image [B, 3, H, W] -> feature [B, F]."""
+
+    def predict_fast(
+        self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
+    ) -> Any:
+        """Cached features [B, *contract.feature_shape], states and history -> chunk."""
+
+
+class NoiseModel(Protocol):
+    """The noise that a diffusion solve starts from."""
+
+    @property
+    def initial_noise(self) -> Any:
+        """[1, horizon, 4]; the same for a whole flight."""
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
+
+
+@runtime_checkable
+class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
+    """A policy whose solve can be entered before any of its steps, and left after any.
+
+    ``predict_fast`` is ``denoise_fast`` by all steps from ``initial_noise``.
+    """
+
+    def denoise_fast(
+        self,
+        feature: Any,
+        state: Any,
+        action_history: Any,
+        noisy: Any,
+        num_diffusion_steps: int,
+        first: int,
+        count: int,
+    ) -> Any:
+        """``count`` steps of a solve: ``noisy`` [B, horizon, 4] as step ``first`` starts with it
+        -> as the next step would; after the last step, the chunk."""
+
+
+def keep_nothing() -> None:
+    """Reset a policy that keeps nothing between chunks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Executable:
+    """A policy ready to run on one engine, numpy in and numpy out, as the loops call it.
+
+    ``encode`` runs in the vision thread, ``act`` and ``reset`` in the policy thread. Without a fast
+    path ``encode`` only preprocesses and ``act`` does the rest.
+    """
+
+    contract: Contract
+    name: str
+    engine: str
+    dual_rate: bool
+    encode: Callable[[NDArray[np.uint8]], FloatArray]
+    """RGB [any height, any width, 3] -> what ``act`` of the same executable takes: opaque to the
+    loops, float32, of a shape that each engine knows."""
+    act: Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
+    """(encode's value, state [1, state_dim], history [1, K, 4], seconds from the state of the last
+    chunk to this one or None to start afresh) -> chunk [1, horizon, 4]."""
+    close: Callable[[], None] = keep_nothing
+    """Ends what the policy has opened; called once, after the last call of the others."""
+    reset: Callable[[], None] = keep_nothing
+    """Forgets earlier flights; called when a flight begins. A warm start needs no reset: ``act``
+    starts it afresh where no time is given."""
