@@ -18,7 +18,7 @@ from mavbridge.commands.bench.results import EngineTiming
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from policy.contract import ACTION_DIM
-from policy.engines.openvino_cpu import precisions
+from policy.engines.openvino_compile import precisions
 
 DTYPES = {"f32": torch.float32, "bf16": torch.bfloat16}
 MATRIX_SIDE = 1024

@@ -1,8 +1,9 @@
 """From a camera image and a vehicle state to what a net takes: one copy for training and flight.
 
-The image is normalised here, before the net, by the checkpoint's contract. The state is turned
-into body axes and normalised inside the nets (``encoders.StateEncoder``) by the functions of this
-module, so that a checkpoint takes SI units. No torch: the scripted policies pass through here too.
+The image is cut, fitted and normalised here, before the net, by the checkpoint's contract. The
+state is turned into body axes and normalised inside the nets (``encoders.StateEncoder``) by the
+functions of this module, so that a checkpoint takes SI units. No torch: the scripted policies pass
+through here too.
 """
 
 from collections.abc import Sequence
@@ -75,7 +76,23 @@ def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
 def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:
     """RGB image [H, W, 3] uint8 of any size -> [1, 3, image_height, image_width] float32.
 
-    It is resized, then normalised as ``(rgb / 255 - mean) / std`` by the contract.
+    It is fitted by ``fit_image``, then normalised as ``(value / 255 - mean) / std`` by the
+    contract, with the channels in the contract's order.
+
+    Raises:
+        PolicyError: the array is not an RGB uint8 image.
+    """
+    fitted = fit_image(rgb, contract)
+    scale, offset = _scale_offset(contract)
+    planes = np.empty((1, 3, contract.image_height, contract.image_width), np.float32)
+    for place, colour in enumerate((0, 1, 2) if contract.image_channels == "rgb" else (2, 1, 0)):
+        np.multiply(fitted[..., colour], scale[colour], out=planes[0, place])
+        planes[0, place] += offset[colour]
+    return planes
+
+
+def fit_image(rgb: NDArray[np.uint8], contract: Contract) -> NDArray[np.uint8]:
+    """RGB image [H, W, 3] of any size -> the contract's part of it [image_height, image_width, 3].
 
     Raises:
         PolicyError: the array is not an RGB uint8 image.
@@ -86,13 +103,32 @@ def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:
             "convert it in the camera source"
         )
     height, width = contract.image_height, contract.image_width
-    resized = resize(rgb, height, width)
-    scale, offset = _scale_offset(contract)
-    planes = np.empty((1, 3, height, width), np.float32)
-    for channel in range(3):
-        np.multiply(resized[..., channel], scale[channel], out=planes[0, channel])
-        planes[0, channel] += offset[channel]
-    return planes
+    top, left, bottom, right = contract.image_crop
+    image = rgb[_part(len(rgb), top, bottom), _part(rgb.shape[1], left, right)]
+    tall, wide = height / image.shape[0], width / image.shape[1]
+    if contract.image_fit == "stretch" or tall == wide:
+        return resize(image, height, width)
+    if contract.image_fit == "crop":
+        spare_rows, spare_columns = (0.5 - side / max(tall, wide) / 2 for side in (tall, wide))
+        rows = _part(image.shape[0], spare_rows, 1 - spare_rows)
+        columns = _part(image.shape[1], spare_columns, 1 - spare_columns)
+        return resize(image[rows, columns], height, width)
+    least = min(tall, wide)
+    inner = resize(image, _at_least_1(image.shape[0] * least), _at_least_1(image.shape[1] * least))
+    above, beside = (height - inner.shape[0]) // 2, (width - inner.shape[1]) // 2
+    padded = np.zeros((height, width, 3), np.uint8)
+    padded[above : above + inner.shape[0], beside : beside + inner.shape[1]] = inner
+    return padded
+
+
+def _part(length: int, start: float, end: float) -> slice:
+    """Pixels between two shares of a side; at least one."""
+    first = min(round(start * length), length - 1)
+    return slice(first, max(round(end * length), first + 1))
+
+
+def _at_least_1(pixels: float) -> int:
+    return max(round(pixels), 1)
 
 
 def resize(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:

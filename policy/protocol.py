@@ -1,6 +1,6 @@
 """The methods of a policy, and a policy that is ready to run on one engine."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,11 +20,13 @@ class SingleRatePolicy(Protocol):
     class with these members will do; nothing is inherited.
 
     Two more methods, without arguments, are optional. ``reset()`` is called once after loading, and
-    whenever a flight begins; ``close()`` once, when no method will be called again. The vision
-    thread calls ``encode_visual``; the policy thread calls the other methods and ``reset``, so what
-    ``encode_visual`` keeps is not for ``reset`` to change without a lock. A method that has no
-    chunk to give for now raises ``policy.errors.NoChunkError``; any other exception ends the
-    flight.
+    whenever a flight begins; ``close()`` once at the end, also after an error. The main thread
+    makes the policy, tries each method on a dummy sample, and closes it when the other threads have
+    ended; if one hangs, while that one still runs. In between the vision threads call
+    ``encode_visual``, never for two images at once; the policy thread calls the other methods and
+    ``reset``, so what ``encode_visual`` keeps is not for ``reset`` to change without a lock. A
+    method that has no chunk to give for now raises ``policy.errors.NoChunkError``; any other
+    exception ends the flight.
     """
 
     contract: Contract
@@ -82,6 +84,39 @@ class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
         -> as the next step would; after the last step, the chunk."""
 
 
+class Encode(Protocol):
+    """``Executable.encode``."""
+
+    def __call__(self, rgb: NDArray[np.uint8], camera: int = 0, /) -> FloatArray:
+        """RGB image of one of ``contract.cameras`` -> its encoded image."""
+
+
+@runtime_checkable
+class StepwisePolicy(DualRatePolicy, Protocol):
+    """A diffusion policy that can be asked for one call of its network at a time.
+
+    An engine that compiles compiles ``denoise`` alone, once, and runs the solver around it: that
+    is one copy of the weights, and seconds to convert in place of minutes. A warm start needs the
+    members of ``WarmStartPolicy`` as well.
+    """
+
+    schedule: Any
+    """A ``nets.diffusion.NoiseSchedule``: the timesteps of a solve, and what an output means."""
+
+    @property
+    def initial_noise(self) -> Any:
+        """[1, L, A]: what every solve of a flight starts from, in the network's own form."""
+
+    def denoise(
+        self, noisy: Any, timestep: Any, feature: Any, state: Any, action_history: Any
+    ) -> Any:
+        """One network call: noisy [B, L, A] at the timestep [B], float32 -> [B, L, A], what the
+        schedule says that the network predicts."""
+
+    def to_chunk(self, sample: Any) -> Any:
+        """The end of a solve, [B, L, A] -> chunk [B, horizon, 4] of the contract."""
+
+
 def keep_nothing() -> None:
     """Reset a policy that keeps nothing between chunks."""
 
@@ -90,22 +125,35 @@ def keep_nothing() -> None:
 class Executable:
     """A policy ready to run on one engine, numpy in and numpy out, as the loops call it.
 
-    ``encode`` runs in the vision thread, ``act`` and ``reset`` in the policy thread. Without a fast
-    path ``encode`` only preprocesses and ``act`` does the rest.
+    ``encode`` runs in the threads of the cameras, one image at a time, ``act`` and ``reset`` in the
+    policy thread, ``close`` in the main thread. Without a fast path ``encode`` only preprocesses
+    and ``act`` does the rest.
     """
 
     contract: Contract
     name: str
     engine: str
     dual_rate: bool
-    encode: Callable[[NDArray[np.uint8]], FloatArray]
-    """RGB [any height, any width, 3] -> what ``act`` of the same executable takes: opaque to the
-    loops, float32, of a shape that each engine knows."""
+    encode: Encode
+    """RGB [any height, any width, 3] of one camera -> float32 [1, feature_dim], or without a fast
+    path the image [1, 3, image_height, image_width]; ``join`` makes of them what ``act`` takes."""
     act: Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
-    """(encode's value, state [1, state_dim], history [1, K, 4], seconds from the state of the last
-    chunk to this one or None to start afresh) -> chunk [1, horizon, 4]."""
+    """(joined images [1, *contract.feature_shape], or without a fast path [1,
+    *contract.image_shape]; state [1, *contract.state_shape]; history [1, K, 4]; seconds from the
+    state of the last chunk to this one or None to start afresh) -> chunk [1, horizon, 4]."""
     close: Callable[[], None] = keep_nothing
     """Ends what the policy has opened; called once, after the last call of the others."""
     reset: Callable[[], None] = keep_nothing
     """Forgets earlier flights; called when a flight begins. A warm start needs no reset: ``act``
     starts it afresh where no time is given."""
+
+    def join(self, encoded: Sequence[Sequence[FloatArray]]) -> FloatArray:
+        """``encode``'s value of each camera, at each observation from the oldest on -> for ``act``.
+
+        The same array where there is only one.
+        """
+        rows = [row[0] if len(row) == 1 else self._side_by_side(row) for row in encoded]
+        return rows[0] if len(rows) == 1 else np.stack(rows, axis=1)
+
+    def _side_by_side(self, row: Sequence[FloatArray]) -> FloatArray:
+        return np.concatenate(row, axis=1) if self.dual_rate else np.stack(row, axis=1)

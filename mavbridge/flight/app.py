@@ -70,11 +70,13 @@ def fly(config: FlyConfig) -> int:
     clock = MonotonicClock()
     check_flight(config, clock)
     console = flight_console()
-    with ExitStack() as stack:
+    # The policy is closed last: whatever its close does, the gate has ended before.
+    with ExitStack() as policy_life, ExitStack() as stack:
         gate = start_gate(config, clock, stack)  # finds the vehicle while the weights load
         loaded = load_configured_policy(
             config.policy, clock, starts_in_air=config.takeoff is not None
         )
+        policy_life.enter_context(loaded)
         for note in loaded.notes:
             console.print(Text(note, style="yellow"))
         fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
@@ -188,7 +190,7 @@ class _Flight:
             executable,
             clock=clock,
             send=self._gate.send,
-            camera=camera,
+            cameras=(camera,),
             sinks=(*self._observers.sinks, *sinks),
             watches_images=looks_at_images(config),
         )
@@ -196,7 +198,7 @@ class _Flight:
     def run(self, stop: StopRequest) -> None:
         """Fly until the gate ends, a loop ends, or a signal comes."""
         rates, bridge, screen = self._config.rates, self._bridge, self._observers.screen
-        see = self._scheduled(bridge.vision.run, realtime=False, cpu=rates.vision_cpu)
+        see = self._scheduled(bridge.visions[0].run, realtime=False, cpu=rates.vision_cpu)
         act = self._scheduled(bridge.policy.run, realtime=rates.realtime, cpu=rates.action_cpu)
         vision, policy = Worker("mavbridge-vision", see), Worker("mavbridge-policy", act)
         # On the way of every attitude to the policy, so it must not wait for ordinary threads.
@@ -251,7 +253,7 @@ class _Flight:
         self._looked_ns = now_ns
         for name, alive_ns, limit_ns in (
             ("policy", self._bridge.policy.alive_ns, self._hang_ns),
-            ("encoder", self._bridge.vision.alive_ns, self._encoder_hang_ns),
+            ("encoder", self._bridge.visions[0].alive_ns, self._encoder_hang_ns),
         ):
             idle_ns = now_ns - max(alive_ns, self._resumed_ns)
             if idle_ns > limit_ns:

@@ -2,15 +2,19 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.config.flight import CameraConfig, FlyConfig
+from mavbridge.config.rates import LoopRates
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
+from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
+from mavbridge.flight.observation import ObservationSource, StateHistory, observation_ages_ns
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.flight.state import Freshness
@@ -19,6 +23,7 @@ from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.flight.vision_rate import AdaptiveRate
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.wire import Absence
+from policy.contract import Contract
 from policy.protocol import Executable
 
 
@@ -26,7 +31,8 @@ from policy.protocol import Executable
 class Bridge:
     """Camera to feature cache, state and feature to chunks, and what the gate says of both."""
 
-    vision: VisionLoop
+    visions: tuple[VisionLoop, ...]
+    """One for each camera of the contract, in its order."""
     policy: PolicyLoop
     view: VehicleView
 
@@ -37,74 +43,99 @@ def build_bridge(
     *,
     clock: Clock,
     send: Callable[[Chunk | Absence], object],
-    camera: Camera,
+    cameras: Sequence[Camera],
     sinks: Sequence[TickSink],
     watches_images: bool,
-    cache: FeatureCache | None = None,
+    caches: Sequence[FeatureCache] = (),
     policy_clock: Clock | None = None,
-    vision_clock: Clock | None = None,
+    vision_clocks: Sequence[Clock] = (),
     delay_vision: Callable[[TickSink], TickSink] | None = None,
 ) -> Bridge:
-    """Join a policy, a camera and the gate.
+    """Join a policy, its cameras and the gate.
 
     Args:
         config: rates and limits; its camera and address are not used.
         executable: the policy on its engine.
         clock: time of everything that has no clock of its own.
         send: hands a chunk to the gate, or the reason why there is none.
-        camera: used by the vision loop alone.
-        sinks: see every tick and every encoded frame.
+        cameras: those of the contract, in its order; each is used by its vision loop alone.
+        sinks: see every tick and every encoded frame of the first camera.
         watches_images: a frozen or a black image is a fault; False where nobody looks at it.
-        cache: holds the newest feature; simulation passes one that publishes late.
+        caches: one for each camera; simulation passes some that publish late.
         policy_clock: time of the policy loop, where simulated solving takes simulated time.
-        vision_clock: time of the vision loop, likewise.
+        vision_clocks: time of each vision loop, likewise.
         delay_vision: wraps the sink of the vision loop, for the same reason.
     """
-    cache = cache or FeatureCache()
     contract = executable.contract
     loops = config.rates.loops(is_dual=executable.dual_rate)
-    rate = AdaptiveRate(min_hz=loops.min_vision_hz, max_hz=loops.max_vision_hz)
-    sink = FanOut([rate, *sinks] if rate.is_adaptive else sinks)
     limits = effective_freshness(contract, config.limits)
     frame = action_frame(contract)
     settings = PolicySettings(
         state_frame=contract.state_frame,
-        since_exposure=contract.since_exposure,
         action_frame=frame,
         chunk_dt_s=contract.chunk_dt_s,
         freshness=Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns),
-        max_feature_age_ns=limits.feature_ns,
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
         period_ns=period_ns(loops.action_hz),
     )
+    past_ns = observation_ages_ns(contract)[0]
+    states = StateHistory(span_ns=past_ns) if past_ns else None
+    caches = caches or [FeatureCache(span_ns=past_ns) for _ in cameras]
+    rates = _visual_rates(contract, loops)
+    adaptive = [[rate] if rate.is_adaptive else [] for rate in rates]
     history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s, frame=frame)
     view = VehicleView(
         history=history,
-        sink=sink,
+        sink=FanOut([*chain(*adaptive), *sinks]),
         state_frame=settings.state_frame,
         freshness=settings.freshness,
+        states=states,
     )
-    vision = VisionLoop(
-        camera=camera,
-        encode=executable.encode,
-        cache=cache,
-        sink=delay_vision(sink) if delay_vision else sink,
-        clock=vision_clock or clock,
-        period_ns=rate.period_ns,
-        image_watch=_image_watch(config.camera) if watches_images else None,
-        is_airborne=lambda: view.is_airborne,
+    vision_sinks = [
+        FanOut([*own, *(sinks if number == 0 else ())]) for number, own in enumerate(adaptive)
+    ]
+    visions = tuple(
+        VisionLoop(
+            camera=camera,
+            encode=_encoder(executable, number),
+            cache=caches[number],
+            sink=delay_vision(vision_sinks[number]) if delay_vision else vision_sinks[number],
+            clock=vision_clocks[number] if vision_clocks else clock,
+            period_ns=rates[number].period_ns,
+            image_watch=_image_watch(config.camera) if watches_images else None,
+            is_airborne=lambda: view.is_airborne,
+        )
+        for number, camera in enumerate(cameras)
     )
     policy = PolicyLoop(
         clock=policy_clock or clock,
         view=view,
-        cache=cache,
+        observations=ObservationSource(
+            contract,
+            caches=caches,
+            join=executable.join,
+            states=states,
+            max_feature_age_ns=limits.feature_ns,
+        ),
         history=history,
         act=executable.act,
         reset=executable.reset,
         send=send,
         settings=settings,
     )
-    return Bridge(vision=vision, policy=policy, view=view)
+    return Bridge(visions=visions, policy=policy, view=view)
+
+
+def _visual_rates(contract: Contract, loops: LoopRates) -> list[AdaptiveRate]:
+    """Rate of each camera: that of the flight, or of the contract where that is lower."""
+    return [
+        AdaptiveRate(min_hz=min(loops.min_vision_hz, hz), max_hz=min(loops.max_vision_hz, hz))
+        for hz in contract.camera_rates_hz or (loops.max_vision_hz,) * len(contract.cameras)
+    ]
+
+
+def _encoder(executable: Executable, camera: int) -> Callable[[ImageArray], FloatArray]:
+    return executable.encode if camera == 0 else lambda rgb: executable.encode(rgb, camera)
 
 
 def _image_watch(config: CameraConfig) -> ImageWatch:

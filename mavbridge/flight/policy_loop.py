@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
-from mavbridge.core.records import FeatureFrame, FloatArray, VehicleState
+from mavbridge.core.records import FloatArray, VehicleState
 from mavbridge.core.vehicle import Release
 from mavbridge.flight.action_frames import ActionFrame
-from mavbridge.flight.ego_motion import EgoMotion
-from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
+from mavbridge.flight.observation import Observation, ObservationSource
 from mavbridge.flight.state import Freshness, FrozenStateCheck, StateFrame, build_state
 from mavbridge.flight.vehicle_view import SolveInputs, VehicleView
 from mavbridge.gate.chunks import Chunk
@@ -20,8 +19,7 @@ from mavbridge.gate.wire import Absence
 from policy.errors import NoChunkError
 
 Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
-"""(encoded image, state [1, 13 or 20], history [1, K, 4], seconds since the state of the last chunk
-or None to start afresh) -> chunk [1, horizon, 4]."""
+"""``Executable.act``."""
 
 WAIT_NS = 100 * NS_PER_MS
 """Longest wait for an attitude before the stop flag is checked, and the gate told why it waits."""
@@ -35,12 +33,9 @@ class PolicySettings:
     """Parts of the contract and of the configuration that the loop needs."""
 
     state_frame: StateFrame
-    since_exposure: bool
-    """The age of the image and the motion since its exposure are appended to the state."""
     action_frame: ActionFrame
     chunk_dt_s: float
     freshness: Freshness
-    max_feature_age_ns: int
     max_frozen_ns: int
     """Longest time for which the attitude may stay exactly the same; 0 = no limit."""
     period_ns: int
@@ -58,7 +53,7 @@ class PolicyLoop:
         *,
         clock: Clock,
         view: VehicleView,
-        cache: FeatureCache,
+        observations: ObservationSource,
         history: SentHistory,
         act: Act,
         reset: Callable[[], None],
@@ -67,15 +62,12 @@ class PolicyLoop:
     ) -> None:
         self._clock = clock
         self._view = view
-        self._cache = cache
+        self._observations = observations
         self._history = history
         self._act = act
         self._reset = reset
         self._send = send
         self._settings = settings
-        self._ego_motion: EgoMotion | None = None
-        if settings.since_exposure:
-            self._ego_motion = EgoMotion(span_ns=settings.max_feature_age_ns)
         self._frozen = FrozenStateCheck(max_frozen_ns=settings.max_frozen_ns)
         self._serial = 0
         self._flights = 0
@@ -116,42 +108,34 @@ class PolicyLoop:
             self._flights = self._view.flights
             self._chunk_state_ns = None
             self._reset()
-        feature = self._cache.latest()
         state = build_state(
             self._view.telemetry(),
             now_ns,
             frame=self._settings.state_frame,
             freshness=self._settings.freshness,
         )
-        if isinstance(state, VehicleState) and self._ego_motion is not None:
-            self._ego_motion.push(state)
-        if isinstance(state, Release):
-            self._refuse(state.reason)
-        elif (frozen := self._frozen.problem(state)) is not None:
-            self._refuse(frozen)
-        elif feature is None:
-            self._refuse("no image feature yet")
-        elif now_ns - feature.captured_ns > self._settings.max_feature_age_ns:
-            limit_ms = self._settings.max_feature_age_ns // NS_PER_MS
-            self._refuse(f"the image feature is older than {limit_ms} ms")
-        elif feature.fault is not None:
-            self._refuse(feature.fault)
+        observation = self._observe(state, now_ns) if isinstance(state, VehicleState) else state
+        if isinstance(observation, Release):
+            self._refuse(observation.reason)
         else:
-            self._solve(state, feature, now_ns)
+            self._solve(observation, now_ns)
+
+    def _observe(self, state: VehicleState, now_ns: int) -> Observation | Release:
+        self._observations.push(state)
+        frozen = self._frozen.problem(state)
+        return self._observations.observe(state, now_ns) if frozen is None else Release(frozen)
 
     def _refuse(self, reason: str) -> None:
         self._chunk_state_ns = None
         self._send(Absence(reason))
 
-    def _solve(self, state: VehicleState, feature: FeatureFrame, now_ns: int) -> None:
+    def _solve(self, observation: Observation, now_ns: int) -> None:
+        state, feature = observation.state, observation.feature
         history = self._history.resample(now_ns)
         last_ns, self._chunk_state_ns = self._chunk_state_ns, state.attitude_ns
         elapsed_s = None if last_ns is None else (state.attitude_ns - last_ns) / NS_PER_S
-        values = state.values[None]
-        if self._ego_motion is not None:
-            values = self._ego_motion.append_to(state, feature.captured_ns)
         try:
-            array = self._act(feature.value, values, history, elapsed_s)
+            array = self._act(observation.encoded, observation.states, history, elapsed_s)
         except NoChunkError as error:
             self._refuse(str(error))
             return
@@ -182,7 +166,7 @@ class PolicyLoop:
                 serial=self._serial,
                 attitude_ns=min(state.attitude_ns, state.rate_ns),
                 velocity_ns=min(state.velocity_ns, state.specific_force_ns),
-                image_ns=feature.captured_ns,
+                image_ns=observation.image_ns,
                 computed_ns=done_ns,
                 first_ns=state.attitude_ns,
                 step_ns=round(self._settings.chunk_dt_s * NS_PER_S),

@@ -13,6 +13,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.ports import TickSink
 from mavbridge.core.records import ImageArray
 from mavbridge.flight.bridge import build_bridge
+from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.settings import flight_settings, link_settings
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.loop import GateLoop
@@ -183,20 +184,21 @@ class SimulatedFlight:
         camera = self._make_camera(executable, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
         send = sender(world, policy_clock, flight_port)
         send(flight_settings(config, executable))
+        past_ns = observation_ages_ns(executable.contract)[0]
         bridge = build_bridge(
             config,
             self._take_time(executable, vision_clock, policy_clock),
             clock=world,
             send=send,
-            camera=camera,
+            cameras=(camera,),
             sinks=sinks,
             watches_images=self._settings.draw_images,
-            cache=DelayedFeatureCache(world),
+            caches=(DelayedFeatureCache(world, span_ns=past_ns),),
             policy_clock=policy_clock,
-            vision_clock=vision_clock,
+            vision_clocks=(vision_clock,),
             delay_vision=lambda sink: DelayedSink(world, sink),
         )
-        VisionStepper(world, vision_clock, camera, bridge.vision)
+        VisionStepper(world, vision_clock, camera, bridge.visions[0])
         policy = PolicyStepper(world, policy_clock, flight_port, bridge.policy, bridge.view)
         gate_stepper = GateStepper(world, gate)
         to_flight.on_arrival = policy.receive
@@ -232,9 +234,9 @@ class SimulatedFlight:
         action_ns = self._settings.delays.action.samples_ns(self._random(5))
         is_dual = executable.dual_rate
 
-        def encode(rgb: ImageArray) -> FloatArray:
+        def encode(rgb: ImageArray, camera: int = 0, /) -> FloatArray:
             vision_clock.ahead_ns += next(vision_ns) if is_dual else 0
-            return executable.encode(rgb)
+            return executable.encode(rgb, camera)
 
         def act(
             encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None

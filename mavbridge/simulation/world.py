@@ -175,8 +175,8 @@ class SimulatedCamera:
 class DelayedFeatureCache(FeatureCache):
     """Publishes each feature at its ``ready_ns``."""
 
-    def __init__(self, clock: SteppedClock) -> None:
-        super().__init__()
+    def __init__(self, clock: SteppedClock, *, span_ns: int = 0) -> None:
+        super().__init__(span_ns=span_ns)
         self._clock = clock
 
     def publish(self, frame: FeatureFrame) -> None:

@@ -11,10 +11,10 @@ from importlib.util import find_spec
 
 import numpy as np
 import torch
-from torch import nn
 
 from policy.contract import FloatArray
-from policy.engines.executable import EngineName, ExecutionSettings
+from policy.engines.executable import EngineName, ExecutionSettings, encode_all
+from policy.engines.kept import changes, modules_of, snapshot
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
@@ -38,13 +38,25 @@ def choose_executable(
         PolicyError: the engine asked for is absent here or does not serve this policy or device;
             or the policy itself failed.
     """
-    if engine == "torch" or (engine == "auto" and not isinstance(policy, Toge | ResnetUnet)):
+    modules = modules_of(policy)
+    for module in modules:
+        module.eval()  # before any engine looks: a flight trains nothing
+    if engine == "torch" or (engine == "auto" and not modules):
         return make_torch_executable(policy, settings), ()
-    if not isinstance(policy, nn.Module):
+    if not modules:
         raise PolicyError(
-            f"--engine {engine} takes a torch.nn.Module: leave it out, and {settings.name} runs on "
-            "torch"
+            f"--engine {engine} takes a torch.nn.Module, or a class that holds one as an "
+            f"attribute: leave it out, and {settings.name} runs on torch"
         )
+    if engine == "auto" and not isinstance(policy, Toge | ResnetUnet):
+        if settings.vision_device != "cpu" or settings.action_device != "cpu":
+            return make_torch_executable(policy, settings), ()
+        if hasattr(policy, "reset"):
+            note = (
+                "engine torch: the policy has reset, so it keeps something from call to call, "
+                "which a graph cannot; without reset it is converted to the faster openvino"
+            )
+            return make_torch_executable(policy, settings), (note,)
     candidates = _candidates(policy, engine, settings)
     return first_that_agrees(policy, candidates, settings)
 
@@ -61,7 +73,11 @@ def first_that_agrees(
     if candidates:
         on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
         samples = make_parity_samples(policy.contract)
-        expected = chunks_of_samples(make_torch_executable(policy, on_cpu), samples)
+        reference = make_torch_executable(policy, on_cpu)
+        before = snapshot(policy)
+        expected = chunks_of_samples(reference, samples)
+        if (reason := _impurity(policy, before, reference, samples, expected)) is not None:
+            return make_torch_executable(policy, settings), (f"engine torch: {reason}",)
     for label, make in candidates:
         try:
             executable = make()
@@ -78,10 +94,32 @@ def chunks_of_samples(executable: Executable, samples: ParitySamples) -> FloatAr
     """Chunks [2 * samples, horizon, 4] from image to stick: each sample afresh, then once more."""
     chunks = []
     for rgb, state, history in zip(samples.rgb, samples.state, samples.history, strict=True):
-        encoded = executable.encode(rgb)
+        encoded = encode_all(executable, rgb)
         for elapsed_s in (None, SAMPLE_ELAPSED_S):
             chunks.append(executable.act(encoded, state[None], history[None], elapsed_s)[0])
     return np.stack(chunks)
+
+
+def _impurity(
+    policy: SingleRatePolicy,
+    before: dict[str, object],
+    reference: Executable,
+    samples: ParitySamples,
+    expected: FloatArray,
+) -> str | None:
+    """Why no graph computes what this policy does; None where one may."""
+    if isinstance(policy, Toge | ResnetUnet):
+        return None
+    if changed := changes(before, snapshot(policy)):
+        return f"it keeps {', '.join(changed)} from call to call, which a graph cannot"
+    encoded = reference.encode(samples.rgb[0])
+    again = reference.act(encoded, samples.state[:1], samples.history[:1], None)[0]
+    if np.array_equal(again, expected[0]):
+        return None
+    return (
+        "the same inputs do not give the same chunk again, so it draws random numbers, or keeps "
+        "something from call to call, which a graph cannot"
+    )
 
 
 def _candidates(
@@ -93,12 +131,16 @@ def _candidates(
     if engine == "cuda-graph" and devices != {"cuda"}:
         raise PolicyError(f"--engine cuda-graph runs on --device cuda, not on {sorted(devices)}")
     if devices == {"cpu"} and find_spec("openvino") is not None:
-        from policy.engines.openvino_cpu import make_openvino_executable, precisions
+        from policy.engines.openvino_compile import precisions
+        from policy.engines.openvino_cpu import make_openvino_executable
+        from policy.engines.openvino_modules import ModuleConverter
 
+        is_ours = isinstance(policy, Toge | ResnetUnet)
+        converter = None if is_ours else ModuleConverter(policy, settings.name)
         return [
             (
                 f"openvino (images {vision}, actions {action})",
-                partial(make_openvino_executable, policy, settings, vision, action),
+                partial(make_openvino_executable, policy, settings, vision, action, converter),
             )
             for vision, action in precisions()
         ]

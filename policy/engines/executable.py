@@ -1,17 +1,25 @@
 """Shared by all engines: a policy becomes an ``Executable``, tried once before it flies."""
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, Contract, FloatArray
-from policy.engines.warm_start import Segment, WarmStart, make_solve
+from policy.contract import ACTION_DIM, QUATERNION, Contract, FloatArray
+from policy.engines.warm_start import Segment, WarmStart, make_solve, to_numpy
 from policy.errors import PolicyError, user_code
 from policy.preprocess import image_to_input
-from policy.protocol import DualRatePolicy, Executable, SingleRatePolicy, WarmStartPolicy
+from policy.protocol import (
+    DualRatePolicy,
+    Executable,
+    SingleRatePolicy,
+    StepwisePolicy,
+    WarmStartPolicy,
+)
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
@@ -49,10 +57,13 @@ def make_executable(
     *,
     engine: str,
     settings: ExecutionSettings,
+    compile_end: Compile | None = None,
 ) -> Executable:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
     ``vision`` encodes images and ``action`` samples chunks: one policy, perhaps on two devices.
+    With ``compile_end`` the solver of a ``StepwisePolicy`` is not compiled, but runs around its
+    network; ``compile_end`` is for the end of the solve, ``to_chunk``.
 
     Raises:
         PolicyError: no fast path where one was asked for, or the policy failed on the sample.
@@ -63,22 +74,32 @@ def make_executable(
         predict = compile_action(
             lambda i, s, h: action.predict(i, s, h, steps), ((1, *contract.image_shape), *rest)
         )
-        return assemble(contract, lambda array: array, always_full(predict), engine, settings)
+        return assemble(contract, (), always_full(predict), engine, settings)
     if not isinstance(vision, DualRatePolicy) or not isinstance(action, DualRatePolicy):
         raise PolicyError(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
         )
-    encode = compile_vision(
-        vision.encode_visual, ((1, 3, contract.image_height, contract.image_width),)
-    )
+    image = ((1, 3, contract.image_height, contract.image_width),)
+    encode = [compile_vision(method, image) for method in _encoders(vision)]
     fast = ((1, *contract.feature_shape), *rest)
-    if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
+    if compile_end is not None and isinstance(action, StepwisePolicy):
+        act = _stepwise(action, fast, compile_action, compile_end, settings)
+    elif isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
         act = _warm_started(action, fast, compile_action, settings, settings.head_steps)
     else:
         sampler = action
         sample = compile_action(lambda e, s, h: sampler.predict_fast(e, s, h, steps), fast)
         act = always_full(sample)
     return assemble(contract, encode, act, engine, settings)
+
+
+def _encoders(vision: DualRatePolicy) -> list[Callable[..., Any]]:
+    """``encode_visual`` of each camera: one argument, the image."""
+    cameras = len(vision.contract.cameras)
+    if cameras == 1:
+        return [vision.encode_visual]
+    encode: Callable[..., Any] = vision.encode_visual
+    return [lambda image, camera=camera: encode(image, camera) for camera in range(cameras)]
 
 
 def make_numpy_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
@@ -126,6 +147,47 @@ def _warm_started(
     return WarmStart(solve, chunk_dt_s=policy.contract.chunk_dt_s)
 
 
+def _stepwise(
+    policy: StepwisePolicy,
+    shapes: Sequence[Shape],
+    compile_: Compile,
+    compile_end: Compile,
+    settings: ExecutionSettings,
+) -> Act:
+    with user_code(f"{settings.name} failed to prepare its solver"):
+        noise = to_numpy(policy.initial_noise)
+        denoise = compile_(policy.denoise, (noise.shape, (1,), *shapes))
+        to_chunk = compile_end(policy.to_chunk, (noise.shape,))
+        segment = partial(solver_segment, denoise, policy.schedule, settings.num_diffusion_steps)
+        if settings.head_steps is None or not isinstance(policy, WarmStartPolicy):
+            solve = segment(0, settings.num_diffusion_steps)
+            return always_full(lambda e, s, h: to_chunk(solve(e, s, h, noise)))
+        warm = make_solve(policy, segment, settings.num_diffusion_steps, settings.head_steps)
+    return WarmStart(warm, chunk_dt_s=policy.contract.chunk_dt_s)
+
+
+def solver_segment(
+    denoise: ArrayFunction, schedule: Any, num_diffusion_steps: int, first: int, count: int
+) -> Segment:
+    """``count`` DDIM steps of a solve from ``first`` on, around the network call ``denoise``.
+
+    ``denoise`` and ``schedule`` are as those of ``protocol.StepwisePolicy``.
+    """
+    steps = schedule.ddim_steps(num_diffusion_steps)[first : first + count]
+    timesteps = [np.array([step.timestep], np.float32) for step in steps]
+    coefficients = [schedule.coefficients(step) for step in steps]
+
+    def run(
+        encoded: FloatArray, state: FloatArray, history: FloatArray, noisy: FloatArray
+    ) -> FloatArray:
+        for timestep, (a, b, c, d) in zip(timesteps, coefficients, strict=True):
+            output = denoise(noisy, timestep, encoded, state, history)
+            noisy = c * np.clip(a * noisy + b * output, -1.0, 1.0) + d * noisy
+        return noisy
+
+    return run
+
+
 def always_full(sample: ArrayFunction) -> Act:
     """Every chunk by ``sample(encoded, state, history)``, whenever the last one was."""
     return lambda encoded, state, history, _elapsed_s: sample(encoded, state, history)
@@ -133,22 +195,28 @@ def always_full(sample: ArrayFunction) -> Act:
 
 def assemble(
     contract: Contract,
-    encode: Callable[[FloatArray], FloatArray],
+    encode: Sequence[ArrayFunction],
     act: Act,
     engine: str,
     settings: ExecutionSettings,
 ) -> Executable:
-    """An executable of an engine's two functions, tried on a dummy sample, which warms it up.
+    """An executable of an engine's functions, tried on a dummy sample, which warms it up.
 
-    ``encode`` takes a normalised image [1, 3, H, W], ``act`` is that of ``Executable``.
+    ``encode`` has a function for each camera, which takes a normalised image [1, 3, H, W]; without
+    a fast path it is empty. ``act`` is that of ``Executable``.
 
     Raises:
         PolicyError: a function failed on the sample, or returned the wrong shape or no numbers.
     """
+    one_at_a_time = threading.Lock()  # each camera has a thread, and no policy must be ready for it
 
-    def encode_rgb(rgb: NDArray[np.uint8]) -> FloatArray:
+    def encode_rgb(rgb: NDArray[np.uint8], camera: int = 0, /) -> FloatArray:
         with user_code(f"{settings.name} failed on an image"):
-            return encode(image_to_input(rgb, contract))
+            image = image_to_input(rgb, contract)
+            if not encode:
+                return image
+            with one_at_a_time:
+                return encode[camera](image)
 
     def act_on(
         encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
@@ -168,22 +236,44 @@ def assemble(
     return executable
 
 
+def encode_all(executable: Executable, rgb: NDArray[np.uint8]) -> FloatArray:
+    """One image for each camera at each observation -> what ``act`` takes.
+
+    ``rgb`` is [H, W, 3], before that [N] for several cameras, before that [T] for several
+    observations, as ``Contract.image_shape``.
+    """
+    contract = executable.contract
+    steps, cameras = contract.observation_steps, len(contract.cameras)
+    images = rgb.reshape(steps, cameras, *rgb.shape[-3:])
+    return executable.join(
+        [[executable.encode(image, camera) for camera, image in enumerate(row)] for row in images]
+    )
+
+
+def level_state(contract: Contract) -> FloatArray:
+    """State [1, *state_shape] of a vehicle at rest and level; zeros but for the attitude."""
+    state = np.zeros((1, *contract.state_shape), np.float32)
+    state[..., QUATERNION.start] = 1.0
+    return state
+
+
 def _try(executable: Executable) -> None:
     contract = executable.contract
-    rgb = np.full((contract.image_height, contract.image_width, 3), 128, np.uint8)
-    state = np.zeros((1, contract.state_dim), np.float32)
-    state[0, 3] = 1.0  # level attitude
+    shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
+    rgb, state = np.full(shape, 128, np.uint8), level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     try:
-        encoded = executable.encode(rgb)
         if executable.dual_rate:
-            _require(executable, "encode_visual", encoded, (1, contract.feature_dim))
+            for camera in range(len(contract.cameras)):
+                feature = executable.encode(rgb.reshape(-1, *shape[-3:])[0], camera)
+                _require(executable, "encode_visual", feature, (1, contract.feature_dim))
+        encoded = encode_all(executable, rgb)
         chunks = [executable.act(encoded, state, history, elapsed_s) for elapsed_s in (None, 0.01)]
     except PolicyError as error:
         raise PolicyError(
-            f"{error}; this was a dummy sample: image [1, 3, {contract.image_height}, "
-            f"{contract.image_width}], state [1, {contract.state_dim}], action_history "
-            f"[1, {contract.history_len}, {ACTION_DIM}], as {contract.arrays} arrays"
+            f"{error}; this was a dummy sample: image {[1, *contract.image_shape]}, state "
+            f"{[1, *contract.state_shape]}, action_history [1, {contract.history_len}, "
+            f"{ACTION_DIM}], as {contract.arrays} arrays"
         ) from error
     for chunk in chunks:
         _require(executable, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))

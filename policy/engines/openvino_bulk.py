@@ -5,7 +5,7 @@ import openvino as ov
 
 from policy.contract import FloatArray
 from policy.engines.executable import Precision
-from policy.engines.openvino_cpu import DEVICE
+from policy.engines.openvino_compile import DEVICE
 from policy.engines.openvino_graph import convert
 from policy.engines.signal_stack import signal_stack_kept
 from policy.nets.resnet_unet import ResnetUnet

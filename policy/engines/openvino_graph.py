@@ -22,7 +22,6 @@ from policy.contract import ACTION_DIM, FloatArray
 from policy.engines.executable import Shape
 from policy.errors import user_code
 from policy.nets.action_head import DiffusionHead, size_dims
-from policy.nets.diffusion import DdimStep, NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.nets.unet1d import Conv, Norm, ResidualBlock, UNet1d
@@ -112,24 +111,15 @@ def step_inputs(
     with torch.inference_mode():
         film_of_steps = head.unet.film_of_timestep(timesteps.to(head.initial_noise.device)).cpu()
         films = (film_of_steps + one_at_every_scale).numpy()
-    updates = np.array([_coefficients(head.schedule, step) for step in steps], np.float32)
+    updates = np.array([head.schedule.coefficients(step) for step in steps], np.float32)
     idle = unrolled - count
     unchanged = np.tile(np.array([[0, 0, 0, 1]], np.float32), (idle, 1))
     films = np.concatenate([films[:1].repeat(idle, axis=0), films])
     return films, np.concatenate([unchanged, updates])
 
 
-def _coefficients(schedule: NoiseSchedule, step: DdimStep) -> tuple[float, float, float, float]:
-    """``NoiseSchedule.ddim_update`` as ``next = c * clip(a * noisy + b * output) + d * noisy``."""
-    a, b = 0.0, 1.0
-    if schedule.prediction == "epsilon":
-        a, b = 1 / step.signal, -step.noise / step.signal
-    kept = step.next_noise / step.noise
-    return a, b, step.next_signal - kept * step.signal, kept
-
-
 def _updated(noisy: Tensor, output: Tensor, update: Tensor) -> Tensor:
-    """One reverse step by the net's output; ``update`` [1, 4] are its ``_coefficients``.
+    """One reverse step by the net's output; ``update`` [1, 4] are the schedule's ``coefficients``.
 
     ``noisy`` and ``update`` also reach the graph's end by a way without convolutions; along such a
     way OpenVINO keeps float32 where the rest is bf16.

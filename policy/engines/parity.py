@@ -26,7 +26,8 @@ SAMPLES = 4
 class ParitySamples:
     """Synthetic inputs that exercise every input of a policy; the same for the same contract.
 
-    They are rgb [samples, H, W, 3], state [samples, state_dim] and history [samples, K, 4].
+    They are rgb [samples, H, W, 3], state [samples, state_dim] and history [samples, K, 4]. With
+    several cameras or observations rgb and state have axes as in ``Contract.image_shape``.
     """
 
     rgb: NDArray[np.uint8]
@@ -38,20 +39,24 @@ def make_parity_samples(contract: Contract) -> ParitySamples:
     """Soft random images, and states and sticks of a brisk flight."""
     random = np.random.default_rng(0)
     height, width = contract.image_height, contract.image_width
-    coarse = random.integers(0, 256, (SAMPLES, 8, 8, 3), dtype=np.uint8)
+    images = (SAMPLES, *contract.image_shape[:-3])
+    coarse = random.integers(0, 256, (*images, 8, 8, 3), dtype=np.uint8)
     rows, columns = np.arange(height) * 8 // height, np.arange(width) * 8 // width
-    fine = random.integers(0, 32, (SAMPLES, height, width, 3), dtype=np.uint8)
-    rgb = coarse[:, rows][:, :, columns] // 8 * 7 + fine
-    state = random.normal(0.0, 2.0, (SAMPLES, STATE_DIM))
-    state[:, QUATERNION] /= np.linalg.norm(state[:, QUATERNION], axis=1, keepdims=True)
+    fine = random.integers(0, 32, (*images, height, width, 3), dtype=np.uint8)
+    rgb = coarse[..., rows, :, :][..., columns, :] // 8 * 7 + fine
+    states = (SAMPLES, *contract.state_shape[:-1])
+    parts = [random.normal(0.0, 2.0, (*states, STATE_DIM))]
+    parts[0][..., QUATERNION] /= np.linalg.norm(parts[0][..., QUATERNION], axis=-1, keepdims=True)
     history = random.uniform(-1.0, 1.0, (SAMPLES, contract.history_len, ACTION_DIM))
     if contract.since_exposure:
-        since = random.uniform(-1.0, 1.0, (SAMPLES, SINCE_EXPOSURE_DIM)) * SINCE_EXPOSURE_SCALE
-        since[:, 0] = np.abs(since[:, 0])
-        state = np.concatenate([state, since], axis=1)
+        since = random.uniform(-1.0, 1.0, (*states, SINCE_EXPOSURE_DIM)) * SINCE_EXPOSURE_SCALE
+        since[..., 0] = np.abs(since[..., 0])
+        parts.append(since)
+    extras = contract.state_dim - sum(part.shape[-1] for part in parts)
+    parts.append(random.normal(0.0, 5.0, (*states, extras)))  # metres
     return ParitySamples(
         rgb=rgb.astype(np.uint8),
-        state=state.astype(np.float32),
+        state=np.concatenate(parts, axis=-1).astype(np.float32),
         history=history.astype(np.float32),
     )
 

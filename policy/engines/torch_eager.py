@@ -41,14 +41,16 @@ def make_torch_executable(policy: SingleRatePolicy, settings: ExecutionSettings)
     return make_executable(
         vision,
         action,
-        _compile(settings.name, settings.vision_device),
-        _compile(settings.name, settings.action_device),
+        run_eagerly(settings.name, settings.vision_device),
+        run_eagerly(settings.name, settings.action_device),
         engine=NAME,
         settings=settings,
     )
 
 
-def _compile(name: str, device: str) -> Compile:
+def run_eagerly(name: str, device: str) -> Compile:
+    """What "compiles" a function for torch on a device: arrays to tensors and back."""
+
     def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
         def run(*arrays: FloatArray) -> FloatArray:
             with torch.inference_mode():

@@ -9,6 +9,7 @@ more than twice the steps of a warm start.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -73,13 +74,17 @@ def make_solve(
     ends = reversed(range(num_diffusion_steps, 0, -segment_steps))
     spans = [(max(end - segment_steps, 0), min(end, segment_steps)) for end in ends]
     guess_share, noise_share = start.noise_shares(num_diffusion_steps, spans[-1][0])
-    noise = start.initial_noise  # of any kind of arrays, on any device
     return Solve(
-        noise=np.array(noise.cpu().numpy() if hasattr(noise, "cpu") else noise, np.float32),
+        noise=to_numpy(start.initial_noise),
         segments=tuple(segment(first, count) for first, count in spans),
         guess_share=guess_share,
         noise_share=noise_share,
     )
+
+
+def to_numpy(array: Any) -> FloatArray:
+    """A float32 copy of an array of any kind, on any device."""
+    return np.array(array.cpu().numpy() if hasattr(array, "cpu") else array, np.float32)
 
 
 def shift_chunk(chunk: FloatArray, periods: float) -> FloatArray:

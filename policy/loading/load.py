@@ -6,36 +6,30 @@
                              a fixed program in any kind of action, e.g. scripted:square:velocity;
                              air: begin in the air, without the climb
     package.module:Class     any class that keeps protocol.SingleRatePolicy or DualRatePolicy
+    ./file.py:Class          the same, by its file
 
 torch is imported only where a policy needs it.
 """
 
-import inspect
-import sys
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import suppress
 from dataclasses import replace
-from importlib.util import find_spec
-from typing import TYPE_CHECKING
 
 from policy.checkpoints.header import read_contract
 from policy.contract import Contract
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
-from policy.errors import PolicyError, user_code
-from policy.foreign.user_class import FORMS, load_user_class, user_class_name
+from policy.errors import PolicyError
+from policy.foreign.user_class import check_user_class, load_user_class
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
+from policy.loading.life import life_method
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
 from policy.protocol import (
     DualRatePolicy,
     Executable,
     SingleRatePolicy,
     WarmStartPolicy,
-    keep_nothing,
 )
 from policy.scripted.spec import IN_AIR, make_scripted
-
-if TYPE_CHECKING:
-    pass
 
 
 def check_request(request: PolicyRequest) -> None:
@@ -58,12 +52,7 @@ def check_request(request: PolicyRequest) -> None:
             _require_image_size(contract, request.image_size)
         _require_devices(request)
     else:
-        package = user_class_name(request.spec)[0].partition(".")[0]
-        if package not in sys.modules and find_spec(package) is None:
-            raise PolicyError(
-                f"--policy {request.spec}: there is no module {package}; put its folder on "
-                f"PYTHONPATH or install it, or write {FORMS}"
-            )
+        check_user_class(request.spec)
 
 
 def read_policy_contract(request: PolicyRequest) -> Contract:
@@ -74,7 +63,9 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
     """
     check_request(request)
     if request.spec.partition(":")[0] not in BUILTIN_KINDS:
-        return _find(request, lambda: 0.0)[0].contract
+        policy, _ = _find(request, lambda: 0.0)
+        life_method(policy, "close", request.spec)()
+        return policy.contract
     checkpoint = builtin_checkpoint(request)
     contract = None if checkpoint is None else read_contract(checkpoint)
     return contract or default_contract(request.image_size)
@@ -88,7 +79,22 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     """
     check_request(request)
     policy, notes = _find(request, now_s)
-    reset = _reset(policy, request.spec)
+    reset, close = (life_method(policy, name, request.spec) for name in ("reset", "close"))
+    try:
+        executable, engine_notes = _on_engine(policy, request, notes)
+        reset()  # of what the trial on dummy samples left behind
+    except BaseException:
+        with suppress(PolicyError):
+            close()
+        raise
+    executable = replace(executable, reset=reset, close=close)
+    return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes))
+
+
+def _on_engine(
+    policy: SingleRatePolicy, request: PolicyRequest, notes: list[str]
+) -> tuple[Executable, tuple[str, ...]]:
+    """The policy on its engine, tried once; adds to ``notes`` what is not as it was asked for."""
     _require_image_size(policy.contract, request.image_size)
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
     if request.dual_rate and not dual_rate:
@@ -109,9 +115,7 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
         head_steps=request.head_steps,
         dual_rate=dual_rate,
     )
-    executable, engine_notes = _executable(policy, request, settings)
-    reset()  # of what the trial on dummy samples left behind
-    return LoadedPolicy(executable=replace(executable, reset=reset), notes=(*notes, *engine_notes))
+    return _executable(policy, request, settings)
 
 
 def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:
@@ -154,38 +158,6 @@ def _scripted(
     if request.starts_in_air and options[-1:] != [IN_AIR]:
         options = [*(options or ["hover"]), IN_AIR]
     return make_scripted(options, now_s, contract=contract)
-
-
-def _reset(policy: SingleRatePolicy, spec: str) -> Callable[[], None]:
-    """The policy's own ``reset``, ready for the loops; one that does nothing where it has none."""
-    method: object = getattr(policy, "reset", None)
-    if method is None:
-        return keep_nothing
-    if not callable(method):
-        raise PolicyError(
-            f"--policy {spec}: reset must be a method without arguments, which is called when a "
-            f"flight begins; it is {method!r}"
-        )
-    try:
-        inspect.signature(method).bind()
-    except (TypeError, ValueError) as error:
-        raise PolicyError(
-            f"--policy {spec}: reset is called without arguments when a flight begins, and cannot "
-            f"be: {error}; give its parameters defaults, or give it another name"
-        ) from error
-    with_torch = policy.contract.arrays == "torch"
-
-    def reset() -> None:
-        with ExitStack() as stack:
-            stack.enter_context(user_code(f"{spec} failed to reset"))
-            if with_torch:
-                import torch
-
-                # As chunks are computed: torch refuses to change their tensors in place elsewhere.
-                stack.enter_context(torch.inference_mode())
-            method()
-
-    return reset
 
 
 def _require_image_size(contract: Contract, image_size: int | None) -> None:

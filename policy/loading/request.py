@@ -5,6 +5,7 @@ from pathlib import Path
 
 from policy.contract import Contract
 from policy.engines.executable import EngineName
+from policy.errors import PolicyError
 from policy.protocol import Executable
 
 
@@ -44,10 +45,27 @@ class PolicyRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedPolicy:
-    """A policy that may fly, and notes about it for the user."""
+    """A policy that may fly, and notes about it for the user.
+
+    As a context manager it closes the policy: after its loops have ended, in the thread that
+    loaded it, once. A policy that fails to close never hides why the flight failed.
+    """
 
     executable: Executable
     notes: tuple[str, ...]
+
+    def __enter__(self) -> "LoadedPolicy":
+        """Return itself."""
+        return self
+
+    def __exit__(self, _kind: object, failure: BaseException | None, _traceback: object) -> None:
+        """Close the policy; raises PolicyError if that fails, unless something failed before."""
+        try:
+            self.executable.close()
+        except PolicyError as error:
+            if failure is None:
+                raise
+            failure.add_note(str(error))
 
 
 def default_contract(image_size: int | None) -> Contract:

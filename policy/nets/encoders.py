@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
-from policy.errors import PolicyError
+from policy.errors import ContractError, PolicyError
 from policy.preprocess import egocentric_columns, egocentric_scale
 
 HEADS = 4
@@ -23,6 +23,13 @@ class StateEncoder(nn.Module):
 
     def __init__(self, dim: int, contract: Contract) -> None:
         super().__init__()
+        if len(contract.cameras) > 1 or contract.observation_steps > 1 or contract.state_extras:
+            raise ContractError(
+                "the networks of this project take the newest image of one camera and the newest "
+                f"state; the contract asks for cameras {list(contract.cameras)}, "
+                f"{contract.observation_steps} observations and extras "
+                f"{list(contract.state_extras)}: use a policy class of your own"
+            )
         scale = egocentric_scale(contract)
         self.mlp = nn.Sequential(nn.Linear(len(scale), dim), nn.SiLU(), nn.Linear(dim, dim))
         self._scale: Tensor

@@ -136,10 +136,10 @@ class GateFlight:
             executable,
             clock=self.clock,
             send=self._send,
-            camera=NoCamera(),
+            cameras=(NoCamera(),),
             sinks=[self.sink],
             watches_images=False,
-            cache=self.features,
+            caches=(self.features,),
             policy_clock=self._policy_clock,
         )
         self.view = bridge.view
@@ -160,7 +160,7 @@ class GateFlight:
             name="test",
             engine="numpy",
             dual_rate=True,
-            encode=lambda rgb: np.zeros((1, 1), np.float32),
+            encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
             act=self._act,
         )
 

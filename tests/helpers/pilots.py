@@ -30,7 +30,7 @@ def steady(sticks: Callable[[], tuple[float, float, float, float]]) -> Executabl
         name="test",
         engine="numpy",
         dual_rate=True,
-        encode=lambda rgb: np.full((1, 1), rgb.mean(), np.float32),
+        encode=lambda rgb, camera=0: np.full((1, 1), rgb.mean(), np.float32),
         act=act,
     )
 

@@ -64,7 +64,7 @@ def noise_executable(contract: Contract | None = None) -> Executable:
     """A policy whose sticks depend on every pixel, the state and the history."""
     contract = contract or Contract(feature_dim=1, arrays="numpy")
 
-    def encode(rgb: ImageArray) -> FloatArray:
+    def encode(rgb: ImageArray, camera: int = 0) -> FloatArray:
         return np.array([[rgb.astype(np.int64).sum() % 9973]], np.float32)
 
     def act(feature: FloatArray, state: FloatArray, history: FloatArray, _: object) -> FloatArray:

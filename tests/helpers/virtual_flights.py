@@ -139,16 +139,16 @@ class VirtualFlight:
             executable,
             clock=world,
             send=self._send,
-            camera=self.camera,
+            cameras=(self.camera,),
             sinks=(self.sink,),
             watches_images=False,
-            cache=DelayedFeatureCache(world),
+            caches=(DelayedFeatureCache(world),),
             policy_clock=self._policy_clock,
-            vision_clock=self._vision_clock,
+            vision_clocks=(self._vision_clock,),
             delay_vision=lambda sink: DelayedSink(world, sink),
         )
         self.view = bridge.view
-        VisionStepper(world, self._vision_clock, self.camera, bridge.vision)  # type: ignore[arg-type]
+        VisionStepper(world, self._vision_clock, self.camera, bridge.visions[0])  # type: ignore[arg-type]
         policy = PolicyStepper(world, self._policy_clock, port, bridge.policy, bridge.view)
         self._gate_stepper = GateStepper(world, gate)
         to_flight.on_arrival, to_gate.on_arrival = policy.receive, self._gate_stepper.step

@@ -76,7 +76,7 @@ def watched() -> Watched:
     one.watch_steps(lambda: watched.steps_ns.append(one.vehicle.ap.now_ns))
     pilot = steady(lambda: CLIMB)
 
-    def encode(rgb: np.ndarray) -> FloatArray:
+    def encode(rgb: np.ndarray, camera: int = 0) -> FloatArray:
         watched.encoded.append(float(rgb.mean()))
         return np.full((1, 1), rgb.mean(), np.float32)
 

@@ -1,6 +1,7 @@
 """Encoding one image and sampling one chunk on each engine, one thread, with nothing beside it."""
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,7 +13,8 @@ from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.flight.policies import load_configured_policy
-from policy.contract import ACTION_DIM, QUATERNION
+from policy.contract import ACTION_DIM
+from policy.engines.executable import encode_all, level_state
 from policy.errors import PolicyError
 from policy.protocol import Executable
 
@@ -43,18 +45,19 @@ def time_engines(
     """
     torch.set_num_threads(1)
     cases, notes = [], []
-    for policy in policies:
-        found, remarks = _cases(policy)
-        cases += found
-        notes += remarks
-    for number in range(rounds):
-        print_status(f"engines, round {number + 1} of {rounds}")
-        for case in cases:
-            _time(case, block_s)
+    with ExitStack() as lives:
+        for policy in policies:
+            found, remarks = _cases(policy, lives)
+            cases += found
+            notes += remarks
+        for number in range(rounds):
+            print_status(f"engines, round {number + 1} of {rounds}")
+            for case in cases:
+                _time(case, block_s)
     return tuple(map(_timing, cases)), tuple(notes)
 
 
-def _cases(policy: PolicyConfig) -> tuple[list[_Case], list[str]]:
+def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[str]]:
     devices = (policy.device, policy.vision_device or "", policy.action_device or "")
     fast: Engine = "cuda-graph" if any(name.startswith("cuda") for name in devices) else "openvino"
     engines: tuple[Engine, ...] = (EAGER, fast) if policy.engine == "auto" else (policy.engine,)
@@ -62,44 +65,45 @@ def _cases(policy: PolicyConfig) -> tuple[list[_Case], list[str]]:
     notes = []
     for engine in engines:
         try:
-            cases += _cases_on(replace(policy, engine=engine))
+            cases += _cases_on(replace(policy, engine=engine), lives)
         except PolicyError as error:
             notes.append(f"{name_of(policy)} on {engine}: not measured: {error}")
     if cases:
         return cases, notes
-    return _cases_on(policy), []  # a policy in numpy runs on "auto" alone; others are refused
+    return _cases_on(
+        policy, lives
+    ), []  # a policy in numpy runs on "auto" alone; others are refused
 
 
-def _cases_on(policy: PolicyConfig) -> list[_Case]:
-    full = _load(replace(policy, head_steps=None))
+def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
+    full = _load(replace(policy, head_steps=None), lives)
     contract = full.contract
-    shape = (contract.image_height, contract.image_width, 3)
-    rgb = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
-    state = np.zeros((1, contract.state_dim), np.float32)
-    state[0, QUATERNION.start] = 1.0  # level
+    shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
+    images = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    rgb, state = images.reshape(-1, *shape[-3:])[0], level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
-    feature = full.encode(rgb)
+    feature = encode_all(full, images)
     engine = full.engine if policy.engine == "auto" else policy.engine
 
     def case(work: str, call: Callable[[], object]) -> _Case:
         return _Case(policy=name_of(policy), work=work, engine=engine, call=call)
 
     if not full.dual_rate:
-        return [case(BOTH, lambda: full.act(full.encode(rgb), state, history, None))]
+        return [case(BOTH, lambda: full.act(encode_all(full, images), state, history, None))]
     cases = [
         case(ENCODE, lambda: full.encode(rgb)),
         case(CHUNK, lambda: full.act(feature, state, history, None)),
     ]
     if policy.head_steps is not None:
-        warm = _load(policy)
+        warm = _load(policy, lives)
         warm.act(feature, state, history, None)  # the chunk that the next one starts from
         name = f"{CHUNK}, warm start of {policy.head_steps}"
         cases.append(case(name, lambda: warm.act(feature, state, history, WARM_ELAPSED_S)))
     return cases
 
 
-def _load(policy: PolicyConfig) -> Executable:
-    loaded = load_configured_policy(policy, MonotonicClock())
+def _load(policy: PolicyConfig, lives: ExitStack) -> Executable:
+    loaded = lives.enter_context(load_configured_policy(policy, MonotonicClock()))
     if policy.engine != "auto" and not loaded.executable.engine.startswith(policy.engine):
         raise PolicyError("; ".join(loaded.notes))  # says why the engine was passed over
     return loaded.executable

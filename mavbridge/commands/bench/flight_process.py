@@ -17,7 +17,7 @@ from mavbridge.commands.bench.missed_slots import GateProbe, stolen_ms_since, st
 from mavbridge.commands.bench.results import OURS, Flight, name_of, solves_of, to_json
 from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import PeerError
 from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_executable, start_gate
@@ -50,7 +50,13 @@ def measure_flight(
 ) -> None:
     """Fly the policy, changed by ``alter``, and write the figures."""
     clock = MonotonicClock()
-    executable = load_configured_policy(job.policy, clock).executable
+    with load_configured_policy(job.policy, clock) as loaded:
+        _measure(job, clock, loaded.executable, alter)
+
+
+def _measure(
+    job: FlightJob, clock: Clock, executable: Executable, alter: Callable[[Executable], Executable]
+) -> None:
     loops = job.rates.loops(is_dual=executable.dual_rate)
     meter = FlightMeter(
         stick_hz=job.rates.stick_rate, action_hz=loops.action_hz, vision_hz=loops.max_vision_hz

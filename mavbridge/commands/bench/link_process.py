@@ -82,10 +82,10 @@ def link_bridge(config: FlyConfig, gate: GateProcess, meter: "ClientMeter") -> B
         ROLL_RATE,
         clock=clock,
         send=gate.send,
-        camera=NoCamera(),
+        cameras=(NoCamera(),),
         sinks=(meter,),
         watches_images=False,
-        cache=cache,
+        caches=(cache,),
     )
 
 
@@ -125,7 +125,7 @@ ROLL_RATE = Executable(
     name="roll rate",
     engine="none",
     dual_rate=True,
-    encode=lambda _: np.zeros((1, 1), np.float32),
+    encode=lambda _rgb, _camera=0: np.zeros((1, 1), np.float32),
     act=repeat_roll_rate,
 )
 

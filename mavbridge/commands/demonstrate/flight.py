@@ -1,6 +1,7 @@
 """One demonstration: a simulated flight, labelled with the expert's sticks and recorded."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -49,12 +50,19 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
     """
     rmtree(spec.folder, ignore_errors=True)
     prepare_folder(spec.folder)
+    with ExitStack() as stack:
+        return _fly(spec, should_stop, stack)
+
+
+def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitStack) -> bool:
+    """The same, with the student's life on ``stack``."""
     variation, wanted = draw_variation(spec.seed), spec.config.policy
     student: Executable | None = None
     size_px = wanted.image_size or SIM_CAMERA_PX
     contract = Contract(feature_dim=1, arrays="numpy", image_height=size_px, image_width=size_px)
     if wanted.checkpoint is not None:
-        student = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock()).executable
+        loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
+        student = stack.enter_context(loaded).executable
         contract = student.contract
     flight = SimulatedFlight(
         course_seed=spec.seed,

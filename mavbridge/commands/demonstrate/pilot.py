@@ -109,7 +109,7 @@ class Pilot:
             name=f"expert at {speed_mps:g} m/s",
             engine="numpy",
             dual_rate=True,
-            encode=lambda _: np.zeros((1, 1), np.float32),
+            encode=lambda _rgb, _camera=0: np.zeros((1, 1), np.float32),
             act=self._act,
         )
         self.executable = replace(student or expert, act=self._act, reset=self._start)

@@ -96,9 +96,9 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
             autopilot=config.autopilot, gains=config.gains, conditions_seed=spec.conditions_seed
         ),
     )
-    loaded = load_for_episodes(config.policy, flight.clock)
-    executable = _measured(loaded.executable, config)
-    result = flight.fly(executable, max_time_s=config.max_time, should_stop=should_stop)
+    with load_for_episodes(config.policy, flight.clock) as loaded:
+        executable = _measured(loaded.executable, config)
+        result = flight.fly(executable, max_time_s=config.max_time, should_stop=should_stop)
     return FlownEpisode(engine=loaded.executable.engine, notes=tuple(loaded.notes), result=result)
 
 
@@ -180,8 +180,11 @@ def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> tuple[str, StickMeter
         arm=True,
         duration=settings.max_time,
     )
-    executable = _measured(load_configured_policy(config.policy, clock).executable, settings)
-    with Path("/dev/null").open("w") as nowhere:
+    with (
+        load_configured_policy(config.policy, clock) as loaded,
+        Path("/dev/null").open("w") as nowhere,
+    ):
+        executable = _measured(loaded.executable, settings)
         console = Console(file=nowhere)
         fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))
     return executable.engine, meter

@@ -56,11 +56,12 @@ def imagine(config: ImagineConfig) -> int:
         )
     start = read_start(flight, model.config, config.start_at)
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=config.serial, clock=clock)
-    decider = _make_decider(config, sampler, clock, console)
     # One core is left for the decoder: torch's threads spin at the end of every operation until the
     # last is done. Serially, too: how a sum is split up decides how it is rounded.
     free = torch.get_num_threads() - 1
-    with torch_threads(free), ExitStack() as stack:
+    with ExitStack() as stack:
+        decider = _make_decider(config, sampler, clock, console, stack)
+        stack.enter_context(torch_threads(free))
         on_frame: OnFrame = ignore_frame
         if config.rerun != "off":
             from mavbridge.observe.rerun_rollout import RolloutView
@@ -147,7 +148,7 @@ def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> Wor
 
 
 def _make_decider(
-    config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console
+    config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console, stack: ExitStack
 ) -> Decider:
     if config.decider == "world-model":
         if config.policy.checkpoint is not None:
@@ -157,7 +158,8 @@ def _make_decider(
             )
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
     # One image, one chunk, as in flight; warm starts are for a policy that runs at 100 Hz.
-    loaded = load_configured_policy(replace(config.policy, dual_rate=True, head_steps=None), clock)
+    wanted = replace(config.policy, dual_rate=True, head_steps=None)
+    loaded = stack.enter_context(load_configured_policy(wanted, clock))
     for note in loaded.notes:
         console.print(Text(note, style="yellow" if note.startswith("warning") else "dim"))
     return PolicyDecider(loaded.executable, sampler)

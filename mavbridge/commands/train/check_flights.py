@@ -16,10 +16,10 @@ def share_of_gates(checkpoint: Path, policy: str, flights: int) -> float:
         MavbridgeError, PolicyError: it cannot be flown.
     """
     wanted = PolicyConfig(policy=policy, checkpoint=checkpoint, dual_rate=True)
-    executable = load_configured_policy(wanted, MonotonicClock()).executable
     passed = total = 0
-    for index in range(flights):
-        flight = SimulatedFlight(course_seed=CHECK_COURSE_SEED + index, seed=index)
-        result = flight.fly(executable)
-        passed, total = passed + result.gates_passed, total + result.gates_total
+    with load_configured_policy(wanted, MonotonicClock()) as loaded:
+        for index in range(flights):
+            flight = SimulatedFlight(course_seed=CHECK_COURSE_SEED + index, seed=index)
+            result = flight.fly(loaded.executable)
+            passed, total = passed + result.gates_passed, total + result.gates_total
     return passed / total

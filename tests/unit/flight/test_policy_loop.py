@@ -15,6 +15,7 @@ from mavbridge.core.vehicle import ForwardedPacket, Velocity
 from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
+from mavbridge.flight.observation import ObservationSource
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.vehicle_view import VehicleView
@@ -48,18 +49,22 @@ class Rig:
         self.loop = PolicyLoop(
             clock=self.clock,
             view=self.view,
-            cache=self.cache,
+            observations=ObservationSource(
+                Contract(),
+                caches=(self.cache,),
+                join=lambda encoded: encoded[0][0],
+                states=None,
+                max_feature_age_ns=300 * MS,
+            ),
             history=history,
             act=self._act,
             reset=self._reset,
             send=self.sent.append,
             settings=PolicySettings(
                 state_frame="ned_frd",
-                since_exposure=False,
                 action_frame=frame,
                 chunk_dt_s=0.05,
                 freshness=FRESH,
-                max_feature_age_ns=300 * MS,
                 max_frozen_ns=500 * MS,
                 period_ns=10 * MS,
             ),

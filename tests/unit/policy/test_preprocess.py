@@ -23,10 +23,10 @@ def test_normalises_each_channel_by_the_contract() -> None:
 def test_any_size_keeps_brightness_and_sides(size: tuple[int, int]) -> None:
     rgb = np.zeros((*size, 3), np.uint8)
     rgb[:, size[1] // 2 :] = 200
-    plain = Contract(
+    unchanged = Contract(
         image_height=32, image_width=48, image_mean_rgb=(0, 0, 0), image_std_rgb=(1, 1, 1)
     )
-    planes = image_to_input(rgb, plain)
+    planes = image_to_input(rgb, unchanged)
     assert planes.shape == (1, 3, 32, 48)
     np.testing.assert_allclose(planes[0, :, :, :20], 0.0, atol=1e-6)
     np.testing.assert_allclose(planes[0, :, :, -20:], 200 / 255, rtol=1e-5)
@@ -35,10 +35,10 @@ def test_any_size_keeps_brightness_and_sides(size: tuple[int, int]) -> None:
 def test_shrinking_averages_instead_of_picking_pixels() -> None:
     rgb = np.zeros((64, 96, 3), np.uint8)
     rgb[::2] = 200
-    plain = Contract(
+    unchanged = Contract(
         image_height=32, image_width=48, image_mean_rgb=(0, 0, 0), image_std_rgb=(1, 1, 1)
     )
-    np.testing.assert_allclose(image_to_input(rgb, plain), 100 / 255, atol=1 / 255)
+    np.testing.assert_allclose(image_to_input(rgb, unchanged), 100 / 255, atol=1 / 255)
 
 
 def test_takes_read_only_and_strided_views() -> None:
@@ -61,3 +61,96 @@ def test_takes_read_only_and_strided_views() -> None:
 def test_refuses_what_is_no_rgb_image(image: np.ndarray) -> None:
     with pytest.raises(PolicyError, match=r"uint8 \[height, width, 3\]"):
         image_to_input(image, CONTRACT)
+
+
+RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
+BLACK = (0, 0, 0)
+
+
+def quarters(height: int, width: int) -> np.ndarray:
+    """Red | green over blue | white: no two corners are alike."""
+    image = np.empty((height, width, 3), np.uint8)
+    image[: height // 2, : width // 2], image[: height // 2, width // 2 :] = RED, GREEN
+    image[height // 2 :, : width // 2], image[height // 2 :, width // 2 :] = BLUE, WHITE
+    return image
+
+
+def plain(**settings: object) -> Contract:
+    """A contract that leaves the values of an image as they are: 0 to 255."""
+    one = 1 / 255
+    return Contract(
+        image_height=32,
+        image_width=32,
+        image_mean_rgb=(0, 0, 0),
+        image_std_rgb=(one, one, one),
+        **settings,  # type: ignore[arg-type]
+    )
+
+
+def pixels(rgb: np.ndarray, contract: Contract) -> np.ndarray:
+    """[H, W, 3] as the policy sees it."""
+    return image_to_input(rgb, contract)[0].transpose(1, 2, 0).round().astype(int)
+
+
+def corners(seen: np.ndarray) -> list[tuple[int, ...]]:
+    return [tuple(seen[row, column].tolist()) for row in (0, -1) for column in (0, -1)]
+
+
+@pytest.mark.parametrize("size", [(32, 32), (64, 64), (48, 96), (90, 40), (20, 200)])
+def test_a_stretched_picture_keeps_its_four_corners(size: tuple[int, int]) -> None:
+    seen = pixels(quarters(*size), plain())
+    assert corners(seen) == [RED, GREEN, BLUE, WHITE]
+    for row, column in ((14, 14), (14, 17), (17, 14), (17, 17)):  # the middle stays the middle
+        assert tuple(seen[row, column]) == tuple(seen[row // 16 * 31, column // 16 * 31])
+
+
+def test_bgr_swaps_red_and_blue_and_their_normalisation() -> None:
+    assert corners(pixels(quarters(64, 64), plain(image_channels="bgr"))) == [
+        BLUE,
+        GREEN,
+        RED,
+        WHITE,
+    ]
+    rgb = np.full((8, 8, 3), (255, 0, 51), np.uint8)
+    usual, swapped = (
+        image_to_input(rgb, Contract(image_height=16, image_width=16, image_channels=order))
+        for order in ("rgb", "bgr")
+    )
+    np.testing.assert_array_equal(swapped, usual[:, ::-1])
+
+
+def test_the_part_of_the_image_is_cut_out_before_it_is_resized() -> None:
+    top_right = plain(image_crop=(0.0, 0.5, 0.5, 1.0))
+    assert (pixels(quarters(60, 100), top_right) == GREEN).all()
+    lower_half = pixels(quarters(60, 100), plain(image_crop=(0.5, 0.0, 1.0, 1.0)))
+    assert corners(lower_half) == [BLUE, WHITE, BLUE, WHITE]
+    assert (pixels(quarters(60, 100), plain(image_crop=(0.99, 0.0, 0.991, 0.001))) == BLUE).all()
+
+
+@pytest.mark.parametrize("size", [(40, 80), (80, 40)])
+def test_crop_cuts_the_longer_sides_off_evenly(size: tuple[int, int]) -> None:
+    height, width = size
+    image = np.zeros((*size, 3), np.uint8)
+    image[:] = RED
+    image[height // 2 - 20 : height // 2 + 20, width // 2 - 20 : width // 2 + 20] = quarters(40, 40)
+    seen = pixels(image, plain(image_fit="crop"))
+    assert corners(seen) == [RED, GREEN, BLUE, WHITE]
+    np.testing.assert_array_equal(seen, pixels(quarters(40, 40), plain()))
+
+
+def test_pad_keeps_proportions_between_black_bars() -> None:
+    wide = pixels(quarters(40, 80), plain(image_fit="pad"))
+    assert (wide[:8] == BLACK).all()
+    assert (wide[24:] == BLACK).all()
+    assert corners(wide[8:24]) == [RED, GREEN, BLUE, WHITE]
+    tall = pixels(quarters(80, 40), plain(image_fit="pad"))
+    assert corners(tall[:, 8:24]) == [RED, GREEN, BLUE, WHITE]
+    assert corners(tall) == [BLACK] * 4
+
+
+@pytest.mark.parametrize("fit", ["crop", "pad"])
+def test_the_right_proportions_need_no_fitting(fit: str) -> None:
+    image = quarters(64, 64)
+    np.testing.assert_array_equal(
+        pixels(image, plain(image_fit=fit)), pixels(image, plain(image_fit="stretch"))
+    )

@@ -12,7 +12,8 @@ import torch
 from policy.contract import Contract, FloatArray
 from policy.engines.choose import Candidate, choose_executable, chunks_of_samples, first_that_agrees
 from policy.engines.executable import EngineName, ExecutionSettings
-from policy.engines.openvino_cpu import make_openvino_executable, precisions
+from policy.engines.openvino_compile import precisions
+from policy.engines.openvino_cpu import make_openvino_executable
 from policy.engines.parity import MAX_STICK_ERROR, make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError

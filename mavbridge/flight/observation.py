@@ -1,0 +1,165 @@
+"""What the policy sees at one moment: images of all cameras and states, the past ones as well."""
+
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.records import FeatureFrame, FloatArray, VehicleState
+from mavbridge.core.vehicle import Release
+from mavbridge.flight.ego_motion import EgoMotion
+from mavbridge.flight.feature_cache import FeatureCache
+from policy.contract import Contract
+
+Join: TypeAlias = Callable[[Sequence[Sequence[FloatArray]]], FloatArray]
+"""``Executable.join``."""
+
+MAX_STATES = 4096
+"""Most past states that are kept: ten seconds of the fastest attitude stream."""
+
+
+class Observation(NamedTuple):
+    """Inputs of one chunk, and the moments that they come from."""
+
+    encoded: FloatArray
+    """What ``Executable.act`` takes."""
+    states: FloatArray
+    """[1, *contract.state_shape]."""
+    state: VehicleState
+    """The newest."""
+    feature: FeatureFrame
+    """The newest of the first camera."""
+    image_ns: int
+    """Exposure of the oldest among the newest images of all cameras."""
+
+
+class StateHistory:
+    """States as they came, for policies that take several; one thread pushes, another one reads."""
+
+    def __init__(self, *, span_ns: int) -> None:
+        """``span_ns``: time before the newest attitude for which states are kept."""
+        self._span_ns = span_ns
+        self._lock = threading.Lock()
+        self._states: deque[VehicleState] = deque(maxlen=MAX_STATES)
+
+    def push(self, state: VehicleState) -> None:
+        """Remember a state whose attitude is newer than the last one's."""
+        with self._lock:
+            states = self._states
+            if states and state.attitude_ns <= states[-1].attitude_ns:
+                return
+            states.append(state)
+            while len(states) > 1 and states[1].attitude_ns <= state.attitude_ns - self._span_ns:
+                states.popleft()
+
+    def all(self) -> tuple[VehicleState, ...]:
+        """The states of the span, oldest first, and one from before it."""
+        with self._lock:
+            return tuple(self._states)
+
+
+class ObservationSource:
+    """Joins the newest and the past images and states of one flight; for the policy's thread.
+
+    A past observation is the image, or the state, that is nearest in time to the one wanted: so
+    many steps before the newest of its own kind and camera. Where nothing older exists yet, the
+    oldest is repeated.
+    """
+
+    def __init__(
+        self,
+        contract: Contract,
+        *,
+        caches: Sequence[FeatureCache],
+        join: Join,
+        states: StateHistory | None,
+        max_feature_age_ns: int,
+    ) -> None:
+        """Join nothing yet.
+
+        Args:
+            contract: says how many observations there are, and of what.
+            caches: one for each camera of the contract, in its order.
+            join: of the executable.
+            states: past states; None where the policy takes only the newest.
+            max_feature_age_ns: oldest image to act on.
+        """
+        self._cameras = contract.cameras
+        self._caches = tuple(caches)
+        self._join = join
+        self._history = states
+        self._max_feature_age_ns = max_feature_age_ns
+        self._before_ns = observation_ages_ns(contract)
+        self._ego_motion: EgoMotion | None = None
+        if contract.since_exposure:
+            span_ns = max_feature_age_ns + self._before_ns[0]
+            self._ego_motion = EgoMotion(span_ns=span_ns)
+
+    def push(self, state: VehicleState) -> None:
+        """Take a state, also one that no chunk will come from; in order."""
+        if self._ego_motion is None:
+            return
+        for past in self._history.all() if self._history else ():
+            self._ego_motion.push(past)
+        self._ego_motion.push(state)
+
+    def observe(self, state: VehicleState, now_ns: int) -> Observation | Release:
+        """The inputs of a chunk from ``state``, which was pushed; or what is missing for one."""
+        newest = []
+        for camera, cache in enumerate(self._caches):
+            feature = cache.latest()
+            if feature is None:
+                return Release(f"no image feature yet{self._of(camera)}")
+            if now_ns - feature.captured_ns > self._max_feature_age_ns:
+                limit_ms = self._max_feature_age_ns // NS_PER_MS
+                return Release(f"the image feature{self._of(camera)} is older than {limit_ms} ms")
+            if feature.fault is not None:
+                return Release(feature.fault + self._of(camera))
+            newest.append(feature)
+        rows = [
+            [
+                feature if before_ns == 0 else cache.nearest(feature, before_ns=before_ns)
+                for feature, cache in zip(newest, self._caches, strict=True)
+            ]
+            for before_ns in self._before_ns
+        ]
+        return Observation(
+            encoded=self._join([[feature.value for feature in row] for row in rows]),
+            states=self._states(state, [row[0] for row in rows]),
+            state=state,
+            feature=newest[0],
+            image_ns=min(feature.captured_ns for feature in newest),
+        )
+
+    def _states(self, state: VehicleState, features: Sequence[FeatureFrame]) -> FloatArray:
+        """States at the observations whose images of the first camera are ``features``."""
+        if self._history is None:
+            return self._with_motion(state, features[0])
+        known = (*self._history.all(), state)
+        rows = []
+        for before_ns, feature in zip(self._before_ns, features, strict=True):
+            at_ns = state.attitude_ns - before_ns
+            past = state if before_ns == 0 else _nearest(known, at_ns)
+            rows.append(self._with_motion(past, feature)[0])
+        return np.stack(rows)[None]
+
+    def _with_motion(self, state: VehicleState, feature: FeatureFrame) -> FloatArray:
+        if self._ego_motion is None:
+            return state.values[None]
+        return self._ego_motion.append_to(state, feature.captured_ns)
+
+    def _of(self, camera: int) -> str:
+        return "" if len(self._cameras) == 1 else f" of camera {self._cameras[camera]}"
+
+
+def observation_ages_ns(contract: Contract) -> tuple[int, ...]:
+    """Time from each observation to the newest one, oldest first; the last is 0."""
+    step_ns = round(contract.observation_dt_s * NS_PER_S)
+    return tuple(step_ns * steps for steps in reversed(range(contract.observation_steps)))
+
+
+def _nearest(states: Sequence[VehicleState], at_ns: int) -> VehicleState:
+    return min(states, key=lambda state: abs(state.attitude_ns - at_ns))

@@ -1,0 +1,51 @@
+"""What a policy of anybody keeps: its modules, and whatever changes from call to call."""
+
+from collections.abc import Collection
+
+from torch import Tensor, nn
+
+
+def modules_of(policy: object) -> list[nn.Module]:
+    """The policy itself where it is a module, or the modules among its attributes."""
+    if isinstance(policy, nn.Module):
+        return [policy]
+    values = vars(policy).values() if hasattr(policy, "__dict__") else ()
+    return [value for value in values if isinstance(value, nn.Module)]
+
+
+def snapshot(policy: object) -> dict[str, object]:
+    """The attributes of a policy and of all its modules, by name, in a form that can be compared.
+
+    A tensor stands for its values, but for the weights, which no forward call changes; a number or
+    a text for itself; a collection for the identity of its elements; any other object for its own.
+    """
+    holders: dict[str, object] = {"": policy}
+    for at, module in enumerate(modules_of(policy)):
+        holders |= {f"{at}.{name}.": child for name, child in module.named_modules() if name}
+        holders[f"{at}."] = module
+    marks: dict[str, object] = {}
+    for path, holder in holders.items():
+        attributes = dict(vars(holder)) if hasattr(holder, "__dict__") else {}
+        attributes |= attributes.pop("_buffers", {})
+        attributes.pop("_parameters", None)
+        marks |= {f"{path}{name}": _mark(value) for name, value in attributes.items()}
+    return marks
+
+
+def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
+    """Names of attributes that came, went or changed, without the path to them."""
+    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    return sorted({name.rpartition(".")[2] for name in names})
+
+
+def _mark(value: object) -> object:
+    if isinstance(value, Tensor):
+        array = value.detach().cpu().contiguous()
+        return str(array.dtype), tuple(array.shape), array.float().numpy().tobytes()
+    if value is None or isinstance(value, bool | int | float | str | bytes):
+        return value
+    if isinstance(value, dict):
+        return tuple((id(key), id(element)) for key, element in value.items())
+    if isinstance(value, Collection):
+        return tuple(map(id, value))
+    return id(value)

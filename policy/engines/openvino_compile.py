@@ -1,0 +1,99 @@
+"""OpenVINO graphs compiled for the CPU, or taken from the user's cache.
+
+Each graph infers on the calling thread alone, without the GIL, on arrays that are bound once.
+Threads are not pinned to cores: measured beside a second loop, pinning was slower or made no
+difference.
+"""
+
+import hashlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import openvino as ov
+import torch
+
+from policy.contract import FloatArray
+from policy.engines.compile_cache import CompileCache, user_cache_folder
+from policy.engines.executable import Precision
+from policy.engines.signal_stack import signal_stack_kept
+from policy.errors import PolicyError
+
+NAME = "openvino"
+DEVICE = "CPU"
+
+
+@signal_stack_kept()
+def precisions() -> tuple[tuple[Precision, Precision], ...]:
+    """Pairs to try for the image and the action path, the fastest first.
+
+    bf16 only where the CPU computes in it; elsewhere it is emulated, or slower than float32.
+    """
+    if "BF16" in ov.Core().get_property(DEVICE, "OPTIMIZATION_CAPABILITIES"):
+        return ("bf16", "bf16"), ("bf16", "f32"), ("f32", "f32")
+    return (("f32", "f32"),)
+
+
+def engine_name(vision: Precision, action: Precision) -> str:
+    """Name of the engine at these precisions of the image and the action path."""
+    return f"{NAME}-{vision}" if vision == action else f"{NAME}-{vision}-{action}"
+
+
+class GraphCompiler:
+    """Compiles graphs; ``subject`` is a text that differs wherever one of its graphs does."""
+
+    def __init__(self, subject: str) -> None:
+        self._core = ov.Core()
+        self._cache = CompileCache(user_cache_folder() / NAME)
+        digest = hashlib.sha256()
+        here = Path(__file__).parent
+        for source in sorted([*here.glob("openvino_*.py"), *here.parent.glob("nets/*.py")]):
+            digest.update(source.read_bytes())
+        cpu = self._core.get_property(DEVICE, "FULL_DEVICE_NAME")
+        capabilities = self._core.get_property(DEVICE, "OPTIMIZATION_CAPABILITIES")
+        versions = f"{ov.__version__} {torch.__version__}"
+        self._key = f"{subject} {digest.hexdigest()} {versions} {cpu} {capabilities}"
+
+    def compile(self, name: str, precision: Precision, build: Callable[[], "ov.Model"]) -> "Graph":
+        """The graph that ``build`` makes, at a precision; ``name`` tells it from others here."""
+        properties = {
+            "PERFORMANCE_HINT": "LATENCY",
+            "NUM_STREAMS": "1",
+            "INFERENCE_NUM_THREADS": "1",
+            "ENABLE_CPU_PINNING": "NO",
+            "INFERENCE_PRECISION_HINT": precision,
+        }
+        key = f"{self._key} {name} {properties}"
+        stored = self._cache.load(key)
+        if stored is not None:
+            try:
+                return Graph(self._core.import_model(io.BytesIO(stored), DEVICE, properties))
+            except RuntimeError:
+                pass  # of another build after all: compile it again
+        compiled = self._core.compile_model(build(), DEVICE, properties)
+        self._cache.store(key, compiled.export_model().getvalue())
+        return Graph(compiled)
+
+
+class Graph:
+    """One compiled graph with arrays of its own at every input; for one thread."""
+
+    def __init__(self, compiled: "ov.CompiledModel") -> None:
+        self._request = compiled.create_infer_request()
+        self._inputs = [np.zeros(port.shape, np.float32) for port in compiled.inputs]
+        for index, array in enumerate(self._inputs):
+            self._request.set_input_tensor(index, ov.Tensor(array, shared_memory=True))
+        self._output = np.zeros(compiled.output(0).shape, np.float32)
+        self._request.set_output_tensor(ov.Tensor(self._output, shared_memory=True))
+
+    def __call__(self, *arrays: FloatArray) -> FloatArray:
+        """Run the graph; the result is the caller's. An array of another shape is refused."""
+        for index, (own, array) in enumerate(zip(self._inputs, arrays, strict=True)):
+            if own.shape != array.shape:
+                raise PolicyError(
+                    f"input {index} must be {list(own.shape)}, got {list(array.shape)}"
+                )
+            np.copyto(own, array)
+        self._request.infer()
+        return self._output.copy()

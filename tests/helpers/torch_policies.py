@@ -1,0 +1,154 @@
+"""Torch policies as a user might write them, small and untrained."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from policy.contract import Contract
+from policy.nets.diffusion import DdimStep, NoiseSchedule, ddim_solve
+
+SINGLE = Contract(image_height=32, image_width=32, horizon=8)
+DUAL = Contract(image_height=32, image_width=32, horizon=8, feature_dim=12)
+
+
+class Encoder(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, 8, 5, stride=4), nn.BatchNorm2d(8), nn.ReLU(), nn.Flatten()
+        )
+        self.project = nn.Linear(8 * 7 * 7, DUAL.feature_dim)
+
+    def forward(self, image: Tensor) -> Tensor:
+        feature: Tensor = self.project(self.layers(image))
+        return feature
+
+
+class Head(nn.Module):
+    def __init__(self, extra: int = 0) -> None:
+        super().__init__()
+        inputs = DUAL.feature_dim + DUAL.state_dim + DUAL.history_len * 4 + extra
+        self.layers = nn.Sequential(
+            nn.Linear(inputs, 32), nn.SiLU(), nn.Dropout(), nn.Linear(32, DUAL.horizon * 4)
+        )
+
+    def forward(self, feature: Tensor, state: Tensor, history: Tensor, *more: Tensor) -> Tensor:
+        if state.shape[1] != DUAL.state_dim:
+            raise ValueError("a check of a shape is no decision by values")
+        parts = [feature, state * 0.1, history.flatten(1), *(part.flatten(1) for part in more)]
+        chunk: Tensor = self.layers(torch.cat(parts, dim=1)).tanh()
+        return chunk.reshape(-1, DUAL.horizon, 4)
+
+
+class TwoRates(nn.Module):
+    """The whole protocol on a module."""
+
+    contract = DUAL
+
+    def __init__(self) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(1)
+            self.visual_encoder, self.head = Encoder(), Head()
+
+    def encode_visual(self, image: Tensor) -> Tensor:
+        return torch.as_tensor(self.visual_encoder(image))
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return torch.as_tensor(self.head(feature, state, history))
+
+    def predict(self, image: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return self.predict_fast(self.encode_visual(image), state, history, steps)
+
+
+class PlainClass:
+    """The same on a class that is no module, but holds two."""
+
+    contract = DUAL
+
+    def __init__(self) -> None:
+        whole = TwoRates()
+        self.encoder, self.head = whole.visual_encoder, whole.head
+
+    def encode_visual(self, image: Tensor) -> Tensor:
+        return torch.as_tensor(self.encoder(image))
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return torch.as_tensor(self.head(feature, state, history))
+
+    def predict(self, image: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return self.predict_fast(self.encode_visual(image), state, history, steps)
+
+
+class Counting(TwoRates):
+    calls = 0
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        self.calls += 1
+        return super().predict_fast(feature, state, history, steps)
+
+
+class Deciding(TwoRates):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return chunk if state[0, 2] < 100 else -chunk
+
+
+class Drawing(TwoRates):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return chunk + 0.1 * torch.randn_like(chunk)
+
+
+class Resetting(TwoRates):
+    def reset(self) -> None:
+        """A flight begins."""
+
+
+class Looping(TwoRates):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        for _ in range(5000):
+            chunk = chunk + 1e-9
+        return chunk
+
+
+class Stepwise(TwoRates):
+    """A diffusion policy that says how one step of it is computed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(2)
+            self.head = Head(extra=DUAL.horizon * 4 + 1)
+            self.register_buffer("initial_noise", torch.randn(1, DUAL.horizon, 4))
+        self.schedule = NoiseSchedule(prediction="epsilon")
+
+    def denoise(self, noisy: Tensor, timestep: Tensor, *rest: Any) -> Tensor:
+        return torch.as_tensor(self.head(*rest, noisy, timestep[:, None] / 100))
+
+    def to_chunk(self, sample: Tensor) -> Tensor:
+        return sample
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        step = self.schedule.ddim_steps(num_diffusion_steps)[first]
+        return step.signal, step.noise
+
+    def denoise_fast(
+        self, feature: Tensor, state: Tensor, history: Tensor, noisy: Tensor, num_steps: int,
+        first: int, count: int,
+    ) -> Tensor:  # fmt: skip
+        steps: tuple[DdimStep, ...] = self.schedule.ddim_steps(num_steps)[first : first + count]
+        return ddim_solve(
+            self.schedule,
+            steps,
+            lambda at, n: self.denoise(
+                n, torch.full((1,), float(steps[at].timestep)), feature, state, history
+            ),
+            noisy,
+        )
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        noise = torch.as_tensor(self.initial_noise)
+        return self.denoise_fast(feature, state, history, noise, steps, 0, steps)

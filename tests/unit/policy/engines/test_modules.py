@@ -1,0 +1,98 @@
+"""Torch modules of a user: which of them are converted, and why others are not."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from helpers import torch_policies
+from helpers.torch_policies import PlainClass, Stepwise, TwoRates
+from policy.engines import openvino_modules
+from policy.engines.choose import choose_executable, chunks_of_samples
+from policy.engines.executable import ExecutionSettings
+from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.torch_eager import make_torch_executable
+from policy.protocol import SingleRatePolicy
+
+SETTINGS = ExecutionSettings(name="mine", num_diffusion_steps=4)
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+@pytest.fixture
+def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+def require_parity(policy: SingleRatePolicy, settings: ExecutionSettings) -> None:
+    executable, notes = choose_executable(policy, "auto", settings)
+    assert executable.engine.startswith("openvino"), notes
+    samples = make_parity_samples(policy.contract)
+    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
+    assert parity_failure(expected, chunks_of_samples(executable, samples)) is None
+
+
+@pytest.mark.parametrize("make", [TwoRates, PlainClass])
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_modules_fly_converted(make: type[SingleRatePolicy], dual_rate: bool) -> None:
+    require_parity(make(), replace(SETTINGS, dual_rate=dual_rate))
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("Counting", "it keeps calls from call to call"),
+        ("Drawing", "the same inputs do not give the same chunk again"),
+        ("Resetting", "the policy has reset"),
+        ("Deciding", "it decides by the values of a tensor"),
+        ("Looping", "its graph has 5,0.. operations, and at most 4,000"),
+    ],
+)
+def test_what_a_graph_cannot_do_runs_in_torch_and_says_why(name: str, reason: str) -> None:
+    policy = getattr(torch_policies, name)()
+    executable, notes = choose_executable(policy, "auto", SETTINGS)
+    assert executable.engine == "torch"
+    assert notes
+    assert all(re.search(reason, note) for note in notes)
+
+
+@pytest.mark.parametrize("head_steps", [None, 2])
+def test_the_solver_runs_around_a_graph_of_one_step(head_steps: int | None) -> None:
+    require_parity(Stepwise(), replace(SETTINGS, num_diffusion_steps=10, head_steps=head_steps))
+
+
+def test_a_solver_that_is_no_policy_s_own_step_is_not_unrolled_over_its_weights(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    weights = sum(value.numel() for value in Stepwise().parameters())
+    monkeypatch.setattr(openvino_modules, "MAX_WEIGHTS", weights)
+    require_parity(Stepwise(), SETTINGS)
+    monkeypatch.delattr(Stepwise, "to_chunk")  # so that it is no StepwisePolicy
+    executable, notes = choose_executable(Stepwise(), "auto", SETTINGS)
+    assert executable.engine == "torch"
+    assert "weights, each counted as often as it is used" in notes[0]
+    assert "protocol.StepwisePolicy" in notes[0]
+
+
+def test_a_second_start_converts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    converted = []
+
+    def convert(module: nn.Module, examples: tuple[torch.Tensor, ...]) -> Any:
+        converted.append(module)
+        return right(module, examples)
+
+    right = openvino_modules._converted
+    monkeypatch.setattr(openvino_modules, "_converted", convert)
+    require_parity(TwoRates(), SETTINGS)
+    at_first = len(converted)
+    require_parity(TwoRates(), SETTINGS)
+    assert len(converted) == at_first == 2
+    changed = TwoRates()
+    with torch.no_grad():
+        changed.head.layers[0].bias[0] += 1  # type: ignore[union-attr, operator]
+    require_parity(changed, SETTINGS)
+    assert len(converted) == at_first + 1  # the encoder is the same
