@@ -21,6 +21,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
 from mavbridge.config.identify import IdentifyConfig
 from mavbridge.config.imagine import EvaluateImaginationConfig, ImagineConfig
+from mavbridge.config.record import RecordConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
@@ -68,6 +69,18 @@ def identify(config: IdentifyConfig | None = None) -> int:
     from mavbridge.commands.identify.run import identify as run_identification
 
     return run_identification(config)
+
+
+@cli.command
+def record(config: RecordConfig) -> int:
+    """Record a human pilot's flights, to learn from; nothing is sent but requests."""
+    if not config.vehicle.connect:
+        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
+    require_supported_system()
+    require_extra("record")
+    from mavbridge.commands.record.run import record as run_recording
+
+    return run_recording(config)
 
 
 @cli.command
@@ -165,7 +178,7 @@ def train_world_model(
 
 @cli.command
 def export(*flights: Path, config: ExportConfig) -> int:
-    """Make a LeRobot dataset (v3.0) of flights. Demonstrations that failed are left out.
+    """Make a LeRobot dataset (v3.0) of flights, without those that failed.
 
     Args:
         flights: flight folders, or folders of them.

@@ -6,6 +6,7 @@ functions of this module, so that a checkpoint takes SI units. No torch: the scr
 through here too.
 """
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -119,6 +120,14 @@ def fit_image(rgb: NDArray[np.uint8], contract: Contract) -> NDArray[np.uint8]:
     padded = np.zeros((height, width, 3), np.uint8)
     padded[above : above + inner.shape[0], beside : beside + inner.shape[1]] = inner
     return padded
+
+
+def least_source_px(contract: Contract) -> int:
+    """Side that a camera's image should have, so that none of it must be enlarged."""
+    top, left, bottom, right = contract.image_crop
+    return math.ceil(
+        max(contract.image_height / (bottom - top), contract.image_width / (right - left))
+    )
 
 
 def _part(length: int, start: float, end: float) -> slice:

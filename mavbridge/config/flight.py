@@ -206,9 +206,10 @@ class LinkConfig:
 class CameraConfig:
     """Where the images come from."""
 
-    camera: str = "0"
+    camera: Annotated[tuple[str, ...], Parameter(negative="", show_default=" ".join)] = ("0",)
     """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
-    screen:WINDOW TITLE, or none for a policy that looks at no image."""
+    screen:WINDOW TITLE, or none for a policy that looks at no image. For a policy with several
+    cameras give each by its name in the contract: --camera front=0 --camera down=/dev/video2."""
     window_name: Annotated[str | None, Parameter(group=RARE)] = None
     """Same as --camera "screen:WINDOW TITLE"."""
     camera_timeout: Annotated[float, Parameter(group=RARE)] = 10.0
@@ -228,10 +229,38 @@ class CameraConfig:
         check_range("max-frozen-image", self.max_frozen_image, 0, 60, "s")
         check_range("max-black-image", self.max_black_image, 0, 60, "s")
 
+        names = [name for name, _ in self._named]
+        if len(set(names)) < len(names) or (len(names) > 1 and "" in names):
+            raise UserError(
+                f"--camera {' '.join(self.camera)}: with several cameras each has a name of its "
+                "own, as in --camera front=0 --camera down=/dev/video2"
+            )
+
     @property
-    def source(self) -> str:
-        """The camera specification that both flags lead to."""
-        return self.camera if self.window_name is None else f"screen:{self.window_name}"
+    def _named(self) -> tuple[tuple[str, str], ...]:
+        """Name and source of each; an empty name where none was given."""
+        if self.window_name is not None:
+            return (("", f"screen:{self.window_name}"),)
+        matches = [re.fullmatch(r"(?:([A-Za-z_]\w*)=)?(.*)", text) for text in self.camera]
+        return tuple((match[1] or "", match[2]) for match in matches if match)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Camera specifications that the flags lead to, in the order in which they were given."""
+        return tuple(source for _, source in self._named)
+
+    def sources_of(self, cameras: tuple[str, ...]) -> tuple[str, ...]:
+        """The specification of each camera of a contract; UserError if the names do not match."""
+        found = dict(self._named)
+        if len(cameras) == 1 and "" in found:
+            return (found[""],)
+        if set(found) == set(cameras):
+            return tuple(found[name] for name in cameras)
+        wanted = " ".join(f"--camera {name}=SOURCE" for name in cameras)
+        raise UserError(
+            f"--camera {' '.join(self.camera)}: this policy looks through the "
+            f"camera{'s' if len(cameras) > 1 else ''} {', '.join(cameras)}: give {wanted}"
+        )
 
 
 @Parameter(name="*")

@@ -1,7 +1,7 @@
 """One real flight: starts the gate, opens what the flags name, stops all in reverse order."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.files import require_writable
-from mavbridge.core.ports import TickSink
+from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.realtime import (
     prepare_to_die_first,
     settle_process,
@@ -40,6 +40,8 @@ from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
+from policy.contract import Contract
+from policy.preprocess import least_source_px
 from policy.protocol import Executable
 
 JOIN_S = 2.0
@@ -90,7 +92,8 @@ def check_flight(config: FlyConfig, clock: Clock) -> None:
         MavbridgeError: a flag names something that cannot be opened, written or loaded.
     """
     make_transport(config.link.connect, clock)
-    check_camera(config.camera.source, latency_ms=config.camera.camera_latency)
+    for source in config.camera.sources:
+        check_camera(source, latency_ms=config.camera.camera_latency)
     check_configured_policy(config.policy)
     require_writable(config.report, "--report")
     if config.record is not None:
@@ -173,15 +176,12 @@ class _Flight:
         self._observers = FlightObservers(config, executable, clock=clock, console=console)
         stack.callback(self._observers.close_recorder)  # after the gate: it records the release
         self._observers.open_viewer(stack)
-        camera = open_camera(
-            config.camera.source,
-            image_size=executable.contract.image_height,
-            clock=clock,
-            timeout_s=config.camera.camera_timeout,
-            latency_ms=config.camera.camera_latency,
-            report=lambda line: console.print(Text(line)),
-        )
-        stack.callback(camera.close)
+        contract = executable.contract
+        self._cameras = contract.cameras
+        cameras = [
+            self._open_camera(source, contract, console)
+            for source in config.camera.sources_of(contract.cameras)
+        ]
         self._observers.open_recorder(
             gate.tlog_pipe, self._gate, lambda: self._bridge.view.status.autopilot
         )
@@ -190,17 +190,36 @@ class _Flight:
             executable,
             clock=clock,
             send=self._gate.send,
-            cameras=(camera,),
+            cameras=cameras,
             sinks=(*self._observers.sinks, *sinks),
             watches_images=looks_at_images(config),
         )
 
+    def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:
+        config = self._config.camera
+        camera = open_camera(
+            source,
+            image_size=least_source_px(contract),
+            clock=self._clock,
+            timeout_s=config.camera_timeout,
+            latency_ms=config.camera_latency,
+            report=lambda line: console.print(Text(line)),
+        )
+        self._stack.callback(camera.close)
+        return camera
+
     def run(self, stop: StopRequest) -> None:
         """Fly until the gate ends, a loop ends, or a signal comes."""
         rates, bridge, screen = self._config.rates, self._bridge, self._observers.screen
-        see = self._scheduled(bridge.visions[0].run, realtime=False, cpu=rates.vision_cpu)
+        visions = [
+            Worker(
+                "mavbridge-vision" if number == 0 else f"mavbridge-vision-{self._cameras[number]}",
+                self._scheduled(vision.run, realtime=False, cpu=rates.vision_cpu),
+            )
+            for number, vision in enumerate(bridge.visions)
+        ]
         act = self._scheduled(bridge.policy.run, realtime=rates.realtime, cpu=rates.action_cpu)
-        vision, policy = Worker("mavbridge-vision", see), Worker("mavbridge-policy", act)
+        policy = Worker("mavbridge-policy", act)
         # On the way of every attitude to the policy, so it must not wait for ordinary threads.
         listen = self._scheduled(
             partial(self._gate.listen, view=bridge.view),
@@ -210,7 +229,7 @@ class _Flight:
         listener = Worker("mavbridge-gate", listen)
         settle_process()
         # Joined in reverse: the gate has ended before anything that feeds it is closed.
-        for worker in (vision, policy, listener):
+        for worker in (*visions, policy, listener):
             self._stack.callback(self._join, worker)
             worker.start()
         keyboard = Keyboard(self._on_key)
@@ -219,7 +238,7 @@ class _Flight:
         screen.start(hint=KEYS_HINT if has_keys else None)
         ending = Ending(reason="the flight was ended by a signal")
         while listener.is_alive and not stop.is_set():
-            if (fault := self._fault(vision, policy)) is not None:
+            if (fault := self._fault(visions, policy)) is not None:
                 ending = Ending(reason=fault, is_fault=True)
                 break
             stop.wait(1 / STATUS_HZ)
@@ -241,25 +260,33 @@ class _Flight:
 
         return run_settled
 
-    def _fault(self, vision: Worker, policy: Worker) -> str | None:
+    def _fault(self, visions: Sequence[Worker], policy: Worker) -> str | None:
         """Why no more chunks will come, or None."""
-        if not vision.is_alive:
-            return "the camera or its encoder has failed"
+        for vision, camera in zip(visions, self._cameras, strict=True):
+            if not vision.is_alive:
+                return f"the camera{self._named(camera)} or its encoder has failed"
         if not policy.is_alive:
             return "the policy has failed"
-        now_ns = self._clock.now_ns()
+        now_ns, encoder_hang_ns = self._clock.now_ns(), self._encoder_hang_ns
         if now_ns - self._looked_ns > STOPPED_NS:
             self._resumed_ns = now_ns
         self._looked_ns = now_ns
         for name, alive_ns, limit_ns in (
             ("policy", self._bridge.policy.alive_ns, self._hang_ns),
-            ("encoder", self._bridge.visions[0].alive_ns, self._encoder_hang_ns),
+            *(
+                (f"encoder{self._named(camera, 'of camera ')}", vision.alive_ns, encoder_hang_ns)
+                for camera, vision in zip(self._cameras, self._bridge.visions, strict=True)
+            ),
         ):
             idle_ns = now_ns - max(alive_ns, self._resumed_ns)
             if idle_ns > limit_ns:
                 self._has_hung = True
                 return f"the {name} has hung for {idle_ns / NS_PER_S:.1f} s"
         return None
+
+    def _named(self, camera: str, prefix: str = "") -> str:
+        """The name of one of several cameras, for a message."""
+        return f" {prefix}{camera}" if len(self._cameras) > 1 else ""
 
     def _end(self, ending: Ending, listener: Worker, stop: StopRequest) -> None:
         """Have the gate give the sticks back, and wait for it while it holds any."""

@@ -112,12 +112,12 @@ class ObservationSource:
         for camera, cache in enumerate(self._caches):
             feature = cache.latest()
             if feature is None:
-                return Release(f"no image feature yet{self._of(camera)}")
+                return Release(f"{self._of(camera)}no image feature yet")
             if now_ns - feature.captured_ns > self._max_feature_age_ns:
                 limit_ms = self._max_feature_age_ns // NS_PER_MS
-                return Release(f"the image feature{self._of(camera)} is older than {limit_ms} ms")
+                return Release(f"{self._of(camera)}the image feature is older than {limit_ms} ms")
             if feature.fault is not None:
-                return Release(feature.fault + self._of(camera))
+                return Release(self._of(camera) + feature.fault)
             newest.append(feature)
         rows = [
             [
@@ -152,7 +152,7 @@ class ObservationSource:
         return self._ego_motion.append_to(state, feature.captured_ns)
 
     def _of(self, camera: int) -> str:
-        return "" if len(self._cameras) == 1 else f" of camera {self._cameras[camera]}"
+        return "" if len(self._cameras) == 1 else f"camera {self._cameras[camera]}: "
 
 
 def observation_ages_ns(contract: Contract) -> tuple[int, ...]:

@@ -68,7 +68,7 @@ def looks_at_images(config: FlyConfig) -> bool:
 
     Without a camera a user's class is taken at its user's word; the built-in nets need images.
     """
-    is_blind = config.camera.source == NO_CAMERA and not is_stateless(config.policy)
+    is_blind = set(config.camera.sources) == {NO_CAMERA} and not is_stateless(config.policy)
     return not is_blind and not is_scripted(config.policy)
 
 

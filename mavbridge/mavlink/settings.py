@@ -24,6 +24,9 @@ class LinkSettings:
     """Rate of attitude, velocity and acceleration to ask the vehicle for."""
     min_battery_percent: float = 0.0
     """Charge below which the battery is reported as low; 0 = only what the vehicle itself says."""
+    pilot_hz: float | None = None
+    """Rate of RC_CHANNELS to ask for where the pilot's sticks are recorded; None: what the check of
+    our own sticks needs."""
     stick_hz: float = 100.0
     """Rate at which sticks will be sent."""
     forward: str = ""

@@ -6,11 +6,12 @@ import signal
 import sys
 import termios
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from mavbridge.core.workers import Worker
 
 ENGAGE_KEY, RELEASE_KEY = "e", "q"
+FLIGHT_KEYS = (RELEASE_KEY, ENGAGE_KEY)
 KEYS_HINT = "e engages, q releases"
 POLL_S = 0.1
 _LOCAL_MODES = 3
@@ -27,15 +28,25 @@ def ignore_job_control() -> None:
 
 
 class Keyboard:
-    """Passes each ``e`` and ``q`` to ``on_key``, in lower case, from a thread of its own.
+    """Passes each key of ``keys`` to ``on_key``, in lower case, from a thread of its own.
 
     The terminal gives keys at once and without echo while this process is in its foreground;
     Ctrl-C stays a signal. Without a terminal nothing happens. ``on_key`` must not block.
     """
 
-    def __init__(self, on_key: Callable[[str], None], *, fd: int | None = None) -> None:
-        """Read ``fd``, by default standard input."""
+    def __init__(
+        self,
+        on_key: Callable[[str], None],
+        *,
+        keys: Sequence[str] = FLIGHT_KEYS,
+        fd: int | None = None,
+    ) -> None:
+        """Read ``fd``, by default standard input.
+
+        The first of ``keys`` is heard among others that are typed at once; the others only alone.
+        """
         self._on_key = on_key
+        self._urgent_key, *self._keys = keys
         self._fd = _standard_input() if fd is None else fd
         self._old_modes: list[int | list[bytes | int]] | None = None
         self._worker: Worker | None = None
@@ -96,10 +107,10 @@ class Keyboard:
         """Pass on what was typed; returns False at the end of the input."""
         typed = os.read(fd, 1024).decode(errors="replace").lower()
         # Several at once are a paste, or the sequence of a function key: that engages nothing.
-        if RELEASE_KEY in typed and not typed.startswith("\x1b"):
-            self._on_key(RELEASE_KEY)
-        elif set(typed) == {ENGAGE_KEY}:
-            self._on_key(ENGAGE_KEY)
+        if self._urgent_key in typed and not typed.startswith("\x1b"):
+            self._on_key(self._urgent_key)
+        elif len(set(typed)) == 1 and typed[0] in self._keys:
+            self._on_key(typed[0])
         return bool(typed)
 
 

@@ -26,7 +26,7 @@ MAX_MESSAGES = 100
 """Messages that may wait for the reader; the oldest are dropped first, and counted."""
 
 
-class _RateMeter:
+class RateMeter:
     """Rate of a series of stamps over the last ``RATE_WINDOW_S`` of refreshes."""
 
     def __init__(self) -> None:
@@ -36,6 +36,10 @@ class _RateMeter:
     def count(self, stamp_ns: int) -> None:
         """Count an event; count and stamp change in one step, since another thread reads them."""
         self._newest = (self._newest[0] + 1, stamp_ns)
+
+    def set(self, count: int, stamp_ns: int) -> None:
+        """Take a count that somebody else keeps, with the stamp of the newest event."""
+        self._newest = (count, stamp_ns)
 
     def sample_hz(self) -> float | None:
         """Events per second, to be called once a refresh; None while no events come."""
@@ -69,7 +73,7 @@ class FlightScreen:
         self._readonly = readonly
         self._hint: str | None = None
         self._final_status: str | None = None
-        self._action, self._vision = _RateMeter(), _RateMeter()
+        self._action, self._vision = RateMeter(), RateMeter()
         self._tick: Tick | None = None
         self._missed_slots = 0
         self._activity, self._activity_ns = "", 0

@@ -13,7 +13,7 @@ from policy.errors import ContractError
 
 FORMAT = "mavbridge-flight"
 VERSION = 1
-FlightSource = Literal["flight", "demonstration", "dagger", "imagined"]
+FlightSource = Literal["flight", "demonstration", "dagger", "imagined", "pilot"]
 
 
 class FlightError(MavbridgeError):
@@ -55,6 +55,9 @@ class FlightMeta:
     packets_dropped: int | None = None
     """Each of the three counts what was lost before the last row of its file."""
     success: bool | None = None
+    """Whether it is an example to follow: by the course, by its pilot's mark, False by a crash."""
+    crash: str | None = None
+    """How it was seen to have crashed, in words."""
     gates_passed: int | None = None
     conditions: dict[str, float] = field(default_factory=dict)
     """Physical quantities that were randomised, by name."""

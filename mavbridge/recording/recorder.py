@@ -5,11 +5,12 @@ and an error ends the recording alone, with one warning.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mavbridge.core.observers import ObserverThread
 from mavbridge.core.records import Event, Tick, VisionTick
+from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.tlog import TlogPipe
@@ -69,6 +70,16 @@ class Recorder:
         """Ticks, frames and packets that are not in the recording; exact after ``close``."""
         return self._observer.dropped + self._consumer.frames_lost + self._packets_dropped()
 
+    @property
+    def crash(self) -> str | None:
+        """How the vehicle has crashed so far, in words; read by any thread."""
+        return self._consumer.crash_watch.reason
+
+    @property
+    def meta(self) -> FlightMeta:
+        """What ``meta.json`` holds; complete after ``close``."""
+        return self._consumer.writer.meta
+
     def summary(self) -> str:
         """One line for a person: the folder, what it holds and what it lacks."""
         writer = self._consumer.writer
@@ -88,6 +99,7 @@ class _FlightConsumer:
     packets_dropped: Callable[[], int]
     autopilot: Callable[[], str]
     report: Callable[[str], None]
+    crash_watch: CrashWatch = field(default_factory=CrashWatch)
     _seen_frames: int = 0
     _has_failed: bool = False
 
@@ -102,6 +114,7 @@ class _FlightConsumer:
         try:
             for event in batch:
                 if isinstance(event, Tick):
+                    self.crash_watch.see(event)
                     self.writer.tick(event)
                 else:
                     self._write_frame(event)
@@ -123,5 +136,13 @@ class _FlightConsumer:
         if self._has_failed:
             self.writer.close()
             return
-        meta, dropped = self.writer.meta, self.packets_dropped()
-        self.writer.finish(replace(meta, autopilot=self.autopilot(), packets_dropped=dropped))
+        crash = self.crash_watch.reason
+        self.writer.finish(
+            replace(
+                self.writer.meta,
+                autopilot=self.autopilot(),
+                packets_dropped=self.packets_dropped(),
+                success=None if crash is None else False,
+                crash=crash,
+            )
+        )

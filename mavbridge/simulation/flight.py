@@ -1,6 +1,6 @@
 """One simulated flight of one course: the real bridge, its world on a stepped clock."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -24,6 +24,7 @@ from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper, se
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.referee import EpisodeResult, Referee
 from mavbridge.simulation.world import (
+    MOUNTS,
     NOMINAL_VEHICLE,
     BlankRenderer,
     DelayedFeatureCache,
@@ -33,10 +34,11 @@ from mavbridge.simulation.world import (
     VehicleStepper,
     VisionStepper,
 )
-from policy.contract import FloatArray
+from policy.contract import Contract, FloatArray
 from policy.protocol import Executable
 from sitl.camera.fpv import FpvRenderer
 from sitl.course.layout import make_course
+from sitl.rotation import Quat
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
@@ -180,68 +182,93 @@ class SimulatedFlight:
             forward=lambda packet: gate.forward(packet),
         )
         gate = GateLoop(world, link, MemoryPort(outgoing=to_flight, incoming=to_gate))
-        policy_clock, vision_clock = AheadClock(world), AheadClock(world)
-        camera = self._make_camera(executable, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
+        contract, policy_clock = executable.contract, AheadClock(world)
+        vision_clocks = [AheadClock(world) for _ in contract.cameras]
+        cameras = self._make_cameras(contract, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
         send = sender(world, policy_clock, flight_port)
         send(flight_settings(config, executable))
-        past_ns = observation_ages_ns(executable.contract)[0]
+        past_ns = observation_ages_ns(contract)[0]
         bridge = build_bridge(
             config,
-            self._take_time(executable, vision_clock, policy_clock),
+            self._take_time(executable, vision_clocks, policy_clock),
             clock=world,
             send=send,
-            cameras=(camera,),
+            cameras=cameras,
             sinks=sinks,
             watches_images=self._settings.draw_images,
-            caches=(DelayedFeatureCache(world, span_ns=past_ns),),
+            caches=[DelayedFeatureCache(world, span_ns=past_ns) for _ in cameras],
             policy_clock=policy_clock,
-            vision_clocks=(vision_clock,),
+            vision_clocks=vision_clocks,
             delay_vision=lambda sink: DelayedSink(world, sink),
         )
-        VisionStepper(world, vision_clock, camera, bridge.visions[0])
+        for clock, camera, vision in zip(vision_clocks, cameras, bridge.visions, strict=True):
+            VisionStepper(world, clock, camera, vision)
         policy = PolicyStepper(world, policy_clock, flight_port, bridge.policy, bridge.view)
         gate_stepper = GateStepper(world, gate)
         to_flight.on_arrival = policy.receive
         to_gate.on_arrival = self._downlink.on_arrival = gate_stepper.step
         return gate
 
-    def _make_camera(self, executable: Executable, *, camera_hz: float) -> SimulatedCamera:
-        camera_period_ns = period_ns(camera_hz)
-        contract, least_px = executable.contract, self._settings.least_camera_px
+    def _make_cameras(self, contract: Contract, *, camera_hz: float) -> list[SimulatedCamera]:
+        """The cameras of a policy; a lone one looks ahead, whatever its name.
+
+        Raises:
+            UserError: there is no camera of that name.
+        """
+        mounts = ["front"] if len(contract.cameras) == 1 else list(contract.cameras)
+        if unknown := [name for name in mounts if name not in MOUNTS]:
+            raise UserError(
+                f"the simulator has no cameras {unknown}: a policy with several cameras takes some "
+                f"of {', '.join(MOUNTS)} here"
+            )
+        cameras = [
+            self._make_camera(contract, number, MOUNTS[name], period_ns(camera_hz))
+            for number, name in enumerate(mounts)
+        ]
+        cameras[0].exposure_watchers += self._exposure_watchers
+        return cameras
+
+    def _make_camera(
+        self, contract: Contract, number: int, mount: Quat, camera_period_ns: int
+    ) -> SimulatedCamera:
+        least_px, conditions = self._settings.least_camera_px, self._vehicle_config.conditions
         width, height = max(contract.image_width, least_px), max(contract.image_height, least_px)
-        conditions = self._vehicle_config.conditions
-        camera = SimulatedCamera(
+        return SimulatedCamera(
             self.clock,
             lambda: self.vehicle.pose,
             FpvRenderer(self.course, width, height, conditions)
             if self._settings.draw_images
             else BlankRenderer(width, height),
             period_ns=camera_period_ns,
-            phase_ns=int(self._random(2).integers(camera_period_ns)),
-            delays_ns=self._settings.delays.camera.samples_ns(self._random(3)),
+            phase_ns=int(self._random(10 * number + 2).integers(camera_period_ns)),
+            delays_ns=self._settings.delays.camera.samples_ns(self._random(10 * number + 3)),
+            mount=mount,
         )
-        camera.exposure_watchers += self._exposure_watchers
-        return camera
 
     def _take_time(
-        self, executable: Executable, vision_clock: AheadClock, policy_clock: AheadClock
+        self, executable: Executable, vision_clocks: Sequence[AheadClock], policy_clock: AheadClock
     ) -> Executable:
         """The same executable, whose calls take simulated time.
 
-        Without a fast path the whole network runs for every action, which then takes both times.
+        Without a fast path the whole network runs for every action, which then takes both times,
+        the one for the image once for each camera.
         """
-        vision_ns = self._settings.delays.vision.samples_ns(self._random(4))
+        vision = self._settings.delays.vision
+        vision_ns = [
+            vision.samples_ns(self._random(10 * number + 4)) for number in range(len(vision_clocks))
+        ]
         action_ns = self._settings.delays.action.samples_ns(self._random(5))
         is_dual = executable.dual_rate
 
         def encode(rgb: ImageArray, camera: int = 0, /) -> FloatArray:
-            vision_clock.ahead_ns += next(vision_ns) if is_dual else 0
+            vision_clocks[camera].ahead_ns += next(vision_ns[camera]) if is_dual else 0
             return executable.encode(rgb, camera)
 
         def act(
             encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
         ) -> FloatArray:
-            policy_clock.ahead_ns += next(action_ns) + (0 if is_dual else next(vision_ns))
+            policy_clock.ahead_ns += next(action_ns)
+            policy_clock.ahead_ns += 0 if is_dual else sum(next(each_ns) for each_ns in vision_ns)
             return executable.act(encoded, state, history, elapsed_s)
 
         return replace(executable, encode=encode, act=act)

@@ -3,6 +3,7 @@
 The vision loop runs as an event when a frame arrives, and publishes at its stamps.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -15,12 +16,21 @@ from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.network import DelayedChannel
 from sitl.camera.fpv import FpvRenderer
-from sitl.rotation import Quat, Vec3
+from sitl.rotation import IDENTITY, Quat, Vec3, from_euler, multiply
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import random_conditions
 from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 from sitl.vehicle.dynamics import BodyState
 
+MOUNTS: dict[str, Quat] = {
+    "front": IDENTITY,
+    "down": from_euler(0.0, -math.pi / 2, 0.0),
+    "left": from_euler(0.0, 0.0, -math.pi / 2),
+    "right": from_euler(0.0, 0.0, math.pi / 2),
+    "back": from_euler(0.0, 0.0, math.pi),
+}
+"""Where the cameras of a policy that has several look, by name: body_from_mount. Each is tilted as
+the front one; the upper edge of the image of ``down`` lies ahead."""
 NOMINAL_VEHICLE = VehicleConfig(estimator_ready_s=0.5, position_ready_s=0.5)
 """Nothing is random; ready at once, since the handshake alone takes longer than half a second."""
 
@@ -123,8 +133,10 @@ class SimulatedCamera:
         period_ns: int,
         phase_ns: int,
         delays_ns: Iterator[int],
+        mount: Quat = IDENTITY,
     ) -> None:
         self._clock = clock
+        self._mount = mount
         self._pose = pose
         self._renderer = renderer
         self._period_ns = period_ns
@@ -164,7 +176,10 @@ class SimulatedCamera:
         if exposure is None:
             return None
         body = exposure.body
-        rgb = self._renderer.render(body.position_ned_m, body.ned_from_body_wxyz)
+        attitude = body.ned_from_body_wxyz
+        if self._mount != IDENTITY:
+            attitude = multiply(attitude, self._mount)
+        rgb = self._renderer.render(body.position_ned_m, attitude)
         rgb.setflags(write=False)
         return Frame(frame_id=exposure.frame_id, captured_ns=exposure.captured_ns, rgb=rgb)
 

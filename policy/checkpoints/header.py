@@ -10,6 +10,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
+from policy.checkpoints.what_file import recognise
 from policy.contract import Contract
 from policy.errors import CheckpointError
 
@@ -17,7 +18,7 @@ CONTRACT_KEY = "contract"
 ARCHITECTURE_KEY = "architecture"
 TRAINING_KEY = "training"
 HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
-SUFFIXES = (".safetensors", ".pt", ".pth")
+SUFFIXES = (".safetensors", ".pt", ".pth", ".ckpt")
 
 
 @contextmanager
@@ -34,6 +35,8 @@ def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
 
 def require_file(path: Path, suffixes: Sequence[str]) -> None:
     """Refuse a path that is not a file of one of these suffixes, and say what is there."""
+    if (sentence := recognise(path)) is not None:
+        raise CheckpointError(sentence)
     if path.suffix not in suffixes:
         raise CheckpointError(f"{path}: not a checkpoint; use one of {', '.join(suffixes)}")
     if not path.is_file():

@@ -11,7 +11,7 @@ import json
 import pickle
 import struct
 import warnings
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,20 +22,22 @@ from torch import Tensor
 from policy.checkpoints.header import (
     ARCHITECTURE_KEY,
     CONTRACT_KEY,
-    HEADER_KEYS,
     SUFFIXES,
     TRAINING_KEY,
     require_file,
     require_header,
 )
+from policy.checkpoints.state_dicts import FoundWeights, find_weights
 from policy.checkpoints.tensors import (
     pack,
     read_tensors,
     require_finite,
     require_fit,
+    shapes_of,
     unpack,
     write_tensors,
 )
+from policy.checkpoints.which_of_ours import which_of_ours
 from policy.contract import Contract, FloatArray
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.errors import CheckpointError, PolicyError
@@ -62,10 +64,12 @@ _DAMAGED = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Contents:
-    """Contents of a file; texts are None and ``vector`` is empty where it does not say."""
+    """Contents of a file; texts are None and the rest is empty where it does not say."""
 
-    state: dict[str, Tensor]
-    vector: dict[str, Tensor]
+    state: dict[str, Tensor] = field(default_factory=dict)
+    vector: dict[str, Tensor] = field(default_factory=dict)
+    loaded: dict[Any, Any] = field(default_factory=dict)
+    """Everything in a torch file: which of it are the weights depends on the network."""
     contract: str | None
     architecture: str | None
 
@@ -112,20 +116,30 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
         CheckpointError: missing, corrupt, of another policy or contract version, not finite, or
             it no longer makes the chunks of its test vector.
     """
+    return load_checkpoint_with_notes(path, fallback=fallback)[0]
+
+
+def load_checkpoint_with_notes(
+    path: Path, *, fallback: BuiltinConfig
+) -> tuple[BuiltinPolicy, tuple[str, ...]]:
+    """``load_checkpoint``, and what a person should know of where the weights were found."""
     require_file(path, SUFFIXES)
     is_safetensors = path.suffix == ".safetensors"
     contents = _read_safetensors(path) if is_safetensors else _read_torch(path)
-    require_finite(path, contents.state)
     try:
         policy = build_policy(_config_of(contents, fallback))
     except PolicyError as error:
         raise CheckpointError(f"{path}: {error}") from error
-    require_fit(path, policy, contents.state)
-    policy.load_state_dict(contents.state)
+    found = FoundWeights(state=contents.state)
+    if not is_safetensors:
+        found = find_weights(path, contents.loaded, shapes_of(policy))
+    require_finite(path, found.state)
+    require_fit(path, policy, found.state, lambda: which_of_ours(found.state, policy.contract))
+    policy.load_state_dict(found.state)
     policy.eval()
     if contents.vector:
         _require_reproduced(path, policy, contents.vector)
-    return policy
+    return policy, () if found.note is None else (found.note,)
 
 
 def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
@@ -241,25 +255,9 @@ def _read_torch(path: Path) -> _Contents:
             "save model.state_dict()"
         )
     return _Contents(
-        state=_weights(path, loaded),
-        vector={},
+        loaded=loaded,
         contract=_text_or_none(path, loaded, CONTRACT_KEY),
         architecture=_text_or_none(path, loaded, ARCHITECTURE_KEY),
-    )
-
-
-def _weights(path: Path, loaded: dict[Any, Any]) -> dict[str, Tensor]:
-    """The state dict in what torch.load returned: under a usual key, or the dict itself."""
-    state = {name: value for name, value in loaded.items() if name not in HEADER_KEYS}
-    for key in ("model_state_dict", "state_dict"):
-        if isinstance(loaded.get(key), dict):
-            state = loaded[key]
-            break
-    if state and all(isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()):
-        return state
-    raise CheckpointError(
-        f"{path}: no weights found; it must hold 'model_state_dict' or 'state_dict', or be a state "
-        f"dict itself, and holds {sorted(map(str, loaded))[:8]}"
     )
 
 

@@ -1,6 +1,6 @@
 """Files of weights, whatever the network: read, written, and refused by a ``CheckpointError``."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
@@ -9,6 +9,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from policy.checkpoints.header import open_safetensors
+from policy.checkpoints.state_dicts import Shapes, misfits
 from policy.errors import CheckpointError
 
 SCALE = ".int8_scale"
@@ -46,20 +47,19 @@ def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
         )
 
 
-def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor]) -> None:
-    """Name the first few weights that do not fit; torch's own message lists hundreds."""
-    wanted = {name: list(value.shape) for name, value in policy.state_dict().items()}
-    problems = [f"missing {name!r}" for name in wanted if name not in state]
-    problems += [f"unexpected {name!r}" for name in state if name not in wanted]
-    problems += [
-        f"{name!r} is {list(state[name].shape)}, must be {shape}"
-        for name, shape in wanted.items()
-        if name in state and list(state[name].shape) != shape
-    ]
-    if problems:
+def shapes_of(network: nn.Module) -> Shapes:
+    """Shape of each weight of a network."""
+    return {name: tuple(value.shape) for name, value in network.state_dict().items()}
+
+
+def require_fit(
+    path: Path, policy: nn.Module, state: Mapping[str, Tensor], advise: Callable[[], str]
+) -> None:
+    """Name the first weights that do not fit, and what to do; torch's message lists hundreds."""
+    if problems := misfits(state, shapes_of(policy)):
         raise CheckpointError(
             f"{path}: does not fit this policy in {len(problems)} places: "
-            f"{'; '.join(problems[:4])}. Choose the size and backbone that it was trained with"
+            f"{'; '.join(problems[:4])}. {advise()}"
         )
 
 

@@ -70,6 +70,6 @@ def load_world_model(path: Path) -> WorldModel:
         model = WorldModel(WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract))
     except PolicyError as error:
         raise CheckpointError(f"{path}: {error}") from error
-    require_fit(path, model, state)
+    require_fit(path, model, state, lambda: "Train it again with this version of mavbridge")
     model.load_state_dict(state)
     return model.eval()

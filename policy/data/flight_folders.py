@@ -48,9 +48,36 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_exemplary(folder: Path) -> bool:
-    """False for a demonstration that failed: flying into a gate's frame is not to be imitated."""
+    """False for a flight that failed: flying into a gate's frame is not to be imitated.
+
+    It missed gates as a demonstration, its pilot has marked it as bad, or it crashed. A policy's
+    flight that an expert has labelled ("dagger") is learnt from whatever became of it.
+    """
     meta = _read_meta(folder)
-    return meta.get("source") != "demonstration" or meta.get("success") is not False
+    return meta.get("source") == "dagger" or meta.get("success") is not False
+
+
+def leave_out_failed(
+    folders: Sequence[Path], *, include_failed: bool
+) -> tuple[list[Path], str | None]:
+    """The flights to learn from, and a line that says how many were left out.
+
+    Raises:
+        DatasetError: every flight has failed.
+    """
+    exemplary = [folder for folder in folders if include_failed or is_exemplary(folder)]
+    failed = len(folders) - len(exemplary)
+    if folders and not exemplary:
+        raise DatasetError(
+            f"all {failed} flights have failed (crashed, marked as bad, or off the course): "
+            "--include-failed takes them all the same"
+        )
+    if not failed:
+        return exemplary, None
+    return exemplary, (
+        f"left out: {failed} of {len(folders)} flights that failed (crashed, marked as bad, or off "
+        "the course); --include-failed takes them in"
+    )
 
 
 def read_flight(folder: Path) -> FlightData:

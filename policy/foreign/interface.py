@@ -24,6 +24,7 @@ All of it is optional but what the kind of policy asks for.
 """
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -109,8 +110,11 @@ class Interface:
         return np.ascontiguousarray((actions * scale + offset)[..., self.action_columns])
 
 
-def read_interface(path: Path) -> Interface:
+def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> Interface:
     """Read a contract file.
+
+    ``derived`` are fields of the contract that the policy's own files say: the contract file may
+    repeat them, not contradict them.
 
     Raises:
         ContractError: it cannot be read, is not TOML, or says something unknown or malformed.
@@ -122,18 +126,25 @@ def read_interface(path: Path) -> Interface:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ContractError(f"--contract {path} is not TOML: {error}") from error
     try:
-        return _interface(data)
+        return _interface(data, derived or {})
     except (ContractError, TypeError, ValueError) as error:
         raise ContractError(f"--contract {path}: {error}") from error
 
 
-def _interface(data: dict[str, Any]) -> Interface:
+def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface:
     tables = {name: dict(data.pop(name, {})) for name in ("contract", "state", "action", "images")}
     task = dict(data.pop("task", {}))
     known = {field.name for field in fields(Contract) if field.init}
     if unknown := sorted(set(tables["contract"]) - known):
         raise ContractError(f"[contract] has unknown fields {unknown}; known are {sorted(known)}")
-    contract = Contract(**{name: _frozen(value) for name, value in tables["contract"].items()})
+    said = {name: _frozen(value) for name, value in tables["contract"].items()}
+    for name, value in derived.items():
+        if said.setdefault(name, value) != value:
+            raise ContractError(
+                f"[contract] {name} = {said[name]!r} contradicts the policy's own files, which say "
+                f"{value!r}: leave it out"
+            )
+    contract = Contract(**said)
     state, action, images = tables["state"], tables["action"], tables["images"]
     if images and sorted(images) != sorted(contract.cameras):
         raise ContractError(

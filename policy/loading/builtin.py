@@ -80,16 +80,16 @@ def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinCo
 def _trained(
     config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
 ) -> tuple["BuiltinPolicy", list[str]]:
-    from policy.checkpoints.policy_file import load_checkpoint
+    from policy.checkpoints.policy_file import load_checkpoint_with_notes
 
-    policy = load_checkpoint(checkpoint, fallback=config)
+    policy, found = load_checkpoint_with_notes(checkpoint, fallback=config)
     parts = (policy.config.size, getattr(policy.config, "backbone", "resnet18"))
     if contradicted := [option for option in options if option not in parts]:
         raise PolicyError(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
         )
     policy.seed_noise(seed)
-    notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
+    notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}", *found]
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
         notes.append(

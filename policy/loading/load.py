@@ -5,6 +5,7 @@
     scripted[:PROGRAM][:ACTION][:air]
                              a fixed program in any kind of action, e.g. scripted:square:velocity;
                              air: begin in the air, without the climb
+    lerobot:DIR              an ACT or DiffusionPolicy as LeRobot saved it, with --contract FILE
     package.module:Class     any class that keeps protocol.SingleRatePolicy or DualRatePolicy
     ./file.py:Class          the same, by its file
 
@@ -14,13 +15,16 @@ torch is imported only where a policy needs it.
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 from policy.checkpoints.header import read_contract
+from policy.checkpoints.what_file import recognise
 from policy.contract import Contract
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError
 from policy.foreign.user_class import check_user_class, load_user_class
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
+from policy.loading.lerobot import LEROBOT, check_lerobot, load_lerobot
 from policy.loading.life import life_method
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
 from policy.protocol import (
@@ -51,7 +55,11 @@ def check_request(request: PolicyRequest) -> None:
         if checkpoint is not None and (contract := read_contract(checkpoint)) is not None:
             _require_image_size(contract, request.image_size)
         _require_devices(request)
+    elif kind == LEROBOT:
+        check_lerobot(request)
+        _require_devices(request)
     else:
+        _require_no_path(request.spec)
         check_user_class(request.spec)
 
 
@@ -62,7 +70,10 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
         PolicyError: as ``check_request``; or a user's class cannot be made.
     """
     check_request(request)
-    if request.spec.partition(":")[0] not in BUILTIN_KINDS:
+    kind = request.spec.partition(":")[0]
+    if kind == LEROBOT:
+        return check_lerobot(request).interface.contract
+    if kind not in BUILTIN_KINDS:
         policy, _ = _find(request, lambda: 0.0)
         life_method(policy, "close", request.spec)()
         return policy.contract
@@ -123,6 +134,8 @@ def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRat
     if kind == "scripted":
         note = f"{request.spec}: flies a fixed program, the camera is not looked at"
         return _scripted(options, request, now_s), [note]
+    if kind == LEROBOT:
+        return load_lerobot(request)
     if kind not in BUILTIN_KINDS:
         return load_user_class(request.spec, request.checkpoint), [
             f"{request.spec}: a class of yours"
@@ -158,6 +171,22 @@ def _scripted(
     if request.starts_in_air and options[-1:] != [IN_AIR]:
         options = [*(options or ["hover"]), IN_AIR]
     return make_scripted(options, now_s, contract=contract)
+
+
+def _require_no_path(spec: str) -> None:
+    """Say how that flies which was named as a policy by its path alone."""
+    path = Path(spec)
+    if not spec or ":" in spec or path.suffix == ".py":
+        return
+    if path.exists():
+        advice = f"{spec} is a file: give weights of ours as --checkpoint {spec}"
+        raise PolicyError(f"--policy {recognise(path) or advice}")
+    if path.name != spec:
+        raise PolicyError(
+            f"--policy {spec}: there is no such file or folder; a model of the Hugging Face hub is "
+            f"downloaded first (hf download {spec} --local-dir DIR), and a policy of LeRobot then "
+            "flies as lerobot:DIR"
+        )
 
 
 def _require_image_size(contract: Contract, image_size: int | None) -> None:

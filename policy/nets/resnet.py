@@ -85,11 +85,15 @@ class ResNet(nn.Module):
         self.layer4 = _layer(block, 256 * wide, 512, depths[3], stride=2)
         self.out_dim = MOMENTS * 512 * wide
 
+    def last_map(self, image: Tensor) -> Tensor:
+        """Image -> [B, 512 * expansion, ceil(H / 32), ceil(W / 32)]."""
+        x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
+        out: Tensor = self.layer4(self.layer3(self.layer2(self.layer1(x))))
+        return out
+
     def forward(self, image: Tensor) -> Tensor:
         """``pooling.moments`` of the last map, flat."""
-        x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
-        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
-        pooled: Tensor = moments(x).flatten(1)
+        pooled: Tensor = moments(self.last_map(image)).flatten(1)
         return pooled
 
 

@@ -72,6 +72,8 @@ class RunSettings:
     validations: int | None = None
     """Validations in the run, evenly spaced, each of which also saves the state of the run; one
     every two minutes or fifty steps, 4 to 20, if not given."""
+    include_failed: bool = False
+    """Learn from flights, too, that crashed, were marked as bad, or missed gates."""
     camera_key: str | None = None
     """Camera of a LeRobot dataset that has several, e.g. observation.images.front."""
 

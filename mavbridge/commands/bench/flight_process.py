@@ -65,7 +65,7 @@ def _measure(
         link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}"),
         policy=job.policy,
         # High above the course the simulator's view, which has no noise, hardly changes.
-        camera=CameraConfig(camera=job.camera, max_frozen_image=0.0),
+        camera=CameraConfig(camera=(job.camera,), max_frozen_image=0.0),
         rates=job.rates,
         envelope=NO_CEILING,
         mode="ALT_HOLD",

@@ -174,7 +174,7 @@ def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> tuple[str, StickMeter
     config = FlyConfig(
         link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}", raw_sticks=settings.raw_sticks),
         policy=settings.policy,
-        camera=CameraConfig(camera=job.camera),
+        camera=CameraConfig(camera=(job.camera,)),
         rates=settings.rates,
         limits=settings.limits,
         arm=True,

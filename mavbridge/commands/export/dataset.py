@@ -25,6 +25,8 @@ from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
 from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.data import lerobot_format as names
+from policy.foreign.state import state_values
+from policy.preprocess import resize
 
 Json: TypeAlias = "str | int | float | bool | list[Json] | dict[str, Json] | None"
 
@@ -34,9 +36,12 @@ _ROW_NUMBERS = ("frame_index", "episode_index", "index", "task_index")
 class DatasetWriter:
     """A dataset that grows by an episode at a time; whole only after ``finish``."""
 
-    def __init__(self, folder: Path, spec: DatasetSpec) -> None:
-        """Prepare; nothing is written yet into the folder, which is there and empty."""
-        self._folder, self._spec = folder, spec
+    def __init__(self, folder: Path, spec: DatasetSpec, image_size: int | None = None) -> None:
+        """Prepare; nothing is written yet into the folder, which is there and empty.
+
+        ``image_size``: as in ``fit_size``.
+        """
+        self._folder, self._spec, self._image_size = folder, spec, image_size
         self._video, self._data = VideoFiles(folder, spec), TableFiles(folder, spec)
         self._episodes: list[dict[str, Json]] = []
         self._colours = ImageStats()
@@ -64,9 +69,9 @@ class DatasetWriter:
         colours = ImageStats()
         count = 0
         for rgb in chain(first, images):
-            self._require_size(part, rgb)
-            image = rgb[: self._spec.height, : self._spec.width]
-            self._video.append(np.ascontiguousarray(image))
+            image = np.ascontiguousarray(fit_size(rgb, self._image_size))
+            self._require_size(part, image)
+            self._video.append(image)
             colours.add(image)
             count += 1
         columns = self._columns(part.part(0, count))
@@ -87,8 +92,8 @@ class DatasetWriter:
         self.rows += count
         return count
 
-    def _require_size(self, part: Stretch, rgb: ImageArray) -> None:
-        height, width = even_size(rgb)
+    def _require_size(self, part: Stretch, image: ImageArray) -> None:
+        height, width = image.shape[:2]
         if (height, width) != (self._spec.height, self._spec.width):
             raise VideoError(
                 f"{part.episode.name} has images of {width}x{height}, the first flight of "
@@ -98,8 +103,11 @@ class DatasetWriter:
     def _columns(self, part: Stretch) -> dict[str, NDArray[np.generic]]:
         count = len(part)
         frame_index = np.arange(count, dtype=np.int64)
+        state = part.columns[names.STATE_KEY]
+        wanted = state_values(list(state.T), STATE_NAMES, self._spec.state_names)
         return {
             **part.columns,
+            names.STATE_KEY: np.stack(wanted, axis=1),
             "timestamp": (frame_index / self._spec.fps).astype(np.float32),
             "frame_index": frame_index,
             "episode_index": np.full(count, self.episodes, np.int64),
@@ -182,10 +190,15 @@ class DatasetWriter:
         (self._folder / name).write_text(json.dumps(document, indent=4, allow_nan=False) + "\n")
 
 
-def even_size(rgb: ImageArray) -> tuple[int, int]:
-    """Height and width of the image without an odd last row or column, which 4:2:0 cannot have."""
+def fit_size(rgb: ImageArray, image_size: int | None) -> ImageArray:
+    """The image at the size of the dataset: ``image_size`` in height and width, or its own.
+
+    An odd last row or column is cut off, which 4:2:0 cannot have.
+    """
+    if image_size is not None:
+        return resize(rgb, image_size, image_size)
     height, width = rgb.shape[:2]
-    return height - height % 2, width - width % 2
+    return rgb[: height - height % 2, : width - width % 2]
 
 
 def _arrow(values: NDArray[np.generic]) -> pa.Array:
@@ -222,7 +235,7 @@ def _features(spec: DatasetSpec) -> dict[str, Json]:
             "has_audio": False,
         },
     }
-    state = _feature("float32", STATE_NAMES) | {"info": {names.STATE_FRAME: spec.state_frame}}
+    state = _feature("float32", spec.state_names) | {"info": {names.STATE_FRAME: spec.state_frame}}
     return {
         names.CAMERA_KEY: camera,
         names.STATE_KEY: state,

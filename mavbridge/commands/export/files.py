@@ -19,7 +19,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from mavbridge.core.records import ImageArray
-from policy.contract import StateFrame
+from policy.contract import STATE_NAMES, StateFrame
 from policy.data import lerobot_format as names
 
 MB = 1024**2
@@ -57,6 +57,8 @@ class DatasetSpec:
     width: int
     state_frame: StateFrame
     task: str
+    state_names: tuple[str, ...] = STATE_NAMES
+    """Numbers of ``observation.state``: the contract's, or made of them by ``foreign.state``."""
     data_file_bytes: int = DATA_FILE_MB * MB
     video_file_bytes: int = VIDEO_FILE_MB * MB
     """Size of a file; one episode alone may be larger."""

@@ -11,7 +11,7 @@ from av.error import FFmpegError
 from rich.console import Console
 from rich.progress import TaskID
 
-from mavbridge.commands.export.dataset import DatasetWriter, even_size
+from mavbridge.commands.export.dataset import DatasetWriter, fit_size
 from mavbridge.commands.export.files import DATA_FILE_MB, MB, VIDEO_FILE_MB, DatasetSpec
 from mavbridge.commands.export.rows import Stretch, common_fps, stretches, worst_shift_ns
 from mavbridge.commands.output import progress_bar
@@ -20,8 +20,10 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import stop_on_signals
+from policy.contract import STATE_NAMES
 from policy.data.flight_data import FlightData, common_frame
-from policy.data.flight_folders import find_flights, is_exemplary, read_flight
+from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
+from policy.foreign.state import BODY_STATE_NAMES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,11 +42,9 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
     """Export flights."""
     console = Console(stderr=True, highlight=False, emoji=False)
     folders = find_flights(flights)
-    exemplary = [folder for folder in folders if is_exemplary(folder)]
-    if not exemplary:
-        raise UserError("nothing to export: these demonstrations all failed")
-    if failed := len(folders) - len(exemplary):
-        console.print(f"left out: {failed} of {len(folders)} flights, demonstrations that failed")
+    exemplary, note = leave_out_failed(folders, include_failed=config.include_failed)
+    if note is not None:
+        console.print(note, soft_wrap=True)
     with (
         stop_on_signals() as stop,
         progress_bar(console) as progress,
@@ -93,17 +93,18 @@ def write_dataset(
     first = next(chain.from_iterable(part.episode.decode() for part in every), None)
     if first is None:
         raise UserError("nothing to export: not one image of these flights can be decoded")
-    height, width = even_size(first)
+    height, width = fit_size(first, config.image_size).shape[:2]
     spec = DatasetSpec(
         fps=fps,
         height=height,
         width=width,
         state_frame=common_frame(list(episodes)),
         task=config.task,
+        state_names=BODY_STATE_NAMES if config.state == "body" else STATE_NAMES,
         data_file_bytes=data_file_bytes,
         video_file_bytes=video_file_bytes,
     )
-    with closing(DatasetWriter(folder, spec)) as writer:
+    with closing(DatasetWriter(folder, spec, config.image_size)) as writer:
         for episode, of_flight in zip(episodes, parts, strict=True):
             _write_flight(writer, episode, of_flight, on_frame)
         writer.finish()

@@ -65,7 +65,7 @@ def doublet_flight(config: IdentifyConfig, trained: Contract) -> FlyConfig:
     return replace(
         flight,
         policy=PolicyConfig(policy=f"scripted:doublet:{trained.action}", dual_rate=True),
-        camera=replace(flight.camera, camera="none", window_name=None, camera_latency=0.0),
+        camera=replace(flight.camera, camera=("none",), window_name=None, camera_latency=0.0),
         link=replace(flight.link, raw_sticks=not config.mapped_sticks),
         duration=flight.duration or CLIMB_S + doublet_length_s(trained.action),
     )

@@ -17,13 +17,13 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from policy.contract import Contract
 from policy.data.flight_data import FlightData, common_frame
-from policy.data.flight_folders import find_flights, is_exemplary, read_flight
+from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.loading.builtin import builtin_config
 from policy.training.policy_run import Check, Network, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import TrainingStoppedError
-from policy.training.settings import TrainSettings, WorldModelSettings
+from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
 from policy.training.world_model.run import train_world_model
 from policy.world_model.config import WorldModelConfig
 
@@ -52,7 +52,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
         def check(checkpoint: Path) -> float:
             return share_of_gates(checkpoint, settings.policy, settings.check_flights)
 
-    flights = _read_flights(paths, settings.camera_key)
+    flights = _read_flights(paths, settings)
     network = fit_to_flights(network, flights, settings)
     return _finish(lambda hooks: train_policy(flights, network, settings, hooks, check))
 
@@ -61,7 +61,7 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
     """Train a world model; see ``run_policy_training``."""
     _require_device(settings.device)
     config = WorldModelConfig(image_size=settings.image_size)
-    flights = _read_flights(paths, settings.camera_key)
+    flights = _read_flights(paths, settings)
     config = replace(config, contract=Contract(state_frame=common_frame(flights)))
     return _finish(lambda hooks: train_world_model(flights, config, settings, hooks))
 
@@ -132,13 +132,17 @@ def _finish(train: Callable[[Hooks], TrainResult]) -> int:
     return 0
 
 
-def _read_flights(paths: Sequence[Path], camera_key: str | None) -> list[FlightData]:
+def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightData]:
+    camera_key = settings.camera_key
     datasets = [path for path in paths if is_lerobot(path)]
     if camera_key is not None and not datasets:
         raise UserError("--camera-key is for LeRobot datasets; flights have one camera")
     own = [path for path in paths if path not in datasets]
     folders = find_flights(own) if own else []
-    flights = [read_flight(folder) for folder in folders if is_exemplary(folder)]
+    folders, note = leave_out_failed(folders, include_failed=settings.include_failed)
+    if note is not None:
+        Console(stderr=True, highlight=False).print(note, soft_wrap=True)
+    flights = [read_flight(folder) for folder in folders]
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]
 
 

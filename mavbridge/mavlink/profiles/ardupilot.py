@@ -64,17 +64,18 @@ class ArduPilot(Profile):
     }
     params = ardupilot_params.FIRST_NAMES
 
-    def streams(self, *, state_hz: float) -> tuple[StreamGroup, ...]:
+    def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
         """Legacy streams serve versions that do not know SET_MESSAGE_INTERVAL."""
-        attitude, imu = (
+        attitude, imu, radio = (
             ("ATTITUDE_QUATERNION", "ATTITUDE"),
             ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2"),
+            ("RC_CHANNELS",),
         )
         return (
             StreamGroup(attitude, dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
             StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
             StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
-            StreamGroup(("RC_CHANNELS",), dialect.MAV_DATA_STREAM_RC_CHANNELS, RC_CHANNELS_HZ),
+            StreamGroup(radio, dialect.MAV_DATA_STREAM_RC_CHANNELS, pilot_hz or RC_CHANNELS_HZ),
             optional_stream("SYS_STATUS", 2.0),
             optional_stream("EXTENDED_SYS_STATE", 5.0),
             optional_stream("EKF_STATUS_REPORT", 5.0),

@@ -109,8 +109,11 @@ class Profile(ABC):
     """Parameters to read first, those of other versions of the firmware included."""
 
     @abstractmethod
-    def streams(self, *, state_hz: float) -> tuple[StreamGroup, ...]:
-        """Telemetry that every flight needs, then what is also watched; without the echo."""
+    def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
+        """Telemetry that every flight needs, then what is also watched; without the echo.
+
+        ``pilot_hz`` is the rate of RC_CHANNELS, None: the usual one.
+        """
 
     @abstractmethod
     def echo(self, output: Output) -> StreamGroup:

@@ -24,6 +24,8 @@ from mavbridge.mavlink.profiles.sticks import StickCurves
 
 CURRENT_MODE_HZ = 50.0
 """It shows a change of mode within 30 ms; without one it comes at 2 Hz."""
+RC_CHANNELS_HZ = 20.0
+"""Shows the switches of a radio."""
 POSITION_CEILING_HZ = 125.0
 """Rate of the estimator's position, and of targets: asked for more, they come at this rate."""
 FAST_HZ = 250.0
@@ -127,8 +129,11 @@ class Px4(Profile):
         *("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_DEADZONE", "MPC_HOLD_DZ"),
     )
 
-    def streams(self, *, state_hz: float) -> tuple[StreamGroup, ...]:
-        """RC_CHANNELS comes only where a receiver is, GLOBAL_POSITION_INT only with a position."""
+    def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
+        """RC_CHANNELS comes only where a receiver is, GLOBAL_POSITION_INT only with a position.
+
+        The pilot's sticks come in MANUAL_CONTROL, which ``echo`` asks for at their own rate.
+        """
         fast_hz = state_hz if state_hz <= _UNEVEN_HZ else FAST_HZ
         slow_hz = min(state_hz, POSITION_CEILING_HZ)
         return (
@@ -136,7 +141,7 @@ class Px4(Profile):
             StreamGroup(("LOCAL_POSITION_NED",), None, slow_hz),
             StreamGroup(("HIGHRES_IMU", "SCALED_IMU"), None, fast_hz),
             optional_stream("CURRENT_MODE", CURRENT_MODE_HZ, least_hz=1.0),
-            optional_stream("RC_CHANNELS", 20.0, least_hz=0.0),
+            optional_stream("RC_CHANNELS", pilot_hz or RC_CHANNELS_HZ, least_hz=0.0),
             optional_stream("SYS_STATUS", 2.0),
             optional_stream("EXTENDED_SYS_STATE", 5.0),
             optional_stream("ESTIMATOR_STATUS", 5.0),

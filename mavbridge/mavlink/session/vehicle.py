@@ -80,7 +80,7 @@ class VehicleSession:
         self._unique_id = ""
         self._version_attempts = 0
         self._version_due_ns = 0
-        streams = self.profile.streams(state_hz=config.state_hz)
+        streams = self.profile.streams(state_hz=config.state_hz, pilot_hz=config.pilot_hz)
         self._streams = StreamRequester(streams, report=report)
         self._params = VehicleParams(
             self.profile, identity.source.system, config, streams=streams, report=report

@@ -49,5 +49,5 @@ def test_a_users_class_is_found_in_the_working_directory_by_check_and_loading(
 def test_black_frames_are_no_fault_of_a_policy_that_is_flown_without_a_camera(
     policy: str, camera: str, looks: bool
 ) -> None:
-    config = FlyConfig(policy=PolicyConfig(policy=policy), camera=CameraConfig(camera=camera))
+    config = FlyConfig(policy=PolicyConfig(policy=policy), camera=CameraConfig(camera=(camera,)))
     assert looks_at_images(config) is looks

@@ -9,6 +9,7 @@ from policy.contract import (
     ACTION_TERMS,
     AGE,
     FLIGHT_TERMS,
+    OBSERVATION_TERMS,
     ROTATION,
     SINCE_EXPOSURE_NAMES,
     STATE_NAMES,
@@ -43,7 +44,9 @@ def test_round_trips_through_its_header_form() -> None:
 def header_of_version_1(**changes: object) -> dict[str, Any]:
     header = json.loads(Contract(**changes).to_json())
     return {
-        name: value for name, value in header.items() if name not in (*FLIGHT_TERMS, *ACTION_TERMS)
+        name: value
+        for name, value in header.items()
+        if name not in (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS)
     } | {"version": 1}
 
 

@@ -16,7 +16,7 @@ def test_the_flight_is_the_users_with_the_doublet_in_place_of_the_policy() -> No
     asked = FlyConfig(link=link, arm=True, takeoff=10.0, policy=PolicyConfig(policy="toge"))
     flight = doublet_flight(IdentifyConfig(flight=asked), Contract(action="velocity"))
     assert flight.policy.policy == "scripted:doublet:velocity"
-    assert flight.camera.source == "none"
+    assert flight.camera.sources == ("none",)
     assert flight.link.raw_sticks
     assert flight.takeoff == 10.0
     assert flight.duration is not None

@@ -1,0 +1,318 @@
+"""One recording session: opens everything, follows the orders of ``EpisodeControl``, ends it."""
+
+import queue
+import threading
+from contextlib import ExitStack
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+import mavbridge
+from mavbridge.camera.image_watch import ImageWatch
+from mavbridge.camera.open import NO_CAMERA, check_camera, open_camera
+from mavbridge.commands.record.control import KEYS, KEYS_HINT, EpisodeControl, Orders, Seen
+from mavbridge.commands.record.disk import LEAST_S, DiskWatch
+from mavbridge.commands.record.episodes import Episodes, prepare_out
+from mavbridge.commands.record.pilot_view import PilotView
+from mavbridge.commands.record.screen import RecordScreen, Shown
+from mavbridge.config.flight import FlyConfig
+from mavbridge.config.rates import Rates
+from mavbridge.config.record import RecordConfig
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
+from mavbridge.core.errors import UserError
+from mavbridge.core.observers import FanOut, ObserverThread
+from mavbridge.core.ports import TickSink
+from mavbridge.core.records import FloatArray
+from mavbridge.core.stopping import StopRequest, stop_on_signals
+from mavbridge.core.workers import Worker
+from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.history import SentHistory
+from mavbridge.flight.settings import flight_settings, gate_settings
+from mavbridge.flight.state import Freshness
+from mavbridge.flight.vision_loop import VisionLoop
+from mavbridge.gate.departure import Ending
+from mavbridge.gate.settings import GateSettings
+from mavbridge.mavlink.transport.sockets import make_transport
+from mavbridge.observe.keyboard import Keyboard
+from mavbridge.observe.output import flight_console
+from mavbridge.observe.rerun_flight import RerunView
+from mavbridge.recording.meta import FlightMeta
+from policy.contract import Contract
+from policy.protocol import Executable
+
+STEP_S = 0.05
+DISK_NS = NS_PER_S
+"""Between two looks at the disk."""
+JOIN_S = 2.0
+RERUN_CAPACITY = 1000
+GATE_END_S = 5.0
+MAX_FROZEN_S = MAX_BLACK_S = 0.5
+"""Of the image, before it is shown as a problem."""
+NOTHING = np.zeros((1, 1), np.float32)
+CONTRACT = Contract(feature_dim=1, arrays="numpy")
+"""What the recorded sticks mean: those of a policy with the usual contract, into whose terms the
+vehicle's own are mapped."""
+
+
+def record(config: RecordConfig) -> int:
+    """Record until the user, a signal or a full disk ends it; returns the exit status.
+
+    Raises:
+        MavbridgeError: anything that the user, the vehicle or the camera got wrong.
+    """
+    clock = MonotonicClock()
+    make_transport(config.vehicle.connect, clock)
+    check_camera(config.film.camera, latency_ms=config.film.camera_latency)
+    if config.film.camera == NO_CAMERA:
+        raise UserError("--camera none: there is nothing to learn from without images")
+    prepare_out(config.out)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    cv2.setNumThreads(1)
+    session: _Session | None = None
+    try:
+        with ExitStack() as stack:
+            session = _Session(config, clock, flight_console(), stack)
+            session.run(stack.enter_context(stop_on_signals()))
+    finally:
+        if session is not None:
+            session.screen.close(JOIN_S)
+    return 0
+
+
+def pilot_flight(config: RecordConfig) -> FlyConfig:
+    """The flight of nobody's policy that only listens, at the rates of the recording."""
+    rates = Rates(
+        action_rate=config.rate,
+        stick_rate=config.rate,
+        visual_rate=config.film.visual_rate,
+        realtime=False,
+    )
+    return FlyConfig(link=config.vehicle.link, rates=rates)
+
+
+def listening_gate(config: RecordConfig, clock: Clock) -> GateSettings:
+    """Settings of a gate that asks for the pilot's sticks at the rate of the recording."""
+    settings = gate_settings(
+        pilot_flight(config), is_dual=True, tlog_fd=None, wall_offset_ns=wall_offset_ns(clock)
+    )
+    link = replace(settings.link, pilot_hz=config.rate, stick_hz=0.0, min_battery_percent=0.0)
+    return replace(settings, link=link)
+
+
+def nobody() -> Executable:
+    """A policy that is never asked: its contract alone counts."""
+
+    def act(_f: FloatArray, _s: FloatArray, _h: FloatArray, _t: float | None) -> FloatArray:
+        raise AssertionError("a recording has no policy loop")
+
+    return Executable(
+        contract=CONTRACT,
+        name="pilot",
+        engine="none",
+        dual_rate=True,
+        encode=lambda _image, _camera=0, /: NOTHING.copy(),
+        act=act,
+    )
+
+
+class _Session:
+    """Everything that is opened goes on the exit stack at once."""
+
+    def __init__(
+        self, config: RecordConfig, clock: Clock, console: Console, stack: ExitStack
+    ) -> None:
+        self._config = config
+        self._clock = clock
+        self._stack = stack
+        self._keys: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._control = EpisodeControl(
+            has_switch=config.episode_channel is not None, on_arm=config.on_arm
+        )
+        self._disk = DiskWatch(config.out, reserve_bytes=config.disk_reserve * 1e9)
+        self._disk_s, self._disk_due_ns = 0.0, 0
+        vision_hz = config.film.visual_rate
+        self.screen = RecordScreen(console, rate_hz=config.rate, vision_hz=vision_hz)
+        viewer = self._open_viewer()
+        self._gate = GateProcess(listening_gate(config, clock))
+        stack.callback(self._gate.close)
+        film = config.film
+        camera = open_camera(
+            film.camera,
+            image_size=film.camera_size,
+            clock=clock,
+            timeout_s=film.camera_timeout,
+            latency_ms=film.camera_latency,
+            report=lambda line: console.print(Text(line)),
+        )
+        stack.callback(camera.close)
+        self._episodes = Episodes(
+            config.out,
+            clock=clock,
+            make_meta=self._meta,
+            log_to=lambda log: self._view.log_to(log),
+            autopilot=lambda: self._view.status.autopilot,
+            wall_offset_ns=wall_offset_ns(clock),
+            report=self.screen.show_message,
+        )
+        sink = FanOut((self.screen, self._episodes, *viewer))
+        flight, executable = flight_settings(pilot_flight(config), nobody()), nobody()
+        self._view = PilotView(
+            history=SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s),
+            sink=sink,
+            state_frame=CONTRACT.state_frame,
+            freshness=Freshness(
+                attitude_ns=flight.freshness.state_ns, velocity_ns=flight.freshness.velocity_ns
+            ),
+        )
+        self._images = FeatureCache()
+        self._vision = VisionLoop(
+            camera=camera,
+            encode=executable.encode,
+            cache=self._images,
+            sink=sink,
+            clock=clock,
+            period_ns=lambda: period_ns(vision_hz),
+            image_watch=ImageWatch(max_frozen_s=MAX_FROZEN_S, max_black_s=MAX_BLACK_S),
+            is_airborne=lambda: self._view.status.armed and self._view.status.is_landed is False,
+        )
+        self._gate.send(flight)
+
+    def _open_viewer(self) -> tuple[TickSink, ...]:
+        if self._config.rerun == "off":
+            return ()
+        view = RerunView(self._config.rerun, vision_hz=self._config.film.visual_rate)
+        viewer = ObserverThread("mavbridge-rerun", view, capacity=RERUN_CAPACITY)
+        self._stack.callback(viewer.close, JOIN_S)
+        return (viewer,)
+
+    def _meta(self, begin_ns: int) -> FlightMeta:
+        wall_s = (begin_ns + wall_offset_ns(self._clock)) / NS_PER_S
+        return FlightMeta(
+            started_at=datetime.fromtimestamp(wall_s, UTC).isoformat(),
+            start_ns=begin_ns,
+            mavbridge_version=mavbridge.__version__,
+            source="pilot",
+            policy=None,
+            engine=None,
+            mode="dual",
+            action_hz=self._config.rate,
+            visual_hz=self._config.film.visual_rate,
+            contract=CONTRACT,
+        )
+
+    def run(self, stop: StopRequest) -> None:
+        """Follow orders until one of them, a signal, a worker's death or the disk ends it."""
+        vision = Worker("mavbridge-vision", self._vision.run)
+        listener = Worker("mavbridge-gate", self._listen)
+        for worker in (vision, listener):
+            self._stack.callback(worker.join, JOIN_S)
+            worker.start()
+        keyboard = Keyboard(self._keys.put, keys=KEYS)
+        self._stack.callback(keyboard.stop, JOIN_S)
+        has_keys = keyboard.start()
+        self.screen.start(hint=KEYS_HINT if has_keys else None)
+        reason = "a signal"
+        try:
+            while not stop.wait(STEP_S):
+                if not (listener.is_alive and vision.is_alive):
+                    reason = "the camera's end" if listener.is_alive else "the link's end"
+                    break
+                if not self._step():
+                    break
+        finally:
+            self._episodes.end(reason)
+        self._gate.send(Ending(reason="the recording is over"))
+        listener.ends_within(GATE_END_S)
+
+    def _listen(self, stop: threading.Event) -> None:
+        self._gate.listen(stop, self._view)
+
+    def _step(self) -> bool:
+        """Look at everything that decides about episodes; False: the session is over."""
+        orders = self._control.step(self._seen())
+        if orders.mark_before is not None:
+            self._episodes.mark(orders.mark_before)
+        self._follow(orders)
+        self._look_at_disk()
+        counts, config = self._episodes.counts, self._config
+        self.screen.shown = Shown(
+            number=self._episodes.number,
+            duration_ns=self._episodes.duration_ns if self._episodes.is_recording else None,
+            counts=counts,
+            disk_s=self._disk_s,
+            stick_packets=self._view.stick_packets,
+            sticks_ns=self._view.sticks_ns,
+            problem=self._missing() or self._doubt(),
+        )
+        is_enough = config.episodes is not None and self._episodes.finished >= config.episodes
+        return not (orders.quit or is_enough)
+
+    def _seen(self) -> Seen:
+        keys = ""
+        while not self._keys.empty():
+            keys += self._keys.get_nowait()
+        status, channel = self._view.status, self._config.episode_channel
+        has_channel = channel is not None and len(status.rc_channels_us) >= channel
+        return Seen(
+            now_ns=self._clock.now_ns(),
+            armed=status.armed,
+            switch_us=status.rc_channels_us[channel - 1] if channel and has_channel else 0,
+            is_recording=self._episodes.is_recording,
+            keys=keys,
+        )
+
+    def _follow(self, orders: Orders) -> None:
+        if orders.end is not None:
+            self._episodes.end(orders.end)
+        elif (crash := self._episodes.crash) is not None:
+            self._episodes.end(f"a crash ({crash})")
+        if orders.begin is None:
+            return
+        missing = self._missing()
+        if missing is None and not self._disk.may_begin:
+            left_s = self._disk.left_s()
+            missing = f"room on the disk for {left_s:.0f} of {LEAST_S:.0f} s above --disk-reserve"
+        if missing is not None:
+            self.screen.show_message(f"not recording: {missing}")
+            return
+        self._episodes.begin()
+        doubt = self._doubt()
+        begun = f"episode {self._episodes.number} begins ({orders.begin})"
+        self.screen.show_message(begun if doubt is None else f"{begun}; {doubt}")
+
+    def _missing(self) -> str | None:
+        """What a demonstration cannot do without, and is not there."""
+        if self._view.status.mode is None:
+            return "no vehicle yet"
+        if self._view.telemetry().ned_from_body_wxyz is None:
+            return "no attitude from the vehicle"
+        if self._view.telemetry().velocity_ned_mps is None:
+            return "no velocity from the vehicle: it has no position estimate"
+        if self._view.status.rc_sticks is None:
+            return "no sticks of a pilot: is the transmitter on?"
+        return None
+
+    def _doubt(self) -> str | None:
+        """Why what is recorded now may be worth little, or None."""
+        image, mode = self._images.latest(), self._view.status.mode
+        if image is not None and image.fault is not None:
+            return image.fault
+        if self._view.status.armed and mode is not None and mode not in CONTRACT.modes:
+            return f"sticks mean something else in {mode} than in {CONTRACT.modes[0]}"
+        return None
+
+    def _look_at_disk(self) -> None:
+        now_ns = self._clock.now_ns()
+        if now_ns < self._disk_due_ns:
+            return
+        self._disk_due_ns = now_ns + DISK_NS
+        if (folder := self._episodes.folder) is not None:
+            self._disk.measure(folder, self._episodes.duration_ns)
+        self._disk_s = self._disk.left_s()
+        if self._episodes.is_recording and self._disk.is_full:
+            self._episodes.end("the disk, which is full up to --disk-reserve")

@@ -1,0 +1,98 @@
+"""The terminal of a recording session: its status line."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.text import Text
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import Event, Tick
+from mavbridge.core.vehicle import Sticks
+from mavbridge.observe.report_table import rate_style, shown_rate
+from mavbridge.observe.terminal import FlightScreen, RateMeter
+
+LOW_MINUTES = 10.0
+"""Room on the disk that is shown as a warning."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """What the status line tells besides the newest tick."""
+
+    number: int
+    duration_ns: int | None
+    """Length of this episode; None while none is recorded."""
+    counts: Counter[bool | None]
+    """Episodes that are good, bad and unmarked."""
+    disk_s: float
+    stick_packets: int
+    sticks_ns: int
+    """Packets with the pilot's sticks so far, and the arrival of the newest."""
+    problem: str | None
+    """What is missing, or cannot be learnt from."""
+
+
+class RecordScreen(FlightScreen):
+    """A ``FlightScreen`` whose line is about the pilot; any thread may replace ``shown``."""
+
+    def __init__(self, console: Console, *, rate_hz: float, vision_hz: float) -> None:
+        super().__init__(console, action_hz=rate_hz, vision_hz=vision_hz, readonly=True)
+        self.shown: Shown | None = None
+        self._wanted_hz = (rate_hz, vision_hz)
+        self._states, self._images, self._sticks = RateMeter(), RateMeter(), RateMeter()
+        self._newest: Tick | None = None
+        self._state_ns = 0
+
+    def emit(self, event: Event) -> None:
+        """Remember the event and the messages in it."""
+        if not isinstance(event, Tick):
+            self._images.count(event.ready_ns)
+            return
+        for text in event.texts:
+            self.show_message(text)
+        if event.state is not None and event.state.attitude_ns != self._state_ns:
+            self._state_ns = event.state.attitude_ns
+            self._states.count(event.woke_ns)
+        self._newest = event
+
+    def status_line(self) -> Text:
+        """The status now; to be called at ``STATUS_HZ``, since rates are averages over calls."""
+        shown, tick = self.shown, self._newest
+        line = Text(no_wrap=True, overflow="ellipsis")
+        if shown is None or tick is None:
+            line.append("waiting for the vehicle", style="dim")
+            return line
+        if shown.duration_ns is None:
+            line.append(f"next: episode {shown.number}", style="bold yellow")
+        else:
+            seconds = shown.duration_ns / NS_PER_S
+            line.append(f"RECORDING episode {shown.number} {seconds:5.1f} s", style="bold red")
+        line.append(f"  {tick.mode or 'mode unknown'} {'armed' if tick.armed else 'disarmed'}")
+        line.append(f"  {_sticks(tick.rc_sticks)}")
+        self._sticks.set(shown.stick_packets, shown.sticks_ns)
+        rate_hz, vision_hz = self._wanted_hz
+        for name, meter, wanted_hz in (
+            ("sticks", self._sticks, None),
+            ("state", self._states, rate_hz),
+            ("camera", self._images, vision_hz),
+        ):
+            hz = meter.sample_hz()
+            line.append(f"  {name} ")
+            style = "" if wanted_hz is None else rate_style(hz, wanted_hz)
+            line.append(f"{shown_rate(hz)} Hz", style=style)
+        minutes = shown.disk_s / 60
+        line.append(f"  disk {minutes:.0f} min", style="yellow" if minutes < LOW_MINUTES else "")
+        counts = shown.counts
+        line.append(f"  {counts[True]} good {counts[False]} bad {counts[None]} unmarked")
+        if shown.problem is not None:
+            line.append(f"  {shown.problem}", style="bold yellow")
+        return line
+
+
+def _sticks(sticks: Sticks | None) -> str:
+    if sticks is None:
+        return "no sticks"
+    return " ".join(
+        f"{name}{value:+.2f}" for name, value in zip(("T", "Y", "P", "R"), sticks, strict=True)
+    )

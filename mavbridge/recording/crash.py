@@ -1,0 +1,66 @@
+"""Notices from the ticks of a flight that the vehicle has crashed."""
+
+import math
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.records import FloatArray, Tick
+
+OVERTURNED_NS = 500 * NS_PER_MS
+"""Time beyond 90 degrees of tilt, armed, that is a crash: a flip takes less."""
+FALL_NS = NS_PER_S
+"""Motors that stop in the air make a fall of 9.8 m/s within this time."""
+FALL_MPS = 1.5
+"""Speed while disarmed that no vehicle at rest reports, and less than that of any fall."""
+_WORDS = ("crash", "flight termination", "lockdown")
+"""What ArduPilot ("Crash: Disarming") and PX4 ("Flight termination active", "Lockdown") say."""
+_FROM_VEHICLE = "vehicle: "
+"""How the link begins a text of the vehicle."""
+
+
+class CrashWatch:
+    """Takes each tick of a flight in order; ``reason`` is the first crash that it saw."""
+
+    def __init__(self) -> None:
+        self.reason: str | None = None
+        self._over_since_ns: int | None = None
+        self._was_armed = False
+        self._disarmed_ns: int | None = None
+
+    def see(self, tick: Tick) -> None:
+        """Take one tick."""
+        if self.reason is None:
+            self.reason = self._said(tick) or self._overturned(tick) or self._fallen(tick)
+
+    def _said(self, tick: Tick) -> str | None:
+        for text in tick.texts:
+            said = text.removeprefix(_FROM_VEHICLE)
+            if said != text and any(word in said.lower() for word in _WORDS):
+                return f"the vehicle said {said!r}"
+        return None
+
+    def _overturned(self, tick: Tick) -> str | None:
+        if tick.state is None or not tick.armed or not _is_overturned(tick.state.values[3:7]):
+            self._over_since_ns = None
+            return None
+        if self._over_since_ns is None:
+            self._over_since_ns = tick.woke_ns
+        is_long = tick.woke_ns - self._over_since_ns >= OVERTURNED_NS
+        return "it lay on its back while armed" if is_long else None
+
+    def _fallen(self, tick: Tick) -> str | None:
+        if self._was_armed and not tick.armed:
+            self._disarmed_ns = tick.woke_ns
+        self._was_armed = tick.armed
+        if self._disarmed_ns is None or tick.armed or tick.state is None:
+            return None
+        is_soon = tick.woke_ns - self._disarmed_ns <= FALL_NS
+        speed_mps = math.hypot(*tick.state.values[:3].tolist())
+        if not is_soon or speed_mps < FALL_MPS:
+            return None
+        return f"it was disarmed in the air, and moved at {speed_mps:.1f} m/s"
+
+
+def _is_overturned(wxyz: FloatArray) -> bool:
+    """More than 90 degrees between the body's down and the world's, in NED/FRD as in ENU/FLU: the
+    cosine is 1 - 2 (x^2 + y^2)."""
+    return bool(wxyz[1] ** 2 + wxyz[2] ** 2 > 0.5)

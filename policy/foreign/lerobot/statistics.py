@@ -1,0 +1,183 @@
+"""How a LeRobot policy normalises: its preprocessor and postprocessor, without their code.
+
+Since 0.4 the statistics lie in a state file beside policy_preprocessor.json; before, in the
+weights, as ``normalize_inputs.buffer_observation_state.mean``. All modes are of one affine form.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from policy.contract import FloatArray
+from policy.errors import CheckpointError
+from policy.foreign.lerobot.config import ACTION_KEY, MODES, STATE_KEY, Features, read_json
+
+PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+WEIGHTS_FILE = "model.safetensors"
+_HARMLESS = ("to_batch_processor", "device_processor")
+_BOUNDS = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
+_EPSILON = 1e-8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Affine:
+    """``normalised = gain * (value - shift) / divisor - bias``, as LeRobot's own code rounds it.
+
+    Back it goes by ``(normalised + bias) / gain * span + shift``.
+    """
+
+    shift: FloatArray
+    divisor: FloatArray
+    span: FloatArray
+    gain: float
+    bias: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Normalisation:
+    """Of each input by its name in config.json, and of the action; None: as it is."""
+
+    images: Mapping[str, Affine | None]
+    state: Affine | None
+    action: Affine | None
+    renamed: Mapping[str, str]
+    """What the data called an input -> its name in config.json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Statistics:
+    """Statistics by feature and name, and by which of them each kind of feature is normalised."""
+
+    path: Path
+    modes: Mapping[str, str]
+    epsilon: float
+    arrays: Mapping[str, Mapping[str, FloatArray]]
+
+    def affine(self, key: str, kind: str) -> Affine | None:
+        """The transformation of one feature; None where it stays as it is."""
+        mode, own = self.modes.get(kind, "IDENTITY"), self.arrays.get(key, {})
+        if mode not in MODES:
+            raise CheckpointError(
+                f"{self.path}: normalises {key} by {mode!r}; supported are {', '.join(MODES)}"
+            )
+        if mode == "IDENTITY" or not own:
+            return None
+        names = _BOUNDS.get(mode, ("mean", "std"))
+        if missing := [name for name in names if name not in own]:
+            raise CheckpointError(
+                f"{self.path}: {key} is normalised by {mode}, but its statistics lack {missing}; "
+                f"there are {sorted(own)}"
+            )
+        shape = (3, 1, 1) if kind == "VISUAL" else (-1,)
+        low, high = (own[name].astype(np.float32).reshape(shape) for name in names)
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise CheckpointError(f"{self.path}: the statistics of {key} hold NaN or infinity")
+        epsilon = np.float32(self.epsilon)
+        if mode == "MEAN_STD":
+            return Affine(shift=low, divisor=high + epsilon, span=high, gain=1.0, bias=0.0)
+        span = np.where(high == low, epsilon, high - low)
+        return Affine(shift=low, divisor=span, span=span, gain=2.0, bias=1.0)
+
+
+def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation, list[str]]:
+    """What a policy's files say, and notes for the user.
+
+    Raises:
+        CheckpointError: a file or a statistic is missing, or a step of a processor is unknown.
+    """
+    renamed: dict[str, str] = {}
+    if (folder / PREPROCESSOR).is_file():
+        inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor")
+        outputs, _ = _processor(folder / POSTPROCESSOR, "unnormalizer_processor")
+    else:
+        inputs = outputs = _legacy(folder, features)
+    normalisation = Normalisation(
+        images={key: inputs.affine(key, "VISUAL") for key in features.image_keys},
+        state=inputs.affine(STATE_KEY, "STATE") if features.state_dim else None,
+        action=outputs.affine(ACTION_KEY, "ACTION"),
+        renamed=renamed,
+    )
+    asked = {
+        STATE_KEY: ("STATE", normalisation.state),
+        ACTION_KEY: ("ACTION", normalisation.action),
+    }
+    asked |= {key: ("VISUAL", affine) for key, affine in normalisation.images.items()}
+    return normalisation, [
+        f"warning: {folder} holds no statistics of {key}: it flies as it is, not normalised"
+        for key, (kind, affine) in asked.items()
+        if affine is None
+        and features.modes.get(kind, "IDENTITY") != "IDENTITY"
+        and (key != STATE_KEY or features.state_dim)
+    ]
+
+
+def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]]:
+    """What the steps of a processor do to values: at most one normalisation, and renamings."""
+    renamed: dict[str, str] = {}
+    found = _Statistics(path=path, modes={}, epsilon=0.0, arrays={})
+    steps = read_json(path).get("steps")
+    if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
+        raise CheckpointError(f"{path}: no list of steps")
+    for step in steps:
+        name, config = step.get("registry_name", step.get("class")), step.get("config", {})
+        if name == "rename_observations_processor":
+            renamed |= config.get("rename_map", {})
+        elif name == normaliser:
+            file, only = step.get("state_file"), config.get("normalize_observation_keys")
+            arrays = _by_feature(_read_arrays(path.parent / file)) if file else {}
+            found = _Statistics(
+                path=path,
+                modes=config.get("norm_map", {}),
+                epsilon=float(config.get("eps", _EPSILON)),
+                arrays={
+                    k: v for k, v in arrays.items() if only is None or k in (*only, ACTION_KEY)
+                },
+            )
+        elif name not in _HARMLESS:
+            known = ("rename_observations_processor", normaliser, *_HARMLESS)
+            raise CheckpointError(
+                f"{path}: the step {name!r} is not supported; supported are {', '.join(known)}. "
+                "Serve it from its own environment, and fly --policy ws://HOST:PORT"
+            )
+    return found, renamed
+
+
+def _legacy(folder: Path, features: Features) -> _Statistics:
+    """Statistics in the weights: ``normalize_inputs``, and ``unnormalize_outputs`` of actions."""
+    path = folder / WEIGHTS_FILE
+    sides = ("normalize_inputs.buffer_", "unnormalize_outputs.buffer_")
+    found = _by_feature(_read_arrays(path, sides))
+    if not found:
+        raise CheckpointError(
+            f"{folder}: there is no {PREPROCESSOR}, and {WEIGHTS_FILE} holds no statistics "
+            "(normalize_inputs.buffer_*): copy the whole folder that LeRobot wrote"
+        )
+    keys = {key: sides[0] + key.replace(".", "_") for key in (*features.image_keys, STATE_KEY)}
+    keys[ACTION_KEY] = sides[1] + ACTION_KEY
+    arrays = {key: found[name] for key, name in keys.items() if name in found}
+    return _Statistics(path=path, modes=features.modes, epsilon=_EPSILON, arrays=arrays)
+
+
+def _by_feature(arrays: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray]]:
+    """``observation.state.mean`` and the like, by what is before the last dot, then behind it."""
+    found: dict[str, dict[str, FloatArray]] = {}
+    for name, array in arrays.items():
+        key, _, statistic = name.rpartition(".")
+        found.setdefault(key, {})[statistic] = array
+    return found
+
+
+def _read_arrays(path: Path, starts: tuple[str, ...] = ("",)) -> dict[str, FloatArray]:
+    if not path.is_file():
+        raise CheckpointError(f"{path} is missing: copy the whole folder that LeRobot wrote")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            names = [name for name in file.keys() if name.startswith(starts)]  # noqa: SIM118
+            return {name: file.get_tensor(name) for name in names}
+    except (OSError, SafetensorError, TypeError) as error:
+        raise CheckpointError(
+            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
+        ) from error

@@ -1,0 +1,133 @@
+"""A policy that looks through two cameras and back in time, flown in memory."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers.fakes import ListSink
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.errors import UserError
+from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
+from policy.contract import Contract
+from policy.engines.executable import ExecutionSettings, make_numpy_executable
+
+MS = NS_PER_MS
+STEP_NS = 100 * MS
+TWO_EYES = Contract(
+    arrays="numpy",
+    feature_dim=2,
+    image_height=32,
+    image_width=32,
+    since_exposure=True,
+    cameras=("front", "down"),
+    camera_rates_hz=(30.0, 10.0),
+    observation_steps=2,
+    observation_dt_s=0.1,
+)
+
+
+class Watchful:
+    """Climbs, leaning now and then, and remembers when it saw what."""
+
+    def __init__(self, clock: Clock, contract: Contract = TWO_EYES) -> None:
+        self.contract = contract
+        self._clock = clock
+        self.brightness: list[list[float]] = [[], []]
+        self.encoded_ns: list[list[int]] = [[], []]
+        self.calls: list[tuple[int, np.ndarray, np.ndarray]] = []
+
+    def encode_visual(self, image: np.ndarray, camera: int) -> np.ndarray:
+        self.brightness[camera].append(float(image.mean()))
+        self.encoded_ns[camera].append(self._clock.now_ns())
+        return np.array([[len(self.encoded_ns[camera]) - 1, camera]], np.float32)
+
+    def predict_fast(self, feature: Any, state: Any, history: Any, steps: int) -> np.ndarray:
+        self.calls.append((self._clock.now_ns(), feature, state))
+        chunk = np.zeros((1, self.contract.horizon, 4), np.float32)
+        chunk[..., 0], chunk[..., 2] = 0.5, 0.3 * np.sin(self._clock.now_ns() / NS_PER_S)
+        return chunk
+
+    predict = predict_fast
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[Watchful, ListSink]:
+    one, sink = SimulatedFlight(course_seed=3, seed=0), ListSink()
+    policy = Watchful(one.clock)
+    executable = make_numpy_executable(policy, ExecutionSettings(name="watchful"))
+    policy.calls.clear()
+    for seen in (*policy.encoded_ns, *policy.brightness):
+        seen.clear()  # of the trial
+    result = one.fly(executable, max_time_s=2.0, sinks=(sink,))
+    assert result.outcome == "timed out"
+    assert -one.vehicle.ap.truth.position_ned_m[2] > 1.0
+    return policy, sink
+
+
+def test_each_camera_has_a_rate_and_a_view_of_its_own(flown: tuple[Watchful, ListSink]) -> None:
+    front, down = (np.diff(stamps) for stamps in flown[0].encoded_ns)
+    assert np.median(front) / MS == pytest.approx(1000 / 30, abs=4)
+    assert np.median(down) / MS == pytest.approx(100, abs=8)
+    bright, dark = (np.mean(seen) for seen in flown[0].brightness)
+    assert bright - dark > 0.2  # there is sky ahead, and none below
+
+
+def test_a_past_image_is_one_step_older_than_the_newest(
+    flown: tuple[Watchful, ListSink],
+) -> None:
+    policy, _ = flown
+    settled = [call for call in policy.calls if call[0] > policy.calls[0][0] + 300 * MS]
+    assert len(settled) > 150
+    for _, feature, _ in settled:
+        assert feature.shape == (1, 2, 4)
+        (front_then, front, down_then, down) = feature[0, :, [0, 2]].ravel().astype(int)
+        assert feature[0, :, [1, 3]].tolist() == [[0, 0], [1, 1]]  # by camera, at both times
+        for camera, then, newest in ((0, front_then, front), (1, down_then, down)):
+            stamps_ns = policy.encoded_ns[camera]
+            gap_ns = stamps_ns[newest] - stamps_ns[then]
+            assert abs(gap_ns - STEP_NS) < 25 * MS  # half a period of the camera, and its jitter
+
+
+def test_a_past_state_is_the_one_of_that_time(flown: tuple[Watchful, ListSink]) -> None:
+    policy, _ = flown
+    newest = [(now_ns, state[0, 1, :13]) for now_ns, _, state in policy.calls]
+    checked = 0
+    for now_ns, _, state in policy.calls[60:]:
+        assert state.shape == (1, 2, 20)
+        then = [past for at_ns, past in newest if abs(now_ns - at_ns - STEP_NS) <= 15 * MS]
+        assert any(np.array_equal(state[0, 0, :13], past) for past in then)
+        assert not np.array_equal(state[0, 0, :13], state[0, 1, :13])
+        # Its image was as old then as an image is; a mix-up of times would make it a step older.
+        assert 0 < state[0, 0, 13] < 0.08
+        checked += 1
+    assert checked > 100
+
+
+def test_the_slowest_camera_decides_whether_an_image_is_too_old() -> None:
+    """An image every half second from below, where 0.3 s is the limit; the other is fast."""
+    contract = Contract(
+        arrays="numpy",
+        feature_dim=2,
+        cameras=("front", "down"),
+        camera_rates_hz=(30.0, 2.0),
+        image_height=32,
+        image_width=32,
+    )
+    one, sink = SimulatedFlight(course_seed=3, seed=0), ListSink()
+    executable = make_numpy_executable(Watchful(one.clock, contract), ExecutionSettings(name="w"))
+    one.fly(executable, max_time_s=4.0, sinks=(sink,))
+    reasons = {tick.release_reason for tick in sink.ticks}
+    assert any(
+        "camera down: the image feature is older than 300 ms" in (reason or "")
+        for reason in reasons
+    )
+    assert not any("camera front" in (reason or "") for reason in reasons)
+
+
+def test_the_simulator_says_which_cameras_it_has() -> None:
+    one = SimulatedFlight(course_seed=3, seed=0, settings=SimulationSettings(draw_images=False))
+    contract = Contract(arrays="numpy", feature_dim=2, cameras=("front", "wrist"))
+    executable = make_numpy_executable(Watchful(one.clock, contract), ExecutionSettings(name="w"))
+    with pytest.raises(UserError, match=r"no cameras \['wrist'\].*front, down, left, right, back"):
+        one.fly(executable, max_time_s=1.0)

@@ -1,0 +1,184 @@
+"""Which images and states one chunk comes from."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import FeatureFrame, VehicleState
+from mavbridge.core.vehicle import Release
+from mavbridge.flight.feature_cache import MAX_PAST, FeatureCache
+from mavbridge.flight.observation import (
+    MAX_STATES,
+    Observation,
+    ObservationSource,
+    StateHistory,
+    observation_ages_ns,
+)
+from policy.contract import Contract
+from policy.protocol import Executable
+
+MS = NS_PER_MS
+NOW_NS = 10_000 * MS
+THREE_STEPS = Contract(observation_steps=3, observation_dt_s=0.1, feature_dim=1)
+TWO_CAMERAS = Contract(cameras=("front", "down"), feature_dim=1)
+
+
+def seen(ago_ms: float, fault: str | None = None) -> FeatureFrame:
+    """A feature whose value is its age in ms."""
+    captured_ns = NOW_NS - round(ago_ms * MS)
+    value = np.full((1, 1), ago_ms, np.float32)
+    return FeatureFrame(
+        frame_id=0, captured_ns=captured_ns, ready_ns=captured_ns, value=value, fault=fault
+    )
+
+
+def felt(ago_ms: float) -> VehicleState:
+    at_ns = NOW_NS - round(ago_ms * MS)
+    values = np.full(13, ago_ms, np.float32)
+    values[3:7] = (1, 0, 0, 0)
+    return VehicleState(
+        values=values, attitude_ns=at_ns, rate_ns=at_ns, velocity_ns=at_ns, specific_force_ns=at_ns
+    )
+
+
+def source(
+    contract: Contract, *caches: FeatureCache, states: StateHistory | None = None
+) -> ObservationSource:
+    executable = Executable(
+        contract=contract,
+        name="",
+        engine="",
+        dual_rate=True,
+        encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
+        act=lambda e, s, h, t: e,
+    )
+    return ObservationSource(
+        contract,
+        caches=caches,
+        join=executable.join,
+        states=states,
+        max_feature_age_ns=300 * MS,
+    )
+
+
+def cache_of(*ago_ms: float, span_ms: int = 200) -> FeatureCache:
+    cache = FeatureCache(span_ns=span_ms * MS)
+    for each_ms in ago_ms:
+        cache.publish(seen(each_ms))
+    return cache
+
+
+def observed(found: Observation | Release) -> Observation:
+    assert isinstance(found, Observation)
+    return found
+
+
+def test_past_features_are_the_nearest_to_each_step_before_the_newest() -> None:
+    # 30 Hz with jitter; the newest is 20 ms old, so 120 and 220 ms are wanted.
+    cache = cache_of(254, 221.5, 187, 154, 119, 86, 53, 20)
+    states = StateHistory(span_ns=200 * MS)
+    for ago_ms in (210, 201, 190, 110, 99, 90, 10):
+        states.push(felt(ago_ms))
+    found = observed(source(THREE_STEPS, cache, states=states).observe(felt(0), NOW_NS))
+    assert found.encoded.shape == (1, 3, 1)
+    assert found.encoded[0, :, 0].tolist() == [221.5, 119, 20]
+    assert found.states.shape == (1, 3, 13)
+    assert found.states[0, :, 0].tolist() == [201, 99, 0]
+    assert found.image_ns == found.feature.captured_ns == NOW_NS - 20 * MS
+
+
+def test_the_oldest_is_repeated_where_there_is_no_older_one() -> None:
+    states = StateHistory(span_ns=200 * MS)
+    states.push(felt(30))
+    found = observed(source(THREE_STEPS, cache_of(60, 20), states=states).observe(felt(0), NOW_NS))
+    assert found.encoded[0, :, 0].tolist() == [60, 60, 20]
+    assert found.states[0, :, 0].tolist() == [30, 30, 0]
+    alone = source(THREE_STEPS, cache_of(20), states=StateHistory(span_ns=200 * MS))
+    found = observed(alone.observe(felt(0), NOW_NS))
+    assert found.encoded[0, :, 0].tolist() == [20, 20, 20]
+    assert found.states[0, :, 0].tolist() == [0, 0, 0]
+
+
+def test_an_image_with_a_fault_is_nobodys_past() -> None:
+    cache = cache_of(221, 187)
+    cache.publish(seen(120, fault="the image has been black"))
+    cache.publish(seen(20))
+    states = StateHistory(span_ns=200 * MS)
+    found = observed(source(THREE_STEPS, cache, states=states).observe(felt(0), NOW_NS))
+    assert found.encoded[0, :, 0].tolist() == [221, 187, 20]
+
+
+def test_each_past_state_is_told_of_its_own_image() -> None:
+    contract = replace(THREE_STEPS, since_exposure=True)
+    states = StateHistory(span_ns=200 * MS)
+    for ago_ms in (250, 200, 150, 100, 50):
+        states.push(felt(ago_ms))
+    looks = source(contract, cache_of(230, 125, 20), states=states)
+    looks.push(felt(0))
+    rows = observed(looks.observe(felt(0), NOW_NS)).states[0]
+    np.testing.assert_allclose(rows[:, 13], [0.030, 0.025, 0.020], atol=1e-6)
+    # Velocity is -time here: since the exposure each component has fallen by the image's age in ms.
+    np.testing.assert_allclose(rows[:, 17], [-30, -25, -20], atol=1e-3)
+
+
+def test_one_observation_of_one_camera_passes_through_untouched() -> None:
+    cache = FeatureCache()
+    cache.publish(feature := seen(20))
+    state = felt(0)
+    found = observed(source(Contract(feature_dim=1), cache).observe(state, NOW_NS))
+    assert found.encoded is feature.value
+    np.testing.assert_array_equal(found.states, state.values[None])
+
+
+@pytest.mark.parametrize(
+    ("front", "down", "reason"),
+    [
+        (None, seen(20), "camera front: no image feature yet"),
+        (seen(20), None, "camera down: no image feature yet"),
+        (seen(20), seen(301), "camera down: the image feature is older than 300 ms"),
+        (seen(20), seen(20, "it is black"), "camera down: it is black"),
+        (seen(20), seen(20), None),
+    ],
+)
+def test_no_camera_may_be_missing_old_or_at_fault(
+    front: FeatureFrame | None, down: FeatureFrame | None, reason: str | None
+) -> None:
+    caches = FeatureCache(), FeatureCache()
+    for cache, frame in zip(caches, (front, down), strict=True):
+        if frame is not None:
+            cache.publish(frame)
+    found = source(TWO_CAMERAS, *caches).observe(felt(0), NOW_NS)
+    assert (found.reason if isinstance(found, Release) else None) == reason
+
+
+def test_the_age_is_that_of_the_oldest_of_the_newest_images() -> None:
+    caches = FeatureCache(), FeatureCache()
+    for cache, ago_ms in zip(caches, (20, 90), strict=True):
+        cache.publish(seen(150))
+        cache.publish(seen(ago_ms))
+    found = observed(source(TWO_CAMERAS, *caches).observe(felt(0), NOW_NS))
+    assert found.image_ns == NOW_NS - 90 * MS
+    assert found.encoded.tolist() == [[20, 90]]
+    assert found.feature.captured_ns == NOW_NS - 20 * MS
+
+
+def test_histories_are_bounded() -> None:
+    cache, states = FeatureCache(span_ns=60_000 * MS), StateHistory(span_ns=60_000 * MS)
+    for ago_ms in range(6000, 0, -1):
+        cache.publish(seen(ago_ms))
+        states.push(felt(ago_ms))
+    assert len(states.all()) == MAX_STATES
+    assert cache.nearest(seen(0), before_ns=60_000 * MS).value[0, 0] == MAX_PAST
+    short = StateHistory(span_ns=100 * MS)
+    for ago_ms in range(6000, 0, -1):
+        short.push(felt(ago_ms))
+    assert len(short.all()) == 101
+    short.push(felt(50))  # late
+    assert len(short.all()) == 101
+
+
+def test_ages_of_observations() -> None:
+    assert observation_ages_ns(THREE_STEPS) == (200 * MS, 100 * MS, 0)
+    assert observation_ages_ns(Contract()) == (0,)

@@ -1,0 +1,162 @@
+"""What trainers put around weights: taken off where the network then fits, else explained."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+from policy.checkpoints.policy_file import build_policy, load_checkpoint_with_notes
+from policy.contract import Contract
+from policy.errors import CheckpointError
+from policy.loading.load import load_policy
+from policy.loading.request import PolicyRequest
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import Toge, TogeConfig
+
+NAME = "fusion.mlp.0.weight"
+State = dict[str, Tensor]
+
+
+def behind(prefix: str, state: State) -> State:
+    return {prefix + name: value for name, value in state.items()}
+
+
+def with_other(state: State) -> State:
+    """Weights of the same names that are not these."""
+    return {
+        name: value + 1 if value.is_floating_point() else value for name, value in state.items()
+    }
+
+
+def lightning(prefix: str) -> Callable[[State], Any]:
+    return lambda state: {
+        "pytorch-lightning_version": "2.5",
+        "epoch": 3,
+        "state_dict": {**behind(prefix, state), "loss.weight": torch.ones(2)},
+        "optimizer_states": [{"state": {0: {"exp_avg": torch.ones(2)}}, "param_groups": []}],
+        "hyper_parameters": {"lr": 1e-4},
+    }
+
+
+WRAPPED: list[tuple[str, Callable[[State], Any], str | None]] = [
+    ("plain", lambda s: s, None),
+    ("lightning", lightning("model."), "weights under 'state_dict.model'"),
+    ("lightning policy", lightning("policy."), "weights under 'state_dict.policy'"),
+    ("ddp", lambda s: behind("module.", s), "weights under 'module'"),
+    ("compiled ddp", lambda s: behind("module._orig_mod.", s), "weights under 'module._orig_mod'"),
+    (
+        "trainer",
+        lambda s: {"model": s, "optimizer": {"state": {0: {"exp_avg": torch.ones(2)}}}},
+        "weights under 'model'",
+    ),
+    (
+        "ema beside",
+        lambda s: {"model": with_other(s), "ema": s},
+        "averaged weights under 'ema' fly, not those under 'model'",
+    ),
+    ("ema alone", lambda s: {"model_ema": s}, "averaged weights under 'model_ema' fly"),
+    (
+        "ema in lightning",
+        lambda s: {"state_dict": {**behind("model.", with_other(s)), **behind("ema_model.", s)}},
+        "under 'state_dict.ema_model' fly, not those under 'state_dict.model'",
+    ),
+    (
+        "averaged",
+        lambda s: {"averaged_model": {"n_averaged": torch.tensor(3), **behind("module.", s)}},
+        "averaged weights under 'averaged_model.module' fly",
+    ),
+    (
+        "two levels",
+        lambda s: {"state_dicts": {"model": with_other(s), "ema_model": s}},
+        "under 'state_dicts.ema_model' fly, not those under 'state_dicts.model'",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("wrap", "note"), [each[1:] for each in WRAPPED], ids=[each[0] for each in WRAPPED]
+)
+def test_what_is_around_the_weights_is_taken_off_and_said(
+    small_toge: Toge, tmp_path: Path, wrap: Callable[[State], Any], note: str | None
+) -> None:
+    state = small_toge.state_dict()
+    path = tmp_path / "a.ckpt"
+    torch.save(wrap(dict(state)), path)
+    policy, notes = load_checkpoint_with_notes(path, fallback=small_toge.config)
+    assert torch.equal(policy.state_dict()[NAME], state[NAME])
+    assert (notes[0] if notes else None) == note or (note is not None and note in notes[0])
+
+
+def test_torchs_own_wrappers_load(small_toge: Toge, tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    for wrapped in (AveragedModel(small_toge), nn.Sequential(small_toge)):
+        torch.save(wrapped.state_dict(), path)
+        policy, _ = load_checkpoint_with_notes(path, fallback=small_toge.config)
+        assert torch.equal(policy.state_dict()[NAME], small_toge.state_dict()[NAME])
+
+
+def test_the_user_is_told_at_loading(small_toge: Toge, tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    torch.save({"ema": small_toge.state_dict()}, path)
+    request = PolicyRequest(
+        spec="toge:small:resnet18", checkpoint=path, image_size=32, engine="torch"
+    )
+    notes = load_policy(request, now_s=lambda: 0.0).notes
+    assert "the averaged weights under 'ema' fly" in notes
+
+
+REFUSED: list[tuple[str, Callable[[State], Any], str]] = [
+    ("optimiser", lambda s: torch.optim.Adam([nn.Parameter(s[NAME])]).state_dict(), "optimiser"),
+    ("optimiser key", lambda s: {"optimizer": {"state": {}}, "epoch": 1}, "state of an optimiser"),
+    ("nameless ema", lambda s: {"shadow_params": list(s.values())}, "without their names"),
+    (
+        "int8",
+        lambda s: (
+            {n: v.to(torch.int8) if v.ndim > 1 else v for n, v in behind("x.", s).items()}
+            | {"x.scale": torch.ones(1)}
+        ),
+        "quantised network: save the state_dict of the one with floating-point",
+    ),
+    ("another network", lambda s: nn.Linear(3, 3).state_dict(), r"belongs to no network.*file\.py"),
+]
+
+
+@pytest.mark.parametrize(
+    ("wrap", "message"), [each[1:] for each in REFUSED], ids=[each[0] for each in REFUSED]
+)
+def test_what_holds_no_weights_of_ours_is_explained(
+    small_toge: Toge, tmp_path: Path, wrap: Callable[[State], Any], message: str
+) -> None:
+    path = tmp_path / "a.pt"
+    torch.save(wrap(dict(small_toge.state_dict())), path)
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint_with_notes(path, fallback=small_toge.config)
+
+
+@pytest.mark.parametrize(
+    ("config", "spec"),
+    [
+        (TogeConfig(size="medium", backbone="resnet8"), "toge:medium:resnet8"),
+        (TogeConfig(size="large", backbone="convnext_tiny"), "toge:large:convnext_tiny"),
+        (ResnetUnetConfig(size="small"), "resnet-unet:small"),
+    ],
+)
+def test_a_wrong_architecture_is_told_which_of_ours_fits(
+    small_toge: Toge, tmp_path: Path, config: TogeConfig | ResnetUnetConfig, spec: str
+) -> None:
+    path = tmp_path / "a.pt"
+    torch.save(behind("module.", build_policy(config).state_dict()), path)
+    with pytest.raises(CheckpointError, match=f"It fits --policy {spec}$"):
+        load_checkpoint_with_notes(path, fallback=small_toge.config)
+
+
+def test_another_contract_is_told_as_the_nearest_of_ours(small_toge: Toge, tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    other = TogeConfig(backbone="resnet8", contract=Contract(since_exposure=True))
+    torch.save(build_policy(other).state_dict(), path)
+    with pytest.raises(CheckpointError, match=r"nearest to --policy toge:small:resnet8, but for"):
+        load_checkpoint_with_notes(path, fallback=small_toge.config)
