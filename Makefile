@@ -7,6 +7,8 @@ PORT ?= 14550
 COURSE ?= 1000007
 DURATION ?= 60
 POLICY ?= toge
+# Flags of mavbridge for this flight, as in FLAGS="--takeoff 5".
+FLAGS ?=
 # Firmware of the simulated vehicle: ardupilot or px4.
 AUTOPILOT ?= ardupilot
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
@@ -19,7 +21,7 @@ WARM := $(if $(filter toge%,$(POLICY)),--head-steps 2)
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable '.[sitl,record,screen,bench,cluster,dev]'
+	$(PIP) --editable '.[sitl,record,remote,screen,pilot,bench,cluster,dev]'
 	touch $@
 
 # The peers live apart: MAVProxy brings the OpenCV build with a GUI, which shadows the headless one.
@@ -35,7 +37,7 @@ fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy 
 		--camera shm:fpv-$(PORT) --course $(COURSE) --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --dual-rate --policy $(POLICY) $(WARM) \
-		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) \
+		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(FLAGS) \
 		--rerun out/flight.rrd --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
 	echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \

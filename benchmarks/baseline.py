@@ -67,6 +67,7 @@ class Baseline:
 
     def __init__(self, job: FlightJob) -> None:
         self._job = job
+        self._action_hz = job.rates.loops(is_dual=True).action_hz
         self._net = eager_toge(job.policy)
         self._clock = MonotonicClock()
         contract = self._net.contract
@@ -101,7 +102,7 @@ class Baseline:
                 self._connection.target_system,
                 self._connection.target_component,
                 mav.MAV_CMD_SET_MESSAGE_INTERVAL,
-                *(0, message, 1e6 / self._job.rates.action_rate, 0, 0, 0, 0, 0),
+                *(0, message, 1e6 / self._action_hz, 0, 0, 0, 0, 0),
             )
         vision = threading.Thread(target=self._vision_loop, name="baseline-vision")
         vision.start()
@@ -158,7 +159,7 @@ class Baseline:
             if self._step(started_ns) and end_ns is None:
                 end_ns = started_ns + round(self._job.duration * NS_PER_S)
                 cpu_ns, start_stolen_ns = time.process_time_ns(), stolen_ns()
-            self._sleep(1 / self._job.rates.action_rate, started_ns)
+            self._sleep(1 / self._action_hz, started_ns)
         return self._flight(time.process_time_ns() - cpu_ns, stolen_ms_since(start_stolen_ns))
 
     def _step(self, started_ns: int) -> bool:
@@ -224,21 +225,20 @@ class Baseline:
         time.sleep(max(0.0, period_s - elapsed_s))  # noqa: TID251 - common practice, under test
 
     def _flight(self, cpu_ns: int, stolen_ms: float | None) -> Flight:
-        action_hz = self._job.rates.action_rate
         duration_s = (self._stamps_ns[-1] - self._stamps_ns[0]) / NS_PER_S
         return Flight(
             runner=BASELINE,
             policy=self._job.policy.policy,
             solves="full solves",
             engine=EAGER,
-            asked_stick_hz=action_hz,
-            asked_action_hz=action_hz,
+            asked_stick_hz=self._action_hz,
+            asked_action_hz=self._action_hz,
             asked_vision_hz=self._vision_hz,
             duration_s=round(duration_s, 3),
             stick_hz=_rate_hz(self._stamps_ns),
             action_hz=_rate_hz(self._stamps_ns),
             vision_hz=_rate_hz(self._frames_ns),
-            missed_slots=max(0, round(action_hz * duration_s) + 1 - len(self._stamps_ns)),
+            missed_slots=max(0, round(self._action_hz * duration_s) + 1 - len(self._stamps_ns)),
             lateness_ms=None,
             coasting_sends=None,
             chunks=len(self._stamps_ns),

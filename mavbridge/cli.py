@@ -22,9 +22,11 @@ from mavbridge.config.groups import RARE
 from mavbridge.config.identify import IdentifyConfig
 from mavbridge.config.imagine import EvaluateImaginationConfig, ImagineConfig
 from mavbridge.config.record import RecordConfig
+from mavbridge.config.serve import ServeConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
+from policy.foreign.websocket.kind import require_packages
 from policy.training.settings import TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
@@ -89,6 +91,15 @@ def bench(config: BenchConfig | None = None) -> int:
     from mavbridge.commands.bench.run import bench as run_bench
 
     return run_bench(BenchConfig() if config is None else config)
+
+
+@cli.command
+def serve(config: ServeConfig | None = None) -> int:
+    """Serve a policy for flights on other computers, which name it --policy ws://HOST:PORT."""
+    require_packages("serve")
+    from mavbridge.commands.serve.run import serve as run_server
+
+    return run_server(ServeConfig() if config is None else config)
 
 
 @cli.command

@@ -91,7 +91,6 @@ ACTION_MODES: dict[ActionKind, tuple[str, ...]] = {
     "attitude": ATTITUDE_MODES,
     "velocity": ("GUIDED", "OFFBOARD"),
 }
-_USUAL_STICK_MODES = ("ALT_HOLD", "ALTCTL")
 MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 FLIGHT_TERMS = (
@@ -99,8 +98,7 @@ FLIGHT_TERMS = (
     *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
     *ENVELOPE_TERMS,
 )
-"""Fields that came with version 2. They say when a policy may fly, and change no array of it; a
-contract of version 1 is read with their defaults."""
+"""Fields that came with version 2; a contract of version 1 is read with their defaults."""
 ACTION_TERMS = (
     *("velocity_frame", "hover_thrust"),
     *("full_lean_deg", "full_yaw_rate_degps", "full_climb_mps", "full_descent_mps"),
@@ -112,6 +110,7 @@ OBSERVATION_TERMS = (
     *("image_crop", "image_fit", "image_channels", "state_extras", "play_s"),
 )
 """Fields that came with version 4: what a policy sees, and how long it plays one chunk."""
+_TUPLES = ("cameras", "camera_rates_hz", "image_crop", "state_extras")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,8 +201,7 @@ class Contract:
     def __post_init__(self) -> None:
         """Refuse values that no runtime could serve."""
         if self.modes == () and self.action in ACTION_MODES:
-            is_sticks = self.action == "sticks"
-            modes = _USUAL_STICK_MODES if is_sticks else ACTION_MODES[self.action]
+            modes = ("ALT_HOLD", "ALTCTL") if self.action == "sticks" else ACTION_MODES[self.action]
             object.__setattr__(self, "modes", modes)
         for name, known in (
             ("state_frame", StateFrame),
@@ -234,24 +232,24 @@ class Contract:
             value = getattr(self, name)
             if not (math.isfinite(value) and 0 < value <= 1):
                 raise ContractError(f"{name} must be in (0, 1] seconds, got {value!r}")
-        self._require_image_statistics()
         self._require_observation()
         self._require_flight_terms()
 
-    def _require_image_statistics(self) -> None:
+    def _require_observation(self) -> None:
         if not all(map(math.isfinite, (*self.image_mean_rgb, *self.image_std_rgb))):
             raise ContractError("image_mean_rgb and image_std_rgb must be finite numbers")
         if min(self.image_std_rgb) <= 0:
             raise ContractError(f"image_std_rgb must be positive, got {self.image_std_rgb}")
-
-    def _require_observation(self) -> None:
-        top, left, bottom, right = self.image_crop
-        if not (0 <= top < bottom <= 1 and 0 <= left < right <= 1):
+        for name in _TUPLES:
+            if not isinstance(getattr(self, name), tuple):
+                raise ContractError(f"{name} must be a list, got {getattr(self, name)!r}")
+        crop = self.image_crop
+        if len(crop) != 4 or not (0 <= crop[0] < crop[2] <= 1 and 0 <= crop[1] < crop[3] <= 1):
             raise ContractError(
                 f"image_crop must be top, left, bottom, right within [0, 1], got {self.image_crop}"
             )
         names = self.cameras
-        if not names or len(set(names)) < len(names) or not all(n.isidentifier() for n in names):
+        if not names or len(set(names)) < len(names) or not all(map(str.isidentifier, names)):
             raise ContractError(f"cameras must be one or more different names, got {names!r}")
         rates_hz = self.camera_rates_hz
         if len(rates_hz) not in (0, len(names)) or not all(0 < hz <= 240 for hz in rates_hz):
@@ -371,7 +369,7 @@ class Contract:
             raise ContractError(
                 f"unknown contract keys {unknown}; those of version {version} are {sorted(known)}"
             )
-        for name in ("modes", "cameras", "camera_rates_hz", "image_crop", "state_extras"):
+        for name in ("modes", *_TUPLES):
             if isinstance(data.get(name), list):
                 data[name] = tuple(data[name])
         for name in ("image_mean_rgb", "image_std_rgb"):

@@ -8,11 +8,13 @@ from contextlib import suppress
 from pathlib import Path
 
 from sitl import UsageError
-from sitl.app import print_status, run_vehicle
+from sitl.app import PilotOptions, print_status, run_vehicle
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import stop_on_signal
 from sitl.course.layout import course_to_json, make_course
+from sitl.pilot.axes import DEFAULT_AXES
+from sitl.pilot.choose import NAMES as PILOTS
 from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, VehicleConfig
 
@@ -52,6 +54,14 @@ def _parser() -> argparse.ArgumentParser:
     add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
     rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/rc_input.py)"
     add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
+    pilot_help = (
+        "who moves the receiver: a gamepad, the keys of a window, or the expert, who flies "
+    )
+    pilot_help += "flies the course (docs/commands.md)"
+    add("--pilot", choices=PILOTS, help=pilot_help)
+    axes_help = f"axes of the gamepad, a minus reverses one (default: {DEFAULT_AXES})"
+    add("--pilot-axes", default=DEFAULT_AXES, metavar="AXES", help=axes_help)
+    add("--pilot-speed", type=_POSITIVE, default=4.0, metavar="MPS", help="of the expert")
     type_help = "MAV_TYPE of its heartbeats (default: 2, quadrotor)"
     add("--vehicle-type", type=_MAV_TYPE, default=2, metavar="N", help=type_help)
     conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
@@ -85,7 +95,10 @@ def _fly(args: argparse.Namespace) -> None:
     if not links + onboard:
         raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
     conditions = NOMINAL if args.conditions is None else random_conditions(args.conditions)
-    receiver = args.receiver or ("none" if args.autopilot == "px4" else "idle")
+    if args.pilot and (args.rc_in or args.receiver):
+        raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
+    has_receiver = args.autopilot != "px4" or args.pilot
+    receiver = args.receiver or ("idle" if has_receiver else "none")
     run_vehicle(
         links + onboard,
         VehicleConfig(
@@ -99,6 +112,7 @@ def _fly(args: argparse.Namespace) -> None:
         make_course(args.course),
         camera=None if args.camera is None else _camera(args),
         rc_port=args.rc_in,
+        pilot=PilotOptions(args.pilot, args.pilot_axes, args.pilot_speed) if args.pilot else None,
         report=args.report,
         duration_s=args.duration,
         end_with_course=args.end_with_course,

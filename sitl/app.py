@@ -5,6 +5,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from sitl import UsageError
 from sitl.camera.fpv import CameraOptions, FpvRenderer
@@ -13,11 +14,23 @@ from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
 from sitl.course.layout import Course
 from sitl.link.rc_input import RcInput
 from sitl.link.transport import Transport, open_transport
+from sitl.pilot.choose import PilotName, make_pilot, prepare_vehicle
+from sitl.pilot.transmitter import Pilot
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
+
+
+class PilotOptions(NamedTuple):
+    """Who moves the receiver."""
+
+    name: PilotName
+    axes: str
+    """Of a gamepad, as ``sitl.pilot.axes`` reads them."""
+    speed_mps: float
+    """Of the expert."""
 
 
 def run_vehicle(
@@ -27,6 +40,7 @@ def run_vehicle(
     *,
     camera: CameraOptions | None,
     rc_port: int | None,
+    pilot: PilotOptions | None = None,
     report: Path | None,
     duration_s: float | None,
     end_with_course: bool,
@@ -34,7 +48,8 @@ def run_vehicle(
     """Fly until the duration is over (None: endless), the course ends, or a signal comes.
 
     Raises:
-        UsageError: a link, the RC input, the camera's name or the report's folder cannot be used.
+        UsageError: a link, the RC input, the pilot, the camera's name or the report's folder cannot
+            be used.
     """
     if report is not None and not report.parent.is_dir():
         raise UsageError(f"--report {report}: there is no folder {report.parent}")
@@ -44,9 +59,22 @@ def run_vehicle(
         vehicle = SimulatedVehicle(
             links=len(transports), boot_ns=clock.now_ns(), config=config, course=course
         )
-        rc_input = None
+        rc_input: Pilot | None = None
         if rc_port is not None:
             rc_input = stack.enter_context(closing(RcInput(rc_port)))
+        if pilot is not None:
+            prepare_vehicle(vehicle, config.autopilot)
+            rc_input, line = make_pilot(
+                pilot.name,
+                vehicle=vehicle,
+                autopilot=config.autopilot,
+                course=course,
+                axes=pilot.axes,
+                speed_mps=pilot.speed_mps,
+                clock=clock,
+            )
+            stack.enter_context(closing(rc_input))
+            print_status(line)
         stop = stack.enter_context(stop_on_signal())
         if camera is not None:
             stack.enter_context(filming(vehicle, course, camera, clock))
@@ -73,7 +101,7 @@ def fly(
     stop: StopRequest,
     end_ns: int | None,
     *,
-    rc_input: RcInput | None = None,
+    rc_input: Pilot | None = None,
     end_with_course: bool = False,
 ) -> None:
     """Run the loop on a 2.5 ms grid: receive, advance the vehicle to now, send what is due.

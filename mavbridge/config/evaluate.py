@@ -28,10 +28,11 @@ class EvaluateConfig:
     limits: Limits = field(default_factory=Limits)
     visual_rate: float | str = 30.0
     """Most frames a second through the image encoder (dual rate), or auto[:MIN:MAX]."""
-    action_rate: float = 100.0
-    """Most chunks of actions a second (dual rate)."""
-    rate: float = 30.0
-    """The same in single-rate mode."""
+    action_rate: float | None = None
+    """Most chunks of actions a second (dual rate): by default 100, or 2 for each time that the
+    policy is meant to play a chunk."""
+    rate: float | None = None
+    """The same in single-rate mode: by default 30, or likewise."""
     episodes: int = 20
     """Courses to fly."""
     max_time: float = 60.0

@@ -26,6 +26,7 @@ from mavbridge.core.vehicle import OnFault, Risk
 
 OutputChoice = Literal["auto", "rc-override", "manual-control", "attitude", "rates", "velocity"]
 """``core.vehicle.Output``, or the usual one."""
+MAX_GOAL_M = 100_000.0
 _FLOAT32_MAX = 3.4e38
 """Largest value of a MAVLink parameter."""
 
@@ -281,6 +282,11 @@ class FlyConfig:
     """Flight mode to ask for when engaging; one of those that the policy flies in."""
     takeoff: Annotated[float | None, Parameter(group=ENGAGING)] = None
     """With --arm: metres to which the autopilot climbs by its own means before the policy flies."""
+    goal: Annotated[
+        str | None, Parameter(group=ENGAGING, allow_leading_hyphen=True, show_default=False)
+    ] = None
+    """NORTH,EAST,DOWN in metres from the estimator's origin, where the vehicle was switched on: for
+    a policy that flies to a goal."""
     engage_channel: Annotated[int | None, Parameter(group=ENGAGING)] = None
     """Radio channel, from 5, whose switch engages when it goes high while armed, and releases when
     it goes low."""
@@ -310,6 +316,7 @@ class FlyConfig:
             check_range("takeoff", self.takeoff, 0.5, 100, "m")
             if not self.arm:
                 raise UserError("--takeoff needs --arm: nothing else takes off by itself")
+        _ = self.goal_ned_m
         if self.engage_channel is not None:
             check_range("engage-channel", self.engage_channel, 5, 18, "")
         engages = self.arm or self.engage_on_arm or self.engage_channel is not None
@@ -318,3 +325,19 @@ class FlyConfig:
                 "--readonly sends nothing, so it cannot be used with --arm, --mode, "
                 "--engage-channel or --engage-on-arm"
             )
+
+    @property
+    def goal_ned_m(self) -> tuple[float, float, float] | None:
+        """Value of ``--goal``; UserError if it is not three numbers."""
+        if self.goal is None:
+            return None
+        try:
+            north, east, down = (float(text) for text in self.goal.split(","))
+        except ValueError:
+            north = east = down = math.nan
+        if not max(abs(north), abs(east), abs(down)) < MAX_GOAL_M:  # also true of NaN
+            raise UserError(
+                f"--goal {self.goal} is not understood: use NORTH,EAST,DOWN in metres, such as "
+                "20,0,-5 for 20 m north and 5 m up"
+            )
+        return north, east, down

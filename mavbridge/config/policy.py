@@ -18,11 +18,14 @@ class PolicyConfig:
     """The policy, its weights, and what runs it."""
 
     policy: str = "toge"
-    """toge[:small|medium|large[:BACKBONE]], resnet-unet, your own package.module:Class, or
-    scripted[:hover|square|circle|yaw|doublet][:sticks|attitude|rates|velocity][:air]; air: the
-    vehicle flies already, so do not climb first."""
+    """toge[:small|medium|large[:BACKBONE]], resnet-unet; your own class, ./file.py:Class or
+    package.module:Class; lerobot:DIR, onnx:DIR, torchscript:FILE; ws://HOST:PORT, a server
+    (mavbridge serve, openpi's); or
+    scripted[:hover|square|circle|yaw|doublet][:sticks|attitude|rates|velocity][:air], air: the
+    vehicle flies already, so do not climb first. docs/policies.md has the details."""
     checkpoint: Path | None = None
-    """Weights: .safetensors with the contract in its header, or .pt; toge has shipped ones."""
+    """Weights: .safetensors with the contract in its header, .pt or .ckpt; toge has shipped ones. A
+    class of yours is made as Class(checkpoint=path)."""
     contract: Path | None = None
     """TOML file that says what the files of a policy trained elsewhere do not: rate, names, units,
     camera; mavbridge contract writes a first draft."""

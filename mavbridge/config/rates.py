@@ -10,8 +10,14 @@ from mavbridge.config.checks import check_range
 from mavbridge.config.groups import RARE, RATES
 from mavbridge.core.errors import UserError
 
+LEAST_HZ = 0.5
 AUTO_VISUAL_HZ = (10.0, 60.0)
 """Limits of --visual-rate auto where none are given."""
+ACTION_HZ, SINGLE_HZ = 100.0, 30.0
+"""Most chunks a second, by dual and by single rate, where neither a flag nor the policy says it."""
+SOLVES_PER_PLAY = 2.0
+"""Chunks that are computed in the time for which a policy is meant to play one: a new one is there
+before the last one ends, also when a solve is late."""
 STATE_HZ = 50.0
 """Lowest rate of telemetry to ask for, however slow the actions: age limits are in seconds."""
 SIM_CAMERA_HZ = 30.0
@@ -46,10 +52,11 @@ class Rates:
     visual_rate: float | str = 30.0
     """Most frames a second through the image encoder (dual rate); auto[:MIN:MAX] encodes more often
     when the vehicle turns or the image changes."""
-    action_rate: float = 100.0
-    """Most chunks of actions a second, each from the newest attitude (dual rate)."""
-    rate: float = 30.0
-    """The same in single-rate mode, each with the newest image."""
+    action_rate: float | None = None
+    """Most chunks of actions a second, each from the newest attitude (dual rate). By default 100,
+    or 2 for each time that the policy is meant to play a chunk (play_s of its contract)."""
+    rate: float | None = None
+    """The same in single-rate mode, each with the newest image. By default 30, or likewise."""
     stick_rate: float = 100.0
     """Stick commands a second that leave for the autopilot, whatever the policy's rate."""
     realtime: Annotated[bool, Parameter(group=RARE)] = True
@@ -67,8 +74,9 @@ class Rates:
         low_hz, high_hz = self.visual_limits_hz
         check_range("visual-rate", low_hz, 0.5, high_hz, "Hz")
         check_range("visual-rate", high_hz, low_hz, 240, "Hz")
-        check_range("action-rate", self.action_rate, 0.5, 500, "Hz")
-        check_range("rate", self.rate, 0.5, 500, "Hz")
+        for name, rate_hz in (("action-rate", self.action_rate), ("rate", self.rate)):
+            if rate_hz is not None:
+                check_range(name, rate_hz, LEAST_HZ, 500, "Hz")
         check_range("stick-rate", self.stick_rate, 20, 400, "Hz")
 
     @property
@@ -87,8 +95,18 @@ class Rates:
             )
         return low_hz, high_hz
 
-    def loops(self, *, is_dual: bool) -> LoopRates:
-        """Rates of both loops; without dual rate each action has an image of its own."""
-        min_hz, max_hz = self.visual_limits_hz if is_dual else (self.rate, self.rate)
+    def loops(self, *, is_dual: bool, play_s: float = 0.0) -> LoopRates:
+        """Rates of both loops of a policy that plays each chunk for up to ``play_s``.
+
+        Without dual rate images are only resized as they come. A chunk takes the newest one, so
+        they come at the visual rate where chunks are slower: it must not be old when it is used.
+        """
         action_hz = self.action_rate if is_dual else self.rate
+        if action_hz is None:
+            action_hz = ACTION_HZ if is_dual else SINGLE_HZ
+            if play_s > 0:
+                action_hz = max(LEAST_HZ, min(action_hz, SOLVES_PER_PLAY / play_s))
+        min_hz, max_hz = self.visual_limits_hz
+        if not is_dual:
+            min_hz = max_hz = max(action_hz, max_hz)
         return LoopRates(action_hz=action_hz, min_vision_hz=min_hz, max_vision_hz=max_hz)

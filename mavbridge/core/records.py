@@ -51,6 +51,10 @@ class VehicleState:
     rate_ns: int
     velocity_ns: int
     specific_force_ns: int
+    extras: tuple[float, ...] = ()
+    """The contract's ``state_extras``, as it orders them."""
+    extras_ns: int | None = None
+    """When the oldest of them was measured; None without any."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

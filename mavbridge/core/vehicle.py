@@ -148,6 +148,10 @@ class Telemetry:
     rate_body_radps: Reading | None = None
     velocity_ned_mps: Reading | None = None
     specific_force_body_mps2: Reading | None = None
+    position_ned_m: Reading | None = None
+    """From the estimator's origin."""
+    height_above_home_m: Reading | None = None
+    """One number; comes only where a policy takes it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ from rich.text import Text
 from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import STATUS_HZ
-from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, wall_offset_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.files import require_writable
 from mavbridge.core.ports import Camera, TickSink
@@ -33,6 +33,7 @@ from mavbridge.flight.policies import (
     looks_at_images,
 )
 from mavbridge.flight.settings import effective_freshness, flight_settings, gate_settings
+from mavbridge.flight.speed import require_speed
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Phase
 from mavbridge.mavlink.transport.sockets import make_transport
@@ -79,7 +80,7 @@ def fly(config: FlyConfig) -> int:
             config.policy, clock, starts_in_air=config.takeoff is not None
         )
         policy_life.enter_context(loaded)
-        for note in loaded.notes:
+        for note in (*loaded.notes, *require_speed(config, loaded)):
             console.print(Text(note, style="yellow"))
         fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
     return 0
@@ -168,8 +169,12 @@ class _Flight:
         self._stack = stack
         self._gate = gate.process
         self._has_hung = False
-        loops = config.rates.loops(is_dual=executable.dual_rate)
-        self._hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * period_ns(loops.action_hz))
+        settings = flight_settings(config, executable)
+        self._hang_ns = max(
+            LEAST_HANG_NS,
+            HANG_PERIODS * settings.chunk_period_ns,
+            settings.freshness.state_ns,  # of a slow policy that plays each chunk for long
+        )
         feature_ns = effective_freshness(executable.contract, config.limits).feature_ns
         self._encoder_hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * feature_ns)
         self._looked_ns = self._resumed_ns = clock.now_ns()
@@ -267,16 +272,18 @@ class _Flight:
                 return f"the camera{self._named(camera)} or its encoder has failed"
         if not policy.is_alive:
             return "the policy has failed"
-        now_ns, encoder_hang_ns = self._clock.now_ns(), self._encoder_hang_ns
+        now_ns = self._clock.now_ns()
         if now_ns - self._looked_ns > STOPPED_NS:
             self._resumed_ns = now_ns
         self._looked_ns = now_ns
-        for name, alive_ns, limit_ns in (
-            ("policy", self._bridge.policy.alive_ns, self._hang_ns),
-            *(
-                (f"encoder{self._named(camera, 'of camera ')}", vision.alive_ns, encoder_hang_ns)
-                for camera, vision in zip(self._cameras, self._bridge.visions, strict=True)
-            ),
+        # Encoders wait for one another: the one that was silent first is the one that has hung.
+        encoders = sorted(
+            (vision.alive_ns, f"encoder{self._named(camera, 'of camera ')}")
+            for camera, vision in zip(self._cameras, self._bridge.visions, strict=True)
+        )
+        for alive_ns, name, limit_ns in (
+            (self._bridge.policy.alive_ns, "policy", self._hang_ns),
+            *((alive_ns, name, self._encoder_hang_ns) for alive_ns, name in encoders),
         ):
             idle_ns = now_ns - max(alive_ns, self._resumed_ns)
             if idle_ns > limit_ns:

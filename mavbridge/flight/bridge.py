@@ -7,10 +7,10 @@ from itertools import chain
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.config.rates import LoopRates
-from mavbridge.core.clock import NS_PER_S, Clock, period_ns
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
-from mavbridge.core.records import FloatArray, ImageArray
+from mavbridge.core.records import FloatArray, ImageArray, VehicleState
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
@@ -18,6 +18,7 @@ from mavbridge.flight.observation import ObservationSource, StateHistory, observ
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.flight.state import Freshness
+from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.flight.vision_rate import AdaptiveRate
@@ -25,6 +26,10 @@ from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.wire import Absence
 from policy.contract import Contract
 from policy.protocol import Executable
+
+SPARSE_NS = 50 * NS_PER_MS
+"""States of chunks that are farther apart do not tell the motion since an exposure: it takes those
+in between as well."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,29 +72,36 @@ def build_bridge(
         delay_vision: wraps the sink of the vision loop, for the same reason.
     """
     contract = executable.contract
-    loops = config.rates.loops(is_dual=executable.dual_rate)
+    loops = config.rates.loops(is_dual=executable.dual_rate, play_s=contract.play_s)
     limits = effective_freshness(contract, config.limits)
     frame = action_frame(contract)
+    freshness = Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns)
+    reader = StateReader(contract, freshness=freshness, goal_ned_m=config.goal_ned_m)
     settings = PolicySettings(
-        state_frame=contract.state_frame,
         action_frame=frame,
         chunk_dt_s=contract.chunk_dt_s,
-        freshness=Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns),
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
         period_ns=period_ns(loops.action_hz),
     )
     past_ns = observation_ages_ns(contract)[0]
-    states = StateHistory(span_ns=past_ns) if past_ns else None
+    is_sparse = contract.since_exposure and settings.period_ns > SPARSE_NS
+    span_ns = past_ns + (limits.feature_ns if is_sparse else 0)
+    states = StateHistory(span_ns=span_ns) if span_ns else None
     caches = caches or [FeatureCache(span_ns=past_ns) for _ in cameras]
     rates = _visual_rates(contract, loops)
     adaptive = [[rate] if rate.is_adaptive else [] for rate in rates]
     history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s, frame=frame)
+
+    def remember() -> None:
+        if states is not None:
+            _push_state(states, reader, view)
+
     view = VehicleView(
         history=history,
         sink=FanOut([*chain(*adaptive), *sinks]),
-        state_frame=settings.state_frame,
-        freshness=settings.freshness,
-        states=states,
+        state_frame=contract.state_frame,
+        freshness=freshness,
+        on_attitude=remember,
     )
     vision_sinks = [
         FanOut([*own, *(sinks if number == 0 else ())]) for number, own in enumerate(adaptive)
@@ -110,6 +122,7 @@ def build_bridge(
     policy = PolicyLoop(
         clock=policy_clock or clock,
         view=view,
+        reader=reader,
         observations=ObservationSource(
             contract,
             caches=caches,
@@ -132,6 +145,14 @@ def _visual_rates(contract: Contract, loops: LoopRates) -> list[AdaptiveRate]:
         AdaptiveRate(min_hz=min(loops.min_vision_hz, hz), max_hz=min(loops.max_vision_hz, hz))
         for hz in contract.camera_rates_hz or (loops.max_vision_hz,) * len(contract.cameras)
     ]
+
+
+def _push_state(states: StateHistory, reader: StateReader, view: VehicleView) -> None:
+    """Remember the state at the attitude that has just come in."""
+    has_position = view.status.has_position
+    state = reader.read(view.telemetry(), view.attitude_ns, has_position=has_position)
+    if isinstance(state, VehicleState):
+        states.push(state)
 
 
 def _encoder(executable: Executable, camera: int) -> Callable[[ImageArray], FloatArray]:

@@ -84,7 +84,7 @@ class ObservationSource:
             contract: says how many observations there are, and of what.
             caches: one for each camera of the contract, in its order.
             join: of the executable.
-            states: past states; None where the policy takes only the newest.
+            states: past states; None where the policy takes only the newest, and takes it often.
             max_feature_age_ns: oldest image to act on.
         """
         self._cameras = contract.cameras
@@ -136,7 +136,7 @@ class ObservationSource:
 
     def _states(self, state: VehicleState, features: Sequence[FeatureFrame]) -> FloatArray:
         """States at the observations whose images of the first camera are ``features``."""
-        if self._history is None:
+        if self._history is None or len(self._before_ns) == 1:
             return self._with_motion(state, features[0])
         known = (*self._history.all(), state)
         rows = []
@@ -147,9 +147,13 @@ class ObservationSource:
         return np.stack(rows)[None]
 
     def _with_motion(self, state: VehicleState, feature: FeatureFrame) -> FloatArray:
-        if self._ego_motion is None:
-            return state.values[None]
-        return self._ego_motion.append_to(state, feature.captured_ns)
+        """[1, state_dim]"""
+        row = state.values[None]
+        if self._ego_motion is not None:
+            row = self._ego_motion.append_to(state, feature.captured_ns)
+        if state.extras:
+            row = np.append(row, np.array([state.extras], np.float32), axis=1)
+        return row
 
     def _of(self, camera: int) -> str:
         return "" if len(self._cameras) == 1 else f"camera {self._cameras[camera]}: "

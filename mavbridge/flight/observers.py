@@ -42,7 +42,9 @@ class FlightObservers:
         self._config = config
         self._executable = executable
         self._clock = clock
-        self._loops = config.rates.loops(is_dual=executable.dual_rate)
+        self._loops = config.rates.loops(
+            is_dual=executable.dual_rate, play_s=executable.contract.play_s
+        )
         self._mode: Mode = "dual" if executable.dual_rate else "single"
         action_hz, vision_hz = self._loops.action_hz, self._loops.max_vision_hz
         self._timing = FlightTiming(

@@ -12,7 +12,8 @@ from mavbridge.core.vehicle import Release
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import Observation, ObservationSource
-from mavbridge.flight.state import Freshness, FrozenStateCheck, StateFrame, build_state
+from mavbridge.flight.state import FrozenStateCheck
+from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import SolveInputs, VehicleView
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.wire import Absence
@@ -24,6 +25,10 @@ Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, float | None], Fl
 WAIT_NS = 100 * NS_PER_MS
 """Longest wait for an attitude before the stop flag is checked, and the gate told why it waits."""
 
+RETRY_NS = 100 * NS_PER_MS
+"""After a solve that was refused the next one starts at the latest so much later, however slow the
+policy is."""
+
 MAX_HORIZON = 1024
 """Most actions of a chunk, as in a contract: the gate has to read each one between two sticks."""
 
@@ -32,10 +37,8 @@ MAX_HORIZON = 1024
 class PolicySettings:
     """Parts of the contract and of the configuration that the loop needs."""
 
-    state_frame: StateFrame
     action_frame: ActionFrame
     chunk_dt_s: float
-    freshness: Freshness
     max_frozen_ns: int
     """Longest time for which the attitude may stay exactly the same; 0 = no limit."""
     period_ns: int
@@ -53,6 +56,7 @@ class PolicyLoop:
         *,
         clock: Clock,
         view: VehicleView,
+        reader: StateReader,
         observations: ObservationSource,
         history: SentHistory,
         act: Act,
@@ -62,6 +66,7 @@ class PolicyLoop:
     ) -> None:
         self._clock = clock
         self._view = view
+        self._reader = reader
         self._observations = observations
         self._history = history
         self._act = act
@@ -81,8 +86,11 @@ class PolicyLoop:
         """Solve until told to stop."""
         self.alive_ns = self._clock.now_ns()
         while not stop.is_set():
-            self._clock.sleep_until_ns(self.start_ns)
-            if self._view.wait_for_attitude(newer_than_ns=self.start_ns - 1, timeout_ns=WAIT_NS):
+            looks_ns = self._clock.now_ns() + WAIT_NS
+            self._clock.sleep_until_ns(min(self.start_ns, looks_ns))
+            if self.start_ns > looks_ns:
+                pass  # a slow policy: the stop flag is looked at meanwhile
+            elif self._view.wait_for_attitude(newer_than_ns=self.start_ns - 1, timeout_ns=WAIT_NS):
                 self.step()
             else:
                 self._send(Absence("no attitude from the vehicle"))
@@ -108,12 +116,8 @@ class PolicyLoop:
             self._flights = self._view.flights
             self._chunk_state_ns = None
             self._reset()
-        state = build_state(
-            self._view.telemetry(),
-            now_ns,
-            frame=self._settings.state_frame,
-            freshness=self._settings.freshness,
-        )
+        has_position = self._view.status.has_position
+        state = self._reader.read(self._view.telemetry(), now_ns, has_position=has_position)
         observation = self._observe(state, now_ns) if isinstance(state, VehicleState) else state
         if isinstance(observation, Release):
             self._refuse(observation.reason)
@@ -127,6 +131,9 @@ class PolicyLoop:
 
     def _refuse(self, reason: str) -> None:
         self._chunk_state_ns = None
+        if self._due_ns is not None:
+            soon_ns = self._clock.now_ns() + RETRY_NS + self._settings.period_ns // 4
+            self._due_ns = min(self._due_ns, soon_ns)
         self._send(Absence(reason))
 
     def _solve(self, observation: Observation, now_ns: int) -> None:
@@ -165,7 +172,11 @@ class PolicyLoop:
             Chunk(
                 serial=self._serial,
                 attitude_ns=min(state.attitude_ns, state.rate_ns),
-                velocity_ns=min(state.velocity_ns, state.specific_force_ns),
+                velocity_ns=min(
+                    state.velocity_ns,
+                    state.specific_force_ns,
+                    state.velocity_ns if state.extras_ns is None else state.extras_ns,
+                ),
                 image_ns=observation.image_ns,
                 computed_ns=done_ns,
                 first_ns=state.attitude_ns,

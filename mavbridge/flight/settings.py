@@ -49,17 +49,36 @@ def gate_settings(
 def flight_settings(config: FlyConfig, executable: Executable) -> FlightSettings:
     """Settings of a flight of this policy; raises UserError."""
     rates, limits, contract = config.rates, config.limits, executable.contract
-    loops = rates.loops(is_dual=executable.dual_rate)
+    loops = rates.loops(is_dual=executable.dual_rate, play_s=contract.play_s)
+    _require_goal(config, contract)
     return FlightSettings(
         stick_period_ns=period_ns(rates.stick_rate),
         chunk_period_ns=period_ns(loops.action_hz),
-        freshness=effective_freshness(contract, limits),
+        freshness=effective_freshness(contract, limits).while_played(
+            round(contract.play_s * NS_PER_S)
+        ),
         meaning=action_meaning(contract, config.link),
         output=None if config.link.output == "auto" else config.link.output,
         smoothing=Smoothing(limits=limit_settings(config).of(contract.action), tau_s=limits.tau),
         envelope=envelope_limits(config.envelope, _policy_envelope(contract)),
         engagement=engagement_settings(config, contract),
+        watches_home_height="height" in contract.state_extras,
+        watches_position=bool({"goal", "altitude"} & set(contract.state_extras)),
     )
+
+
+def _require_goal(config: FlyConfig, contract: Contract) -> None:
+    """Raise UserError unless the flight has a goal just where the policy takes one."""
+    if "goal" in contract.state_extras and config.goal is None:
+        raise UserError(
+            "this policy flies to a goal: give --goal NORTH,EAST,DOWN, in metres from the "
+            "estimator's origin"
+        )
+    if "goal" not in contract.state_extras and config.goal is not None:
+        raise UserError(
+            f"--goal {config.goal}: this policy takes no goal (state_extras of its contract): "
+            "leave it out"
+        )
 
 
 def limit_settings(config: FlyConfig) -> LimitSettings:
@@ -182,7 +201,7 @@ def envelope_limits(config: EnvelopeConfig, policy: EnvelopeLimits | None) -> En
 
 
 def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
-    """Ages by which a flight of this policy is judged: the flag's where given, else the contract's.
+    """Ages at which a chunk may begin: the flag's where given, else the contract's.
 
     Raises:
         UserError: a flag would loosen a limit of the contract.

@@ -2,6 +2,7 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
@@ -9,7 +10,6 @@ from mavbridge.core.ports import TickSink
 from mavbridge.core.records import Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.observation import StateHistory
 from mavbridge.flight.state import Freshness, StateFrame, build_state
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.wire import (
@@ -52,7 +52,7 @@ class VehicleView:
         sink: TickSink,
         state_frame: StateFrame,
         freshness: Freshness,
-        states: StateHistory | None = None,
+        on_attitude: Callable[[], object] = lambda: None,
     ) -> None:
         """Start without a vehicle.
 
@@ -61,13 +61,13 @@ class VehicleView:
             sink: takes a tick for every send, and for every slot without one.
             state_frame: frame of the states in ticks in which the policy does not fly.
             freshness: oldest readings that such a state may have.
-            states: takes the state at each attitude, where the policy wants past ones.
+            on_attitude: called for each new attitude, in the thread of ``receive``.
         """
         self._history = history
         self._sink = sink
         self._state_frame = state_frame
         self._freshness = freshness
-        self._states = states
+        self._on_attitude = on_attitude
         self._codec = Codec(source_system=0, source_component=0)
         self._telemetry = TelemetryCollector()
         self._solves: OrderedDict[int, SolveInputs] = OrderedDict()
@@ -141,8 +141,7 @@ class VehicleView:
                     if isinstance(message.body, LocalVelocity) and message.body.position_ned_m:
                         self.height_m = -message.body.position_ned_m[2]
         if self.attitude_ns != before_ns:
-            if self._states is not None and (state := self._state_at(self.attitude_ns)) is not None:
-                self._states.push(state)
+            self._on_attitude()
             with self._news:
                 self._news.notify_all()
 

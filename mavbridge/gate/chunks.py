@@ -10,7 +10,8 @@ from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind
 
 LEAST_GRACE_NS = 100 * NS_PER_MS
 GRACE_PERIODS = 3
-"""A late chunk is bridged for 100 ms or three chunk periods, whichever is longer."""
+"""A late chunk is bridged for 100 ms or three chunk periods, whichever is longer, but never for
+more than 100 ms beyond the limits and the horizon of the one that is flown."""
 MAX_REFUSED = 5
 """Malformed chunks within the window below that end the flight, even if good ones lie between."""
 REFUSED_WINDOW_NS = NS_PER_S
@@ -25,7 +26,7 @@ policy. The first ones after loading may be slow."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreshnessLimits:
-    """Greatest ages at the moment of sending of what a stick was computed from."""
+    """Greatest ages of what a stick is computed from."""
 
     state_ns: int
     """Attitude and body rates."""
@@ -35,6 +36,15 @@ class FreshnessLimits:
     """Image, since its exposure."""
     chunk_ns: int
     """Since the chunk was computed."""
+
+    def while_played(self, play_ns: int) -> "FreshnessLimits":
+        """Limits at the moment of sending, where a chunk is meant to be played for so long."""
+        return FreshnessLimits(
+            state_ns=self.state_ns + play_ns,
+            velocity_ns=self.velocity_ns + play_ns,
+            feature_ns=self.feature_ns + play_ns,
+            chunk_ns=self.chunk_ns + play_ns,
+        )
 
 
 class Chunk(NamedTuple):
@@ -83,7 +93,13 @@ class ChunkBuffer:
     """
 
     def __init__(self, limits: FreshnessLimits, *, period_ns: int, kind: ActionKind) -> None:
-        """``period_ns`` is the time between the policy's chunks, ``kind`` that of their actions."""
+        """Hold nothing yet.
+
+        Args:
+            limits: those at the moment of sending.
+            period_ns: time between the policy's chunks.
+            kind: that of their actions.
+        """
         self._class = ACTION_CLASSES[kind]
         self._limits = limits
         self._period_ns = period_ns
@@ -93,6 +109,8 @@ class ChunkBuffer:
         """Why the newest chunk was not taken; None if it was."""
         self.newest: Chunk | None = None
         self._taken_ns = 0
+        self._until_ns = 0
+        """End of the grace of the newest chunk."""
         self._gaps_ns: deque[int] = deque(maxlen=RECENT_GAPS)
         """Times between the last chunks that were taken."""
         self._slow = 0
@@ -116,6 +134,8 @@ class ChunkBuffer:
         if self.newest is not None:
             self._gaps_ns.append(now_ns - self._taken_ns)
         self.newest, self._taken_ns = chunk, now_ns
+        limited_ns = max(now_ns, min(self._stale_ns(chunk), chunk.end_ns)) + LEAST_GRACE_NS
+        self._until_ns = min(now_ns + self.grace_ns, limited_ns)
         return True
 
     def explain_absence(self, reason: str) -> None:
@@ -143,15 +163,20 @@ class ChunkBuffer:
     def problem(self, now_ns: int) -> str | None:
         """Why no flight may begin now, or None: a chunk must be fresh, by all limits."""
         chunk = self.newest
-        if chunk is None or now_ns - self._taken_ns > self.grace_ns:
+        if chunk is None or now_ns > self._until_ns:
             return self._refusal or "no chunk from the policy yet"
         if len(self._gaps_ns) < LEAST_GAPS:
             return "the policy has only just begun"
-        if (gap_ns := max(self._gaps_ns)) > self.grace_ns:
+        bridged_ns = self._until_ns - self._taken_ns
+        if (gap_ns := max(self._gaps_ns)) > bridged_ns:
+            advice = "it is too slow here for its rate; ask for a lower one"
+            if bridged_ns < self.grace_ns:
+                advice = (
+                    "its limits and horizon let none be flown for longer; ask for a higher rate"
+                )
             return (
                 f"the policy's chunks come up to {gap_ns // NS_PER_MS} ms apart, beyond the "
-                f"{self.grace_ns // NS_PER_MS} ms that are bridged: it is too slow here for its "
-                "rate; ask for a lower one"
+                f"{bridged_ns // NS_PER_MS} ms that are bridged: {advice}"
             )
         return self._stale(chunk, now_ns)
 
@@ -161,8 +186,9 @@ class ChunkBuffer:
         refused = self._refused_ns
         if len(refused) == MAX_REFUSED and now_ns - refused[0] < window_ns:
             return f"the policy returned {MAX_REFUSED} unusable chunks within a short time"
-        if self.newest is None or now_ns - self._taken_ns > self.grace_ns:
-            late = f"no chunk of the policy that may be flown for {self.grace_ns // NS_PER_MS} ms"
+        if self.newest is None or now_ns > self._until_ns:
+            bridged_ms = (self._until_ns - self._taken_ns) // NS_PER_MS
+            late = f"no chunk of the policy that may be flown for {bridged_ms} ms"
             return late if self._refusal is None else f"{late}: {self._refusal}"
         return None
 
@@ -172,14 +198,22 @@ class ChunkBuffer:
             return None
         return self.newest.action_at(at_ns)
 
-    def _stale(self, chunk: Chunk, now_ns: int) -> str | None:
+    def _ages(self, chunk: Chunk) -> tuple[tuple[str, int, int], ...]:
+        """What a chunk came from, when that happened, and how old it may be."""
         limits = self._limits
-        for name, happened_ns, limit_ns in (
+        return (
             ("attitude", chunk.attitude_ns, limits.state_ns),
             ("velocity", chunk.velocity_ns, limits.velocity_ns),
             ("image", chunk.image_ns, limits.feature_ns),
             ("chunk", chunk.computed_ns, limits.chunk_ns),
-        ):
+        )
+
+    def _stale_ns(self, chunk: Chunk) -> int:
+        """The last moment at which a chunk keeps its limits."""
+        return min(happened_ns + limit_ns for _, happened_ns, limit_ns in self._ages(chunk))
+
+    def _stale(self, chunk: Chunk, now_ns: int) -> str | None:
+        for name, happened_ns, limit_ns in self._ages(chunk):
             if now_ns - happened_ns > limit_ns:
                 # In tens of ms: reasons are compared from step to step.
                 age_ms = (now_ns - happened_ns) // (10 * NS_PER_MS) * 10

@@ -45,6 +45,10 @@ class FlightSettings:
     smoothing: Smoothing
     envelope: EnvelopeLimits
     engagement: EngagementSettings
+    watches_home_height: bool = False
+    """The policy takes the height above home, which the vehicle is asked for then."""
+    watches_position: bool = False
+    """It takes a position: the flight process is told whether there is one to be trusted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

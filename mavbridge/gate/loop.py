@@ -70,6 +70,9 @@ class GateLink(Protocol):
     def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
         """Choose the message that carries such actions; raises PeerError where none can."""
 
+    def watch_home_height(self) -> None:
+        """Keep the height above home coming."""
+
     def send(self, decision: Decision) -> Action | None:
         """Send the decision; returns the action as rounded and sent, None when released."""
 
@@ -115,6 +118,7 @@ class GateLoop:
         self._gate: Gate | None = None
         self._packets: list[ForwardedPacket] = []
         self._status: GateStatus | None = None
+        self._watches_position = False
         self._phase = Phase.WAITING
         self._stop: Ending | None = None
         self._finish_until_ns: int | None = None
@@ -223,6 +227,7 @@ class GateLoop:
             is_landed=vehicle.is_landed if vehicle else None,
             rc_channels_us=vehicle.rc_channels_us if vehicle else (),
             rc_sticks=vehicle.rc_sticks if vehicle else None,
+            has_position=self._watches_position and bool(vehicle and vehicle.position_ned_m),
         )
         if status != self._status:
             self._status = status
@@ -245,6 +250,9 @@ class GateLoop:
                 case FlightSettings() as settings if self._gate is None:
                     self._gate = Gate(settings, self._clock.now_ns())
                     self._link.begin_flight(settings.meaning, settings.output)
+                    self._watches_position = settings.watches_position
+                    if settings.watches_home_height:
+                        self._link.watch_home_height()
                 case Ending() as ending:
                     self.stop(ending)
                 case "engage" | "release" as new:

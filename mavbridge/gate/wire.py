@@ -70,6 +70,8 @@ class GateStatus(NamedTuple):
     is_landed: bool | None
     rc_channels_us: tuple[int, ...]
     rc_sticks: Sticks | None
+    has_position: bool = False
+    """The estimator has a position that may be trusted, and the policy takes one."""
 
 
 class GateMessage(NamedTuple):
@@ -281,9 +283,12 @@ def _decode_from_gate(data: bytes) -> FromGate:
         case b"P":
             return tuple(_decode_packets(data))
         case b"V":
-            autopilot, mode, armed, is_landed, channels_us, sticks = json.loads(data[1:])
+            autopilot, mode, armed, is_landed, channels_us, sticks, has_position = json.loads(
+                data[1:]
+            )
             rc_sticks = None if sticks is None else Sticks(*sticks)
-            return GateStatus(autopilot, mode, armed, is_landed, tuple(channels_us), rc_sticks)
+            channels = tuple(channels_us)
+            return GateStatus(autopilot, mode, armed, is_landed, channels, rc_sticks, has_position)
         case b"M":
             return GateMessage(*json.loads(data[1:]))
         case b"X":

@@ -18,6 +18,7 @@ from mavbridge.core.vehicle import (
     Output,
 )
 from mavbridge.mavlink.codec.messages import (
+    Altitude,
     Attitude,
     CommandAck,
     CommandRequest,
@@ -83,6 +84,7 @@ class MavlinkLink:
         """We hold the vehicle's sticks, or are giving them back: no other address is followed."""
         self._started_ns = self._heartbeat_due_ns = clock.now_ns()
         self._vehicle: VehicleSession | None = None
+        self._watches_home_height = False
         self._interruption: str | None = None
         self._interruptions = 0
         self._namesakes = Namesakes()
@@ -173,7 +175,7 @@ class MavlinkLink:
             case LocalVelocity() if not vehicle.condition.is_velocity_usable(arrived_ns):
                 vehicle.receive(message, arrived_ns)
                 return  # the estimator says that it has none: nobody takes it for one
-            case Attitude() | LocalVelocity() | SpecificForce() as body:
+            case Attitude() | LocalVelocity() | SpecificForce() | Altitude() as body:
                 happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
                 self._telemetry.receive(body, arrived_ns, happened_ns)
             case Timesync() as reply:
@@ -286,6 +288,8 @@ class MavlinkLink:
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""
         self._vehicle = VehicleSession(identity, self._config, report=self._report)
+        if self._watches_home_height:
+            self._vehicle.watch_home_height()
         self._sender.equip(self._vehicle)
         self._telemetry = TelemetryCollector()
         self._timesync.restart()
@@ -301,6 +305,12 @@ class MavlinkLink:
         ``output`` None: the usual one of such actions and this vehicle.
         """
         self._sender.begin_flight(meaning, output)
+
+    def watch_home_height(self) -> None:
+        """Keep the height above home coming, now and from any vehicle that follows."""
+        self._watches_home_height = True
+        if self._vehicle is not None:
+            self._vehicle.watch_home_height()
 
     def _report(self, text: str) -> None:
         self._connection.texts.append(text)

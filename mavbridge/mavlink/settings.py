@@ -25,8 +25,8 @@ class LinkSettings:
     min_battery_percent: float = 0.0
     """Charge below which the battery is reported as low; 0 = only what the vehicle itself says."""
     pilot_hz: float | None = None
-    """Rate of RC_CHANNELS to ask for where the pilot's sticks are recorded; None: what the check of
-    our own sticks needs."""
+    """Rate of RC_CHANNELS to ask for where a pilot's flight is recorded, and none of our own sticks
+    will leave; None: what the check of those needs."""
     stick_hz: float = 100.0
     """Rate at which sticks will be sent."""
     forward: str = ""

@@ -57,6 +57,8 @@ class SimulationSettings:
     delays: Delays = field(default_factory=Delays)
     raw_sticks: bool = False
     """Sticks leave as the policy has put them out, whatever the vehicle's curves make of them."""
+    goal: str | None = None
+    """--goal of the flight."""
     draw_images: bool = True
     """False: images stay black, where neither the policy nor a sink looks at them."""
     least_camera_px: int = SIM_CAMERA_PX
@@ -164,9 +166,10 @@ class SimulatedFlight:
             link=LinkConfig(connect="lockstep", raw_sticks=self._settings.raw_sticks),
             rates=self._settings.rates,
             limits=self._settings.limits,
+            goal=self._settings.goal,
             arm=True,
         )
-        loops = config.rates.loops(is_dual=executable.dual_rate)
+        loops = config.rates.loops(is_dual=executable.dual_rate, play_s=executable.contract.play_s)
         to_gate = DelayedChannel(world, hop.samples_ns(self._random(7)))
         to_flight = DelayedChannel(world, hop.samples_ns(self._random(8)))
         flight_port = MemoryPort(outgoing=to_gate, incoming=to_flight)

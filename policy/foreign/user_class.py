@@ -20,7 +20,7 @@ from policy.protocol import DualRatePolicy, SingleRatePolicy
 
 FORMS = (
     "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air], "
-    "lerobot:DIR, package.module:Class or ./file.py:Class"
+    "lerobot:DIR, ws://HOST:PORT, package.module:Class or ./file.py:Class"
 )
 """What a user may write to name a policy."""
 OUR_PACKAGES = ("policy", "sitl", "mavbridge")

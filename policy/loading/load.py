@@ -8,6 +8,7 @@
     lerobot:DIR              an ACT or DiffusionPolicy as LeRobot saved it, with --contract FILE
     package.module:Class     any class that keeps protocol.SingleRatePolicy or DualRatePolicy
     ./file.py:Class          the same, by its file
+    ws://HOST:PORT           a server that speaks openpi's websocket protocol; wss:// with TLS
 
 torch is imported only where a policy needs it.
 """
@@ -23,10 +24,12 @@ from policy.contract import Contract
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError
 from policy.foreign.user_class import check_user_class, load_user_class
+from policy.foreign.websocket.kind import SCHEMES, check_server, load_server_policy
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
 from policy.loading.lerobot import LEROBOT, check_lerobot, load_lerobot
 from policy.loading.life import life_method
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
+from policy.loading.timing import measure_times
 from policy.protocol import (
     DualRatePolicy,
     Executable,
@@ -58,6 +61,8 @@ def check_request(request: PolicyRequest) -> None:
     elif kind == LEROBOT:
         check_lerobot(request)
         _require_devices(request)
+    elif kind in SCHEMES:
+        check_server(request.spec, request.contract_file, request.checkpoint)
     else:
         _require_no_path(request.spec)
         check_user_class(request.spec)
@@ -83,7 +88,9 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
 
 
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
-    """Find, build, load and try a policy; ``now_s``, monotonic seconds, is for scripted programs.
+    """Find, build, load, try and time a policy.
+
+    ``now_s``, monotonic seconds, is what it is timed by, and what scripted programs follow.
 
     Raises:
         PolicyError: with what was wrong, what was available and what to do.
@@ -93,13 +100,14 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     reset, close = (life_method(policy, name, request.spec) for name in ("reset", "close"))
     try:
         executable, engine_notes = _on_engine(policy, request, notes)
+        times = measure_times(executable, now_s)
         reset()  # of what the trial on dummy samples left behind
     except BaseException:
         with suppress(PolicyError):
             close()
         raise
     executable = replace(executable, reset=reset, close=close)
-    return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes))
+    return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes), times=times)
 
 
 def _on_engine(
@@ -136,6 +144,8 @@ def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRat
         return _scripted(options, request, now_s), [note]
     if kind == LEROBOT:
         return load_lerobot(request)
+    if kind in SCHEMES:
+        return load_server_policy(request.spec, request.contract_file)
     if kind not in BUILTIN_KINDS:
         return load_user_class(request.spec, request.checkpoint), [
             f"{request.spec}: a class of yours"

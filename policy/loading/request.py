@@ -6,6 +6,7 @@ from pathlib import Path
 from policy.contract import Contract
 from policy.engines.executable import EngineName
 from policy.errors import PolicyError
+from policy.loading.timing import SolveTimes
 from policy.protocol import Executable
 
 
@@ -53,6 +54,8 @@ class LoadedPolicy:
 
     executable: Executable
     notes: tuple[str, ...]
+    times: SolveTimes | None = None
+    """Measured on a dummy sample; None where it had no chunk for that."""
 
     def __enter__(self) -> "LoadedPolicy":
         """Return itself."""

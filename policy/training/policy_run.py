@@ -18,7 +18,7 @@ from policy.checkpoints.policy_file import (
     save_checkpoint,
 )
 from policy.contract import FLIGHT_TERMS, STATE_NAMES
-from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
+from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
@@ -45,6 +45,8 @@ Check: TypeAlias = Callable[[Path], float]
 VALIDATION_SAMPLES = 256
 NORM_IMAGES = 1024
 """Images from which batch norms take their final statistics."""
+USUAL_AGES_MS = (20.0, 90.0)
+"""Age of the image at a tick of a flight with frames at 30 Hz and an encoder of 5 to 35 ms."""
 AGE_BIN_MS = 5
 FINE_TUNE_RATE = 1 / 3
 """Learning rate over the usual one, for weights that were trained before."""
@@ -96,6 +98,12 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         self._flights = [whole[index] for index in kept]
         self._batches = self._batches_of(whole, kept, store)
         self._held = self._batches_of(whole, held, store) if held else None
+        if settings.ages is None and not _are_ages_measured(flights):
+            low_ms, high_ms = USUAL_AGES_MS
+            self.note(
+                f"no policy looked in these flights: image ages of {low_ms:g} to {high_ms:g} ms "
+                "are assumed (--ages names a flight of a policy on this computer, or a range)"
+            )
         if not held:
             self.note("no flight is held out: the last weights will be kept, not the best")
         targets = np.concatenate([flight.target for flight in self._flights])
@@ -214,20 +222,24 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
 
 
 def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds:
-    """Sorted ages of images to train for: measured ones, or a range that is drawn from evenly."""
+    """Sorted ages of images to train for: measured ones, or a range that is drawn from evenly.
+
+    Where nobody's policy looked, as in a human pilot's flights, the usual range.
+    """
     if settings.age_range_ms is not None:
-        low_ms, high_ms = settings.age_range_ms
-        return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
+        return _evenly(settings.age_range_ms)
     if settings.ages is not None:
         return read_ages(Path(settings.ages))
     ages = np.concatenate([flight.age_ns for flight in flights])
     ages = np.sort(ages[(ages > 0) & (ages <= MAX_AGE_MS * NS_PER_MS)])
     if len(ages) == 0:
-        raise DatasetError(
-            "no flight says how old its images were at a tick (feature_captured_ns): name a flight "
-            "of a policy, or a range, with --ages"
-        )
+        return _evenly(USUAL_AGES_MS)
     return ages
+
+
+def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:
+    low_ms, high_ms = range_ms
+    return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
 
 
 def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
@@ -271,6 +283,16 @@ def _state_dict(path: Path) -> dict[str, torch.Tensor]:
     return {str(name): value for name, value in loaded.items() if isinstance(value, torch.Tensor)}
 
 
+def _source_of_ages(flights: Sequence[FlightData], settings: TrainSettings) -> str:
+    if settings.ages is not None:
+        return "--ages"
+    return "the flights" if _are_ages_measured(flights) else "nowhere: the usual range"
+
+
+def _are_ages_measured(flights: Sequence[FlightData]) -> bool:
+    return any((flight.age_ns > 0).any() for flight in flights)
+
+
 def _training_card(
     settings: TrainSettings,
     flights: Sequence[FlightData],
@@ -293,7 +315,7 @@ def _training_card(
         "world_yaw": "drawn evenly",
         "gate_weight": settings.gate_weight,
         "feature_age_ms": {
-            "measured_in": "the flights" if settings.ages is None else "--ages",
+            "measured_in": _source_of_ages(flights, settings),
             "bin_ms": AGE_BIN_MS,
             "counts_from_0": np.histogram(ages_ms, edges)[0].tolist(),
         },

@@ -124,7 +124,7 @@ class TrainSettings(RunSettings):
     """Give the policy its image's age and the motion since; --no-since-exposure to leave it out."""
     ages: str | None = None
     """Image ages to train for: the flight folder that they were measured in, or LOW:HIGH in ms; by
-    default those measured in the flights."""
+    default those measured in the flights, or 20 to 90 ms where no policy flew."""
     start_from: Path | None = None
     """Checkpoint to start from, e.g. after more flights were added."""
     freeze_encoder: bool = False

@@ -10,6 +10,7 @@ from contextlib import suppress
 
 from sitl.ardupilot.failsafe import GcsFailsafe, RadioFailsafe
 from sitl.ardupilot.flight_modes import STOPPED, FlightControl, Mode
+from sitl.ardupilot.gesture import RudderGesture
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import Params
 from sitl.ardupilot.rc import ModeSwitch, RcEngine
@@ -68,6 +69,7 @@ class Autopilot:
         self.control = FlightControl(params)
         """Targets and thrust, for telemetry; only this autopilot commands it."""
         self._mode_switch = ModeSwitch()
+        self._gesture = RudderGesture()
         self._quad = Quadrotor(config.conditions)
         self._wind = Wind(config.conditions, STEP_S)
         self._noise = SensorNoise(config.conditions)
@@ -148,7 +150,7 @@ class Autopilot:
             return "Throttle below failsafe"
         return None
 
-    def _stick_refusal(self) -> str | None:
+    def _stick_refusal(self, *, by_rudder: bool) -> str | None:
         """ArduCopter's reason why mode or sticks forbid arming, or None."""
         if not self.mode.can_arm:
             return f"{self.mode.name} mode not armable"
@@ -161,15 +163,15 @@ class Autopilot:
         if self.params.integer("RC_OPTIONS") & RC_OPTION_SKIP_NEUTRAL_CHECK:
             return None
         for axis, value in (("Roll", sticks.roll), ("Pitch", sticks.pitch), ("Yaw", sticks.yaw)):
-            if value != 0.0:
+            if value != 0.0 and not (by_rudder and axis == "Yaw"):
                 return f"{axis} (RC{self.rc.index_of(axis.upper()) + 1}) is not neutral"
         return None
 
-    def arm(self, *, force: bool) -> bool:
+    def arm(self, *, force: bool, by_rudder: bool = False) -> bool:
         """Start the motors; a refusal becomes a status text. True if armed afterwards."""
         if self.armed:
             return True
-        refusal = self.prearm_refusal() or self._stick_refusal()
+        refusal = self.prearm_refusal() or self._stick_refusal(by_rudder=by_rudder)
         if refusal is not None and not force:
             self._send_text(SEVERITY_CRITICAL, f"Arm: {refusal}")
             return False
@@ -317,6 +319,11 @@ class Autopilot:
     def _read_radio(self) -> None:
         new_input = self.rc.update(self.now_ns)
         self._read_mode_switch()
+        match self._gesture.update(read_sticks(self.rc, self.params), self.now_ns):
+            case "arm":
+                self.arm(force=False, by_rudder=True)
+            case "disarm":
+                self.disarm(force=False)
         changed = self.radio_failsafe.update(
             new_input=new_input,
             throttle_us=self.rc.channels_us[self.rc.index_of("THROTTLE")],

@@ -17,6 +17,9 @@ CHECK_PERIOD_NS = 20 * NS_PER_MS
 LOW_THROTTLE, MIDDLE_THROTTLE = -0.8, 0.2
 """Most that arming allows where the stick is thrust, and where it is a climb rate."""
 
+_BOOT_MODES = {1: Mode.ALTCTL, 2: Mode.POSCTL}
+"""COM_FLTMODE_BOOT; 4, and whatever this vehicle does not have, is Hold."""
+
 
 class Commander:
     """Decides on mode and arming of one boot; texts and events wait in lists for the links."""
@@ -25,8 +28,8 @@ class Commander:
         self._params = params
         self._sticks = sticks
         self._boot_ns = self.now_ns = boot_ns
-        self.mode = self.intended = Mode.AUTO_LOITER
-        self._last_armable = Mode.AUTO_LOITER
+        boot_mode = _BOOT_MODES.get(params.integer("COM_FLTMODE_BOOT"), Mode.AUTO_LOITER)
+        self.mode = self.intended = self._last_armable = boot_mode
         self.armed = False
         self.terminated = False
         self.landed = True

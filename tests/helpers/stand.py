@@ -66,6 +66,8 @@ class Flight:
         self.relay = relay
         self._shm = shm
         self._vehicle_flags = vehicle
+        self.cameras: tuple[str, ...] = ()
+        """Names of the policy's cameras, where it has several: all see the vehicle's."""
         self._vehicle = self._start_vehicle()
         self._flags: tuple[str, ...] = ()
         self._is_read = True
@@ -102,7 +104,9 @@ class Flight:
         """A bridge for this vehicle, without any flag of its flight."""
         address = f"udp:127.0.0.1:{self.relay.bridge_port}"
         command = [sys.executable, "-m", "mavbridge", "--connect", address]
-        return [*command, "--camera", f"shm:{self._shm}", "--report", str(report)]
+        sources = [f"{name}=shm:{self._shm}" for name in self.cameras] or [f"shm:{self._shm}"]
+        cameras = [flag for source in sources for flag in ("--camera", source)]
+        return [*command, *cameras, "--report", str(report)]
 
     def environment(self) -> dict[str, str]:
         folder = str(Path(__file__).parents[1])

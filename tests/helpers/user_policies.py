@@ -141,6 +141,41 @@ class HangingEncoder(Leaning):
         return super().encode_visual(image)
 
 
+class TwoEyed(Leaning):
+    """Takes two images of each of two cameras; leans only if they are the right ones."""
+
+    contract = Contract(
+        arrays="numpy",
+        feature_dim=2,
+        image_height=32,
+        image_width=32,
+        cameras=("front", "down"),
+        camera_rates_hz=(30.0, 15.0),
+        observation_steps=2,
+        observation_dt_s=0.1,
+    )
+
+    def encode_visual(self, image: Array, camera: int = 0) -> Array:
+        return np.full((1, 2), camera, np.float32)
+
+    def predict_fast(
+        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
+    ) -> Array:
+        if feature.tolist() != [[[0, 0, 1, 1]] * 2] or state.shape != (1, 2, 13):
+            raise ValueError(f"features {feature.tolist()}, states {state.shape}")
+        return super().predict_fast(feature, state, action_history, num_diffusion_steps)
+
+
+class HangingBelow(TwoEyed):
+    """The encoder of the second camera stops answering once the flight leans."""
+
+    def encode_visual(self, image: Array, camera: int = 0) -> Array:
+        if camera == 1 and self._flown is not None and self._flown > self.fault_calls:
+            mark_fault()
+            time.sleep(HANG_S)  # noqa: TID251 - the hang itself
+        return super().encode_visual(image, camera)
+
+
 class AlwaysNan(Leaning):
     def misbehave(self, chunk: Array) -> None:
         if self.has_begun:

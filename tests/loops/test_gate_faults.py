@@ -4,13 +4,16 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
+import numpy as np
 import pytest
 
 from helpers.gate_flights import CONTRACT, HOVER, MS, NAN, GateFlight, hovering, leaning
 from mavbridge.config.flight import EnvelopeConfig, Limits
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import FloatArray
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
@@ -142,6 +145,7 @@ def test_a_contract_with_longer_limits_flies_a_slow_policy() -> None:
         max_velocity_age_s=2.0,
         max_chunk_age_s=2.0,
         max_feature_age_s=2.0,
+        horizon=32,  # 1.6 s, longer than solve and period
     )
     flight = GateFlight(contract=slow, rates=Rates(action_rate=2.0))
     flight.solve_ns = 400 * MS
@@ -153,6 +157,85 @@ def test_a_contract_with_longer_limits_flies_a_slow_policy() -> None:
     assert flight.phase is Phase.FLYING, flight.describe()
     sent_ns = [at_ns for at_ns, _ in flight.sticks_sent()]
     assert max(b - a for a, b in pairwise(sent_ns)) < 16 * MS, "100 sticks a second all the same"
+
+
+# --- slow policies, which play each chunk for long
+
+
+class PlayedFlight(GateFlight):
+    """A policy that plans its whole horizon: each action is that of its own time."""
+
+    def _act(
+        self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        self._policy_clock.ahead_ns += self.solve_ns
+        start_s = self.clock.now_ns() / NS_PER_S
+        plan = [self.policy(start_s + 0.05 * step) for step in range(self._horizon)]
+        return np.array([plan], np.float32)
+
+
+def played(hz: float, *, horizon: int = 64) -> PlayedFlight:
+    """A flight of a policy whose contract makes it ``hz`` chunks a second, in 150 ms each."""
+    contract = replace(CONTRACT, play_s=2 / hz, horizon=horizon)
+    flight = PlayedFlight(weaving, contract=contract, on_fault="release")
+    flight.solve_ns = 150 * MS
+    flight.launch()
+    flight.run(2.5 / hz)
+    flight.act("engage")
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.1)
+    return flight
+
+
+def oldest_s(flight: GateFlight) -> float:
+    """Greatest age of an attitude when a stick that came from it left."""
+    return max((t.sent_ns - t.state.attitude_ns) / NS_PER_S for t in flown_ticks(flight))
+
+
+def flown_ticks(flight: GateFlight) -> list[Any]:
+    return [t for t in flight.sink.ticks if t.trace is not None and t.state is not None]
+
+
+@pytest.mark.parametrize("hz", [1.0, 2.0, 5.0])
+def test_a_slow_policy_flies_its_plan_at_the_stick_rate(hz: float) -> None:
+    flight = played(hz)
+    flight.run(6)
+
+    assert flight.phase is Phase.FLYING, flight.describe()
+    ticks = flown_ticks(flight)
+    assert len({t.chunk_serial for t in ticks}) == pytest.approx(6 * hz, abs=2)
+    assert max(b.sent_ns - a.sent_ns for a, b in pairwise(ticks)) < 16 * MS
+    assert not any(t.is_coasting for t in ticks)
+    assert oldest_s(flight) < 1 / hz + 0.2
+    for tick in ticks:
+        wanted = weaving(tick.sent_ns / NS_PER_S + Limits().tau)
+        assert tick.trace.raw == pytest.approx(wanted, abs=0.05)
+
+
+@pytest.mark.parametrize(("horizon", "within_s"), [(64, 1.2), (20, 1.1)])
+def test_a_slow_policy_that_hangs_is_flown_no_longer_than_its_chunk_may_be(
+    horizon: int, within_s: float
+) -> None:
+    """The attitude may be 0.1 + 1 s old, or the horizon is 1 s; 0.1 s bridge what comes late."""
+    flight = played(2.0, horizon=horizon)
+    flight.run(2)
+    flight.is_flight_process_stopped = True
+    flight.until(lambda: flight.phase is Phase.LEAVING, within_s=within_s)
+    neutral_ns = flight.clock.now_ns()
+    flight.run(4)
+
+    assert "no chunk of the policy" in flight.reason
+    assert oldest_s(flight) <= within_s
+    assert largest(flight, neutral_ns) < 0.01
+
+
+def test_the_death_of_a_slow_policy_is_noticed_as_fast() -> None:
+    flight = played(1.0)
+    flight.run(2)
+    died_ns = flight.clock.now_ns()
+    flight.die()
+    flight.run(0.06)
+    assert flight.phase is not Phase.FLYING
+    assert largest(flight, died_ns + 20 * MS) < 0.01
 
 
 # --- inputs

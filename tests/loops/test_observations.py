@@ -1,14 +1,18 @@
 """A policy that looks through two cameras and back in time, flown in memory."""
 
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 
 from helpers.fakes import ListSink
+from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
+from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 
@@ -131,3 +135,85 @@ def test_the_simulator_says_which_cameras_it_has() -> None:
     executable = make_numpy_executable(Watchful(one.clock, contract), ExecutionSettings(name="w"))
     with pytest.raises(UserError, match=r"no cameras \['wrist'\].*front, down, left, right, back"):
         one.fly(executable, max_time_s=1.0)
+
+
+class GoalSeeker(Watchful):
+    """Flies to its goal by velocities, or climbs by sticks."""
+
+    def encode_visual(self, image: np.ndarray, camera: int = 0) -> np.ndarray:
+        return np.zeros((1, 1), np.float32)
+
+    def predict_fast(self, feature: Any, state: Any, history: Any, steps: int) -> np.ndarray:
+        self.calls.append((self._clock.now_ns(), feature, state))
+        chunk = np.zeros((1, self.contract.horizon, 4), np.float32)
+        if self.contract.action == "sticks":
+            chunk[..., 0] = 0.5
+            return chunk
+        to_goal, distance_m = state[0, 13:16], float(np.linalg.norm(state[0, 13:16]))
+        chunk[..., :3] = min(2.0, distance_m) * to_goal / max(distance_m, 1e-3)
+        return chunk
+
+
+@pytest.mark.parametrize(("autopilot", "action"), [("ardupilot", "sticks"), ("px4", "velocity")])
+def test_goal_height_and_altitude_are_those_of_the_vehicle(autopilot: Any, action: Any) -> None:
+    goal = (3.0, -2.0, -4.0)
+    one = SimulatedFlight(
+        course_seed=3,
+        seed=0,
+        settings=SimulationSettings(goal="3,-2,-4", draw_images=False),
+        vehicle=make_vehicle(autopilot=autopilot),
+    )
+    contract = Contract(
+        arrays="numpy",
+        feature_dim=1,
+        action=action,
+        state_extras=("goal", "height", "altitude"),
+        image_height=32,
+        image_width=32,
+    )
+    policy = GoalSeeker(one.clock, contract)
+    executable = make_numpy_executable(policy, ExecutionSettings(name="seeker"))
+    policy.calls.clear()
+    one.fly(executable, max_time_s=12.0 if action == "velocity" else 3.0)
+    place_ned_m = np.array(one.vehicle.ap.truth.position_ned_m)
+    if action == "velocity":
+        assert place_ned_m == pytest.approx(goal, abs=0.4)
+    assert -place_ned_m[2] > 2
+    _, _, state = policy.calls[-1]
+    assert state.shape == (1, 18)
+    np.testing.assert_allclose(state[0, 13:16], np.array(goal) - place_ned_m, atol=0.3)
+    np.testing.assert_allclose(state[0, 16:], -place_ned_m[2], atol=0.3)
+
+
+def test_a_slow_policy_gets_the_states_between_its_solves() -> None:
+    """It solves twice a second; the past state is 0.1 s old, not as old as the last solve."""
+    settings = SimulationSettings(rates=Rates(action_rate=2.0), draw_images=False)
+    one = SimulatedFlight(course_seed=3, seed=0, settings=settings)
+    contract = replace(
+        TWO_EYES,
+        horizon=64,
+        play_s=1.0,
+        max_state_age_s=1.0,
+        max_velocity_age_s=1.0,
+        max_chunk_age_s=1.0,
+    )
+    policy = Watchful(one.clock, contract)
+    executable = make_numpy_executable(policy, ExecutionSettings(name="slow"))
+    policy.calls.clear()
+    north_mps: dict[int, float] = {}
+    one.watch_steps(
+        lambda: north_mps.update({one.clock.now_ns(): one.vehicle.ap.truth.velocity_ned_mps[0]})
+    )
+    one.fly(executable, max_time_s=6.0)
+
+    def near(at_ns: int) -> float:
+        return north_mps[min(north_mps, key=lambda stamp_ns: abs(stamp_ns - at_ns))]
+
+    calls = policy.calls[-8:]
+    assert all(b[0] - a[0] > 450 * MS for a, b in pairwise(calls))
+    then = np.array([state[0, 0, 0] for _, _, state in calls])
+    # An attitude is some 10 ms old when it is used.
+    wanted = np.array([near(now_ns - STEP_NS - 10 * MS) for now_ns, _, _ in calls])
+    np.testing.assert_allclose(then, wanted, atol=0.1)
+    of_last_solve = np.array([near(now_ns - 500 * MS) for now_ns, _, _ in calls])
+    assert np.abs(then - of_last_solve).max() > 0.5

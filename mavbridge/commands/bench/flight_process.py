@@ -57,7 +57,7 @@ def measure_flight(
 def _measure(
     job: FlightJob, clock: Clock, executable: Executable, alter: Callable[[Executable], Executable]
 ) -> None:
-    loops = job.rates.loops(is_dual=executable.dual_rate)
+    loops = job.rates.loops(is_dual=executable.dual_rate, play_s=executable.contract.play_s)
     meter = FlightMeter(
         stick_hz=job.rates.stick_rate, action_hz=loops.action_hz, vision_hz=loops.max_vision_hz
     )

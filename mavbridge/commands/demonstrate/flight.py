@@ -105,7 +105,7 @@ def _meta(spec: DemonstrationSpec, variation: Variation, executable: Executable)
         policy=executable.name,
         engine=executable.engine,
         mode="dual",
-        action_hz=Rates().action_rate,
+        action_hz=Rates().loops(is_dual=True).action_hz,
         visual_hz=Rates().visual_limits_hz[1],
         contract=executable.contract,
         course_seed=spec.seed,

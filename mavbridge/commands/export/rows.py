@@ -105,11 +105,14 @@ def common_fps(parts: Sequence[Stretch]) -> int:
         UserError: flights of several rates.
     """
     fps = max(1, round(_rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))))
+    by_flight: dict[str, list[Nanoseconds]] = {}
     for part in parts:
-        own = _rate_hz(np.diff(part.captured_ns))
+        by_flight.setdefault(part.episode.name, []).append(np.diff(part.captured_ns))
+    for name, periods in by_flight.items():  # a stretch of a few frames has no rate of its own
+        own = _rate_hz(np.concatenate(periods))
         if abs(own / fps - 1.0) > MAX_RATE_OFF:
             raise UserError(
-                f"{part.episode.name} has {own:.3g} frames a second, most of the rest {fps}: a "
+                f"{name} has {own:.3g} frames a second, most of the rest {fps}: a "
                 "LeRobot dataset has one rate, so export them apart"
             )
     return fps

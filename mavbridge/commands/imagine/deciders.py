@@ -90,8 +90,15 @@ class PolicyDecider:
         """Make sure that the two belong together.
 
         Raises:
-            UserError: policy and world model have their states in different frames.
+            UserError: policy and world model have their states in different frames, or the policy
+                takes what nobody imagines.
         """
+        seen = executable.contract
+        if len(seen.cameras) > 1 or seen.observation_steps > 1 or seen.state_extras:
+            raise UserError(
+                f"{executable.name} takes several cameras, past observations or a place in the "
+                "world; flights are imagined for policies that take the newest image and state"
+            )
         ours, theirs = sampler.config.contract.state_frame, executable.contract.state_frame
         if ours != theirs:
             raise UserError(

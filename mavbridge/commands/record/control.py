@@ -16,6 +16,7 @@ MIDDLE_NS = 300 * NS_PER_MS
 
 Mark: TypeAlias = Literal["good", "bad"]
 Position: TypeAlias = Literal["low", "middle", "high"]
+_MARKS: dict[str, Mark] = {GOOD_KEY: "good", BAD_KEY: "bad"}
 
 
 class Seen(NamedTuple):
@@ -54,28 +55,38 @@ class EpisodeControl:
         """When the switch came from high to the middle."""
         self._was_armed = False
         self._disarmed_ns: int | None = None
+        self._wanted: str | None = None
+        """Why the switch or the arming wants an episode that could not begin yet."""
 
     def step(self, seen: Seen) -> Orders:
         """Advance to this moment."""
         keyed = self._by_keys(seen)
         switched = self._by_switch(seen) if self._has_switch else Orders()
         armed = self._by_arming(seen) if self._on_arm else Orders()
+        self._keep_wanting(seen, switched.begin or armed.begin)
         every = (keyed, switched, armed)
         return Orders(
             mark_before=next((o.mark_before for o in every if o.mark_before), None),
             end=next((o.end for o in every if o.end), None),
-            begin=next((o.begin for o in every if o.begin), None),
+            begin=keyed.begin or self._wanted,
             quit=keyed.quit,
         )
 
+    def _keep_wanting(self, seen: Seen, begin: str | None) -> None:
+        """Ask again for as long as the switch is high, or the vehicle armed: what was missing for
+        an episode may come."""
+        is_on = self._position == "high" if self._has_switch else seen.armed
+        if begin is not None:
+            self._wanted = begin
+        elif seen.is_recording or not is_on:
+            self._wanted = None
+
     def _by_keys(self, seen: Seen) -> Orders:
-        mark: Mark | None = None
-        for key in seen.keys:
-            mark = {GOOD_KEY: "good", BAD_KEY: "bad"}.get(key, mark)  # type: ignore[assignment]
+        marks = [_MARKS[key] for key in seen.keys if key in _MARKS]
         is_toggled = sum(seen.keys.count(key) for key in (TOGGLE_KEY, " ")) % 2 == 1
         is_over = QUIT_KEY in seen.keys
         return Orders(
-            mark_before=mark,
+            mark_before=marks[-1] if marks else None,
             end="a key" if seen.is_recording and (is_toggled or is_over) else None,
             begin="a key" if is_toggled and not (seen.is_recording or is_over) else None,
             quit=is_over,

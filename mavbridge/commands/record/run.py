@@ -17,7 +17,7 @@ from mavbridge.camera.open import NO_CAMERA, check_camera, open_camera
 from mavbridge.commands.record.control import KEYS, KEYS_HINT, EpisodeControl, Orders, Seen
 from mavbridge.commands.record.disk import LEAST_S, DiskWatch
 from mavbridge.commands.record.episodes import Episodes, prepare_out
-from mavbridge.commands.record.pilot_view import PilotView
+from mavbridge.commands.record.pilot_view import STICKS_FRESH_NS, PilotView
 from mavbridge.commands.record.screen import RecordScreen, Shown
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import Rates
@@ -135,6 +135,8 @@ class _Session:
         )
         self._disk = DiskWatch(config.out, reserve_bytes=config.disk_reserve * 1e9)
         self._disk_s, self._disk_due_ns = 0.0, 0
+        self._told_missing: str | None = None
+        """Why the last begin was refused."""
         vision_hz = config.film.visual_rate
         self.screen = RecordScreen(console, rate_hz=config.rate, vision_hz=vision_hz)
         viewer = self._open_viewer()
@@ -272,13 +274,16 @@ class _Session:
         elif (crash := self._episodes.crash) is not None:
             self._episodes.end(f"a crash ({crash})")
         if orders.begin is None:
+            self._told_missing = None
             return
         missing = self._missing()
         if missing is None and not self._disk.may_begin:
             left_s = self._disk.left_s()
             missing = f"room on the disk for {left_s:.0f} of {LEAST_S:.0f} s above --disk-reserve"
+        told, self._told_missing = self._told_missing, missing
         if missing is not None:
-            self.screen.show_message(f"not recording: {missing}")
+            if missing != told:
+                self.screen.show_message(f"not recording: {missing}")
             return
         self._episodes.begin()
         doubt = self._doubt()
@@ -293,8 +298,11 @@ class _Session:
             return "no attitude from the vehicle"
         if self._view.telemetry().velocity_ned_mps is None:
             return "no velocity from the vehicle: it has no position estimate"
-        if self._view.status.rc_sticks is None:
+        is_silent = self._clock.now_ns() - self._view.sticks_ns > STICKS_FRESH_NS
+        if is_silent:
             return "no sticks of a pilot: is the transmitter on?"
+        if self._view.status.rc_sticks is None:
+            return f"the pilot's sticks cannot be read ({self._view.reason})"
         return None
 
     def _doubt(self) -> str | None:

@@ -46,7 +46,7 @@ class Attitude(NamedTuple):
 
     is_quaternion: bool
     boot_us: int
-    """Vehicle's clock since it started; 0 = the vehicle does not say. Also in the next two."""
+    """Vehicle's clock since it started; 0 = the vehicle does not say. Also in the next three."""
     ned_from_body_wxyz: tuple[float, float, float, float]
     rate_body_radps: tuple[float, float, float]
 
@@ -107,10 +107,12 @@ class VelocityTarget(NamedTuple):
 
 
 class Altitude(NamedTuple):
-    """GLOBAL_POSITION_INT (33), of which only the height is used."""
+    """GLOBAL_POSITION_INT (33), of which only the heights are used."""
 
     amsl_m: float
     """Above mean sea level."""
+    above_home_m: float = 0.0
+    boot_us: int = 0
 
 
 class SystemStatus(NamedTuple):
@@ -220,7 +222,7 @@ Body: TypeAlias = (
 )
 
 
-Measurement: TypeAlias = Attitude | LocalVelocity | SpecificForce
+Measurement: TypeAlias = Attitude | LocalVelocity | SpecificForce | Altitude
 """Parts of the vehicle's state, each with the vehicle's own stamp."""
 
 

@@ -165,7 +165,9 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
     "MANUAL_CONTROL": lambda m: ManualControl(m.x, m.y, m.z, m.r),
     "ATTITUDE_TARGET": _attitude_target,
     "POSITION_TARGET_LOCAL_NED": _velocity_target,
-    "GLOBAL_POSITION_INT": lambda m: Altitude(m.alt / 1000),
+    "GLOBAL_POSITION_INT": lambda m: Altitude(
+        m.alt / 1000, m.relative_alt / 1000, 1000 * m.time_boot_ms
+    ),
     "CURRENT_MODE": lambda m: CurrentMode(m.custom_mode, m.intended_custom_mode),
     "EVENT": lambda m: Event(m.id),
     "SYS_STATUS": _sys_status,

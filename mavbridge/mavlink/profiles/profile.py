@@ -34,6 +34,10 @@ def optional_stream(message: str, rate_hz: float, *, least_hz: float | None = No
     return StreamGroup((message,), None, rate_hz, is_optional=True, least_hz=least_hz)
 
 
+HOME_HEIGHT = optional_stream("GLOBAL_POSITION_INT", 20.0, least_hz=5.0)
+"""Height above home, for a policy that takes it: as often as a velocity may be old, and some."""
+
+
 class EventMeaning(NamedTuple):
     """What an EVENT says about the vehicle."""
 

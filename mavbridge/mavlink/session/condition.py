@@ -76,7 +76,7 @@ class VehicleCondition:
                 self._receive_mode(body, arrived_ns)
             case Event(event_id):
                 self._receive_event(event_id, arrived_ns)
-            case Altitude(amsl_m):
+            case Altitude(amsl_m=amsl_m):
                 self._altitude = (arrived_ns, amsl_m)
             case LocalVelocity():
                 self._position = (arrived_ns, body)

@@ -46,6 +46,11 @@ class _Stream:
         number = message_id(self.group.messages[self._choice % len(self.group.messages)])
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
+    def want(self, group: StreamGroup) -> None:
+        """Ask anew, for this group of the same messages."""
+        self.group, self.rate_hz, self.attempts = group, group.rate_hz, 0
+        self.is_settled = self.is_given_up = False
+
     def accept(self) -> None:
         self.is_settled, self.attempts = True, 0
 
@@ -120,8 +125,11 @@ class StreamRequester:
             self.add(group)
 
     def add(self, group: StreamGroup) -> None:
-        """Keep this group coming too, unless its message is kept coming already."""
-        if group.messages[0] not in self._by_message:
+        """Keep this group coming too, unless its message is kept coming already at that rate."""
+        known = self._by_message.get(group.messages[0])
+        if known is not None and known.group.rate_hz < group.rate_hz:
+            known.want(group)
+        elif known is None:
             stream = _Stream(group)
             self._streams.append(stream)
             self._by_message |= dict.fromkeys(group.messages, stream)

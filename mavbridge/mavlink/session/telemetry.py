@@ -2,7 +2,7 @@
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Reading, Telemetry
-from mavbridge.mavlink.codec.messages import Attitude, LocalVelocity, Measurement
+from mavbridge.mavlink.codec.messages import Altitude, Attitude, LocalVelocity, Measurement
 
 _YIELD_NS = 300 * NS_PER_MS
 """Silence after which a better message gives way to a worse one."""
@@ -52,11 +52,13 @@ class TelemetryCollector:
 
     def __init__(self) -> None:
         self._attitude_filter, self._velocity_filter = _Filter(), _Filter()
-        self._force_filter = _Filter()
+        self._force_filter, self._height_filter = _Filter(), _Filter()
         self._attitude: Reading | None = None
         self._rate: Reading | None = None
         self._velocity: Reading | None = None
         self._force: Reading | None = None
+        self._position: Reading | None = None
+        self._height: Reading | None = None
 
     def receive(self, body: Measurement, arrived_ns: int, happened_ns: int) -> None:
         """Take a message, with its arrival and the time that it tells about."""
@@ -71,6 +73,12 @@ class TelemetryCollector:
             delay_ns = self._velocity_filter.delay_ns(0, boot_us, arrived_ns, happened_ns)
             if delay_ns is not None:
                 self._velocity = Reading(arrived_ns, body.velocity_ned_mps, delay_ns)
+                if body.position_ned_m is not None:
+                    self._position = Reading(arrived_ns, body.position_ned_m, delay_ns)
+        elif isinstance(body, Altitude):
+            delay_ns = self._height_filter.delay_ns(0, boot_us, arrived_ns, happened_ns)
+            if delay_ns is not None:
+                self._height = Reading(arrived_ns, (body.above_home_m,), delay_ns)
         else:
             rank = _FORCE_RANK[body.message_name]
             delay_ns = self._force_filter.delay_ns(rank, boot_us, arrived_ns, happened_ns)
@@ -89,4 +97,6 @@ class TelemetryCollector:
             rate_body_radps=self._rate,
             velocity_ned_mps=self._velocity,
             specific_force_body_mps2=self._force,
+            position_ned_m=self._position,
+            height_above_home_m=self._height,
         )

@@ -26,6 +26,7 @@ from mavbridge.mavlink.codec.messages import (
     StatusText,
 )
 from mavbridge.mavlink.profiles.choice import require_profile
+from mavbridge.mavlink.profiles.profile import HOME_HEIGHT
 from mavbridge.mavlink.session.condition import ConditionMessage, VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
@@ -96,6 +97,10 @@ class VehicleSession:
         """Fly with this output from now on: its echo is asked for, its demands are checked."""
         self._params.use_output(output)
         self._streams.add(self.profile.echo(output))
+
+    def watch_home_height(self) -> None:
+        """Keep the height above home coming, often enough to fly by."""
+        self._streams.add(HOME_HEIGHT)
 
     @property
     def has_rebooted(self) -> bool:

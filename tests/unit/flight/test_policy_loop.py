@@ -16,8 +16,9 @@ from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import ObservationSource
-from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
+from mavbridge.flight.policy_loop import RETRY_NS, PolicyLoop, PolicySettings
 from mavbridge.flight.state import Freshness
+from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.engagement import Phase
@@ -36,6 +37,7 @@ class Rig:
         self,
         chunk: Callable[[], FloatArray] | None = None,
         frame: ActionFrame = STICKS_FRAME,
+        period_ms: int = 10,
     ) -> None:
         self.clock, self.cache, self.end = FakeClock(), FeatureCache(), WireEnd()
         history = SentHistory(length=2, dt_s=0.05, frame=frame)
@@ -49,6 +51,7 @@ class Rig:
         self.loop = PolicyLoop(
             clock=self.clock,
             view=self.view,
+            reader=StateReader(Contract(), freshness=FRESH),
             observations=ObservationSource(
                 Contract(),
                 caches=(self.cache,),
@@ -61,12 +64,10 @@ class Rig:
             reset=self._reset,
             send=self.sent.append,
             settings=PolicySettings(
-                state_frame="ned_frd",
                 action_frame=frame,
                 chunk_dt_s=0.05,
-                freshness=FRESH,
                 max_frozen_ns=500 * MS,
-                period_ns=10 * MS,
+                period_ns=period_ms * MS,
             ),
         )
 
@@ -237,6 +238,14 @@ def test_an_attitude_starts_a_solve_from_a_quarter_of_a_period_before_it_is_due(
     for at_ms, is_wanted in ((7, False), (7.3, False), (7.5, True)):
         rig.clock = FakeClock(START_NS + round(at_ms * MS))
         assert rig.measure().loop.has_news is is_wanted, at_ms
+
+
+def test_a_slow_policy_tries_again_soon_after_a_solve_without_inputs() -> None:
+    rig = Rig(period_ms=1000)
+    rig.measure().loop.step()  # no image yet
+    assert rig.loop.start_ns <= START_NS + RETRY_NS
+    run_on(rig, 120)
+    assert rig.loop.start_ns > rig.clock.now_ns() + 500 * MS
 
 
 def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() -> None:

@@ -1,10 +1,20 @@
 from dataclasses import replace
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import Sticks
-from mavbridge.gate.chunks import MAX_REFUSED, SLOW_CHUNKS, Chunk, ChunkBuffer, FreshnessLimits
+from mavbridge.core.vehicle import NEUTRAL, Sticks
+from mavbridge.gate.chunks import (
+    GRACE_PERIODS,
+    LEAST_GRACE_NS,
+    MAX_REFUSED,
+    SLOW_CHUNKS,
+    Chunk,
+    ChunkBuffer,
+    FreshnessLimits,
+)
 
 MS = NS_PER_MS
 LIMITS = FreshnessLimits(
@@ -89,6 +99,71 @@ def test_without_a_new_chunk_it_coasts_for_the_grace_and_then_is_at_fault() -> N
 @pytest.mark.parametrize(("period_ms", "grace_ms"), [(2, 100), (10, 100), (33, 100), (500, 1500)])
 def test_the_grace_is_100_ms_or_three_periods(period_ms: int, grace_ms: int) -> None:
     assert buffer(period_ms).grace_ns == grace_ms * MS
+
+
+def test_the_grace_of_a_slow_policy_ends_with_its_limits() -> None:
+    slow = buffer(500)
+    slow.offer(chunk(1, 1000), 1000 * MS)  # from an attitude at 995 ms, which may be 100 ms old
+    assert slow.fault(1195 * MS) is None
+    assert "195 ms" in (slow.fault(1195 * MS + 1) or "")
+
+
+def test_a_chunk_that_is_meant_to_be_played_for_a_second_may_be_older_by_that() -> None:
+    played = buffer(500, LIMITS.while_played(NS_PER_S))
+    played.offer(chunk(1, 1000, actions=(NEUTRAL,) * 40), 1000 * MS)
+    assert not played.is_coasting(2000 * MS)
+    assert played.fault(2195 * MS) is None
+    assert "1195 ms" in (played.fault(2195 * MS + 1) or "")
+
+
+def test_the_grace_of_a_slow_policy_ends_with_its_horizon() -> None:
+    played = buffer(500, LIMITS.while_played(NS_PER_S))
+    played.offer(chunk(1, 1000), 1000 * MS)  # its last action ends at 1795 ms
+    assert played.fault(1895 * MS) is None
+    assert played.fault(1895 * MS + 1) is not None
+
+
+def test_chunks_that_are_farther_apart_than_one_may_be_flown_begin_no_flight() -> None:
+    slow = buffer(500)
+    for serial, now_ms in enumerate((1000, 1500, 2000), start=1):
+        slow.offer(chunk(serial, now_ms), now_ms * MS)
+    assert "come up to 500 ms apart, beyond the 195 ms" in (slow.problem(2000 * MS) or "")
+    assert "ask for a higher rate" in (slow.problem(2000 * MS) or "")
+
+
+ages = st.integers(0, 400).map(lambda ms: ms * MS)
+
+
+@given(
+    period_ms=st.integers(2, 2000),
+    play_ns=ages,
+    taken=st.tuples(ages, ages, ages),
+    steps=st.integers(1, 16),
+)
+def test_no_action_is_flown_beyond_the_horizon_or_100_ms_beyond_a_limit(
+    period_ms: int, play_ns: int, taken: tuple[int, int, int], steps: int
+) -> None:
+    limits, now_ns = LIMITS.while_played(play_ns), 1000 * MS
+    held = buffer(period_ms, limits)
+    attitude_ns, image_ns, computed_ns = (now_ns - age_ns for age_ns in taken)
+    offered = chunk(
+        1,
+        1000,
+        attitude_ns=attitude_ns,
+        first_ns=attitude_ns,
+        image_ns=image_ns,
+        computed_ns=computed_ns,
+        actions=(NEUTRAL,) * steps,
+    )
+    kept_ns = min(
+        attitude_ns + limits.state_ns, image_ns + limits.feature_ns, computed_ns + limits.chunk_ns
+    )
+    assert held.offer(offered, now_ns) == (now_ns <= kept_ns)
+    for at_ns in range(now_ns, now_ns + 3000 * MS, 25 * MS):
+        if held.fault(at_ns) is None and held.action_at(at_ns) is not None:
+            assert at_ns <= kept_ns + LEAST_GRACE_NS
+            assert at_ns <= offered.end_ns
+            assert at_ns <= now_ns + max(LEAST_GRACE_NS, GRACE_PERIODS * period_ms * MS)
 
 
 def test_stale_chunks_that_keep_coming_do_not_prolong_the_grace() -> None:

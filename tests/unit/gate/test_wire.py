@@ -76,7 +76,7 @@ TICK = GateTick(
     phase=Phase.FLYING,
     reason="",
 )
-STATUS = GateStatus("ArduPilot 4.6.3", "ALT_HOLD", True, False, (1500,) * 8, STICKS)
+STATUS = GateStatus("ArduPilot 4.6.3", "ALT_HOLD", True, False, (1500,) * 8, STICKS, True)
 STATS = LinkStats(
     messages_per_s=(("ATTITUDE_QUATERNION", 99.9), ("HEARTBEAT", 10.0)),
     lost_fraction=0.25,

@@ -141,7 +141,10 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
         m.position_target_local_ned_encode(7, 1, 3079, nan, nan, nan, 1, 2, -3, 0, 0, 0, 0, 0.5),
         VelocityTarget(7000, 3079, (1, 2, -3), 0.5),
     ),
-    (m.global_position_int_encode(7, 0, 0, 489423, 0, 0, 0, 0, 0), Altitude(amsl_m=489.423)),
+    (
+        m.global_position_int_encode(7, 0, 0, 489423, -12345, 0, 0, 0, 0),
+        Altitude(amsl_m=489.423, above_home_m=-12.345, boot_us=7000),
+    ),
     (m.timesync_encode(5, -6), Timesync(tc1=5, ts1=-6)),
     (
         m.autopilot_version_encode(0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 0),

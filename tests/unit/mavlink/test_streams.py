@@ -12,7 +12,7 @@ from mavbridge.mavlink.codec.messages import (
     StreamRequest,
 )
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
-from mavbridge.mavlink.profiles.profile import Profile, StreamGroup
+from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile, StreamGroup
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.streams import StreamRequester, message_id
 
@@ -170,6 +170,15 @@ def test_an_echo_is_asked_for_once_it_is_known_which() -> None:
     settle(ardupilot)
     ardupilot.add(ARDUPILOT.echo("rc-override"))  # comes anyway
     assert settle(ardupilot) == []
+
+
+def test_a_height_that_a_policy_takes_is_asked_for_more_often() -> None:
+    for profile in (PX4, ARDUPILOT):
+        requester = StreamRequester(profile.streams(state_hz=100))
+        settle(requester)
+        requester.add(HOME_HEIGHT)
+        requester.add(HOME_HEIGHT)
+        assert [ids(request) for request in settle(requester)] == [(33, 50_000)]
 
 
 def settle(requester: StreamRequester) -> list[Request]:

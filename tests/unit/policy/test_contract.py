@@ -53,7 +53,7 @@ def header_of_version_1(**changes: object) -> dict[str, Any]:
 def test_version_1_flies_sticks_in_the_modes_that_hold_altitude() -> None:
     contract = Contract.from_json(json.dumps(header_of_version_1(horizon=8)))
     assert contract == Contract(horizon=8)
-    assert contract.version == 3
+    assert contract.version == 4
     assert (contract.action, contract.modes) == ("sticks", ("ALT_HOLD", "ALTCTL"))
     ages_s = (contract.max_state_age_s, contract.max_velocity_age_s)
     assert (*ages_s, contract.max_feature_age_s, contract.max_chunk_age_s) == (0.1, 0.25, 0.3, 0.3)
@@ -78,6 +78,19 @@ def test_a_header_that_does_not_speak_of_the_exposure_is_of_thirteen_numbers() -
     assert replace(contract, since_exposure=True).state_dim == 20
 
 
+def test_shapes_grow_by_cameras_observations_and_extras() -> None:
+    one = Contract(feature_dim=64, image_height=48, image_width=96)
+    assert (one.state_shape, one.feature_shape, one.image_shape) == ((13,), (64,), (3, 48, 96))
+    eyes = replace(one, cameras=("front", "down"))
+    assert (eyes.feature_shape, eyes.image_shape) == ((128,), (2, 3, 48, 96))
+    past = replace(eyes, observation_steps=2, since_exposure=True, state_extras=("height", "goal"))
+    assert past.state_shape == (2, 24)
+    assert past.state_names[20:] == ("height_above_home_m", "goal_x_m", "goal_y_m", "goal_z_m")
+    assert (past.feature_shape, past.image_shape) == ((2, 128), (2, 2, 3, 48, 96))
+    assert replace(one, observation_steps=2).image_shape == (2, 3, 48, 96)
+    assert Contract.from_json(past.to_json()) == past
+
+
 def test_the_appended_names_lie_where_their_slices_say() -> None:
     names = STATE_NAMES + SINCE_EXPOSURE_NAMES
     assert names[AGE] == ("age_s",)
@@ -89,7 +102,24 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"version": 4}, "version 4 is not supported"),
+        ({"cameras": "front"}, "cameras must be a list"),
+        ({"cameras": []}, "one or more different names"),
+        ({"cameras": ["front", "front"]}, "one or more different names"),
+        ({"cameras": ["the front"]}, "one or more different names"),
+        ({"cameras": [1]}, "malformed"),
+        ({"camera_rates_hz": [30.0, 10.0]}, "a rate in"),
+        ({"camera_rates_hz": [0.0]}, "a rate in"),
+        ({"image_crop": [0.0, 0.0, 1.0]}, "top, left, bottom, right"),
+        ({"image_crop": [0.5, 0.0, 0.5, 1.0]}, "top, left, bottom, right"),
+        ({"image_crop": [0.0, 0.0, float("nan"), 1.0]}, "top, left, bottom, right"),
+        ({"image_fit": "squash"}, "'stretch' or 'crop' or 'pad'"),
+        ({"image_channels": "gbr"}, "'rgb' or 'bgr'"),
+        ({"observation_steps": 0}, "observation_steps must be an integer in 1..16"),
+        ({"observation_dt_s": 0}, "observation_dt_s must be in"),
+        ({"state_extras": ["speed"]}, "goal, height, altitude"),
+        ({"state_extras": ["goal", "goal"]}, "each once"),
+        ({"play_s": 0.9}, "at most the 0.8 s of a chunk"),
+        ({"version": 5}, "version 5 is not supported"),
         ({"state_frame": "nwu"}, "ned_frd"),
         ({"arrays": "jax"}, "numpy"),
         ({"horizon": 0}, "horizon must be an integer in"),
@@ -103,7 +133,7 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
         ({"image_std_rgb": [0.2, 0.2, float("nan")]}, "finite"),
         ({"since_exposure": 1}, "since_exposure must be true or false"),
         ({"colour": "bgr"}, "unknown contract keys"),
-        ({"version": "2"}, "this build reads versions 1, 2, 3"),
+        ({"version": "2"}, "this build reads versions 1, 2, 3, 4"),
         ({"action": "torque"}, "'torque' is unknown; use one of sticks, rates, attitude, velocity"),
         ({"action": "velocity", "modes": ["GUIDED_NOGPS"]}, "known are GUIDED, OFFBOARD"),
         ({"velocity_frame": "body"}, "velocity_frame 'body' is unknown"),

@@ -180,6 +180,8 @@ class VehicleParams:
 
     def _advise(self, status: VehicleStatus | None) -> None:
         context = self._context(status)
+        if self._config.pilot_hz is not None:
+            return  # no stick of ours will leave
         if context.output is None or context == self._advised or not self._changes.is_settled:
             return
         self._advised = context

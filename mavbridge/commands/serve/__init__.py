@@ -1,0 +1,1 @@
+"""``mavbridge serve``: a policy on this computer for flights and robots elsewhere."""

@@ -1,0 +1,116 @@
+"""Whether this computer is fast enough for a policy, by figures measured before arming."""
+
+import math
+from typing import NamedTuple
+
+from mavbridge.config.flight import FlyConfig
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import PolicyError
+from mavbridge.flight.settings import effective_freshness
+from mavbridge.gate.chunks import FreshnessLimits
+from policy.contract import Contract
+from policy.loading.request import LoadedPolicy
+from policy.loading.timing import SolveTimes
+
+CLEARLY = 1.5
+"""A limit is out of reach from this factor on: other programs may have slowed the measurement."""
+NEARLY = 1.1
+"""A rate is not reached from this factor on."""
+FASTER = (
+    "Take fewer --num-diffusion-steps, a smaller policy, another --engine or --device, a faster "
+    "computer, or one that serves the policy (ws://)"
+)
+
+
+class _Age(NamedTuple):
+    """The greatest age that something would reach in flight, and what that may be."""
+
+    what: str
+    reached_s: float
+    allowed_s: float
+    by: str = "contract"
+    """What says so."""
+
+    @property
+    def share(self) -> float:
+        """1 = the limit."""
+        return self.reached_s / self.allowed_s
+
+
+def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
+    """Notes about the policy's speed and rates, for the user.
+
+    Raises:
+        PolicyError: it clearly cannot keep the limits of its own contract; with the figures.
+    """
+    executable, times = loaded.executable, loaded.times
+    contract, is_dual = executable.contract, executable.dual_rate
+    rates = config.rates
+    loops = rates.loops(is_dual=is_dual, play_s=contract.play_s)
+    action_hz, image_hz = loops.action_hz, min((loops.max_vision_hz, *contract.camera_rates_hz))
+    flag = "--action-rate" if is_dual else "--rate"
+    notes = []
+    if contract.play_s and (rates.action_rate if is_dual else rates.rate) is None:
+        notes.append(
+            f"{action_hz:g} chunks a second, since this policy is meant to play each one for "
+            f"{_text(contract.play_s)}; {flag} asks for another rate"
+        )
+    if times is None:
+        return tuple(notes)
+    figures = f"a chunk takes {_text(times.act_s)} here, an image {_text(times.encode_s)}"
+    limits = effective_freshness(contract, config.limits)
+    worst = _worst(contract, limits, times, action_hz=action_hz, image_hz=image_hz)
+    told = (
+        f"{figures}; at {action_hz:g} chunks and {image_hz:g} images a second, {worst.what} up to "
+        f"{_text(worst.reached_s)} old, beyond the {_text(worst.allowed_s)} of its {worst.by}"
+    )
+    if worst.share > CLEARLY:
+        fastest = _worst(contract, limits, times, action_hz=math.inf, image_hz=math.inf)
+        is_by_rate = fastest.share <= CLEARLY
+        advice = f"Ask for a higher {flag} or --visual-rate" if is_by_rate else FASTER
+        raise PolicyError(f"{executable.name} is too slow: {told}. {advice}")
+    if worst.share > 1:
+        notes.append(f"warning: {told}: it will coast")
+    for what, asked_hz, each_s in (
+        ("chunks", action_hz, times.act_s),
+        ("images", image_hz, times.encode_s),
+    ):
+        if each_s * asked_hz > NEARLY:
+            reached = f"this computer makes some {1 / each_s:.2g}"
+            notes.append(f"warning: asked for {asked_hz:g} {what} a second, {reached}: {figures}")
+    return tuple(notes)
+
+
+def _worst(
+    contract: Contract,
+    limits: FreshnessLimits,
+    times: SolveTimes,
+    *,
+    action_hz: float,
+    image_hz: float,
+) -> _Age:
+    """The age that comes nearest to its limit, when the last stick of a chunk leaves.
+
+    That is just before the next one comes. An image is older by the time that its camera takes,
+    which is not known here.
+    """
+    played = limits.while_played(round(contract.play_s * NS_PER_S))
+    every_s = max(1 / action_hz, times.act_s)
+    state_s = times.act_s + every_s
+    image_s = times.encode_s + max(1 / image_hz, times.encode_s)
+    sent, horizon_s = "when a stick leaves, ", contract.horizon * contract.chunk_dt_s
+    ages = (
+        _Age(f"{sent}the attitude is", state_s, played.state_ns / NS_PER_S),
+        _Age(f"{sent}the velocity is", state_s, played.velocity_ns / NS_PER_S),
+        _Age(f"{sent}the chunk is", every_s, played.chunk_ns / NS_PER_S),
+        _Age(f"{sent}the start of its chunk is", state_s, horizon_s, "horizon"),
+        _Age("when a chunk is begun, the image is", image_s, limits.feature_ns / NS_PER_S),
+        _Age(f"{sent}the image is", image_s + state_s, played.feature_ns / NS_PER_S),
+    )
+    return max(ages, key=lambda age: age.share)
+
+
+def _text(duration_s: float) -> str:
+    if duration_s >= 1:
+        return f"{duration_s:.3g} s"
+    return f"{duration_s * 1e3:.{0 if duration_s >= 0.01 else 1}f} ms"

@@ -1,0 +1,101 @@
+"""``--policy ws://HOST:PORT``: what is checked of it, and how it is loaded.
+
+msgpack and websockets are an extra, and imported only where such a policy is loaded.
+"""
+
+import os
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from policy.contract import Contract
+from policy.errors import ContractError, PolicyError
+from policy.foreign.interface import Interface, read_interface
+
+if TYPE_CHECKING:
+    from policy.foreign.websocket.messages import Message
+    from policy.foreign.websocket.remote_policy import RemotePolicy
+
+SCHEMES = ("ws", "wss")
+PACKAGES = ("msgpack", "websockets")
+"""Of ``pip install 'mavbridge[remote]'``."""
+
+
+def require_packages(what: str) -> None:
+    """Refuse what cannot be done without the extra.
+
+    Raises:
+        PolicyError: a package of it is missing; ``what`` needs it.
+    """
+    if missing := [name for name in PACKAGES if find_spec(name) is None]:
+        raise PolicyError(f"{what} needs {' and '.join(missing)}: pip install 'mavbridge[remote]'")
+
+
+def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) -> None:
+    """Refuse in milliseconds an address, a contract file or a flag that cannot serve.
+
+    Raises:
+        PolicyError: with what was wrong and what to write.
+    """
+    require_packages(f"--policy {url}")
+    try:
+        parts = urlsplit(url)
+        is_good = bool(parts.hostname) and (parts.port is not None or parts.scheme == "wss")
+    except ValueError:
+        is_good = False
+    if not is_good:
+        raise PolicyError(f"--policy {url}: write ws://HOST:PORT, as in ws://127.0.0.1:8000")
+    if parts.username is not None or parts.password is not None:
+        raise PolicyError("--policy: leave the name and password out of the address")
+    if checkpoint is not None:
+        raise PolicyError(
+            f"--policy {url}: the server has the weights; leave out --checkpoint {checkpoint}"
+        )
+    if contract_file is not None:
+        read_interface(contract_file)
+
+
+def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePolicy", list[str]]:
+    """Connect to a policy server, find its contract and try it; with lines for the user.
+
+    Raises:
+        PolicyError: nobody serves a policy there, its contract is not known, or what it answers is
+            no chunk by that contract, or comes too late.
+    """
+    from policy.foreign.websocket.link import API_KEY_VARIABLE, ServerLink
+    from policy.foreign.websocket.messages import CONTRACT_KEY
+    from policy.foreign.websocket.remote_policy import RemotePolicy
+
+    link = ServerLink(url, api_key=os.environ.get(API_KEY_VARIABLE))
+    try:
+        metadata = link.connect()
+        interface = _interface(url, contract_file, metadata)
+        policy = RemotePolicy(link, interface, is_ours=CONTRACT_KEY in metadata)
+        return policy, [policy.try_out()]
+    except PolicyError as error:
+        link.close()
+        raise PolicyError(f"--policy {url}: {error}") from error
+    except BaseException:
+        link.close()
+        raise
+
+
+def _interface(url: str, contract_file: Path | None, metadata: "Message") -> Interface:
+    """That of the user's file, or of our own server's metadata."""
+    from policy.foreign.websocket.messages import CONTRACT_KEY
+
+    if contract_file is not None:
+        return read_interface(contract_file)
+    served = metadata.get(CONTRACT_KEY)
+    if not isinstance(served, str):
+        raise PolicyError(
+            "the server says neither its rate nor what its state and actions mean: give --contract "
+            f"FILE; mavbridge contract {url} drafts one"
+        )
+    try:
+        contract = Contract.from_json(served)
+    except ContractError as error:
+        raise ContractError(f"the server's contract cannot be used: {error}") from error
+    return Interface(contract=replace(contract, arrays="numpy"))

@@ -1,0 +1,50 @@
+"""How long a policy takes on this computer, measured before it flies."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from policy.contract import ACTION_DIM
+from policy.engines.executable import encode_all, level_state
+from policy.errors import NoChunkError
+from policy.protocol import Executable
+
+REPETITIONS = 5
+MOST_S = 0.5
+"""No further repetition after so much time: a slow policy is known to be slow after one."""
+ELAPSED_S = 0.02
+"""Time since the last chunk of a solve; with a warm start each one refines the one before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolveTimes:
+    """Medians, by the clock that they were measured with: zero on one that stands still."""
+
+    encode_s: float
+    """One image of each camera; without a fast path that is resizing alone."""
+    act_s: float
+    """One chunk."""
+
+
+def measure_times(executable: Executable, now_s: Callable[[], float]) -> SolveTimes | None:
+    """Time a policy that was tried before; None if it had no chunk for the dummy sample."""
+    contract = executable.contract
+    shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
+    rgb, state = np.full(shape, 128, np.uint8), level_state(contract)
+    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+    encode_s: list[float] = []
+    act_s: list[float] = []
+    begun_s = now_s()
+    while len(act_s) < REPETITIONS and (not act_s or now_s() - begun_s < MOST_S):
+        before_s = now_s()
+        encoded = encode_all(executable, rgb)
+        encoded_s = now_s()
+        try:
+            executable.act(encoded, state, history, ELAPSED_S)
+        except NoChunkError:
+            return None
+        encode_s.append((encoded_s - before_s) / contract.observation_steps)
+        act_s.append(now_s() - encoded_s)
+    return SolveTimes(encode_s=median(encode_s), act_s=median(act_s))

@@ -1,0 +1,109 @@
+"""A gamepad, or a transmitter on USB, as the pilot."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import pygame
+
+from sitl.clock import Clock
+from sitl.pilot.axes import Axes
+from sitl.pilot.transmitter import OFF_US, Hand, Switch, Transmitter
+
+RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7
+"""A, B, back and start of the usual pad."""
+HELP = (
+    "hold button 7 (start) to arm, 6 (back) to disarm; button 0 (A) moves the switch of channel 7 "
+    "up and down, 1 (B) to its middle"
+)
+
+
+class Pad(Protocol):
+    """A gamepad as far as it is used here."""
+
+    def poll(self) -> bool:
+        """Take what has happened; False while none is connected."""
+
+    def axes(self) -> Sequence[float]:
+        """Positions in [-1, 1], by number."""
+
+    def buttons(self) -> Sequence[bool]:
+        """Those that are pressed, by number."""
+
+
+class GamepadPilot:
+    """A `Pilot`; without the pad the receiver has no signal."""
+
+    def __init__(self, pad: Pad, axes: Axes, clock: Clock) -> None:
+        self._pad = pad
+        self._axes = axes
+        self._clock = clock
+        self._transmitter = Transmitter(clock.now_ns())
+        self._switch: Switch = "low"
+        self._pressed: set[int] = set()
+
+    def latest(self) -> Sequence[int] | None:
+        """See `Pilot`."""
+        now_ns = self._clock.now_ns()
+        if not self._transmitter.is_due(now_ns):
+            return None
+        if not self._pad.poll():
+            self._pressed = set()
+            return OFF_US
+        pressed = {number for number, is_down in enumerate(self._pad.buttons()) if is_down}
+        self._move_switch(pressed - self._pressed)
+        self._pressed = pressed
+        hand = Hand(sticks=self._axes.sticks(self._pad.axes()), switch=self._switch)
+        if ARM_BUTTON in pressed:
+            hand = hand._replace(gesture="arm")
+        elif DISARM_BUTTON in pressed:
+            hand = hand._replace(gesture="disarm")
+        return self._transmitter.channels_us(hand, now_ns)
+
+    def _move_switch(self, newly: set[int]) -> None:
+        if RECORD_BUTTON in newly:
+            self._switch = "low" if self._switch == "high" else "high"
+        if BAD_BUTTON in newly:
+            self._switch = "middle"
+
+    def close(self) -> None:
+        """See `Pilot`."""
+        pygame.quit()
+
+
+class PygamePad:
+    """The first gamepad of this computer; another one may be plugged in in its place."""
+
+    def __init__(self) -> None:
+        pygame.display.init()  # events come through it
+        pygame.joystick.init()
+        self._pad: pygame.joystick.JoystickType | None = None
+
+    @property
+    def description(self) -> str | None:
+        """Its name, and how many axes and buttons it has; None while there is none."""
+        if not self.poll() or self._pad is None:
+            return None
+        pad = self._pad
+        return f"{pad.get_name()}: {pad.get_numaxes()} axes, {pad.get_numbuttons()} buttons"
+
+    def poll(self) -> bool:
+        """See `Pad`."""
+        for event in pygame.event.get():
+            is_ours = self._pad is not None and (
+                getattr(event, "instance_id", None) == self._pad.get_instance_id()
+            )
+            if event.type == pygame.JOYDEVICEREMOVED and is_ours:
+                self._pad = None
+        if self._pad is None and pygame.joystick.get_count():
+            self._pad = pygame.joystick.Joystick(0)
+        return self._pad is not None
+
+    def axes(self) -> Sequence[float]:
+        """See `Pad`."""
+        pad = self._pad
+        return () if pad is None else [pad.get_axis(k) for k in range(pad.get_numaxes())]
+
+    def buttons(self) -> Sequence[bool]:
+        """See `Pad`."""
+        pad = self._pad
+        return () if pad is None else [pad.get_button(k) for k in range(pad.get_numbuttons())]

@@ -1,0 +1,117 @@
+"""Policy servers on loopback: one that a test scripts, and our own around any policy."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+
+import numpy as np
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+
+from mavbridge.commands.serve.answers import AnswerLoop
+from mavbridge.commands.serve.server import MAX_CLIENTS, PolicyServer
+from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.workers import Worker
+from policy.foreign.websocket.messages import Message, pack, unpack
+from policy.protocol import Executable
+
+Reply = bytes | str | None
+"""None: close the connection."""
+START_S = 10.0
+
+
+@contextmanager
+def _in_thread(listen: Callable[[], "asyncio.Future[Server]"]) -> Iterator[int]:
+    """Run a server on a loop of its own; gives its port."""
+    port: Future[int] = Future()
+    end: list[Callable[[], None]] = []
+
+    async def run() -> None:
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+        end.append(lambda: loop.call_soon_threadsafe(stop.set))
+        server = await listen()
+        port.set_result(server.sockets[0].getsockname()[1])
+        await stop.wait()
+        server.close()
+        with suppress(TimeoutError):
+            await asyncio.wait_for(server.wait_closed(), 1.0)
+
+    worker = Worker("test-policy-server", lambda _stop: asyncio.run(run()))
+    worker.start()
+    try:
+        yield port.result(START_S)
+    finally:
+        end[0]()
+        worker.join(START_S)
+
+
+@contextmanager
+def scripted_server(
+    reply: Callable[[Message], Reply], *, greeting: bytes | str = pack({}), port: int = 0
+) -> Iterator[int]:
+    """A server that answers by ``reply``, which runs in a thread and may wait; gives its port."""
+
+    async def talk(connection: ServerConnection) -> None:
+        with suppress(ConnectionClosed):
+            await connection.send(greeting)
+            async for request in connection:
+                answer = await asyncio.to_thread(reply, unpack(request))
+                if answer is None:
+                    return
+                await connection.send(answer)
+
+    def listen() -> "asyncio.Future[Server]":
+        return asyncio.ensure_future(_listening(talk, port))
+
+    with _in_thread(listen) as bound:
+        yield bound
+
+
+async def _listening(talk: Callable[[ServerConnection], object], port: int) -> Server:
+    return await serve(talk, "127.0.0.1", port, compression=None, max_size=None)
+
+
+@contextmanager
+def our_server(
+    executable: Executable, *, api_key: str | None = None, image_bytes: int = 2**20
+) -> Iterator[int]:
+    """``mavbridge serve`` without its command line; gives its port."""
+    answers = AnswerLoop(executable, clock=MonotonicClock(), capacity=MAX_CLIENTS)
+    server = PolicyServer(
+        answers, image_bytes=image_bytes, api_key=api_key, report=lambda _line: None
+    )
+    policy = Worker("test-policy", answers.run)
+    policy.start()
+    try:
+        with _in_thread(lambda: asyncio.ensure_future(server.listen("127.0.0.1", 0))) as port:
+            yield port
+    finally:
+        policy.join(START_S)
+
+
+def chunk_of(value: float, horizon: int = 16) -> bytes:
+    """An answer whose actions all have one value."""
+    return pack(
+        {
+            "actions": np.full((horizon, 4), value, np.float64),
+            "server_timing": {"infer_ms": 2.5},
+        }
+    )
+
+
+class Gate:
+    """Holds the answers of a scripted server while it is shut."""
+
+    def __init__(self) -> None:
+        self.is_open = threading.Event()
+        self.is_open.set()
+        self.requests = 0
+
+    def reply(self, _message: Message) -> bytes:
+        """The number of the request, once the gate is open."""
+        self.requests += 1
+        number = self.requests
+        assert self.is_open.wait(START_S)
+        return chunk_of(number)

@@ -1,0 +1,107 @@
+"""The policies in ``examples/`` fly as their first lines say."""
+
+import math
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.processes import free_port, running
+from mavbridge.core.records import Event, Tick
+from mavbridge.simulation.flight import SimulatedFlight
+from policy.errors import PolicyError
+from policy.loading.load import load_policy
+from policy.loading.request import LoadedPolicy, PolicyRequest
+from sitl.vehicle.dynamics import BodyState
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FLIGHT_S = 9.0
+STEADY_TICKS = 300
+"""The last three seconds, when the climb is over."""
+
+
+def load(spec: str) -> LoadedPolicy:
+    return load_policy(PolicyRequest(spec=spec, dual_rate=True), now_s=lambda: 0.0)
+
+
+class TruthAtTicks:
+    """A ``TickSink`` that keeps the vehicle's true state whenever the policy's sticks leave."""
+
+    def __init__(self, flight: SimulatedFlight) -> None:
+        self._flight = flight
+        self.states: list[BodyState] = []
+
+    def emit(self, event: Event) -> None:
+        if isinstance(event, Tick) and event.trace is not None:
+            self.states.append(self._flight.vehicle.ap.truth)
+
+
+def fly(loaded: LoadedPolicy) -> list[BodyState]:
+    """States of the steady part of a flight that began on the ground."""
+    flight = SimulatedFlight(course_seed=3, seed=0)
+    sink = TruthAtTicks(flight)
+    with loaded:
+        result = flight.fly(loaded.executable, max_time_s=FLIGHT_S, sinks=(sink,))
+    assert result.outcome == "timed out"  # it passes no gates, and does not crash
+    assert len(sink.states) > 2 * STEADY_TICKS
+    return sink.states[-STEADY_TICKS:]
+
+
+def heights_m(states: list[BodyState]) -> list[float]:
+    return [-body.position_ned_m[2] for body in states]
+
+
+def turned_deg(states: list[BodyState]) -> float:
+    """Sum of the changes of heading, nose right positive."""
+    headings = [heading_rad(body) for body in states]
+    return math.degrees(sum(math.remainder(b - a, math.tau) for a, b in pairwise(headings)))
+
+
+def heading_rad(body: BodyState) -> float:
+    w, x, y, z = body.ned_from_body_wxyz
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def assert_holds_3_m(states: list[BodyState]) -> None:
+    heights = heights_m(states)
+    assert min(heights) > 2.5
+    assert max(heights) < 3.3
+
+
+def test_the_numpy_policy_climbs_and_turns() -> None:
+    states = fly(load(f"{EXAMPLES}/numpy_policy.py:ClimbAndTurn"))
+    assert_holds_3_m(states)
+    assert turned_deg(states) > 20
+
+
+def test_the_torch_policy_climbs_and_looks_for_light() -> None:
+    loaded = load(f"{EXAMPLES}/torch_policy.py:TowardsLight")
+    assert loaded.executable.dual_rate
+    assert loaded.executable.engine.startswith("openvino")
+    assert_holds_3_m(fly(loaded))
+
+
+def test_the_server_policy_climbs_and_turns(tmp_path: Path) -> None:
+    for package in ("websockets", "msgpack"):
+        pytest.importorskip(package)
+    port = free_port()
+    command = (sys.executable, str(EXAMPLES / "server_policy.py"), str(port))
+    with running(*command, log=tmp_path / "server.log"):
+        states = fly(when_it_listens(lambda: load(f"ws://127.0.0.1:{port}")))
+    assert_holds_3_m(states)
+    assert turned_deg(states) > 20
+
+
+def when_it_listens(connect: Callable[[], LoadedPolicy]) -> LoadedPolicy:
+    """Connect to a server that is starting; it refuses connections until it listens."""
+    clock = MonotonicClock()
+    until_ns = clock.now_ns() + 30 * NS_PER_S
+    while clock.now_ns() < until_ns:
+        with suppress(PolicyError):
+            return connect()
+        clock.sleep_until_ns(clock.now_ns() + NS_PER_S // 10)
+    return connect()

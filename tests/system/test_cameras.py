@@ -1,0 +1,42 @@
+"""A policy with two cameras, in real processes."""
+
+from pathlib import Path
+
+import pytest
+
+from helpers.stand import flight
+
+pytestmark = pytest.mark.system
+
+FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")
+
+
+def test_two_cameras_feed_one_policy(tmp_path: Path) -> None:
+    with flight(tmp_path) as flying:
+        flying.cameras = ("down", "front")  # their order is the contract's, not this one
+        flags = ("--policy", "helpers.user_policies:TwoEyed", "--duration", "4")
+        flying.start(*FLY, *flags)
+        status, output = flying.end()
+    assert status == 0, output
+    assert flying.vehicle_report()["max_altitude_m"] > 0.3
+    assert flying.report()["vision"]["frames"] > 0
+
+
+def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
+    with flight(tmp_path) as flying:
+        flying.cameras = ("front", "down")
+        flying.start(*FLY, "--policy", "helpers.user_policies:HangingBelow")
+        status, output = flying.end()
+    assert status == 1
+    assert "the image feature is older than 300 ms" in output
+    assert "the encoder of camera down has hung" in output
+    assert "Traceback" not in output
+
+
+def test_a_camera_without_its_name_is_refused(tmp_path: Path) -> None:
+    with flight(tmp_path) as flying:
+        flying.start(*FLY, "--policy", "helpers.user_policies:TwoEyed")
+        status, output = flying.end()
+    assert status == 1, output
+    assert "give --camera front=SOURCE --camera down=SOURCE" in output
+    assert flying.relay.overrides == []

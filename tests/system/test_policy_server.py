@@ -1,0 +1,404 @@
+"""Policies on servers: real sockets on loopback, every wait with a deadline."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import websockets.sync.client
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from helpers.policy_servers import Gate, chunk_of, our_server, scripted_server
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.processes import free_port
+from policy.contract import Contract, FloatArray
+from policy.engines.executable import (
+    ExecutionSettings,
+    encode_all,
+    level_state,
+    make_numpy_executable,
+)
+from policy.errors import NoChunkError, PolicyError
+from policy.foreign.websocket import link, remote_policy
+from policy.foreign.websocket.kind import load_server_policy
+from policy.foreign.websocket.messages import number_array, pack, unpack
+from policy.foreign.websocket.remote_policy import RemotePolicy, answer_deadline_s
+from policy.loading.load import load_policy, read_policy_contract
+from policy.loading.request import PolicyRequest
+from policy.protocol import Executable
+
+pytestmark = pytest.mark.system
+
+SMALL = Contract(arrays="numpy", image_height=32, image_width=32)
+CLOCK = MonotonicClock()
+PATIENT_S = 20.0
+"""Longest wait of a test for something that another thread does."""
+CONTRACT = """
+[contract]
+image_height = 32
+image_width = 32
+max_state_age_s = 0.5
+max_velocity_age_s = 0.5
+max_feature_age_s = 0.5
+"""
+
+
+@pytest.fixture
+def contract_file(tmp_path: Path) -> Path:
+    path = tmp_path / "contract.toml"
+    path.write_text(CONTRACT)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def no_thread_stays() -> Iterator[None]:
+    yield
+    left = [thread.name for thread in threading.enumerate() if "server-link" in thread.name]
+    assert left == []
+
+
+def loaded(port: int, contract_file: Path) -> "closing[RemotePolicy]":
+    policy, notes = load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
+    assert "its deadline is 500 ms" in notes[0]
+    policy.reset()
+    return closing(policy)
+
+
+def predict(policy: RemotePolicy) -> float:
+    """The value that a scripted server gives to all of a chunk."""
+    contract = policy.contract
+    image = np.zeros((1, *contract.image_shape), np.float32)
+    history = np.zeros((1, contract.history_len, 4), np.float32)
+    chunk = policy.predict(image, level_state(contract), history, 10)
+    assert chunk.shape == (1, contract.horizon, 4)
+    assert (chunk == chunk[0, 0, 0]).all()
+    return float(chunk[0, 0, 0])
+
+
+def predict_until(policy: RemotePolicy, is_good: Callable[[float | str], bool]) -> None:
+    """Ask again and again for a chunk, as a flight does, until its value or its error is good."""
+    ends_ns = CLOCK.now_ns() + round(PATIENT_S * NS_PER_S)
+    while CLOCK.now_ns() < ends_ns:
+        try:
+            outcome: float | str = predict(policy)
+        except NoChunkError as error:
+            outcome = str(error)
+        if is_good(outcome):
+            return
+        threading.Event().wait(0.01)
+    raise AssertionError(f"still {outcome}")
+
+
+def test_a_late_answer_is_never_flown(contract_file: Path) -> None:
+    gate = Gate()
+    with scripted_server(gate.reply) as port, loaded(port, contract_file) as policy:
+        tried = gate.requests
+        assert predict(policy) == tried + 1
+        gate.is_open.clear()
+        begun_ns = CLOCK.now_ns()
+        with pytest.raises(NoChunkError, match="has not answered within 500 ms"):
+            predict(policy)
+        assert 0.4 < (CLOCK.now_ns() - begun_ns) / NS_PER_S < 5.0
+        gate.is_open.set()
+        # The answer to the request before is thrown away: this is the one to the newest.
+        predict_until(policy, lambda value: value == gate.requests)
+        assert gate.requests >= tried + 3
+
+
+def test_the_server_says_how_long_it_took(contract_file: Path) -> None:
+    with (
+        scripted_server(lambda _: chunk_of(0.5)) as port,
+        loaded(port, contract_file) as policy,
+    ):
+        assert predict(policy) == 0.5
+        assert policy.infer_s == pytest.approx(2.5e-3)
+        assert 0 < policy.round_trip_s < PATIENT_S
+
+
+def test_a_server_that_comes_back_is_flown_again(contract_file: Path) -> None:
+    with scripted_server(lambda _: chunk_of(0.1)) as port:
+        policy, _ = load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
+    with closing(policy):
+        policy.reset()
+        predict_until(policy, lambda found: "nobody listens" in str(found))
+        with scripted_server(lambda _: chunk_of(0.2), port=port):
+            predict_until(policy, lambda found: found == pytest.approx(0.2))
+
+
+def test_a_server_of_another_policy_is_not_flown() -> None:
+    executable = make_numpy_executable(Echo(), ExecutionSettings(name="echo", dual_rate=False))
+    with our_server(executable) as port:
+        policy, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
+    with closing(policy), scripted_server(lambda _: chunk_of(0.2), port=port):
+        predict_until(policy, lambda found: "serves another policy now" in str(found))
+
+
+def test_a_server_that_falls_silent_is_connected_to_again(
+    contract_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link, "LOST_S", 0.05)
+    monkeypatch.setattr(remote_policy, "MOST_WAIT_S", 0.05)
+    gate = Gate()
+    with scripted_server(gate.reply) as port:
+        policy, _ = load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
+        with closing(policy):
+            policy.reset()
+            gate.is_open.clear()
+            predict_until(policy, lambda found: "connecting again" in str(found))
+            gate.is_open.set()
+            predict_until(policy, lambda found: found == gate.requests)
+
+
+@pytest.mark.parametrize(
+    ("reply", "told"),
+    [
+        ("Traceback:\n  File x\nKeyError: 'image'", "the policy server failed: KeyError: 'image'"),
+        (b"garbage", "not a msgpack map"),
+        (pack({"action_chunk": [1]}), "no 'actions' in it; it has"),
+        (chunk_of(0.1, horizon=50), r"actions \[50, 4\].*\[16, 4\]"),
+        (pack({"actions": np.zeros((16, 7))}), r"actions \[16, 7\]"),
+        (pack({"actions": "left"}), "no array of numbers"),
+        (None, "has closed the connection|is lost"),
+    ],
+)
+def test_what_is_no_chunk_is_refused_at_loading_and_coasted_over_in_flight(
+    reply: bytes | str | None, told: str, contract_file: Path
+) -> None:
+    answers: list[bytes | str | None] = [chunk_of(0.5)]
+    with (
+        scripted_server(lambda _: answers[0]) as port,
+        loaded(port, contract_file) as policy,
+    ):
+        answers[0] = reply
+        with pytest.raises(NoChunkError, match=told):
+            predict(policy)
+        with pytest.raises(PolicyError, match=told):
+            load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
+        answers[0] = chunk_of(0.75)
+        predict_until(policy, lambda found: found == 0.75)
+
+
+def test_a_policy_that_gives_no_numbers_is_refused_at_loading(contract_file: Path) -> None:
+    with scripted_server(lambda _: chunk_of(np.nan)) as port:
+        request = PolicyRequest(spec=f"ws://127.0.0.1:{port}", contract_file=contract_file)
+        with pytest.raises(PolicyError, match="NaN or infinity"):
+            load_policy(request, now_s=lambda: 0.0)
+
+
+def test_a_server_that_is_too_slow_is_refused_with_its_figures(contract_file: Path) -> None:
+    never = threading.Event()
+
+    def reply(_message: object) -> bytes:
+        never.wait(0.05)
+        return chunk_of(0.5)
+
+    contract_file.write_text(CONTRACT.replace("0.5", "0.02"))
+    with (
+        scripted_server(reply) as port,
+        pytest.raises(PolicyError, match=r"answers in \d+ ms, .* may take 20 ms by the age limits"),
+    ):
+        load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
+
+
+def test_addresses_without_a_policy_server(
+    contract_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link, "CONNECT_S", 0.5)
+    with pytest.raises(PolicyError, match=r"nobody listens .* start the policy server"):
+        load_server_policy(f"ws://127.0.0.1:{free_port(socket.SOCK_STREAM)}", None)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"ws://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(PolicyError, match="has not answered like a policy server"):
+            load_server_policy(url, contract_file)
+    for greeting in ("hello", b"\x00 no map"):
+        with (
+            scripted_server(lambda _: chunk_of(0.5), greeting=greeting) as port,
+            pytest.raises(PolicyError, match="is no policy server, its first message"),
+        ):
+            load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
+    with scripted_server(lambda _: chunk_of(0.5)) as port:
+        url = f"ws://127.0.0.1:{port}"
+        with pytest.raises(PolicyError, match="give --contract FILE; mavbridge contract"):
+            read_policy_contract(PolicyRequest(spec=url))
+
+
+def test_the_deadline_is_what_the_gate_would_fly() -> None:
+    def contract(age_s: float, play_s: float) -> Contract:
+        return Contract(
+            max_state_age_s=age_s, max_velocity_age_s=1.0, max_feature_age_s=1.0, play_s=play_s
+        )
+
+    assert answer_deadline_s(contract(0.1, 0.0)) == pytest.approx(0.1)
+    assert answer_deadline_s(contract(0.1, 0.4)) == pytest.approx(0.5)
+    assert answer_deadline_s(contract(1.0, 0.5)) == pytest.approx(0.8)  # the whole chunk
+    assert answer_deadline_s(contract(5.0, 0.0)) == pytest.approx(0.8)
+
+
+class Echo:
+    """Puts everything it is given into its actions, and counts its resets."""
+
+    contract = SMALL
+
+    def __init__(self) -> None:
+        self.resets = 0
+
+    def predict(
+        self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
+    ) -> FloatArray:
+        chunk = np.zeros((1, 16, 4), np.float32)
+        chunk[0, :13, 0] = state[0]
+        chunk[0, :4, 1:] = action_history[0, :, 1:]
+        chunk[0, 4:8, 1] = image[0].mean(), image[0].std(), image[0, 0, 3, 7], image[0, 2, 9, 1]
+        return chunk
+
+    def reset(self) -> None:
+        self.resets += 1
+
+
+def sample(executable: Executable, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    rng, contract = np.random.default_rng(seed), executable.contract
+    rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    state = rng.normal(size=(1, *contract.state_shape)).astype(np.float32)
+    history = rng.uniform(-1, 1, (1, contract.history_len, 4)).astype(np.float32)
+    return encode_all(executable, rgb), state, history
+
+
+@pytest.mark.parametrize("name", ["echo", "toge"])
+def test_a_served_policy_flies_the_same_sticks_as_here(name: str) -> None:
+    """To the last bit; TOGE by its shipped weights, in float32 on torch."""
+    if name == "toge":
+        request = PolicyRequest(spec="toge", engine="torch", dual_rate=False, num_diffusion_steps=2)
+        here = load_policy(request, now_s=lambda: 0.0).executable
+    else:
+        here = make_numpy_executable(Echo(), ExecutionSettings(name="echo", dual_rate=False))
+    size = int(np.prod(here.contract.image_shape))
+    with our_server(here, image_bytes=size) as port:
+        policy, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
+        settings = ExecutionSettings(name="served", dual_rate=False)
+        there = make_numpy_executable(policy, settings)
+        with closing(policy):
+            assert there.contract.image_shape == here.contract.image_shape
+            for seed in range(3):
+                inputs = sample(here, seed)
+                assert np.array_equal(inputs[0], sample(there, seed)[0])
+                assert np.array_equal(there.act(*inputs, None), here.act(*inputs, None))
+
+
+def test_a_served_policy_is_told_that_a_flight_begins() -> None:
+    policy = Echo()
+    executable = make_numpy_executable(policy, ExecutionSettings(name="echo", dual_rate=False))
+    executable = Executable(**{**vars(executable), "reset": policy.reset})
+    with our_server(executable) as port:
+        remote, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
+        with closing(remote):
+            inputs = sample(executable, 0)
+            remote.predict(*inputs, 10)
+            assert policy.resets == 0
+            remote.reset()
+            remote._timeout_s = PATIENT_S  # type: ignore[attr-defined]
+            remote.predict(*inputs, 10)
+            remote.predict(*inputs, 10)
+            assert policy.resets == 1
+
+
+def served_echo() -> Executable:
+    return make_numpy_executable(Echo(), ExecutionSettings(name="echo", dual_rate=False))
+
+
+def connect(port: int, **headers: str) -> Any:
+    return websockets.sync.client.connect(
+        f"ws://127.0.0.1:{port}",
+        compression=None,
+        max_size=None,
+        proxy=None,
+        additional_headers=headers,
+    )
+
+
+def test_our_server_keeps_the_protocol_of_openpi() -> None:
+    """As its own client speaks: metadata first, a chunk for a request, a text for an error."""
+    request = {
+        "observation.images.front": np.zeros((32, 32, 3), np.uint8),
+        "observation.state": np.arange(13, dtype=np.float64),
+        "action_history": np.zeros((4, 4), np.float32),
+    }
+    with our_server(served_echo()) as port, connect(port) as client:
+        metadata = unpack(client.recv(PATIENT_S))
+        assert Contract.from_json(str(metadata["mavbridge_contract"])) == SMALL
+        for bad, told in (
+            (b"garbage", "not a msgpack map"),
+            (pack({"observation/image": 1}), "no 'observation.images.front' in it"),
+            (pack({**request, "observation.state": np.zeros(3)}), "[13]"),
+            ("text", "a text in place"),
+            (pack(request), None),
+        ):
+            client.send(bad)
+            answer = client.recv(PATIENT_S)
+            if told is not None:
+                assert told in str(answer)
+                continue
+            message: Any = unpack(answer)
+            actions = number_array(message, "actions")
+            assert (actions.shape, actions.dtype) == ((16, 4), np.float32)
+            assert actions[:13, 0].tolist() == list(range(13))
+            assert message["server_timing"]["infer_ms"] > 0
+
+
+def test_our_server_bounds_clients_and_requests() -> None:
+    with our_server(served_echo()) as port, ExitStack() as stack:
+        clients = [stack.enter_context(connect(port)) for _ in range(5)]
+        greeted = [client.recv(PATIENT_S) for client in clients[:4]]
+        assert len(greeted) == 4
+        with pytest.raises(ConnectionClosed, match="4 clients"):
+            clients[4].recv(PATIENT_S)
+        clients[0].send(b"\0" * 4 * 2**20)
+        with pytest.raises(ConnectionClosed, match="1009"):
+            clients[0].recv(PATIENT_S)
+        url = f"http://127.0.0.1:{port}/healthz"
+        with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(url) as response:
+            assert (response.status, response.read()) == (200, b"OK\n")
+
+
+def test_a_server_with_a_key_lets_in_who_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    with our_server(served_echo(), api_key="secret") as port:
+        url = f"ws://127.0.0.1:{port}"
+        for key in ("", "wrong"):
+            monkeypatch.setenv(link.API_KEY_VARIABLE, key)
+            with pytest.raises(PolicyError, match=r"wants an API key.* MAVBRIDGE_API_KEY"):
+                load_server_policy(url, None)
+        with pytest.raises(InvalidStatus, match="401"):
+            connect(port, Authorization="Api-Key other").__enter__()
+        monkeypatch.setenv(link.API_KEY_VARIABLE, "secret")
+        assert read_policy_contract(PolicyRequest(spec=url)).image_height == 32
+        with connect(port, Authorization="Api-Key secret") as client:
+            assert unpack(client.recv(PATIENT_S))
+
+
+def test_the_command_serves_until_it_is_told_to_stop() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    command = [sys.executable, "-m", "mavbridge", "serve", "--policy", "scripted:hover:velocity"]
+    command += ["--port", str(port)]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout is not None
+        ends = threading.Timer(PATIENT_S * 3, process.kill)
+        ends.start()
+        try:
+            lines = iter(process.stdout.readline, "")
+            assert any(f"at ws://127.0.0.1:{port}" in line for line in lines)
+            contract = read_policy_contract(PolicyRequest(spec=f"ws://127.0.0.1:{port}"))
+            assert (contract.action, contract.arrays) == ("velocity", "numpy")
+            process.send_signal(signal.SIGINT)
+            assert process.wait(PATIENT_S) == 0
+        finally:
+            ends.cancel()
+            process.kill()

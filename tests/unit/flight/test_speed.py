@@ -1,0 +1,101 @@
+"""Measured durations against a contract; the measuring itself is in unit/policy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.config.rates import Rates
+from mavbridge.core.errors import PolicyError
+from mavbridge.flight.speed import require_speed
+from policy.contract import Contract
+from policy.loading.request import LoadedPolicy
+from policy.loading.timing import SolveTimes
+from policy.protocol import Executable
+
+CONTRACT = Contract(feature_dim=1, arrays="numpy", horizon=100)
+
+
+def notes_of(
+    encode_ms: float,
+    act_ms: float | None,
+    *,
+    hz: float | None = None,
+    is_dual: bool = True,
+    contract: Contract = CONTRACT,
+) -> str:
+    """What the user is told where a policy takes so long; its horizon is 5 s."""
+    executable = Executable(
+        contract=contract,
+        name="test",
+        engine="numpy",
+        dual_rate=is_dual,
+        encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
+        act=lambda *inputs: np.zeros((1, 100, 4), np.float32),
+    )
+    times = None
+    if act_ms is not None:
+        times = SolveTimes(encode_s=encode_ms / 1e3, act_s=act_ms / 1e3)
+    config = FlyConfig(link=LinkConfig(connect="memory"), rates=Rates(rate=hz, action_rate=hz))
+    loaded = LoadedPolicy(executable=executable, notes=(), times=times)
+    return "; ".join(require_speed(config, loaded))
+
+
+def playing(play_s: float) -> Contract:
+    return replace(CONTRACT, play_s=play_s)
+
+
+@pytest.mark.parametrize("is_dual", [True, False])
+def test_a_policy_that_is_fast_enough_needs_no_words(is_dual: bool) -> None:
+    assert notes_of(7, 4, is_dual=is_dual) == ""
+
+
+@pytest.mark.parametrize(
+    ("encode_ms", "act_ms", "hz", "play_s", "told"),
+    [
+        (
+            0,
+            900,
+            None,
+            0,
+            "a chunk takes 900 ms here.* attitude is up to 1.8 s old, beyond the 100",
+        ),
+        (300, 4, None, 0, "an image 300 ms.* the image is up to 614 ms old, beyond the 300 ms"),
+        (0, 900, None, 0, "Take fewer --num-diffusion-steps"),
+        (0, 20, 5, 0, "attitude is up to 220 ms old.* Ask for a higher --action-rate"),
+        (0, 900, 0.5, 0.8, "attitude is up to 2.9 s old, beyond the 900 ms"),
+        (500, 20, 1, 2, "when a chunk is begun, the image is up to 1 s old, beyond the 300 ms"),
+    ],
+)
+def test_one_that_clearly_cannot_keep_its_limits_is_refused_with_the_figures(
+    encode_ms: float, act_ms: float, hz: float | None, play_s: float, told: str
+) -> None:
+    with pytest.raises(PolicyError, match=told):
+        notes_of(encode_ms, act_ms, hz=hz, contract=playing(play_s))
+
+
+def test_chunks_must_come_before_the_horizon_of_the_last_one_ends() -> None:
+    short = replace(playing(0.8), horizon=16)
+    with pytest.raises(PolicyError, match=r"1\.4 s old, beyond the 800 ms of its horizon"):
+        notes_of(0, 400, hz=1, contract=short)
+
+
+def test_a_slow_policy_may_be_slow_where_it_plays_its_chunks_for_long() -> None:
+    told = notes_of(0, 400, contract=playing(1.0))
+    assert told.startswith("2 chunks a second, since this policy is meant to play each one for 1 s")
+    assert "warning" not in told
+
+
+def test_a_limit_that_is_hardly_missed_is_a_warning_since_a_measurement_may_be_wrong() -> None:
+    assert "up to 120 ms old, beyond the 100 ms of its contract: it will coast" in notes_of(0, 60)
+
+
+def test_a_rate_that_is_not_reached_is_told() -> None:
+    told = notes_of(0, 32)
+    assert "asked for 100 chunks a second, this computer makes some 31: a chunk takes 32 ms" in told
+    assert "asked for 30 images a second, this computer makes some 20" in notes_of(50, 4)
+
+
+def test_where_nothing_could_be_measured_nothing_is_refused() -> None:
+    assert notes_of(0, None) == ""

@@ -1,0 +1,126 @@
+"""Goal, height and altitude behind the state; the 13 numbers before them are test_state's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.errors import UserError
+from mavbridge.core.records import VehicleState
+from mavbridge.core.vehicle import Reading, Release, Telemetry
+from mavbridge.flight.settings import flight_settings
+from mavbridge.flight.state import Freshness
+from mavbridge.flight.state_reader import StateReader
+from policy.contract import Contract, StateExtra
+from policy.protocol import Executable
+
+MS = NS_PER_MS
+NOW_NS = 5_000 * MS
+FRESH = Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS)
+GOAL = (100.0, 20.0, -30.0)
+
+
+def at(age_ms: int, *values: float) -> Reading:
+    """A reading that happened so long ago, half of it on the way here."""
+    return Reading(NOW_NS - age_ms * MS // 2, values, age_ms * MS - age_ms * MS // 2)
+
+
+FLYING = Telemetry(
+    ned_from_body_wxyz=at(4, 1, 0, 0, 0),
+    rate_body_radps=at(4, 0, 0, 0),
+    velocity_ned_mps=at(8, 1, 2, 3),
+    specific_force_body_mps2=at(6, 0, 0, -9.8),
+    position_ned_m=at(40, 10, 50, -12),
+    height_above_home_m=at(60, 11.5),
+)
+
+
+def read(
+    telemetry: Telemetry = FLYING,
+    *extras: StateExtra,
+    has_position: bool = True,
+    **contract: object,
+) -> VehicleState | Release:
+    asked = Contract(state_extras=extras, **contract)  # type: ignore[arg-type]
+    reader = StateReader(asked, freshness=FRESH, goal_ned_m=GOAL)
+    return reader.read(telemetry, NOW_NS, has_position=has_position)
+
+
+@pytest.mark.parametrize(
+    ("frame", "goal"), [("ned_frd", (90, -30, -18)), ("enu_flu", (-30, 90, 18))]
+)
+def test_extras_follow_in_the_contracts_order_and_axes(frame: str, goal: tuple[float, ...]) -> None:
+    state = read(FLYING, "height", "goal", "altitude", state_frame=frame)
+    assert isinstance(state, VehicleState)
+    assert state.extras == (11.5, *goal, 12.0)
+    assert state.extras_ns == NOW_NS - 60 * MS
+    plain = read(FLYING, state_frame=frame)
+    assert isinstance(plain, VehicleState)
+    np.testing.assert_array_equal(state.values, plain.values)
+    assert (plain.extras, plain.extras_ns) == ((), None)
+
+
+@pytest.mark.parametrize(
+    ("extra", "field"),
+    [
+        ("goal", "position_ned_m"),
+        ("altitude", "position_ned_m"),
+        ("height", "height_above_home_m"),
+    ],
+)
+def test_what_is_missing_or_old_is_a_reason_and_never_a_zero(extra: StateExtra, field: str) -> None:
+    what = "position" if field == "position_ned_m" else "height above home"
+    reading = getattr(FLYING, field)
+    missing = read(replace(FLYING, **{field: None}), extra)
+    assert missing == Release(f"no {what} from the vehicle yet, or none that it trusts")
+    just = replace(FLYING, **{field: at(250, *reading.values)})
+    assert isinstance(read(just, extra), VehicleState)
+    old = replace(FLYING, **{field: at(252, *reading.values)})
+    assert read(old, extra) == Release(f"{what} is older than 250 ms")
+    assert isinstance(read(old), VehicleState)  # nobody asks for it
+
+
+def test_a_position_that_the_estimator_does_not_trust_is_none() -> None:
+    for extra in ("goal", "altitude"):
+        assert isinstance(read(FLYING, extra, has_position=False), Release)  # type: ignore[arg-type]
+    assert isinstance(read(FLYING, "height", has_position=False), VehicleState)
+
+
+def config(goal: str | None) -> FlyConfig:
+    return FlyConfig(link=LinkConfig(connect="udp:127.0.0.1:14550"), goal=goal)
+
+
+@pytest.mark.parametrize("goal", ["1,2", "1,2,3,4", "", "a,b,c", "nan,0,0", "0,inf,0", "1e6,0,0"])
+def test_a_goal_is_three_numbers(goal: str) -> None:
+    with pytest.raises(UserError, match="use NORTH,EAST,DOWN in metres"):
+        config(goal)
+
+
+def test_a_goal_is_given_just_where_the_policy_takes_one() -> None:
+    def settings(goal: str | None, *extras: StateExtra) -> object:
+        executable = Executable(
+            contract=Contract(state_extras=extras),
+            name="",
+            engine="",
+            dual_rate=True,
+            encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
+            act=lambda e, s, h, t: e,
+        )
+        return flight_settings(config(goal), executable)
+
+    assert config("-10.5, 2,-3").goal_ned_m == (-10.5, 2.0, -3.0)
+    with pytest.raises(UserError, match="this policy flies to a goal: give --goal"):
+        settings(None, "goal")
+    with pytest.raises(UserError, match="takes no goal"):
+        settings("1,2,3")
+    for extras, height, position in (
+        ((), False, False),
+        (("height",), True, False),
+        (("altitude",), False, True),
+        (("goal", "height"), True, True),
+    ):
+        found = settings("1,2,3" if "goal" in extras else None, *extras)  # type: ignore[arg-type]
+        assert found.watches_home_height is height  # type: ignore[attr-defined]
+        assert found.watches_position is position  # type: ignore[attr-defined]
