@@ -21,7 +21,7 @@ WARM := $(if $(filter toge%,$(POLICY)),--head-steps 2)
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable '.[sitl,record,remote,screen,pilot,bench,cluster,dev]'
+	$(PIP) --editable '.[sitl,record,remote,screen,pilot,bench,onnx,cluster,dev]'
 	touch $@
 
 # The peers live apart: MAVProxy brings the OpenCV build with a GUI, which shadows the headless one.

@@ -14,9 +14,11 @@ from cyclopts.config import Toml
 import mavbridge
 from mavbridge.commands.train.checks import prepare as prepare_training
 from mavbridge.config.bench import BenchConfig
+from mavbridge.config.contract import ContractConfig
 from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.export import ExportConfig
+from mavbridge.config.export_policy import ExportPolicyConfig
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
 from mavbridge.config.identify import IdentifyConfig
@@ -201,6 +203,32 @@ def export(*flights: Path, config: ExportConfig) -> int:
     if not flights:
         raise UserError("name the flights to export: mavbridge export DIR... --out DIR")
     return run_export(flights, config)
+
+
+@cli.command
+def export_policy(checkpoint: Path | None = None, *, config: ExportPolicyConfig) -> int:
+    """Write a policy of ours as ONNX or TorchScript.
+
+    Args:
+        checkpoint: its weights, .safetensors; left out, those that TOGE ships with.
+        config: the settings.
+    """
+    from mavbridge.commands.export_policy.run import export_policy as run_export
+
+    return run_export(checkpoint, config)
+
+
+@cli.command
+def contract(source: Path, config: ContractConfig | None = None) -> int:
+    """Draft a contract file: what a LeRobot policy's own files do not say, such as its rate.
+
+    Args:
+        source: folder of a LeRobot policy, or of a LeRobot dataset.
+        config: the settings.
+    """
+    from mavbridge.commands.contract.run import contract as run_contract
+
+    return run_contract(source, config or ContractConfig())
 
 
 @cli.meta.default

@@ -101,7 +101,8 @@ class StepwisePolicy(DualRatePolicy, Protocol):
     """
 
     schedule: Any
-    """A ``nets.diffusion.NoiseSchedule``: the timesteps of a solve, and what an output means."""
+    """A ``nets.diffusion.NoiseSchedule``, or another with its ``ddim_steps`` and ``ddim_update``:
+    the timesteps of a solve, and what an output means."""
 
     @property
     def initial_noise(self) -> Any:

@@ -65,21 +65,31 @@ class ObserverThread:
     """A ``TickSink`` that passes events in batches to a consumer on its own thread.
 
     Ticks and vision ticks queue separately, so images, which are large and slow to handle, drop
-    first and never push a tick out. Each kind must be emitted by one thread. The observer's thread
+    first and never push a tick out. Ticks must be emitted by one thread, and the vision ticks of
+    each camera by one. The observer's thread
     is a daemon: a consumer that hangs cannot keep the process alive.
     """
 
     def __init__(
-        self, name: str, consumer: Consumer, *, capacity: int, image_capacity: int = 16
+        self,
+        name: str,
+        consumer: Consumer,
+        *,
+        capacity: int,
+        image_capacity: int = 16,
+        cameras: int = 1,
     ) -> None:
         """Start the thread, which alone uses the consumer from here on.
 
-        ``capacity`` is the most ticks that may wait, ``image_capacity`` the most vision ticks.
+        ``capacity`` is the most ticks that may wait, ``image_capacity`` the most vision ticks
+        of each of so many ``cameras``.
         """
         self._name = name
         self._consumer = consumer
         self._ticks: BoundedQueue[Event] = BoundedQueue(capacity)
-        self._visions: BoundedQueue[Event] = BoundedQueue(image_capacity)
+        self._visions: list[BoundedQueue[Event]] = [
+            BoundedQueue(image_capacity) for _ in range(cameras)
+        ]
         self._closing = threading.Event()
         self._out_of_time = threading.Event()
         self._open = True
@@ -91,7 +101,7 @@ class ObserverThread:
 
     def emit(self, event: Event) -> None:
         """Queue the event, or drop and count it; never blocks, never raises."""
-        queue = self._ticks if type(event) is Tick else self._visions
+        queue = self._ticks if isinstance(event, Tick) else self._visions[event.camera]
         if self._open:
             queue.put(event)
         else:
@@ -100,10 +110,11 @@ class ObserverThread:
     @property
     def dropped(self) -> int:
         """Events that the consumer never got, or failed on."""
-        dropped = self._ticks.dropped + self._visions.dropped
+        queues = (self._ticks, *self._visions)
+        dropped = sum(queue.dropped for queue in queues)
         if self._thread.is_alive() and not self._out_of_time.is_set():
             return dropped
-        return dropped + len(self._ticks) + len(self._visions) + self._in_flight
+        return dropped + sum(map(len, queues)) + self._in_flight
 
     def close(self, timeout_s: float) -> None:
         """Let the consumer empty the queue and finish, for at most ``timeout_s``."""
@@ -118,7 +129,9 @@ class ObserverThread:
         try:
             while not self._out_of_time.is_set():
                 is_last_round = self._closing.wait(BATCH_PERIOD_S)
-                batch = self._ticks.take(BATCH_EVENTS) + self._visions.take(BATCH_EVENTS)
+                batch = self._ticks.take(BATCH_EVENTS)
+                for queue in self._visions:
+                    batch += queue.take(BATCH_EVENTS)
                 if batch:
                     self._in_flight = len(batch)
                     self._consumer.consume(batch)

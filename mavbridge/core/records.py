@@ -130,6 +130,8 @@ class VisionTick:
     """Frames dropped by the source since it was opened."""
     rgb: ImageArray
     """[H, W, 3] uint8, read-only: what the policy saw, before resizing."""
+    camera: int = 0
+    """Its place among the cameras of the contract; ``serial`` and all others are of this camera."""
 
 
 Event: TypeAlias = Tick | VisionTick

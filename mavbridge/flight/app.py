@@ -198,6 +198,7 @@ class _Flight:
             cameras=cameras,
             sinks=(*self._observers.sinks, *sinks),
             watches_images=looks_at_images(config),
+            all_cameras=self._observers.recorders,
         )
 
     def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:

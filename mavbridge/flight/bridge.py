@@ -51,6 +51,7 @@ def build_bridge(
     cameras: Sequence[Camera],
     sinks: Sequence[TickSink],
     watches_images: bool,
+    all_cameras: Sequence[TickSink] = (),
     caches: Sequence[FeatureCache] = (),
     policy_clock: Clock | None = None,
     vision_clocks: Sequence[Clock] = (),
@@ -66,6 +67,7 @@ def build_bridge(
         cameras: those of the contract, in its order; each is used by its vision loop alone.
         sinks: see every tick and every encoded frame of the first camera.
         watches_images: a frozen or a black image is a fault; False where nobody looks at it.
+        all_cameras: see the encoded frames of the other cameras, each in the thread of its own.
         caches: one for each camera; simulation passes some that publish late.
         policy_clock: time of the policy loop, where simulated solving takes simulated time.
         vision_clocks: time of each vision loop, likewise.
@@ -104,7 +106,8 @@ def build_bridge(
         on_attitude=remember,
     )
     vision_sinks = [
-        FanOut([*own, *(sinks if number == 0 else ())]) for number, own in enumerate(adaptive)
+        FanOut([*own, *(sinks if number == 0 else all_cameras)])
+        for number, own in enumerate(adaptive)
     ]
     visions = tuple(
         VisionLoop(
@@ -116,6 +119,7 @@ def build_bridge(
             period_ns=rates[number].period_ns,
             image_watch=_image_watch(config.camera) if watches_images else None,
             is_airborne=lambda: view.is_airborne,
+            number=number,
         )
         for number, camera in enumerate(cameras)
     )

@@ -63,6 +63,11 @@ class FlightObservers:
         optional = (self._recorder, self._viewer)
         return (self._timing, self.screen, *(sink for sink in optional if sink is not None))
 
+    @property
+    def recorders(self) -> tuple[TickSink, ...]:
+        """The recorder, if it is open: it alone takes the images of all cameras."""
+        return () if self._recorder is None else (self._recorder,)
+
     def open_viewer(self, stack: ExitStack) -> None:
         """Start the viewer or its file, if one is wanted; it is closed with ``stack``."""
         if self._config.rerun == "off":

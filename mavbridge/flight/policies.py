@@ -13,7 +13,7 @@ from policy.contract import Contract
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
 
-BUILT_IN = ("toge", "resnet-unet")
+STATELESS = ("toge", "resnet-unet", "onnx")
 
 
 def load_configured_policy(
@@ -73,8 +73,8 @@ def looks_at_images(config: FlyConfig) -> bool:
 
 
 def is_stateless(policy: PolicyConfig) -> bool:
-    """Return whether the policy keeps nothing between flights: the built-in nets."""
-    return policy.policy.partition(":")[0] in BUILT_IN
+    """Return whether the policy keeps nothing between flights: nets that are loaded by us."""
+    return policy.policy.partition(":")[0] in STATELESS
 
 
 @lru_cache(maxsize=1)

@@ -32,6 +32,7 @@ class VisionLoop:
         period_ns: Callable[[], int],
         image_watch: ImageWatch | None = None,
         is_airborne: Callable[[], bool] = lambda: False,
+        number: int = 0,
     ) -> None:
         """Join a camera, an encoder and a cache; nothing runs yet.
 
@@ -46,8 +47,10 @@ class VisionLoop:
                 renderer draws none.
             is_airborne: whether the policy flies and the vehicle is known not to be landed; a
                 frozen image is a fault only then. Called from this loop's thread.
+            number: place of the camera in the contract.
         """
         self._camera = camera
+        self._number = number
         self._encode = encode
         self._cache = cache
         self._sink = sink
@@ -101,6 +104,7 @@ class VisionLoop:
                 ready_ns=ready_ns,
                 dropped_frames=self._camera.dropped_frames,
                 rgb=frame.rgb,
+                camera=self._number,
             )
         )
         self._frames += 1

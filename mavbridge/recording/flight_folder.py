@@ -7,7 +7,7 @@ from typing import Any
 
 from mavbridge.core.records import ImageArray
 from mavbridge.recording import rows
-from mavbridge.recording.folder import FRAMES, TICKS, VIDEO
+from mavbridge.recording.folder import TICKS, VIDEO, frames_of, video_of
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
 from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
 from mavbridge.recording.tables import read_table
@@ -24,6 +24,8 @@ class RecordedFlight:
     """``pyarrow.Table`` with the columns of docs/flight_folder.md."""
     frames: Any
     """The same, one row an image."""
+    video: str = VIDEO
+    """Name of the file of the images."""
 
     def tick_rows(self) -> Iterator[TickRow]:
         """The ticks as records, with their labels where the flight is a demonstration."""
@@ -36,11 +38,11 @@ class RecordedFlight:
 
     def images(self) -> Iterator[ImageArray]:
         """The images one by one, [H, W, 3] uint8 RGB; raises VideoError if the video is damaged."""
-        return read_video(self.folder / VIDEO, self.frames.num_rows)
+        return read_video(self.folder / self.video, self.frames.num_rows)
 
 
-def open_flight(folder: Path) -> RecordedFlight:
-    """Read the tables of a flight.
+def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
+    """Read the tables of a flight, with the frames of its first camera or of the one named.
 
     A flight that was cut off (``meta.finished`` is false) is read up to its last whole batch of
     rows; frames without a row, and rows without a frame, are left out.
@@ -50,25 +52,33 @@ def open_flight(folder: Path) -> RecordedFlight:
     """
     meta = read_meta(folder)
     ticks = read_table(folder / TICKS, rows.TICKS, later=rows.LATER)
-    return RecordedFlight(folder=folder, meta=meta, ticks=ticks, frames=_frames(folder, meta))
+    known = ("front",) if meta.contract is None else meta.contract.cameras
+    if camera is not None and camera not in known:
+        raise FlightError(f"{folder} has no camera {camera}: it has {', '.join(known)}")
+    other = None if camera == known[0] else camera
+    frames = _frames(folder, meta, other)
+    return RecordedFlight(
+        folder=folder, meta=meta, ticks=ticks, frames=frames, video=video_of(other)
+    )
 
 
-def _frames(folder: Path, meta: FlightMeta) -> Any:
-    has_table = any((folder / FRAMES).with_suffix(end).exists() for end in (".parquet", ".arrows"))
-    has_video = (folder / VIDEO).exists()
+def _frames(folder: Path, meta: FlightMeta, camera: str | None) -> Any:
+    stem, video = frames_of(camera), video_of(camera)
+    has_table = any((folder / stem).with_suffix(end).exists() for end in (".parquet", ".arrows"))
+    has_video = (folder / video).exists()
     if not (has_table and has_video):
-        if meta.finished and meta.frames:
-            missing = VIDEO if has_table else f"{FRAMES}.parquet"
+        if meta.finished and meta.frames and (camera is None or has_table or has_video):
+            missing = video if has_table else f"{stem}.parquet"
             raise FlightError(
                 f"{folder} lacks {missing}, though {meta.frames} frames were recorded: copy the "
                 "folder again, whole"
             )
         return rows.FRAMES.empty_table()  # the flight ended before its first frame
-    table = read_table(folder / FRAMES, rows.FRAMES)
-    whole = count_frames(folder / VIDEO)
+    table = read_table(folder / stem, rows.FRAMES)
+    whole = count_frames(folder / video)
     if meta.finished and whole != table.num_rows:
         raise FlightError(
-            f"{folder / VIDEO} holds {whole} frames, {FRAMES}.parquet {table.num_rows} rows: one "
+            f"{folder / video} holds {whole} frames, {stem}.parquet {table.num_rows} rows: one "
             "of them was damaged or replaced later"
         )
     return table.slice(0, min(whole, table.num_rows))

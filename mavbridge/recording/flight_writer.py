@@ -5,12 +5,13 @@ from pathlib import Path
 
 from mavbridge.core.records import Tick, VisionTick
 from mavbridge.recording import rows
-from mavbridge.recording.folder import FRAMES, TICKS, TLOG, VIDEO
+from mavbridge.recording.camera_files import CameraFiles
+from mavbridge.recording.folder import TICKS, TLOG
 from mavbridge.recording.meta import FlightMeta, write_meta
-from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow, ticks_batch
+from mavbridge.recording.rows import FrameTruth, TickLabels, TickRow, ticks_batch
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.tlog import TlogJob, TlogPipe
-from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError
+from mavbridge.recording.video.writer import Pressure, WriterDiedError, WriterError
 
 FLUSH_NS = 500_000_000
 """Longest span of events that a crash may take with it."""
@@ -44,29 +45,33 @@ class FlightWriter:
         """
         self._folder = folder
         self.meta = meta
-        self.video_failure: WriterDiedError | None = None
-        """Reason why no more frames are recorded, while the rest is."""
         self._schema = rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS
         self._rows: list[TickRow] = []
         self._flushed_ns = meta.start_ns
-        self._tick_serial = self._frame_serial = -1
+        self._tick_serial = -1
         self._ticks_dropped = 0
-        self._source_size: tuple[int, int] | None = None
-        self._video = VideoWriter(
-            folder / VIDEO,
-            pressure=pressure,
-            hz=meta.visual_hz,
-            rows=folder / FRAMES,
-            with_truth=with_labels,
-            tlog=None if tlog_pipe is None else TlogJob(folder / TLOG, tlog_pipe.reader),
-        )
+        names = (None,) if meta.contract is None else (None, *meta.contract.cameras[1:])
+        job = None if tlog_pipe is None else TlogJob(folder / TLOG, tlog_pipe.reader)
+        self.cameras: list[CameraFiles] = []
+        """Those of the contract, in its order."""
         try:
+            for camera in names:
+                self.cameras.append(
+                    CameraFiles(
+                        folder,
+                        camera,
+                        pressure=pressure,
+                        hz=meta.visual_hz,
+                        with_truth=with_labels,
+                        tlog=job if camera is None else None,
+                    )
+                )
             write_meta(folder, meta)
             self._table = TableWriter(folder / TICKS, self._schema)
             # The first conversion imports modules: now, and not in flight.
             self._table.append(ticks_batch([], self._schema))
-        except OSError:
-            self._video.close()
+        except (OSError, WriterError):
+            self._close_cameras()
             raise
 
     def tick(self, tick: Tick, labels: TickLabels | None = None) -> None:
@@ -80,28 +85,18 @@ class FlightWriter:
         self._flush_if_due(tick.woke_ns)
 
     def frame(self, vision: VisionTick, truth: FrameTruth | None = None) -> None:
-        """Record a frame; serial numbers that were left out count as dropped.
+        """Record a frame of any camera; serial numbers that were left out count as dropped.
 
         A writer process that died costs the frames alone: see ``video_failure``.
         """
         self._flush_if_due(vision.ready_ns)
-        dropped = vision.serial - self._frame_serial - 1
-        self._frame_serial = vision.serial
-        if self.video_failure is not None:
-            return
-        if self._source_size is None:
-            self._source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
-        row = FrameRow(
-            frame_id=vision.frame_id,
-            captured_ns=vision.captured_ns,
-            ready_ns=vision.ready_ns,
-            dropped_before=dropped,
-            truth=truth,
-        )
-        try:
-            self._video.submit(vision.rgb, row)
-        except WriterDiedError as error:
-            self.video_failure = error
+        self.cameras[vision.camera].write(vision, truth)
+
+    @property
+    def video_failure(self) -> WriterDiedError | None:
+        """Reason why no more frames of a camera are recorded, while the rest is."""
+        failures = (files.failure for files in self.cameras)
+        return next((failure for failure in failures if failure is not None), None)
 
     def _flush_if_due(self, now_ns: int) -> None:
         if now_ns - self._flushed_ns >= FLUSH_NS:
@@ -116,8 +111,8 @@ class FlightWriter:
 
     @property
     def frames_written(self) -> int:
-        """Frames known to be in the video."""
-        return self._video.written
+        """Frames known to be in the videos."""
+        return sum(files.written for files in self.cameras)
 
     @property
     def ticks(self) -> int:
@@ -132,17 +127,15 @@ class FlightWriter:
         try:
             self._flush()
             self._table.finish()
-            if self.video_failure is None:
-                try:
-                    self._video.finish()
-                except WriterDiedError as error:
-                    self.video_failure = error
+            for files in self.cameras:
+                files.finish()
         except BaseException:
             self.close()
             raise
         is_whole = self.video_failure is None
-        height, width = self._video.size or (None, None)
-        source_height, source_width = self._source_size or (None, None)
+        first = self.cameras[0]
+        height, width = first.size or (None, None)
+        source_height, source_width = first.source_size or (None, None)
         self.meta = replace(
             meta,
             image_height=height,
@@ -151,13 +144,17 @@ class FlightWriter:
             source_width=source_width,
             finished=is_whole,
             ticks=self._table.rows,
-            frames=self._video.written if is_whole else None,
+            frames=first.written if is_whole else None,
             ticks_dropped=self._ticks_dropped,
-            frames_dropped=self._frame_serial + 1 - self._video.written,
+            frames_dropped=first.dropped,
         )
         write_meta(self._folder, self.meta)
 
     def close(self) -> None:
         """Leave everything as it is, after an error; may be called twice."""
-        self._video.close()
+        self._close_cameras()
         self._table.abandon()
+
+    def _close_cameras(self) -> None:
+        for files in self.cameras:
+            files.close()

@@ -12,8 +12,19 @@ FRAMES = "frames"
 VIDEO = "camera.mp4"
 TLOG = "link.tlog"
 
+
 EXTRA = ("av", "pyarrow")
 """Packages of ``pip install 'mavbridge[record]'``."""
+
+
+def video_of(camera: str | None) -> str:
+    """Video of the first camera, or of another one by its name."""
+    return VIDEO if camera is None else f"camera_{camera}.mp4"
+
+
+def frames_of(camera: str | None) -> str:
+    """Stem of the table of its frames."""
+    return FRAMES if camera is None else f"{FRAMES}_{camera}"
 
 
 def require_extra(what: str) -> None:

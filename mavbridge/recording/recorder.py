@@ -51,7 +51,11 @@ class Recorder:
         self._consumer = _FlightConsumer(writer, packets_dropped, autopilot, report)
         self._packets_dropped = packets_dropped
         self._observer = ObserverThread(
-            "mavbridge-recorder", self._consumer, capacity=CAPACITY, image_capacity=IMAGE_CAPACITY
+            "mavbridge-recorder",
+            self._consumer,
+            capacity=CAPACITY,
+            image_capacity=IMAGE_CAPACITY,
+            cameras=len(writer.cameras),
         )
 
     def emit(self, event: Event) -> None:

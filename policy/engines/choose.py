@@ -112,7 +112,7 @@ def _impurity(
         return None
     if changed := changes(before, snapshot(policy)):
         return f"it keeps {', '.join(changed)} from call to call, which a graph cannot"
-    encoded = reference.encode(samples.rgb[0])
+    encoded = encode_all(reference, samples.rgb[0])
     again = reference.act(encoded, samples.state[:1], samples.history[:1], None)[0]
     if np.array_equal(again, expected[0]):
         return None

@@ -35,6 +35,8 @@ from policy.protocol import Executable, SingleRatePolicy
 
 MAX_OPERATIONS = 4000
 """In one graph: 3 ms each to convert; ten unrolled steps of a TOGE are 2,700, one is 500."""
+MAX_SCRIPT_OPERATIONS = 20_000
+"""The same limit where the graph is TorchScript's, which counts constants and shapes as well."""
 MAX_WEIGHTS = 600_000_000
 """In one graph, each counted as often as it is used: a copy of 4 bytes each, at least, is made for
 each use while it is converted. One step of the largest usual diffusion policy is 263 million."""
@@ -80,6 +82,10 @@ class ModuleConverter:
     def __init__(self, policy: object, name: str) -> None:
         self._modules = nn.ModuleList(modules_of(policy)).eval()
         self._name = name
+        self._is_script = any(
+            isinstance(module, torch.jit.ScriptModule) for module in self._modules.modules()
+        )
+        """TorchScript keeps its decisions where it is traced, and torch.export does not take it."""
         self._models: dict[str, ov.Model] = {}
         if not self._modules:
             raise PolicyError(
@@ -99,9 +105,12 @@ class ModuleConverter:
         module = _Traceable(self._modules, function).eval()
         examples = tuple(torch.zeros(shape) for shape in shapes)
         with user_code(f"{self._name} cannot be converted"), _quiet(), torch.no_grad():
-            program = _exported(module, examples)
-            _require_bounded(program)
-            digest = _digest(program)
+            if self._is_script:
+                digest = _digest_of_script(module, examples)
+            else:
+                program = _exported(module, examples)
+                _require_bounded(program)
+                digest = _digest(program)
 
             def build() -> ov.Model:
                 if digest not in self._models:
@@ -197,10 +206,33 @@ def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
             yield node.name, stored[target], len(node.users)
 
 
+def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
+    """As ``_digest`` of a module that calls TorchScript.
+
+    Raises:
+        PolicyError: it is too large to be converted.
+    """
+    graph = _traced(module, examples).inlined_graph
+    operations = sum(1 for _ in graph.nodes())
+    if operations > MAX_SCRIPT_OPERATIONS:
+        raise PolicyError(
+            f"its graph has {operations:,} operations, and at most {MAX_SCRIPT_OPERATIONS:,} are "
+            "converted: if it loops over denoising steps, export one step as `denoiser`"
+        )
+    digest = hashlib.sha256(str(graph).encode())
+    for name, value in module.state_dict().items():
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
 def _converted(module: nn.Module, examples: tuple[Tensor, ...]) -> ov.Model:
     # Traced, and not made of the exported program, whose graphs are slower on the CPU: 0.8 ms
     # instead of 0.45 for a step of TOGE in bf16.
-    trace: Any = torch.jit.trace  # without types
-    traced = trace(module, examples, check_trace=False, strict=False)
     shapes = [list(example.shape) for example in examples]
-    return ov.convert_model(traced, example_input=examples, input=shapes)
+    return ov.convert_model(_traced(module, examples), example_input=examples, input=shapes)
+
+
+def _traced(module: nn.Module, examples: tuple[Tensor, ...]) -> Any:
+    trace: Any = torch.jit.trace  # without types
+    return trace(module, examples, check_trace=False, strict=False)

@@ -6,7 +6,8 @@
 
     [state]                      # the state vector that it was trained on
     key = "observation.state"
-    names = ["vx_mps", "vy_mps", "vz_mps", "qw", "qx", "qy", "qz"]
+    names = ["vx_mps", "vy_mps", "vz_mps", "roll_rad", "pitch_rad", "yaw_rad"]
+    scale = [1.0, 1.0, 1.0, 57.29578, 57.29578, 57.29578]  # it takes its angles in degrees
 
     [action]                     # its action vector; scaled and shifted it is the contract's
     key = "action"
@@ -20,19 +21,28 @@
     [task]
     prompt = "fly through the gates"
 
-All of it is optional but what the kind of policy asks for.
+All of it is optional but what the kind of policy asks for. State names are those of the contract
+and of ``foreign.state``. A draft has the text "?" where only the user knows the answer, and is not
+flown before each has one: ``foreign.drafts`` writes them.
 """
 
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from policy.contract import ACTION_DIM, ACTION_NAMES, Contract, FloatArray
 from policy.errors import ContractError
+from policy.foreign.state import DERIVED_NAMES, state_values
+
+ArrayOrTensor = TypeVar("ArrayOrTensor")
+CONTRACT_FILE = "mavbridge.toml"
+"""Its name beside a policy or dataset, where flights find it without --contract."""
+UNANSWERED = "?"
+"""In a contract file: the user has to say."""
 
 ACTION_FIELDS: dict[str, tuple[str, ...]] = {
     "sticks": ACTION_NAMES,
@@ -53,7 +63,10 @@ class Interface:
 
     contract: Contract
     state_names: tuple[str, ...] = ()
-    """Its state vector, as names of ``contract.state_names``; empty: the same as the contract's."""
+    """Its state vector, as names of ``contract.state_names`` and ``state.DERIVED_NAMES``; empty:
+    the same as the contract's."""
+    state_scale: tuple[float, ...] = ()
+    """Factor from the contract's unit to the policy's of each of them; empty: ones."""
     action_names: tuple[str, ...] = ()
     """Its action vector, as names of ``ACTION_FIELDS``; empty: the same as the contract's."""
     action_scale: tuple[float, ...] = ()
@@ -69,7 +82,7 @@ class Interface:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be mapped."""
-        known = self.contract.state_names
+        known = (*self.contract.state_names, *DERIVED_NAMES)
         if unknown := [name for name in self.state_names if name not in known]:
             raise ContractError(f"[state] names {unknown} are unknown; known are {list(known)}")
         wanted = ACTION_FIELDS[self.contract.action]
@@ -78,9 +91,16 @@ class Interface:
                 f"[action] names must be {list(wanted)} in some order for action "
                 f"{self.contract.action!r}, got {list(self.action_names)}"
             )
+        if len(self.state_scale) not in (0, self.state_dim):
+            raise ContractError(
+                f"[state] scale must be {self.state_dim} numbers, one a name, got "
+                f"{list(self.state_scale)}"
+            )
         for name, values in (("scale", self.action_scale), ("offset", self.action_offset)):
             if values and len(values) != ACTION_DIM:
                 raise ContractError(f"[action] {name} must be {ACTION_DIM} numbers, got {values}")
+        if 0 in self.action_scale:
+            raise ContractError(f"[action] scale must not be 0, got {self.action_scale}")
         if self.image_keys and len(self.image_keys) != len(self.contract.cameras):
             raise ContractError(
                 f"[images] must name each of the cameras {list(self.contract.cameras)}"
@@ -91,6 +111,30 @@ class Interface:
         """Column of ``contract.state_names`` of each number of the policy's state."""
         names = self.state_names or self.contract.state_names
         return [self.contract.state_names.index(name) for name in names]
+
+    @property
+    def state_dim(self) -> int:
+        """Width of the policy's state."""
+        return len(self.state_names or self.contract.state_names)
+
+    def to_state(self, state: ArrayOrTensor) -> ArrayOrTensor:
+        """The contract's state [..., S] -> the policy's [..., state_dim], float32.
+
+        Both are numpy arrays or both torch tensors; in torch, the operations can be traced.
+        """
+        names = self.contract.state_names
+        wanted = self.state_names or names
+        values: Any = state
+        library, options = _library(state)
+        if not set(wanted) <= set(names):
+            columns = [values[..., column] for column in range(len(names))]
+            derived = state_values(columns, names, wanted, library.arctan2)
+            values = library.stack(derived, -1)
+        elif wanted != names:
+            values = values[..., [names.index(name) for name in wanted]]
+        if self.state_scale:
+            values = values * library.asarray(self.state_scale, **options)
+        return cast(ArrayOrTensor, values)
 
     @property
     def action_columns(self) -> list[int]:
@@ -108,6 +152,15 @@ class Interface:
         scale = np.array(self.action_scale or (1.0,) * ACTION_DIM, np.float32)
         offset = np.array(self.action_offset or (0.0,) * ACTION_DIM, np.float32)
         return np.ascontiguousarray((actions * scale + offset)[..., self.action_columns])
+
+    def from_actions(self, actions: FloatArray) -> FloatArray:
+        """The contract's actions [..., 4] -> the policy's [..., 4]: ``to_actions``, undone."""
+        scale = np.array(self.action_scale or (1.0,) * ACTION_DIM, np.float32)
+        offset = np.array(self.action_offset or (0.0,) * ACTION_DIM, np.float32)
+        theirs = np.empty_like(actions)
+        theirs[..., self.action_columns] = actions
+        unscaled: FloatArray = (theirs - offset) / scale
+        return unscaled
 
 
 def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> Interface:
@@ -132,6 +185,11 @@ def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> I
 
 
 def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface:
+    if unanswered := _unanswered(data):
+        raise ContractError(
+            f"this is a draft, in which {len(unanswered)} answers are missing: "
+            f"{', '.join(unanswered)}. Replace each {UNANSWERED!r} there, by what the comment asks"
+        )
     tables = {name: dict(data.pop(name, {})) for name in ("contract", "state", "action", "images")}
     task = dict(data.pop("task", {}))
     known = {field.name for field in fields(Contract) if field.init}
@@ -153,6 +211,7 @@ def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface
     interface = Interface(
         contract=contract,
         state_names=tuple(state.pop("names", ())),
+        state_scale=tuple(float(value) for value in state.pop("scale", ())),
         state_key=str(state.pop("key", Interface.state_key)),
         action_names=tuple(action.pop("names", ())),
         action_key=str(action.pop("key", Interface.action_key)),
@@ -164,6 +223,28 @@ def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface
     if rest := sorted((*data, *state, *action, *task)):
         raise ContractError(f"unknown entries {rest}")
     return interface
+
+
+def _unanswered(data: Mapping[str, Any]) -> list[str]:
+    """Entries that are, or hold, ``UNANSWERED``."""
+    return [
+        f"[{table}] {name}"
+        for table, entries in data.items()
+        if isinstance(entries, dict)
+        for name, value in entries.items()
+        if value == UNANSWERED or (isinstance(value, list) and UNANSWERED in value)
+    ]
+
+
+def _library(state: object) -> tuple[Any, dict[str, Any]]:
+    """The library of an array or tensor, and how its constants are made."""
+    if isinstance(state, np.ndarray):
+        return np, {"dtype": np.float32}
+    import torch
+
+    if not isinstance(state, torch.Tensor):
+        raise TypeError(f"neither an array nor a tensor: {type(state)}")
+    return torch, {"dtype": torch.float32, "device": state.device}
 
 
 def _frozen(value: object) -> Any:

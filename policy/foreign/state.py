@@ -24,7 +24,7 @@ EGOCENTRIC_NAMES = (
 EULER_NAMES = ("roll_rad", "pitch_rad", "yaw_rad")
 DERIVED_NAMES = (*EGOCENTRIC_NAMES, *EULER_NAMES)
 BODY_STATE_NAMES = (*EGOCENTRIC_NAMES, *STATE_NAMES[QUATERNION.stop :])
-"""A whole state without a heading: body velocity, vertical axis, rates and specific force."""
+"""A state without a heading: velocity, vertical axis, rates and specific force of the body."""
 
 
 def state_values(

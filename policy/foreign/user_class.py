@@ -20,7 +20,8 @@ from policy.protocol import DualRatePolicy, SingleRatePolicy
 
 FORMS = (
     "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air], "
-    "lerobot:DIR, ws://HOST:PORT, package.module:Class or ./file.py:Class"
+    "lerobot:DIR, onnx:DIR_OR_FILE, torchscript:FILE, ws://HOST:PORT, package.module:Class or "
+    "./file.py:Class"
 )
 """What a user may write to name a policy."""
 OUR_PACKAGES = ("policy", "sitl", "mavbridge")
@@ -62,7 +63,11 @@ def load_user_class(spec: str, checkpoint: Path | None) -> SingleRatePolicy:
         raise PolicyError(f"--policy {spec}: {error}; {_import_hint(error.__cause__)}") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
-        classes = sorted(name for name, value in vars(module).items() if isinstance(value, type))
+        classes = sorted(
+            name
+            for name, value in vars(module).items()
+            if isinstance(value, type) and (hasattr(value, "predict") or hasattr(value, "forward"))
+        )
         raise PolicyError(f"--policy {spec}: no class {class_name} there; it has {classes}")
     return _instance(spec, found, checkpoint)
 

@@ -6,6 +6,8 @@
                              a fixed program in any kind of action, e.g. scripted:square:velocity;
                              air: begin in the air, without the climb
     lerobot:DIR              an ACT or DiffusionPolicy as LeRobot saved it, with --contract FILE
+    onnx:DIR, onnx:FILE.onnx an ONNX export, with --contract FILE where nothing beside it is one
+    torchscript:FILE.pt      a TorchScript archive, likewise
     package.module:Class     any class that keeps protocol.SingleRatePolicy or DualRatePolicy
     ./file.py:Class          the same, by its file
     ws://HOST:PORT           a server that speaks openpi's websocket protocol; wss:// with TLS
@@ -26,6 +28,14 @@ from policy.errors import PolicyError
 from policy.foreign.user_class import check_user_class, load_user_class
 from policy.foreign.websocket.kind import SCHEMES, check_server, load_server_policy
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
+from policy.loading.exported import (
+    ONNX,
+    TORCHSCRIPT,
+    check_onnx,
+    check_torchscript,
+    load_archive,
+    load_onnx,
+)
 from policy.loading.lerobot import LEROBOT, check_lerobot, load_lerobot
 from policy.loading.life import life_method
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
@@ -63,6 +73,11 @@ def check_request(request: PolicyRequest) -> None:
         _require_devices(request)
     elif kind in SCHEMES:
         check_server(request.spec, request.contract_file, request.checkpoint)
+    elif kind == ONNX:
+        _require_image_size(check_onnx(request).description.interface.contract, request.image_size)
+    elif kind == TORCHSCRIPT:
+        _require_image_size(check_torchscript(request).interface.contract, request.image_size)
+        _require_devices(request)
     else:
         _require_no_path(request.spec)
         check_user_class(request.spec)
@@ -78,6 +93,10 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
     kind = request.spec.partition(":")[0]
     if kind == LEROBOT:
         return check_lerobot(request).interface.contract
+    if kind == ONNX:
+        return check_onnx(request).description.interface.contract
+    if kind == TORCHSCRIPT:
+        return check_torchscript(request).interface.contract
     if kind not in BUILTIN_KINDS:
         policy, _ = _find(request, lambda: 0.0)
         life_method(policy, "close", request.spec)()
@@ -146,6 +165,10 @@ def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRat
         return load_lerobot(request)
     if kind in SCHEMES:
         return load_server_policy(request.spec, request.contract_file)
+    if kind == ONNX:
+        return load_onnx(request)
+    if kind == TORCHSCRIPT:
+        return load_archive(request)
     if kind not in BUILTIN_KINDS:
         return load_user_class(request.spec, request.checkpoint), [
             f"{request.spec}: a class of yours"
@@ -157,6 +180,11 @@ def _executable(
     policy: SingleRatePolicy, request: PolicyRequest, settings: ExecutionSettings
 ) -> tuple[Executable, tuple[str, ...]]:
     """An engine that takes the policy's kind of arrays, and notes about the choice."""
+    if request.spec.partition(":")[0] == ONNX:
+        from policy.foreign.onnx.policies import OnnxPolicy, choose_precision
+
+        if isinstance(policy, OnnxPolicy):
+            return choose_precision(policy, settings)
     if policy.contract.arrays == "numpy":
         if request.engine != "auto":
             raise PolicyError(

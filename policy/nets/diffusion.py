@@ -15,17 +15,20 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
+from policy.contract import FloatArray
 from policy.errors import PolicyError
 
 BetaSchedule = Literal["squared_cosine", "linear"]
 Prediction = Literal["sample", "epsilon"]
 
 TRAIN_TIMESTEPS = 100
+Chunk = TypeVar("Chunk", Tensor, FloatArray)
+"""Actions [B, horizon, 4], clean or noisy."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,22 +122,22 @@ class NoiseSchedule:
         return a, b, step.next_signal - kept * step.signal, kept
 
     def ddim_update(
-        self, step: DdimStep, noisy: Tensor, output: Tensor, *, limit: float = 1.0
-    ) -> Tensor:
-        """One reverse step from the net's output.
+        self, step: DdimStep, noisy: Chunk, output: Chunk, *, limit: float = 1.0
+    ) -> Chunk:
+        """One reverse step from the net's output, both tensors or both arrays.
 
         x_0 is clipped to [-limit, limit], by default the range of an action, and eps is then
         recomputed, so that both still explain ``noisy``.
         """
-        if self.prediction == "sample":
-            clean = output
-        else:
+        clean: Any = output
+        if self.prediction == "epsilon":
             clean = (noisy - step.noise * output) / step.signal
-        clean = clean.clamp(-limit, limit)
-        if step.next_noise == 0.0:
-            return clean
-        noise = (noisy - step.signal * clean) / step.noise
-        return step.next_signal * clean + step.next_noise * noise
+        clean = clean.clip(-limit, limit)
+        after: Chunk = clean
+        if step.next_noise != 0.0:
+            noise = (noisy - step.signal * clean) / step.noise
+            after = step.next_signal * clean + step.next_noise * noise
+        return after
 
 
 def ddim_solve(

@@ -36,7 +36,7 @@ class ExpertPilot:
     def latest(self) -> Sequence[int] | None:
         """See `Pilot`."""
         now_ns = self._vehicle.ap.now_ns
-        if not self._transmitter.is_due(now_ns):
+        if not self._transmitter.begins_frame(now_ns):
             return None
         return self._transmitter.channels_us(self._hand(now_ns), now_ns)
 

@@ -44,7 +44,7 @@ class GamepadPilot:
     def latest(self) -> Sequence[int] | None:
         """See `Pilot`."""
         now_ns = self._clock.now_ns()
-        if not self._transmitter.is_due(now_ns):
+        if not self._transmitter.begins_frame(now_ns):
             return None
         if not self._pad.poll():
             self._pressed = set()

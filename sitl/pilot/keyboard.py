@@ -45,7 +45,7 @@ class KeyboardPilot:
     def latest(self) -> Sequence[int] | None:
         """See `Pilot`."""
         now_ns = self._clock.now_ns()
-        if not self._transmitter.is_due(now_ns):
+        if not self._transmitter.begins_frame(now_ns):
             return None
         for event in pygame.event.get():
             self._take(event)

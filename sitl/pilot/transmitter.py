@@ -49,11 +49,11 @@ class Transmitter:
         self._start_ns = start_ns
         self._due_ns = start_ns
 
-    def is_due(self, now_ns: int) -> bool:
-        """It is time for another frame; say so once for each."""
+    def begins_frame(self, now_ns: int) -> bool:
+        """It is time for another frame; true once for each."""
         if now_ns < self._due_ns:
             return False
-        self._due_ns = max(self._due_ns + PERIOD_NS, now_ns)
+        self._due_ns = now_ns + PERIOD_NS - min(PERIOD_NS - 1, now_ns - self._due_ns)
         return True
 
     def channels_us(self, hand: Hand, now_ns: int) -> tuple[int, ...]:

@@ -49,9 +49,16 @@ def _in_thread(listen: Callable[[], "asyncio.Future[Server]"]) -> Iterator[int]:
 
 @contextmanager
 def scripted_server(
-    reply: Callable[[Message], Reply], *, greeting: bytes | str = pack({}), port: int = 0
+    reply: Callable[[Message], Reply],
+    *,
+    greeting: bytes | str = pack({}),
+    port: int = 0,
+    on_close: Callable[[int | None], None] = lambda _code: None,
 ) -> Iterator[int]:
-    """A server that answers by ``reply``, which runs in a thread and may wait; gives its port."""
+    """A server that answers by ``reply``, which runs in a thread and may wait; gives its port.
+
+    ``on_close`` gets the code by which a client has closed its connection.
+    """
 
     async def talk(connection: ServerConnection) -> None:
         with suppress(ConnectionClosed):
@@ -61,6 +68,7 @@ def scripted_server(
                 if answer is None:
                     return
                 await connection.send(answer)
+        on_close(connection.close_code)
 
     def listen() -> "asyncio.Future[Server]":
         return asyncio.ensure_future(_listening(talk, port))

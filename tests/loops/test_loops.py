@@ -83,7 +83,8 @@ def test_the_sticks_keep_their_rate_whatever_the_rate_of_the_policy(
     stick_hz: float, action_hz: float
 ) -> None:
     rates = Rates(stick_rate=stick_hz, action_rate=action_hz)
-    flown = VirtualFlight(rates=rates).fly(2.0).flown
+    contract = Contract(feature_dim=8, arrays="numpy", play_s=0.2)
+    flown = VirtualFlight(contract=contract, rates=rates).fly(2.0).flown
     gaps_ns = np.diff([tick.sent_ns for tick in flown])
     assert gaps_ns.max() <= 1.5 * NS_PER_S / stick_hz
     assert sum(tick.missed_slots for tick in flown) == 0

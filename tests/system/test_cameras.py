@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from helpers.stand import flight
+from mavbridge.recording.flight_folder import open_flight
 
 pytestmark = pytest.mark.system
 
@@ -14,10 +15,16 @@ FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")
 def test_two_cameras_feed_one_policy(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
         flying.cameras = ("down", "front")  # their order is the contract's, not this one
+        folder = tmp_path / "recording"
         flags = ("--policy", "helpers.user_policies:TwoEyed", "--duration", "4")
-        flying.start(*FLY, *flags)
+        flying.start(*FLY, *flags, "--record", str(folder))
         status, output = flying.end()
     assert status == 0, output
+    front, down = open_flight(folder), open_flight(folder, "down")
+    assert front.meta.finished
+    assert front.meta.frames == front.frames.num_rows == sum(1 for _ in front.images())
+    assert 0 < down.frames.num_rows == sum(1 for _ in down.images())
+    assert down.frames.num_rows < 0.7 * front.frames.num_rows  # 15 images a second, not 30
     assert flying.vehicle_report()["max_altitude_m"] > 0.3
     assert flying.report()["vision"]["frames"] > 0
 

@@ -9,7 +9,9 @@ import threading
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
+from queue import Queue
 from typing import Any
 
 import numpy as np
@@ -114,6 +116,14 @@ def test_a_late_answer_is_never_flown(contract_file: Path) -> None:
         assert gate.requests >= tried + 3
 
 
+def test_a_flight_that_ends_takes_its_leave(contract_file: Path) -> None:
+    codes: Queue[int | None] = Queue()
+    with scripted_server(lambda _: chunk_of(0.5), on_close=codes.put) as port:
+        with loaded(port, contract_file):
+            pass
+        assert codes.get(timeout=PATIENT_S) == 1000
+
+
 def test_the_server_says_how_long_it_took(contract_file: Path) -> None:
     with (
         scripted_server(lambda _: chunk_of(0.5)) as port,
@@ -204,7 +214,9 @@ def test_a_server_that_is_too_slow_is_refused_with_its_figures(contract_file: Pa
     contract_file.write_text(CONTRACT.replace("0.5", "0.02"))
     with (
         scripted_server(reply) as port,
-        pytest.raises(PolicyError, match=r"answers in \d+ ms, .* may take 20 ms by the age limits"),
+        pytest.raises(
+            PolicyError, match=r"answers in [0-9.]+ ms, .* may take 20 ms by the age limits"
+        ),
     ):
         load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
 
@@ -227,7 +239,7 @@ def test_addresses_without_a_policy_server(
             load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
     with scripted_server(lambda _: chunk_of(0.5)) as port:
         url = f"ws://127.0.0.1:{port}"
-        with pytest.raises(PolicyError, match="give --contract FILE; mavbridge contract"):
+        with pytest.raises(PolicyError, match="give --contract FILE; docs"):
             read_policy_contract(PolicyRequest(spec=url))
 
 
@@ -293,6 +305,18 @@ def test_a_served_policy_flies_the_same_sticks_as_here(name: str) -> None:
                 assert np.array_equal(there.act(*inputs, None), here.act(*inputs, None))
 
 
+def test_a_contract_file_says_when_a_served_policy_may_fly(tmp_path: Path) -> None:
+    path = tmp_path / "contract.toml"
+    path.write_text("[contract]\nplay_s = 0.25\nmax_state_age_s = 0.15\n")
+    with our_server(served_echo()) as port:
+        request = PolicyRequest(spec=f"ws://127.0.0.1:{port}", contract_file=path)
+        contract = read_policy_contract(request)
+        assert contract == replace(SMALL, play_s=0.25, max_state_age_s=0.15)
+        path.write_text("[contract]\nimage_height = 64\n")
+        with pytest.raises(PolicyError, match="contradicts the policy's own files, which say 32"):
+            read_policy_contract(request)
+
+
 def test_a_served_policy_is_told_that_a_flight_begins() -> None:
     policy = Echo()
     executable = make_numpy_executable(policy, ExecutionSettings(name="echo", dual_rate=False))
@@ -325,7 +349,7 @@ def connect(port: int, **headers: str) -> Any:
 
 
 def test_our_server_keeps_the_protocol_of_openpi() -> None:
-    """As its own client speaks: metadata first, a chunk for a request, a text for an error."""
+    """As its reference client speaks: first metadata, then chunks, and texts for errors."""
     request = {
         "observation.images.front": np.zeros((32, 32, 3), np.uint8),
         "observation.state": np.arange(13, dtype=np.float64),

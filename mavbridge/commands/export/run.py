@@ -23,6 +23,11 @@ from mavbridge.core.stopping import stop_on_signals
 from policy.contract import STATE_NAMES
 from policy.data.flight_data import FlightData, common_frame
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
+from policy.data.tables import read_json
+from policy.foreign.drafts.entries import Entry, draft_text
+from policy.foreign.drafts.lerobot import dataset_entries
+from policy.foreign.drafts.recorded import recorded_entries
+from policy.foreign.interface import CONTRACT_FILE
 from policy.foreign.state import BODY_STATE_NAMES
 
 
@@ -64,6 +69,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         frames = sum(len(episode.captured_ns) for episode in episodes)
         writing = progress.add_task("writing frames", total=frames)
         done = write_dataset(episodes, folder, config, lambda: advance(writing))
+        write_contract(folder, exemplary, config)
     _print_summary(done, config.out)
     return 0
 
@@ -115,6 +121,27 @@ def write_dataset(
         frames_lost=sum(map(len, every)) - writer.rows,
         worst_shift_ns=max(worst_shift_ns(part, fps) for part in every),
     )
+
+
+def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig) -> None:
+    """Write the contract file of a policy that is trained on a dataset made of these flights.
+
+    Raises:
+        DatasetError: a flight's meta.json cannot be read.
+    """
+    metas = [read_json(flight / "meta.json", "flight folder") for flight in flights]
+    contracts = [meta.get("contract") for meta in metas]
+    # The one camera is the vehicle's own, whatever its name: the contract's default.
+    entries = [
+        *(entry for entry in dataset_entries(dataset) if entry.name != "cameras"),
+        *recorded_entries([each for each in contracts if isinstance(each, dict)]),
+        Entry(table="task", name="prompt", value=config.task, origin="read", why="--task"),
+    ]
+    title = (
+        "Contract of the policies that are trained on this dataset, written by mavbridge export: "
+        "mavbridge --policy lerobot:DIR --contract THIS_FILE"
+    )
+    (dataset / CONTRACT_FILE).write_text(draft_text(title, entries))
 
 
 def _write_flight(

@@ -2,6 +2,7 @@
 
 from torch import Tensor, nn
 
+from policy.foreign.lerobot.group_norm import GroupNorm
 from policy.nets.resnet import BasicBlock, Bottleneck, ResNet
 
 _DEPTHS: dict[str, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, int, int]]] = {
@@ -40,6 +41,6 @@ def _replace_batch_norms(module: nn.Module) -> None:
     for name, child in module.named_children():
         if isinstance(child, nn.BatchNorm2d):
             channels = child.num_features
-            setattr(module, name, nn.GroupNorm(channels // _CHANNELS_PER_GROUP, channels))
+            setattr(module, name, GroupNorm(channels // _CHANNELS_PER_GROUP, channels))
         else:
             _replace_batch_norms(child)

@@ -5,17 +5,14 @@ else each time. Here a solve is what LeRobot computes with noise_scheduler_type 
 in few steps, from one fixed noise. Parameters have LeRobot's names.
 """
 
-import math
-from dataclasses import dataclass
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM
-from policy.errors import PolicyError
 from policy.foreign.lerobot.backbone import Backbone, torchvision_name
 from policy.foreign.lerobot.config import DiffusionConfig, map_size
+from policy.foreign.lerobot.schedule import DdimSchedule
 from policy.foreign.lerobot.unet import UNet
 
 
@@ -60,61 +57,6 @@ class RgbEncoder(nn.Module):
         return F.relu(self.out(self.pool(self.backbone(image))))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Step:
-    """A reverse step from ``timestep``: sqrt(a) and sqrt(1 - a) of the noise before and after."""
-
-    timestep: int
-    signal: float
-    noise: float
-    next_signal: float
-    next_noise: float
-
-
-def ddim_steps(config: DiffusionConfig, count: int) -> list[Step]:
-    """The steps of a solve, noisiest first, at the timesteps that LeRobot's DDIM takes.
-
-    Those are multiples of the spacing from 0 on, so a solve of few steps does not begin at the
-    noisiest one. Computed in float32, as LeRobot's schedule is.
-
-    Raises:
-        PolicyError: more steps than in training.
-    """
-    total = config.num_train_timesteps
-    if not 1 <= count <= total:
-        raise PolicyError(
-            f"num_diffusion_steps must be an integer in 1..{total}, the steps of its training; got "
-            f"{count}"
-        )
-    power = torch.cumprod(1 - _betas(config), dim=0)
-    signal, noise = power.sqrt().tolist(), (1 - power).sqrt().tolist()
-    spacing = total // count
-    return [
-        Step(
-            timestep=t,
-            signal=signal[t],
-            noise=noise[t],
-            next_signal=signal[t - spacing] if t >= spacing else 1.0,
-            next_noise=noise[t - spacing] if t >= spacing else 0.0,
-        )
-        for t in reversed(range(0, spacing * count, spacing))
-    ]
-
-
-def _betas(config: DiffusionConfig) -> Tensor:
-    total, low, high = config.num_train_timesteps, config.beta_start, config.beta_end
-    if config.beta_schedule == "linear":
-        return torch.linspace(low, high, total, dtype=torch.float32)
-    if config.beta_schedule == "scaled_linear":
-        return torch.linspace(low**0.5, high**0.5, total, dtype=torch.float32) ** 2
-
-    def power(share: float) -> float:  # Nichol & Dhariwal 2021, section 3.2
-        return math.cos((share + 0.008) / 1.008 * math.pi / 2) ** 2
-
-    shares = [power((t + 1) / total) / power(t / total) for t in range(total)]
-    return torch.tensor([min(1 - share, 0.999) for share in shares], dtype=torch.float32)
-
-
 class Diffusion(nn.Module):
     """Normalised images and states -> normalised actions."""
 
@@ -125,13 +67,11 @@ class Diffusion(nn.Module):
 
     def __init__(self, config: DiffusionConfig) -> None:
         super().__init__()
-        self.config = config
-        cameras, separate = (
-            len(config.features.image_keys),
-            config.use_separate_rgb_encoder_per_camera,
-        )
+        self.steps_before_now = config.n_obs_steps - 1
+        self.schedule = DdimSchedule(config)
+        cameras = len(config.features.image_keys)
         self.rgb_encoder: nn.Module = RgbEncoder(config)
-        if separate:
+        if config.use_separate_rgb_encoder_per_camera:
             self.rgb_encoder = nn.ModuleList(RgbEncoder(config) for _ in range(cameras))
         each = (config.features.state_dim or 0) + cameras * config.feature_dim
         self.unet = UNet(config, each * config.n_obs_steps)
@@ -158,31 +98,32 @@ class Diffusion(nn.Module):
         feature: Tensor = encoder(image)
         return feature
 
+    def film_of_condition(self, feature: Tensor, state: Tensor) -> list[Tensor]:
+        """Features [B, T, cameras, F] and states [B, T, S] -> their share of FiLM."""
+        condition = torch.cat([state, feature.flatten(2)], dim=-1).flatten(1)
+        return self.unet.film_of_condition(condition)
+
+    def denoise(self, noisy: Tensor, timestep: Tensor, of_condition: list[Tensor]) -> Tensor:
+        """One call of the network: noisy actions [B, predicted, 4] at timesteps [B]."""
+        of_timestep = self.unet.film_of_timestep(timestep)
+        films = [a + b for a, b in zip(of_timestep, of_condition, strict=True)]
+        prediction: Tensor = self.unet(noisy, films)
+        return prediction
+
     def act(self, feature: Tensor, state: Tensor, num_diffusion_steps: int) -> Tensor:
-        """Features [B, T, cameras, F] and states [B, T, S] -> actions from now on [B, horizon, 4].
+        """A whole solve -> actions from now on [B, horizon, 4].
 
         Raises:
             PolicyError: more steps than in training.
         """
-        condition = torch.cat([state, feature.flatten(2)], dim=-1).flatten(1)
-        of_condition = self.unet.film_of_condition(condition)
-        sample = self.initial_noise.expand(condition.shape[0], -1, -1)
-        for step in ddim_steps(self.config, num_diffusion_steps):
-            of_timestep = self.unet.film_of_timestep(step.timestep)
-            films = [a + b for a, b in zip(of_timestep, of_condition, strict=True)]
-            sample = self._stepped(step, sample, self.unet(sample, films))
-        return sample[:, self.config.n_obs_steps - 1 :]
+        of_condition = self.film_of_condition(feature, state)
+        sample = self.initial_noise.expand(feature.shape[0], -1, -1)
+        for step in self.schedule.ddim_steps(num_diffusion_steps):
+            timestep = torch.full((1,), float(step.timestep), device=sample.device)
+            output = self.denoise(sample, timestep, of_condition)
+            sample = self.schedule.ddim_update(step, sample, output)
+        return self.from_now(sample)
 
-    def _stepped(self, step: Step, noisy: Tensor, output: Tensor) -> Tensor:
-        """DDIM with eta = 0 (Song et al. 2021, eq. 12).
-
-        The noise is that of the estimate before it is clipped.
-        """
-        if self.config.prediction_type == "epsilon":
-            clean, noise = (noisy - step.noise * output) / step.signal, output
-        else:
-            clean, noise = output, (noisy - step.signal * output) / step.noise
-        if self.config.clip_sample:
-            limit = self.config.clip_sample_range
-            clean = clean.clamp(-limit, limit)
-        return step.next_signal * clean + step.next_noise * noise
+    def from_now(self, sample: Tensor) -> Tensor:
+        """Without the actions at the earlier observations: [B, predicted, 4] -> [B, horizon, 4]."""
+        return sample[:, self.steps_before_now :]

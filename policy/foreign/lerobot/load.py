@@ -9,9 +9,8 @@ from torch import Tensor
 
 from policy.errors import CheckpointError
 from policy.foreign.lerobot.config import ActConfig
-from policy.foreign.lerobot.diffusion import Diffusion
 from policy.foreign.lerobot.plan import Plan
-from policy.foreign.lerobot.policy import LeRobotPolicy
+from policy.foreign.lerobot.policy import LeRobotDiffusion, LeRobotPolicy, build_policy_of
 from policy.foreign.lerobot.statistics import WEIGHTS_FILE
 
 _STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
@@ -29,10 +28,10 @@ def load_policy_of(
     Raises:
         CheckpointError: the weights cannot be read, or are not of the policy that config.json says.
     """
-    policy = LeRobotPolicy(plan)
+    policy = build_policy_of(plan)
     policy.net.load_state_dict(_read(plan.folder / WEIGHTS_FILE, policy))
     policy.eval().requires_grad_(False)
-    if isinstance(policy.net, Diffusion):
+    if isinstance(policy, LeRobotDiffusion):
         policy.net.seed_noise(seed)
     return policy, [*plan.notes, *_notes(plan, policy, seed, num_diffusion_steps)]
 

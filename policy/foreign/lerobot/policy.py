@@ -3,11 +3,12 @@
 import torch
 from torch import Tensor, nn
 
-from policy.contract import Contract
+from policy.contract import ACTION_DIM, Contract
 from policy.foreign.lerobot.act import Act
-from policy.foreign.lerobot.config import ActConfig
+from policy.foreign.lerobot.config import ActConfig, DiffusionConfig
 from policy.foreign.lerobot.diffusion import Diffusion
 from policy.foreign.lerobot.plan import Plan
+from policy.foreign.lerobot.schedule import DdimSchedule
 from policy.foreign.lerobot.statistics import Affine
 
 
@@ -45,23 +46,20 @@ class LeRobotPolicy(nn.Module):
     actions are not looked at, and ACT ignores ``num_diffusion_steps``.
     """
 
+    net: Act | Diffusion
+
     def __init__(self, plan: Plan) -> None:
         super().__init__()
         self.contract: Contract = plan.interface.contract
-        config, normalisation = plan.config, plan.normalisation
-        self.net: Act | Diffusion
-        self.net = Act(config) if isinstance(config, ActConfig) else Diffusion(config)
+        normalisation, interface = plan.normalisation, plan.interface
         self._policy_cameras = plan.policy_cameras
-        keys = config.features.image_keys
+        keys = plan.config.features.image_keys
         self._images = nn.ModuleList(Normaliser(normalisation.images[key]) for key in keys)
-        self._state, self._action = (
-            Normaliser(normalisation.state),
-            Normaliser(normalisation.action),
-        )
-        interface = plan.interface
-        self._state_columns = interface.state_columns
+        self._state = Normaliser(normalisation.state)
+        self._action = Normaliser(normalisation.action)
+        self._to_state = interface.to_state
         self._action_columns = interface.action_columns
-        ones, zeros = (1.0,) * len(self._action_columns), (0.0,) * len(self._action_columns)
+        ones, zeros = (1.0,) * ACTION_DIM, (0.0,) * ACTION_DIM
         self._scale: Tensor
         self.register_buffer("_scale", torch.tensor(interface.action_scale or ones), False)
         self._offset: Tensor
@@ -77,14 +75,8 @@ class LeRobotPolicy(nn.Module):
     ) -> Tensor:
         """Cached features [B, (T,) cameras * F] and states [B, (T,) S] -> chunk [B, horizon, 4]."""
         del action_history
-        steps, cameras = self.contract.observation_steps, len(self._policy_cameras)
-        by_camera = feature.reshape(feature.shape[0], steps, cameras, self.contract.feature_dim)
-        if self._policy_cameras != tuple(range(cameras)):  # into the policy's order
-            by_camera = by_camera[:, :, [self._policy_cameras.index(own) for own in range(cameras)]]
-        own_state = state.reshape(state.shape[0], steps, -1)[..., self._state_columns]
-        actions = self.net.act(by_camera, self._state(own_state), num_diffusion_steps)
-        in_units = self._action.back(actions) * self._scale + self._offset
-        return in_units[..., self._action_columns]
+        inputs = self._network_inputs(feature, state)
+        return self._in_units(self.net.act(*inputs, num_diffusion_steps))
 
     def predict(
         self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
@@ -100,3 +92,68 @@ class LeRobotPolicy(nn.Module):
         ]
         feature = torch.cat(features, dim=1).reshape(batch, *contract.feature_shape)
         return self.predict_fast(feature, state, action_history, num_diffusion_steps)
+
+    def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Features [B, T, cameras, F] and normalised states [B, T, S], in the policy's order."""
+        steps, cameras = self.contract.observation_steps, len(self._policy_cameras)
+        by_camera = feature.reshape(feature.shape[0], steps, cameras, self.contract.feature_dim)
+        if self._policy_cameras != tuple(range(cameras)):
+            by_camera = by_camera[:, :, [self._policy_cameras.index(own) for own in range(cameras)]]
+        own_state = self._to_state(state.reshape(state.shape[0], steps, -1))
+        return by_camera, self._state(own_state)
+
+    def _in_units(self, actions: Tensor) -> Tensor:
+        in_units: Tensor = self._action.back(actions) * self._scale + self._offset
+        return in_units[..., self._action_columns]
+
+
+class LeRobotAct(LeRobotPolicy):
+    """An ACT."""
+
+    def __init__(self, plan: Plan, config: ActConfig) -> None:
+        super().__init__(plan)
+        self.net = Act(config)
+
+
+class LeRobotDiffusion(LeRobotPolicy):
+    """A DiffusionPolicy; keeps ``policy.protocol.StepwisePolicy``."""
+
+    net: Diffusion
+
+    def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
+        super().__init__(plan)
+        self.net = Diffusion(config)
+
+    @property
+    def schedule(self) -> DdimSchedule:
+        """The steps of a solve."""
+        return self.net.schedule
+
+    @property
+    def initial_noise(self) -> Tensor:
+        """[1, predicted, 4]; the same for a whole flight."""
+        return self.net.initial_noise
+
+    def denoise(
+        self,
+        noisy: Tensor,
+        timestep: Tensor,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor,
+    ) -> Tensor:
+        """One call of the network: noisy actions [B, predicted, 4] at timesteps [B]."""
+        del action_history
+        of_condition = self.net.film_of_condition(*self._network_inputs(feature, state))
+        return self.net.denoise(noisy, timestep, of_condition)
+
+    def to_chunk(self, sample: Tensor) -> Tensor:
+        """The end of a solve [B, predicted, 4] -> chunk [B, horizon, 4]."""
+        return self._in_units(self.net.from_now(sample))
+
+
+def build_policy_of(plan: Plan) -> LeRobotPolicy:
+    """A policy with random weights."""
+    if isinstance(plan.config, ActConfig):
+        return LeRobotAct(plan, plan.config)
+    return LeRobotDiffusion(plan, plan.config)

@@ -12,20 +12,8 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM
 from policy.foreign.lerobot.config import DiffusionConfig
+from policy.foreign.lerobot.group_norm import GroupNorm
 from policy.nets.unet1d import sinusoid_frequencies
-
-
-class GroupNorm(nn.GroupNorm):
-    """The same function, written as a layer norm of each group.
-
-    OpenVINO's CPU plugin takes a group norm apart into slower parts.
-    """
-
-    def forward(self, x: Tensor) -> Tensor:
-        """[B, C, L] -> [B, C, L]."""
-        groups = x.reshape(x.shape[0], self.num_groups, -1)
-        normed = F.layer_norm(groups, [int(groups.shape[-1])], eps=self.eps).reshape(x.shape)
-        return normed * self.weight[:, None] + self.bias[:, None]
 
 
 class ConvBlock(nn.Module):
@@ -110,10 +98,10 @@ class UNet(nn.Module):
         frequencies = sinusoid_frequencies(self.time_dim)
         self.register_buffer("_frequencies", frequencies, persistent=False)
 
-    def film_of_timestep(self, timestep: int) -> list[Tensor]:
-        """What a timestep adds to the FiLM of each block, [film_dim] of that block."""
-        angle = timestep * self._frequencies
-        embedded = self.diffusion_step_encoder(torch.cat([angle.sin(), angle.cos()]))
+    def film_of_timestep(self, timestep: Tensor) -> list[Tensor]:
+        """What timesteps [B], float32, add to the FiLM of each block, [B, film_dim] of it."""
+        angle = timestep.unsqueeze(-1) * self._frequencies
+        embedded = self.diffusion_step_encoder(torch.cat([angle.sin(), angle.cos()], dim=-1))
         return self._film(embedded, slice(None, self.time_dim), bias=True)
 
     def film_of_condition(self, condition: Tensor) -> list[Tensor]:

@@ -4,13 +4,14 @@ msgpack and websockets are an extra, and imported only where such a policy is lo
 """
 
 import os
-from dataclasses import replace
+import tomllib
+from dataclasses import fields, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from policy.contract import Contract
+from policy.contract import ENVELOPE_TERMS, Contract
 from policy.errors import ContractError, PolicyError
 from policy.foreign.interface import Interface, read_interface
 
@@ -21,6 +22,13 @@ if TYPE_CHECKING:
 SCHEMES = ("ws", "wss")
 PACKAGES = ("msgpack", "websockets")
 """Of ``pip install 'mavbridge[remote]'``."""
+
+
+TERMS = (
+    *("play_s", "modes", "max_state_age_s", "max_velocity_age_s", "max_feature_age_s"),
+    *("max_chunk_age_s", *ENVELOPE_TERMS),
+)
+"""Fields of the contract of our own server that a contract file may replace: when it may fly."""
 
 
 def require_packages(what: str) -> None:
@@ -71,7 +79,7 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
     link = ServerLink(url, api_key=os.environ.get(API_KEY_VARIABLE))
     try:
         metadata = link.connect()
-        interface = _interface(url, contract_file, metadata)
+        interface = _interface(contract_file, metadata)
         policy = RemotePolicy(link, interface, is_ours=CONTRACT_KEY in metadata)
         return policy, [policy.try_out()]
     except PolicyError as error:
@@ -82,20 +90,28 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
         raise
 
 
-def _interface(url: str, contract_file: Path | None, metadata: "Message") -> Interface:
-    """That of the user's file, or of our own server's metadata."""
+def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
+    """That of our own server, under the terms of the user's file; or that of the file alone."""
     from policy.foreign.websocket.messages import CONTRACT_KEY
 
-    if contract_file is not None:
-        return read_interface(contract_file)
     served = metadata.get(CONTRACT_KEY)
     if not isinstance(served, str):
+        if contract_file is not None:
+            return read_interface(contract_file)
         raise PolicyError(
-            "the server says neither its rate nor what its state and actions mean: give --contract "
-            f"FILE; mavbridge contract {url} drafts one"
+            "the server does not say its rate nor what its state and actions mean: write that in a "
+            "file, and give --contract FILE; docs/policies.md has one to begin with"
         )
     try:
-        contract = Contract.from_json(served)
+        contract = replace(Contract.from_json(served), arrays="numpy", feature_dim=0)
     except ContractError as error:
         raise ContractError(f"the server's contract cannot be used: {error}") from error
-    return Interface(contract=replace(contract, arrays="numpy"))
+    if contract_file is None:
+        return Interface(contract=contract)
+    said = tomllib.loads(contract_file.read_text()).get("contract", {})
+    kept = {
+        field.name: getattr(contract, field.name)
+        for field in fields(Contract)
+        if field.init and not (field.name in TERMS and field.name in said)
+    }
+    return read_interface(contract_file, kept)

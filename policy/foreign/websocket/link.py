@@ -140,21 +140,28 @@ class ServerLink:
             ping_interval=None,
             proxy=None,
         ) as connection:
-            async with asyncio.timeout(CONNECT_S):
-                metadata = unpack(await connection.recv())
-            if not self._metadata.done():
-                self._metadata.set_result(metadata)
-            elif metadata.get(CONTRACT_KEY) != self._metadata.result().get(CONTRACT_KEY):
-                raise PolicyError(f"{self._url} serves another policy now: start the flight again")
-            self._problem = None
-            closing = asyncio.ensure_future(connection.wait_closed())
-            closing.add_done_callback(lambda _: self._woken.set())
-            while not closing.done():
-                await self._woken.wait()
-                self._woken.clear()
-                if self._next is not None:
-                    await self._exchange(connection)
-            raise PolicyError(f"{self._url} has closed the connection: {connection.close_reason}")
+            try:
+                await self._serve_requests(connection)
+            except asyncio.CancelledError:
+                await connection.close()  # in order, and not as after an error of ours
+                raise
+
+    async def _serve_requests(self, connection: ClientConnection) -> None:
+        async with asyncio.timeout(CONNECT_S):
+            metadata = unpack(await connection.recv())
+        if not self._metadata.done():
+            self._metadata.set_result(metadata)
+        elif metadata.get(CONTRACT_KEY) != self._metadata.result().get(CONTRACT_KEY):
+            raise PolicyError(f"{self._url} serves another policy now: start the flight again")
+        self._problem = None
+        closing = asyncio.ensure_future(connection.wait_closed())
+        closing.add_done_callback(lambda _: self._woken.set())
+        while not closing.done():
+            await self._woken.wait()
+            self._woken.clear()
+            if self._next is not None:
+                await self._exchange(connection)
+        raise PolicyError(f"{self._url} has closed the connection: {connection.close_reason}")
 
     async def _exchange(self, connection: ClientConnection) -> None:
         request, self._next = self._next, None

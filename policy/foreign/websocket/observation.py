@@ -82,11 +82,15 @@ def to_uint8(planes: FloatArray, contract: Contract) -> NDArray[np.uint8]:
     float32 keeps the levels of a byte far apart: they come back with an error below 0.001.
     """
     order = slice(None) if contract.image_channels == "rgb" else slice(None, None, -1)
-    mean = np.array(contract.image_mean_rgb, np.float32)[order, None, None]
-    std = np.array(contract.image_std_rgb, np.float32)[order, None, None]
-    levels = np.rint((planes * std + mean) * np.float32(255.0))
-    levels = np.clip(levels, 0.0, 255.0).astype(np.uint8)
-    return np.ascontiguousarray(np.moveaxis(levels, -3, -1))
+    mean, std = (
+        255.0 * np.array(values, np.float32)[order, None, None]
+        for values in (contract.image_mean_rgb, contract.image_std_rgb)
+    )
+    levels = planes * std
+    levels += mean
+    np.rint(levels, out=levels)
+    np.clip(levels, 0.0, 255.0, out=levels)
+    return np.ascontiguousarray(np.moveaxis(levels.astype(np.uint8), -3, -1))
 
 
 def from_uint8(images: NDArray[np.uint8], contract: Contract) -> FloatArray:

@@ -104,8 +104,8 @@ class RemotePolicy:
             self.predict(image, state, history, 1)
             times_s.append(self.round_trip_s)
         took_ms, limit_ms = 1e3 * min(times_s[1:]), 1e3 * answer_deadline_s(contract)
-        share = "" if self.infer_s is None else f", {1e3 * self.infer_s:.0f} ms of them its own"
-        line = f"the policy server answers in {took_ms:.0f} ms{share}"
+        share = "" if self.infer_s is None else f", {1e3 * self.infer_s:.1f} ms of them its own"
+        line = f"the policy server answers in {took_ms:.1f} ms{share}"
         if took_ms > limit_ms:
             raise PolicyError(
                 f"{line}, and an answer may take {limit_ms:.0f} ms by the age limits and play_s of "

@@ -14,9 +14,10 @@ from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
+from mavbridge.recording.meta import FlightError
 from mavbridge.recording.rows import LATER, TICKS, FrameTruth, TickLabels
 from mavbridge.recording.tlog import open_tlog_pipe
-from policy.contract import ACTION_TERMS, FLIGHT_TERMS
+from policy.contract import ACTION_TERMS, FLIGHT_TERMS, OBSERVATION_TERMS, Contract
 
 
 def record(folder: Path, *, ticks: int = 30, frames: int = 10) -> FlightWriter:
@@ -107,6 +108,30 @@ def test_what_an_observer_missed_is_counted_before_the_next_row(tmp_path: Path) 
     assert [row.dropped_before for row in back.frame_rows()] == [1, 0, 2]
     assert [row.tick.serial for row in back.tick_rows()] == [1, 2, 5]
     assert (back.meta.ticks_dropped, back.meta.frames_dropped) == (3, 3)
+
+
+def test_each_camera_has_a_video_and_a_table_of_its_own(tmp_path: Path) -> None:
+    contract = Contract(cameras=("front", "down"))
+    writer = FlightWriter(tmp_path, make_meta(contract=contract), pressure="offline")
+    writer.tick(make_tick(0))
+    for serial in range(6):
+        writer.frame(make_frame(serial))
+        if serial % 2 == 0 and serial != 2:  # every other one; one was lost on the way
+            below = make_frame(100 + serial, camera=1, serial=serial // 2)
+            writer.frame(below)
+    writer.finish(writer.meta)
+    first, below = open_flight(tmp_path), open_flight(tmp_path, "down")
+    assert [number_of(rgb) for rgb in first.images()] == list(range(6))
+    assert [number_of(rgb) for rgb in below.images()] == [100, 104]
+    assert [row.dropped_before for row in below.frame_rows()] == [0, 1]
+    assert (first.meta.frames, first.meta.frames_dropped) == (6, 0)
+    assert open_flight(tmp_path, "front").frames.num_rows == 6
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        *("camera.mp4", "camera_down.mp4", "frames.parquet", "frames_down.parquet"),
+        *("meta.json", "ticks.parquet"),
+    ]
+    with pytest.raises(FlightError, match="has no camera left: it has front, down"):
+        open_flight(tmp_path, "left")
 
 
 def test_a_flight_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
@@ -204,8 +229,8 @@ def test_what_is_no_flight_says_what_is_wanted(flight: Path) -> None:
 def test_a_flight_whose_contract_is_of_version_1_is_read(flight: Path) -> None:
     path = flight / "meta.json"
     contract = json.loads(path.read_text())["contract"]
-    assert contract["version"] == 3
-    later = (*FLIGHT_TERMS, *ACTION_TERMS)
+    assert contract["version"] == 4
+    later = (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS)
     old = {name: value for name, value in contract.items() if name not in later}
     _meta(contract={**old, "version": 1})(flight)
     assert open_flight(flight).meta.contract == make_meta().contract

@@ -1,0 +1,1 @@
+"""``mavbridge contract``: a first draft of a contract file."""

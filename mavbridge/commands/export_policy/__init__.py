@@ -1,0 +1,1 @@
+"""``mavbridge export-policy``: a policy of ours as ONNX or TorchScript."""

@@ -1,0 +1,82 @@
+"""What is said of an exported policy, beside its graphs or within them.
+
+    {
+      "contract": {"action": "sticks", "chunk_dt_s": 0.05},
+      "schedule": {"num_train_timesteps": 100, "betas": "squared_cosine", "prediction": "sample"},
+      "inputs": {"state": "obs_vector"}
+    }
+
+``contract`` are fields of ``policy.contract.Contract``, ``schedule`` those of
+``nets.diffusion.NoiseSchedule``, ``inputs`` the names of an ONNX file's inputs by their meaning. A
+contract file (``interface``) takes the place of ``contract``.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from policy.contract import Contract
+from policy.errors import CheckpointError, PolicyError
+from policy.foreign.interface import Interface, read_interface
+
+DESCRIPTION, CONTRACT_FILE = "policy.json", "mavbridge.toml"
+ROLES = ("image", "feature", "state", "action_history", "noisy", "timestep")
+"""What an input of a graph may be."""
+TABLES = ("contract", "schedule", "inputs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """How a policy sees and acts, and what its graphs mean."""
+
+    interface: Interface
+    schedule: dict[str, Any] = field(default_factory=dict)
+    """Fields of ``nets.diffusion.NoiseSchedule``; empty where nothing is said."""
+    inputs: dict[str, str] = field(default_factory=dict)
+    """Name of an input by its role."""
+
+
+def describe(
+    spec: str, text: str | None, *, where: Path, beside: Path, contract_file: Path | None
+) -> Description:
+    """Put together what is known of the policy ``spec``.
+
+    ``text`` is the JSON of this module's docstring, read from ``where``, if there is one; the
+    contract is that of ``contract_file``, else that of the text, else that of mavbridge.toml in the
+    folder ``beside``.
+
+    Raises:
+        PolicyError: something is malformed, or nothing says what the contract is.
+    """
+    data = {} if text is None else _parsed(where, text)
+    rest = {"schedule": data.get("schedule", {}), "inputs": data.get("inputs", {})}
+    if unknown := sorted(set(rest["inputs"]) - set(ROLES)):
+        raise CheckpointError(f"{where}: inputs {unknown} are unknown; known are {list(ROLES)}")
+    if contract_file is not None:
+        return Description(interface=read_interface(contract_file), **rest)
+    if "contract" in data:
+        try:
+            contract = Contract.from_json(json.dumps(data["contract"]))
+        except PolicyError as error:
+            raise CheckpointError(f"{where}: {error}") from error
+        return Description(interface=Interface(contract=contract), **rest)
+    if (beside / CONTRACT_FILE).is_file():
+        return Description(interface=read_interface(beside / CONTRACT_FILE), **rest)
+    raise CheckpointError(
+        f"--policy {spec}: nothing says at which rate and in which units it flies: give "
+        f"--contract FILE.toml, or put {CONTRACT_FILE} beside it"
+    )
+
+
+def _parsed(where: Path, text: str) -> dict[str, dict[str, Any]]:
+    try:
+        data: Any = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{where} is not JSON: {error}") from error
+    if not isinstance(data, dict) or not set(data) <= set(TABLES):
+        there = sorted(data) if isinstance(data, dict) else type(data).__name__
+        raise CheckpointError(f"{where} must be an object of {list(TABLES)}, not {there}")
+    if wrong := [name for name, value in data.items() if not isinstance(value, dict)]:
+        raise CheckpointError(f"{where}: {wrong} must be objects")
+    return data

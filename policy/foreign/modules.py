@@ -1,0 +1,236 @@
+"""Torch modules as a policy: those that a user's class names, and those of a TorchScript archive.
+
+    forward(image, state, action_history)            alone: a single-rate policy
+    visual_encoder(image)                            with one of the next two: dual rate
+    action_head(feature, state, action_history)      a chunk in one call
+    denoiser(noisy, timestep, feature, state, action_history)
+                                                     one step of a diffusion policy; the loop is
+                                                     ours, by ``noise_schedule``
+
+Shapes are those of ``policy.protocol``; ``forward`` and ``action_head`` return chunks
+[B, horizon, 4], ``denoiser`` what the schedule says that the network predicts; ``timestep`` is [B]
+float32. What is behind the last argument that a function declares is left out. A TorchScript
+archive may have methods of these names, too.
+"""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from policy.contract import ACTION_DIM
+from policy.engines.kept import modules_of
+from policy.errors import PolicyError, user_code
+from policy.foreign.interface import Interface
+from policy.nets.diffusion import NoiseSchedule, ddim_solve
+from policy.protocol import SingleRatePolicy
+
+PARTS = "forward alone, visual_encoder and action_head, or visual_encoder and denoiser"
+
+
+def adopt_modules(
+    name: str, holder: object, interface: Interface, *, schedule: NoiseSchedule | None, seed: int
+) -> SingleRatePolicy | None:
+    """The policy that the modules or methods of ``holder`` are; None where it has none of them.
+
+    A contract without feature_dim gets it from the encoder's output.
+
+    Raises:
+        PolicyError: the encoder fails on a dummy image, or a part is missing.
+    """
+    encoder, head, denoiser = (
+        getattr(holder, part, None) for part in ("visual_encoder", "action_head", "denoiser")
+    )
+    if encoder is None and head is None and denoiser is None:
+        if not isinstance(holder, nn.Module) or not callable(getattr(holder, "forward", None)):
+            return None
+        return _with_life(ForwardPolicy(interface, holder), holder)
+    if encoder is None or (head is None) == (denoiser is None):
+        raise PolicyError(f"{name}: its modules do not make a policy: it takes {PARTS}")
+    for module in modules_of(holder):
+        module.eval()
+    interface = _with_feature(name, encoder, interface)
+    if head is not None:
+        return _with_life(HeadPolicy(interface, holder, encoder, head), holder)
+    schedule = schedule or getattr(holder, "noise_schedule", None) or NoiseSchedule()
+    return _with_life(DenoiserPolicy(interface, holder, encoder, denoiser, schedule, seed), holder)
+
+
+def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:
+    """A schedule from the fields of a description; a PolicyError names the file of a wrong one."""
+    try:
+        return NoiseSchedule(**fields)
+    except (TypeError, PolicyError) as error:
+        raise PolicyError(
+            f"{where}: schedule {fields} is malformed ({error}): it takes num_train_timesteps, "
+            "betas and prediction"
+        ) from error
+
+
+class ForwardPolicy(nn.Module):
+    """Image, state and history in, a chunk out: single rate."""
+
+    def __init__(self, interface: Interface, holder: object, call: Any = None) -> None:
+        super().__init__()
+        self.contract = interface.contract
+        self.held = nn.ModuleList(modules_of(holder))
+        self._call = _leave_out_rest(holder if call is None else call)
+        self._state_columns = interface.state_columns
+        self._action_columns = interface.action_columns
+        self._scale: Tensor
+        self._offset: Tensor
+        for name, values, default in (
+            ("_scale", interface.action_scale, 1.0),
+            ("_offset", interface.action_offset, 0.0),
+        ):
+            value = torch.tensor(values or (default,) * ACTION_DIM)
+            self.register_buffer(name, value, persistent=False)
+
+    def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
+        """One call of the module."""
+        return self.to_chunk(self._call(image, *self._own(state, action_history)))
+
+    def to_chunk(self, sample: Tensor) -> Tensor:
+        """The policy's actions [B, L, 4] -> the contract's."""
+        return (sample * self._scale + self._offset)[..., self._action_columns]
+
+    def _own(self, state: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
+        """State and history as the policy orders and scales them."""
+        return state[..., self._state_columns], self._from_actions(history)
+
+    def _from_actions(self, actions: Tensor) -> Tensor:
+        place = [self._action_columns.index(column) for column in range(ACTION_DIM)]
+        return (actions[..., place] - self._offset) / self._scale
+
+
+class HeadPolicy(ForwardPolicy):
+    """An encoder and a head that makes a chunk in one call: dual rate."""
+
+    def __init__(self, interface: Interface, holder: object, encoder: Any, head: Any) -> None:
+        super().__init__(interface, holder, head)
+        self._encoder = _leave_out_rest(encoder)
+
+    def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
+        """Image [B, 3, H, W] -> feature [B, F], by one encoder for every camera."""
+        return self._encoder(image).flatten(1)
+
+    def predict_fast(
+        self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
+    ) -> Tensor:
+        """One call of the head."""
+        return self.to_chunk(self._call(feature, *self._own(state, action_history)))
+
+    def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
+        """Encode the images, then as ``predict_fast``."""
+        feature = self.encode_visual(image.reshape(-1, *image.shape[-3:]))
+        shaped = feature.reshape(-1, *self.contract.feature_shape)
+        return self.predict_fast(shaped, state, action_history, steps)
+
+
+class DenoiserPolicy(HeadPolicy):
+    """An encoder and one step of a diffusion solve: dual rate, and with a warm start.
+
+    Keeps ``protocol.StepwisePolicy`` and ``protocol.WarmStartPolicy``.
+    """
+
+    def __init__(
+        self,
+        interface: Interface,
+        holder: object,
+        encoder: Any,
+        denoiser: Any,
+        schedule: NoiseSchedule,
+        seed: int,
+    ) -> None:
+        super().__init__(interface, holder, encoder, denoiser)
+        if not isinstance(schedule, NoiseSchedule):
+            raise PolicyError(
+                f"noise_schedule must be a policy.nets.diffusion.NoiseSchedule, got {schedule!r}"
+            )
+        if interface.action_scale or interface.action_offset or interface.action_names:
+            raise PolicyError(
+                "a denoiser works on the contract's actions as they are: leave [action] out of "
+                "the contract file"
+            )
+        self.schedule = schedule
+        self.initial_noise: Tensor
+        shape = (1, self.contract.horizon, ACTION_DIM)
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+        self.register_buffer("initial_noise", noise, persistent=False)
+
+    def denoise(
+        self,
+        noisy: Tensor,
+        timestep: Tensor,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor,
+    ) -> Tensor:
+        """One call of the denoiser."""
+        return self._call(noisy, timestep, feature, *self._own(state, action_history))
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
+        step = self.schedule.ddim_steps(num_diffusion_steps)[first]
+        return step.signal, step.noise
+
+    def denoise_fast(
+        self,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor,
+        noisy: Tensor,
+        num_diffusion_steps: int,
+        first: int,
+        count: int,
+    ) -> Tensor:
+        """Steps ``first`` to ``first + count`` of a solve: [B, horizon, 4] -> the same."""
+        steps = self.schedule.ddim_steps(num_diffusion_steps)[first : first + count]
+
+        def denoise(index: int, noisy: Tensor) -> Tensor:
+            timestep = noisy.new_full((len(noisy),), float(steps[index].timestep))
+            return self.denoise(noisy, timestep, feature, state, action_history)
+
+        return ddim_solve(self.schedule, steps, denoise, noisy)
+
+    def predict_fast(
+        self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
+    ) -> Tensor:
+        """A whole solve."""
+        noise = self.initial_noise.expand(len(state), -1, -1)
+        return self.denoise_fast(feature, state, action_history, noise, steps, 0, steps)
+
+
+def _with_feature(name: str, encoder: Any, interface: Interface) -> Interface:
+    """The interface, with feature_dim by the encoder's output if it has none."""
+    contract = interface.contract
+    if contract.feature_dim > 0:
+        return interface
+    with user_code(f"{name}: visual_encoder failed on a dummy image"), torch.inference_mode():
+        image = torch.zeros(1, 3, contract.image_height, contract.image_width)
+        dim = encoder(image).flatten(1).shape[1]
+    return replace(interface, contract=replace(contract, feature_dim=dim))
+
+
+def _with_life(policy: ForwardPolicy, holder: object) -> ForwardPolicy:
+    """The policy with ``reset`` and ``close`` of the object whose modules it uses."""
+    for name in ("reset", "close"):
+        if (method := getattr(holder, name, None)) is not None:
+            setattr(policy, name, method)
+    return policy
+
+
+def _leave_out_rest(function: Any) -> Callable[..., Tensor]:
+    """``function``, called with as many arguments as it declares."""
+    called = function.forward if isinstance(function, nn.Module) else function
+    schema = getattr(called, "schema", None)  # of TorchScript
+    if schema is not None:
+        count = len(schema.arguments) - 1  # less self
+    else:
+        kinds = [each.kind for each in inspect.signature(called).parameters.values()]
+        count = len(kinds) if inspect.Parameter.VAR_POSITIONAL not in kinds else 99
+    return lambda *arguments: function(*arguments[:count])

@@ -1,0 +1,1 @@
+"""Policies in ONNX files, flown through OpenVINO; and ours, written as such."""

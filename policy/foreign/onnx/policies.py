@@ -1,0 +1,255 @@
+"""Policies of ONNX graphs behind the policy protocol, on numpy arrays."""
+
+import math
+from dataclasses import replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from policy.contract import ACTION_DIM, Contract, FloatArray
+from policy.engines.choose import chunks_of_samples
+from policy.engines.executable import (
+    ExecutionSettings,
+    Precision,
+    Shape,
+    make_numpy_executable,
+    solver_segment,
+)
+from policy.engines.openvino_compile import engine_name, precisions
+from policy.engines.parity import make_parity_samples, parity_failure
+from policy.errors import PolicyError
+from policy.foreign.modules import make_schedule
+from policy.foreign.onnx.files import DENOISER, OnnxFiles
+from policy.foreign.onnx.graphs import USUAL_NAMES, GraphFile, Wanted, require_roles
+from policy.nets.diffusion import NoiseSchedule
+from policy.protocol import Executable
+
+
+class OnnxGraphs:
+    """The graphs of a policy, read and checked against its contract.
+
+    Raises:
+        PolicyError: a file cannot be read, or does not fit the contract.
+    """
+
+    def __init__(self, files: OnnxFiles, seed: int) -> None:
+        wanted = _wanted(files)
+        self.files = files
+        self.seed = seed
+        self.schedule = _schedule(files)
+        self.encoder: GraphFile | None = None
+        contract = replace(files.description.interface.contract, arrays="numpy")
+        if files.encoder is not None:
+            image = replace(wanted["image"], shape=(1, *contract.image_shape[-3:]))
+            self.encoder = GraphFile(files.encoder, {"image": image})
+            contract = _with_feature(contract, self.encoder, files.encoder)
+            wanted["feature"] = replace(wanted["feature"], shape=(1, *contract.feature_shape))
+        self.interface = replace(files.description.interface, contract=contract)
+        needed = ("noisy", "timestep") if files.is_denoiser else ()
+        seen = "image" if self.encoder is None else "feature"
+        taken = (*needed, seen, "state", "action_history")
+        self.rest = GraphFile(files.rest, {role: wanted[role] for role in taken})
+        require_roles(self.rest, files.rest, needed)
+
+    def at(self, vision: Precision, action: Precision) -> "OnnxPolicy":
+        """The policy with its encoder and the rest compiled at these precisions."""
+        kind = HeadPolicy if self.schedule is None else DenoiserPolicy
+        return (WholePolicy if self.encoder is None else kind)(self, vision, action)
+
+
+class OnnxPolicy:
+    """What all three kinds of policy share."""
+
+    def __init__(self, graphs: OnnxGraphs, _vision: Precision, action: Precision) -> None:
+        self.graphs = graphs
+        self.contract = graphs.interface.contract
+        self._interface = graphs.interface
+        self._graph = graphs.rest.compile(action)
+
+    def predict(
+        self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
+    ) -> FloatArray:
+        """Image, state and history -> chunk [1, horizon, 4]."""
+        raise NotImplementedError
+
+    def _call(self, state: FloatArray, history: FloatArray, **arrays: FloatArray) -> FloatArray:
+        """The graph on a state and a history as the policy orders and scales them."""
+        columns = self._interface.state_columns
+        theirs = self._interface.from_actions(history)
+        return self._graph(state=state[..., columns], action_history=theirs, **arrays)
+
+
+class WholePolicy(OnnxPolicy):
+    """Image, state and history in, a chunk out: single rate."""
+
+    def predict(
+        self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
+    ) -> FloatArray:
+        """One call of the graph."""
+        return self._interface.to_actions(self._call(state, action_history, image=image))
+
+
+class HeadPolicy(OnnxPolicy):
+    """An encoder and a head that makes a chunk in one call: dual rate."""
+
+    def __init__(self, graphs: OnnxGraphs, vision: Precision, action: Precision) -> None:
+        super().__init__(graphs, vision, action)
+        if graphs.encoder is None:
+            raise PolicyError("a policy at two rates needs an encoder")
+        self._encoder = graphs.encoder.compile(vision)
+
+    def encode_visual(self, image: FloatArray, camera: int = 0) -> FloatArray:
+        """Image [1, 3, H, W] -> feature [1, F], by one encoder for every camera."""
+        return self._encoder(image=image).reshape(1, -1)
+
+    def predict_fast(
+        self, feature: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
+    ) -> FloatArray:
+        """One call of the head."""
+        return self._interface.to_actions(self._call(state, action_history, feature=feature))
+
+    def predict(
+        self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
+    ) -> FloatArray:
+        """Encode the images, then as ``predict_fast``."""
+        images = image.reshape(-1, 1, *image.shape[-3:])
+        features = np.stack([self.encode_visual(each) for each in images])
+        feature = features.reshape(1, *self.contract.feature_shape)
+        return self.predict_fast(feature, state, action_history, steps)
+
+
+class DenoiserPolicy(HeadPolicy):
+    """An encoder and one step of a diffusion solve: dual rate, and with a warm start.
+
+    ``initial_noise`` is that of our own policies for the same seed.
+    """
+
+    def __init__(self, graphs: OnnxGraphs, vision: Precision, action: Precision) -> None:
+        super().__init__(graphs, vision, action)
+        self._schedule = graphs.schedule or NoiseSchedule()
+        shape = (1, self.contract.horizon, ACTION_DIM)
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(graphs.seed))
+        self.initial_noise = self._interface.to_actions(noise.numpy())
+        segment = partial(solver_segment, self._denoise, self._schedule)
+        self._segment = lru_cache(maxsize=64)(segment)
+
+    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
+        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
+        step = self._schedule.ddim_steps(num_diffusion_steps)[first]
+        return step.signal, step.noise
+
+    def denoise_fast(
+        self,
+        feature: FloatArray,
+        state: FloatArray,
+        action_history: FloatArray,
+        noisy: FloatArray,
+        num_diffusion_steps: int,
+        first: int,
+        count: int,
+    ) -> FloatArray:
+        """Steps ``first`` to ``first + count`` of a solve, from and to actions of the contract."""
+        solve = self._segment(num_diffusion_steps, first, count)
+        theirs = self._interface.from_actions(noisy)
+        return self._interface.to_actions(solve(feature, state, action_history, theirs))
+
+    def predict_fast(
+        self, feature: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
+    ) -> FloatArray:
+        """A whole solve."""
+        noise = self.initial_noise
+        return self.denoise_fast(feature, state, action_history, noise, steps, 0, steps)
+
+    def _denoise(
+        self,
+        noisy: FloatArray,
+        timestep: FloatArray,
+        feature: FloatArray,
+        state: FloatArray,
+        history: FloatArray,
+    ) -> FloatArray:
+        return self._call(state, history, noisy=noisy, timestep=timestep, feature=feature)
+
+
+def choose_precision(
+    policy: OnnxPolicy, settings: ExecutionSettings
+) -> tuple[Executable, tuple[str, ...]]:
+    """The executable at the fastest precision whose sticks are those of float32, and notes.
+
+    ``policy`` is in float32. There is nothing else to compare with: that these graphs are the
+    policy is taken from the files.
+
+    Raises:
+        PolicyError: the policy fails on a dummy sample, or gives other shapes than the contract's,
+            or no numbers.
+    """
+    samples = make_parity_samples(policy.contract)
+
+    def chunks(executable: Executable) -> FloatArray:
+        return chunks_of_samples(executable, samples)
+
+    def executable_of(policy: OnnxPolicy, vision: Precision, action: Precision) -> Executable:
+        executable = make_numpy_executable(policy, settings)
+        return replace(executable, engine=engine_name(vision, action))
+
+    reference = executable_of(policy, "f32", "f32")
+    notes: list[str] = []
+    expected = chunks(reference)
+    for vision, action in precisions():
+        if vision == action == "f32":
+            break
+        try:
+            candidate = executable_of(policy.graphs.at(vision, action), vision, action)
+            reason = parity_failure(expected, chunks(candidate))
+        except (PolicyError, RuntimeError) as error:
+            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
+        if reason is None:
+            return candidate, (*notes, f"engine {candidate.engine}: agrees with float32")
+        notes.append(f"warning: {engine_name(vision, action)} is passed over: {reason}")
+    return reference, (*notes, f"engine {reference.engine}")
+
+
+def _with_feature(contract: Contract, encoder: GraphFile, path: Path) -> Contract:
+    dim = math.prod(encoder.output_shape[1:])
+    if contract.feature_dim not in (0, dim):
+        raise PolicyError(
+            f"{path} makes {dim} numbers of an image, and the contract says feature_dim "
+            f"{contract.feature_dim}"
+        )
+    return replace(contract, feature_dim=dim)
+
+
+def _schedule(files: OnnxFiles) -> NoiseSchedule | None:
+    if not files.is_denoiser:
+        return None
+    if any(files.description.interface.action_offset):
+        raise PolicyError(
+            f"{files.rest}: [action] offset must be zeros for a {DENOISER}, whose noise is about 0"
+        )
+    return make_schedule(files.rest.parent, files.description.schedule)
+
+
+def _wanted(files: OnnxFiles) -> dict[str, Wanted]:
+    """Names and shapes of all that a graph of the policy may take."""
+    interface, contract = files.description.interface, files.description.interface.contract
+    state = (1, *contract.state_shape[:-1], len(interface.state_columns))
+    keys = {"image": interface.camera_keys, "state": (interface.state_key,)}
+    shapes: dict[str, Shape] = {
+        "image": (1, *contract.image_shape),
+        "feature": (1, *contract.feature_shape),
+        "state": state,
+        "action_history": (1, contract.history_len, ACTION_DIM),
+        "noisy": (1, contract.horizon, ACTION_DIM),
+        "timestep": (1,),
+    }
+    return {
+        role: Wanted(
+            names=(files.description.inputs[role],)
+            if role in files.description.inputs
+            else (*keys.get(role, ()), *USUAL_NAMES[role]),
+            shape=shape,
+        )
+        for role, shape in shapes.items()
+    }

@@ -1,0 +1,42 @@
+"""A TorchScript archive: torch.jit.load runs it, and nothing in it is a program for Python.
+
+It has modules or methods as ``foreign.modules`` says, and may hold a file policy.json as
+``foreign.description`` says (``torch.jit.save(..., _extra_files={"policy.json": text})``).
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from policy.errors import CheckpointError
+from policy.foreign.description import Description
+from policy.foreign.modules import PARTS, adopt_modules, make_schedule
+from policy.protocol import SingleRatePolicy
+
+
+def load_torchscript(
+    spec: str, path: Path, description: Description, seed: int
+) -> SingleRatePolicy:
+    """The policy of an archive, on the CPU.
+
+    Raises:
+        PolicyError: the archive is damaged, or has no modules that make a policy.
+    """
+    try:
+        module = torch.jit.load(path, map_location="cpu").eval()  # type: ignore[no-untyped-call]
+    except (RuntimeError, OSError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise CheckpointError(f"{path}: damaged TorchScript archive ({reason})") from error
+    contract = replace(description.interface.contract, arrays="torch")
+    schedule = make_schedule(path, description.schedule) if description.schedule else None
+    policy = adopt_modules(
+        spec,
+        module,
+        replace(description.interface, contract=contract),
+        schedule=schedule,
+        seed=seed,
+    )
+    if policy is None:
+        raise CheckpointError(f"--policy {spec}: the archive has none of {PARTS}")
+    return policy

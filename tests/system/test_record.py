@@ -1,0 +1,112 @@
+"""A pilot's flight in real processes: recorded by ``mavbridge record``, then learnt from."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mavbridge.__main__ import main
+from mavbridge.core.processes import free_port
+from mavbridge.recording.flight_folder import open_flight
+from policy.data.flight_folders import read_flight
+
+pytestmark = pytest.mark.system
+
+TIMEOUT_S = 180.0
+SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")
+
+
+@contextmanager
+def vehicle(folder: Path, port: int, *flags: str) -> Iterator[None]:
+    """The simulated vehicle; at the end it writes ``fc.json`` into the folder."""
+    command = [sys.executable, "-m", "sitl", "--connect", f"udpout:127.0.0.1:{port}"]
+    command += ["--camera", f"shm:record-{port}", "--image-size", "64"]
+    command += ["--report", str(folder / "fc.json"), *flags]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        yield
+        process.send_signal(signal.SIGINT)
+        assert process.wait(TIMEOUT_S) == 0
+    finally:
+        process.kill()
+        process.wait(TIMEOUT_S)
+
+
+def recorded(out: Path, port: int, *flags: str) -> str:
+    """Record; what the command printed."""
+    command = [sys.executable, "-m", "mavbridge", "record", "--out", str(out)]
+    command += ["--connect", f"udp:127.0.0.1:{port}", "--camera", f"shm:record-{port}"]
+    done = subprocess.run(
+        [*command, *flags],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=TIMEOUT_S,
+        env=os.environ | {"COLUMNS": "200"},
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+def status_of(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert isinstance(stopped.value.code, int)
+    return stopped.value.code
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the expert's flight over a course, and the vehicle's own report of it."""
+    folder = tmp_path_factory.mktemp("pilot")
+    port = free_port()
+    with vehicle(folder, port, "--course", "5", "--pilot", "expert", "--pilot-speed", "6"):
+        printed = recorded(folder / "flights", port, "--on-arm", "--episodes", "1")
+    assert "episode 1 begins (armed)" in printed
+    assert "ended by disarmed, not marked" in printed
+    return folder
+
+
+def test_nothing_is_sent_that_moves_the_vehicle(flown: Path) -> None:
+    report = json.loads((flown / "fc.json").read_text())
+    assert report["overrides"]["count"] == 0
+    assert report["releases"]["count"] == 0
+    assert report["course"]["gates_passed"] == report["course"]["gates"]
+
+
+def test_the_flight_holds_the_pilots_sticks_the_state_the_images_and_the_packets(
+    flown: Path,
+) -> None:
+    flight = open_flight(flown / "flights" / "episode-0001")
+    meta = flight.meta
+    assert (meta.source, meta.finished, meta.success, meta.crash) == ("pilot", True, None, None)
+    assert meta.autopilot is not None
+    assert meta.autopilot.startswith("ardupilot")
+    rows = [row.tick for row in flight.tick_rows()]
+    assert all(tick.sent is None for tick in rows)
+    sticks = np.array([tick.rc_sticks for tick in rows if tick.rc_sticks is not None])
+    assert len(sticks) > 0.8 * len(rows)
+    assert np.ptp(sticks[:, 2]) > 0.5, "it leans forward and brakes"
+    assert sum(1 for _ in flight.images()) == flight.frames.num_rows > 100
+    assert (flight.folder / "link.tlog").stat().st_size > 100_000
+    learnt = read_flight(flight.folder)
+    assert len(learnt.target) > 0.7 * len(rows)
+
+
+def test_it_is_trained_from_and_exported(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = flown / "policy.safetensors"
+    flights = str(flown / "flights")
+    assert status_of("train", flights, "--out", str(out), *SMALL, "--steps", "3") == 0
+    assert out.stat().st_size > 0
+    assert "image ages of 20 to 90 ms are assumed" in " ".join(capsys.readouterr().err.split())
+    assert status_of("export", flights, "--out", str(flown / "dataset")) == 0
+    assert (flown / "dataset" / "meta" / "info.json").is_file()

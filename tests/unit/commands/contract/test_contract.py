@@ -1,0 +1,198 @@
+"""``mavbridge contract``: drafts from LeRobot's folders."""
+
+import json
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavbridge.__main__ import main
+from policy.contract import ACTION_NAMES, STATE_NAMES
+from policy.errors import ContractError
+from policy.foreign.interface import read_interface
+
+CAMERA = "observation.images.front"
+
+
+def write_json(path: Path, document: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document))
+    return path
+
+
+def dataset(
+    folder: Path,
+    state: Sequence[str] | dict[str, Any] | None,
+    action: Sequence[str] | None = ACTION_NAMES,
+    cameras: Sequence[str] = (CAMERA,),
+    state_dim: int = 3,
+    az_mps2: float | None = None,
+) -> Path:
+    """A foreign dataset's meta; without our note about axes."""
+    features = {
+        "observation.state": {"dtype": "float32", "shape": [state_dim], "names": state},
+        "action": {"dtype": "float32", "shape": [4], "names": action},
+        **{key: {"dtype": "video", "shape": [96, 96, 3]} for key in cameras},
+        "timestamp": {"dtype": "float32", "shape": [1]},
+    }
+    write_json(folder / "meta/info.json", {"fps": 20, "features": features})
+    if az_mps2 is not None:
+        mean = [0.0] * (state_dim - 1) + [az_mps2]
+        write_json(folder / "meta/stats.json", {"observation.state": {"mean": mean}})
+    return folder
+
+
+def checkpoint(folder: Path, state_dim: int = 3, action_dim: int = 4) -> Path:
+    inputs = {
+        CAMERA: {"type": "VISUAL", "shape": [3, 96, 96]},
+        "observation.state": {"type": "STATE", "shape": [state_dim]},
+    }
+    outputs = {"action": {"type": "ACTION", "shape": [action_dim]}}
+    config = {"type": "act", "input_features": inputs, "output_features": outputs}
+    write_json(folder / "config.json", config)
+    return folder
+
+
+def draft(source: Path, *options: str) -> Path:
+    assert status("contract", str(source), *options) == 0
+    return source / "mavbridge.toml"
+
+
+def status(*arguments: str) -> object:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    return ended.value.code
+
+
+def test_a_policy_alone_leaves_the_answers_to_the_user(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = draft(checkpoint(tmp_path))
+    with pytest.raises(ContractError) as refused:
+        read_interface(path)
+    missing = "chunk_dt_s, [contract] state_frame, [contract] action, [state] names, [action] names"
+    assert f"5 answers are missing: [contract] {missing}" in str(refused.value)
+    said = capsys.readouterr().out
+    assert "please answer: [contract] chunk_dt_s" in said
+    assert "--dataset" in said
+
+
+def test_a_draft_with_all_answers_is_read(tmp_path: Path) -> None:
+    path = draft(checkpoint(tmp_path))
+    answers = {
+        'chunk_dt_s = "?"': "chunk_dt_s = 0.1",
+        'state_frame = "?"': 'state_frame = "enu_flu"',
+        'action = "?"': 'action = "velocity"',
+        'names = ["?", "?", "?"]': 'names = ["yaw_rad", "vx_mps", "vy_mps"]',
+        'names = ["?", "?", "?", "?"]': 'names = ["yaw_rate_radps", "vx_mps", "vy_mps", "vz_mps"]',
+        "# scale = [1.0, 1.0, 1.0]": "scale = [57.3, 1.0, 1.0]",
+        "# scale = [1.0, 1.0, 1.0, 1.0]": "scale = [0.01745, 1.0, 1.0, 1.0]",
+    }
+    lines = path.read_text().splitlines()
+    assert not set(answers) - set(lines)
+    path.write_text("\n".join(answers.get(line, line) for line in lines))
+    interface = read_interface(path)
+    assert interface.contract.chunk_dt_s == 0.1
+    assert (interface.contract.state_frame, interface.contract.action) == ("enu_flu", "velocity")
+    assert interface.state_names == ("yaw_rad", "vx_mps", "vy_mps")
+    assert interface.state_scale == (57.3, 1.0, 1.0)
+    assert interface.action_scale == (0.01745, 1.0, 1.0, 1.0)
+    assert interface.camera_keys == (CAMERA,)
+
+
+def test_a_dataset_says_its_names_and_its_rate(tmp_path: Path) -> None:
+    names = [*STATE_NAMES[:2], "az_mps2"]
+    path = draft(dataset(tmp_path, {"motors": names}, az_mps2=-9.7))
+    interface = read_interface(path)
+    assert interface.contract.chunk_dt_s == 0.05
+    assert interface.contract.state_frame == "ned_frd"
+    assert interface.contract.action == "sticks"
+    assert interface.state_names == tuple(names)
+    assert "# GUESSED: the mean of az_mps2 is -9.7" in path.read_text()
+
+
+def test_names_are_guessed_by_their_spelling_and_marked(tmp_path: Path) -> None:
+    path = draft(dataset(tmp_path, ["Vel_X", "vy", "acc_z"], az_mps2=9.8))
+    assert tomllib.loads(path.read_text())["state"]["names"] == ["vx_mps", "vy_mps", "az_mps2"]
+    text = " ".join(line.removeprefix("# ") for line in path.read_text().splitlines())
+    assert "GUESSED: the dataset's meta/info.json calls them Vel_X, vy, acc_z" in text
+
+
+@pytest.mark.parametrize("state", [["vx", "battery", "vz"], None, ["vx"]])
+def test_one_unknown_name_leaves_the_names_to_the_user(
+    tmp_path: Path, state: Sequence[str] | None
+) -> None:
+    path = draft(dataset(tmp_path, state))
+    with pytest.raises(ContractError, match=r"missing: \[contract\] state_frame, \[state\] names"):
+        read_interface(path)
+
+
+def test_several_cameras_are_called_by_the_ends_of_their_keys(tmp_path: Path) -> None:
+    cameras = ("observation.images.front", "observation.images.down")
+    read = tomllib.loads(draft(dataset(tmp_path, None, cameras=cameras)).read_text())
+    assert read["contract"]["cameras"] == ["down", "front"]
+    assert read["images"] == {key.rpartition(".")[2]: key for key in cameras}
+
+
+def test_cameras_without_usable_names_are_numbered(tmp_path: Path) -> None:
+    cameras = ("left.rgb", "right.rgb")
+    read = tomllib.loads(draft(dataset(tmp_path, None, cameras=cameras)).read_text())
+    assert read["images"] == {"camera_0": "left.rgb", "camera_1": "right.rgb"}
+
+
+def test_the_dataset_that_training_noted_is_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = dataset(tmp_path / "data", ["vx_mps", "vy_mps", "az_mps2"], az_mps2=-9.0)
+    policy = checkpoint(tmp_path / "policy")
+    write_json(policy / "train_config.json", {"dataset": {"root": str(data), "repo_id": "a/b"}})
+    assert read_interface(draft(policy)).contract.chunk_dt_s == 0.05
+    assert f"its dataset is {data}" in capsys.readouterr().out
+
+
+def test_the_file_beside_the_dataset_is_taken_as_it_is(tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data", None)
+    (data / "mavbridge.toml").write_text("[contract]\nchunk_dt_s = 0.02\n")
+    path = draft(checkpoint(tmp_path / "policy"), "--dataset", str(data))
+    assert path.read_text() == (data / "mavbridge.toml").read_text()
+
+
+def test_the_datasets_state_must_be_the_policys(tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data", ["vx_mps", "vy_mps", "az_mps2"], az_mps2=-9.0)
+    path = draft(checkpoint(tmp_path / "policy", state_dim=5), "--dataset", str(data))
+    with pytest.raises(ContractError, match=r"\[state\] names"):
+        read_interface(path)
+
+
+@pytest.mark.parametrize(
+    ("prepare", "said"),
+    [
+        (lambda folder: folder.mkdir(), "neither a LeRobot policy"),
+        (lambda folder: checkpoint(folder, action_dim=6), "its action has 6 numbers, but 4 fly"),
+        (lambda folder: write_json(folder / "config.json", {}), "input_features must be"),
+        (lambda folder: write_json(folder / "config.json", []), "not a JSON object"),
+        (
+            lambda folder: (checkpoint(folder) / "mavbridge.toml").write_text("mine"),
+            "is there already",
+        ),
+    ],
+)
+def test_what_cannot_be_drafted_is_refused_and_nothing_is_written(
+    tmp_path: Path, prepare: Any, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "source"
+    prepare(folder)
+    before = {path: path.read_bytes() for path in folder.rglob("*")}
+    assert status("contract", str(folder)) == 1
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert {path: path.read_bytes() for path in folder.rglob("*")} == before
+
+
+def test_a_folder_that_is_no_dataset_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = checkpoint(tmp_path / "policy")
+    assert status("contract", str(policy), "--dataset", str(tmp_path)) == 1
+    assert "not a LeRobot dataset" in capsys.readouterr().err

@@ -1,0 +1,125 @@
+import pytest
+
+from mavbridge.commands.record.control import EpisodeControl, Orders, Seen
+from mavbridge.core.clock import NS_PER_MS
+
+STEP_NS = 50 * NS_PER_MS
+LOW, MIDDLE, HIGH = 1000, 1500, 2000
+
+
+class Session:
+    """Follows the orders, as a recording session does."""
+
+    def __init__(self, *, has_switch: bool = False, on_arm: bool = False) -> None:
+        self.control = EpisodeControl(has_switch=has_switch, on_arm=on_arm)
+        self.now_ns = 0
+        self.is_recording = False
+        self.may_begin = True
+        self.done: list[str] = []
+
+    def step(
+        self, *, keys: str = "", switch_us: int = 0, armed: bool = False, times: int = 1
+    ) -> list[str]:
+        """What was done in these steps."""
+        self.done = []
+        for _ in range(times):
+            self.now_ns += STEP_NS
+            seen = Seen(self.now_ns, armed, switch_us, self.is_recording, keys)
+            self._follow(self.control.step(seen))
+            keys = ""
+        return self.done
+
+    def _follow(self, orders: Orders) -> None:
+        if orders.mark_before is not None:
+            self.done.append(orders.mark_before)
+        if orders.end is not None:
+            assert self.is_recording
+            self.is_recording = False
+            self.done.append("end")
+        if orders.begin is not None and self.may_begin:
+            assert not self.is_recording
+            self.is_recording = True
+            self.done.append("begin")
+        if orders.quit:
+            self.done.append("quit")
+
+
+def test_a_key_begins_and_ends_and_marks() -> None:
+    session = Session()
+    assert session.step() == []
+    assert session.step(keys="r") == ["begin"]
+    assert session.step(keys="g") == ["good"]
+    assert session.step(keys=" ") == ["end"]
+    assert session.step(keys="b") == ["bad"]
+    assert session.step(keys="gb") == ["bad"], "the last word counts"
+    assert session.step(keys="rr") == [], "begun and ended at once"
+    assert session.step(keys="r") == ["begin"]
+    assert session.step(keys="q") == ["end", "quit"]
+
+
+def test_a_key_that_could_not_begin_is_not_remembered() -> None:
+    session = Session()
+    session.may_begin = False
+    assert session.step(keys="r") == []
+    session.may_begin = True
+    assert session.step(times=5) == []
+
+
+def test_a_switch_records_while_it_is_high() -> None:
+    session = Session(has_switch=True)
+    assert session.step(switch_us=LOW) == []
+    assert session.step(switch_us=MIDDLE, times=2) == []
+    assert session.step(switch_us=HIGH, times=5) == ["begin"]
+    assert session.step(switch_us=MIDDLE, times=3) == ["end"], "passing through the middle"
+    assert session.step(switch_us=LOW, times=20) == []
+    assert session.step(switch_us=HIGH) == ["begin"]
+    assert session.step(switch_us=LOW) == ["end"]
+
+
+def test_the_middle_of_the_switch_marks_as_bad() -> None:
+    session = Session(has_switch=True)
+    session.step(switch_us=LOW)
+    assert session.step(switch_us=HIGH) == ["begin"]
+    assert session.step(switch_us=MIDDLE, times=20) == ["end", "bad"]
+    assert session.step(switch_us=HIGH) == ["begin"], "the next one"
+    assert session.step(switch_us=LOW) == ["end"]
+    assert session.step(switch_us=MIDDLE, times=20) == [], "it did not come from high"
+
+
+def test_a_switch_that_is_high_already_begins_nothing_nor_does_a_lost_radio_end() -> None:
+    session = Session(has_switch=True)
+    assert session.step(switch_us=HIGH, times=5) == []
+    session.step(switch_us=LOW)
+    assert session.step(switch_us=HIGH) == ["begin"]
+    assert session.step(switch_us=0, times=20) == []
+    assert session.step(switch_us=HIGH) == []
+    assert session.step(switch_us=LOW) == ["end"]
+
+
+def test_armed_is_recording_and_a_second_longer() -> None:
+    session = Session(on_arm=True)
+    assert session.step() == []
+    assert session.step(armed=True, times=10) == ["begin"]
+    assert session.step(armed=False, times=19) == [], "a fall has time to show"
+    assert session.step(armed=False, times=5) == ["end"]
+    assert session.step(armed=True) == ["begin"]
+    assert session.step(armed=False, times=3) == []
+    assert session.step(armed=True, times=3) == [], "armed again within the second: the same one"
+
+
+@pytest.mark.parametrize("switch", [True, False])
+def test_what_could_not_begin_begins_when_it_can_for_as_long_as_it_is_wanted(switch: bool) -> None:
+    session = Session(has_switch=switch, on_arm=not switch)
+    session.step(switch_us=LOW)
+    session.may_begin = False
+    assert session.step(switch_us=HIGH, armed=True, times=5) == []
+    session.may_begin = True
+    assert session.step(switch_us=HIGH, armed=True, times=3) == ["begin"]
+    session.is_recording = False  # ended by a crash, or a full disk
+    assert session.step(switch_us=HIGH, armed=True, times=5) == []
+    session.step(switch_us=LOW, times=30)
+    session.may_begin = False
+    assert session.step(switch_us=HIGH, armed=True, times=2) == []
+    assert session.step(switch_us=LOW, times=30) == []
+    session.may_begin = True
+    assert session.step(switch_us=LOW, times=5) == []

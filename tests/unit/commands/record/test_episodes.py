@@ -1,0 +1,144 @@
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from helpers.factories import make_tick
+from helpers.recordings import make_frame, make_meta
+from mavbridge.commands.record.episodes import Episodes, prepare_out
+from mavbridge.core.errors import UserError
+from mavbridge.core.vehicle import Packet
+from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+
+PACKET = bytes(20)
+
+
+class Clock:
+    """Stands still at the first tick."""
+
+    def now_ns(self) -> int:
+        return make_tick(0).woke_ns
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        raise AssertionError("nothing waits")
+
+
+@dataclass
+class Stand:
+    """Episodes, their log, and what was told."""
+
+    out: Path
+    told: list[str] = field(default_factory=list)
+    log: PacketPipe | None = None
+
+    def __post_init__(self) -> None:
+        self.episodes = Episodes(
+            self.out,
+            clock=Clock(),
+            make_meta=lambda begin_ns: make_meta(start_ns=begin_ns, source="pilot"),
+            log_to=self._log_to,
+            autopilot=lambda: "ardupilot 4.7.0",
+            wall_offset_ns=0,
+            report=self.told.append,
+        )
+
+    def _log_to(self, log: PacketPipe | None) -> None:
+        self.log = log
+
+    def record(self, first: int, count: int = 3, **changes: object) -> None:
+        """One episode of ticks and frames whose numbers begin at ``first``."""
+        self.episodes.begin()
+        assert self.log is not None
+        self.log.put(Packet(0, PACKET))
+        for number in range(first, first + count):
+            self.episodes.emit(make_tick(number, **changes))
+            self.episodes.emit(make_frame(number))
+        self.episodes.end("a key")
+
+    def flight(self, number: int) -> RecordedFlight:
+        return open_flight(self.out / f"episode-{number:04}")
+
+
+@pytest.fixture
+def stand(tmp_path: Path) -> Iterator[Stand]:
+    prepare_out(tmp_path / "out")
+    stood = Stand(tmp_path / "out")
+    yield stood
+    stood.episodes.end("the test")
+
+
+def test_each_episode_is_a_flight_of_its_own_without_drops(stand: Stand) -> None:
+    stand.record(5)
+    stand.record(40)
+    for number in (1, 2):
+        flight = stand.flight(number)
+        assert flight.meta.finished
+        assert flight.meta.source == "pilot"
+        assert (flight.meta.ticks, flight.meta.frames) == (3, 3)
+        assert (flight.meta.ticks_dropped, flight.meta.frames_dropped) == (0, 0)
+        assert flight.meta.success is None
+        assert (flight.folder / "link.tlog").read_bytes().endswith(PACKET)
+    assert [row.tick.index for row in stand.flight(2).tick_rows()] == [40, 41, 42]
+    assert stand.episodes.finished == 2
+    assert stand.log is None, "no packet goes into the log of an episode that has ended"
+
+
+def test_what_was_before_the_begin_is_left_out(stand: Stand) -> None:
+    stand.episodes.begin()
+    begin_ns = make_tick(0).woke_ns
+    stand.episodes.emit(make_tick(3, woke_ns=begin_ns - 1))
+    stand.episodes.emit(make_frame(3, captured_ns=begin_ns - 1))
+    stand.episodes.emit(make_tick(4))
+    stand.episodes.emit(make_frame(4, captured_ns=begin_ns))
+    stand.episodes.end("a key")
+    assert (stand.flight(1).meta.ticks, stand.flight(1).meta.frames) == (1, 1)
+
+
+@pytest.mark.parametrize(("mark", "success"), [("good", True), ("bad", False)])
+def test_a_mark_counts_before_and_after_the_end(stand: Stand, mark: str, success: bool) -> None:
+    stand.episodes.begin()
+    stand.episodes.mark("bad" if success else "good")
+    stand.episodes.mark("good" if success else "bad")
+    stand.episodes.emit(make_tick(0))
+    stand.episodes.end("a key")
+    assert stand.flight(1).meta.success is success
+    stand.episodes.mark("bad" if success else "good")
+    assert stand.flight(1).meta.success is not success
+    assert stand.flight(1).meta.ticks == 1
+    assert stand.episodes.counts == {not success: 1}
+
+
+def test_a_crash_is_bad_by_itself_and_a_mark_has_the_last_word(stand: Stand) -> None:
+    stand.record(0, texts=("vehicle: Crash: Disarming",))
+    meta = stand.flight(1).meta
+    assert meta.success is False
+    assert meta.crash == "the vehicle said 'Crash: Disarming'"
+    assert stand.episodes.counts == {False: 1}
+    stand.episodes.mark("good")
+    assert stand.flight(1).meta.success is True
+    assert stand.flight(1).meta.crash == meta.crash
+
+
+def test_a_later_session_goes_on_counting(stand: Stand) -> None:
+    stand.record(0)
+    again = Stand(stand.out)
+    again.record(0)
+    assert again.episodes.number == 3
+    assert stand.flight(2).meta.ticks == 3
+
+
+def test_a_mark_without_an_episode_says_so(stand: Stand) -> None:
+    stand.episodes.mark("good")
+    assert stand.told == ["there is no episode yet to mark"]
+
+
+def test_a_flight_is_no_folder_for_flights(stand: Stand) -> None:
+    stand.record(0)
+    with pytest.raises(UserError, match="is a flight itself"):
+        prepare_out(stand.out / "episode-0001")
+    (stand.out / "file").write_text(json.dumps({}))
+    with pytest.raises(UserError, match="cannot be made"):
+        prepare_out(stand.out / "file")

@@ -1,0 +1,123 @@
+"""Pilots who fly the simulated vehicle by its receiver alone, in stepped time."""
+
+import pytest
+
+from sitl import UsageError
+from sitl.clock import NS_PER_S, Clock
+from sitl.course.layout import make_course
+from sitl.expert.stick_response import CENTRED
+from sitl.pilot.axes import DEFAULT_AXES
+from sitl.pilot.choose import make_pilot, prepare_vehicle
+from sitl.pilot.transmitter import OFF_US, Hand, Transmitter
+from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import STEP_NS, VehicleConfig
+
+COURSE = make_course(5)
+
+
+def vehicle_of(autopilot, **changes):
+    config = VehicleConfig(autopilot=autopilot, receiver=True, **changes)
+    made = SimulatedVehicle(links=1, boot_ns=0, config=config, course=COURSE)
+    prepare_vehicle(made, autopilot)
+    return made
+
+
+def pilot_of(name, vehicle, autopilot="ardupilot", axes=DEFAULT_AXES):
+    pilot, _ = make_pilot(
+        name,
+        vehicle=vehicle,
+        autopilot=autopilot,
+        course=COURSE,
+        axes=axes,
+        speed_mps=5.0,
+        clock=Clock(),
+    )
+    return pilot
+
+
+class Flight:
+    """Holds a hand on the transmitter."""
+
+    def __init__(self, vehicle):
+        self.vehicle = vehicle
+        self.transmitter = Transmitter(0)
+        self.now_ns = 0
+
+    def hold(self, hand, seconds):
+        for _ in range(round(seconds * NS_PER_S / STEP_NS)):
+            self.now_ns += STEP_NS
+            if self.transmitter.begins_frame(self.now_ns):
+                us = OFF_US if hand is None else self.transmitter.channels_us(hand, self.now_ns)
+                self.vehicle.set_receiver(us)
+            self.vehicle.step(self.now_ns)
+
+
+@pytest.mark.parametrize(("autopilot", "mode"), [("ardupilot", "ALT_HOLD"), ("px4", "ALTCTL")])
+def test_both_firmwares_are_armed_flown_and_disarmed_by_the_receiver(autopilot, mode):
+    vehicle = vehicle_of(autopilot)
+    flight = Flight(vehicle)
+    down = Hand(CENTRED._replace(throttle=-1.0))
+    flight.hold(down, 7)
+    assert not vehicle.ap.armed
+    assert vehicle.ap.mode_name == mode
+    flight.hold(Hand(gesture="arm"), 3)
+    assert vehicle.ap.armed
+    flight.hold(Hand(CENTRED._replace(throttle=0.7)), 4)
+    climbed_m = -vehicle.ap.truth.position_ned_m[2]
+    assert climbed_m > 2.0
+    assert not vehicle.ap.landed
+    flight.hold(Hand(CENTRED._replace(pitch=0.4)), 2)
+    assert vehicle.ap.truth.velocity_ned_mps[0] > 1.0, "nose down flies forward, north"
+    flight.hold(Hand(gesture="disarm"), 1.5)
+    assert vehicle.ap.armed, "not in the air"
+    flight.hold(down, 8)
+    assert vehicle.ap.landed
+    flight.hold(Hand(gesture="disarm"), 3)
+    assert not vehicle.ap.armed
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_a_lost_signal_in_flight_is_a_failsafe(autopilot):
+    vehicle = vehicle_of(autopilot)
+    flight = Flight(vehicle)
+    flight.hold(Hand(CENTRED._replace(throttle=-1.0)), 7)
+    flight.hold(Hand(gesture="arm"), 3)
+    flight.hold(Hand(CENTRED._replace(throttle=0.7)), 4)
+    assert not vehicle.ap.in_failsafe
+    flight.hold(None, 3)
+    assert vehicle.ap.in_failsafe
+
+
+def test_the_expert_flies_the_course_lands_and_disarms():
+    vehicle = vehicle_of("ardupilot")
+    pilot = pilot_of("expert", vehicle)
+    switch = []
+    was_armed = False
+    for _ in range(80 * NS_PER_S // STEP_NS):
+        if (us := pilot.latest()) is not None:
+            vehicle.set_receiver(us)
+            switch.append(us[6])
+        vehicle.step(vehicle.ap.now_ns + STEP_NS)
+        was_armed |= vehicle.ap.armed
+        if was_armed and not vehicle.ap.armed:
+            break
+    assert was_armed
+    assert not vehicle.ap.armed
+    assert vehicle.ap.landed
+    assert vehicle.log.next_gate is None, "every gate"
+    assert not vehicle.log.crashed
+    high = [us for us in switch if us == 2000]
+    assert 0 < len(high) < len(switch)
+    assert switch[-1] == 1000
+    pilot.close()
+
+
+def test_what_a_pilot_cannot_be_is_refused(monkeypatch):
+    vehicle = vehicle_of("px4")
+    with pytest.raises(UsageError, match="ardupilot alone"):
+        pilot_of("expert", vehicle, autopilot="px4")
+    with pytest.raises(UsageError, match="--pilot-axes"):
+        pilot_of("gamepad", vehicle, axes="roll=1")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
+    with pytest.raises(UsageError, match="needs a display"):
+        pilot_of("keyboard", vehicle)
