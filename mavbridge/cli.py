@@ -220,10 +220,10 @@ def export_policy(checkpoint: Path | None = None, *, config: ExportPolicyConfig)
 
 @cli.command
 def contract(source: Path, config: ContractConfig | None = None) -> int:
-    """Draft a contract file: what a LeRobot policy's own files do not say, such as its rate.
+    """Draft a contract file: what the files of a policy do not say, such as its rate.
 
     Args:
-        source: folder of a LeRobot policy, or of a LeRobot dataset.
+        source: folder of a LeRobot policy, of a LeRobot dataset, or of ONNX files; or one of those.
         config: the settings.
     """
     from mavbridge.commands.contract.run import contract as run_contract

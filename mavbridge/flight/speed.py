@@ -18,7 +18,8 @@ NEARLY = 1.1
 """A rate is not reached from this factor on."""
 FASTER = (
     "Take fewer --num-diffusion-steps, a smaller policy, another --engine or --device, a faster "
-    "computer, or one that serves the policy (ws://)"
+    "computer, or one that serves the policy (ws://); if it was trained to play each chunk for "
+    "longer, its contract may say so (play_s)"
 )
 
 

@@ -9,8 +9,11 @@ import hashlib
 import os
 from pathlib import Path
 
-MAX_ENTRIES = 12
-"""Files kept, about six policies of two graphs each; the least recently used is dropped first."""
+MAX_ENTRIES = 24
+"""Files kept, about eight policies of two graphs each, some at two precisions; the least recently
+used is dropped first."""
+MAX_BYTES = 2_000_000_000
+"""Of all files together: the graphs of a large policy are as large as its weights."""
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
@@ -40,7 +43,7 @@ class CompileCache:
         return blob if hashlib.sha256(blob).digest() == digest else None
 
     def store(self, key: str, blob: bytes) -> None:
-        """Keep ``blob`` if possible; the oldest entries beyond ``MAX_ENTRIES`` are deleted."""
+        """Keep ``blob`` if possible; the oldest beyond ``MAX_ENTRIES`` or ``MAX_BYTES`` go."""
         path = self._path(key)
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
         try:
@@ -59,6 +62,10 @@ class CompileCache:
         entries = []
         for path in self._folder.glob("*.graph*"):  # leftovers of a killed process count too
             with contextlib.suppress(FileNotFoundError):  # another process made room
-                entries.append((path.stat().st_mtime_ns, path))
-        for _, path in sorted(entries, reverse=True)[MAX_ENTRIES:]:
-            path.unlink(missing_ok=True)
+                stat = path.stat()
+                entries.append((stat.st_mtime_ns, path, stat.st_size))
+        total = 0
+        for place, (_, path, size) in enumerate(sorted(entries, reverse=True)):
+            total += size
+            if place >= MAX_ENTRIES or total > MAX_BYTES:
+                path.unlink(missing_ok=True)

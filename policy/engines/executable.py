@@ -3,21 +3,19 @@
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, QUATERNION, Contract, FloatArray
-from policy.engines.warm_start import Segment, WarmStart, make_solve, to_numpy
+from policy.engines.warm_start import Segment, WarmStart, make_solve
 from policy.errors import PolicyError, user_code
 from policy.preprocess import image_to_input
 from policy.protocol import (
     DualRatePolicy,
     Executable,
     SingleRatePolicy,
-    StepwisePolicy,
     WarmStartPolicy,
 )
 
@@ -57,13 +55,10 @@ def make_executable(
     *,
     engine: str,
     settings: ExecutionSettings,
-    compile_end: Compile | None = None,
 ) -> Executable:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
     ``vision`` encodes images and ``action`` samples chunks: one policy, perhaps on two devices.
-    With ``compile_end`` the solver of a ``StepwisePolicy`` is not compiled, but runs around its
-    network; ``compile_end`` is for the end of the solve, ``to_chunk``.
 
     Raises:
         PolicyError: no fast path where one was asked for, or the policy failed on the sample.
@@ -80,11 +75,9 @@ def make_executable(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
         )
     image = ((1, 3, contract.image_height, contract.image_width),)
-    encode = [compile_vision(method, image) for method in _encoders(vision)]
+    encode = [compile_vision(method, image) for method in encoders(vision)]
     fast = ((1, *contract.feature_shape), *rest)
-    if compile_end is not None and isinstance(action, StepwisePolicy):
-        act = _stepwise(action, fast, compile_action, compile_end, settings)
-    elif isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
+    if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
         act = _warm_started(action, fast, compile_action, settings, settings.head_steps)
     else:
         sampler = action
@@ -93,7 +86,7 @@ def make_executable(
     return assemble(contract, encode, act, engine, settings)
 
 
-def _encoders(vision: DualRatePolicy) -> list[Callable[..., Any]]:
+def encoders(vision: DualRatePolicy) -> list[Callable[..., Any]]:
     """``encode_visual`` of each camera: one argument, the image."""
     cameras = len(vision.contract.cameras)
     if cameras == 1:
@@ -145,46 +138,6 @@ def _warm_started(
     with user_code(f"{settings.name} failed to prepare its warm start"):
         solve = make_solve(policy, segment, steps, head_steps)
     return WarmStart(solve, chunk_dt_s=policy.contract.chunk_dt_s)
-
-
-def _stepwise(
-    policy: StepwisePolicy,
-    shapes: Sequence[Shape],
-    compile_: Compile,
-    compile_end: Compile,
-    settings: ExecutionSettings,
-) -> Act:
-    with user_code(f"{settings.name} failed to prepare its solver"):
-        noise = to_numpy(policy.initial_noise)
-        denoise = compile_(policy.denoise, (noise.shape, (1,), *shapes))
-        to_chunk = compile_end(policy.to_chunk, (noise.shape,))
-        segment = partial(solver_segment, denoise, policy.schedule, settings.num_diffusion_steps)
-        if settings.head_steps is None or not isinstance(policy, WarmStartPolicy):
-            solve = segment(0, settings.num_diffusion_steps)
-            return always_full(lambda e, s, h: to_chunk(solve(e, s, h, noise)))
-        warm = make_solve(policy, segment, settings.num_diffusion_steps, settings.head_steps)
-    return WarmStart(warm, chunk_dt_s=policy.contract.chunk_dt_s)
-
-
-def solver_segment(
-    denoise: ArrayFunction, schedule: Any, num_diffusion_steps: int, first: int, count: int
-) -> Segment:
-    """``count`` DDIM steps of a solve from ``first`` on, around the network call ``denoise``.
-
-    ``denoise`` and ``schedule`` are as those of ``protocol.StepwisePolicy``.
-    """
-    steps = schedule.ddim_steps(num_diffusion_steps)[first : first + count]
-    timesteps = [np.array([step.timestep], np.float32) for step in steps]
-
-    def run(
-        encoded: FloatArray, state: FloatArray, history: FloatArray, noisy: FloatArray
-    ) -> FloatArray:
-        for step, timestep in zip(steps, timesteps, strict=True):
-            output = denoise(noisy, timestep, encoded, state, history)
-            noisy = schedule.ddim_update(step, noisy, output)
-        return noisy
-
-    return run
 
 
 def always_full(sample: ArrayFunction) -> Act:

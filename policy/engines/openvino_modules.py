@@ -29,9 +29,10 @@ from policy.engines.executable import (
 from policy.engines.kept import modules_of
 from policy.engines.openvino_compile import GraphCompiler, engine_name
 from policy.engines.signal_stack import signal_stack_kept
+from policy.engines.stepwise import make_stepwise_executable
 from policy.engines.torch_eager import run_eagerly
 from policy.errors import PolicyError, user_code
-from policy.protocol import Executable, SingleRatePolicy
+from policy.protocol import Executable, SingleRatePolicy, StepwisePolicy
 
 MAX_OPERATIONS = 4000
 """In one graph: 3 ms each to convert; ten unrolled steps of a TOGE are 2,700, one is 500."""
@@ -61,15 +62,12 @@ def make_module_executable(
     def compile_as(precision: Precision) -> Compile:
         return lambda function, shapes: converter.compile(function, shapes, precision)
 
-    return make_executable(
-        policy,
-        policy,
-        compile_as(vision),
-        compile_as(action),
-        engine=engine_name(vision, action),
-        settings=settings,
-        compile_end=run_eagerly(settings.name, "cpu"),
-    )
+    name = engine_name(vision, action)
+    compilers = compile_as(vision), compile_as(action)
+    if isinstance(policy, StepwisePolicy):
+        end = run_eagerly(settings.name, "cpu")
+        return make_stepwise_executable(policy, *compilers, end, engine=name, settings=settings)
+    return make_executable(policy, policy, *compilers, engine=name, settings=settings)
 
 
 class ModuleConverter:

@@ -18,9 +18,9 @@ from typing import Any
 
 from policy.contract import Contract
 from policy.errors import CheckpointError, PolicyError
-from policy.foreign.interface import Interface, read_interface
+from policy.foreign.interface import CONTRACT_FILE, Interface, read_interface
 
-DESCRIPTION, CONTRACT_FILE = "policy.json", "mavbridge.toml"
+DESCRIPTION = "policy.json"
 ROLES = ("image", "feature", "state", "action_history", "noisy", "timestep")
 """What an input of a graph may be."""
 TABLES = ("contract", "schedule", "inputs")

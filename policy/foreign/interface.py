@@ -107,12 +107,6 @@ class Interface:
             )
 
     @property
-    def state_columns(self) -> list[int]:
-        """Column of ``contract.state_names`` of each number of the policy's state."""
-        names = self.state_names or self.contract.state_names
-        return [self.contract.state_names.index(name) for name in names]
-
-    @property
     def state_dim(self) -> int:
         """Width of the policy's state."""
         return len(self.state_names or self.contract.state_names)

@@ -14,7 +14,7 @@ archive may have methods of these names, too.
 """
 
 import inspect
-from collections.abc import Callable
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ def adopt_modules(
         getattr(holder, part, None) for part in ("visual_encoder", "action_head", "denoiser")
     )
     if encoder is None and head is None and denoiser is None:
-        if not isinstance(holder, nn.Module) or not callable(getattr(holder, "forward", None)):
+        if not _has_forward(holder):
             return None
         return _with_life(ForwardPolicy(interface, holder), holder)
     if encoder is None or (head is None) == (denoiser is None):
@@ -78,8 +78,8 @@ class ForwardPolicy(nn.Module):
         super().__init__()
         self.contract = interface.contract
         self.held = nn.ModuleList(modules_of(holder))
-        self._call = _leave_out_rest(holder if call is None else call)
-        self._state_columns = interface.state_columns
+        self._call = _Call(holder if call is None else call)
+        self._to_state = interface.to_state
         self._action_columns = interface.action_columns
         self._scale: Tensor
         self._offset: Tensor
@@ -100,7 +100,7 @@ class ForwardPolicy(nn.Module):
 
     def _own(self, state: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
         """State and history as the policy orders and scales them."""
-        return state[..., self._state_columns], self._from_actions(history)
+        return self._to_state(state), self._from_actions(history)
 
     def _from_actions(self, actions: Tensor) -> Tensor:
         place = [self._action_columns.index(column) for column in range(ACTION_DIM)]
@@ -112,7 +112,7 @@ class HeadPolicy(ForwardPolicy):
 
     def __init__(self, interface: Interface, holder: object, encoder: Any, head: Any) -> None:
         super().__init__(interface, holder, head)
-        self._encoder = _leave_out_rest(encoder)
+        self._encoder = _Call(encoder)
 
     def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
         """Image [B, 3, H, W] -> feature [B, F], by one encoder for every camera."""
@@ -224,13 +224,26 @@ def _with_life(policy: ForwardPolicy, holder: object) -> ForwardPolicy:
     return policy
 
 
-def _leave_out_rest(function: Any) -> Callable[..., Tensor]:
-    """``function``, called with as many arguments as it declares."""
-    called = function.forward if isinstance(function, nn.Module) else function
-    schema = getattr(called, "schema", None)  # of TorchScript
-    if schema is not None:
-        count = len(schema.arguments) - 1  # less self
-    else:
+def _has_forward(holder: object) -> bool:
+    if isinstance(holder, torch.jit.ScriptModule):
+        return getattr(getattr(holder, "forward", None), "schema", None) is not None
+    return isinstance(holder, nn.Module) and type(holder).forward is not nn.Module.forward
+
+
+class _Call:
+    """A module or a function, called with as many arguments as it declares."""
+
+    def __init__(self, function: Any) -> None:
+        self._function = function
+        called = function.forward if isinstance(function, nn.Module) else function
+        schema = getattr(called, "schema", None)  # of TorchScript
+        if schema is not None:
+            self._count = len(schema.arguments) - 1  # less self
+            return
         kinds = [each.kind for each in inspect.signature(called).parameters.values()]
-        count = len(kinds) if inspect.Parameter.VAR_POSITIONAL not in kinds else 99
-    return lambda *arguments: function(*arguments[:count])
+        takes_any = inspect.Parameter.VAR_POSITIONAL in kinds
+        self._count = sys.maxsize if takes_any else len(kinds)
+
+    def __call__(self, *arguments: Tensor) -> Tensor:
+        result: Tensor = self._function(*arguments[: self._count])
+        return result

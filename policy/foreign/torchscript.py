@@ -4,6 +4,7 @@ It has modules or methods as ``foreign.modules`` says, and may hold a file polic
 ``foreign.description`` says (``torch.jit.save(..., _extra_files={"policy.json": text})``).
 """
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,9 @@ def load_torchscript(
         PolicyError: the archive is damaged, or has no modules that make a policy.
     """
     try:
-        module = torch.jit.load(path, map_location="cpu").eval()  # type: ignore[no-untyped-call]
+        # torch says that this will go one day, in favour of a format that few export to so far.
+        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+            module = torch.jit.load(path, map_location="cpu").eval()  # type: ignore[no-untyped-call]
     except (RuntimeError, OSError) as error:
         reason = str(error).strip().partition("\n")[0]
         raise CheckpointError(f"{path}: damaged TorchScript archive ({reason})") from error

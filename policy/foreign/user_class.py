@@ -16,6 +16,7 @@ from types import ModuleType
 
 from policy.contract import Contract
 from policy.errors import PolicyError, user_code
+from policy.foreign.interface import Interface
 from policy.protocol import DualRatePolicy, SingleRatePolicy
 
 FORMS = (
@@ -45,8 +46,11 @@ def check_user_class(spec: str) -> None:
         )
 
 
-def load_user_class(spec: str, checkpoint: Path | None) -> SingleRatePolicy:
+def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> SingleRatePolicy:
     """Import a class that keeps the protocol of ``policy.protocol``, and make one.
+
+    It may also name the torch modules of its policy, as ``foreign.modules`` says; ``seed`` is that
+    of a denoiser's initial noise.
 
     Raises:
         PolicyError: there is no such class, it cannot be made, or a member is missing.
@@ -66,10 +70,11 @@ def load_user_class(spec: str, checkpoint: Path | None) -> SingleRatePolicy:
         classes = sorted(
             name
             for name, value in vars(module).items()
-            if isinstance(value, type) and (hasattr(value, "predict") or hasattr(value, "forward"))
+            if isinstance(value, type)
+            and (value.__module__ == module.__name__ or hasattr(value, "predict"))
         )
         raise PolicyError(f"--policy {spec}: no class {class_name} there; it has {classes}")
-    return _instance(spec, found, checkpoint)
+    return _instance(spec, found, checkpoint, seed)
 
 
 def _split(spec: str) -> tuple[Path | str, str]:
@@ -149,7 +154,7 @@ def _import_hint(error: BaseException | None) -> str:
     return f"mend that, or write {FORMS}"
 
 
-def _instance(spec: str, found: type, checkpoint: Path | None) -> SingleRatePolicy:
+def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> SingleRatePolicy:
     arguments: dict[str, Path] = {} if checkpoint is None else {"checkpoint": checkpoint}
     try:
         inspect.signature(found).bind(**arguments)
@@ -166,6 +171,13 @@ def _instance(spec: str, found: type, checkpoint: Path | None) -> SingleRatePoli
     with user_code(f"--policy {spec}: making it failed"):
         policy: object = found(**arguments)
     contract = getattr(policy, "contract", None)
+    if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
+        from policy.foreign.modules import adopt_modules  # imports torch
+
+        interface = Interface(contract=contract)
+        adopted = adopt_modules(f"--policy {spec}", policy, interface, schedule=None, seed=seed)
+        if adopted is not None:
+            return adopted
     lacking = [] if isinstance(contract, Contract) else ["contract"]
     lacking += [] if hasattr(policy, "predict") else ["predict"]
     if not isinstance(policy, SingleRatePolicy) or not isinstance(contract, Contract):
@@ -173,7 +185,9 @@ def _instance(spec: str, found: type, checkpoint: Path | None) -> SingleRatePoli
             f"--policy {spec}: a policy needs a member contract (a policy.contract.Contract) and "
             "predict(image, state, action_history, num_diffusion_steps); for the dual-rate mode "
             "also encode_visual(image) and predict_fast(feature, state, action_history, "
-            f"num_diffusion_steps). Missing or wrong here: {lacking}"
+            "num_diffusion_steps); or torch modules as attributes (visual_encoder and action_head "
+            "or denoiser), or be one with forward(image, state, action_history). Missing or wrong "
+            f"here: {lacking}"
         )
     if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
         raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")

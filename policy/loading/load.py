@@ -59,6 +59,7 @@ def check_request(request: PolicyRequest) -> None:
         PolicyError: with what was wrong, what was available and what to do.
     """
     kind, *options = request.spec.split(":")
+    _require_flags_of_kind(kind, request)
     if kind == "scripted":
         _scripted(options, request, lambda: 0.0)
     elif kind in BUILTIN_KINDS:
@@ -170,9 +171,8 @@ def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRat
     if kind == TORCHSCRIPT:
         return load_archive(request)
     if kind not in BUILTIN_KINDS:
-        return load_user_class(request.spec, request.checkpoint), [
-            f"{request.spec}: a class of yours"
-        ]
+        policy = load_user_class(request.spec, request.checkpoint, seed=request.seed)
+        return policy, [f"{request.spec}: a class of yours"]
     return load_builtin(request)
 
 
@@ -209,6 +209,21 @@ def _scripted(
     if request.starts_in_air and options[-1:] != [IN_AIR]:
         options = [*(options or ["hover"]), IN_AIR]
     return make_scripted(options, now_s, contract=contract)
+
+
+def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
+    """Refuse a contract file where it has no use, and a file of another kind than was named."""
+    if kind in (LEROBOT, ONNX, TORCHSCRIPT):
+        path = Path(request.spec.partition(":")[2]).expanduser()
+        sentence = recognise(path) if path.is_file() else None
+        own = tuple(f"--policy {kind}:{each}" for each in (path, path.parent))
+        if sentence is not None and not sentence.endswith(own):
+            raise PolicyError(f"--policy {request.spec}: {sentence}")
+    elif kind not in SCHEMES and request.contract_file is not None:
+        raise PolicyError(
+            f"--policy {request.spec} has a contract of its own, and --contract "
+            f"{request.contract_file} is for files and servers that say too little: leave it out"
+        )
 
 
 def _require_no_path(spec: str) -> None:

@@ -29,7 +29,10 @@ class SolveTimes:
 
 
 def measure_times(executable: Executable, now_s: Callable[[], float]) -> SolveTimes | None:
-    """Time a policy that was tried before; None if it had no chunk for the dummy sample."""
+    """Time a policy that was tried before; None if it had no chunk for the dummy sample.
+
+    By a clock that stands still, as in simulations, it is asked only once.
+    """
     contract = executable.contract
     shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
     rgb, state = np.full(shape, 128, np.uint8), level_state(contract)
@@ -37,7 +40,7 @@ def measure_times(executable: Executable, now_s: Callable[[], float]) -> SolveTi
     encode_s: list[float] = []
     act_s: list[float] = []
     begun_s = now_s()
-    while len(act_s) < REPETITIONS and (not act_s or now_s() - begun_s < MOST_S):
+    while len(act_s) < REPETITIONS and (not act_s or 0 < now_s() - begun_s < MOST_S):
         before_s = now_s()
         encoded = encode_all(executable, rgb)
         encoded_s = now_s()

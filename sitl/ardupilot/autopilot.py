@@ -319,11 +319,8 @@ class Autopilot:
     def _read_radio(self) -> None:
         new_input = self.rc.update(self.now_ns)
         self._read_mode_switch()
-        match self._gesture.update(read_sticks(self.rc, self.params), self.now_ns):
-            case "arm":
-                self.arm(force=False, by_rudder=True)
-            case "disarm":
-                self.disarm(force=False)
+        if new_input:
+            self._read_gesture()
         changed = self.radio_failsafe.update(
             new_input=new_input,
             throttle_us=self.rc.channels_us[self.rc.index_of("THROTTLE")],
@@ -336,6 +333,13 @@ class Autopilot:
             self._fail_over("Radio", "FS_THR_ENABLE")
         else:
             self._send_text(SEVERITY_WARNING, "Radio Failsafe Cleared")
+
+    def _read_gesture(self) -> None:
+        match self._gesture.update(read_sticks(self.rc, self.params), self.now_ns):
+            case "arm":
+                self.arm(force=False, by_rudder=True)
+            case "disarm":
+                self.disarm(force=False)
 
     def _read_mode_switch(self) -> None:
         channel = self.params.integer("FLTMODE_CH")

@@ -53,7 +53,8 @@ class Transmitter:
         """It is time for another frame; true once for each."""
         if now_ns < self._due_ns:
             return False
-        self._due_ns = now_ns + PERIOD_NS - min(PERIOD_NS - 1, now_ns - self._due_ns)
+        is_on_time = now_ns - self._due_ns < PERIOD_NS
+        self._due_ns = (self._due_ns if is_on_time else now_ns) + PERIOD_NS
         return True
 
     def channels_us(self, hand: Hand, now_ns: int) -> tuple[int, ...]:

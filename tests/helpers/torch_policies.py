@@ -152,3 +152,61 @@ class Stepwise(TwoRates):
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         noise = torch.as_tensor(self.initial_noise)
         return self.denoise_fast(feature, state, history, noise, steps, 0, steps)
+
+
+class ForwardOnly(nn.Module):
+    """A single-rate policy: a contract, and forward of two arguments out of three."""
+
+    contract = SINGLE
+
+    def __init__(self) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(3)
+            self.net = nn.Linear(3 + SINGLE.state_dim, SINGLE.horizon * 4)
+
+    def forward(self, image: Tensor, state: Tensor) -> Tensor:
+        seen = torch.cat([image.mean(dim=(2, 3)), state * 0.1], dim=1)
+        chunk: Tensor = self.net(seen).tanh()
+        return chunk.reshape(-1, SINGLE.horizon, 4)
+
+
+class NamedHead:
+    """No module and no methods: two modules by name."""
+
+    contract = SINGLE
+
+    def __init__(self) -> None:
+        whole = TwoRates()
+        self.visual_encoder, self.action_head = whole.visual_encoder, whole.head
+
+
+class NoisyHead(Head):
+    """A head as one step of a diffusion policy, in the order that a denoiser has."""
+
+    def __init__(self) -> None:
+        super().__init__(extra=DUAL.horizon * 4 + 1)
+
+    def forward(
+        self, noisy: Tensor, timestep: Tensor, feature: Tensor, state: Tensor, history: Tensor
+    ) -> Tensor:  # type: ignore[override]
+        return super().forward(feature, state, history, noisy, timestep[:, None] / 100)
+
+
+class NamedDenoiser:
+    """The same with a denoiser."""
+
+    contract = SINGLE
+    noise_schedule = NoiseSchedule(prediction="epsilon", betas="linear")
+
+    def __init__(self) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(4)
+            self.visual_encoder, self.denoiser = Encoder(), NoisyHead()
+
+
+class Incomplete:
+    contract = SINGLE
+
+    def __init__(self) -> None:
+        self.visual_encoder = Encoder()

@@ -89,6 +89,21 @@ class Leaning(Climbing):
         return self._flown == self.fault_calls + 1
 
 
+class Deliberate(Leaning):
+    """Makes two chunks a second, in 0.3 s each, and is meant to play one for a second."""
+
+    contract = Contract(
+        arrays="numpy", feature_dim=1, image_height=32, image_width=32, horizon=40, play_s=1.0
+    )
+    lean_calls = 8
+
+    def predict_fast(
+        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
+    ) -> Array:
+        time.sleep(0.3)  # noqa: TID251 - the slow policy itself
+        return super().predict_fast(feature, state, action_history, num_diffusion_steps)
+
+
 def mark_fault() -> None:
     """Tell the test when the fault began."""
     path = Path(os.environ["MAVBRIDGE_TEST_MARK"])

@@ -70,7 +70,7 @@ def no_thread_stays() -> Iterator[None]:
 
 def loaded(port: int, contract_file: Path) -> "closing[RemotePolicy]":
     policy, notes = load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
-    assert "its deadline is 500 ms" in notes[0]
+    assert "longer than 500 ms is not flown" in notes[0]
     policy.reset()
     return closing(policy)
 
@@ -202,23 +202,6 @@ def test_a_policy_that_gives_no_numbers_is_refused_at_loading(contract_file: Pat
         request = PolicyRequest(spec=f"ws://127.0.0.1:{port}", contract_file=contract_file)
         with pytest.raises(PolicyError, match="NaN or infinity"):
             load_policy(request, now_s=lambda: 0.0)
-
-
-def test_a_server_that_is_too_slow_is_refused_with_its_figures(contract_file: Path) -> None:
-    never = threading.Event()
-
-    def reply(_message: object) -> bytes:
-        never.wait(0.05)
-        return chunk_of(0.5)
-
-    contract_file.write_text(CONTRACT.replace("0.5", "0.02"))
-    with (
-        scripted_server(reply) as port,
-        pytest.raises(
-            PolicyError, match=r"answers in [0-9.]+ ms, .* may take 20 ms by the age limits"
-        ),
-    ):
-        load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
 
 
 def test_addresses_without_a_policy_server(

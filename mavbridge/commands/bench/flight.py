@@ -16,8 +16,9 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.processes import end, free_port, running, wait
 
 FLIGHT_PROCESS = "mavbridge.commands.bench.flight_process"
-STARTING_S = 90.0
-"""Most that a process may take beside its flight: imports, compiling an engine, arming."""
+STARTING_S = 300.0
+"""Most that a process may take beside its flight: imports, compiling an engine, arming. A network
+of 263 M parameters compiles for one or two minutes."""
 
 
 @Parameter(name="*")

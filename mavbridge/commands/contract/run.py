@@ -14,12 +14,13 @@ from policy.foreign.drafts.lerobot import (
     dataset_entries,
     dataset_of,
 )
+from policy.foreign.drafts.onnx import onnx_entries, onnx_files
 from policy.foreign.interface import CONTRACT_FILE, UNANSWERED
 
 
 def contract(source: Path, config: ContractConfig) -> int:
-    """Write a contract file for a policy or a dataset of LeRobot's."""
-    out = config.out or source / CONTRACT_FILE
+    """Write a contract file for a LeRobot policy or dataset, or for ONNX."""
+    out = config.out or (source if source.is_dir() else source.parent) / CONTRACT_FILE
     if out.exists():
         raise UserError(f"{out} is there already: change that, or name another file by --out")
     text, summary = _draft(source, config.dataset)
@@ -38,10 +39,12 @@ def _draft(source: Path, dataset: Path | None) -> tuple[str, str]:
         raise UserError(f"--dataset {dataset}: not a LeRobot dataset, it has no meta/info.json")
     if is_lerobot(source):
         return _described(source, dataset_entries(source))
+    if graphs := onnx_files(source):
+        return _described(source, onnx_entries(graphs))
     if not (source / CONFIG_FILE).is_file():
         raise UserError(
-            f"{source}: neither a LeRobot policy (a folder with {CONFIG_FILE}) nor a LeRobot "
-            "dataset (a folder with meta/info.json)"
+            f"{source}: neither a LeRobot policy (a folder with {CONFIG_FILE}), nor a LeRobot "
+            "dataset (a folder with meta/info.json), nor ONNX (a file, or a folder of them)"
         )
     dataset = dataset or dataset_of(source)
     if dataset is not None and (dataset / CONTRACT_FILE).is_file():

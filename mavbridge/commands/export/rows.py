@@ -7,7 +7,7 @@ interpolated; the stamps say how old each of them was.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,14 +105,13 @@ def common_fps(parts: Sequence[Stretch]) -> int:
         UserError: flights of several rates.
     """
     fps = max(1, round(_rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))))
-    by_flight: dict[str, list[Nanoseconds]] = {}
-    for part in parts:
-        by_flight.setdefault(part.episode.name, []).append(np.diff(part.captured_ns))
-    for name, periods in by_flight.items():  # a stretch of a few frames has no rate of its own
-        own = _rate_hz(np.concatenate(periods))
+    # By flight, since a stretch of a few frames has no rate of its own.
+    for _, of_flight in groupby(parts, key=lambda part: id(part.episode)):
+        whole = list(of_flight)
+        own = _rate_hz(np.concatenate([np.diff(part.captured_ns) for part in whole]))
         if abs(own / fps - 1.0) > MAX_RATE_OFF:
             raise UserError(
-                f"{name} has {own:.3g} frames a second, most of the rest {fps}: a "
+                f"{whole[0].episode.name} has {own:.3g} frames a second, most of the rest {fps}: a "
                 "LeRobot dataset has one rate, so export them apart"
             )
     return fps

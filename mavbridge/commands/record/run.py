@@ -25,7 +25,7 @@ from mavbridge.config.record import RecordConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import FanOut, ObserverThread
-from mavbridge.core.ports import TickSink
+from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.records import FloatArray
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import Worker
@@ -137,21 +137,11 @@ class _Session:
         self._disk_s, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
         """Why the last begin was refused."""
-        vision_hz = config.film.visual_rate
-        self.screen = RecordScreen(console, rate_hz=config.rate, vision_hz=vision_hz)
+        self.screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
         viewer = self._open_viewer()
         self._gate = GateProcess(listening_gate(config, clock))
         stack.callback(self._gate.close)
-        film = config.film
-        camera = open_camera(
-            film.camera,
-            image_size=film.camera_size,
-            clock=clock,
-            timeout_s=film.camera_timeout,
-            latency_ms=film.camera_latency,
-            report=lambda line: console.print(Text(line)),
-        )
-        stack.callback(camera.close)
+        camera = self._open_camera(console)
         self._episodes = Episodes(
             config.out,
             clock=clock,
@@ -162,7 +152,7 @@ class _Session:
             report=self.screen.show_message,
         )
         sink = FanOut((self.screen, self._episodes, *viewer))
-        flight, executable = flight_settings(pilot_flight(config), nobody()), nobody()
+        flight = flight_settings(pilot_flight(config), nobody())
         self._view = PilotView(
             history=SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s),
             sink=sink,
@@ -172,17 +162,35 @@ class _Session:
             ),
         )
         self._images = FeatureCache()
-        self._vision = VisionLoop(
+        self._vision = self._vision_loop(camera, sink)
+        self._gate.send(flight)
+
+    def _open_camera(self, console: Console) -> Camera:
+        film = self._config.film
+        camera = open_camera(
+            film.camera,
+            image_size=film.camera_size,
+            clock=self._clock,
+            timeout_s=film.camera_timeout,
+            latency_ms=film.camera_latency,
+            report=lambda line: console.print(Text(line)),
+        )
+        self._stack.callback(camera.close)
+        return camera
+
+    def _vision_loop(self, camera: Camera, sink: TickSink) -> VisionLoop:
+        """A loop that encodes nothing, but paces, stamps and judges the images."""
+        frame_ns = period_ns(self._config.film.visual_rate)
+        return VisionLoop(
             camera=camera,
-            encode=executable.encode,
+            encode=nobody().encode,
             cache=self._images,
             sink=sink,
-            clock=clock,
-            period_ns=lambda: period_ns(vision_hz),
+            clock=self._clock,
+            period_ns=lambda: frame_ns,
             image_watch=ImageWatch(max_frozen_s=MAX_FROZEN_S, max_black_s=MAX_BLACK_S),
             is_airborne=lambda: self._view.status.armed and self._view.status.is_landed is False,
         )
-        self._gate.send(flight)
 
     def _open_viewer(self) -> tuple[TickSink, ...]:
         if self._config.rerun == "off":
@@ -226,8 +234,16 @@ class _Session:
                     break
                 if not self._step():
                     break
+        except OSError as error:
+            reason = "an error"
+            raise UserError(f"--out {self._config.out}: {error}") from error
         finally:
             self._episodes.end(reason)
+        counts, out = self._episodes.counts, self._config.out
+        self.screen.show_message(
+            f"{self._episodes.finished} episodes recorded in {out}: {counts[True]} good, "
+            f"{counts[False]} bad, {counts[None]} not marked"
+        )
         self._gate.send(Ending(reason="the recording is over"))
         listener.ends_within(GATE_END_S)
 

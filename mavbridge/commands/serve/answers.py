@@ -6,7 +6,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, Clock
-from policy.contract import CONTRACT_VERSION
 from policy.errors import PolicyError
 from policy.foreign.interface import Interface
 from policy.foreign.websocket.messages import CONTRACT_KEY, pack, unpack
@@ -42,7 +41,6 @@ class AnswerLoop:
         return pack(
             {
                 CONTRACT_KEY: self._executable.contract.to_json(),
-                "contract_version": CONTRACT_VERSION,
                 "policy": self._executable.name,
             }
         )

@@ -1,4 +1,4 @@
 """First drafts of contract files: ``mavbridge contract``, and the file beside an export.
 
-lerobot, recorded --entries--> entries.draft_text --> TOML for ``foreign.interface``
+lerobot, onnx, recorded --entries--> entries.draft_text --> TOML for ``foreign.interface``
 """

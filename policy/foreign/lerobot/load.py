@@ -45,13 +45,14 @@ def _read(path: Path, policy: LeRobotPolicy) -> dict[str, Tensor]:
             f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
         ) from error
     state = {name: value for name, value in wanted.items() if name.endswith(_COUNTS)}
-    problems = []
+    problems, seen = [], set(state)
     for name, value in tensors.items():
         if name.startswith(_STATISTICS):
             continue
         own = net.own_name(name.removeprefix(net.prefix)) if name.startswith(net.prefix) else name
         if own is None:
             continue
+        seen.add(own)
         if own not in wanted:
             problems.append(f"unexpected {name!r}")
         elif value.shape != wanted[own].shape:
@@ -60,7 +61,7 @@ def _read(path: Path, policy: LeRobotPolicy) -> dict[str, Tensor]:
             problems.append(f"{name!r} holds NaN or infinity")
         else:
             state[own] = value.to(wanted[own].dtype)
-    problems += [f"missing {name!r}" for name in wanted if name not in state]
+    problems += [f"missing {name!r}" for name in wanted if name not in seen]
     if problems:
         raise CheckpointError(
             f"{path}: does not fit the policy of its config.json in {len(problems)} places: "

@@ -9,12 +9,9 @@ from pathlib import Path
 
 from policy.contract import Contract
 from policy.errors import CheckpointError, ContractError
-from policy.foreign.interface import Interface, read_interface
+from policy.foreign.interface import CONTRACT_FILE, Interface, read_interface
 from policy.foreign.lerobot.config import STATE_KEY, Config, Features, read_config
 from policy.foreign.lerobot.statistics import WEIGHTS_FILE, Normalisation, read_normalisation
-
-CONTRACT_FILE = "mavbridge.toml"
-"""Beside config.json, where the user names no other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +43,8 @@ def read_plan(folder: Path, contract_file: Path | None) -> Plan:
     if not path.is_file():
         raise ContractError(
             f"{path}: no such file. A LeRobot folder does not say at which rate it was trained, "
-            "nor what its state and action mean: write a contract file (mavbridge contract "
-            f"{folder} makes a first draft) and name it by --contract FILE.toml"
+            "nor what its state and action mean: mavbridge contract "
+            f"{folder} writes a first draft there, or name a file by --contract FILE.toml"
         )
     interface = _interface(path, config)
     _require_state(path, interface, config.features)
@@ -83,7 +80,7 @@ def _interface(path: Path, config: Config) -> Interface:
 
 def _require_state(path: Path, interface: Interface, features: Features) -> None:
     names = interface.state_names or interface.contract.state_names
-    if features.state_dim is not None and len(names) != features.state_dim:
+    if features.state_dim is not None and interface.state_dim != features.state_dim:
         raise ContractError(
             f"{path}: the policy takes a state of {features.state_dim} numbers, and these are "
             f"{len(names)}: {', '.join(names)}. Name its numbers in their order: [state] names"

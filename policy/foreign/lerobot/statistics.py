@@ -20,6 +20,8 @@ WEIGHTS_FILE = "model.safetensors"
 _HARMLESS = ("to_batch_processor", "device_processor")
 _BOUNDS = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
 _EPSILON = 1e-8
+_CONSTANT = 1e-6
+"""A number of the state that varied by less did not vary."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,13 +107,20 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
         ACTION_KEY: ("ACTION", normalisation.action),
     }
     asked |= {key: ("VISUAL", affine) for key, affine in normalisation.images.items()}
-    return normalisation, [
+    notes = [
         f"warning: {folder} holds no statistics of {key}: it flies as it is, not normalised"
         for key, (kind, affine) in asked.items()
         if affine is None
         and features.modes.get(kind, "IDENTITY") != "IDENTITY"
         and (key != STATE_KEY or features.state_dim)
     ]
+    state = normalisation.state
+    if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
+        notes.append(
+            f"warning: numbers {constant} (from 0) of {STATE_KEY} never changed in the training "
+            "data: any other value is divided by almost nothing, as in LeRobot, and rules the chunk"
+        )
+    return normalisation, notes
 
 
 def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]]:

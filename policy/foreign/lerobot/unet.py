@@ -16,6 +16,20 @@ from policy.foreign.lerobot.group_norm import GroupNorm
 from policy.nets.unet1d import sinusoid_frequencies
 
 
+class Mish(nn.Module):
+    """Mish (Misra 2019) of vectors, ``x * tanh(softplus(x))``, without that operation.
+
+    With w = exp(x), tanh(softplus(x)) = w (w + 2) / (w (w + 2) + 2). OpenVINO 2026.4 fails to
+    compile a Mish between small products of matrices in float32.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Element by element."""
+        w = x.clamp(max=20.0).exp()  # above, the quotient is 1
+        n = w * (w + 2)
+        return x * (n / (n + 2))
+
+
 class ConvBlock(nn.Module):
     """Convolution, norm, Mish."""
 
@@ -45,7 +59,7 @@ class ResidualBlock(nn.Module):
         self.conv1 = ConvBlock(channels_in, channels_out, kernel, groups)
         self.conv2 = ConvBlock(channels_out, channels_out, kernel, groups)
         self.film_dim = channels_out * (2 if self.scales else 1)
-        self.cond_encoder = nn.Sequential(nn.Mish(), nn.Linear(condition_dim, self.film_dim))
+        self.cond_encoder = nn.Sequential(Mish(), nn.Linear(condition_dim, self.film_dim))
         self.residual_conv: nn.Module = nn.Identity()
         if channels_in != channels_out:
             self.residual_conv = nn.Conv1d(channels_in, channels_out, 1)
@@ -75,7 +89,7 @@ class UNet(nn.Module):
         self.diffusion_step_encoder = nn.Sequential(
             nn.Identity(),  # LeRobot has its sinusoids here, which have no parameters
             nn.Linear(self.time_dim, 4 * self.time_dim),
-            nn.Mish(),
+            Mish(),
             nn.Linear(4 * self.time_dim, self.time_dim),
         )
         # In the order in which they run: ``_film`` counts on it.
@@ -125,7 +139,7 @@ class UNet(nn.Module):
         return out.transpose(1, 2)
 
     def _film(self, value: Tensor, columns: slice, *, bias: bool) -> list[Tensor]:
-        active = F.mish(value)
         blocks = [module for module in self.modules() if isinstance(module, ResidualBlock)]
+        active: Tensor = blocks[0].cond_encoder[0](value)
         linears: list[Any] = [block.cond_encoder[1] for block in blocks]
         return [F.linear(active, m.weight[:, columns], m.bias if bias else None) for m in linears]

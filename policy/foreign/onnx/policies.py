@@ -15,10 +15,10 @@ from policy.engines.executable import (
     Precision,
     Shape,
     make_numpy_executable,
-    solver_segment,
 )
 from policy.engines.openvino_compile import engine_name, precisions
 from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.stepwise import solver_segment
 from policy.errors import PolicyError
 from policy.foreign.modules import make_schedule
 from policy.foreign.onnx.files import DENOISER, OnnxFiles
@@ -76,9 +76,9 @@ class OnnxPolicy:
 
     def _call(self, state: FloatArray, history: FloatArray, **arrays: FloatArray) -> FloatArray:
         """The graph on a state and a history as the policy orders and scales them."""
-        columns = self._interface.state_columns
+        own_state = self._interface.to_state(state)
         theirs = self._interface.from_actions(history)
-        return self._graph(state=state[..., columns], action_history=theirs, **arrays)
+        return self._graph(state=own_state, action_history=theirs, **arrays)
 
 
 class WholePolicy(OnnxPolicy):
@@ -234,7 +234,7 @@ def _schedule(files: OnnxFiles) -> NoiseSchedule | None:
 def _wanted(files: OnnxFiles) -> dict[str, Wanted]:
     """Names and shapes of all that a graph of the policy may take."""
     interface, contract = files.description.interface, files.description.interface.contract
-    state = (1, *contract.state_shape[:-1], len(interface.state_columns))
+    state = (1, *contract.state_shape[:-1], interface.state_dim)
     keys = {"image": interface.camera_keys, "state": (interface.state_key,)}
     shapes: dict[str, Shape] = {
         "image": (1, *contract.image_shape),

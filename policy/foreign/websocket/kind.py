@@ -70,7 +70,7 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
 
     Raises:
         PolicyError: nobody serves a policy there, its contract is not known, or what it answers is
-            no chunk by that contract, or comes too late.
+            no chunk by that contract.
     """
     from policy.foreign.websocket.link import API_KEY_VARIABLE, ServerLink
     from policy.foreign.websocket.messages import CONTRACT_KEY
@@ -84,7 +84,8 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
         return policy, [policy.try_out()]
     except PolicyError as error:
         link.close()
-        raise PolicyError(f"--policy {url}: {error}") from error
+        told = str(error)
+        raise PolicyError(told if url in told else f"--policy {url}: {told}") from error
     except BaseException:
         link.close()
         raise

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.foreign.interface import Interface
-from policy.foreign.state import state_values
 from policy.foreign.websocket.messages import Message, MessageError, number_array
 from policy.preprocess import image_to_input
 
@@ -34,10 +33,7 @@ def to_message(
     # [N, H, W, 3] and [T, N, H, W, 3] only with several cameras
     per_camera = [images] if len(contract.cameras) == 1 else list(np.moveaxis(images, -4, 0))
     message: Message = dict(zip(interface.camera_keys, per_camera, strict=True))
-    columns = np.moveaxis(state, -1, 0)
-    wanted = interface.state_names or contract.state_names
-    values = state_values(list(columns), contract.state_names, wanted)
-    message[interface.state_key] = np.stack(values, axis=-1).astype(np.float32)
+    message[interface.state_key] = interface.to_state(state)
     if interface.prompt:
         message["prompt"] = interface.prompt
     if history is not None:

@@ -71,6 +71,17 @@ def test_streams_are_requested_one_after_the_other_what_is_needed_first(
     assert requested == expected
 
 
+@pytest.mark.parametrize("profile", [ARDUPILOT, PX4])
+def test_the_radio_comes_at_the_rate_of_a_recording(profile: Profile) -> None:
+    def radio_hz(pilot_hz: float | None) -> float:
+        groups = profile.streams(state_hz=100, pilot_hz=pilot_hz)
+        (group,) = (group for group in groups if group.messages == ("RC_CHANNELS",))
+        return group.rate_hz
+
+    assert radio_hz(100.0) == 100.0
+    assert radio_hz(None) < 60.0
+
+
 @pytest.mark.parametrize("answer", [None, dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_FAILED])
 def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
     requester = StreamRequester(ARDUPILOT.streams(state_hz=100))

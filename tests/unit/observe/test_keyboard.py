@@ -113,6 +113,19 @@ def test_a_paste_or_a_function_key_engages_nothing(
     assert got in ([*expected, "q"], ["q"])
 
 
+def test_other_keys_may_be_listened_to(terminal: tuple[int, int]) -> None:
+    user, fd = terminal
+    pressed = Pressed()
+    keyboard = Keyboard(pressed.keys.put, keys=("q", " ", "g"), fd=fd)
+    assert keyboard.start()
+    while local_modes(fd) & termios.ICANON:
+        select.select([], [], [], 0.05)
+    for key in ("g", " ", "q"):
+        os.write(user, key.encode())
+        assert pressed.next() == key
+    keyboard.stop(30.0)
+
+
 def test_a_release_among_other_keys_counts(terminal: tuple[int, int]) -> None:
     user, fd = terminal
     pressed = Pressed()

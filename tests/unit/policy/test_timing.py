@@ -55,6 +55,12 @@ def test_a_slow_policy_is_asked_once() -> None:
     assert timed.acts == 1
 
 
+def test_by_a_clock_that_stands_still_it_is_asked_once_and_takes_no_time() -> None:
+    timed = Timed([0.004], ONE)
+    assert measure_times(timed.executable, lambda: 7.0) == SolveTimes(encode_s=0.0, act_s=0.0)
+    assert timed.acts == 1
+
+
 def test_an_image_is_one_of_each_camera_however_many_observations_there_are() -> None:
     contract = Contract(
         feature_dim=1, arrays="numpy", cameras=("front", "down"), observation_steps=3

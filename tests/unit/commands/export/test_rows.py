@@ -108,6 +108,13 @@ def test_the_rate_is_the_mean_where_no_frame_is_missing() -> None:
     assert 30 * MS < worst_shift_ns(part, 30) < 40 * MS
 
 
+def test_a_stretch_of_a_few_hurried_frames_has_the_rate_of_its_flight() -> None:
+    captured = np.cumsum([100, *[33] * 100, 300, 20]).tolist()
+    both = stretches(episode(captured, list(range(0, 5000, 10))))
+    assert [len(part) for part in both] == [101, 2]
+    assert common_fps(both) == 30
+
+
 def test_two_rates_are_refused() -> None:
     with pytest.raises(UserError, match="export them apart"):
         common_fps(parts([33] * 20, [100] * 10))

@@ -232,6 +232,30 @@ def test_what_is_unknown_is_left_to_its_reader(tmp_path: Path, content: bytes) -
     assert recognise(tmp_path / TORCH) is None
 
 
+@pytest.mark.parametrize("kind", ["lerobot", "onnx", "torchscript"])
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"<html>", "is a web page"),
+        (b"\x80\x02ctorch.nn.modules.linear\nLinear\n.", "is a whole pickled object"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+    ],
+)
+def test_a_form_of_a_foreign_policy_names_what_else_its_file_is(
+    tmp_path: Path, kind: str, content: bytes, message: str
+) -> None:
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(content)
+    with pytest.raises(PolicyError, match=rf"^--policy {kind}:{path}: .*{message}"):
+        check_request(PolicyRequest(spec=f"{kind}:{path}"))
+
+
+@pytest.mark.parametrize("spec", ["toge", "scripted:hover", "./mine.py:Mine"])
+def test_a_contract_file_that_has_no_use_is_refused(tmp_path: Path, spec: str) -> None:
+    with pytest.raises(PolicyError, match=r"has a contract of its own.*leave it out"):
+        check_request(PolicyRequest(spec=spec, contract_file=tmp_path / "contract.toml"))
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [

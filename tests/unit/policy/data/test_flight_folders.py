@@ -16,7 +16,13 @@ from helpers.flight_folders import (
     write_spot_flight,
 )
 from policy.data.flight_data import DatasetError, common_frame, hold_out
-from policy.data.flight_folders import find_flights, is_exemplary, read_ages, read_flight
+from policy.data.flight_folders import (
+    find_flights,
+    is_exemplary,
+    leave_out_failed,
+    read_ages,
+    read_flight,
+)
 
 WOKE = [0, 10 * MS, 20 * MS]
 STICK = (0.1, 0.2, 0.3, 0.4)
@@ -79,6 +85,21 @@ def test_a_flight_left_behind_by_a_crash_is_read_to_its_last_whole_batch(tmp_pat
     episode = read_flight(folder)
     assert len(episode.tick_ns) == 40  # of 50
     assert len(episode.captured_ns) == 10  # of 15
+
+
+def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_path: Path) -> None:
+    for name, success in (("a", True), ("b", False), ("c", None)):
+        write_meta(tmp_path / name, source="pilot", success=success)
+    folders = [tmp_path / name for name in "abc"]
+    kept, note = leave_out_failed(folders, include_failed=False)
+    assert kept == [tmp_path / "a", tmp_path / "c"]
+    assert note is not None
+    assert "1 of 3 flights" in note
+    assert "--include-failed" in note
+    assert leave_out_failed(folders, include_failed=True) == (folders, None)
+    assert leave_out_failed([], include_failed=False) == ([], None)
+    with pytest.raises(DatasetError, match="all 1 flights have failed"):
+        leave_out_failed([tmp_path / "b"], include_failed=False)
 
 
 def test_folders_of_flights_are_opened(tmp_path: Path) -> None:
@@ -191,9 +212,13 @@ def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
         ({"source": "demonstration", "success": True}, True),
         ({"source": "dagger", "success": False}, True),
         ({"source": "flight", "success": None}, True),
+        ({"source": "flight", "success": False, "crash": "it lay on its back"}, False),
+        ({"source": "pilot", "success": None}, True),
+        ({"source": "pilot", "success": True, "crash": "a hard landing"}, True),
+        ({"source": "pilot", "success": False}, False),
     ],
 )
-def test_a_failed_demonstration_is_nothing_to_imitate(
+def test_a_failed_flight_is_nothing_to_imitate(
     tmp_path: Path, meta: dict[str, object], exemplary: bool
 ) -> None:
     write_meta(tmp_path / "flight", **meta)

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from policy.engines import compile_cache
 from policy.engines.compile_cache import MAX_ENTRIES, CompileCache, user_cache_folder
 
 BLOB = b"a compiled graph" * 100
@@ -43,6 +44,18 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path, at: int) -> None:
     content[at] ^= 1
     path.write_bytes(content)
     assert cache.load("a") is None
+
+
+def test_files_have_a_size_together_that_they_do_not_exceed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compile_cache, "MAX_BYTES", 3 * len(BLOB))
+    cache = CompileCache(tmp_path)
+    for index in range(5):
+        cache.store(str(index), BLOB)
+        newest = max(tmp_path.iterdir(), key=lambda path: path.stat().st_mtime_ns)
+        os.utime(newest, (index, index))
+    assert [cache.load(str(index)) is not None for index in range(5)] == [False] * 3 + [True] * 2
 
 
 def test_the_least_recently_used_goes_first(tmp_path: Path) -> None:

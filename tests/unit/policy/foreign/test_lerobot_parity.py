@@ -10,8 +10,17 @@ from safetensors.numpy import save_file
 
 from helpers import lerobot_checkpoints as formula
 from policy.contract import STATE_NAMES
+from policy.engines.choose import chunks_of_samples
+from policy.engines.executable import ExecutionSettings, solver_segment
+from policy.engines.openvino_modules import ModuleConverter, make_module_executable
+from policy.engines.parity import make_parity_samples
+from policy.engines.torch_eager import make_torch_executable
+from policy.errors import CheckpointError
+from policy.foreign.lerobot.config import read_config
+from policy.foreign.lerobot.diffusion import Diffusion
 from policy.foreign.lerobot.load import load_policy_of
 from policy.foreign.lerobot.plan import read_plan
+from policy.protocol import StepwisePolicy
 
 GOLDENS = Path(__file__).parents[3] / "data" / "lerobot"
 CASES = sorted(path.parent.name for path in GOLDENS.glob("*/config.json"))
@@ -100,3 +109,77 @@ def test_actions_are_those_of_lerobot(golden):
     wanted = in_contract_units(expected["actions"])
     assert actions.shape == (len(image), policy.contract.horizon, 4)
     np.testing.assert_allclose(actions, wanted, rtol=0, atol=ATOL)
+
+
+@torch.inference_mode()
+def test_the_loops_get_the_same_actions_from_cached_features(golden):
+    _, expected, policy, cameras = golden
+    image, state = inputs(policy, expected, cameras)
+    contract, history = policy.contract, torch.zeros(1, 4, 4)
+    images = image[:1].reshape(-1, len(cameras), 1, *image.shape[-3:])
+    rows = [
+        torch.cat([policy.encode_visual(each, camera) for camera, each in enumerate(row)], dim=1)
+        for row in images
+    ]
+    feature = torch.stack(rows, dim=1).reshape(1, *contract.feature_shape)
+    actions = policy.predict_fast(feature, state[:1], history, 4)
+    torch.testing.assert_close(actions, policy.predict(image[:1], state[:1], history, 4))
+
+
+@torch.inference_mode()
+def test_a_solve_step_by_step_is_the_whole_one(golden):
+    case, _, policy, _ = golden
+    assert isinstance(policy, StepwisePolicy) == case.startswith("diffusion")
+    if not isinstance(policy, StepwisePolicy):
+        return
+    contract = policy.contract
+    feature = formula.drawn("feature", (1, *contract.feature_shape))
+    state = formula.drawn("any state", (1, *contract.state_shape))
+
+    def denoise(*arrays):
+        return policy.denoise(*(torch.from_numpy(array) for array in arrays)).numpy()
+
+    solve = solver_segment(denoise, policy.schedule, 3, 0, 3)
+    noise = policy.initial_noise.numpy()
+    sample = solve(feature, state, np.zeros((1, 4, 4), np.float32), noise)
+    whole = policy.predict_fast(*map(torch.from_numpy, (feature, state)), None, 3)
+    torch.testing.assert_close(
+        policy.to_chunk(torch.from_numpy(sample)), whole, rtol=0, atol=2 * ATOL
+    )
+
+
+@pytest.mark.parametrize("golden", ["act", "diffusion", "diffusion_separate"], indirect=True)
+def test_the_openvino_engine_computes_the_same(golden):
+    _, _, policy, _ = golden
+    settings = ExecutionSettings(name="lerobot", num_diffusion_steps=2)
+    converter = ModuleConverter(policy, "lerobot")
+    graphs = make_module_executable(policy, settings, "f32", "f32", converter)
+    samples = make_parity_samples(policy.contract)
+    samples.state[..., STATE_NAMES.index(STATE[12])] = policy._state.shift[12]  # a constant there
+    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
+    found = chunks_of_samples(graphs, samples)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+
+
+def test_noise_of_a_flight_is_that_of_its_seed():
+    config = read_config(GOLDENS / "diffusion")[0]
+    first, again, other = (Diffusion(config) for _ in range(3))
+    for net, seed in ((first, 1), (again, 1), (other, 2)):
+        net.seed_noise(seed)
+    assert torch.equal(first.initial_noise, again.initial_noise)
+    assert not torch.equal(first.initial_noise, other.initial_noise)
+
+
+def test_weights_of_another_network_are_refused(tmp_path):
+    shutil.copytree(GOLDENS / "act", tmp_path, dirs_exist_ok=True)
+    weights = formula.weights(tmp_path, dict(np.load(tmp_path / "expected.npz")))
+    del weights["model.action_head.bias"]
+    weights["model.action_head.weight"] = np.zeros((4, 31), np.float32)
+    weights["model.decoder_pos_embed.weight"][0] = np.nan
+    weights["model.nose.weight"] = np.zeros(1, np.float32)
+    save_file(weights, tmp_path / "model.safetensors")
+    contract_file(tmp_path, "act", 13)
+    with pytest.raises(CheckpointError) as caught:
+        load_policy_of(read_plan(tmp_path, None), seed=0, num_diffusion_steps=4)
+    for said in ("4 places", "[4, 31], not [4, 32]", "NaN", "unexpected 'model.nose"):
+        assert said in str(caught.value)

@@ -1,0 +1,107 @@
+"""A diffusion policy whose network is compiled alone: the solver runs around it, in numpy."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from policy.contract import ACTION_DIM, Contract, FloatArray
+from policy.engines.executable import (
+    Act,
+    ArrayFunction,
+    Compile,
+    ExecutionSettings,
+    always_full,
+    assemble,
+    encoders,
+)
+from policy.engines.warm_start import Segment, WarmStart, make_solve, to_numpy
+from policy.errors import user_code
+from policy.protocol import Executable, StepwisePolicy, WarmStartPolicy
+
+
+def make_stepwise_executable(
+    policy: StepwisePolicy,
+    compile_vision: Compile,
+    compile_action: Compile,
+    compile_end: Compile,
+    *,
+    engine: str,
+    settings: ExecutionSettings,
+) -> Executable:
+    """As ``executable.make_executable``; ``compile_end`` is for ``to_chunk``, the end of a solve.
+
+    Raises:
+        PolicyError: the policy failed on the dummy sample.
+    """
+    contract = policy.contract
+    image = ((1, 3, contract.image_height, contract.image_width),)
+    encode = [compile_vision(method, image) for method in encoders(policy)]
+    with user_code(f"{settings.name} failed to prepare its solver"):
+        act = _act(policy, compile_action, compile_end, settings)
+    if settings.dual_rate:
+        return assemble(contract, encode, act, engine, settings)
+    return assemble(contract, (), _on_images(encode, act, contract), engine, settings)
+
+
+def _act(
+    policy: StepwisePolicy,
+    compile_action: Compile,
+    compile_end: Compile,
+    settings: ExecutionSettings,
+) -> Act:
+    contract, steps = policy.contract, settings.num_diffusion_steps
+    noise = to_numpy(policy.initial_noise)
+    denoise = compile_action(
+        policy.denoise,
+        (
+            *(noise.shape, (1,), (1, *contract.feature_shape)),
+            *((1, *contract.state_shape), (1, contract.history_len, ACTION_DIM)),
+        ),
+    )
+    segment = partial(solver_segment, denoise, policy.schedule, steps)
+    head_steps = settings.head_steps if settings.dual_rate else None
+    if head_steps is not None and isinstance(policy, WarmStartPolicy):
+        warm = make_solve(policy, segment, steps, head_steps)
+        return WarmStart(warm, chunk_dt_s=contract.chunk_dt_s)
+    solve, to_chunk = segment(0, steps), compile_end(policy.to_chunk, (noise.shape,))
+    return always_full(lambda e, s, h: to_chunk(solve(e, s, h, noise)))
+
+
+def _on_images(encode: Sequence[ArrayFunction], act: Act, contract: Contract) -> Act:
+    """``act`` on images [1, *contract.image_shape] in place of their features: single rate."""
+
+    def act_on_images(
+        images: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        steps = images.reshape(-1, len(encode), 1, *images.shape[-3:])
+        features = [
+            encode_one(step[camera]) for step in steps for camera, encode_one in enumerate(encode)
+        ]
+        feature = np.concatenate(features, axis=1).reshape(1, *contract.feature_shape)
+        return act(feature, state, history, elapsed_s)
+
+    return act_on_images
+
+
+def solver_segment(
+    denoise: ArrayFunction, schedule: Any, num_diffusion_steps: int, first: int, count: int
+) -> Segment:
+    """``count`` DDIM steps of a solve from ``first`` on, around the network call ``denoise``.
+
+    ``denoise`` and ``schedule`` are as those of ``protocol.StepwisePolicy``.
+    """
+    steps = schedule.ddim_steps(num_diffusion_steps)[first : first + count]
+    timesteps = [np.array([step.timestep], np.float32) for step in steps]
+    coefficients = [schedule.coefficients(step) for step in steps]
+
+    def run(
+        encoded: FloatArray, state: FloatArray, history: FloatArray, noisy: FloatArray
+    ) -> FloatArray:
+        for timestep, (a, b, c, d) in zip(timesteps, coefficients, strict=True):
+            output = denoise(noisy, timestep, encoded, state, history)
+            noisy = c * np.clip(a * noisy + b * output, -1.0, 1.0) + d * noisy
+        return noisy
+
+    return run

@@ -1,0 +1,81 @@
+"""``mavbridge export-policy``: what it writes, what it refuses, and that it compares."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mavbridge.commands.export_policy import run
+from mavbridge.commands.export_policy.run import export_policy
+from mavbridge.config.export_policy import ExportFormat, ExportPolicyConfig
+from mavbridge.core.errors import UserError
+from policy.contract import Contract, FloatArray
+from policy.errors import PolicyError
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def test_the_shipped_policy_is_written_as_onnx(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "deep" / "toge"
+    assert export_policy(None, ExportPolicyConfig(out=out)) == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        "denoiser.onnx", "encoder.onnx", "policy.json",
+    ]  # fmt: skip
+    described = json.loads((out / "policy.json").read_text())
+    assert set(described) == {"contract", "schedule"}
+    Contract.from_json(json.dumps(described["contract"]))
+    said = capsys.readouterr().err
+    assert "it agrees with torch" in said
+    assert f"--policy onnx:{out}" in said
+    with pytest.raises(UserError, match="is taken: name a new or empty folder"):
+        export_policy(None, ExportPolicyConfig(out=out))
+
+
+@pytest.mark.parametrize("format_", ["onnx", "torchscript"])
+def test_files_that_are_another_policy_are_not_praised(
+    tmp_path: Path, format_: ExportFormat, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compared: list[FloatArray] = []
+
+    def chunks_of_samples(*_: object) -> FloatArray:
+        compared.append(np.full((8, 16, 4), 0.1 + 0.02 * len(compared), np.float32))
+        return compared[-1]
+
+    monkeypatch.setattr(run, "chunks_of_samples", chunks_of_samples)
+    config = ExportPolicyConfig(out=tmp_path / "toge.pt", format=format_)
+    with pytest.raises(UserError, match=r"another policy: a stick is off by 0\.02"):
+        export_policy(None, config)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"out": "here", "policy": "scripted"}, "policies of toge and resnet-unet are exported"),
+        ({"out": "taken", "format": "torchscript"}, "name a new file in a folder that exists"),
+        ({"out": "no/mine.pt", "format": "torchscript"}, "name a new file in a folder that exists"),
+        ({"out": "taken"}, "is taken"),
+        ({"out": "here", "policy": "resnet-unet"}, "needs trained weights"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(
+    tmp_path: Path, config: dict[str, str], message: str
+) -> None:
+    (tmp_path / "taken").write_bytes(b"")
+    wanted = {**config, "out": tmp_path / config["out"]}
+    with pytest.raises((UserError, PolicyError), match=message):
+        export_policy(None, ExportPolicyConfig(**wanted))  # type: ignore[arg-type]
+    assert (tmp_path / "taken").read_bytes() == b""
+
+
+def test_without_the_package_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"pip install 'mavbridge\[onnx\]'"):
+        export_policy(None, ExportPolicyConfig(out=tmp_path / "here"))

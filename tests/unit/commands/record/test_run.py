@@ -1,0 +1,66 @@
+"""The command before anything is opened: its settings, and what it refuses."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from helpers.recordings import make_meta
+from mavbridge.__main__ import main
+from mavbridge.commands.record.run import listening_gate, nobody, pilot_flight
+from mavbridge.config.record import ListenConfig, RecordConfig
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.flight.settings import flight_settings
+from mavbridge.recording.meta import write_meta
+
+CONNECT = ("--connect", "udp:127.0.0.1:14999")
+
+
+def test_the_gate_only_listens_and_asks_for_the_pilots_sticks_at_the_rate(tmp_path: Path) -> None:
+    config = RecordConfig(out=tmp_path, vehicle=ListenConfig(connect="udp:x:1"), rate=50.0)
+    gate = listening_gate(config, MonotonicClock())
+    assert gate.link.readonly
+    assert (gate.link.pilot_hz, gate.link.state_hz) == (50.0, 50.0)
+    flight = flight_settings(pilot_flight(config), nobody())
+    assert flight.engagement.readonly
+    assert flight.stick_period_ns == NS_PER_S // 50
+    assert flight.meaning.stick_gains is not None, "the vehicle's sticks in a policy's terms"
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        ((), "name the vehicle: --connect"),
+        ((*CONNECT, "--camera", "none"), "nothing to learn from without images"),
+        ((*CONNECT, "--camera", "no such file"), "no such file"),
+        ((*CONNECT, "--on-arm", "--episode-channel", "7"), "leave one out"),
+        ((*CONNECT, "--episode-channel", "4"), "--episode-channel"),
+        ((*CONNECT, "--rate", "5"), "--rate"),
+        ((*CONNECT, "--disk-reserve", "0"), "--disk-reserve"),
+        (("--connect", "udp:nowhere"), "udp:nowhere"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused_before_anything_is_opened(
+    flags: tuple[str, ...], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["record", "--out", str(tmp_path / "out"), *flags])
+    assert stopped.value.code not in (0, None)
+    assert says in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_flight_is_no_folder_for_flights(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_meta(tmp_path, make_meta())
+    with pytest.raises(SystemExit) as stopped:
+        main(["record", "--out", str(tmp_path), *CONNECT, "--camera", "shm:x"])
+    assert stopped.value.code == 1
+    assert "is a flight itself" in " ".join(capsys.readouterr().err.split())
+
+
+def test_no_network_is_loaded_to_record() -> None:
+    code = "import sys, mavbridge.commands.record.run; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
