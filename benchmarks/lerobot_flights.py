@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.lerobot_policies import PEER
 from mavbridge.commands.bench.flight import fly
 from mavbridge.commands.bench.results import Flight
 from mavbridge.config.policy import PolicyConfig
@@ -26,7 +27,6 @@ from mavbridge.core.vehicle import Percentiles
 from policy.contract import ACTION_DIM
 from policy.foreign.lerobot.plan import read_plan
 
-PEER = Path(__file__).with_name("lerobot_peer.py")
 CONTRACT_FILE = "mavbridge.toml"
 HEAD = (
     "| policy | chunks/s, images/s | slots missed | chunk, p50 / p99 | image | LeRobot: chunk |",

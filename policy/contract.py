@@ -220,7 +220,7 @@ class Contract:
         for name, low, high in (
             ("image_height", 16, 4096),
             ("image_width", 16, 4096),
-            ("feature_dim", 0, 65536),
+            ("feature_dim", 0, 1 << 20),  # the cells of an ACT at 640x480 are 153,600
             ("horizon", 1, 1024),
             ("history_len", 1, 1024),
             ("observation_steps", 1, 16),

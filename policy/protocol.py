@@ -24,9 +24,9 @@ class SingleRatePolicy(Protocol):
     makes the policy, tries each method on a dummy sample, and closes it when the other threads have
     ended; if one hangs, while that one still runs. In between the vision threads call
     ``encode_visual``, never for two images at once; the policy thread calls the other methods and
-    ``reset``, so what ``encode_visual`` keeps is not for ``reset`` to change without a lock. A
-    method that has no chunk to give for now raises ``policy.errors.NoChunkError``; any other
-    exception ends the flight.
+    ``reset``, so what ``encode_visual`` keeps is not for ``reset`` to change without a lock. Where
+    there is no chunk for now, ``predict`` or ``predict_fast`` raises
+    ``policy.errors.NoChunkError``; any other exception ends the flight.
     """
 
     contract: Contract

@@ -54,10 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
     rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/rc_input.py)"
     add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
-    pilot_help = (
-        "who moves the receiver: a gamepad, the keys of a window, or the expert, who flies "
-    )
-    pilot_help += "flies the course (docs/commands.md)"
+    pilot_help = "a gamepad, the keys of a window, or the expert over the course moves the receiver"
     add("--pilot", choices=PILOTS, help=pilot_help)
     axes_help = f"axes of the gamepad, a minus reverses one (default: {DEFAULT_AXES})"
     add("--pilot-axes", default=DEFAULT_AXES, metavar="AXES", help=axes_help)

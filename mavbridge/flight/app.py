@@ -24,8 +24,10 @@ from mavbridge.core.realtime import (
 )
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import HungError, Worker
-from mavbridge.flight.bridge import Bridge, build_bridge
+from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
+from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.policies import (
     check_configured_policy,
@@ -183,8 +185,13 @@ class _Flight:
         self._observers.open_viewer(stack)
         contract = executable.contract
         self._cameras = contract.cameras
+        past_ns = observation_ages_ns(contract)[0]
         cameras = [
-            self._open_camera(source, contract, console)
+            CameraPath(
+                camera=self._open_camera(source, contract, console),
+                cache=FeatureCache(span_ns=past_ns),
+                clock=clock,
+            )
             for source in config.camera.sources_of(contract.cameras)
         ]
         self._observers.open_recorder(
@@ -320,8 +327,10 @@ class _Flight:
             raise PeerError(f"{ending.reason}: it is too slow for this machine, or stuck")
 
     def _join(self, worker: Worker) -> None:
+        """Join a loop: one call of the policy may last until it would count as hung."""
+        longest_s = 0.0 if self._has_hung else max(self._hang_ns, self._encoder_hang_ns) / NS_PER_S
         try:
-            worker.join(JOIN_S)
+            worker.join(max(JOIN_S, longest_s))
         except HungError:
             if not self._has_hung:  # else that is being reported already
                 raise

@@ -42,19 +42,28 @@ class Bridge:
     view: VehicleView
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraPath:
+    """What belongs to one camera of the contract."""
+
+    camera: Camera
+    """Read by its vision loop alone."""
+    cache: FeatureCache
+    """Holds its features; in simulation they appear in it when their encoding is over."""
+    clock: Clock
+    """Time of its vision loop."""
+
+
 def build_bridge(
     config: FlyConfig,
     executable: Executable,
     *,
     clock: Clock,
     send: Callable[[Chunk | Absence], object],
-    cameras: Sequence[Camera],
+    cameras: Sequence[CameraPath],
     sinks: Sequence[TickSink],
     watches_images: bool,
     all_cameras: Sequence[TickSink] = (),
-    caches: Sequence[FeatureCache] = (),
-    policy_clock: Clock | None = None,
-    vision_clocks: Sequence[Clock] = (),
     delay_vision: Callable[[TickSink], TickSink] | None = None,
 ) -> Bridge:
     """Join a policy, its cameras and the gate.
@@ -62,37 +71,31 @@ def build_bridge(
     Args:
         config: rates and limits; its camera and address are not used.
         executable: the policy on its engine.
-        clock: time of everything that has no clock of its own.
+        clock: time of the policy loop; in simulation its solves take simulated time.
         send: hands a chunk to the gate, or the reason why there is none.
-        cameras: those of the contract, in its order; each is used by its vision loop alone.
+        cameras: those of the contract, in its order.
         sinks: see every tick and every encoded frame of the first camera.
         watches_images: a frozen or a black image is a fault; False where nobody looks at it.
         all_cameras: see the encoded frames of the other cameras, each in the thread of its own.
-        caches: one for each camera; simulation passes some that publish late.
-        policy_clock: time of the policy loop, where simulated solving takes simulated time.
-        vision_clocks: time of each vision loop, likewise.
-        delay_vision: wraps the sink of the vision loop, for the same reason.
+        delay_vision: wraps the sink of each vision loop, where encoding takes simulated time.
     """
     contract = executable.contract
     loops = config.rates.loops(is_dual=executable.dual_rate, play_s=contract.play_s)
     limits = effective_freshness(contract, config.limits)
-    frame = action_frame(contract)
     freshness = Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns)
     reader = StateReader(contract, freshness=freshness, goal_ned_m=config.goal_ned_m)
     settings = PolicySettings(
-        action_frame=frame,
+        action_frame=action_frame(contract),
         chunk_dt_s=contract.chunk_dt_s,
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
         period_ns=period_ns(loops.action_hz),
     )
-    past_ns = observation_ages_ns(contract)[0]
-    is_sparse = contract.since_exposure and settings.period_ns > SPARSE_NS
-    span_ns = past_ns + (limits.feature_ns if is_sparse else 0)
-    states = StateHistory(span_ns=span_ns) if span_ns else None
-    caches = caches or [FeatureCache(span_ns=past_ns) for _ in cameras]
+    states = _state_history(contract, settings.period_ns, limits.feature_ns)
+    history = SentHistory(
+        length=contract.history_len, dt_s=contract.history_dt_s, frame=settings.action_frame
+    )
     rates = _visual_rates(contract, loops)
     adaptive = [[rate] if rate.is_adaptive else [] for rate in rates]
-    history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s, frame=frame)
 
     def remember() -> None:
         if states is not None:
@@ -105,31 +108,24 @@ def build_bridge(
         freshness=freshness,
         on_attitude=remember,
     )
-    vision_sinks = [
-        FanOut([*own, *(sinks if number == 0 else all_cameras)])
-        for number, own in enumerate(adaptive)
+    vision_sinks: list[TickSink] = [
+        FanOut([*own, *(all_cameras if number else sinks)]) for number, own in enumerate(adaptive)
     ]
-    visions = tuple(
-        VisionLoop(
-            camera=camera,
-            encode=_encoder(executable, number),
-            cache=caches[number],
-            sink=delay_vision(vision_sinks[number]) if delay_vision else vision_sinks[number],
-            clock=vision_clocks[number] if vision_clocks else clock,
-            period_ns=rates[number].period_ns,
-            image_watch=_image_watch(config.camera) if watches_images else None,
-            is_airborne=lambda: view.is_airborne,
-            number=number,
-        )
-        for number, camera in enumerate(cameras)
+    visions = _vision_loops(
+        executable,
+        cameras,
+        rates=rates,
+        sinks=[delay_vision(sink) for sink in vision_sinks] if delay_vision else vision_sinks,
+        watch=config.camera if watches_images else None,
+        is_airborne=lambda: view.is_airborne,
     )
     policy = PolicyLoop(
-        clock=policy_clock or clock,
+        clock=clock,
         view=view,
         reader=reader,
         observations=ObservationSource(
             contract,
-            caches=caches,
+            caches=[path.cache for path in cameras],
             join=executable.join,
             states=states,
             max_feature_age_ns=limits.feature_ns,
@@ -141,6 +137,41 @@ def build_bridge(
         settings=settings,
     )
     return Bridge(visions=visions, policy=policy, view=view)
+
+
+def _vision_loops(
+    executable: Executable,
+    cameras: Sequence[CameraPath],
+    *,
+    rates: Sequence[AdaptiveRate],
+    sinks: Sequence[TickSink],
+    watch: CameraConfig | None,
+    is_airborne: Callable[[], bool],
+) -> tuple[VisionLoop, ...]:
+    """The loop of each camera, with its rate and its sink; ``watch`` judges images, if given."""
+    return tuple(
+        VisionLoop(
+            camera=path.camera,
+            encode=_encoder(executable, number),
+            cache=path.cache,
+            sink=sink,
+            clock=path.clock,
+            period_ns=rate.period_ns,
+            image_watch=None if watch is None else _image_watch(watch),
+            is_airborne=is_airborne,
+            number=number,
+        )
+        for number, (path, rate, sink) in enumerate(zip(cameras, rates, sinks, strict=True))
+    )
+
+
+def _state_history(
+    contract: Contract, chunk_period_ns: int, feature_ns: int
+) -> StateHistory | None:
+    """Past states, where the policy takes several or the motion since an exposure needs them."""
+    is_sparse = contract.since_exposure and chunk_period_ns > SPARSE_NS
+    span_ns = observation_ages_ns(contract)[0] + (feature_ns if is_sparse else 0)
+    return StateHistory(span_ns=span_ns) if span_ns else None
 
 
 def _visual_rates(contract: Contract, loops: LoopRates) -> list[AdaptiveRate]:

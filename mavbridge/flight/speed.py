@@ -53,7 +53,7 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
     notes = []
     if contract.play_s and (rates.action_rate if is_dual else rates.rate) is None:
         notes.append(
-            f"{action_hz:g} chunks a second, since this policy is meant to play each one for "
+            f"{action_hz:.3g} chunks a second, since this policy is meant to play each one for "
             f"{_text(contract.play_s)}; {flag} asks for another rate"
         )
     if times is None:
@@ -62,8 +62,8 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
     limits = effective_freshness(contract, config.limits)
     worst = _worst(contract, limits, times, action_hz=action_hz, image_hz=image_hz)
     told = (
-        f"{figures}; at {action_hz:g} chunks and {image_hz:g} images a second, {worst.what} up to "
-        f"{_text(worst.reached_s)} old, beyond the {_text(worst.allowed_s)} of its {worst.by}"
+        f"{figures}; at {action_hz:.3g} chunks and {image_hz:.3g} images a second, {worst.what} up "
+        f"to {_text(worst.reached_s)} old, beyond the {_text(worst.allowed_s)} of its {worst.by}"
     )
     if worst.share > CLEARLY:
         fastest = _worst(contract, limits, times, action_hz=math.inf, image_hz=math.inf)
@@ -78,7 +78,7 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
     ):
         if each_s * asked_hz > NEARLY:
             reached = f"this computer makes some {1 / each_s:.2g}"
-            notes.append(f"warning: asked for {asked_hz:g} {what} a second, {reached}: {figures}")
+            notes.append(f"warning: asked for {asked_hz:.3g} {what} a second, {reached}: {figures}")
     return tuple(notes)
 
 

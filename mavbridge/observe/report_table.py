@@ -59,7 +59,7 @@ def verdicts(report: TimingReport) -> list[Text]:
     late = f"{_counted(action.late_chunks, 'late chunk')} of {action.chunks}"
     dropped = f"{_counted(vision.dropped_frames, 'frame')} dropped by the camera"
     for name, loop, rest in (("action", action, late), ("vision", vision, dropped)):
-        text = f"{shown_rate(loop.rate_hz)} Hz of {loop.target_hz:g} Hz, {rest}"
+        text = f"{shown_rate(loop.rate_hz)} Hz of {loop.target_hz:.4g} Hz, {rest}"
         lines.append(_line(name, text, rate_style(loop.rate_hz, loop.target_hz)))
     if report.link is not None:
         lines.append(_line("link", _link_verdict(report.link)))

@@ -12,7 +12,7 @@ from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.ports import TickSink
 from mavbridge.core.records import ImageArray
-from mavbridge.flight.bridge import build_bridge
+from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.settings import flight_settings, link_settings
 from mavbridge.gate.departure import Ending
@@ -194,14 +194,16 @@ class SimulatedFlight:
         bridge = build_bridge(
             config,
             self._take_time(executable, vision_clocks, policy_clock),
-            clock=world,
+            clock=policy_clock,
             send=send,
-            cameras=cameras,
+            cameras=[
+                CameraPath(
+                    camera=camera, cache=DelayedFeatureCache(world, span_ns=past_ns), clock=clock
+                )
+                for camera, clock in zip(cameras, vision_clocks, strict=True)
+            ],
             sinks=sinks,
             watches_images=self._settings.draw_images,
-            caches=[DelayedFeatureCache(world, span_ns=past_ns) for _ in cameras],
-            policy_clock=policy_clock,
-            vision_clocks=vision_clocks,
             delay_vision=lambda sink: DelayedSink(world, sink),
         )
         for clock, camera, vision in zip(vision_clocks, cameras, bridge.visions, strict=True):

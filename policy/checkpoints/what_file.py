@@ -8,6 +8,7 @@ import json
 import pickletools
 import struct
 import zipfile
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -119,7 +120,14 @@ def _zip(path: Path) -> tuple[str, str] | None:
                 return "a zip archive", "unpack it, and name what is in it"
             with archive.open(pickled) as file:
                 return _pickle(path, file.read(MAX_PICKLE_BYTES))
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError):
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        NotImplementedError,
+        RuntimeError,
+        EOFError,
+        ValueError,
+    ):
         return "cut short, or damaged", "copy or download it again, and compare its size"
 
 

@@ -8,6 +8,7 @@ and it tells the size and the content of the graph before any time is spent on i
 
 import hashlib
 import logging
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -34,6 +35,8 @@ from policy.engines.torch_eager import run_eagerly
 from policy.errors import PolicyError, user_code
 from policy.protocol import Executable, SingleRatePolicy, StepwisePolicy
 
+_MANGLED = re.compile(r"___torch_mangle_\d+\.")
+"""In the name of a type: how many others of that name the process has loaded."""
 MAX_OPERATIONS = 4000
 """In one graph: 3 ms each to convert; ten unrolled steps of a TOGE are 2,700, one is 500."""
 MAX_SCRIPT_OPERATIONS = 20_000
@@ -184,8 +187,7 @@ def _digest(program: ExportedProgram) -> str:
     """A text that differs wherever the program does: in operations, constants or weights."""
     digest = hashlib.sha256(program.graph_module.code.encode())
     for name, value, _ in _tensors(program):
-        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-        digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+        _update(digest, name, value)
     return digest.hexdigest()
 
 
@@ -217,11 +219,21 @@ def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
             f"its graph has {operations:,} operations, and at most {MAX_SCRIPT_OPERATIONS:,} are "
             "converted: if it loops over denoising steps, export one step as `denoiser`"
         )
-    digest = hashlib.sha256(str(graph).encode())
-    for name, value in module.state_dict().items():
-        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-        digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+    digest = hashlib.sha256(_MANGLED.sub("", str(graph)).encode())
+    # The weights of a frozen archive are constants, of which the text of a graph has no values.
+    constants = [
+        ("", node.t("value"))
+        for node in graph.findAllNodes("prim::Constant")
+        if node.hasAttribute("value") and node.kindOf("value") == "t"
+    ]
+    for name, value in [*module.state_dict().items(), *constants]:
+        _update(digest, name, value)
     return digest.hexdigest()
+
+
+def _update(digest: "hashlib._Hash", name: str, value: Tensor) -> None:
+    digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+    digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
 
 
 def _converted(module: nn.Module, examples: tuple[Tensor, ...]) -> ov.Model:

@@ -94,14 +94,13 @@ def solver_segment(
     """
     steps = schedule.ddim_steps(num_diffusion_steps)[first : first + count]
     timesteps = [np.array([step.timestep], np.float32) for step in steps]
-    coefficients = [schedule.coefficients(step) for step in steps]
 
     def run(
         encoded: FloatArray, state: FloatArray, history: FloatArray, noisy: FloatArray
     ) -> FloatArray:
-        for timestep, (a, b, c, d) in zip(timesteps, coefficients, strict=True):
+        for step, timestep in zip(steps, timesteps, strict=True):
             output = denoise(noisy, timestep, encoded, state, history)
-            noisy = c * np.clip(a * noisy + b * output, -1.0, 1.0) + d * noisy
+            noisy = schedule.ddim_update(step, noisy, output)
         return noisy
 
     return run

@@ -1,6 +1,7 @@
 """What a TorchScript archive says of itself, read without torch."""
 
 import zipfile
+import zlib
 from pathlib import Path
 
 from policy.errors import CheckpointError
@@ -19,7 +20,7 @@ def read_description(spec: str, path: Path, contract_file: Path | None) -> Descr
             names = archive.namelist()
             extra = [name for name in names if name.endswith(f"/extra/{DESCRIPTION}")]
             text = archive.read(extra[0]).decode() if extra else None
-    except (OSError, zipfile.BadZipFile, UnicodeDecodeError) as error:
+    except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError) as error:
         raise CheckpointError(f"--policy {spec}: {path} cannot be read: {error}") from error
     if not any("/code/" in name for name in names):
         raise CheckpointError(

@@ -1,5 +1,6 @@
 """The pilot that ``--pilot`` names, and a vehicle that obeys its receiver."""
 
+import os
 from typing import Literal
 
 from sitl import UsageError
@@ -46,6 +47,7 @@ def make_pilot(
         expert = ExpertPilot(vehicle, course, speed_mps=speed_mps)
         return expert, f"the expert flies at {speed_mps:g} m/s"
     wanted = parse_axes(axes)
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # a line of its own on every import
     try:
         import pygame
 

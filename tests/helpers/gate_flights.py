@@ -20,7 +20,7 @@ from helpers.wire import WireEnd
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Sticks
-from mavbridge.flight.bridge import build_bridge
+from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.settings import flight_settings, link_settings
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Phase
@@ -134,13 +134,11 @@ class GateFlight:
         bridge = build_bridge(
             config,
             executable,
-            clock=self.clock,
+            clock=self._policy_clock,
             send=self._send,
-            cameras=(NoCamera(),),
+            cameras=[CameraPath(camera=NoCamera(), cache=self.features, clock=self.clock)],
             sinks=[self.sink],
             watches_images=False,
-            caches=(self.features,),
-            policy_clock=self._policy_clock,
         )
         self.view = bridge.view
         self.tell(flight_settings(config, executable))

@@ -11,14 +11,14 @@ from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from mavbridge.commands.serve.answers import AnswerLoop
-from mavbridge.commands.serve.server import MAX_CLIENTS, PolicyServer
+from mavbridge.commands.serve.server import PolicyServer
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.workers import Worker
 from policy.foreign.websocket.messages import Message, pack, unpack
 from policy.protocol import Executable
 
-Reply = bytes | str | None
-"""None: close the connection."""
+Reply = bytes | str | tuple[bytes, ...] | None
+"""Several: one after the other; None: close the connection."""
 START_S = 10.0
 
 
@@ -67,7 +67,8 @@ def scripted_server(
                 answer = await asyncio.to_thread(reply, unpack(request))
                 if answer is None:
                     return
-                await connection.send(answer)
+                for each in answer if isinstance(answer, tuple) else (answer,):
+                    await connection.send(each)
         on_close(connection.close_code)
 
     def listen() -> "asyncio.Future[Server]":
@@ -86,7 +87,7 @@ def our_server(
     executable: Executable, *, api_key: str | None = None, image_bytes: int = 2**20
 ) -> Iterator[int]:
     """``mavbridge serve`` without its command line; gives its port."""
-    answers = AnswerLoop(executable, clock=MonotonicClock(), capacity=MAX_CLIENTS)
+    answers = AnswerLoop(executable, clock=MonotonicClock())
     server = PolicyServer(
         answers, image_bytes=image_bytes, api_key=api_key, report=lambda _line: None
     )

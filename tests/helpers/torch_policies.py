@@ -210,3 +210,32 @@ class Incomplete:
 
     def __init__(self) -> None:
         self.visual_encoder = Encoder()
+
+
+WIDE = Contract(
+    image_height=32, image_width=32, horizon=8, cameras=("front", "down"), observation_steps=2
+)
+
+
+class WideDenoiser(nn.Module):
+    """A step on two observations of two cameras."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        seen = 2 * (2 * DUAL.feature_dim + WIDE.state_dim) + WIDE.horizon * 4
+        self.net = nn.Linear(seen, WIDE.horizon * 4)
+
+    def forward(self, noisy: Tensor, timestep: Tensor, feature: Tensor, state: Tensor) -> Tensor:
+        weight = timestep[:, None] / 100
+        parts = [feature.flatten(1), state.flatten(1) * 0.1, noisy.flatten(1) * weight]
+        chunk: Tensor = self.net(torch.cat(parts, dim=1)).tanh()
+        return chunk.reshape(-1, WIDE.horizon, 4)
+
+
+class Wide:
+    contract = WIDE
+
+    def __init__(self) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(5)
+            self.visual_encoder, self.denoiser = Encoder(), WideDenoiser()

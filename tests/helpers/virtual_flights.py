@@ -12,7 +12,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import FloatArray, Frame, ImageArray, Tick
 from mavbridge.core.vehicle import Command, Sticks
-from mavbridge.flight.bridge import build_bridge
+from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.settings import flight_settings
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Phase
@@ -137,14 +137,15 @@ class VirtualFlight:
         bridge = build_bridge(
             self.config,
             executable,
-            clock=world,
+            clock=self._policy_clock,
             send=self._send,
-            cameras=(self.camera,),
+            cameras=[
+                CameraPath(
+                    camera=self.camera, cache=DelayedFeatureCache(world), clock=self._vision_clock
+                )
+            ],
             sinks=(self.sink,),
             watches_images=False,
-            caches=(DelayedFeatureCache(world),),
-            policy_clock=self._policy_clock,
-            vision_clocks=(self._vision_clock,),
             delay_vision=lambda sink: DelayedSink(world, sink),
         )
         self.view = bridge.view

@@ -20,33 +20,35 @@ from policy.contract import Contract
 CALLS = Path(__file__).with_suffix(".jsonl")
 
 
-def note(method, times):
-    if times <= 2:
+NOTED = set()
+
+
+def note(method):
+    call = (method, threading.current_thread().name)
+    if call not in NOTED or method in ("reset", "close"):
+        NOTED.add(call)
         with CALLS.open("a") as file:
-            file.write(json.dumps([method, threading.current_thread().name]) + "\\n")
+            file.write(json.dumps(call) + "\\n")
 
 
 class Turning:
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
 
     def __init__(self):
-        note("__init__", 1)
-        self.encoded = self.solved = 0
+        note("__init__")
 
     def reset(self):
-        note("reset", 1)
+        note("reset")
 
     def close(self):
-        note("close", 1)
+        note("close")
 
     def encode_visual(self, image):
-        self.encoded += 1
-        note("encode_visual", self.encoded)
+        note("encode_visual")
         return np.zeros((1, 1), np.float32)
 
     def predict_fast(self, feature, state, action_history, num_diffusion_steps):
-        self.solved += 1
-        note("predict_fast", self.solved - 1)
+        note("predict_fast")
         return np.tile(np.array([0.0, 0.3, 0.0, 0.0], np.float32), (1, 16, 1))
 
     def predict(self, image, state, action_history, num_diffusion_steps):

@@ -19,7 +19,7 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from helpers.policy_servers import Gate, chunk_of, our_server, scripted_server
+from helpers.policy_servers import Gate, Reply, chunk_of, our_server, scripted_server
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.processes import free_port
 from policy.contract import Contract, FloatArray
@@ -32,7 +32,7 @@ from policy.engines.executable import (
 from policy.errors import NoChunkError, PolicyError
 from policy.foreign.websocket import link, remote_policy
 from policy.foreign.websocket.kind import load_server_policy
-from policy.foreign.websocket.messages import number_array, pack, unpack
+from policy.foreign.websocket.messages import Message, number_array, pack, unpack
 from policy.foreign.websocket.remote_policy import RemotePolicy, answer_deadline_s
 from policy.loading.load import load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
@@ -114,6 +114,21 @@ def test_a_late_answer_is_never_flown(contract_file: Path) -> None:
         # The answer to the request before is thrown away: this is the one to the newest.
         predict_until(policy, lambda value: value == gate.requests)
         assert gate.requests >= tried + 3
+
+
+def test_an_answer_that_nobody_asked_for_is_not_flown_in_place_of_the_next(
+    contract_file: Path,
+) -> None:
+    gate = Gate()
+
+    def reply(message: Message) -> Reply:
+        answer = gate.reply(message)
+        return (answer, answer) if gate.requests == 3 else answer
+
+    with scripted_server(reply) as port, loaded(port, contract_file) as policy:
+        assert predict(policy) == gate.requests == 3
+        predict_until(policy, lambda outcome: "nobody asked for" in str(outcome))
+        predict_until(policy, lambda value: value == gate.requests)
 
 
 def test_a_flight_that_ends_takes_its_leave(contract_file: Path) -> None:
@@ -365,7 +380,7 @@ def test_our_server_bounds_clients_and_requests() -> None:
         clients = [stack.enter_context(connect(port)) for _ in range(5)]
         greeted = [client.recv(PATIENT_S) for client in clients[:4]]
         assert len(greeted) == 4
-        with pytest.raises(ConnectionClosed, match="4 clients"):
+        with pytest.raises(ConnectionClosed, match="served already: 4"):
             clients[4].recv(PATIENT_S)
         clients[0].send(b"\0" * 4 * 2**20)
         with pytest.raises(ConnectionClosed, match="1009"):
@@ -373,6 +388,14 @@ def test_our_server_bounds_clients_and_requests() -> None:
         url = f"http://127.0.0.1:{port}/healthz"
         with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(url) as response:
             assert (response.status, response.read()) == (200, b"OK\n")
+
+
+def test_a_policy_that_remembers_serves_one_client_alone() -> None:
+    remembers = replace(served_echo(), reset=lambda: None)
+    with our_server(remembers) as port, connect(port) as first, connect(port) as second:
+        assert first.recv(PATIENT_S)
+        with pytest.raises(ConnectionClosed, match="served already: 1"):
+            second.recv(PATIENT_S)
 
 
 def test_a_server_with_a_key_lets_in_who_has_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,7 @@ from mavbridge.core.histogram import Histogram
 from mavbridge.core.realtime import settle_process, settle_thread
 from mavbridge.core.records import Event, FeatureFrame, FloatArray, Frame, Tick
 from mavbridge.core.workers import Worker
-from mavbridge.flight.bridge import Bridge, build_bridge
+from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.settings import flight_settings, gate_settings
@@ -82,10 +82,9 @@ def link_bridge(config: FlyConfig, gate: GateProcess, meter: "ClientMeter") -> B
         ROLL_RATE,
         clock=clock,
         send=gate.send,
-        cameras=(NoCamera(),),
+        cameras=[CameraPath(camera=NoCamera(), cache=cache, clock=clock)],
         sinks=(meter,),
         watches_images=False,
-        caches=(cache,),
     )
 
 

@@ -1,7 +1,7 @@
 """One recording session: opens everything, follows the orders of ``EpisodeControl``, ends it."""
 
-import queue
 import threading
+from collections import deque
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -46,6 +46,8 @@ from policy.contract import Contract
 from policy.protocol import Executable
 
 STEP_S = 0.05
+MAX_KEYS = 64
+"""Keys that may wait for a step; the oldest are forgotten."""
 DISK_NS = NS_PER_S
 """Between two looks at the disk."""
 JOIN_S = 2.0
@@ -129,7 +131,7 @@ class _Session:
         self._config = config
         self._clock = clock
         self._stack = stack
-        self._keys: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._keys: deque[str] = deque(maxlen=MAX_KEYS)
         self._control = EpisodeControl(
             has_switch=config.episode_channel is not None, on_arm=config.on_arm
         )
@@ -222,7 +224,7 @@ class _Session:
         for worker in (vision, listener):
             self._stack.callback(worker.join, JOIN_S)
             worker.start()
-        keyboard = Keyboard(self._keys.put, keys=KEYS)
+        keyboard = Keyboard(self._keys.append, keys=KEYS)
         self._stack.callback(keyboard.stop, JOIN_S)
         has_keys = keyboard.start()
         self.screen.start(hint=KEYS_HINT if has_keys else None)
@@ -272,8 +274,8 @@ class _Session:
 
     def _seen(self) -> Seen:
         keys = ""
-        while not self._keys.empty():
-            keys += self._keys.get_nowait()
+        while self._keys:
+            keys += self._keys.popleft()
         status, channel = self._view.status, self._config.episode_channel
         has_channel = channel is not None and len(status.rc_channels_us) >= channel
         return Seen(

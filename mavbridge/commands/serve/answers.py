@@ -11,8 +11,9 @@ from policy.foreign.interface import Interface
 from policy.foreign.websocket.messages import CONTRACT_KEY, pack, unpack
 from policy.foreign.websocket.observation import RESET_KEY, from_message
 from policy.foreign.websocket.remote_policy import ACTIONS_KEY
-from policy.protocol import Executable
+from policy.protocol import Executable, keep_nothing
 
+MAX_CLIENTS = 4
 WAIT_S = 0.1
 """Longest wait for a request before the stop flag is checked."""
 
@@ -28,12 +29,14 @@ class Job:
 class AnswerLoop:
     """Answers one request after the other; only its own thread calls the policy."""
 
-    def __init__(self, executable: Executable, *, clock: Clock, capacity: int) -> None:
-        """``executable`` is single-rate; at most ``capacity`` requests wait."""
+    def __init__(self, executable: Executable, *, clock: Clock) -> None:
+        """``executable`` is single-rate."""
         self._executable = executable
         self._interface = Interface(contract=executable.contract)
         self._clock = clock
-        self._jobs: queue.Queue[Job] = queue.Queue(capacity)
+        self.max_clients = MAX_CLIENTS if executable.reset is keep_nothing else 1
+        """One alone where the policy remembers: two flights would share what it keeps."""
+        self._jobs: queue.Queue[Job] = queue.Queue(self.max_clients)
 
     @property
     def metadata(self) -> bytes:

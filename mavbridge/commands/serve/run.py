@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.serve.answers import AnswerLoop
-from mavbridge.commands.serve.server import MAX_CLIENTS, PolicyServer
+from mavbridge.commands.serve.server import PolicyServer
 from mavbridge.config.serve import ServeConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.workers import Worker
@@ -36,7 +36,7 @@ def serve(config: ServeConfig) -> int:
         loaded = stack.enter_context(load_configured_policy(config.policy, clock))
         for note in loaded.notes:
             console.print(Text(note, style="yellow"))
-        answers = AnswerLoop(loaded.executable, clock=clock, capacity=MAX_CLIENTS)
+        answers = AnswerLoop(loaded.executable, clock=clock)
         server = PolicyServer(
             answers,
             image_bytes=_image_bytes(loaded.executable.contract),

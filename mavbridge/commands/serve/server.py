@@ -15,7 +15,6 @@ from websockets.http11 import Request, Response
 from mavbridge.commands.serve.answers import AnswerLoop
 from mavbridge.core.errors import UserError
 
-MAX_CLIENTS = 4
 SPARE_BYTES = 2**20
 """Most bytes of a request beside its images."""
 PING_S = 5.0
@@ -88,8 +87,9 @@ class PolicyServer:
         return connection.respond(http.HTTPStatus.UNAUTHORIZED, "the API key is missing or wrong\n")
 
     async def _talk(self, connection: ServerConnection) -> None:
-        if self._clients == MAX_CLIENTS:
-            await connection.close(CloseCode.TRY_AGAIN_LATER, f"{MAX_CLIENTS} clients are served")
+        if self._clients == self._answers.max_clients:
+            reason = f"the most are served already: {self._clients}"
+            await connection.close(CloseCode.TRY_AGAIN_LATER, reason)
             return
         self._clients += 1
         self._report(f"{_name(connection)} has connected")

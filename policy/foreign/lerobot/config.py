@@ -201,15 +201,7 @@ def _act(entries: "_Entries", features: Features) -> ActConfig:
 
 
 def _diffusion(entries: "_Entries", features: Features) -> DiffusionConfig:
-    # Both came after 0.4.0; before, nothing was resized.
-    resize = entries.size("resize_shape") if "resize_shape" in entries.data else None
-    ratio = entries.number("crop_ratio", default=1.0)
-    crop = entries.size("crop_shape")
-    if resize is not None:  # then LeRobot takes the crop from the ratio, whatever crop_shape says
-        crop = None if ratio == 1.0 else (int(resize[0] * ratio), int(resize[1] * ratio))
-    before = resize or (features.image_height, features.image_width)
-    if crop is not None and (crop[0] > before[0] or crop[1] > before[1]):
-        raise CheckpointError(f"{entries.path}: cannot crop images of {before} to {crop}")
+    resize, crop = _resize_and_crop(entries, features)
     if features.state_dim is None:
         raise CheckpointError(f"{entries.path}: a diffusion policy takes {STATE_KEY}")
     train_steps = entries.integer("num_train_timesteps")
@@ -246,6 +238,21 @@ def _diffusion(entries: "_Entries", features: Features) -> DiffusionConfig:
             f"{len(config.down_dims)} down_dims and {config.n_obs_steps} n_obs_steps"
         )
     return config
+
+
+def _resize_and_crop(
+    entries: "_Entries", features: Features
+) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
+    # Both came after 0.4.0; before, nothing was resized.
+    resize = entries.size("resize_shape") if "resize_shape" in entries.data else None
+    ratio = entries.number("crop_ratio", default=1.0)
+    crop = entries.size("crop_shape")
+    if resize is not None:  # then LeRobot takes the crop from the ratio, whatever crop_shape says
+        crop = None if ratio == 1.0 else (int(resize[0] * ratio), int(resize[1] * ratio))
+    before = resize or (features.image_height, features.image_width)
+    if crop is not None and (crop[0] > before[0] or crop[1] > before[1]):
+        raise CheckpointError(f"{entries.path}: cannot crop images of {before} to {crop}")
+    return resize, crop
 
 
 def _features(entries: "_Entries") -> Features:

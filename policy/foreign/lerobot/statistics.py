@@ -102,25 +102,26 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
         action=outputs.affine(ACTION_KEY, "ACTION"),
         renamed=renamed,
     )
-    asked = {
-        STATE_KEY: ("STATE", normalisation.state),
-        ACTION_KEY: ("ACTION", normalisation.action),
-    }
-    asked |= {key: ("VISUAL", affine) for key, affine in normalisation.images.items()}
+    return normalisation, _notes(folder, features, normalisation)
+
+
+def _notes(folder: Path, features: Features, normalisation: Normalisation) -> list[str]:
+    """What LeRobot would compute without a word, and what is seldom meant."""
+    found = [(key, "VISUAL", affine) for key, affine in normalisation.images.items()]
+    found += [(ACTION_KEY, "ACTION", normalisation.action)]
+    state = normalisation.state
+    found += [(STATE_KEY, "STATE", state)] if features.state_dim else []
     notes = [
         f"warning: {folder} holds no statistics of {key}: it flies as it is, not normalised"
-        for key, (kind, affine) in asked.items()
-        if affine is None
-        and features.modes.get(kind, "IDENTITY") != "IDENTITY"
-        and (key != STATE_KEY or features.state_dim)
+        for key, kind, affine in found
+        if affine is None and features.modes.get(kind, "IDENTITY") != "IDENTITY"
     ]
-    state = normalisation.state
     if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
         notes.append(
             f"warning: numbers {constant} (from 0) of {STATE_KEY} never changed in the training "
             "data: any other value is divided by almost nothing, as in LeRobot, and rules the chunk"
         )
-    return normalisation, notes
+    return notes
 
 
 def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]]:

@@ -1,10 +1,11 @@
 """One ONNX file as a compiled graph whose inputs are given by their role."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import openvino as ov
 
 from policy.contract import FloatArray
@@ -75,7 +76,7 @@ class GraphFile:
             RuntimeError: OpenVINO cannot compile it.
         """
         shapes = [list(port.shape) for port in self._model.inputs]
-        compiler = GraphCompiler(f"{_digest(self._path)} {shapes}")
+        compiler = GraphCompiler(f"{_digest(self._path, self._model)} {shapes}")
         graph = compiler.compile("onnx", precision, lambda: self._model)
         return RoleGraph(graph, self.roles, self.output_shape)
 
@@ -127,21 +128,10 @@ def _reason(error: Exception) -> str:
     return lines[-1] if lines else type(error).__name__
 
 
-def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    for each in _with_weights(path):
-        with each.open("rb") as file:
-            _update(digest.update, file.read)
+def _digest(path: Path, model: ov.Model) -> str:
+    """A text that differs wherever the file, or weights that lie in other files, do."""
+    digest = hashlib.sha256(path.read_bytes())
+    for node in model.get_ordered_ops():
+        if node.get_type_name() == "Constant":
+            digest.update(np.ascontiguousarray(node.data).view(np.uint8).data)
     return digest.hexdigest()
-
-
-def _update(update: Callable[[bytes], None], read: Callable[[int], bytes]) -> None:
-    while block := read(1 << 20):
-        update(block)
-
-
-def _with_weights(path: Path) -> Iterator[Path]:
-    """The file, and those beside it in which exporters put large weights."""
-    yield path
-    yield from sorted(each for each in path.parent.glob(f"{path.stem}*") if each.suffix == ".data")
-    yield from sorted(path.parent.glob("*.weight"))

@@ -167,6 +167,7 @@ class ServerLink:
         request, self._next = self._next, None
         assert request is not None
         self._sent = request
+        await self._require_silence(connection)
         async with asyncio.timeout(request.patience_s):
             sent_s = self._loop.time()
             await connection.send(request.payload)
@@ -174,6 +175,16 @@ class ServerLink:
         self._sent = None
         self._pause_s = FIRST_PAUSE_S
         request.answer.set_result(Answer(data, self._loop.time() - sent_s))
+
+    async def _require_silence(self, connection: ClientConnection) -> None:
+        """Refuse a message that lies there before the request: it would be taken for its answer."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(0):
+                await connection.recv()
+                raise PolicyError(
+                    f"{self._url} has sent a message that nobody asked for, so its answers cannot "
+                    "be told apart; connecting again"
+                )
 
     def _fail(self, reason: str) -> None:
         self._problem = reason

@@ -190,7 +190,8 @@ def life(folder: Path) -> str:
 
 
 def closed(loaded_or_failed: str) -> int:
-    module = next(value for name, value in sys.modules.items() if name.endswith("_life"))
+    named = (each for each in sys.modules if each.startswith("_policy_file_"))
+    module = next(sys.modules[each] for each in named if each.endswith("_life"))
     times: int = getattr(module, loaded_or_failed).closed
     return times
 

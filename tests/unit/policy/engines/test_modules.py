@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -101,3 +102,17 @@ def test_a_second_start_converts_nothing(monkeypatch: pytest.MonkeyPatch) -> Non
         changed.head.layers[0].bias[0] += 1  # type: ignore[union-attr, operator]
     require_parity(changed, SETTINGS)
     assert len(converted) == at_first + 1  # the encoder is the same
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_new_weights_of_a_frozen_archive_are_compiled(tmp_path: Path) -> None:
+    def compiled(weight: float) -> float:
+        layer = nn.Linear(64, 64, bias=False).eval()
+        nn.init.constant_(layer.weight, weight)
+        torch.jit.freeze(torch.jit.script(layer)).save(tmp_path / "frozen.pt")
+        frozen = torch.jit.load(tmp_path / "frozen.pt")
+        converter = openvino_modules.ModuleConverter(frozen, "frozen")
+        call = converter.compile(lambda x: frozen(x), [(1, 64)], "f32")
+        return float(call(np.ones((1, 64), np.float32))[0, 0])
+
+    assert [compiled(1.0), compiled(2.0)] == [64.0, 128.0]

@@ -11,9 +11,10 @@ from safetensors.numpy import save_file
 from helpers import lerobot_checkpoints as formula
 from policy.contract import STATE_NAMES
 from policy.engines.choose import chunks_of_samples
-from policy.engines.executable import ExecutionSettings, solver_segment
+from policy.engines.executable import ExecutionSettings
 from policy.engines.openvino_modules import ModuleConverter, make_module_executable
 from policy.engines.parity import make_parity_samples
+from policy.engines.stepwise import solver_segment
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import CheckpointError
 from policy.foreign.lerobot.config import read_config

@@ -53,6 +53,9 @@ def require_same(a: Executable, b: Executable) -> None:
         ("NamedDenoiser", True, None),
         ("NamedDenoiser", True, 2),
         ("NamedDenoiser", False, None),
+        ("Wide", True, None),
+        ("Wide", True, 2),
+        ("Wide", False, None),
     ],
 )
 def test_a_class_that_names_its_modules_flies_converted(
@@ -168,7 +171,7 @@ def test_the_actions_of_a_file_are_those_of_the_contract_file(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("content", "reason"),
-    [(None, "there is no file"), (b"junk", "cannot be read"), (b"", "cannot be read")],
+    [(None, "there is no file"), (b"junk", "cannot be read"), (b"", "is empty, or cut short")],
 )
 def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes | None, reason: str) -> None:
     path = tmp_path / "mine.pt"

@@ -1,14 +1,16 @@
 """Policies in ONNX files, and ours written as such."""
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.torch_policies import DUAL, SINGLE, ForwardOnly, TwoRates
+from helpers.torch_policies import DUAL, SINGLE, WIDE, ForwardOnly, TwoRates, Wide
 from policy.contract import Contract
 from policy.engines.choose import chunks_of_samples
 from policy.engines.executable import ExecutionSettings
@@ -16,6 +18,8 @@ from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.foreign.export import OurPolicy, export_onnx, export_torchscript
+from policy.foreign.onnx import policies
+from policy.foreign.onnx.graphs import GraphFile, Wanted
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
@@ -110,8 +114,6 @@ def test_a_single_rate_policy_of_ours_gains_a_fast_path(tmp_path: Path) -> None:
 
 
 def write(module: torch.nn.Module, path: Path, shapes: dict[str, tuple[int, ...]]) -> None:
-    import warnings
-
     with warnings.catch_warnings(action="ignore"):
         torch.onnx.export(
             module.eval(),
@@ -165,11 +167,23 @@ def test_an_encoder_and_a_head(tmp_path: Path) -> None:
     require_same(executable, reference(policy, ExecutionSettings(name="it")))
 
 
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_several_cameras_and_observations(tmp_path: Path, dual_rate: bool) -> None:
+    policy = Wide()
+    write(policy.visual_encoder, tmp_path / "encoder.onnx", {"image": IMAGE})
+    shapes = {"sample": (1, 8, 4), "timestep": (1,), "global_cond": (1, 2, 24), "state": (1, 2, 13)}
+    write(policy.denoiser, tmp_path / "denoiser.onnx", shapes)
+    description = {"contract": json.loads(WIDE.to_json()), "schedule": {"prediction": "sample"}}
+    (tmp_path / "policy.json").write_text(json.dumps(description))
+    flags: dict[str, Any] = {"dual_rate": dual_rate, "num_diffusion_steps": STEPS}
+    executable, _ = loaded(PolicyRequest(spec=f"onnx:{tmp_path}", **flags))
+    mine = PolicyRequest(spec="helpers.torch_policies:Wide", engine="torch", **flags)
+    require_same(executable, loaded(mine)[0])
+
+
 def test_bf16_is_flown_only_where_it_agrees(
     exported_toge: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from policy.foreign.onnx import policies
-
     failures = iter(["a stick is off", "a stick is off"])
     monkeypatch.setattr(policies, "precisions", lambda: (("bf16", "bf16"), ("f32", "f32")))
     monkeypatch.setattr(policies, "parity_failure", lambda *_: next(failures))
@@ -239,3 +253,29 @@ def test_a_damaged_file_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "policy.onnx").write_bytes(content)
     with pytest.raises(PolicyError, match=r"policy\.onnx"):
         loaded(request)
+
+
+@pytest.mark.parametrize("weights_file", ["policy.onnx_data", "weights.bin"])
+def test_new_weights_in_a_file_of_their_own_are_flown(tmp_path: Path, weights_file: str) -> None:
+    onnx = pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
+
+    def compiled(factor: float) -> float:
+        for old in tmp_path.iterdir():
+            old.unlink()
+        weights = onnx.numpy_helper.from_array(factor * np.eye(13, dtype=np.float32), "w")
+        ends = [
+            onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 13])
+            for name in ("state", "out")
+        ]
+        product = onnx.helper.make_node("MatMul", ["state", "w"], ["out"])
+        graph = onnx.helper.make_graph([product], "graph", ends[:1], ends[1:], [weights])
+        opsets = [onnx.helper.make_opsetid("", 18)]
+        path = tmp_path / "policy.onnx"
+        model = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=9)
+        onnx.save_model(
+            model, path, save_as_external_data=True, location=weights_file, size_threshold=0
+        )
+        file = GraphFile(path, {"state": Wanted(names=("state",), shape=(1, 13))})
+        return float(file.compile("f32")(state=np.ones((1, 13), np.float32))[0, 0])
+
+    assert [compiled(1.0), compiled(2.0)] == [1.0, 2.0]

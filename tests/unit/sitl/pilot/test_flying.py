@@ -3,6 +3,7 @@
 import pytest
 
 from sitl import UsageError
+from sitl.__main__ import main
 from sitl.clock import NS_PER_S, Clock
 from sitl.course.layout import make_course
 from sitl.expert.stick_response import CENTRED
@@ -121,3 +122,10 @@ def test_what_a_pilot_cannot_be_is_refused(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
     with pytest.raises(UsageError, match="needs a display"):
         pilot_of("keyboard", vehicle)
+
+
+def test_a_pilot_and_another_hand_on_the_receiver_contradict(capsys):
+    for other in (("--rc-in", "5501"), ("--receiver", "mid")):
+        flags = ["--connect", "udpout:127.0.0.1:1", "--pilot", "expert", *other]
+        assert main(flags) == 2
+        assert "leave out --rc-in and --receiver" in capsys.readouterr().err

@@ -1,0 +1,117 @@
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+
+from helpers.fakes import START_NS, ListSink
+from helpers.wire import WireEnd
+from mavbridge.commands.record.pilot_view import STICKS_FRESH_NS, PilotView
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import Tick
+from mavbridge.core.vehicle import ForwardedPacket, Sticks
+from mavbridge.flight.history import SentHistory
+from mavbridge.flight.state import Freshness
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.wire import GateMessage, GateStatus, GateTick
+from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+
+STICKS = Sticks(0.1, 0.2, 0.3, 0.4)
+
+
+@dataclass
+class Viewed:
+    sink: ListSink
+    view: PilotView
+    end: WireEnd
+
+    def radio(self, at_ns: int) -> tuple[ForwardedPacket, ...]:
+        mav = self.end.mav
+        channels = mav.rc_channels_encode(0, 8, *[1500] * 18, 255)
+        manual = mav.manual_control_encode(1, 0, 0, 500, 0, 0)
+        other = mav.heartbeat_encode(2, 3, 81, 2, 4)
+        return tuple(
+            ForwardedPacket(at_ns, at_ns, self.end.pack(one)) for one in (channels, manual, other)
+        )
+
+    def tick(self, at_ns: int) -> Tick:
+        self.view.receive(
+            GateTick(
+                index=0,
+                due_ns=at_ns,
+                woke_ns=at_ns,
+                sent_ns=at_ns,
+                missed_slots=0,
+                is_slot=True,
+                is_coasting=False,
+                chunk_serial=None,
+                trace=None,
+                sent=None,
+                phase=Phase.WAITING,
+                reason="no image feature yet",
+            )
+        )
+        event = self.sink.events[-1]
+        assert isinstance(event, Tick)
+        return event
+
+
+@pytest.fixture
+def viewed() -> Viewed:
+    sink = ListSink()
+    view = PilotView(
+        history=SentHistory(length=2, dt_s=0.01),
+        sink=sink,
+        state_frame="ned_frd",
+        freshness=Freshness(attitude_ns=1, velocity_ns=1),
+    )
+    return Viewed(sink, view, WireEnd())
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, PacketPipe]]:
+    reader, writer = os.pipe()
+    log = PacketPipe(writer, wall_offset_ns=0)
+    yield reader, log
+    log.close()
+    os.close(reader)
+
+
+def status(autopilot: str) -> GateStatus:
+    return GateStatus(autopilot, "ALT_HOLD", True, False, (1500,) * 8, STICKS)
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot 4.7.0", "px4 1.18.0"])
+def test_the_message_with_the_sticks_is_counted_by_firmware(viewed: Viewed, autopilot: str) -> None:
+    viewed.view.receive(viewed.radio(START_NS))
+    assert viewed.view.stick_packets == 0, "no firmware is known yet"
+    viewed.view.receive(status(autopilot))
+    for k in range(1, 4):
+        viewed.view.receive(viewed.radio(START_NS + k))
+    viewed.view.receive(GateMessage("a line"))
+    assert (viewed.view.stick_packets, viewed.view.sticks_ns) == (3, START_NS + 3)
+
+
+def test_ticks_are_the_pilots_and_old_sticks_are_none(viewed: Viewed) -> None:
+    viewed.view.receive(status("ardupilot 4.7.0"))
+    viewed.view.receive(viewed.radio(START_NS))
+    tick = viewed.tick(START_NS + 10 * NS_PER_MS)
+    assert tick.rc_sticks == STICKS
+    assert (tick.phase, tick.release_reason) == ("released", "the pilot flies")
+    assert tick.activity == "RELEASED: the pilot flies"
+    assert viewed.tick(START_NS + STICKS_FRESH_NS + 1).rc_sticks is None
+
+
+def test_packets_are_logged_while_there_is_a_log(
+    viewed: Viewed, pipe: tuple[int, PacketPipe]
+) -> None:
+    reader, log = pipe
+    viewed.view.receive(viewed.radio(START_NS))
+    viewed.view.log_to(log)
+    packets = viewed.radio(START_NS)
+    viewed.view.receive(packets)
+    viewed.view.log_to(None)
+    viewed.view.receive(viewed.radio(START_NS))
+    logged = os.read(reader, 1 << 16)
+    assert len(logged) == sum(8 + len(packet.data) for packet in packets)
+    assert logged.endswith(packets[-1].data)
