@@ -35,7 +35,7 @@ HEAD = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class Request:
     """What is asked of every policy."""
 
     steps: int
@@ -53,27 +53,27 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=60.0, help="seconds of each flight")
     parser.add_argument("--peer", help="the Python of LeRobot's environment")
     given = parser.parse_args()
-    plan = Plan(
+    request = Request(
         steps=given.steps, action_hz=given.action_rate, flight_s=given.duration, peer=given.peer
     )
     print("\n".join(HEAD), flush=True)  # noqa: T201 - its result
     for folder in given.folders:
-        print(row(folder, plan), flush=True)  # noqa: T201
+        print(row(folder, request), flush=True)  # noqa: T201
 
 
-def row(folder: Path, plan: Plan) -> str:
+def row(folder: Path, request: Request) -> str:
     """One line of the table; what could not be measured says why."""
     policy = PolicyConfig(
         policy=f"lerobot:{folder}",
         contract=folder / CONTRACT_FILE,
         dual_rate=True,
-        num_diffusion_steps=plan.steps,
+        num_diffusion_steps=request.steps,
     )
     try:
-        flown = _cells(fly(policy, Rates(action_rate=plan.action_hz), plan.flight_s))
+        flown = _cells(fly(policy, Rates(action_rate=request.action_hz), request.flight_s))
     except UserError as error:
         flown = f"not flown: {str(error).splitlines()[-1]} | | | "
-    return f"| {folder.name} | {flown} | {_peer_text(folder, plan)} |"
+    return f"| {folder.name} | {flown} | {_peer_text(folder, request)} |"
 
 
 def _cells(flight: Flight) -> str:
@@ -93,9 +93,9 @@ def _text(found: Percentiles | None, *, both: bool) -> str:
     return f"{found.p50:.1f} / {found.p99:.1f} ms" if both else f"{found.p50:.1f} ms"
 
 
-def _peer_text(folder: Path, plan: Plan) -> str:
+def _peer_text(folder: Path, request: Request) -> str:
     """LeRobot's time of a chunk on the same weights, or why it was not measured."""
-    if plan.peer is None:
+    if request.peer is None:
         return "not measured: give --peer, the Python of an environment with lerobot"
     contract = read_plan(folder, folder / CONTRACT_FILE).interface.contract
     horizon = json.loads((folder / "config.json").read_text()).get("horizon", 1)
@@ -108,7 +108,7 @@ def _peer_text(folder: Path, plan: Plan) -> str:
             images=np.full(images, 0.5, np.float32),
             noise=np.zeros((1, horizon, ACTION_DIM), np.float32),
         )
-        command = [plan.peer, str(PEER), "time", str(folder), str(inputs), str(plan.steps)]
+        command = [request.peer, str(PEER), "time", str(folder), str(inputs), str(request.steps)]
         try:
             run = subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
         except (OSError, subprocess.SubprocessError) as error:

@@ -34,7 +34,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from policy.contract import ACTION_DIM, ACTION_NAMES, Contract, FloatArray
+from policy.contract import ACTION_DIM, ACTION_NAMES, Contract
 from policy.errors import ContractError
 from policy.foreign.state import DERIVED_NAMES, state_values
 
@@ -141,20 +141,24 @@ class Interface:
         """The policy's name of each camera, in the contract's order."""
         return self.image_keys or tuple(f"observation.images.{n}" for n in self.contract.cameras)
 
-    def to_actions(self, actions: FloatArray) -> FloatArray:
-        """The policy's actions [..., 4] -> the contract's [..., 4]."""
-        scale = np.array(self.action_scale or (1.0,) * ACTION_DIM, np.float32)
-        offset = np.array(self.action_offset or (0.0,) * ACTION_DIM, np.float32)
-        return np.ascontiguousarray((actions * scale + offset)[..., self.action_columns])
+    def to_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
+        """The policy's actions [..., 4] -> the contract's [..., 4], arrays or tensors."""
+        values: Any = actions
+        scale, offset = self._action_units(actions)
+        return cast(ArrayOrTensor, _columns(values * scale + offset, self.action_columns))
 
-    def from_actions(self, actions: FloatArray) -> FloatArray:
+    def from_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
         """The contract's actions [..., 4] -> the policy's [..., 4]: ``to_actions``, undone."""
-        scale = np.array(self.action_scale or (1.0,) * ACTION_DIM, np.float32)
-        offset = np.array(self.action_offset or (0.0,) * ACTION_DIM, np.float32)
-        theirs = np.empty_like(actions)
-        theirs[..., self.action_columns] = actions
-        unscaled: FloatArray = (theirs - offset) / scale
-        return unscaled
+        columns = self.action_columns
+        scale, offset = self._action_units(actions)
+        theirs = _columns(actions, [columns.index(column) for column in range(ACTION_DIM)])
+        return cast(ArrayOrTensor, (theirs - offset) / scale)
+
+    def _action_units(self, actions: object) -> tuple[Any, Any]:
+        """Factor and offset of each action, in the library of ``actions``."""
+        library, options = _library(actions)
+        scale = library.asarray(self.action_scale or (1.0,) * ACTION_DIM, **options)
+        return scale, library.asarray(self.action_offset or (0.0,) * ACTION_DIM, **options)
 
 
 def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> Interface:
@@ -228,6 +232,12 @@ def _unanswered(data: Mapping[str, Any]) -> list[str]:
         for name, value in entries.items()
         if value == UNANSWERED or (isinstance(value, list) and UNANSWERED in value)
     ]
+
+
+def _columns(values: Any, columns: list[int]) -> Any:
+    """Columns of the last axis in another order; an array's in one piece of memory."""
+    ordered = values[..., columns]
+    return np.ascontiguousarray(ordered) if isinstance(ordered, np.ndarray) else ordered
 
 
 def _library(state: object) -> tuple[Any, dict[str, Any]]:

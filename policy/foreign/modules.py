@@ -79,16 +79,7 @@ class ForwardPolicy(nn.Module):
         self.contract = interface.contract
         self.held = nn.ModuleList(modules_of(holder))
         self._call = _Call(holder if call is None else call)
-        self._to_state = interface.to_state
-        self._action_columns = interface.action_columns
-        self._scale: Tensor
-        self._offset: Tensor
-        for name, values, default in (
-            ("_scale", interface.action_scale, 1.0),
-            ("_offset", interface.action_offset, 0.0),
-        ):
-            value = torch.tensor(values or (default,) * ACTION_DIM)
-            self.register_buffer(name, value, persistent=False)
+        self._interface = interface
 
     def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
         """One call of the module."""
@@ -96,15 +87,11 @@ class ForwardPolicy(nn.Module):
 
     def to_chunk(self, sample: Tensor) -> Tensor:
         """The policy's actions [B, L, 4] -> the contract's."""
-        return (sample * self._scale + self._offset)[..., self._action_columns]
+        return self._interface.to_actions(sample)
 
     def _own(self, state: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
         """State and history as the policy orders and scales them."""
-        return self._to_state(state), self._from_actions(history)
-
-    def _from_actions(self, actions: Tensor) -> Tensor:
-        place = [self._action_columns.index(column) for column in range(ACTION_DIM)]
-        return (actions[..., place] - self._offset) / self._scale
+        return self._interface.to_state(state), self._interface.from_actions(history)
 
 
 class HeadPolicy(ForwardPolicy):

@@ -9,13 +9,13 @@ from mavbridge.core.errors import UserError
 from policy.data.lerobot import is_lerobot
 from policy.foreign.drafts.entries import Entry, draft_text
 from policy.foreign.drafts.lerobot import (
-    CONFIG_FILE,
     checkpoint_entries,
     dataset_entries,
     dataset_of,
 )
 from policy.foreign.drafts.onnx import onnx_entries, onnx_files
 from policy.foreign.interface import CONTRACT_FILE, UNANSWERED
+from policy.foreign.lerobot.config import CONFIG_FILE
 
 
 def contract(source: Path, config: ContractConfig) -> int:

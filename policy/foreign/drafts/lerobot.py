@@ -17,8 +17,9 @@ from policy.foreign.drafts.entries import (
     rate_entry,
     state_entries,
 )
+from policy.foreign.lerobot.config import CONFIG_FILE, read_json
 
-CONFIG_FILE, TRAIN_CONFIG_FILE = "config.json", "train_config.json"
+TRAIN_CONFIG_FILE = "train_config.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ def dataset_entries(folder: Path) -> list[Entry]:
     Raises:
         CheckpointError: not a dataset, or damaged.
     """
-    info = _read_json(folder / INFO)
+    info = read_json(folder / INFO)
     features = _table(folder / INFO, info, "features")
     images = [key for key, value in features.items() if value.get("dtype") in ("video", "image")]
     vectors = _Vectors(
@@ -54,7 +55,7 @@ def checkpoint_entries(folder: Path, dataset: Path | None) -> list[Entry]:
         CheckpointError: not a policy's folder, damaged, or not of this dataset.
     """
     path = folder / CONFIG_FILE
-    config = _read_json(path)
+    config = read_json(path)
     inputs, outputs = (
         _table(path, config, "input_features"),
         _table(path, config, "output_features"),
@@ -88,7 +89,7 @@ def _entries(vectors: _Vectors, path: Path, dataset: Path | None) -> list[Entry]
     names: dict[str, list[str] | None] = {STATE_KEY: None, ACTION_KEY: None}
     rate_hz, where, frame = None, path.name, frame_entry(None, "to answer", "")
     if dataset is not None:
-        info, where = _read_json(dataset / INFO), f"the dataset's {INFO}"
+        info, where = read_json(dataset / INFO), f"the dataset's {INFO}"
         features = _table(dataset / INFO, info, "features")
         names = {key: _names(features.get(key)) for key in names}
         fps = info.get("fps")
@@ -128,18 +129,6 @@ def _width(feature: object) -> int:
     shape = feature.get("shape") if isinstance(feature, dict) else None
     is_vector = isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int)
     return int(shape[0]) if is_vector and shape else 0
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text())
-    except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror}") from error
-    except ValueError as error:
-        raise CheckpointError(f"{path}: not JSON ({error})") from error
-    if not isinstance(data, dict):
-        raise CheckpointError(f"{path}: not a JSON object")
-    return data
 
 
 def _table(path: Path, data: Mapping[str, Any], name: str) -> dict[str, dict[str, Any]]:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from policy.contract import ACTION_DIM, Contract
+from policy.contract import Contract
 from policy.foreign.lerobot.act import Act
 from policy.foreign.lerobot.config import ActConfig, DiffusionConfig
 from policy.foreign.lerobot.diffusion import Diffusion
@@ -57,13 +57,7 @@ class LeRobotPolicy(nn.Module):
         self._images = nn.ModuleList(Normaliser(normalisation.images[key]) for key in keys)
         self._state = Normaliser(normalisation.state)
         self._action = Normaliser(normalisation.action)
-        self._to_state = interface.to_state
-        self._action_columns = interface.action_columns
-        ones, zeros = (1.0,) * ACTION_DIM, (0.0,) * ACTION_DIM
-        self._scale: Tensor
-        self.register_buffer("_scale", torch.tensor(interface.action_scale or ones), False)
-        self._offset: Tensor
-        self.register_buffer("_offset", torch.tensor(interface.action_offset or zeros), False)
+        self._interface = interface
 
     def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
         """Image [B, 3, H, W] of that camera of the contract -> feature [B, feature_dim]."""
@@ -99,12 +93,11 @@ class LeRobotPolicy(nn.Module):
         by_camera = feature.reshape(feature.shape[0], steps, cameras, self.contract.feature_dim)
         if self._policy_cameras != tuple(range(cameras)):
             by_camera = by_camera[:, :, [self._policy_cameras.index(own) for own in range(cameras)]]
-        own_state = self._to_state(state.reshape(state.shape[0], steps, -1))
+        own_state = self._interface.to_state(state.reshape(state.shape[0], steps, -1))
         return by_camera, self._state(own_state)
 
     def _in_units(self, actions: Tensor) -> Tensor:
-        in_units: Tensor = self._action.back(actions) * self._scale + self._offset
-        return in_units[..., self._action_columns]
+        return self._interface.to_actions(self._action.back(actions))
 
 
 class LeRobotAct(LeRobotPolicy):
