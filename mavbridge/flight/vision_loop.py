@@ -63,6 +63,8 @@ class VisionLoop:
         self._frames = 0
         self.alive_ns = clock.now_ns()
         """When the last step ended; read by another thread."""
+        self.encoding_since_ns: int | None = None
+        """When the encoding in progress was asked for; read by another thread."""
 
     def run(self, stop: threading.Event) -> None:
         """Encode until told to stop; raises CameraError if the camera has died."""
@@ -84,7 +86,9 @@ class VisionLoop:
         if self._image_watch is not None:
             is_airborne = self._is_airborne()
             fault = self._image_watch.check(frame.rgb, captured_ns, is_airborne=is_airborne)
+        self.encoding_since_ns = self._clock.now_ns()
         value = self._encode(frame.rgb)
+        self.encoding_since_ns = None
         value.setflags(write=False)
         ready_ns = self._clock.now_ns()
         feature = FeatureFrame(

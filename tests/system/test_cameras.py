@@ -17,8 +17,7 @@ def test_two_cameras_feed_one_policy(tmp_path: Path) -> None:
         flying.cameras = ("down", "front")  # their order is the contract's, not this one
         folder = tmp_path / "recording"
         flags = ("--policy", "helpers.user_policies:TwoEyed", "--duration", "4")
-        flying.start(*FLY, *flags, "--record", str(folder))
-        status, output = flying.end()
+        status, output = flying.fly(*FLY, *flags, "--record", str(folder))
     assert status == 0, output
     front, down = open_flight(folder), open_flight(folder, "down")
     assert front.meta.finished
@@ -32,8 +31,7 @@ def test_two_cameras_feed_one_policy(tmp_path: Path) -> None:
 def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
         flying.cameras = ("front", "down")
-        flying.start(*FLY, "--policy", "helpers.user_policies:HangingBelow")
-        status, output = flying.end()
+        status, output = flying.fly(*FLY, "--policy", "helpers.user_policies:HangingBelow")
     assert status == 1
     assert "the image feature is older than 300 ms" in output
     assert "the encoder of camera down has hung" in output
@@ -42,8 +40,7 @@ def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
 
 def test_a_camera_without_its_name_is_refused(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
-        flying.start(*FLY, "--policy", "helpers.user_policies:TwoEyed")
-        status, output = flying.end()
+        status, output = flying.fly(*FLY, "--policy", "helpers.user_policies:TwoEyed")
     assert status == 1, output
     assert "give --camera front=SOURCE --camera down=SOURCE" in output
     assert flying.relay.overrides == []

@@ -62,8 +62,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     recording = folder / "recording"
     with flight(folder) as flying:
         flags = ("--record", str(recording), "--rerun", str(recording / "flight.rrd"))
-        flying.start(*FLY, "--policy", "scripted:hover", "--duration", "8", *flags)
-        status, output = flying.end()
+        status, output = flying.fly(*FLY, "--policy", "scripted:hover", "--duration", "8", *flags)
     assert status == 0, output
     overrides = flying.relay.overrides
     return Flown(overrides, output, flying.report(), flying.vehicle_report(), recording)
@@ -128,8 +127,7 @@ def test_a_signal_gives_the_sticks_back(tmp_path: Path) -> None:
 
 def test_an_exception_in_the_policy_gives_the_sticks_back(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
-        flying.start(*FLY, "--policy", "helpers.user_policies:Exploding")
-        status, output = flying.end()
+        status, output = flying.fly(*FLY, "--policy", "helpers.user_policies:Exploding")
     assert status == 1
     assert_released(flying.relay.overrides)
     assert "RuntimeError: the user's policy is broken" in output
@@ -153,8 +151,9 @@ def test_somebody_elses_arming_is_not_engaging(tmp_path: Path) -> None:
 
 def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
-        flying.start("--dual-rate", "--head-steps", "2", "--readonly", "--duration", "2")
-        status, output = flying.end()
+        status, output = flying.fly(
+            "--dual-rate", "--head-steps", "2", "--readonly", "--duration", "2"
+        )
     assert status == 0, output
     report = flying.report()
     assert report["mode"] == "dual"
@@ -167,8 +166,7 @@ def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:
 def test_a_policy_without_a_fast_path_flies_single_rate_after_a_warning(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
         flags = ("--policy", "helpers.user_policies:SingleRate", "--dual-rate", "--readonly")
-        flying.start(*flags, "--duration", "1")
-        status, output = flying.end()
+        status, output = flying.fly(*flags, "--duration", "1")
     assert status == 0, output
     report = flying.report()
     assert report["mode"] == "single"

@@ -193,8 +193,7 @@ def test_what_is_not_a_number_never_reaches_the_wire(
 
 def test_a_policy_that_is_too_slow_is_refused_before_it_flies(tmp_path: Path) -> None:
     with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + "Slow")
-        status, output = flying.end()
+        status, output = flying.fly(*FLY, "--policy", POLICIES + "Slow")
     assert status == 1, output
     assert re.search(r"Slow is too slow: a chunk takes 9\d\d ms here.* of its contract", output)
     assert flying.vehicle_report()["armed_s"] == 0

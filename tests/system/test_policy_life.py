@@ -61,8 +61,9 @@ def test_a_file_of_the_users_flies_after_a_takeoff_and_lives_by_the_guide(tmp_pa
     (tmp_path / "turning.py").write_text(POLICY)
     with flight(tmp_path) as flying:
         flags = ("--mode", "ALT_HOLD", "--arm", "--takeoff", "4", "--duration", "12")
-        flying.start("--dual-rate", *flags, "--policy", f"{tmp_path}/turning.py:Turning")
-        status, output = flying.end()
+        status, output = flying.fly(
+            "--dual-rate", *flags, "--policy", f"{tmp_path}/turning.py:Turning"
+        )
     assert status == 0, output
     assert flying.vehicle_report()["max_altitude_m"] > 3.0
     lines = (tmp_path / "turning.jsonl").read_text().splitlines()
