@@ -12,12 +12,12 @@ from dataclasses import replace
 from cyclopts import App
 
 from benchmarks.roofline import time_rooflines
+from mavbridge.commands.bench.config import BenchOutputs
 from mavbridge.commands.bench.engines import EAGER, time_engines
 from mavbridge.commands.bench.flight import FLIGHT_PROCESS, fly
 from mavbridge.commands.bench.link import OUR_CLIENT, LinkClient, time_link
 from mavbridge.commands.bench.results import BenchResult, this_machine
 from mavbridge.commands.bench.run import BARE_CLIENT, QUICK, Effort, run_and_report
-from mavbridge.config.bench import BenchOutputs
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.processes import IMPORT_ROOT

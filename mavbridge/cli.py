@@ -12,19 +12,19 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 import mavbridge
+from mavbridge.commands.bench.config import BenchConfig
+from mavbridge.commands.contract.config import ContractConfig
+from mavbridge.commands.demonstrate.config import DemonstrateConfig
+from mavbridge.commands.evaluate.config import EvaluateConfig
+from mavbridge.commands.export.config import ExportConfig
+from mavbridge.commands.export_policy.config import ExportPolicyConfig
+from mavbridge.commands.identify.config import IdentifyConfig
+from mavbridge.commands.imagine.config import EvaluateImaginationConfig, ImagineConfig
+from mavbridge.commands.record.config import RecordConfig
+from mavbridge.commands.serve.config import ServeConfig
 from mavbridge.commands.train.checks import prepare as prepare_training
-from mavbridge.config.bench import BenchConfig
-from mavbridge.config.contract import ContractConfig
-from mavbridge.config.demonstrate import DemonstrateConfig
-from mavbridge.config.evaluate import EvaluateConfig
-from mavbridge.config.export import ExportConfig
-from mavbridge.config.export_policy import ExportPolicyConfig
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
-from mavbridge.config.identify import IdentifyConfig
-from mavbridge.config.imagine import EvaluateImaginationConfig, ImagineConfig
-from mavbridge.config.record import RecordConfig
-from mavbridge.config.serve import ServeConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra

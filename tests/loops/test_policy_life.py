@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from mavbridge.commands.bench.engines import time_engines
+from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, fly_simulated
-from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.simulation.referee import EpisodeInterruptedError
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, fly_on_wall_clock
 from mavbridge.commands.evaluate.run import evaluate
-from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.workers import WorkersConfig
 

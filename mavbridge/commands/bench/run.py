@@ -14,6 +14,7 @@ from pathlib import Path
 
 from rich.text import Text
 
+from mavbridge.commands.bench.config import BenchConfig, BenchOutputs
 from mavbridge.commands.bench.engines import EAGER, time_engines
 from mavbridge.commands.bench.flight import fly
 from mavbridge.commands.bench.link import OUR_CLIENT, time_link
@@ -26,7 +27,6 @@ from mavbridge.commands.bench.results import (
     to_json,
 )
 from mavbridge.commands.output import require_outputs, table_console
-from mavbridge.config.bench import BenchConfig, BenchOutputs
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from shutil import rmtree
 
 import mavbridge
+from mavbridge.commands.demonstrate.config import DemonstrateConfig
 from mavbridge.commands.demonstrate.pilot import Pilot, Variation, draw_variation
-from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.records import Event, Tick

@@ -3,10 +3,10 @@
 from rich.console import Console
 from rich.text import Text
 
+from mavbridge.commands.demonstrate.config import DemonstrateConfig
 from mavbridge.commands.demonstrate.flight import DemonstrationSpec, fly_demonstration
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar
-from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.recording.folder import META

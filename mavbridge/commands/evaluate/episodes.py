@@ -16,8 +16,8 @@ from typing import NamedTuple
 from rich.console import Console
 
 from mavbridge.commands.episode_workers import WorkerProcess, raise_failure
+from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES
-from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.rates import SIM_CAMERA_PX
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock

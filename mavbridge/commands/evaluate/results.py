@@ -9,9 +9,9 @@ from functools import cached_property
 from rich.console import Console
 from rich.text import Text
 
+from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.statistics import Estimate, mean, rate
 from mavbridge.commands.output import make_table
-from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.simulation.referee import EpisodeResult, Outcome
 
 

@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.episode_workers import fly_jobs
+from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.episodes import (
     EpisodeSpec,
     FlownEpisode,
@@ -14,7 +15,6 @@ from mavbridge.commands.evaluate.episodes import (
 )
 from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
 from mavbridge.commands.output import progress_bar, require_outputs
-from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 

@@ -23,10 +23,10 @@ from mavbridge.commands.evaluate_imagination.results import (
     to_json,
 )
 from mavbridge.commands.evaluate_imagination.scores import DriftScorer, WindowScorer
+from mavbridge.commands.imagine.config import EvaluateImaginationConfig
 from mavbridge.commands.imagine.run import SHIPPED, load_model
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.commands.output import progress_bar, table_console
-from mavbridge.config.imagine import EvaluateImaginationConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mavbridge.config.export_policy import ExportPolicyConfig
+from mavbridge.commands.export_policy.config import ExportPolicyConfig
 from mavbridge.core.errors import UserError
 from policy.engines.choose import chunks_of_samples
 from policy.engines.parity import make_parity_samples, parity_failure

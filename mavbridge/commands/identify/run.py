@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 from mavbridge.commands.identify.analysis import identify_pushes
+from mavbridge.commands.identify.config import IdentifyConfig
 from mavbridge.commands.identify.recording import ResponseRecording
 from mavbridge.commands.identify.results import print_identification, to_json
 from mavbridge.commands.output import table_console
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.identify import IdentifyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import PeerError, UserError

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 import policy
+from mavbridge.commands.imagine.config import ImagineConfig
 from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
 from mavbridge.commands.imagine.loop import RolloutPlan, rollout
 from mavbridge.commands.imagine.output import (
@@ -23,7 +24,6 @@ from mavbridge.commands.imagine.sampling import Sampler, torch_threads
 from mavbridge.commands.imagine.start import RealFrames, RolloutStart, read_start
 from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.commands.output import progress_bar
-from mavbridge.config.imagine import ImagineConfig
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals

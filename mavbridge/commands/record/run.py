@@ -14,6 +14,7 @@ from rich.text import Text
 import mavbridge
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.camera.open import NO_CAMERA, check_camera, open_camera
+from mavbridge.commands.record.config import RecordConfig
 from mavbridge.commands.record.control import KEYS, KEYS_HINT, EpisodeControl, Orders, Seen
 from mavbridge.commands.record.disk import LEAST_S, DiskWatch
 from mavbridge.commands.record.episodes import Episodes, prepare_out
@@ -21,7 +22,6 @@ from mavbridge.commands.record.pilot_view import STICKS_FRESH_NS, PilotView
 from mavbridge.commands.record.screen import RecordScreen, Shown
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import Rates
-from mavbridge.config.record import RecordConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import FanOut, ObserverThread

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.serve.answers import AnswerLoop
+from mavbridge.commands.serve.config import ServeConfig
 from mavbridge.commands.serve.server import PolicyServer
-from mavbridge.config.serve import ServeConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.workers import Worker
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy

@@ -6,8 +6,8 @@ import pytest
 
 from helpers.bench_results import RESULT
 from mavbridge.commands.bench import run
+from mavbridge.commands.bench.config import BenchConfig, BenchOutputs
 from mavbridge.commands.bench.results import BenchResult
-from mavbridge.config.bench import BenchConfig, BenchOutputs
 from mavbridge.core.errors import UserError
 
 

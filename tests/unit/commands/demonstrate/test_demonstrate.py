@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mavbridge.commands.demonstrate.config import DemonstrateConfig
 from mavbridge.commands.demonstrate.flight import DemonstrationSpec, fly_demonstration
 from mavbridge.commands.demonstrate.pilot import TurnSchedule, draw_variation
 from mavbridge.commands.demonstrate.run import demonstrate
-from mavbridge.config.demonstrate import DemonstrateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight

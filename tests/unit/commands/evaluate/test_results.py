@@ -7,13 +7,13 @@ from rich.console import Console
 
 from helpers.evaluated_flights import crashed, finished
 from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
+from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.results import (
     Evaluation,
     print_evaluation,
     summarise,
     to_json,
 )
-from mavbridge.config.evaluate import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.simulation.referee import EpisodeResult, StickMeter

@@ -11,10 +11,10 @@ import pytest
 from helpers.evaluated_flights import finished
 from mavbridge.__main__ import main
 from mavbridge.commands.evaluate import run
+from mavbridge.commands.evaluate.config import ConditionsKind, EvaluateConfig
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode, fly_simulated
 from mavbridge.commands.evaluate.run import INTERRUPTED, evaluate
 from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES
-from mavbridge.config.evaluate import ConditionsKind, EvaluateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError
 from mavbridge.flight.policies import is_stateless

@@ -15,8 +15,8 @@ import pytest
 from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
 from helpers.lerobot_rules import broken_rules
 from mavbridge.__main__ import main
+from mavbridge.commands.export.config import ExportConfig
 from mavbridge.commands.export.run import ExportSummary, export, write_dataset
-from mavbridge.config.export import ExportConfig
 from mavbridge.core.errors import MavbridgeError, UserError
 from policy.data.flight_data import FlightData
 from policy.data.flight_folders import read_flight

@@ -10,9 +10,9 @@ import pytest
 
 from helpers.flight_folders import write_meta, write_spot_flight
 from helpers.lerobot_rules import broken_rules
+from mavbridge.commands.export.config import ExportConfig
 from mavbridge.commands.export.rows import stretches
 from mavbridge.commands.export.run import export
-from mavbridge.config.export import ExportConfig
 from mavbridge.core.errors import UserError
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError

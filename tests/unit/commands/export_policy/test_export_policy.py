@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mavbridge.commands.export_policy import run
+from mavbridge.commands.export_policy.config import ExportFormat, ExportPolicyConfig
 from mavbridge.commands.export_policy.run import export_policy
-from mavbridge.config.export_policy import ExportFormat, ExportPolicyConfig
 from mavbridge.core.errors import UserError
 from policy.contract import Contract, FloatArray
 from policy.errors import PolicyError

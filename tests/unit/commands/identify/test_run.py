@@ -1,9 +1,9 @@
 import pytest
 
 from helpers.fakes import FakeClock
+from mavbridge.commands.identify.config import IdentifyConfig
 from mavbridge.commands.identify.run import doublet_flight, doublet_policy
 from mavbridge.config.flight import FlyConfig, LinkConfig
-from mavbridge.config.identify import IdentifyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.flight.policies import configured_contract

@@ -8,8 +8,8 @@ import pytest
 
 from helpers.recordings import make_meta
 from mavbridge.__main__ import main
+from mavbridge.commands.record.config import ListenConfig, RecordConfig
 from mavbridge.commands.record.run import listening_gate, nobody, pilot_flight
-from mavbridge.config.record import ListenConfig, RecordConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.flight.settings import flight_settings
 from mavbridge.recording.meta import write_meta

@@ -3,8 +3,8 @@ from typing import Any
 
 import pytest
 
+from mavbridge.commands.serve.config import ServeConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.serve import ServeConfig
 from policy.errors import MavbridgeError, PolicyError
 from policy.foreign.websocket import kind
 from policy.foreign.websocket.kind import check_server
