@@ -8,7 +8,7 @@ from typing import Generic, Protocol, TypeVar
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.ports import TickSink
-from mavbridge.core.records import Event, Tick
+from mavbridge.core.records import Event, Observed, Solve, Tick
 
 BATCH_PERIOD_S = 0.1
 """Time between batches. The queue is polled: waking a thread from ``emit`` would cost the loop a
@@ -23,8 +23,8 @@ _Item = TypeVar("_Item")
 class Consumer(Protocol):
     """The work of an observer; called by the observer's thread alone."""
 
-    def consume(self, batch: Sequence[Event]) -> None:
-        """Handle events: all ticks in order, then all vision ticks in order.
+    def consume(self, batch: Sequence[Observed]) -> None:
+        """Handle events: all ticks in order, then all solves, then all vision ticks in order.
 
         Raises:
             MavbridgeError, OSError: it cannot continue; no further batch will come.
@@ -65,9 +65,9 @@ class ObserverThread:
     """A ``TickSink`` that passes events in batches to a consumer on its own thread.
 
     Ticks and vision ticks queue separately, so images, which are large and slow to handle, drop
-    first and never push a tick out. Ticks must be emitted by one thread, and the vision ticks of
-    each camera by one. The observer's thread
-    is a daemon: a consumer that hangs cannot keep the process alive.
+    first and never push a tick out. Ticks must be emitted by one thread, solves by one, and the
+    vision ticks of each camera by one. The observer's thread is a daemon: a consumer that hangs
+    cannot keep the process alive.
     """
 
     def __init__(
@@ -81,13 +81,14 @@ class ObserverThread:
     ) -> None:
         """Start the thread, which alone uses the consumer from here on.
 
-        ``capacity`` is the most ticks that may wait, ``image_capacity`` the most vision ticks
-        of each of so many ``cameras``.
+        ``capacity`` is the most ticks that may wait, and the most solves; ``image_capacity`` the
+        most vision ticks of each of so many ``cameras``.
         """
         self._name = name
         self._consumer = consumer
-        self._ticks: BoundedQueue[Event] = BoundedQueue(capacity)
-        self._visions: list[BoundedQueue[Event]] = [
+        self._ticks: BoundedQueue[Observed] = BoundedQueue(capacity)
+        self._solves: BoundedQueue[Observed] = BoundedQueue(capacity)
+        self._visions: list[BoundedQueue[Observed]] = [
             BoundedQueue(image_capacity) for _ in range(cameras)
         ]
         self._closing = threading.Event()
@@ -99,18 +100,23 @@ class ObserverThread:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def emit(self, event: Event) -> None:
+    def emit(self, event: Observed) -> None:
         """Queue the event, or drop and count it; never blocks, never raises."""
-        queue = self._ticks if isinstance(event, Tick) else self._visions[event.camera]
+        queue = self._queue_of(event)
         if self._open:
             queue.put(event)
         else:
             queue.dropped += 1
 
+    def _queue_of(self, event: Observed) -> BoundedQueue[Observed]:
+        if isinstance(event, Tick):
+            return self._ticks
+        return self._solves if isinstance(event, Solve) else self._visions[event.camera]
+
     @property
     def dropped(self) -> int:
         """Events that the consumer never got, or failed on."""
-        queues = (self._ticks, *self._visions)
+        queues = (self._ticks, self._solves, *self._visions)
         dropped = sum(queue.dropped for queue in queues)
         if self._thread.is_alive() and not self._out_of_time.is_set():
             return dropped
@@ -130,7 +136,7 @@ class ObserverThread:
             while not self._out_of_time.is_set():
                 is_last_round = self._closing.wait(BATCH_PERIOD_S)
                 batch = self._ticks.take(BATCH_EVENTS)
-                for queue in self._visions:
+                for queue in (self._solves, *self._visions):
                     batch += queue.take(BATCH_EVENTS)
                 if batch:
                     self._in_flight = len(batch)

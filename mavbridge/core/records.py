@@ -5,7 +5,7 @@ arrival). Arrays are read-only once they are published here.
 """
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,14 @@ class VehicleState:
     """When the oldest of them was measured; None without any."""
 
 
+class Position(NamedTuple):
+    """A place in metres from an origin, in a frame that the name of the value tells."""
+
+    north: float
+    east: float
+    down: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tick:
     """One pass of the action loop, complete enough to explain it afterwards."""
@@ -93,6 +101,8 @@ class Tick:
     """The chunk was too old to be flown as fresh, and was flown for the grace alone."""
     phase: str | None = None
     """State of the gate's engagement: a value of ``gate.engagement.Phase``; None in old records."""
+    position_ned_m: Position | None = None
+    """From the estimator's origin; None where the vehicle tells none, or none that is fresh."""
 
     @property
     def activity(self) -> str:
@@ -132,9 +142,46 @@ class VisionTick:
     """[H, W, 3] uint8, read-only: what the policy saw, before resizing."""
     camera: int = 0
     """Its place among the cameras of the contract; ``serial`` and all others are of this camera."""
+    feature: FloatArray | None = None
+    """What the encoder made of it, read-only: dual rate [1, F], single rate the network's image."""
+    fault: str | None = None
+    """Why it must not be acted on, such as a frozen image."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Solve:
+    """One call of the policy: what it was given, when, and what it returned; it can be repeated."""
+
+    serial: int
+    """That of its chunk, which rises by one."""
+    started_ns: int
+    computed_ns: int
+    is_first: bool
+    """``reset`` was called since the last one: a flight begins."""
+    elapsed_s: float | None
+    """Time since the attitude of the chunk that it may build on; None where there is none."""
+    state: VehicleState
+    """The newest."""
+    states: FloatArray
+    """[1, *contract.state_shape], as the policy got them. Read-only."""
+    history: FloatArray
+    """Sticks sent before, [1, history_len, 4]. Read-only."""
+    frame_ids: tuple[tuple[int, ...], ...]
+    """Images whose features it was given, [T][cameras], oldest first, in the contract's order."""
+    image_ns: int
+    """Exposure of the oldest among the newest images of all cameras."""
+    first_ns: int
+    """When the first action acts."""
+    step_ns: int
+    """Time from one action to the next."""
+    actions: FloatArray
+    """[1, horizon, 4] as the policy returned them, in its own frame, not clipped. Read-only."""
 
 
 Event: TypeAlias = Tick | VisionTick
+"""What the loops report to every observer."""
+Observed: TypeAlias = Event | Solve
+"""What the recorder and the viewer take as well."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -206,6 +206,7 @@ class _Flight:
             sinks=(*self._observers.sinks, *sinks),
             watches_images=looks_at_images(config),
             all_cameras=self._observers.recorders,
+            watch_solve=self._observers.watch_solve,
         )
 
     def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:

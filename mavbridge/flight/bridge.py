@@ -10,7 +10,7 @@ from mavbridge.config.rates import LoopRates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
-from mavbridge.core.records import FloatArray, ImageArray, VehicleState
+from mavbridge.core.records import FloatArray, ImageArray, Solve, VehicleState
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
@@ -64,6 +64,7 @@ def build_bridge(
     sinks: Sequence[TickSink],
     watches_images: bool,
     all_cameras: Sequence[TickSink] = (),
+    watch_solve: Callable[[Solve], object] | None = None,
     delay_vision: Callable[[TickSink], TickSink] | None = None,
 ) -> Bridge:
     """Join a policy, its cameras and the gate.
@@ -77,6 +78,7 @@ def build_bridge(
         sinks: see every tick and every encoded frame of the first camera.
         watches_images: a frozen or a black image is a fault; False where nobody looks at it.
         all_cameras: see the encoded frames of the other cameras, each in the thread of its own.
+        watch_solve: is given every solve, in the thread of the policy; must not block.
         delay_vision: wraps the sink of each vision loop, where encoding takes simulated time.
     """
     contract = executable.contract
@@ -135,6 +137,7 @@ def build_bridge(
         reset=executable.reset,
         send=send,
         settings=settings,
+        watch=watch_solve,
     )
     return Bridge(visions=visions, policy=policy, view=view)
 

@@ -34,6 +34,8 @@ class Observation(NamedTuple):
     """The newest of the first camera."""
     image_ns: int
     """Exposure of the oldest among the newest images of all cameras."""
+    frame_ids: tuple[tuple[int, ...], ...]
+    """Images of the features, [T][cameras], oldest first."""
 
 
 class StateHistory:
@@ -132,6 +134,7 @@ class ObservationSource:
             state=state,
             feature=newest[0],
             image_ns=min(feature.captured_ns for feature in newest),
+            frame_ids=tuple(tuple(feature.frame_id for feature in row) for row in rows),
         )
 
     def _states(self, state: VehicleState, features: Sequence[FeatureFrame]) -> FloatArray:

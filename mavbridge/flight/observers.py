@@ -13,6 +13,7 @@ from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import ObserverThread
 from mavbridge.core.ports import TickSink
+from mavbridge.core.records import Solve
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.gate.wire import GateSummary
 from mavbridge.observe.rerun_flight import RerunView
@@ -67,6 +68,19 @@ class FlightObservers:
     def recorders(self) -> tuple[TickSink, ...]:
         """The recorder, if it is open: it alone takes the images of all cameras."""
         return () if self._recorder is None else (self._recorder,)
+
+    @property
+    def watch_solve(self) -> Callable[[Solve], object] | None:
+        """Where every solve of the policy goes; None where nobody keeps or shows them."""
+        takers = [taker for taker in (self._recorder, self._viewer) if taker is not None]
+        if not takers:
+            return None
+
+        def watch(solve: Solve) -> None:
+            for taker in takers:
+                taker.emit(solve)
+
+        return watch
 
     def open_viewer(self, stack: ExitStack) -> None:
         """Start the viewer or its file, if one is wanted; it is closed with ``stack``."""

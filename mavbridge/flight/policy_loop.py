@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
-from mavbridge.core.records import FloatArray, VehicleState
+from mavbridge.core.records import FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import Release
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.history import SentHistory
@@ -63,6 +63,7 @@ class PolicyLoop:
         reset: Callable[[], None],
         send: Callable[[Chunk | Absence], object],
         settings: PolicySettings,
+        watch: Callable[[Solve], object] | None = None,
     ) -> None:
         self._clock = clock
         self._view = view
@@ -73,6 +74,9 @@ class PolicyLoop:
         self._reset = reset
         self._send = send
         self._settings = settings
+        self._watch = watch
+        self._is_reset = True
+        """``reset`` was called since the last solve."""
         self._frozen = FrozenStateCheck(max_frozen_ns=settings.max_frozen_ns)
         self._serial = 0
         self._flights = 0
@@ -116,6 +120,7 @@ class PolicyLoop:
             self._flights = self._view.flights
             self._chunk_state_ns = None
             self._reset()
+            self._is_reset = True
         has_position = self._view.status.has_position
         state = self._reader.read(self._view.telemetry(), now_ns, has_position=has_position)
         observation = self._observe(state, now_ns) if isinstance(state, VehicleState) else state
@@ -168,19 +173,44 @@ class PolicyLoop:
                 predict_ns=done_ns - now_ns,
             )
         )
-        self._send(
-            Chunk(
-                serial=self._serial,
-                attitude_ns=min(state.attitude_ns, state.rate_ns),
-                velocity_ns=min(
-                    state.velocity_ns,
-                    state.specific_force_ns,
-                    state.velocity_ns if state.extras_ns is None else state.extras_ns,
-                ),
-                image_ns=observation.image_ns,
-                computed_ns=done_ns,
-                first_ns=state.attitude_ns,
-                step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
-                actions=self._settings.action_frame.to_gate(array[0]),
-            )
+        chunk = Chunk(
+            serial=self._serial,
+            attitude_ns=min(state.attitude_ns, state.rate_ns),
+            velocity_ns=min(
+                state.velocity_ns,
+                state.specific_force_ns,
+                state.velocity_ns if state.extras_ns is None else state.extras_ns,
+            ),
+            image_ns=observation.image_ns,
+            computed_ns=done_ns,
+            first_ns=state.attitude_ns,
+            step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
+            actions=self._settings.action_frame.to_gate(array[0]),
         )
+        self._send(chunk)
+        if self._watch is not None:
+            is_first, self._is_reset = self._is_reset, False
+            self._watch(
+                Solve(
+                    serial=chunk.serial,
+                    started_ns=now_ns,
+                    computed_ns=done_ns,
+                    is_first=is_first,
+                    elapsed_s=elapsed_s,
+                    state=state,
+                    states=_kept(observation.states),
+                    history=_kept(history),
+                    frame_ids=observation.frame_ids,
+                    image_ns=chunk.image_ns,
+                    first_ns=chunk.first_ns,
+                    step_ns=chunk.step_ns,
+                    actions=_kept(array),
+                )
+            )
+
+
+def _kept(array: FloatArray) -> FloatArray:
+    """A copy that nobody changes: engines may write their next result into the same memory."""
+    copy = array.copy()
+    copy.setflags(write=False)
+    return copy

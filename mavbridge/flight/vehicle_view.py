@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.ports import TickSink
-from mavbridge.core.records import Tick, VehicleState
+from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness, StateFrame, build_state
@@ -24,6 +24,8 @@ from mavbridge.mavlink.codec.messages import LocalVelocity, Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 
+POSITION_NS = NS_PER_S
+"""Oldest position that a tick tells of; nothing is flown by it."""
 MAX_SOLVES = 256
 """Chunks whose inputs are remembered until the gate reports that it has flown them."""
 
@@ -163,6 +165,8 @@ class VehicleView:
         """The gate's report together with the inputs of the chunk that was flown."""
         solve = None if sent.chunk_serial is None else self._solves.get(sent.chunk_serial)
         state = solve.state if solve else self._state_at(sent.sent_ns)
+        position = self._telemetry.snapshot().position_ned_m
+        is_placed = position is not None and sent.sent_ns - position.arrived_ns <= POSITION_NS
         texts = self.take_texts()
         is_flown = sent.phase is Phase.FLYING
         return Tick(
@@ -189,4 +193,5 @@ class VehicleView:
             is_coasting=sent.is_coasting,
             phase=sent.phase.value,
             chunk_computed_ns=solve.computed_ns if solve else None,
+            position_ned_m=Position(*position.values) if position and is_placed else None,
         )

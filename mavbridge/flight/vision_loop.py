@@ -109,6 +109,8 @@ class VisionLoop:
                 dropped_frames=self._camera.dropped_frames,
                 rgb=frame.rgb,
                 camera=self._number,
+                feature=value,
+                fault=fault,
             )
         )
         self._frames += 1

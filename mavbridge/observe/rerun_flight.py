@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import Event, ImageArray, Tick, VisionTick
+from mavbridge.core.records import ImageArray, Observed, Tick, VisionTick
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, Sticks
 from mavbridge.observe.rerun_target import RerunRecording
 
@@ -160,7 +160,7 @@ class RerunView:
         self._missed_slots = 0
         self._first_dropped: int | None = None
 
-    def consume(self, batch: Sequence[Event]) -> None:
+    def consume(self, batch: Sequence[Observed]) -> None:
         """Send one batch; blocks while the viewer does not keep up."""
         self._open()
         ticks = [event for event in batch if isinstance(event, Tick)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mavbridge.core.observers import ObserverThread
-from mavbridge.core.records import Event, Tick, VisionTick
+from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
@@ -58,7 +58,7 @@ class Recorder:
             cameras=len(writer.cameras),
         )
 
-    def emit(self, event: Event) -> None:
+    def emit(self, event: Observed) -> None:
         """Queue the event, or drop and count it."""
         self._observer.emit(event)
 
@@ -112,7 +112,7 @@ class _FlightConsumer:
         """Frames that were taken from the queue and are not in the video."""
         return max(0, self._seen_frames - self.writer.frames_written)
 
-    def consume(self, batch: Sequence[Event]) -> None:
+    def consume(self, batch: Sequence[Observed]) -> None:
         """Write one batch."""
         seen_frames = self._seen_frames
         try:
@@ -120,7 +120,7 @@ class _FlightConsumer:
                 if isinstance(event, Tick):
                     self.crash_watch.see(event)
                     self.writer.tick(event)
-                else:
+                elif isinstance(event, VisionTick):
                     self._write_frame(event)
         except BaseException:
             self._has_failed = True

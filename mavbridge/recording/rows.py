@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import pyarrow as pa
 
-from mavbridge.core.records import Tick, VehicleState
+from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
 from policy.contract import ACTION_DIM, STATE_DIM
 
@@ -91,10 +91,14 @@ TICKS = pa.schema(
         *_fields(pa.bool_(), "is_slot", "is_coasting"),
         *_fields(pa.int64(), "chunk_serial", "chunk_computed_ns"),
         pa.field("phase", pa.string()),
+        pa.field("position_ned_m", _VECTOR),
     ]
 )
-LATER = frozenset({"is_slot", "is_coasting", "chunk_serial", "chunk_computed_ns", "phase"})
-"""Columns of ticks that the first flights lack: there, every tick was a slot with a new chunk."""
+LATER = frozenset(
+    {"is_slot", "is_coasting", "chunk_serial", "chunk_computed_ns", "phase", "position_ned_m"}
+)
+"""Columns of ticks that older flights lack: in the first ones, every tick was a slot with a new
+chunk."""
 DEMONSTRATION_TICKS = TICKS.append(pa.field("expert", _STICKS))
 
 _FRAME_STAMPS = _fields(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False)
@@ -180,6 +184,8 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
     values |= {name: row[name] for name in LATER if row[name] is not None}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
     values |= {"sent": row["sent"] and make(*row["sent"]), "rc_sticks": _sticks(row["rc_sticks"])}
+    if row["position_ned_m"] is not None:
+        values["position_ned_m"] = Position(*row["position_ned_m"])
     state, trace = None, None
     if row["state"] is not None:
         array = np.array(row["state"], np.float32)
