@@ -1,6 +1,6 @@
 """A picture of what the world model imagines, under what was really seen.
 
-python -m benchmarks.imagined_strip FLIGHT --at 0.5 --out docs/imagined.png
+python -m benchmarks.imagined_strip FLIGHT --at 0.5 --out docs/images/imagined.png
 
 The sticks are those that were flown, and in the last row the same with the yaw stick full right.
 """

@@ -1,6 +1,6 @@
 """A study of what a checkpoint needs: one setting changed at a time, on the same courses.
 
-python -m benchmarks.study --episodes 10 --json docs/study.json --plot docs/study.png
+python -m benchmarks.study --episodes 10 --json docs/study.json --plot docs/images/study.png
 --checkpoint fast.safetensors --without-age fast_without_age.safetensors
 
 Each row is a ``mavbridge evaluate`` of its own. Rows that the JSON holds for the same checkpoints

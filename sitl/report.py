@@ -1,4 +1,4 @@
-"""Measures a flight on the vehicle's side of the wire: docs/flight_report.md is the format."""
+"""Measures a flight on the vehicle's side of the wire, as docs/formats/flight_report.md says."""
 
 import json
 import math

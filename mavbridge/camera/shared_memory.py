@@ -1,4 +1,4 @@
-"""Reads frames from shared memory; docs/shm_camera.md describes the format."""
+"""Reads frames from shared memory; docs/formats/shm_camera.md describes the format."""
 
 import mmap
 import os
@@ -217,7 +217,9 @@ def _slot_type(width: int, height: int) -> np.dtype[np.void]:
 def _checked_size(name: str, header: bytes, file_bytes: int) -> tuple[int, int]:
     """Width and height from the header, checked against the length of the file."""
     if len(header) < HEADER.size or not header.startswith(MAGIC):
-        raise CameraError(f"shm:{name}: not a frame segment (docs/shm_camera.md): wrong magic")
+        raise CameraError(
+            f"shm:{name}: not a frame segment (docs/formats/shm_camera.md): wrong magic"
+        )
     _, width, height, channels, slots = HEADER.unpack(header)
     if (channels, slots) != (CHANNELS, SLOTS):
         raise CameraError(

@@ -21,7 +21,7 @@ class RecordedFlight:
     folder: Path
     meta: FlightMeta
     ticks: Any
-    """``pyarrow.Table`` with the columns of docs/flight_folder.md."""
+    """``pyarrow.Table`` with the columns of docs/formats/flight_folder.md."""
     frames: Any
     """The same, one row an image."""
     video: str = VIDEO

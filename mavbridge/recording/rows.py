@@ -1,7 +1,7 @@
 """Rows of a flight's two tables: as records, as Arrow schemas, and the conversion both ways.
 
-docs/flight_folder.md is the format. A column is named as the attribute that it holds, and a value
-that was not there is null.
+docs/formats/flight_folder.md is the format. A column is named as the attribute that it holds, and
+a value that was not there is null.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -118,7 +118,7 @@ def read_table(stem: Path, schema: pa.Schema, *, later: Collection[str] = ()) ->
     if missing:
         raise TableError(
             f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
-            "of docs/flight_folder.md: another program or version wrote it"
+            "of docs/formats/flight_folder.md: another program or version wrote it"
         )
     return table
 

@@ -1,4 +1,4 @@
-"""Reads the project's flight folders (docs/flight_folder.md)."""
+"""Reads the project's flight folders (docs/formats/flight_folder.md)."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""What the vehicle's own report (docs/flight_report.md) says of a fault at a known moment."""
+"""What the vehicle's report (docs/formats/flight_report.md) says of a fault at a known time."""
 
 import json
 import os

@@ -124,7 +124,7 @@ def test_what_was_not_there_is_null_and_not_zero() -> None:
 def test_the_columns_are_those_of_the_document() -> None:
     from pathlib import Path
 
-    text = (Path(__file__).parents[3] / "docs" / "flight_folder.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "formats" / "flight_folder.md").read_text()
     names = {*DEMONSTRATION_TICKS.names, *DEMONSTRATION_FRAMES.names}
     assert [name for name in names if name not in text] == []
 

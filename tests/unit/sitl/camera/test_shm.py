@@ -1,4 +1,4 @@
-"""The writer against docs/shm_camera.md, read here with struct and nothing of the reader's code."""
+"""The writer against docs/formats/shm_camera.md, read with struct and not with the reader."""
 
 import os
 import struct
