@@ -14,8 +14,6 @@ AUTOPILOT ?= ardupilot
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist loadfile
-# Each chunk goes on from the last one in two steps: ten from noise are too slow for two cores.
-WARM := $(if $(filter toge%,$(POLICY)),--head-steps 2)
 
 .PHONY: fly check test lint bench clean
 
@@ -36,7 +34,7 @@ fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy 
 	@$(BIN)/python -m sitl --autopilot $(AUTOPILOT) --connect udpout:127.0.0.1:$(PORT) \
 		--camera shm:fpv-$(PORT) --course $(COURSE) --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
-	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --dual-rate --policy $(POLICY) $(WARM) \
+	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --policy $(POLICY) \
 		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(FLAGS) \
 		--rerun out/flight.rrd --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \

@@ -28,11 +28,11 @@ SHIPPED = PolicyConfig(dual_rate=True, head_steps=2, engine="openvino")
 LARGE = replace(SHIPPED, policy="toge:small", allow_untrained=True)
 FLIGHTS = (
     (SHIPPED, FLIGHT_PROCESS),
-    (replace(SHIPPED, head_steps=None, engine=EAGER), BASELINE_PROCESS),
+    (replace(SHIPPED, head_steps=0, engine=EAGER), BASELINE_PROCESS),
     (LARGE, FLIGHT_PROCESS),
-    (replace(LARGE, head_steps=None), FLIGHT_PROCESS),
-    (replace(LARGE, head_steps=None, engine=EAGER), FLIGHT_PROCESS),
-    (replace(LARGE, head_steps=None, engine=EAGER), BASELINE_PROCESS),
+    (replace(LARGE, head_steps=0), FLIGHT_PROCESS),
+    (replace(LARGE, head_steps=0, engine=EAGER), FLIGHT_PROCESS),
+    (replace(LARGE, head_steps=0, engine=EAGER), BASELINE_PROCESS),
 )
 app = App(help=__doc__)
 

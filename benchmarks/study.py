@@ -30,7 +30,7 @@ from mavbridge.commands.output import (
 )
 from policy.loading.builtin import SHIPPED
 
-DUAL = "--dual-rate --head-steps 2"
+DUAL, FROM_NOISE = "--dual-rate --head-steps 2", "--dual-rate --head-steps 0"
 DELAYS_MS = (0, 30, 60, 100, 150)
 DELAYED, DELAYED_WITHOUT_AGE = "late images", "late images, age unknown"
 app = App(help=__doc__)
@@ -46,24 +46,24 @@ class Setting(NamedTuple):
 
 SETTINGS = (
     Setting("rates", "30 images, 100 actions a second; 2 of 10 steps", DUAL),
-    Setting("rates", "14 and 32", "--dual-rate --visual-rate 14 --action-rate 32"),
+    Setting("rates", "14 and 32", f"{FROM_NOISE} --visual-rate 14 --action-rate 32"),
     Setting(  # eager torch takes 55 ms longer than 11 ms for an image, at 14 images a second
         "rates",
         "14 and 32, encoding 55 ms longer: eager torch",
-        "--dual-rate --visual-rate 14 --action-rate 32 --max-feature-age 0.5 --vision-delay 55",
+        f"{FROM_NOISE} --visual-rate 14 --action-rate 32 --max-feature-age 0.5 --vision-delay 55",
     ),
     Setting(  # benchmarks.baseline with EfficientNet-B3 on two cores without AVX-512
         "rates",
         "5 and 10, encoding 170 ms longer: baseline",
-        "--dual-rate --visual-rate 5 --action-rate 10 --max-feature-age 1 --vision-delay 170",
+        f"{FROM_NOISE} --visual-rate 5 --action-rate 10 --max-feature-age 1 --vision-delay 170",
     ),
-    Setting("rates", "single rate, 30", "--rate 30"),
+    Setting("rates", "single rate, 30", "--single-rate --rate 30"),
     Setting("rates", "50 actions", f"{DUAL} --action-rate 50"),
     Setting("rates", "250 actions", f"{DUAL} --action-rate 250"),
-    Setting("steps", "10 steps, from noise", "--dual-rate"),
-    Setting("steps", "4 steps, from noise", "--dual-rate --num-diffusion-steps 4"),
-    Setting("steps", "2 steps, from noise", "--dual-rate --num-diffusion-steps 2"),
-    Setting("steps", "1 step, from noise", "--dual-rate --num-diffusion-steps 1"),
+    Setting("steps", "10 steps, from noise", FROM_NOISE),
+    Setting("steps", "4 steps, from noise", f"{FROM_NOISE} --num-diffusion-steps 4"),
+    Setting("steps", "2 steps, from noise", f"{FROM_NOISE} --num-diffusion-steps 2"),
+    Setting("steps", "1 step, from noise", f"{FROM_NOISE} --num-diffusion-steps 1"),
     Setting("steps", "1 of 10 steps, warm start", "--dual-rate --head-steps 1"),
     Setting("smoothing", "no smoothing", f"{DUAL} --tau 0 --max-slew 1000"),
     Setting("vehicle", "other vehicles, firmware, wind, light", f"{DUAL} --conditions random"),

@@ -1,4 +1,4 @@
-"""Entry point: expected errors are one message and status 1; anything else is our bug."""
+"""Entry point: expected errors are one message and their status; anything else is our bug."""
 
 import signal
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except MavbridgeError as error:
         message = f"[bold red]error:[/] {escape(str(error))}"
         console = Console(stderr=True, highlight=False, emoji=False)
-        end_process(1, partial(console.print, message, soft_wrap=True))
+        end_process(error.exit_code, partial(console.print, message, soft_wrap=True))
     end_process(status or 0)
 
 

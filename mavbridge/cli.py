@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 from cyclopts.config import Toml
+from rich.text import Text
 
 import mavbridge
 from mavbridge.commands.bench.config import BenchConfig
@@ -20,6 +21,7 @@ from mavbridge.commands.export.config import ExportConfig
 from mavbridge.commands.export_policy.config import ExportPolicyConfig
 from mavbridge.commands.identify.config import IdentifyConfig
 from mavbridge.commands.imagine.config import EvaluateImaginationConfig, ImagineConfig
+from mavbridge.commands.inspect.config import InspectConfig
 from mavbridge.commands.record.config import RecordConfig
 from mavbridge.commands.serve.config import ServeConfig
 from mavbridge.commands.train.checks import prepare as prepare_training
@@ -33,9 +35,15 @@ from policy.training.settings import TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
 
-mavbridge --connect udp:127.0.0.1:14550 --dual-rate --camera 0 --checkpoint my.safetensors
+mavbridge --connect udp:127.0.0.1:14550 --camera 0 --checkpoint my.safetensors
 
-mavbridge --connect /dev/ttyACM0,921600 --dual-rate --policy my_module:MyPolicy --readonly
+mavbridge --connect /dev/ttyACM0,921600 --policy my_module:MyPolicy --readonly
+"""
+
+EXIT_CODES = """Exit status: 0 done, and a flight flown and ended in order; 1 a bug of mavbridge;
+2 a flag, file or policy that cannot be used; 3 no flight: vehicle, camera or network absent, never
+off the ground, or disarmed under the policy; 4 flown, and ended by a fault; 128 + its number: a
+signal before the flight.
 """
 
 
@@ -44,12 +52,23 @@ def _shown_default(value: object) -> str | None:
     return None if value in (False, "", None) else str(value)
 
 
+def _as_ours(error: CycloptsError) -> Text:
+    """An error of the parser in the form of every other one."""
+    text = str(error)
+    if isinstance(error, UnusedCliTokensError):
+        text = f"unexpected word {' '.join(error.unused_tokens or ())!r}: flags begin with --"
+    return Text.assemble(("error: ", "bold red"), text)
+
+
 cli = App(
     name="mavbridge",
     help=HELP,
+    help_epilogue=EXIT_CODES,
     version=mavbridge.__version__,
     default_parameter=Parameter(show_default=_shown_default),
+    error_formatter=_as_ours,
 )
+cli.meta.error_formatter = _as_ours
 
 
 @cli.command(name="fly")
@@ -85,6 +104,20 @@ def record(config: RecordConfig) -> int:
     from mavbridge.commands.record.run import record as run_recording
 
     return run_recording(config)
+
+
+@cli.command
+def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
+    """Report on a recorded flight, or compare two: rates, delays and their causes, who flew when.
+
+    Args:
+        flights: one or two flight folders, as --record makes them.
+        config: the settings.
+    """
+    require_extra("inspect")
+    from mavbridge.commands.inspect.run import inspect as run_inspection
+
+    return run_inspection(flights, config or InspectConfig())
 
 
 @cli.command

@@ -14,6 +14,9 @@ _OURS = Path(__file__).parent
 class MavbridgeError(Exception):
     """Base of all expected errors; printed without a traceback."""
 
+    exit_code: int = 2
+    """Status with which the process ends; ``mavbridge.core.errors`` says what each means."""
+
 
 class PolicyError(MavbridgeError):
     """A policy, contract, checkpoint or dataset that cannot be used; says what to do."""

@@ -54,16 +54,20 @@ def open_device(device: int | Path, *, image_size: int, clock: Clock) -> Capture
     is_path = isinstance(device, Path)
     capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2) if is_path else cv2.VideoCapture(device)
     if not capture.isOpened():
-        names = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*")))
-        present = "there is no /dev/video* on this machine"
-        if names:
-            present = f"present: {names} (in use, or no permission to open it: group video?)"
-        raise CameraError(f"camera {device} cannot be opened; {present}")
+        raise CameraError(f"camera {device} cannot be opened; {present_devices()}")
     width, height = device_mode(image_size)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
     failure = "has stopped delivering frames: was it unplugged?"
     return CaptureSource(capture, f"camera {device}", failure, clock, has_driver_stamps=True)
+
+
+def present_devices() -> str:
+    """The local cameras of this computer, for a message."""
+    names = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*")))
+    if not names:
+        return "there is no /dev/video* on this machine"
+    return f"present: {names} (in use, or no permission to open it: group video?)"
 
 
 def open_stream(url: str, *, clock: Clock) -> CaptureSource:

@@ -1,19 +1,21 @@
 """Opens the camera that ``--camera`` describes."""
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 from mavbridge.camera.blank import BlankCamera
-from mavbridge.camera.capture import open_device, open_stream
+from mavbridge.camera.capture import open_device, open_stream, present_devices
 from mavbridge.camera.deadlines import LiveCamera, wait_for_first_frame
 from mavbridge.camera.grabber import Grabber
 from mavbridge.camera.latency import LatencyCompensatedCamera
+from mavbridge.camera.pipe import PipeCamera, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, Clock
-from mavbridge.core.errors import UserError
+from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.ports import Camera
 
 STREAM_SCHEMES = ("rtsp://", "udp://", "tcp://", "http://", "https://")
@@ -22,8 +24,8 @@ SCREEN_PACKAGES = ("mss", "Xlib")
 NO_CAMERA = "none"
 FORMS = (
     "a device (0, /dev/video0), a stream (rtsp://, udp://, tcp://, http://, https://), "
-    "a video file, shm:NAME, screen:WINDOW TITLE (screen: alone = the whole screen), or none for "
-    "a policy that looks at no image"
+    "a video file, shm:NAME, screen:WINDOW TITLE (screen: alone = the whole screen), pipe:COMMAND "
+    "(MJPEG from a program), or none for a policy that looks at no image"
 )
 
 
@@ -40,6 +42,9 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
             f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps each "
             "frame with its exposure; mend the stamps there, or leave the flag out"
         )
+    if kind == "pipe":
+        parse_pipe(spec.partition(":")[2])
+        return
     if kind == "screen":
         missing = [name for name in SCREEN_PACKAGES if find_spec(name) is None]
         if missing:
@@ -51,6 +56,17 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
     is_known = kind == "shm" or spec == NO_CAMERA or spec.startswith(STREAM_SCHEMES) or is_device
     if not is_known and not Path(spec).is_file():
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
+
+
+def require_present(spec: str) -> None:
+    """Refuse a local camera that is not plugged in, before anything slow is loaded.
+
+    Raises:
+        CameraError: there is no such device.
+    """
+    device = Path(f"/dev/video{spec}" if spec.isdecimal() else spec)
+    if sys.platform == "linux" and device.match("/dev/video*") and not device.exists():
+        raise CameraError(f"camera {spec} is not there: {present_devices()}")
 
 
 def open_camera(
@@ -104,6 +120,8 @@ def _open(spec: str, *, image_size: int, clock: Clock) -> Camera:
         from mavbridge.camera.screen import ScreenCamera
 
         return ScreenCamera(rest, clock=clock)
+    if kind == "pipe":
+        return PipeCamera(parse_pipe(rest), clock=clock)
     if spec.startswith(STREAM_SCHEMES):
         return Grabber(partial(open_stream, spec, clock=clock), clock=clock)
     if spec.isdecimal() or spec.startswith("/dev/video"):

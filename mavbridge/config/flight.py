@@ -21,6 +21,7 @@ from mavbridge.config.groups import (
 )
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
+from mavbridge.core.address import parse_forward
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import OnFault, Risk
 
@@ -137,7 +138,8 @@ class LinkConfig:
     """The vehicle and how to reach it."""
 
     connect: Annotated[str, Parameter(show_default=False)] = ""
-    """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD."""
+    """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD; or as
+    MAVSDK writes it: udpin://0.0.0.0:14540, serial:///dev/ttyACM0:921600."""
     source_system: Annotated[int, Parameter(group=RARE)] = 255
     """Our MAVLink system id; ArduPilot obeys overrides from its MAV_GCS_SYSID (255) only."""
     target_system: Annotated[int, Parameter(group=RARE)] = 0
@@ -172,11 +174,8 @@ class LinkConfig:
             raise UserError("--readonly sets no parameter: leave out --set and --restore-params")
         if self.gcs_sticks_win and not self.forward:
             raise UserError("--gcs-sticks-win needs --forward, the ground station that it is about")
-        if self.forward and not re.fullmatch(r"udp(in|out)?:[^:]+:\d{1,5}", self.forward):
-            raise UserError(
-                f"--forward {self.forward!r} is not understood; use udp:HOST:PORT to send to a "
-                "ground station, or udpin:HOST:PORT to listen for one"
-            )
+        if self.forward:
+            parse_forward(self.forward)
         check_range("source-system", self.source_system, 1, 255, "")
         check_range("target-system", self.target_system, 0, 254, "")
         check_range("connect-timeout", self.connect_timeout, 0.1, 3600, "s")
@@ -209,8 +208,9 @@ class CameraConfig:
 
     camera: Annotated[tuple[str, ...], Parameter(negative="", show_default=" ".join)] = ("0",)
     """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
-    screen:WINDOW TITLE, or none for a policy that looks at no image. For a policy with several
-    cameras give each by its name in the contract: --camera front=0 --camera down=/dev/video2."""
+    screen:WINDOW TITLE, pipe:COMMAND (MJPEG from a program) or pipe:640x480:rgb24:COMMAND (raw), or
+    none for a policy that looks at no image. For a policy with several cameras give each by its
+    name in the contract: --camera front=0 --camera down=/dev/video2."""
     window_name: Annotated[str | None, Parameter(group=RARE)] = None
     """Same as --camera "screen:WINDOW TITLE"."""
     camera_timeout: Annotated[float, Parameter(group=RARE)] = 10.0
@@ -302,6 +302,12 @@ class FlyConfig:
     """Seconds to fly, from the first action of the policy; by default until Ctrl-C."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
     """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
+    serve: Annotated[str, Parameter(group=OUTPUT, show_default=False)] = ""
+    """HOST:PORT of a page with the live flight, for a browser: 127.0.0.1:9090 for one on this
+    computer. The next port carries the data."""
+    gates: Annotated[Path | None, Parameter(group=OUTPUT)] = None
+    """JSON of the gates that the Rerun viewer shows along the path, as ``python -m sitl course
+    --json`` prints it."""
     record: Annotated[Path | None, Parameter(group=OUTPUT)] = None
     """Record the flight into this folder, new or empty: camera, ticks, raw MAVLink; needs the extra
     "record"."""

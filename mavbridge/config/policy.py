@@ -9,6 +9,8 @@ from cyclopts import Parameter
 from mavbridge.config.checks import check_range
 from mavbridge.config.groups import POLICY, RARE
 
+WARM_STEPS = 2
+"""Of toge, as it ships: ten steps from noise for each chunk are too slow for two cores."""
 Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 
 
@@ -29,13 +31,17 @@ class PolicyConfig:
     contract: Path | None = None
     """TOML file that says what the files of a policy trained elsewhere do not: rate, names, units,
     camera; mavbridge contract writes a first draft."""
-    dual_rate: bool = False
-    """Encode images in their own thread and sample actions faster from the cached feature."""
+    dual_rate: Annotated[
+        bool | None, Parameter(negative=("--no-dual-rate", "--single-rate"), show_default=False)
+    ] = None
+    """Encode images in their own thread and sample actions faster from the cached feature; by
+    default wherever the policy can (encode_visual and predict_fast)."""
     num_diffusion_steps: int = 10
     """DDIM steps of the action head."""
     head_steps: int | None = None
-    """Warm start (dual rate, toge): DDIM steps from the last chunk, shifted to now, in place of all
-    steps from noise."""
+    """Warm start at two rates: DDIM steps from the last chunk, shifted to now, in place of all
+    steps from noise; by default 2 for toge, and none for other policies; 0 = every solve from
+    noise."""
     allow_untrained: Annotated[bool, Parameter(group=RARE)] = False
     """Fly TOGE with random weights: for timing and bring-up only."""
     image_size: Annotated[int | None, Parameter(group=RARE)] = None
@@ -55,7 +61,25 @@ class PolicyConfig:
         """Refuse what the scheduler and encoders cannot serve."""
         check_range("num-diffusion-steps", self.num_diffusion_steps, 1, 100, "steps")
         if self.head_steps is not None:
-            check_range("head-steps", self.head_steps, 1, self.num_diffusion_steps, "steps")
+            check_range("head-steps", self.head_steps, 0, self.num_diffusion_steps, "steps")
         if self.image_size is not None:
             check_range("image-size", self.image_size, 32, 1024, "pixels")
         check_range("seed", self.seed, 0, 2**63 - 1, "")
+
+    @property
+    def kind(self) -> str:
+        """The first word of ``policy``: toge, scripted, onnx..."""
+        return self.policy.partition(":")[0]
+
+    @property
+    def may_be_dual(self) -> bool:
+        """Whether it may fly at two rates, as far as that is known before it is loaded."""
+        return self.dual_rate is not False and self.kind != "resnet-unet"
+
+    @property
+    def warm_steps(self) -> int | None:
+        """DDIM steps of a warm start; None: every solve starts from noise."""
+        if self.head_steps is not None:
+            return self.head_steps or None
+        is_warm = self.may_be_dual and self.kind == "toge"
+        return WARM_STEPS if is_warm and self.num_diffusion_steps > WARM_STEPS else None

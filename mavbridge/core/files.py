@@ -1,5 +1,7 @@
 """Files that a command will write at its end, checked at its start."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mavbridge.core.errors import UserError
@@ -23,3 +25,19 @@ def require_writable(path: Path | None, flag: str) -> None:
             f"cannot write {flag} {path}: {error.strerror}; name a file in a folder that you may "
             "write to"
         ) from error
+
+
+@contextmanager
+def empty_folders_removed(*folders: Path | None) -> Iterator[None]:
+    """Remove at the end of the block what was made in it of these folders, and of those above them.
+
+    Only where they are empty: a start that failed leaves nothing behind.
+    """
+    wanted = {each for folder in folders if folder for each in (folder, *folder.parents)}
+    missing = [folder for folder in wanted if not folder.exists()]
+    try:
+        yield
+    finally:
+        for folder in sorted(missing, key=lambda each: len(each.parts), reverse=True):
+            with suppress(OSError):
+                folder.rmdir()

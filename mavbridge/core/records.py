@@ -103,6 +103,9 @@ class Tick:
     """State of the gate's engagement: a value of ``gate.engagement.Phase``; None in old records."""
     position_ned_m: Position | None = None
     """From the estimator's origin; None where the vehicle tells none, or none that is fresh."""
+    decided_ns: int | None = None
+    """The moment that the sticks were decided for: the slot, or when a chunk was seen between two
+    slots. None in old records."""
 
     @property
     def activity(self) -> str:

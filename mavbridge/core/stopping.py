@@ -34,6 +34,8 @@ class StopRequest:
         self._clock = MonotonicClock() if clock is None else clock
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._newest_ns: int | None = None
+        self.signal_number: int | None = None
+        """The first signal that requested it."""
         self.requests = 0
         """Times it was set; signals within ``ONE_REQUEST_NS`` of one another count once."""
 
@@ -66,7 +68,8 @@ def stop_on_signals() -> Iterator[StopRequest]:
     """Let SIGINT, SIGTERM and SIGHUP request the stop; restores the old handlers afterwards."""
     stop = StopRequest()
 
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
+    def on_signal(number: int, _frame: FrameType | None) -> None:
+        stop.signal_number = stop.signal_number or number
         stop.set()
 
     # SIGHUP: the terminal, or the connection to this computer, is gone.

@@ -3,11 +3,13 @@
 import threading
 from collections.abc import Callable
 
-from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.errors import ExitCode, MavbridgeError
 
 
 class HungError(MavbridgeError):
     """A thread that did not stop when it was told to."""
+
+    exit_code = ExitCode.FAULT
 
 
 class Worker:

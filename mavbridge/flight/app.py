@@ -4,18 +4,20 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.camera.open import check_camera, open_camera
+from mavbridge.camera.open import check_camera, open_camera, require_present
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, wall_offset_ns
-from mavbridge.core.errors import PeerError
-from mavbridge.core.files import require_writable
+from mavbridge.core.course import read_gates
+from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError
+from mavbridge.core.files import empty_folders_removed, require_writable
 from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.realtime import (
     prepare_to_die_first,
@@ -29,6 +31,7 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.observers import FlightObservers
+from mavbridge.flight.outcome import flight_verdict
 from mavbridge.flight.policies import (
     check_configured_policy,
     load_configured_policy,
@@ -41,6 +44,8 @@ from mavbridge.gate.engagement import Phase
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console
+from mavbridge.observe.rerun_server import serve_address
+from mavbridge.observe.rerun_target import check_target
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 from policy.contract import Contract
@@ -73,19 +78,25 @@ def fly(config: FlyConfig) -> int:
         MavbridgeError: anything that the user, the vehicle or the policy got wrong.
     """
     clock = MonotonicClock()
-    check_flight(config, clock)
     console = flight_console()
+    report_folder = config.report.parent if config.report else None
+    viewer_folder = Path(config.rerun).parent if config.rerun.endswith(".rrd") else None
     # The policy is closed last: whatever its close does, the gate has ended before.
-    with ExitStack() as policy_life, ExitStack() as stack:
+    with (
+        empty_folders_removed(config.record, report_folder, viewer_folder),
+        ExitStack() as policy_life,
+        ExitStack() as stack,
+    ):
+        check_flight(config, clock)
         gate = start_gate(config, clock, stack)  # finds the vehicle while the weights load
+        gate.process.wait_until_open()
         loaded = load_configured_policy(
             config.policy, clock, starts_in_air=config.takeoff is not None
         )
         policy_life.enter_context(loaded)
         for note in (*loaded.notes, *require_speed(config, loaded)):
             console.print(Text(note, style="yellow"))
-        fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
-    return 0
+        return fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
 
 
 def check_flight(config: FlyConfig, clock: Clock) -> None:
@@ -99,8 +110,15 @@ def check_flight(config: FlyConfig, clock: Clock) -> None:
         check_camera(source, latency_ms=config.camera.camera_latency)
     check_configured_policy(config.policy)
     require_writable(config.report, "--report")
+    if config.serve:
+        serve_address(config.serve)
+    if config.gates is not None:
+        read_gates(config.gates)
     if config.record is not None:
         prepare_folder(config.record)
+    check_target(config.rerun)
+    for source in config.camera.sources:
+        require_present(source)
 
 
 def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate:
@@ -113,7 +131,7 @@ def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate
         tlog_fd = tlog_pipe.writer.fileno()
     settings = gate_settings(
         config,
-        is_dual=config.policy.dual_rate,
+        is_dual=config.policy.may_be_dual,
         tlog_fd=tlog_fd,
         wall_offset_ns=wall_offset_ns(clock),
     )
@@ -132,8 +150,11 @@ def fly_executable(
     console: Console,
     sinks: tuple[TickSink, ...] = (),
     gate: StartedGate | None = None,
-) -> None:
-    """Run one flight of a policy that is loaded already; ``sinks`` see every tick."""
+) -> int:
+    """Run one flight of a policy that is loaded already; returns the exit status.
+
+    ``sinks`` see every tick. Errors that end a flight of the policy have the status of a fault.
+    """
     # OpenCV would print its own complaint about a camera before, and instead of, ours.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)  # both loops may share two cores: no pool of threads under either
@@ -148,6 +169,11 @@ def fly_executable(
             stop = stack.enter_context(stop_on_signals())
             gate.process.send(settings)
             flight.run(stop)
+        return flight.verdict(stop)
+    except MavbridgeError as error:
+        if flight is not None and flight.has_flown:
+            error.exit_code = ExitCode.FAULT
+        raise
     finally:
         if flight is not None:
             flight.finish()
@@ -182,7 +208,6 @@ class _Flight:
         self._looked_ns = self._resumed_ns = clock.now_ns()
         self._observers = FlightObservers(config, executable, clock=clock, console=console)
         stack.callback(self._observers.close_recorder)  # after the gate: it records the release
-        self._observers.open_viewer(stack)
         contract = executable.contract
         self._cameras = contract.cameras
         past_ns = observation_ages_ns(contract)[0]
@@ -194,6 +219,7 @@ class _Flight:
             )
             for source in config.camera.sources_of(contract.cameras)
         ]
+        self._observers.open_viewer(stack)
         self._observers.open_recorder(
             gate.tlog_pipe, self._gate, lambda: self._bridge.view.status.autopilot
         )
@@ -207,6 +233,7 @@ class _Flight:
             watches_images=looks_at_images(config),
             all_cameras=self._observers.recorders,
             watch_solve=self._observers.watch_solve,
+            watch_packets=self._observers.watch_packets,
         )
 
     def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:
@@ -273,6 +300,23 @@ class _Flight:
             run(stop)
 
         return run_settled
+
+    @property
+    def has_flown(self) -> bool:
+        """The policy has had the sticks."""
+        return bool(self._bridge.view.flights)
+
+    def verdict(self, stop: StopRequest) -> int:
+        """Judge the flight, which has ended; tells the user why it is no success."""
+        exit_code, text = flight_verdict(
+            self._gate.summary,
+            stop,
+            reason=self._bridge.view.reason,
+            readonly=self._config.link.readonly,
+        )
+        if text is not None:
+            self._observers.screen.show_message(text)
+        return exit_code
 
     def _fault(self, visions: Sequence[Worker], policy: Worker) -> str | None:
         """Why no more chunks will come, or None."""

@@ -11,6 +11,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.records import FloatArray, ImageArray, Solve, VehicleState
+from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
@@ -65,6 +66,7 @@ def build_bridge(
     watches_images: bool,
     all_cameras: Sequence[TickSink] = (),
     watch_solve: Callable[[Solve], object] | None = None,
+    watch_packets: Callable[[tuple[ForwardedPacket, ...]], object] = lambda packets: None,
     delay_vision: Callable[[TickSink], TickSink] | None = None,
 ) -> Bridge:
     """Join a policy, its cameras and the gate.
@@ -79,6 +81,7 @@ def build_bridge(
         watches_images: a frozen or a black image is a fault; False where nobody looks at it.
         all_cameras: see the encoded frames of the other cameras, each in the thread of its own.
         watch_solve: is given every solve, in the thread of the policy; must not block.
+        watch_packets: is given every packet of the vehicle that arrives; must not block.
         delay_vision: wraps the sink of each vision loop, where encoding takes simulated time.
     """
     contract = executable.contract
@@ -109,6 +112,7 @@ def build_bridge(
         state_frame=contract.state_frame,
         freshness=freshness,
         on_attitude=remember,
+        watch_packets=watch_packets,
     )
     vision_sinks: list[TickSink] = [
         FanOut([*own, *(all_cameras if number else sinks)]) for number, own in enumerate(adaptive)

@@ -6,21 +6,33 @@ import subprocess
 import sys
 import threading
 
-from mavbridge.core.errors import MavbridgeError, PeerError, UserError
+from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import child_environment
 from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.gate.channel import SocketPort, channel_pair
 from mavbridge.gate.settings import GateSettings
-from mavbridge.gate.wire import GateError, GateSummary, ToGate, decode_from_gate, encode_to_gate
+from mavbridge.gate.wire import (
+    FromGate,
+    GateError,
+    GateSummary,
+    ToGate,
+    decode_from_gate,
+    encode_to_gate,
+)
 
 LISTEN_S = 0.1
 """Longest wait for a message before the stop flag is checked."""
+OPEN_S = 20.0
+"""Longest wait for a gate to start and to open the link: it imports little, and TCP is given three
+seconds, but the machine may be busy."""
 CLOSE_S = 1.0
 """Longest wait for a gate that holds no sticks to end and free its port."""
 
 
 class GateDiedError(MavbridgeError):
     """The gate process is gone without having ended in order."""
+
+    exit_code = ExitCode.FAULT
 
 
 class GateProcess:
@@ -33,6 +45,8 @@ class GateProcess:
         self._lock = threading.Lock()
         self._process = _spawn(theirs, settings)
         theirs.close()
+        self._early: list[FromGate] = []
+        """Messages that came before ``listen``."""
         self.summary: GateSummary | None = None
         """The gate's last words; None until it has ended in order."""
         self.error: MavbridgeError | None = None
@@ -49,6 +63,22 @@ class GateProcess:
         with self._lock:
             return self._port.send(encode_to_gate(message))
 
+    def wait_until_open(self, timeout_s: float = OPEN_S) -> None:
+        """Wait for its first word, which says that the link is open; called before ``listen``.
+
+        Raises:
+            PeerError, UserError: the address of the vehicle, or of --forward, cannot be used.
+            GateDiedError: it has ended at once, or says nothing in time.
+        """
+        if not select.select([self._port], [], [], timeout_s)[0]:
+            raise GateDiedError(f"the gate process has said nothing for {timeout_s:g} s")
+        self._early = [decode_from_gate(data) for data in self._port.receive()]
+        for message in self._early:
+            if isinstance(message, GateError):
+                raise _as_exception(message)
+        if not self._early and self._port.is_closed:
+            raise GateDiedError("the gate process has ended before it opened the link")
+
     def listen(self, stop: threading.Event, view: VehicleView) -> None:
         """Pass the gate's messages to ``view`` until it ends or ``stop`` is set.
 
@@ -56,17 +86,13 @@ class GateProcess:
             GateDiedError: the gate has ended without its summary.
             PeerError, UserError: the reason that the gate gave.
         """
+        early, self._early = self._early, []
+        for message in early:
+            self._take(message, view)
         while not stop.is_set():
             select.select([self._port], [], [], LISTEN_S)
             for data in self._port.receive():
-                message = decode_from_gate(data)
-                match message:
-                    case GateSummary():
-                        self.summary = message
-                    case GateError():
-                        self.error = _as_exception(message)
-                    case _:
-                        view.receive(message)
+                self._take(decode_from_gate(data), view)
             if self._port.is_closed:
                 break
         if self.error is not None:
@@ -79,6 +105,15 @@ class GateProcess:
             )
         if self.summary is not None and self.summary.failure is not None:
             raise PeerError(self.summary.failure)
+
+    def _take(self, message: FromGate, view: VehicleView) -> None:
+        match message:
+            case GateSummary():
+                self.summary = message
+            case GateError():
+                self.error = _as_exception(message)
+            case _:
+                view.receive(message)
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for the process to end by itself; returns whether it has."""

@@ -1,8 +1,10 @@
 """The observers of one flight: timing, terminal, Rerun viewer and recorder."""
 
+import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -10,13 +12,18 @@ from rich.console import Console
 import mavbridge
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
+from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import ObserverThread
 from mavbridge.core.ports import TickSink
 from mavbridge.core.records import Solve
+from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.settings import effective_freshness
 from mavbridge.gate.wire import GateSummary
 from mavbridge.observe.rerun_flight import RerunView
+from mavbridge.observe.rerun_layout import ViewedFlight
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
 from mavbridge.recording.tlog import TlogPipe
@@ -66,8 +73,8 @@ class FlightObservers:
 
     @property
     def recorders(self) -> tuple[TickSink, ...]:
-        """The recorder, if it is open: it alone takes the images of all cameras."""
-        return () if self._recorder is None else (self._recorder,)
+        """The observers that take the images of all cameras."""
+        return tuple(sink for sink in (self._recorder, self._viewer) if sink is not None)
 
     @property
     def watch_solve(self) -> Callable[[Solve], object] | None:
@@ -82,16 +89,35 @@ class FlightObservers:
 
         return watch
 
+    def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
+        """Keep when packets of the vehicle came and what they tell of, if there is a recording."""
+        if self._recorder is not None:
+            self._recorder.watch_packets(packets)
+
     def open_viewer(self, stack: ExitStack) -> None:
         """Start the viewer or its file, if one is wanted; it is closed with ``stack``."""
-        if self._config.rerun == "off":
+        if self._config.rerun == "off" and not self._config.serve:
             return
-        view = RerunView(
-            self._config.rerun,
-            vision_hz=self._loops.max_vision_hz,
-            action=self._executable.contract.action,
+        config, contract = self._config, self._executable.contract
+        freshness = effective_freshness(contract, config.limits).while_played(
+            round(contract.play_s * NS_PER_S)
         )
-        self._viewer = ObserverThread("mavbridge-rerun", view, capacity=RERUN_CAPACITY)
+        flight = ViewedFlight(
+            vision_hz=self._loops.max_vision_hz,
+            chunk_hz=self._loops.action_hz,
+            stick_hz=config.rates.stick_rate,
+            contract=contract,
+            max_state_age_s=freshness.state_ns / NS_PER_S,
+            max_feature_age_s=freshness.feature_ns / NS_PER_S,
+            to_ned=action_frame(contract).to_gate,
+            gates=() if config.gates is None else read_gates(config.gates),
+        )
+        view = RerunView(config.rerun, flight, serve=config.serve)
+        if view.url is not None:
+            self.screen.show_message(f"watch this flight in a browser: {view.url}")
+        self._viewer = ObserverThread(
+            "mavbridge-rerun", view, capacity=RERUN_CAPACITY, cameras=len(contract.cameras)
+        )
         stack.callback(self._viewer.close, VIEWER_JOIN_S)
 
     def open_recorder(
@@ -102,6 +128,7 @@ class FlightObservers:
             return
         from mavbridge.recording.meta import FlightMeta
         from mavbridge.recording.recorder import Recorder
+        from mavbridge.recording.settings import ReplaySettings
 
         start_ns, offset_ns = self._clock.now_ns(), self._wall_offset_ns
         meta = FlightMeta(
@@ -125,6 +152,7 @@ class FlightObservers:
                 packets_dropped=lambda: gate.summary.dropped_packets if gate.summary else 0,
                 autopilot=autopilot,
                 report=self.screen.show_message,
+                settings=ReplaySettings(config=self._config, wall_offset_ns=offset_ns),
             )
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error
@@ -135,10 +163,22 @@ class FlightObservers:
             self._recorder.close(RECORDER_JOIN_S)
 
     def finish(self, summary: GateSummary | None, autopilot: str | None) -> None:
-        """Show the report, and write it where --report names a file, if a vehicle was found."""
+        """Show the report, and write it where --report names a file, if a vehicle was found.
+
+        Without one nothing is kept of the flight.
+        """
         if autopilot is not None:
             self._report(summary, autopilot)
+        else:
+            self._discard()
         self.screen.close(SCREEN_CLOSE_S)
+
+    def _discard(self) -> None:
+        """Remove the files of a flight that found no vehicle; both are closed."""
+        if self._recorder is not None and self._config.record is not None:
+            shutil.rmtree(self._config.record, ignore_errors=True)
+        if self._viewer is not None and self._config.rerun.endswith(".rrd"):
+            Path(self._config.rerun).unlink(missing_ok=True)
 
     def _report(self, summary: GateSummary | None, autopilot: str) -> None:
         viewer, recorder = self._viewer, self._recorder

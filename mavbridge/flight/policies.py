@@ -50,9 +50,9 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
         device=wanted.device,
         vision_device=wanted.vision_device,
         action_device=wanted.action_device,
-        dual_rate=wanted.dual_rate,
+        dual_rate=wanted.dual_rate is not False,
         num_diffusion_steps=wanted.num_diffusion_steps,
-        head_steps=wanted.head_steps,
+        head_steps=wanted.warm_steps,
         image_size=wanted.image_size,
         seed=wanted.seed,
     )
@@ -60,7 +60,7 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
 
 def is_scripted(policy: PolicyConfig) -> bool:
     """Return whether the policy flies by no image."""
-    return policy.policy.partition(":")[0] == "scripted"
+    return policy.kind == "scripted"
 
 
 def looks_at_images(config: FlyConfig) -> bool:
@@ -74,7 +74,7 @@ def looks_at_images(config: FlyConfig) -> bool:
 
 def is_stateless(policy: PolicyConfig) -> bool:
     """Return whether the policy keeps nothing between flights: nets that are loaded by us."""
-    return policy.policy.partition(":")[0] in STATELESS
+    return policy.kind in STATELESS
 
 
 @lru_cache(maxsize=1)

@@ -51,6 +51,10 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
     action_hz, image_hz = loops.action_hz, min((loops.max_vision_hz, *contract.camera_rates_hz))
     flag = "--action-rate" if is_dual else "--rate"
     notes = []
+    if is_dual and rates.rate is not None and rates.action_rate is None:
+        notes.append(f"warning: --rate {rates.rate:g} is of a single rate: add --single-rate")
+    if not is_dual and rates.action_rate is not None and rates.rate is None:
+        notes.append(f"warning: --action-rate {rates.action_rate:g} is of two rates: give --rate")
     if contract.play_s and (rates.action_rate if is_dual else rates.rate) is None:
         notes.append(
             f"{action_hz:.3g} chunks a second, since this policy is meant to play each one for "

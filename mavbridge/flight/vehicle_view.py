@@ -55,6 +55,7 @@ class VehicleView:
         state_frame: StateFrame,
         freshness: Freshness,
         on_attitude: Callable[[], object] = lambda: None,
+        watch_packets: Callable[[tuple[ForwardedPacket, ...]], object] = lambda packets: None,
     ) -> None:
         """Start without a vehicle.
 
@@ -64,12 +65,14 @@ class VehicleView:
             state_frame: frame of the states in ticks in which the policy does not fly.
             freshness: oldest readings that such a state may have.
             on_attitude: called for each new attitude, in the thread of ``receive``.
+            watch_packets: is given the packets afterwards, in the same thread; must not block.
         """
         self._history = history
         self._sink = sink
         self._state_frame = state_frame
         self._freshness = freshness
         self._on_attitude = on_attitude
+        self._watch_packets = watch_packets
         self._codec = Codec(source_system=0, source_component=0)
         self._telemetry = TelemetryCollector()
         self._solves: OrderedDict[int, SolveInputs] = OrderedDict()
@@ -146,6 +149,7 @@ class VehicleView:
             self._on_attitude()
             with self._news:
                 self._news.notify_all()
+        self._watch_packets(packets)
 
     def _receive_tick(self, tick: GateTick) -> None:
         if tick.phase is Phase.FLYING and self.phase is not Phase.FLYING:
@@ -174,6 +178,7 @@ class VehicleView:
             index=sent.index,
             due_ns=sent.due_ns,
             woke_ns=sent.woke_ns,
+            decided_ns=sent.decided_ns,
             missed_slots=sent.missed_slots,
             predict_ns=solve.predict_ns if solve else None,
             sent_ns=sent.sent_ns,

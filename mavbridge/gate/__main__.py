@@ -96,6 +96,8 @@ def _run(settings: GateSettings, port: SocketPort, received: list[bytes]) -> Non
         autopilot=link.autopilot,
         link=link.stats(),
         failure=loop.failure,
+        outcome=loop.outcome,
+        params=dict(link.known_params),
         dropped_messages=port.dropped,
         dropped_packets=log.dropped if log else 0,
         ground_station=station.summary() if station else None,

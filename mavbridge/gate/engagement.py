@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.gate.departure import Departure, DepartureSettings, Ending
 from mavbridge.gate.facts import Facts, Hand, Move
+from mavbridge.gate.outcome import Outcome
 from mavbridge.gate.preparation import Preparation, PreparationSettings
 
 PREPARE_TIMEOUT_NS = 90 * NS_PER_S
@@ -107,6 +108,7 @@ class Engagement:
         """Why there was no flight: the vehicle did not take the mode or arm in time."""
         self.engaged_ns: int | None = None
         """First moment of flight."""
+        self.outcome = Outcome()
 
     def stop(self, ending: Ending) -> None:
         """End: give the sticks back as ``ending`` says, and then be ``ENDED``."""
@@ -252,6 +254,7 @@ class Engagement:
     def _take_off(self, facts: Facts) -> Move:
         """The policy takes the sticks."""
         self.phase = Phase.FLYING
+        self.outcome = self.outcome._replace(flights=self.outcome.flights + 1, is_disarmed=False)
         self.reason = ""
         self._own_mode = facts.mode
         self._seen_interruption = facts.interruption
@@ -260,10 +263,12 @@ class Engagement:
         return Move(hand=Hand.POLICY)
 
     def _fly(self, facts: Facts, act: Act | None) -> Move:
+        if facts.is_landed is not None and not self.outcome.has_left_ground:
+            self.outcome = self.outcome._replace(has_left_ground=not facts.is_landed)
         if (taken := self._takeover(facts)) is not None:
             return self._yield(facts, taken)
-        if self._stop_reason is not None:
-            return self._depart(facts, self._stop_reason)
+        if (stop := self._stop_reason) is not None:
+            return self._fail(facts, stop) if stop.is_fault else self._depart(facts, stop)
         if act == "release":
             return self._depart(facts, Ending(reason=OPERATOR))
         if self._is_over(facts):
@@ -274,8 +279,12 @@ class Engagement:
             return self._depart(facts, Ending(reason=facts.landing))
         fault = facts.link_problem or facts.chunk_fault or facts.envelope_problem
         if fault is not None:
-            return self._depart(facts, Ending(reason=fault, is_fault=True))
+            return self._fail(facts, Ending(reason=fault, is_fault=True))
         return Move(hand=Hand.POLICY)
+
+    def _fail(self, facts: Facts, ending: Ending) -> Move:
+        self.outcome = self.outcome._replace(faults=self.outcome.faults + 1)
+        return self._depart(facts, ending)
 
     def _is_over(self, facts: Facts) -> bool:
         duration_ns = self._settings.duration_ns
@@ -315,6 +324,8 @@ class Engagement:
 
         There silence would be the policy's last lean or body rate for one to three seconds.
         """
+        if not facts.armed and self.phase is Phase.FLYING:
+            self.outcome = self.outcome._replace(is_disarmed=True)
         if not self._follows_us(facts):
             return self._give_back(facts, reason)
         self._seen_interruption = facts.interruption

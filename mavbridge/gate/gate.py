@@ -25,6 +25,7 @@ from mavbridge.gate.envelope import Envelope, EnvelopeInput, EnvelopeLimits
 from mavbridge.gate.facts import Facts, Hand, Move
 from mavbridge.gate.grid import Slot, StickGrid
 from mavbridge.gate.limits import first_action, idle_action, neutral_action
+from mavbridge.gate.outcome import Outcome
 from mavbridge.gate.smoothing import ActionSmoother, Smoothing
 
 PILOT_FRESH_NS = 500 * NS_PER_MS
@@ -121,6 +122,11 @@ class Gate:
     def failure(self) -> str | None:
         """Why there was no flight, or None."""
         return self._engagement.failure
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the flights went so far."""
+        return self._engagement.outcome
 
     @property
     def last_setpoint(self) -> Action | None:

@@ -21,6 +21,7 @@ from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Phase
 from mavbridge.gate.gate import FlightSettings, Gate, GateInput, GateOutput
+from mavbridge.gate.outcome import Outcome
 from mavbridge.gate.wire import (
     Absence,
     GateMessage,
@@ -132,6 +133,11 @@ class GateLoop:
         """Why there was no flight, or None."""
         return None if self._gate is None else self._gate.failure
 
+    @property
+    def outcome(self) -> Outcome:
+        """How the flights went."""
+        return Outcome() if self._gate is None else self._gate.outcome
+
     def forward(self, packet: ForwardedPacket) -> None:
         """Take a packet of the vehicle for the flight process; the link calls it in ``poll``."""
         self._packets.append(packet)
@@ -183,7 +189,7 @@ class GateLoop:
             self._clock.sleep_until_ns(at_ns)
         sent = None if output.decision is None else self._link.send(output.decision)
         if output.slot is not None or output.decision is not None or output.phase != self._phase:
-            self._report_tick(output, woke_ns, sent)
+            self._report_tick(output, woke_ns, at_ns, sent)
         self._follow(output)
         if output.phase is not self._phase:
             self._change_phase(output)
@@ -263,12 +269,15 @@ class GateLoop:
             self.stop(Ending(reason="the flight process has died", is_fault=True))
         return GateInput(link=snapshot, chunk=chunk, absence=absence, act=act, stop=self._stop)
 
-    def _report_tick(self, output: GateOutput, woke_ns: int, sent: Action | None) -> None:
+    def _report_tick(
+        self, output: GateOutput, woke_ns: int, decided_ns: int, sent: Action | None
+    ) -> None:
         now_ns, slot = self._clock.now_ns(), output.slot
         tick = GateTick(
             index=slot.index if slot else -1,
             due_ns=slot.due_ns if slot else woke_ns,
             woke_ns=woke_ns,
+            decided_ns=decided_ns,
             sent_ns=now_ns,
             missed_slots=slot.missed if slot else 0,
             is_slot=slot is not None,

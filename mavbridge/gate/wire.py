@@ -24,10 +24,11 @@ from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Phase
 from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.outcome import Outcome
 from mavbridge.gate.settings import GateSettings
 
 _CHUNK = struct.Struct("<cBqqqqqqqH")
-_TICK = struct.Struct("<cqqqqqB?iBBB20d")
+_TICK = struct.Struct("<cqqqqqqB?iBBB20d")
 _PACKET = struct.Struct("<qqH")
 _PHASES = tuple(Phase)
 _CLASSES = tuple(ACTION_CLASSES.values())
@@ -47,6 +48,8 @@ class GateTick:
     index: int
     due_ns: int
     woke_ns: int
+    decided_ns: int
+    """The moment that the sticks were decided for: the slot, or when a chunk was seen."""
     sent_ns: int
     """After the sticks were handed to the kernel."""
     missed_slots: int
@@ -101,6 +104,9 @@ class GateSummary:
     link: LinkStats
     failure: str | None
     """Why there was no flight, or None."""
+    outcome: Outcome
+    params: dict[str, float]
+    """The vehicle's parameters that matter for a flight, by name, as far as they were read."""
     dropped_messages: int
     """Messages to the flight process that did not fit into its queue."""
     dropped_packets: int
@@ -197,7 +203,7 @@ def encode_tick(tick: GateTick) -> bytes:
         stages = (*trace.raw, *trace.clipped, *trace.slewed, *trace.smoothed)
     packed = _TICK.pack(
         b"T",
-        *(tick.index, tick.due_ns, tick.woke_ns, tick.sent_ns),
+        *(tick.index, tick.due_ns, tick.woke_ns, tick.decided_ns, tick.sent_ns),
         *(0 if serial is None else serial, flags, serial is not None, tick.missed_slots),
         _PHASES.index(tick.phase),
         0 if trace is None else _class_index(trace.raw),
@@ -209,8 +215,8 @@ def encode_tick(tick: GateTick) -> bytes:
 
 
 def _decode_tick(data: bytes) -> GateTick:
-    _, index, due_ns, woke_ns, sent_ns, serial, flags, has_chunk, missed, *rest = _TICK.unpack_from(
-        data
+    _, index, due_ns, woke_ns, decided_ns, sent_ns, serial, flags, has_chunk, missed, *rest = (
+        _TICK.unpack_from(data)
     )
     phase, traced, sent_kind, *values = rest
     fours = [values[4 * k : 4 * k + 4] for k in range(5)]
@@ -221,6 +227,7 @@ def _decode_tick(data: bytes) -> GateTick:
         index=index,
         due_ns=due_ns,
         woke_ns=woke_ns,
+        decided_ns=decided_ns,
         sent_ns=sent_ns,
         missed_slots=missed,
         is_slot=bool(flags & _IS_SLOT),
@@ -311,4 +318,5 @@ def _summary(document: dict[str, object]) -> GateSummary:
         saturated=saturated,
         rtt_ms=None if rtt is None else Percentiles(**rtt),
     )
-    return GateSummary(**document, link=stats)  # type: ignore[arg-type]
+    outcome = Outcome(*document.pop("outcome"))  # type: ignore[misc]
+    return GateSummary(**document, link=stats, outcome=outcome)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ class LinkSettings:
     """The vehicle and how to reach it."""
 
     connect: str = ""
-    """udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD."""
+    """Address of the vehicle, as ``core.address`` reads it."""
     source_system: int = 255
     """Our MAVLink system id."""
     target_system: int = 0

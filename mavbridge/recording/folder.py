@@ -11,6 +11,9 @@ FRAMES = "frames"
 """Stems of the tables: .arrows while they grow, .parquet once they are whole."""
 VIDEO = "camera.mp4"
 TLOG = "link.tlog"
+SOLVES, PACKETS, FEATURES = "solves", "packets", "features"
+"""Stems of the tables for a replay."""
+SETTINGS = "settings.json"
 
 
 EXTRA = ("av", "pyarrow")
@@ -25,6 +28,11 @@ def video_of(camera: str | None) -> str:
 def frames_of(camera: str | None) -> str:
     """Stem of the table of its frames."""
     return FRAMES if camera is None else f"{FRAMES}_{camera}"
+
+
+def features_of(camera: str | None) -> str:
+    """Stem of the table of its features."""
+    return FEATURES if camera is None else f"{FEATURES}_{camera}"
 
 
 def require_extra(what: str) -> None:

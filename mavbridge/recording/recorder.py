@@ -9,10 +9,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mavbridge.core.observers import ObserverThread
-from mavbridge.core.records import Observed, Tick, VisionTick
+from mavbridge.core.records import Observed, Solve, Tick, VisionTick
+from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording.crash import CrashWatch
-from mavbridge.recording.flight_writer import FlightWriter
+from mavbridge.recording.flight_writer import FLUSH_NS, FlightWriter
 from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.replay_tables import ReplayTables
+from mavbridge.recording.settings import ReplaySettings, write_settings
 from mavbridge.recording.tlog import TlogPipe
 
 CAPACITY = 6000
@@ -32,6 +35,7 @@ class Recorder:
         packets_dropped: Callable[[], int],
         autopilot: Callable[[], str],
         report: Callable[[str], None],
+        settings: ReplaySettings | None = None,
     ) -> None:
         """Create the files, start the writer process and the thread.
 
@@ -42,13 +46,22 @@ class Recorder:
             packets_dropped: returns how many packets that process has dropped; exact at the end.
             autopilot: returns the autopilot's name at the end.
             report: shows a line to the user; called from the recorder's thread.
+            settings: those of the flight, for a replay; None: it cannot be replayed.
 
         Raises:
             OSError, WriterError: the folder cannot be written, the writer process does not start.
         """
         self._folder = folder
         writer = FlightWriter(folder, meta, pressure="online", tlog_pipe=tlog_pipe)
-        self._consumer = _FlightConsumer(writer, packets_dropped, autopilot, report)
+        cameras = ("front",) if meta.contract is None else meta.contract.cameras
+        try:
+            self._tables = ReplayTables(folder, cameras, has_features=meta.mode == "dual")
+            if settings is not None:
+                write_settings(folder, settings)
+        except OSError:
+            writer.close()
+            raise
+        self._consumer = _FlightConsumer(writer, self._tables, packets_dropped, autopilot, report)
         self._packets_dropped = packets_dropped
         self._observer = ObserverThread(
             "mavbridge-recorder",
@@ -62,6 +75,10 @@ class Recorder:
         """Queue the event, or drop and count it."""
         self._observer.emit(event)
 
+    def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
+        """Queue the stamps of packets that have arrived, or drop and count them; one thread."""
+        self._tables.packets.put(packets)
+
     def close(self, timeout_s: float) -> None:
         """Finish the recording within ``timeout_s``; call it once the link is closed.
 
@@ -72,7 +89,8 @@ class Recorder:
     @property
     def dropped(self) -> int:
         """Ticks, frames and packets that are not in the recording; exact after ``close``."""
-        return self._observer.dropped + self._consumer.frames_lost + self._packets_dropped()
+        lost = self._consumer.frames_lost + self._packets_dropped() + self._tables.packets.dropped
+        return self._observer.dropped + lost
 
     @property
     def crash(self) -> str | None:
@@ -100,12 +118,14 @@ class _FlightConsumer:
     """Runs on the recorder's thread; may raise OSError and WriterError."""
 
     writer: FlightWriter
+    tables: ReplayTables
     packets_dropped: Callable[[], int]
     autopilot: Callable[[], str]
     report: Callable[[str], None]
     crash_watch: CrashWatch = field(default_factory=CrashWatch)
     _seen_frames: int = 0
     _has_failed: bool = False
+    _flushed_ns: int = 0
 
     @property
     def frames_lost(self) -> int:
@@ -121,11 +141,21 @@ class _FlightConsumer:
                     self.crash_watch.see(event)
                     self.writer.tick(event)
                 elif isinstance(event, VisionTick):
+                    self.tables.feature(event)
                     self._write_frame(event)
+                else:
+                    self.tables.solve(event)
+            self._flush_if_due(batch[-1])
         except BaseException:
             self._has_failed = True
             self._seen_frames = seen_frames  # the observer counts this whole batch as lost
             raise
+
+    def _flush_if_due(self, newest: Observed) -> None:
+        now_ns = newest.woke_ns if isinstance(newest, Tick) else _ready_ns(newest)
+        if now_ns - self._flushed_ns >= FLUSH_NS:
+            self._flushed_ns = now_ns
+            self.tables.flush()
 
     def _write_frame(self, vision: VisionTick) -> None:
         self._seen_frames += 1
@@ -139,7 +169,9 @@ class _FlightConsumer:
         """Finish in order, or after an error leave things as they are."""
         if self._has_failed:
             self.writer.close()
+            self.tables.abandon()
             return
+        self.tables.finish()
         crash = self.crash_watch.reason
         self.writer.finish(
             replace(
@@ -150,3 +182,7 @@ class _FlightConsumer:
                 crash=crash,
             )
         )
+
+
+def _ready_ns(event: VisionTick | Solve) -> int:
+    return event.ready_ns if isinstance(event, VisionTick) else event.computed_ns

@@ -92,10 +92,14 @@ TICKS = pa.schema(
         *_fields(pa.int64(), "chunk_serial", "chunk_computed_ns"),
         pa.field("phase", pa.string()),
         pa.field("position_ned_m", _VECTOR),
+        pa.field("decided_ns", pa.int64()),
     ]
 )
 LATER = frozenset(
-    {"is_slot", "is_coasting", "chunk_serial", "chunk_computed_ns", "phase", "position_ned_m"}
+    {
+        *("is_slot", "is_coasting", "chunk_serial", "chunk_computed_ns", "phase"),
+        *("position_ned_m", "decided_ns"),
+    }
 )
 """Columns of ticks that older flights lack: in the first ones, every tick was a slot with a new
 chunk."""

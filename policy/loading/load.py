@@ -139,11 +139,12 @@ def _on_engine(
     if request.dual_rate and not dual_rate:
         notes.append(
             f"warning: {request.spec} has no fast path (encode_visual and predict_fast), so it "
-            "flies in single-rate mode, the whole network for every action"
+            "flies in single-rate mode, the whole network for every action (--single-rate: as "
+            "intended)"
         )
     if request.head_steps is not None and not (dual_rate and isinstance(policy, WarmStartPolicy)):
         notes.append(
-            f"warning: --head-steps {request.head_steps} is not used: it takes --dual-rate and a "
+            f"warning: --head-steps {request.head_steps} is not used: it takes two rates and a "
             "policy with denoise_fast, such as toge; every solve is a full one"
         )
     settings = ExecutionSettings(

@@ -37,7 +37,7 @@ class Received(NamedTuple):
 
 
 def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KINDS) -> "Transport":
-    """Open a link by its name, KIND:HOST:PORT.
+    """Open a link by its name, KIND:HOST:PORT, or KIND://HOST:PORT as MAVSDK writes it.
 
     ``udpout`` sends there first; ``udpin`` listens and answers everybody it has heard; ``tcpin``
     serves clients, together or one after another; ``tcp`` connects whenever there is something to
@@ -47,7 +47,9 @@ def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KIND
         UsageError: the name is malformed, the host is unknown or the port is taken.
     """
     kind, _, rest = url.partition(":")
-    host, _, port_text = rest.rpartition(":")
+    host, _, port_text = rest.removeprefix("//").rpartition(":")
+    if kind == "udpin" and rest.startswith("//:"):
+        host = "0.0.0.0"  # noqa: S104 - MAVSDK's spelling of every interface
     if kind not in kinds or not host or not port_text.isdecimal():
         wanted = ", ".join(f"{kind}:HOST:PORT" for kind in kinds)
         raise UsageError(f"link {url!r}: expected one of {wanted}")

@@ -51,7 +51,10 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         (["--connect", "udp:127.0.0.1:1", "--policy", "toge:medium"], "--allow-untrained"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "tog"], "tog"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "nowhere.at_all:Policy"], "nowhere"),
-        (["--connect", "udp:127.0.0.1:1", "--policy", "pathlib:Path"], "predict"),
+        (
+            ["--connect", "udp:127.0.0.1:1", "--camera", "none", "--policy", "pathlib:Path"],
+            "predict",
+        ),
         (["--connect", "udp:127.0.0.1:1", "--policy", "scripted:loop"], "square"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "scripted:yaw:position"], "velocity"),
         (["identify", "--arm"], "--connect"),
@@ -76,6 +79,11 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
             ["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--record", "Makefile"],
             "cannot be written",
         ),
+        (["fly", "now", "--connect", "udp:127.0.0.1:1"], "unexpected word 'now'"),
+        (["--connect", "udp:127.0.0.1:1", "--tau"], "--tau requires an argument"),
+        (["--connect", "udp:127.0.0.1:1", "--duration", "-5"], "between 0.1 and 86400"),
+        (["evalute"], "did you mean evaluate?"),
+        (["--connect", "/dev/none,57600", "--policy", "scripted", "--camera", "none"], "no such"),
         (
             ["--connect", "bluetooth", "--policy", "scripted", "--camera", "shm:unused"],
             "HOST:PORT",
@@ -86,7 +94,7 @@ def test_a_bad_flag_is_one_clear_error(
     flags: list[str], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, text = run(capsys, *flags)
-    assert status != 0
+    assert status == 2
     assert told in text
 
 
@@ -96,7 +104,7 @@ def test_a_flight_that_did_not_begin_leaves_no_folder_and_no_report(
     folder, report = tmp_path / "flight", tmp_path / "report.json"
     flags = ("--connect", "bluetooth", "--record", str(folder), "--report", str(report))
     status, text = run(capsys, *flags)
-    assert status == 1
+    assert status == 2
     assert "HOST:PORT" in text
     assert list(tmp_path.iterdir()) == []
 
@@ -107,7 +115,7 @@ def test_a_failed_flight_leaves_no_empty_report(
     report = tmp_path / "report.json"
     flags = ("--connect", "udp:127.0.0.1:1", "--policy", "scripted:loop", "--report", str(report))
     status, _ = run(capsys, *flags)
-    assert status == 1
+    assert status == 2
     assert not report.exists()
 
 
@@ -125,7 +133,7 @@ def test_a_corrupt_checkpoint_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     path = tmp_path / "weights.safetensors"
     path.write_bytes(b"these are no weights")
     status, text = run(capsys, "--connect", "udp:127.0.0.1:1", "--checkpoint", str(path))
-    assert status == 1
+    assert status == 2
     assert "weights.safetensors" in text
 
 
@@ -156,25 +164,50 @@ def test_a_port_in_use(camera: str, capsys: pytest.CaptureFixture[str]) -> None:
         other.bind(("127.0.0.1", 0))
         connect = f"udp:127.0.0.1:{other.getsockname()[1]}"
         status, text = run(capsys, "--connect", connect, "--policy", "scripted", "--camera", camera)
-    assert status == 1
+    assert status == 2
     assert "Address already in use" in text
     assert f"process {os.getpid()} " in text
     assert "ms" not in text.split()  # no table of a flight that never was
 
 
+def test_tcp_that_is_refused_is_told_before_the_policy_is_loaded(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    connect = f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    flags = ("--policy", "scripted", "--camera", "none")
+    status, text = run(capsys, "--connect", connect, *flags)
+    assert status == 3
+    assert text.count("nobody listens there") == 1
+    assert "scripted" not in text  # what a loaded policy says of itself
+
+
+def test_a_viewer_and_a_camera_that_are_not_there_are_told_before_the_policy_is_loaded(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    url = f"rerun+http://127.0.0.1:{free_port(socket.SOCK_STREAM)}/proxy"
+    flags = ("--connect", f"udp:127.0.0.1:{free_port()}", "--policy", "scripted")
+    status, text = run(capsys, *flags, "--camera", "none", "--rerun", f"connect={url}")
+    assert (status, "scripted" in text) == (3, False)
+    assert "no Rerun viewer listens" in text
+    status, text = run(capsys, *flags, "--camera", "/dev/video999")
+    assert (status, "scripted:" in text) == (3, False)
+    assert "camera /dev/video999 is not there" in text
+
+
 def test_no_heartbeat(camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = tmp_path / "report.json"
     flags = ("--policy", "scripted", "--camera", camera, "--connect-timeout", "0.2")
+    kept = ("--record", str(tmp_path / "flights" / "1"), "--rerun", str(tmp_path / "flight.rrd"))
     connect = f"udp:127.0.0.1:{free_port()}"
-    status, text = run(capsys, "--connect", connect, *flags, "--report", str(report))
-    assert status == 1
+    status, text = run(capsys, "--connect", connect, *flags, *kept, "--report", str(report))
+    assert status == 3
     assert "heard nothing" in text
-    assert not report.exists()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_camera_that_ends(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
     connect = f"udp:127.0.0.1:{free_port()}"
     flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
     status, text = run(capsys, *flags)
-    assert status == 1
+    assert status == 3
     assert "ended after 15 frames" in text

@@ -32,7 +32,7 @@ def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
         flying.cameras = ("front", "down")
         status, output = flying.fly(*FLY, "--policy", "helpers.user_policies:HangingBelow")
-    assert status == 1
+    assert status == 4
     assert "the image feature is older than 300 ms" in output
     assert "the encoder of camera down has hung" in output
     assert "Traceback" not in output
@@ -41,6 +41,6 @@ def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
 def test_a_camera_without_its_name_is_refused(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
         status, output = flying.fly(*FLY, "--policy", "helpers.user_policies:TwoEyed")
-    assert status == 1, output
+    assert status == 2, output
     assert "give --camera front=SOURCE --camera down=SOURCE" in output
     assert flying.relay.overrides == []

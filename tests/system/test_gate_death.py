@@ -96,7 +96,7 @@ def test_without_a_receiver_neutral_goes_on_until_the_vehicle_is_disarmed(tmp_pa
             check=False,
         )
         assert str(flying.gate.pid) in second.stderr + second.stdout
-        assert second.returncode == 1
+        assert second.returncode == 2
         flying.relay.disarm()
         assert flying.gate.has_ended(END_S)
     report = flying.vehicle_report()
@@ -132,7 +132,7 @@ def test_a_stopped_flight_process_loses_the_sticks_for_good(
             assert flying.wait_for("neutral sticks go on")
             flying.relay.disarm()
         status, output = flying.end()
-    assert status == 0, output
+    assert status == 4, output
     report = flying.vehicle_report()
     assert_safe(report, number.name, receiver, at_ns, limit_ms)
 
@@ -166,7 +166,7 @@ def test_a_policy_that_hangs_ends_the_flight_with_a_message(
         at_ns = flying.fault_ns()
         assert flying.gate.has_ended(END_S)
         status, output = flying.end()
-    assert status == 1, output
+    assert status == 4, output
     assert told in output
     assert "Traceback" not in output
     assert_safe(flying.vehicle_report(), policy, "mid", at_ns, limit_ms)
@@ -184,7 +184,7 @@ def test_what_is_not_a_number_never_reaches_the_wire(
         flying.relay.disarm()
         flying.kill(signal.SIGINT)
         status, output = flying.end()
-    assert status == 0, output
+    assert status == 4, output
     assert "not finite" in output or "unusable" in output
     assert_safe(flying.vehicle_report(), policy, receiver, at_ns, HANG_LIMIT_MS)
     leaning = [sent.override for sent in flying.relay.sent if sent.override]
@@ -194,7 +194,7 @@ def test_what_is_not_a_number_never_reaches_the_wire(
 def test_a_policy_that_is_too_slow_is_refused_before_it_flies(tmp_path: Path) -> None:
     with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
         status, output = flying.fly(*FLY, "--policy", POLICIES + "Slow")
-    assert status == 1, output
+    assert status == 2, output
     assert re.search(r"Slow is too slow: a chunk takes 9\d\d ms here.* of its contract", output)
     assert flying.vehicle_report()["armed_s"] == 0
     assert math.isclose(flying.vehicle_report()["max_altitude_m"], 0, abs_tol=0.1)
@@ -213,6 +213,6 @@ def test_a_camera_without_images_loses_the_sticks_for_good(pause_s: float, tmp_p
             flying.observe(1.5)
             flying.kill(signal.SIGINT)
         status, output = flying.end()
-    assert status == (0 if pause_s < 10 else 1), output
+    assert status == 4, output
     fault = f"images paused {pause_s} s" if pause_s < 10 else "camera killed"
     assert_safe(flying.vehicle_report(), fault, "mid", at_ns, IMAGE_LIMIT_MS)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from helpers.relay import Override
-from helpers.stand import Process, flight
+from helpers.stand import ORDERLY, Process, flight
 from helpers.vehicle_record import aftermath, note, write_row
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.gate.settings import GateSettings
@@ -37,7 +37,7 @@ def test_a_signal_to_the_process_group_ends_the_flight_in_order(
         flying.wait_for_lean()
         at_ns = flying.kill_group(number)
         status, output = flying.end()
-    assert status == 0, output
+    assert status in ORDERLY, output
     assert flying.relay.overrides[-1] == RELEASE
     measured = aftermath(flying.vehicle_report(), at_ns, receiver)
     note(number.name, receiver, measured)
@@ -54,7 +54,7 @@ def test_a_gate_that_is_told_to_end_gives_the_sticks_back_first(tmp_path: Path) 
         at_ns = flying.gate.kill(signal.SIGTERM)
         status, output = flying.end()
     assert "the gate was told to end" in output
-    assert status == 0, output
+    assert status in ORDERLY, output
     assert flying.relay.overrides[-1] == RELEASE
     measured = aftermath(flying.vehicle_report(), at_ns, "mid")
     note("SIGTERM to the gate", "mid", measured)
@@ -70,7 +70,7 @@ def test_the_flight_process_says_so_when_the_gate_was_killed(receiver: str, tmp_
         at_ns = flying.gate.kill(signal.SIGKILL)
         status, output = flying.end()
         flying.observe(3.2)
-    assert status == 1, output
+    assert status == 4, output
     assert "the gate process has died" in output
     measured = aftermath(flying.vehicle_report(), at_ns, receiver)
     note("kill -9 of the gate", receiver, measured)
@@ -87,7 +87,7 @@ def test_a_terminal_that_nobody_reads_does_not_hold_up_the_end(tmp_path: Path) -
         assert flying.gate.has_ended(END_S)
         status, _ = flying.end()
         ended_s = (time.monotonic_ns() - at_ns) / 1e9
-    assert status == 0
+    assert status in ORDERLY
     assert ended_s < 10
     measured = aftermath(flying.vehicle_report(), at_ns, "mid")
     note("SIGTERM, output not read", "mid", measured, ended_s=ended_s)
@@ -100,7 +100,7 @@ def test_without_a_receiver_the_end_is_a_landing(tmp_path: Path) -> None:
         flying.start(*FLY, "--duration", "2")
         flying.wait_for_lean()
         status, output = flying.end()
-    assert status == 0, output
+    assert status in ORDERLY, output
     report = flying.vehicle_report()
     assert report["final"]["mode"] == "LAND"
     assert report["final"]["landed"]

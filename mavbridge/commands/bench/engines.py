@@ -76,7 +76,7 @@ def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[st
 
 
 def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
-    full = _load(replace(policy, head_steps=None), lives)
+    full = _load(replace(policy, head_steps=0), lives)
     contract = full.contract
     shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
     images = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
@@ -94,10 +94,10 @@ def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
         case(ENCODE, lambda: full.encode(rgb)),
         case(CHUNK, lambda: full.act(feature, state, history, None)),
     ]
-    if policy.head_steps is not None:
+    if policy.warm_steps is not None:
         warm = _load(policy, lives)
         warm.act(feature, state, history, None)  # the chunk that the next one starts from
-        name = f"{CHUNK}, warm start of {policy.head_steps}"
+        name = f"{CHUNK}, warm start of {policy.warm_steps}"
         cases.append(case(name, lambda: warm.act(feature, state, history, WARM_ELAPSED_S)))
     return cases
 

@@ -146,9 +146,9 @@ def name_of(policy: PolicyConfig) -> str:
 
 def solves_of(policy: PolicyConfig) -> str:
     """The kind of solve that makes a policy's chunks, for tables."""
-    if not policy.dual_rate:
+    if not policy.may_be_dual:
         return "single rate"
-    return "full solves" if policy.head_steps is None else f"warm start of {policy.head_steps}"
+    return "full solves" if policy.warm_steps is None else f"warm start of {policy.warm_steps}"
 
 
 def this_machine() -> Machine:

@@ -61,7 +61,9 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     size_px = wanted.image_size or SIM_CAMERA_PX
     contract = Contract(feature_dim=1, arrays="numpy", image_height=size_px, image_width=size_px)
     if wanted.checkpoint is not None:
-        loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
+        loaded = load_for_episodes(
+            replace(wanted, dual_rate=True, head_steps=wanted.head_steps or 0), MonotonicClock()
+        )
         student = stack.enter_context(loaded).executable
         contract = student.contract
     flight = SimulatedFlight(

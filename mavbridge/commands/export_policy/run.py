@@ -38,7 +38,7 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
         raise UserError(f"{config.out} was written, but it is another policy: {reason}")
     for note in notes:
         console.print(note, soft_wrap=True)
-    flight = f"mavbridge --connect ... --dual-rate --policy {spec}"
+    flight = f"mavbridge --connect ... --policy {spec}"
     console.print(f"wrote {config.out}; it agrees with torch. Fly it: {flight}", soft_wrap=True)
     return 0
 

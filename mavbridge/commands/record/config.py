@@ -20,7 +20,8 @@ class ListenConfig:
     """The vehicle that is only listened to."""
 
     connect: Annotated[str, Parameter(show_default=False)] = ""
-    """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD."""
+    """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD; or as
+    MAVSDK writes it: udpin://0.0.0.0:14540, serial:///dev/ttyACM0:921600."""
     forward: Annotated[str, Parameter(show_default=False)] = ""
     """Share the link with a ground station: udp:HOST:PORT sends to it, udpin:HOST:PORT listens."""
     target_system: Annotated[int, Parameter(group=RARE)] = 0
@@ -46,8 +47,8 @@ class FilmConfig:
     """The camera, whose images are recorded in the size in which they come."""
 
     camera: str = "0"
-    """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME, or
-    screen:WINDOW TITLE."""
+    """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
+    screen:WINDOW TITLE, or pipe:COMMAND."""
     camera_size: int = 224
     """Pixels a side that the image must cover; a device is asked for such a mode."""
     camera_timeout: Annotated[float, Parameter(group=RARE)] = 10.0

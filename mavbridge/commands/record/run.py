@@ -41,6 +41,7 @@ from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import Keyboard
 from mavbridge.observe.output import flight_console
 from mavbridge.observe.rerun_flight import RerunView
+from mavbridge.observe.rerun_layout import ViewedFlight
 from mavbridge.recording.meta import FlightMeta
 from policy.contract import Contract
 from policy.protocol import Executable
@@ -197,7 +198,9 @@ class _Session:
     def _open_viewer(self) -> tuple[TickSink, ...]:
         if self._config.rerun == "off":
             return ()
-        view = RerunView(self._config.rerun, vision_hz=self._config.film.visual_rate)
+        rate = self._config.rate
+        flight = ViewedFlight(vision_hz=self._config.film.visual_rate, chunk_hz=rate, stick_hz=rate)
+        view = RerunView(self._config.rerun, flight)
         viewer = ObserverThread("mavbridge-rerun", view, capacity=RERUN_CAPACITY)
         self._stack.callback(viewer.close, JOIN_S)
         return (viewer,)

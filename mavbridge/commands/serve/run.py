@@ -5,6 +5,7 @@ import math
 import os
 import signal
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from ipaddress import ip_address
 
 from rich.console import Console
@@ -30,10 +31,11 @@ def serve(config: ServeConfig) -> int:
     Raises:
         MavbridgeError: the policy cannot be loaded, or the address cannot be listened at.
     """
-    check_configured_policy(config.policy)
+    policy_config = replace(config.policy, dual_rate=False)
+    check_configured_policy(policy_config)
     console, clock = Console(highlight=False), MonotonicClock()
     with ExitStack() as stack:
-        loaded = stack.enter_context(load_configured_policy(config.policy, clock))
+        loaded = stack.enter_context(load_configured_policy(policy_config, clock))
         for note in loaded.notes:
             console.print(Text(note, style="yellow"))
         answers = AnswerLoop(loaded.executable, clock=clock)

@@ -15,7 +15,7 @@ def share_of_gates(checkpoint: Path, policy: str, flights: int) -> float:
     Raises:
         MavbridgeError, PolicyError: it cannot be flown.
     """
-    wanted = PolicyConfig(policy=policy, checkpoint=checkpoint, dual_rate=True)
+    wanted = PolicyConfig(policy=policy, checkpoint=checkpoint, dual_rate=True, head_steps=0)
     passed = total = 0
     with load_configured_policy(wanted, MonotonicClock()) as loaded:
         for index in range(flights):

@@ -24,7 +24,7 @@ def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
     frames: list[RawPacket] = []
     at = 0
     while at < len(data):
-        frame = _frame_at(data, at)
+        frame = frame_at(data, at)
         if frame is None:
             return frames, True
         frames.append(frame)
@@ -32,7 +32,10 @@ def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
     return frames, False
 
 
-def _frame_at(data: bytes, at: int) -> RawPacket | None:
+def frame_at(data: bytes, at: int) -> RawPacket | None:
+    """The packet that begins at this place; None if there is none, or not a whole one."""
+    if at >= len(data):
+        return None
     marker = data[at]
     header = _V1_HEADER if marker == _V1 else _V2_HEADER
     if marker not in (_V1, _V2) or len(data) - at < header:

@@ -4,12 +4,13 @@ import socket
 from collections import deque
 from collections.abc import Iterator
 
+from mavbridge.core.address import parse_forward
 from mavbridge.core.clock import Clock
 from mavbridge.core.errors import UserError
 from mavbridge.mavlink.codec.frames import split_frames
 from mavbridge.mavlink.codec.messages import Endpoint
 from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
-from mavbridge.mavlink.transport.sockets import Address
+from mavbridge.mavlink.transport.sockets import Address, resolved
 
 MAX_DATAGRAMS, MAX_PACKETS = 32, 100
 """From the ground station at one look, whichever comes first; the rest waits for the next."""
@@ -19,7 +20,6 @@ MAX_PACKED = 1200
 """Bytes in one datagram, below any usual MTU; what arrived larger leaves larger."""
 _MAX_DATAGRAM = 2048
 """Of the ground station: what is longer than any usual MTU is cut off, and is not MAVLink."""
-_FORMS = "udp:HOST:PORT to send there, or udpin:HOST:PORT to listen"
 
 
 class Forwarding:
@@ -34,10 +34,11 @@ class Forwarding:
     """
 
     def __init__(self, spec: str, clock: Clock, *, sticks_win: bool = False) -> None:
-        kind, address = _parsed(spec)
+        parsed = parse_forward(spec)
+        address = resolved(parsed.host, parsed.port)
         self._clock = clock
         self.rules = GroundStationRules(sticks_win=sticks_win)
-        self._station: Address | None = None if kind == "udpin" else address
+        self._station: Address | None = None if parsed.listens else address
         self._was_heard = False
         self._queue: deque[bytes] = deque()
         self._queued_bytes = 0
@@ -46,7 +47,7 @@ class Forwarding:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
-            self._socket.bind(address if kind == "udpin" else ("", 0))
+            self._socket.bind(address if parsed.listens else ("", 0))
         except OSError as error:
             self._socket.close()
             raise UserError(
@@ -143,15 +144,3 @@ class Forwarding:
             self.dropped += 1
         except OSError:
             pass  # no route, or nobody listens: a ground station may come later
-
-
-def _parsed(spec: str) -> tuple[str, Address]:
-    kind, _, rest = spec.partition(":")
-    host, _, port = rest.rpartition(":")
-    is_known = kind in ("udp", "udpout", "udpin")
-    if not (is_known and host and port.isdecimal() and 0 < int(port) < 65536):
-        raise UserError(f"--forward {spec!r} is not understood; use {_FORMS}")
-    try:
-        return kind, (socket.gethostbyname(host), int(port))  # now: a resolver may block
-    except OSError as error:
-        raise UserError(f"--forward {spec}: cannot find host {host!r}: {error.strerror}") from error

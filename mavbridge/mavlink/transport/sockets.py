@@ -10,18 +10,28 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import serial
+from serial.tools import list_ports
 
+from mavbridge.core.address import (
+    SerialAddress,
+    TcpAddress,
+    UdpAddress,
+    parse_address,
+)
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
-from mavbridge.core.errors import UserError
+from mavbridge.core.errors import PeerError, UserError
 from mavbridge.mavlink.transport.holders import device_holder, udp_holder
 
 Address: TypeAlias = tuple[str, int]
 
 TCP_SILENCE_NS = 5 * NS_PER_S
 """Heartbeats come at 1 Hz: a connection this quiet is dead, even if the kernel has not noticed."""
+TCP_FIRST_S = 3.0
+"""Longest wait for the answer to the first attempt to connect; nothing else waits for it then."""
 _CHUNK_BYTES = 65536
 _STREAM_BYTES = 2048
 """A piece of a TCP stream: some fifty packets, after which a reader may leave the rest."""
@@ -122,6 +132,8 @@ class UdpTransport(_Base[socket.socket]):
             hint = "check the address"
             if error.errno == errno.EADDRINUSE:
                 hint = f"{udp_holder(port)}, or choose another port"
+            elif error.errno == errno.EADDRNOTAVAIL:
+                hint = f"this computer has no such address; udpout:{host}:{port} sends there"
             raise UserError(f"cannot use udp {host}:{port}: {error.strerror}; {hint}") from error
         self._handle = udp
 
@@ -185,11 +197,15 @@ class TcpTransport(_StreamTransport[socket.socket]):
     def __init__(self, address: Address, clock: Clock) -> None:
         super().__init__(clock)
         self._address = address
+        self._was_open = False
         self._is_connected = False
         self._heard_ns = 0
 
     def open(self) -> None:
-        """Begin to connect; ``drain`` finds out whether it succeeded."""
+        """Connect: the first time wait for the answer, later ``drain`` finds out.
+
+        Raises PeerError if nobody answers the first time.
+        """
         tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         tcp.setblocking(False)
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -197,11 +213,25 @@ class TcpTransport(_StreamTransport[socket.socket]):
             code = tcp.connect_ex(self._address)
         except OSError as error:
             code = error.errno or errno.EIO
+        if not self._was_open and code in (errno.EINPROGRESS, errno.EWOULDBLOCK):
+            _, is_done, _ = select.select([], [tcp], [], TCP_FIRST_S)
+            code = (
+                tcp.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) if is_done else errno.ETIMEDOUT
+            )
         if code not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
             tcp.close()
-            raise self._down(code)
+            raise self._down(code) if self._was_open else self._unreachable(code)
         self._handle, self._is_connected, self._unsent = tcp, False, b""
+        self._was_open = True
         self._heard_ns = self._clock.now_ns()
+
+    def _unreachable(self, code: int) -> PeerError:
+        host, port = self._address
+        if code == errno.ECONNREFUSED:
+            reason = "nobody listens there: start the vehicle's end first, or check the port"
+        else:
+            reason = f"{os.strerror(code)}: check the address and the network"
+        return PeerError(f"cannot connect to tcp {host}:{port}: {reason}")
 
     def _down(self, code: int | None) -> TransportDownError:
         host, port = self._address
@@ -259,14 +289,27 @@ class SerialTransport(_StreamTransport[serial.Serial]):
             if self._was_open:
                 raise self._down(error) from error
             raise UserError(
-                f"cannot open {self._device} at {self._baud} baud: {error}; check the name, that "
-                "no other program uses it, and that you have permission (group dialout)"
-                f"{device_holder(self._device)}"
+                f"cannot open {self._device} at {self._baud} baud: {self._obstacle(error)}"
             ) from error
         self._was_open = True
         self._unsent = b""
         self._backlog.clear()
         self._emptied_ns = self._clock.now_ns()
+
+    def _obstacle(self, error: OSError | ValueError) -> str:
+        """What keeps the port from us, and what to do about it."""
+        device = Path(self._device)
+        if isinstance(error, FileNotFoundError) or not device.exists():
+            return f"there is no such port; {_ports_here()}"
+        code = getattr(error, "errno", None)
+        if code == errno.EACCES:
+            return (
+                "no permission: join its group (sudo usermod -aG dialout $USER, then log in anew)"
+            )
+        holder = device_holder(self._device)
+        if holder or code in (errno.EBUSY, errno.EAGAIN):
+            return f"it is in use{holder or '; stop the program that has it'}"
+        return f"{error}"
 
     def _down(self, error: Exception | str) -> TransportDownError:
         return TransportDownError(f"serial {self._device}: {error}")
@@ -316,44 +359,30 @@ class SerialTransport(_StreamTransport[serial.Serial]):
             raise self._down(error) from error
 
 
-_SERIAL = ("/dev/", "COM")
-_FORMS = "udp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyX,BAUD"
+def _ports_here() -> str:
+    """The serial ports of this computer, for a message."""
+    names = sorted(info.device for info in list_ports.comports())
+    return f"present: {', '.join(names)}" if names else "this computer has none: is it plugged in?"
 
 
 def make_transport(spec: str, clock: Clock) -> Transport:
-    """The transport for a connection string in pymavlink's notation, not opened yet.
+    """The transport for an address as ``address.parse_address`` reads it, not opened yet.
 
-    Raises UserError if the string is malformed, or its host does not exist.
+    Raises UserError if it is not understood, or its host does not exist.
     """
-    kind, _, rest = spec.partition(":")
-    if kind in ("udp", "udpin", "udpout"):
-        return UdpTransport(_address(spec, rest), clock, listen=kind != "udpout")
-    if kind == "tcp":
-        return TcpTransport(_address(spec, rest), clock)
-    if spec.startswith(_SERIAL):
-        return SerialTransport(spec.partition(",")[0], _baud(spec), clock)
-    if spec.count(":") == 1:  # a bare HOST:PORT listens, as in pymavlink
-        return UdpTransport(_address(spec, spec), clock, listen=True)
-    raise UserError(f"--connect {spec!r} is not understood; use {_FORMS}")
+    match parse_address(spec):
+        case UdpAddress(host, port, listens):
+            return UdpTransport(resolved(host, port), clock, listen=listens)
+        case TcpAddress(host, port):
+            return TcpTransport(resolved(host, port), clock)
+        case SerialAddress(device, baud):
+            return SerialTransport(device, baud, clock)
 
 
-def serial_baud(spec: str) -> int | None:
-    """Bits per second of the port that a connection string names; None: it is not serial."""
-    return _baud(spec) if spec.startswith(_SERIAL) else None
-
-
-def _baud(spec: str) -> int:
-    baud = spec.partition(",")[2]
-    if baud and not (baud.isdigit() and int(baud)):
-        raise UserError(f"--connect {spec}: {baud!r} is not a baud rate; use {_FORMS}")
-    return int(baud or 57600)
-
-
-def _address(spec: str, text: str) -> Address:
-    host, _, port = text.rpartition(":")
-    if not (host and port.isdigit() and 0 < int(port) < 65536):
-        raise UserError(f"--connect {spec!r}: {text!r} is not HOST:PORT; use {_FORMS}")
+def resolved(host: str, port: int) -> Address:
+    """The number of a host; looked up once, at the start, since a resolver may block."""
     try:
-        return socket.gethostbyname(host), int(port)  # now: a resolver may block
-    except OSError as error:
-        raise UserError(f"cannot find host {host!r}: {error.strerror}") from error
+        return socket.gethostbyname(host), port
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "no such name"
+        raise UserError(f"cannot find host {host!r}: {reason}") from error

@@ -110,6 +110,7 @@ class Rig:
             index=0,
             due_ns=0,
             woke_ns=0,
+            decided_ns=0,
             sent_ns=self.clock.now_ns(),
             missed_slots=0,
             is_slot=True,

@@ -99,3 +99,26 @@ def test_a_rate_that_is_not_reached_is_told() -> None:
 
 def test_where_nothing_could_be_measured_nothing_is_refused() -> None:
     assert notes_of(0, None) == ""
+
+
+@pytest.mark.parametrize(
+    ("is_dual", "rates", "told"),
+    [
+        (True, Rates(rate=2), "warning: --rate 2 is of a single rate: add --single-rate"),
+        (False, Rates(action_rate=50), "warning: --action-rate 50 is of two rates: give --rate"),
+        (True, Rates(rate=30, action_rate=50), None),
+    ],
+)
+def test_a_rate_of_the_other_mode_is_not_ignored_in_silence(
+    is_dual: bool, rates: Rates, told: str | None
+) -> None:
+    executable = Executable(
+        contract=CONTRACT,
+        name="test",
+        engine="numpy",
+        dual_rate=is_dual,
+        encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
+        act=lambda *inputs: np.zeros((1, 100, 4), np.float32),
+    )
+    loaded = LoadedPolicy(executable=executable, notes=())
+    assert require_speed(FlyConfig(rates=rates), loaded) == (() if told is None else (told,))

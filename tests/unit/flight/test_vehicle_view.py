@@ -24,6 +24,7 @@ TICK = GateTick(
     index=4,
     due_ns=START_NS,
     woke_ns=START_NS,
+    decided_ns=START_NS,
     sent_ns=START_NS + MS,
     missed_slots=1,
     is_slot=True,

@@ -11,6 +11,7 @@ from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import ACT_TIMEOUT_NS, PREPARE_TIMEOUT_NS, Phase
 from mavbridge.gate.facts import Hand, Move
+from mavbridge.gate.outcome import Outcome
 
 NOTHING = Move()
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
@@ -363,3 +364,40 @@ def test_an_act_while_the_last_flight_ends_is_refused_aloud(phase: str) -> None:
     assert stepped.phase.value == phase
     stepped.step("engage")
     assert f"still ending ({phase})" in (stepped.engagement.refusal or "")
+
+
+# --- how it went
+
+
+def test_a_flight_in_order_is_told_so() -> None:
+    stepped = flying()
+    stepped.run(1, is_landed=False)
+    stepped.engagement.stop(Ending(reason="the flight is over"))
+    stepped.run(1)
+    assert stepped.engagement.outcome == Outcome(flights=1, has_left_ground=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "ended"),
+    [
+        ({"chunk_fault": "no chunk for 100 ms"}, {"faults": 1}),
+        ({"link_problem": "lost"}, {"faults": 1}),
+        ({"armed": False}, {"is_disarmed": True}),
+        ({"mode": "LOITER"}, {}),  # the pilot has taken over, and goes on
+    ],
+)
+def test_how_a_flight_ended_is_told(changes: dict[str, Any], ended: dict[str, Any]) -> None:
+    stepped = flying()
+    stepped.run(0.1, is_landed=False)
+    stepped.run(0.1, **changes)
+    expected = Outcome(flights=1, has_left_ground=True)._replace(**ended)
+    assert stepped.engagement.outcome == expected
+
+
+def test_a_vehicle_that_stays_on_the_ground_is_told() -> None:
+    stepped = flying()
+    stepped.run(1, is_landed=True)
+    stepped.run(1, is_landed=None)
+    assert stepped.engagement.outcome.has_left_ground is False
+    stepped.run(0.1, is_landed=False)
+    assert stepped.engagement.outcome.has_left_ground is True

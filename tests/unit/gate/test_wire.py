@@ -23,6 +23,7 @@ from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.envelope import EnvelopeLimits
 from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.outcome import Outcome
 from mavbridge.gate.settings import GateSettings
 from mavbridge.gate.wire import (
     Absence,
@@ -66,6 +67,7 @@ TICK = GateTick(
     index=3,
     due_ns=10,
     woke_ns=11,
+    decided_ns=11,
     sent_ns=12,
     missed_slots=2,
     is_slot=True,
@@ -87,7 +89,13 @@ STATS = LinkStats(
     saturated=(("pitch", 0.25), ("yaw", 0.01)),
 )
 SUMMARY = GateSummary(
-    autopilot="PX4", link=STATS, failure="did not arm", dropped_messages=1, dropped_packets=2
+    autopilot="PX4",
+    link=STATS,
+    failure="did not arm",
+    outcome=Outcome(flights=2, has_left_ground=True, faults=1, is_disarmed=False),
+    params={"RC_OVERRIDE_TIME": 0.5},
+    dropped_messages=1,
+    dropped_packets=2,
 )
 TO_GATE: list[ToGate] = [
     CHUNK,
@@ -163,6 +171,7 @@ def test_any_chunk_arrives_bit_by_bit(seven: tuple[int, ...], actions: list[Stic
         index=stamps,
         due_ns=stamps,
         woke_ns=stamps,
+        decided_ns=stamps,
         sent_ns=stamps,
         missed_slots=st.integers(0, 2**31 - 1),
         is_slot=st.booleans(),

@@ -12,7 +12,7 @@ import pytest
 
 from helpers.fakes import FakeClock
 from mavbridge.core.clock import MonotonicClock
-from mavbridge.core.errors import UserError
+from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.processes import free_port
 from mavbridge.mavlink.transport.holders import device_holder, udp_holder
 from mavbridge.mavlink.transport.sockets import (
@@ -36,6 +36,9 @@ from mavbridge.mavlink.transport.sockets import (
         ("tcp:127.0.0.1:5760", TcpTransport),
         ("/dev/ttyACM0,921600", SerialTransport),
         ("/dev/ttyACM0", SerialTransport),
+        ("serial:///dev/ttyACM0:921600", SerialTransport),
+        ("udpin://0.0.0.0:14540", UdpTransport),
+        ("tcpout://127.0.0.1:5760", TcpTransport),
     ],
 )
 def test_connection_strings(spec: str, kind: type) -> None:
@@ -205,9 +208,20 @@ def drain_first(transport: Transport, clock: MonotonicClock) -> bytes:
     return b""
 
 
-def test_tcp_refused_can_be_tried_again() -> None:
+def test_tcp_refused_at_the_start_is_one_clear_error() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    ours = make_transport(f"tcp:127.0.0.1:{port}", MonotonicClock())
+    with pytest.raises(PeerError, match=f"tcp 127.0.0.1:{port}: nobody listens there"):
+        ours.open()
+    assert ours.fileno() is None
+
+
+def test_tcp_refused_later_can_be_tried_again() -> None:
     clock = MonotonicClock()
-    ours = make_transport(f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}", clock)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ours = make_transport(f"tcp:127.0.0.1:{server.getsockname()[1]}", clock)
+        ours.open()
+        ours.close()
 
     def connect() -> None:  # the refusal may come at once, or with the first look
         ours.open()
@@ -291,7 +305,7 @@ def test_a_serial_device_that_is_unplugged_is_noticed() -> None:
 
 def test_a_serial_port_that_does_not_exist_is_the_users_error(tmp_path: Path) -> None:
     ours = SerialTransport(str(tmp_path / "ttyNONE"), 115200, FakeClock())
-    with pytest.raises(UserError, match=r"ttyNONE.*dialout"):
+    with pytest.raises(UserError, match=r"ttyNONE.*there is no such port"):
         ours.open()
 
 

@@ -216,8 +216,9 @@ def test_every_plot_is_in_the_blueprint(action: ActionKind) -> None:
 
 
 def test_an_unwritable_path_is_refused_before_the_flight(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="cannot be written"):
-        RerunView(str(tmp_path / "missing" / "f.rrd"), vision_hz=30)
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(UserError, match="cannot write --rerun"):
+        RerunView(str(tmp_path / "taken" / "f.rrd"), vision_hz=30)
 
 
 def test_two_flights_in_one_process_do_not_mix(tmp_path: Path) -> None:

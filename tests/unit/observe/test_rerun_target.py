@@ -9,7 +9,7 @@ import pytest
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import free_port
 from mavbridge.observe import rerun_target
-from mavbridge.observe.rerun_target import prepare_target, spawn_viewer
+from mavbridge.observe.rerun_target import check_target, prepare_target, spawn_viewer
 
 LISTENS_UNTIL_KILLED = """
 import socket, sys
@@ -27,15 +27,19 @@ def bound_port() -> Iterator[int]:
         yield bound.getsockname()[1]
 
 
-def test_a_file_is_created_at_once(tmp_path: Path) -> None:
+def test_a_file_is_tried_and_not_left_behind(tmp_path: Path) -> None:
     path = tmp_path / "flight.rrd"
     assert prepare_target(str(path)) == path
-    assert path.exists()
+    assert not path.exists()
+    path.write_text("an older flight")
+    check_target(str(path))
+    assert path.read_text() == "an older flight"
 
 
-def test_a_file_in_a_missing_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="No such file or directory"):
-        prepare_target(str(tmp_path / "nowhere" / "flight.rrd"))
+def test_a_file_in_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(UserError, match="--rerun"):
+        prepare_target(str(tmp_path / "taken" / "flight.rrd"))
 
 
 def test_a_folder_called_rrd_is_refused(tmp_path: Path) -> None:

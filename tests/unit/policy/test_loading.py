@@ -177,7 +177,7 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
     assert not asked.executable.dual_rate
     assert [note for note in asked.notes if note.startswith("warning")] == [
         "warning: resnet-unet has no fast path (encode_visual and predict_fast), so it flies in "
-        "single-rate mode, the whole network for every action"
+        "single-rate mode, the whole network for every action (--single-rate: as intended)"
     ]
     assert not any(note.startswith("warning") for note in not_asked.notes)
     assert act(asked).shape == (1, 16, 4)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Mapping
 
+from mavbridge.core.address import serial_baud
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
@@ -13,7 +14,6 @@ from mavbridge.mavlink.session.params.checks import Assessment, assess
 from mavbridge.mavlink.session.params.reader import ParamReader
 from mavbridge.mavlink.session.params.temporary import TemporaryParams
 from mavbridge.mavlink.settings import LinkSettings
-from mavbridge.mavlink.transport.sockets import serial_baud
 
 _AGAIN_NS = 2 * NS_PER_S
 """Between attempts to read parameters that the vehicle did not send."""

@@ -24,7 +24,9 @@ def test_every_piece_of_work_is_timed_on_the_chosen_engine() -> None:
 
 
 def test_a_policy_that_no_engine_compiles_is_timed_as_it_flies() -> None:
-    (timing,), notes = time_engines((PolicyConfig(policy="scripted"),), rounds=1, block_s=0.01)
+    (timing,), notes = time_engines(
+        (PolicyConfig(policy="scripted", dual_rate=False),), rounds=1, block_s=0.01
+    )
     assert timing.work == BOTH
     assert notes == ()
 

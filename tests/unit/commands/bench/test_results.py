@@ -38,9 +38,11 @@ def test_missed_fraction_is_of_the_asked_slots() -> None:
 @pytest.mark.parametrize(
     ("changes", "solves"),
     [
-        ({}, "single rate"),
-        ({"dual_rate": True}, "full solves"),
-        ({"dual_rate": True, "head_steps": 2}, "warm start of 2"),
+        ({"dual_rate": False}, "single rate"),
+        ({"head_steps": 0}, "full solves"),
+        ({"num_diffusion_steps": 1}, "full solves"),
+        ({}, "warm start of 2"),
+        ({"dual_rate": True, "head_steps": 3}, "warm start of 3"),
     ],
 )
 def test_a_policy_is_named_with_its_kind_of_solve(changes: dict[str, int], solves: str) -> None:

@@ -40,6 +40,7 @@ class Viewed:
                 index=0,
                 due_ns=at_ns,
                 woke_ns=at_ns,
+                decided_ns=at_ns,
                 sent_ns=at_ns,
                 missed_slots=0,
                 is_slot=True,

@@ -1,0 +1,205 @@
+"""``pipe:COMMAND``: frames from the standard output of any program, such as a CSI camera's own.
+
+    pipe:COMMAND                         MJPEG
+    pipe:WIDTHxHEIGHT:FORMAT:COMMAND     raw pictures; FORMAT by FFmpeg's name, such as rgb24
+
+The command is split as a shell would split it, and run without one.
+"""
+
+import os
+import re
+import select
+import shlex
+import shutil
+import signal
+import subprocess
+import threading
+from contextlib import suppress
+from typing import NamedTuple
+
+from mavbridge.camera.grabber import Grabber, Image
+from mavbridge.camera.pipe_frames import (
+    MAX_BAD_FRAMES,
+    RAW_FORMATS,
+    FrameCutter,
+    JpegCutter,
+    RawCutter,
+)
+from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.errors import CameraError, UserError
+
+FORM = "pipe:COMMAND (MJPEG) or pipe:WIDTHxHEIGHT:FORMAT:COMMAND (raw pictures)"
+FIRST_NS, SILENT_NS = 10 * NS_PER_S, 2 * NS_PER_S
+"""Longest wait for the first byte, and for each one after it."""
+END_S = 1.0
+"""Time for the program to end by itself before it is killed, and for that."""
+_POLL_S = 0.1
+_READ_BYTES = 1 << 16
+"""A pipe holds as much: a program that nobody reads is held up, so no frame in it is old."""
+_MORE_READS = 64
+"""After a whole frame; a program that is faster than this computer is not followed for ever."""
+_MAX_ERROR_BYTES = 2000
+_RAW = re.compile(r"(\d{1,5})x(\d{1,5}):([a-z0-9]+):(.*)", re.DOTALL)
+
+
+class PipeCommand(NamedTuple):
+    """A program and what comes out of it."""
+
+    words: tuple[str, ...]
+    raw: tuple[int, int, str] | None
+    """Width, height and format; None: MJPEG."""
+
+    def cutter(self) -> FrameCutter:
+        """A new cutter for its output."""
+        if self.raw is None:
+            return JpegCutter()
+        width, height, name = self.raw
+        return RawCutter(width, height, RAW_FORMATS[name])
+
+
+def parse_pipe(text: str) -> PipeCommand:
+    """Read what follows ``pipe:``.
+
+    Raises:
+        UserError: it is malformed, or there is no such program.
+    """
+    spec, raw = f"--camera {f'pipe:{text}'!r}", None
+    if (match := _RAW.fullmatch(text)) is not None:
+        width, height, name, text = int(match[1]), int(match[2]), match[3], match[4]
+        if name not in RAW_FORMATS:
+            known = ", ".join(RAW_FORMATS)
+            raise UserError(f"{spec}: {name!r} is no format of raw pictures; there are {known}")
+        if not (0 < width <= 8192 and 0 < height <= 8192):
+            raise UserError(f"{spec}: no picture has {width}x{height} pixels")
+        if RAW_FORMATS[name].bits in (12, 16) and (width % 2 or height % 2):
+            raise UserError(f"{spec}: pictures in {name} have an even width and height")
+        raw = (width, height, name)
+    try:
+        words = tuple(shlex.split(text))
+    except ValueError as error:
+        raise UserError(f"{spec}: {error}") from error
+    if not words:
+        raise UserError(f"{spec} names no program; use {FORM}")
+    if shutil.which(words[0]) is None:
+        raise UserError(f"{spec}: there is no program {words[0]!r}; use {FORM}")
+    return PipeCommand(words, raw)
+
+
+class PipeCamera(Grabber):
+    """A `LiveCamera` over a program, which is started, ended and waited for by the thread."""
+
+    def __init__(self, command: PipeCommand, *, clock: Clock) -> None:
+        self._ending = threading.Event()
+        super().__init__(lambda: PipeSource(command, clock, self._ending), clock=clock)
+
+    def close(self) -> None:
+        """Stop the thread, which ends the program."""
+        self._ending.set()
+        super().close()
+
+
+class PipeSource:
+    """Implements `ImageSource`; the newest whole frame wins.
+
+    The program has a session of its own, so that Ctrl-C ends the flight and not its camera.
+    """
+
+    def __init__(self, command: PipeCommand, clock: Clock, ending: threading.Event) -> None:
+        """Start the program; raises CameraError if it cannot be."""
+        self._name = f"program {command.words[0]}"
+        self._clock = clock
+        self._ending = ending
+        self._cutter = command.cutter()
+        self._errors = b""
+        self._bad_frames = 0
+        self._silent_after_ns = clock.now_ns() + FIRST_NS
+        try:
+            self._process = subprocess.Popen(
+                command.words,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise CameraError(f"{self._name} cannot be started: {error.strerror}") from error
+        out, err = self._process.stdout, self._process.stderr
+        if out is None or err is None:
+            raise AssertionError("both are pipes")
+        self._out, self._err = out.fileno(), err.fileno()
+        self._open = [self._out, self._err]
+
+    def next_image(self) -> Image:
+        """See `ImageSource`."""
+        while True:
+            frame, first_ns = self._newest_frame()
+            if (rgb := self._cutter.decode(frame)) is not None:
+                self._bad_frames = 0
+                return Image(captured_ns=first_ns, rgb=rgb)
+            self._bad_frames += 1
+            if self._bad_frames > MAX_BAD_FRAMES:
+                raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")
+
+    def _newest_frame(self) -> tuple[bytes, int]:
+        """Read until a frame is whole, then what is there already, which may hold a newer one."""
+        more = _MORE_READS
+        while True:
+            ready, _, _ = select.select(
+                self._open, [], [], 0 if self._cutter.has_frame else _POLL_S
+            )
+            if self._ending.is_set():
+                raise CameraError("the camera has been closed")
+            more -= self._cutter.has_frame
+            if (self._out not in ready or more < 0) and (frame := self._cutter.take()) is not None:
+                return frame
+            if self._err in ready:
+                self._read_error()
+            if self._out in ready:
+                self._read_frames()
+            elif self._clock.now_ns() > self._silent_after_ns:
+                raise CameraError(f"{self._name} is silent{self._last_error()}")
+
+    def _read_frames(self) -> None:
+        data = os.read(self._out, _READ_BYTES)
+        now_ns = self._clock.now_ns()
+        if not data:
+            raise CameraError(self._end_of_stream())
+        self._silent_after_ns = now_ns + SILENT_NS
+        try:
+            self._cutter.put(data, now_ns)
+        except CameraError as error:
+            raise CameraError(f"{self._name}: {error}{self._last_error()}") from error
+
+    def _read_error(self) -> None:
+        data = os.read(self._err, _READ_BYTES)
+        if not data:
+            self._open.remove(self._err)
+        self._errors = (self._errors + data)[-_MAX_ERROR_BYTES:]
+
+    def _last_error(self) -> str:
+        lines = self._errors.decode(errors="replace").strip().splitlines()
+        return f"; it said: {lines[-1].strip()}" if lines else ""
+
+    def _end_of_stream(self) -> str:
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(END_S)
+        while self._err in self._open and select.select([self._err], [], [], 0)[0]:
+            self._read_error()
+        status = self._process.returncode
+        how = "has closed its output" if status is None else f"ended with status {status}"
+        return f"{self._name} {how}{self._cutter.rest()}{self._last_error()}"
+
+    def close(self) -> None:
+        """End the program and whatever it has started, and wait for it."""
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, number)
+            try:
+                self._process.wait(END_S)
+            except subprocess.TimeoutExpired:
+                continue
+            break
+        for stream in (self._process.stdout, self._process.stderr):
+            if stream is not None:
+                stream.close()

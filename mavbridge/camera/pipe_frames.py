@@ -1,0 +1,201 @@
+"""Cuts the output of a camera program into frames: MJPEG, or raw pictures of one size."""
+
+import re
+from typing import NamedTuple, Protocol
+
+import cv2
+import numpy as np
+
+from mavbridge.core.errors import CameraError
+from mavbridge.core.records import ImageArray
+
+MAX_JPEG_BYTES = 16 << 20
+MAX_BETWEEN_BYTES = 4096
+"""Of what is no JPEG before the next one: multipart headers."""
+MAX_BAD_FRAMES = 10
+"""Frames in a row that cannot be decoded."""
+_SOI, _EOI, _SOS, _FILL = b"\xff\xd8", 0xD9, 0xDA, 0xFF
+_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+"""In the coded data of a scan, where 00 and the restart markers D0 to D7 are data."""
+
+
+class RawFormat(NamedTuple):
+    """How a raw picture lies in memory."""
+
+    bits: int
+    """For each pixel."""
+    conversion: int | None
+    """Of OpenCV, to RGB; None: it is RGB."""
+
+
+RAW_FORMATS = {
+    "rgb24": RawFormat(24, None),
+    "bgr24": RawFormat(24, cv2.COLOR_BGR2RGB),
+    "gray": RawFormat(8, cv2.COLOR_GRAY2RGB),
+    "yuv420p": RawFormat(12, cv2.COLOR_YUV2RGB_I420),
+    "nv12": RawFormat(12, cv2.COLOR_YUV2RGB_NV12),
+    "yuyv422": RawFormat(16, cv2.COLOR_YUV2RGB_YUY2),
+}
+"""By FFmpeg's names."""
+
+
+class FrameCutter(Protocol):
+    """Takes bytes as they come, and gives the newest whole frame."""
+
+    @property
+    def has_frame(self) -> bool:
+        """A whole frame is there."""
+
+    def put(self, data: bytes, arrived_ns: int) -> None:
+        """Take bytes. Raises CameraError for what cannot be frames."""
+
+    def take(self) -> tuple[bytes, int] | None:
+        """The newest whole frame and when its first byte came; None: there is none yet."""
+
+    def decode(self, frame: bytes) -> ImageArray | None:
+        """[H, W, 3] uint8 RGB; None if it is damaged."""
+
+    def rest(self) -> str:
+        """What was left over at the end of the stream, for a message."""
+
+
+class RawCutter:
+    """Pictures of one size, one directly after the other."""
+
+    def __init__(self, width: int, height: int, pixels: RawFormat) -> None:
+        self._shape = (height, width)
+        self._format = pixels
+        self._size = width * height * pixels.bits // 8
+        self._partial = bytearray()
+        self._first_ns = 0
+        self._newest: tuple[bytes, int] | None = None
+
+    @property
+    def has_frame(self) -> bool:
+        """See `FrameCutter`."""
+        return self._newest is not None
+
+    def put(self, data: bytes, arrived_ns: int) -> None:
+        """See `FrameCutter`."""
+        if not self._partial:
+            self._first_ns = arrived_ns
+        self._partial += data
+        while len(self._partial) >= self._size:
+            self._newest = bytes(self._partial[: self._size]), self._first_ns
+            del self._partial[: self._size]
+            self._first_ns = arrived_ns
+
+    def take(self) -> tuple[bytes, int] | None:
+        """See `FrameCutter`."""
+        newest, self._newest = self._newest, None
+        return newest
+
+    def decode(self, frame: bytes) -> ImageArray:
+        """See `FrameCutter`; any bytes are a picture."""
+        height, width = self._shape
+        array = np.frombuffer(frame, np.uint8)
+        conversion = self._format.conversion
+        if conversion is None:
+            return array.reshape(height, width, 3).copy()
+        rows = {8: (height, width), 12: (height * 3 // 2, width), 16: (height, width, 2)}
+        shaped = array.reshape(rows.get(self._format.bits, (height, width, 3)))
+        return np.asarray(cv2.cvtColor(shaped, conversion), dtype=np.uint8)
+
+    def rest(self) -> str:
+        """See `FrameCutter`."""
+        if not self._partial:
+            return ""
+        height, width = self._shape
+        return (
+            f"; its last {len(self._partial)} bytes are no whole picture of {self._size} bytes: is "
+            f"{width}x{height} right, and the format?"
+        )
+
+
+class JpegCutter:
+    """JPEG pictures one after the other, with or without the headers of a multipart stream."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._first_ns = 0
+        self._at = 0
+        """Where the search goes on; 0 while the start of a picture is looked for."""
+        self._in_scan = False
+        self._newest: tuple[bytes, int] | None = None
+
+    @property
+    def has_frame(self) -> bool:
+        """See `FrameCutter`."""
+        return self._newest is not None
+
+    def put(self, data: bytes, arrived_ns: int) -> None:
+        """See `FrameCutter`."""
+        self._buffer += data
+        while True:
+            if self._at == 0 and not self._find_start(arrived_ns):
+                return
+            if not self._find_end():
+                if len(self._buffer) > MAX_JPEG_BYTES:
+                    raise CameraError(f"no JPEG ended within {MAX_JPEG_BYTES >> 20} MiB")
+                return
+            self._newest = bytes(self._buffer[: self._at]), self._first_ns
+            del self._buffer[: self._at]
+            self._at, self._in_scan = 0, False
+
+    def _find_start(self, arrived_ns: int) -> bool:
+        start = self._buffer.find(_SOI)
+        if start < 0:
+            if len(self._buffer) > MAX_BETWEEN_BYTES:
+                raise CameraError(
+                    f"its output is no MJPEG: it begins with {bytes(self._buffer[:8]).hex(' ')}; "
+                    "for raw pictures write pipe:WIDTHxHEIGHT:FORMAT:COMMAND"
+                )
+            return False
+        del self._buffer[:start]
+        self._at, self._first_ns = len(_SOI), arrived_ns
+        return True
+
+    def _find_end(self) -> bool:
+        """Walk over the segments of the picture; True: it ends at ``_at``."""
+        buffer = self._buffer
+        while True:
+            if self._in_scan:
+                match = _MARKER.search(buffer, self._at)
+                if match is None:
+                    self._at = max(self._at, len(buffer) - 1)
+                    return False
+                self._at, self._in_scan = match.start(), False
+            if len(buffer) < self._at + 2:
+                return False
+            marker = buffer[self._at + 1]
+            if buffer[self._at] != 0xFF:
+                raise CameraError("its output is no MJPEG, or a damaged one")
+            if marker == _EOI:
+                self._at += 2
+                return True
+            if marker == _FILL:
+                self._at += 1
+                continue
+            if len(buffer) < self._at + 4:
+                return False
+            length = int.from_bytes(buffer[self._at + 2 : self._at + 4], "big")
+            if len(buffer) < self._at + 2 + length:
+                return False
+            self._at += 2 + length
+            self._in_scan = marker == _SOS
+
+    def take(self) -> tuple[bytes, int] | None:
+        """See `FrameCutter`."""
+        newest, self._newest = self._newest, None
+        return newest
+
+    def decode(self, frame: bytes) -> ImageArray | None:
+        """See `FrameCutter`."""
+        bgr = cv2.imdecode(np.frombuffer(frame, np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            return None
+        return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+    def rest(self) -> str:
+        """See `FrameCutter`."""
+        return "; its last picture was cut off" if self._buffer else ""

@@ -1,0 +1,1 @@
+"""The report of a recorded flight: on the terminal and in the viewer."""

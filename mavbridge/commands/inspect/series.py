@@ -1,0 +1,140 @@
+"""A recorded flight's ticks as arrays, for figures and plots."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.records import Tick
+from mavbridge.recording.flight_folder import RecordedFlight
+from policy.contract import STATE_DIM
+from policy.rotation import conjugate, multiply
+
+FloatColumn: TypeAlias = NDArray[np.float64]
+_HALF = 0.5**0.5
+_ENU_FROM_NED, _FRD_FROM_FLU = (0.0, _HALF, _HALF, 0.0), (0.0, 1.0, 0.0, 0.0)
+"""As in ``mavbridge.flight.state``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """Values of all N ticks, whatever the axes of the policy; NaN where there was none."""
+
+    start_ns: int
+    """Wake-up of the first tick, on the clock of all stamps."""
+    t_s: FloatColumn
+    """[N] wake-ups, in seconds since the first one."""
+    action_names: tuple[str, ...]
+    """The four numbers of an action: those of ``raw``, ``smoothed``, ``sent`` and ``echo``."""
+    raw: FloatColumn
+    """[N, 4] as the policy put them out."""
+    smoothed: FloatColumn
+    sent: FloatColumn
+    """[N, 4] as the message held them."""
+    echo: FloatColumn
+    """[N, 4] sticks as the vehicle reported them: ours, or the pilot's."""
+    feature_age_ms: FloatColumn
+    """[N] from the exposure to the send."""
+    state_age_ms: FloatColumn
+    """[N] from the arrival of the attitude to the send."""
+    lateness_ms: FloatColumn
+    """[N] from the slot to its send."""
+    period_ms: FloatColumn
+    """[N] from the send of the slot before, of slots in a row."""
+    velocity_ned_mps: FloatColumn
+    """[N, 3]"""
+    roll_pitch_yaw_deg: FloatColumn
+    """[N, 3]"""
+    rate_frd_dps: FloatColumn
+    """[N, 3]"""
+    position_ned_m: FloatColumn
+    """[N, 3] from the estimator's origin."""
+
+
+def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> Series:
+    """Arrays of the ticks of a flight."""
+    start_ns = ticks[0].woke_ns if ticks else flight.meta.start_ns
+    woke_ns = np.array([tick.woke_ns for tick in ticks], np.int64)
+    contract = flight.meta.contract
+    is_enu = contract is not None and contract.state_frame == "enu_flu"
+    state = _rows(ticks, STATE_DIM, lambda tick: None if tick.state is None else tick.state.values)
+    velocity, attitude, rate = state[:, 0:3], state[:, 3:7], state[:, 7:10]
+    if is_enu:
+        velocity = velocity[:, (1, 0, 2)] * (1, 1, -1)
+        rate = rate * (1, -1, -1)
+        to_ned, to_flu = conjugate(_ENU_FROM_NED), conjugate(_FRD_FROM_FLU)
+        left = np.broadcast_to(to_ned, attitude.shape)
+        attitude = multiply(multiply(left, attitude), np.broadcast_to(to_flu, attitude.shape))
+    names = next((t.sent._fields for t in ticks if t.sent is not None), None)
+    return Series(
+        start_ns=start_ns,
+        t_s=(woke_ns - start_ns) / NS_PER_S,
+        action_names=names or ("throttle", "yaw", "pitch", "roll"),
+        raw=_rows(ticks, 4, lambda tick: None if tick.trace is None else tick.trace.raw),
+        smoothed=_rows(ticks, 4, lambda tick: None if tick.trace is None else tick.trace.smoothed),
+        sent=_rows(ticks, 4, lambda tick: tick.sent),
+        echo=_rows(ticks, 4, lambda tick: tick.rc_sticks),
+        feature_age_ms=_ms(_feature_age_ns(tick) for tick in ticks),
+        state_age_ms=_ms(
+            None
+            if tick.trace is None or tick.state is None
+            else tick.sent_ns - tick.state.attitude_ns
+            for tick in ticks
+        ),
+        lateness_ms=_ms(
+            max(0, tick.sent_ns - tick.due_ns) if tick.trace and tick.is_slot else None
+            for tick in ticks
+        ),
+        period_ms=_periods_ms(ticks),
+        velocity_ned_mps=velocity,
+        roll_pitch_yaw_deg=_euler_deg(attitude),
+        rate_frd_dps=np.degrees(rate),
+        position_ned_m=_rows(ticks, 3, lambda tick: tick.position_ned_m),
+    )
+
+
+def _rows(
+    ticks: Sequence[Tick], width: int, value: Callable[[Tick], Iterable[float] | None]
+) -> FloatColumn:
+    rows = np.full((len(ticks), width), np.nan)
+    for row, tick in zip(rows, ticks, strict=True):
+        if (found := value(tick)) is not None:
+            row[:] = tuple(found)
+    return rows
+
+
+def _ms(values_ns: Iterable[int | None]) -> FloatColumn:
+    return np.array(list(values_ns), np.float64) / NS_PER_MS
+
+
+def _feature_age_ns(tick: Tick) -> int | None:
+    captured_ns = tick.feature_captured_ns
+    return None if tick.trace is None or captured_ns is None else tick.sent_ns - captured_ns
+
+
+def _periods_ms(ticks: Sequence[Tick]) -> FloatColumn:
+    """Time between the sends of two slots of which the policy flew both."""
+    periods_ns: list[int | None] = []
+    last_ns: int | None = None
+    for tick in ticks:
+        is_flown = tick.trace is not None
+        periods_ns.append(None)
+        if is_flown and tick.is_slot:
+            periods_ns[-1] = None if last_ns is None else tick.sent_ns - last_ns
+            last_ns = tick.sent_ns
+        elif not is_flown:
+            last_ns = None
+    return _ms(periods_ns)
+
+
+def _euler_deg(ned_from_frd_wxyz: FloatColumn) -> FloatColumn:
+    """Roll, pitch and yaw of the aerospace sequence (yaw, then pitch, then roll)."""
+    w, x, y, z = np.moveaxis(ned_from_frd_wxyz, -1, 0)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    angles_rad: FloatColumn = np.stack((roll, pitch, yaw), axis=-1)
+    return np.degrees(angles_rad)

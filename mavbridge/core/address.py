@@ -1,0 +1,123 @@
+"""Addresses of a link, in pymavlink's spelling and in MAVSDK's.
+
+    udp:HOST:PORT    udp://HOST:PORT         listen; for --forward: send there
+    udpin:HOST:PORT  udpin://HOST:PORT       listen
+    udpout:HOST:PORT udpout://HOST:PORT      send there
+    tcp:HOST:PORT    tcp://, tcpout://       connect
+    /dev/ttyX,BAUD   serial:///dev/ttyX:BAUD serial port; 57600 baud where none is given
+
+Between the slashes of ``udp://`` and ``udpin://`` an empty host is every interface, as in MAVSDK.
+"""
+
+import re
+from typing import NamedTuple, TypeAlias
+
+from mavbridge.core.errors import UserError
+
+FORMS = (
+    "udp:HOST:PORT or udpin:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD; "
+    "or MAVSDK's udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT, serial:///dev/ttyX:BAUD"
+)
+FORWARD_FORMS = (
+    "udp:HOST:PORT to send to a ground station, or udpin:HOST:PORT to listen for one (also udp://, "
+    "udpin://)"
+)
+DEFAULT_BAUD = 57600
+EVERY_INTERFACE = "0.0.0.0"  # noqa: S104 - only where the user says so
+_KINDS = ("udp", "udpin", "udpout", "tcp", "tcpout")
+_NETWORK = re.compile(rf"(?:({'|'.join(_KINDS)}):)?(//)?([^:/\s]*):(\d{{1,5}})/?", re.ASCII)
+_SERIAL = re.compile(r"(?:serial:(?://)?)?(/dev/[^,]+?|COM\d+)(?:,(.*)|:(\d{4,}))?")
+"""A name may hold colons (/dev/serial/by-path/...): only four digits and more are a rate."""
+
+
+class UdpAddress(NamedTuple):
+    """Datagrams from ``host``'s side of the port, or to it."""
+
+    host: str
+    port: int
+    listens: bool
+    """The host is ours; else that of the other side."""
+
+
+class TcpAddress(NamedTuple):
+    """A server to connect to."""
+
+    host: str
+    port: int
+
+
+class SerialAddress(NamedTuple):
+    """A serial port."""
+
+    device: str
+    baud: int
+
+
+LinkAddress: TypeAlias = UdpAddress | TcpAddress | SerialAddress
+
+
+def parse_address(spec: str) -> LinkAddress:
+    """Read the address of ``--connect``; no name is looked up.
+
+    A bare HOST:PORT listens, as in pymavlink.
+
+    Raises:
+        UserError: it is not understood; the message holds the forms.
+    """
+    if (serial := _serial(spec)) is not None:
+        return serial
+    found = _network(spec)
+    if found is None:
+        hint = ""
+        if spec.startswith("tcpin:"):
+            hint = "mavbridge connects, and does not listen on TCP; "
+        raise UserError(f"--connect {spec!r} is not understood: {hint}use {FORMS}")
+    kind, host, port = found
+    if kind in ("tcp", "tcpout"):
+        return TcpAddress(host, port)
+    return UdpAddress(host, port, listens=kind != "udpout")
+
+
+def parse_forward(spec: str) -> UdpAddress:
+    """Read the address of ``--forward``, where ``udp`` sends.
+
+    Raises:
+        UserError: it is not understood; the message holds the forms.
+    """
+    found = _network(spec)
+    if found is None or found[0] not in ("udp", "udpin", "udpout"):
+        raise UserError(f"--forward {spec!r} is not understood; use {FORWARD_FORMS}")
+    kind, host, port = found
+    if kind != "udpin" and host == EVERY_INTERFACE:
+        raise UserError(f"--forward {spec}: no host to send to; use {FORWARD_FORMS}")
+    return UdpAddress(host, port, listens=kind == "udpin")
+
+
+def serial_baud(spec: str) -> int | None:
+    """Bits per second of the port that an address names; None: it is not serial."""
+    serial = _serial(spec)
+    return None if serial is None else serial.baud
+
+
+def _serial(spec: str) -> SerialAddress | None:
+    match = _SERIAL.fullmatch(spec)
+    if match is None:
+        return None
+    device, after_comma, after_colon = match.groups()
+    baud = after_comma if after_comma is not None else after_colon or str(DEFAULT_BAUD)
+    if not (baud.isascii() and baud.isdigit() and int(baud)):
+        raise UserError(f"--connect {spec}: {baud!r} is not a baud rate; use {FORMS}")
+    return SerialAddress(device, int(baud))
+
+
+def _network(spec: str) -> tuple[str, str, int] | None:
+    """Kind (empty where none is given), host and port; None for anything else."""
+    match = _NETWORK.fullmatch(spec)
+    if match is None or not 0 < (port := int(match[4])) < 65536:
+        return None
+    kind, is_url, host = match[1] or "", match[2], match[3]
+    if (is_url and not kind) or host in _KINDS:
+        return None
+    if not host and is_url and kind in ("udp", "udpin"):
+        host = EVERY_INTERFACE
+    return (kind, host, port) if host else None

@@ -1,0 +1,45 @@
+"""The exit status of a flight, and the sentence that explains it."""
+
+from typing import NamedTuple
+
+from mavbridge.core.errors import ExitCode
+from mavbridge.core.stopping import StopRequest
+from mavbridge.gate.wire import GateSummary
+
+
+class Verdict(NamedTuple):
+    """How a flight went, for scripts and for the user."""
+
+    exit_code: int
+    text: str | None = None
+    """Why it is not 0."""
+
+
+def flight_verdict(
+    summary: GateSummary | None, stop: StopRequest, *, reason: str, readonly: bool
+) -> Verdict:
+    """Judge a flight that ended without an exception.
+
+    Args:
+        summary: the gate's last words; None where it goes on without us.
+        stop: the signals that have come.
+        reason: why the policy does not fly now, from the last tick.
+        readonly: nothing was sent, so there was nothing to fly.
+    """
+    interrupted = None if stop.signal_number is None else 128 + stop.signal_number
+    if summary is None:
+        return Verdict(interrupted or ExitCode.NOT_FLOWN)
+    outcome = summary.outcome
+    if outcome.faults:
+        return Verdict(ExitCode.FAULT, "the policy's flight was ended by a fault")
+    if readonly and outcome.flights:
+        return Verdict(ExitCode.DONE)
+    if not outcome.flights:
+        why = f": {reason}" if reason else ""
+        return Verdict(interrupted or ExitCode.NOT_FLOWN, f"the policy has not flown{why}")
+    if outcome.has_left_ground is False:
+        code = interrupted or ExitCode.NOT_FLOWN
+        return Verdict(code, "the vehicle has not left the ground")
+    if outcome.is_disarmed:
+        return Verdict(ExitCode.NOT_FLOWN, "the vehicle was disarmed while the policy flew it")
+    return Verdict(ExitCode.DONE)

@@ -1,0 +1,273 @@
+"""The viewer's plots and their places on its two pages, ``Flight`` and ``Timing``.
+
+No plot has a legend, which would lie on its data: the title names each line and its colour.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TimelineColumn
+
+from mavbridge.core.course import CourseGate
+from mavbridge.core.records import FloatArray, Position
+from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind
+from policy.contract import Contract
+
+EVENTS = "events"
+SCENE = "scene"
+CHASE = f"{SCENE}/chase"
+"""Moves and turns with the vehicle, and stays level: the axes of an eye that follows it."""
+VEHICLE = f"{CHASE}/vehicle"
+"""Leans in them."""
+PATH = f"{SCENE}/path"
+PLANNED_PATH = f"{SCENE}/planned"
+PLAN_LANES = 2
+"""Planned actions overlap in time: neighbours lie in different entities, or a line would join
+them."""
+PLAN_TAIL_S = 3.0
+"""The scene shows the planned paths of so long before the cursor."""
+ORIGIN = Position(0.0, 0.0, 0.0)
+"""Where a vehicle is shown that does not tell its position."""
+UP = (0.0, 0.0, -1.0)
+NEAR_EYE_M, FAR_EYE_M = (-3.0, 0.8, -1.3), (-16.0, 5.0, -11.0)
+"""Places of eyes that follow: behind, to the right of and above the vehicle."""
+
+Rgb: TypeAlias = tuple[int, int, int]
+BLUE, ORANGE, GREEN, RED = (86, 180, 233), (240, 160, 40), (60, 200, 140), (235, 80, 70)
+PINK, WHITE, GREY = (225, 120, 180), (235, 235, 235), (120, 120, 120)
+DARK_BLUE = (45, 95, 135)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewedFlight:
+    """What the viewer is told of a flight before it begins."""
+
+    vision_hz: float
+    chunk_hz: float
+    stick_hz: float
+    contract: Contract = field(default_factory=Contract)
+    """Kind of the actions, frame of the states, names of the cameras."""
+    max_state_age_s: float | None = None
+    """Limits of the ages when a stick is sent; None: nothing is flown by them."""
+    max_feature_age_s: float | None = None
+    to_ned: Callable[[FloatArray], tuple[Action, ...]] | None = None
+    """Actions [horizon, 4] of a solve -> the same in NED and FRD; None: no plan is shown."""
+    gates: tuple[CourseGate, ...] = ()
+
+
+class Series(NamedTuple):
+    """One line of a plot."""
+
+    name: str
+    color: Rgb
+    width: float = 1.5
+
+
+class Plot(NamedTuple):
+    """One entity: series that share their stamps."""
+
+    path: str
+    title: str
+    series: tuple[Series, ...]
+
+
+def _band(path: str, title: str, bound: str) -> Plot:
+    """Plot of a quantity that jumps from value to value: its spread over short windows."""
+    series = (
+        Series("least", DARK_BLUE),
+        Series("most", DARK_BLUE),
+        Series("median", BLUE, width=2),
+        Series(bound, RED),
+    )
+    return Plot(path, f"{title} [ms], red: {bound}", series)
+
+
+IMAGE_AGE = _band("age/image", "Image age when sent", "limit")
+ATTITUDE_AGE = _band("age/attitude", "Attitude age when sent", "limit")
+LATENESS = _band("jitter/sticks", "Jitter: sticks after their slot", "missed")
+CHUNK_PERIOD = _band("period/chunk", "Time between chunks", "target")
+PREDICT = _band("compute/chunk", "Time to compute a chunk", "target period")
+VISION_JITTER = _band("jitter/vision", "Jitter: images off their period", "period")
+VISION_PERIOD = _band("period/vision", "Time between images", "target")
+ENCODE = _band("compute/vision", "Time to encode an image", "target period")
+BANDS = (
+    *(IMAGE_AGE, ATTITUDE_AGE, LATENESS, CHUNK_PERIOD, PREDICT),
+    *(VISION_JITTER, VISION_PERIOD, ENCODE),
+)
+_COUNTS = (Series("0.1 % of all", RED), Series("count", BLUE, width=2))
+MISSED = Plot("missed/sticks", "Missed slots since the start, red: 0.1 % of all", _COUNTS)
+DROPPED = Plot("missed/vision", "Dropped images since the start, red: 0.1 % of all", _COUNTS)
+_RC_SERIES = tuple(
+    Series(f"channel {number}", color)
+    for number, color in enumerate((BLUE, ORANGE, GREEN, PINK), start=1)
+)
+RC = Plot("rc", "RC channels [us]: 1 blue, 2 orange, 3 green, 4 pink", _RC_SERIES)
+"""As the vehicle echoes them. Channels 1 to 4 hold the sticks, unless RCMAP_* says otherwise."""
+SPEED = Plot(
+    "motion/speed",
+    "Speed [m/s]: blue horizontal, green climb",
+    (Series("horizontal", BLUE, 2), Series("climb", GREEN, 2)),
+)
+HEIGHT = Plot("motion/height", "Height above the origin [m]", (Series("height", BLUE, 2),))
+PLOTS = (*BANDS, MISSED, DROPPED, RC, SPEED, HEIGHT)
+
+ACTION_SERIES = (
+    Series("vehicle's echo", GREEN, width=4),  # first: drawn under the others
+    Series("policy", PINK),
+    Series("smoothed", BLUE),
+    Series("sent", WHITE),
+)
+_PLAN_SERIES = (Series("planned", ORANGE, width=1),)
+
+
+def action_plots(action: ActionKind) -> tuple[Plot, ...]:
+    """One plot for each of the four numbers of an action of this kind."""
+    key = ": white sent, pink policy, orange plan" + (", green echo" if action == "sticks" else "")
+    return tuple(
+        Plot(f"{action}/{name}", f"{name.replace('_', ' ').capitalize()}{key}", ACTION_SERIES)
+        for name in ACTION_CLASSES[action]._fields
+    )
+
+
+def plan_plots(action: ActionKind) -> tuple[tuple[Plot, ...], ...]:
+    """For each lane, the planned course of each of the four numbers."""
+    return tuple(
+        tuple(Plot(f"{plot.path}/plan/{lane}", "", _PLAN_SERIES) for plot in action_plots(action))
+        for lane in range(PLAN_LANES)
+    )
+
+
+def camera_paths(cameras: tuple[str, ...]) -> tuple[str, ...]:
+    """Entity of each camera: below the vehicle, so that its images hang in the scene."""
+    return tuple(f"{VEHICLE}/{name}" for name in cameras)
+
+
+def styles(action: ActionKind) -> tuple[tuple[str, rr.SeriesLines], ...]:
+    """Names, colours and widths of all lines, by entity."""
+    plans = [plot for lane in plan_plots(action) for plot in lane]
+    return tuple((plot.path, _style(plot)) for plot in (*PLOTS, *action_plots(action), *plans))
+
+
+def _style(plot: Plot) -> rr.SeriesLines:
+    return rr.SeriesLines(
+        names=[series.name for series in plot.series],
+        colors=[series.color for series in plot.series],
+        widths=[series.width for series in plot.series],
+        aggregation_policy="MinMax",  # zoomed out: averages would hide stalls
+    )
+
+
+def flight_blueprint(flight: ViewedFlight) -> rrb.Blueprint:
+    """Initial layout of the viewer: where the vehicle is and what it is told, then the timing."""
+    contract = flight.contract
+    cameras = [
+        rrb.Spatial2DView(origin=path, name=f"Camera {name}" if number else "Camera")
+        for number, (path, name) in enumerate(
+            zip(camera_paths(contract.cameras), contract.cameras, strict=True)
+        )
+    ]
+    place = rrb.Vertical(
+        _scenes(flight.gates),
+        rrb.Horizontal(
+            rrb.Horizontal(*cameras),
+            rrb.TextLogView(origin=EVENTS, name="Events", columns=_event_columns()),
+            column_shares=[2, 3],
+        ),
+        row_shares=[3, 2],
+    )
+    motion = rrb.Vertical(
+        *(_time_series(plot) for plot in (SPEED, HEIGHT)),
+        *(
+            _time_series(plot, value_range=(-1.1, 1.1) if contract.action == "sticks" else None)
+            for plot in action_plots(contract.action)
+        ),
+        row_shares=[5, 5, 4, 4, 4, 4],
+    )
+    return rrb.Blueprint(
+        rrb.Tabs(
+            rrb.Horizontal(place, motion, column_shares=[3, 2], name="Flight"),
+            _timing(),
+            active_tab=0,
+        ),
+        rrb.TimePanel(state="collapsed", timeline="time"),
+        collapse_panels=True,
+    )
+
+
+def _scenes(gates: Sequence[CourseGate]) -> rrb.Horizontal:
+    """The path as a whole where its gates are known, else from afar; and the vehicle from near."""
+    until_now = rrb.VisibleTimeRange(
+        "time", start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    )
+    lately = rrb.VisibleTimeRange(
+        "time",
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-PLAN_TAIL_S),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    trails: dict[rr.EntityPath | str, rrb.VisibleTimeRanges] = {
+        PATH: rrb.VisibleTimeRanges(until_now),
+        PLANNED_PATH: rrb.VisibleTimeRanges(lately),
+    }
+
+    def scene(name: str, origin: str, eye: rrb.EyeControls3D) -> rrb.Spatial3DView:
+        return rrb.Spatial3DView(
+            name=name,
+            origin=origin,
+            contents=[f"/{SCENE}/**"],
+            overrides=trails,
+            eye_controls=eye,
+        )
+
+    name = "Path: blue policy, grey others, orange plan"
+    return rrb.Horizontal(
+        scene(name, SCENE, _overlooking(gates))
+        if gates
+        else scene(name, CHASE, _behind(FAR_EYE_M)),
+        scene("From behind: red = front", CHASE, _behind(NEAR_EYE_M)),
+    )
+
+
+def _overlooking(gates: Sequence[CourseGate]) -> rrb.EyeControls3D:
+    """An eye behind and above the start that sees all gates."""
+    centers_m = np.array([ORIGIN, *(gate.center_ned_m for gate in gates)])
+    middle_m = (centers_m.min(axis=0) + centers_m.max(axis=0)) / 2
+    reach_m = float(np.linalg.norm(centers_m - middle_m, axis=1).max())
+    first_m = centers_m[1] / max(float(np.linalg.norm(centers_m[1])), 1e-6)
+    position_m = middle_m - 1.3 * reach_m * first_m + np.array([0.0, 0.0, -0.9 * reach_m])
+    return rrb.EyeControls3D(position=position_m, look_target=middle_m, eye_up=UP)
+
+
+def _behind(position_m: tuple[float, float, float]) -> rrb.EyeControls3D:
+    return rrb.EyeControls3D(position=position_m, look_target=(1.0, 0.0, 0.0), eye_up=UP)
+
+
+def _timing() -> rrb.Horizontal:
+    columns = (
+        (IMAGE_AGE, ATTITUDE_AGE, RC),
+        (LATENESS, CHUNK_PERIOD, PREDICT, MISSED),
+        (VISION_JITTER, VISION_PERIOD, ENCODE, DROPPED),
+    )
+    return rrb.Horizontal(
+        *(rrb.Vertical(*(_time_series(plot) for plot in column)) for column in columns),
+        name="Timing: median, least and most of each quarter of a second",
+    )
+
+
+def _event_columns() -> rrb.TextLogColumns:
+    """Text alone: it begins with the time, for which the viewer's own column is too narrow."""
+    time = TimelineColumn("time", visible=False)
+    return rrb.TextLogColumns(timeline_columns=[time], text_log_columns=["Body"])
+
+
+def _time_series(plot: Plot, value_range: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name=plot.title,
+        contents=[f"/{plot.path}/**"],
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        axis_y=None if value_range is None else rrb.ScalarAxis(range=value_range),
+        plot_legend=rrb.PlotLegend(visible=False),
+    )

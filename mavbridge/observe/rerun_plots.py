@@ -1,0 +1,157 @@
+"""What the viewer plots over time: ages, periods, computing times, counters, motion and actions."""
+
+import math
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import Tick, VisionTick
+from mavbridge.core.vehicle import Action, Sticks
+from mavbridge.observe import rerun_layout as layout
+from mavbridge.observe.rerun_columns import Columns, Spread
+from mavbridge.observe.rerun_layout import ViewedFlight
+
+ALLOWED_SHARE = 0.001
+"""Of slots and of images: what a minute at full rate may lose, by our own measure."""
+_GAP = Sticks(math.nan, math.nan, math.nan, math.nan)
+
+
+class TimingPlots:
+    """The page ``Timing``; images are those of the first camera."""
+
+    def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
+        self._columns = columns
+        slot_ns, chunk_ns = NS_PER_S / flight.stick_hz, NS_PER_S / flight.chunk_hz
+        self._vision_ns = NS_PER_S / flight.vision_hz
+        bounds_ns = {
+            layout.IMAGE_AGE: _ns(flight.max_feature_age_s),
+            layout.ATTITUDE_AGE: _ns(flight.max_state_age_s),
+            layout.LATENESS: slot_ns,
+            layout.CHUNK_PERIOD: chunk_ns,
+            layout.PREDICT: chunk_ns,
+            layout.VISION_JITTER: self._vision_ns,
+            layout.VISION_PERIOD: self._vision_ns,
+            layout.ENCODE: self._vision_ns,
+        }
+        self._spreads = {
+            plot: Spread(columns, plot, bound_ns) for plot, bound_ns in bounds_ns.items()
+        }
+        self._last_chunk: Tick | None = None
+        self._last_started_ns: int | None = None
+        self._last_channels: tuple[int, ...] | None = None
+        self._slots = self._missed_slots = 0
+        self._images = 0
+        self._first_dropped: int | None = None
+
+    def show_ticks(self, ticks: Sequence[Tick]) -> None:
+        """Plot the ages, and the lateness of what was sent in a slot."""
+        ages_ns = [
+            (tick.sent_ns, tick.sent_ns - tick.feature_captured_ns)
+            for tick in ticks
+            if tick.feature_captured_ns is not None
+        ]
+        self._extend(layout.IMAGE_AGE, ages_ns)
+        ages_ns = [
+            (tick.sent_ns, tick.sent_ns - tick.state.attitude_ns)
+            for tick in ticks
+            if tick.state is not None
+        ]
+        self._extend(layout.ATTITUDE_AGE, ages_ns)
+        late_ns = [
+            (tick.sent_ns, max(0, tick.sent_ns - tick.due_ns))
+            for tick in ticks
+            if tick.is_slot and tick.trace is not None
+        ]
+        self._extend(layout.LATENESS, late_ns)
+        self._show_chunks(ticks)
+        self._missed_slots += sum(tick.missed_slots for tick in ticks)
+        self._slots += sum(tick.is_slot + tick.missed_slots for tick in ticks)
+        self._count(layout.MISSED, ticks[-1].woke_ns, self._missed_slots, self._slots)
+        self._show_channels(ticks)
+
+    def _show_chunks(self, ticks: Sequence[Tick]) -> None:
+        """Periods of the chunks that were flown, and what each took to compute."""
+        news: list[Tick] = []
+        last = self._last_chunk
+        for tick in ticks:
+            if tick.chunk_serial is None or tick.chunk_computed_ns is None:
+                last = None  # the time without a chunk is no period
+            elif last is None or tick.chunk_serial != last.chunk_serial:
+                if last is not None and last.chunk_computed_ns is not None:
+                    period_ns = tick.chunk_computed_ns - last.chunk_computed_ns
+                    self._extend(layout.CHUNK_PERIOD, [(tick.sent_ns, period_ns)])
+                news.append(tick)
+                last = tick
+        self._last_chunk = last
+        predict_ns = [(new.sent_ns, new.predict_ns) for new in news if new.predict_ns is not None]
+        self._extend(layout.PREDICT, predict_ns)
+
+    def _show_channels(self, ticks: Sequence[Tick]) -> None:
+        width = len(layout.RC.series)
+        rows: list[tuple[int, tuple[float, ...]]] = []
+        for tick in ticks:
+            if tick.rc_channels_us != self._last_channels or tick is ticks[-1]:
+                self._last_channels = tick.rc_channels_us
+                shown_us = tick.rc_channels_us[:width]
+                rows.append((tick.woke_ns, (*shown_us, *(math.nan,) * (width - len(shown_us)))))
+        stamps_ns, values_us = zip(*rows, strict=True)
+        self._columns.plot(layout.RC, stamps_ns, np.array(values_us))
+
+    def show_visions(self, visions: Sequence[VisionTick]) -> None:
+        """Plot the images of one camera."""
+        ready_ns = [vision.ready_ns for vision in visions]
+        encode_ns = [vision.ready_ns - vision.started_ns for vision in visions]
+        self._spreads[layout.ENCODE].extend(ready_ns, encode_ns)
+        started_ns = [vision.started_ns for vision in visions]
+        if self._last_started_ns is not None:
+            started_ns.insert(0, self._last_started_ns)
+        self._last_started_ns = started_ns[-1]
+        periods_ns = [(after, after - before) for before, after in pairwise(started_ns)]
+        self._extend(layout.VISION_PERIOD, periods_ns)
+        jitter_ns = [(stamp, abs(period - self._vision_ns)) for stamp, period in periods_ns]
+        self._extend(layout.VISION_JITTER, jitter_ns)
+        if self._first_dropped is None:
+            self._first_dropped = visions[0].dropped_frames
+        dropped = visions[-1].dropped_frames - self._first_dropped
+        self._images += len(visions)
+        self._count(layout.DROPPED, ready_ns[-1], dropped, self._images + dropped)
+
+    def _count(self, plot: layout.Plot, stamp_ns: int, count: int, of_all: int) -> None:
+        self._columns.plot(plot, [stamp_ns], np.array([of_all * ALLOWED_SHARE, count]))
+
+    def _extend(self, plot: layout.Plot, values: Iterable[tuple[int, float]]) -> None:
+        pairs = list(values)
+        self._spreads[plot].extend([stamp for stamp, _ in pairs], [value for _, value in pairs])
+
+    def close(self) -> None:
+        """Show what waits for the end of its window."""
+        for spread in self._spreads.values():
+            spread.close()
+
+
+class ActionPlots:
+    """Each number of the actions: as the policy put it out, smoothed, sent, and echoed."""
+
+    def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
+        self._columns = columns
+        self._is_sticks = flight.contract.action == "sticks"
+        self._plots = layout.action_plots(flight.contract.action)
+
+    def show(self, ticks: Sequence[Tick]) -> None:
+        """Plot all ticks."""
+        stamps_ns = [tick.woke_ns for tick in ticks]
+        rows = np.array([self._row(tick) for tick in ticks], dtype=np.float64)
+        for axis, plot in enumerate(self._plots):
+            self._columns.plot(plot, stamps_ns, rows[:, :, axis])
+
+    def _row(self, tick: Tick) -> tuple[Action, ...]:
+        echo: Action = (tick.rc_sticks if self._is_sticks else None) or _GAP
+        trace = tick.trace
+        raw, smoothed = (_GAP, _GAP) if trace is None else (trace.raw, trace.smoothed)
+        return echo, raw, smoothed, tick.sent or _GAP
+
+
+def _ns(limit_s: float | None) -> float | None:
+    return None if limit_s is None else limit_s * NS_PER_S

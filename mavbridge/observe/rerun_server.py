@@ -1,0 +1,120 @@
+"""Rerun's web viewer and the server that feeds it (``--serve``), in a process of their own.
+
+The server keeps what it was sent for browsers that come late, so memory is bounded there, outside
+the flight; a browser that does not keep up holds up the server, never the flight's loops.
+"""
+
+import socket
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.processes import end
+from mavbridge.observe.rerun_process import start_listening
+
+SERVER_MEMORY = "1GB"
+"""Beyond this the server forgets its oldest data."""
+LOOPBACK = ("127.0.0.1", "::1")
+_ANY = ("0.0.0.0", "::")  # noqa: S104 - compared with, where the user asks for it
+_DIE_WITH_PARENT = """
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, 15)  # PR_SET_PDEATHSIG, SIGTERM
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+"""Linux ends the server with the flight's process, also after a kill -9."""
+
+
+class ServeAddress(NamedTuple):
+    """Where the page is served; the data of the flight come from the next port."""
+
+    host: str
+    """An IP address."""
+    port: int
+
+    @property
+    def data_port(self) -> int:
+        """Port of the gRPC server that the page connects to."""
+        return self.port + 1
+
+    @property
+    def data_url(self) -> str:
+        """URL of the gRPC server, from this computer."""
+        host = "127.0.0.1" if self.host in _ANY else self.host
+        return f"rerun+http://{_bracketed(host)}:{self.data_port}/proxy"
+
+    @property
+    def page_url(self) -> str:
+        """Address for a browser, which tells the page where the data are."""
+        host = _bracketed(socket.gethostname() if self.host in _ANY else self.host)
+        data_url = f"rerun+http://{host}:{self.data_port}/proxy"
+        return f"http://{host}:{self.port}/?url={quote(data_url, safe=':/')}"
+
+
+def serve_address(text: str) -> ServeAddress:
+    """Read the value of ``--serve``, and check that both of its ports are free.
+
+    Raises:
+        UserError: not HOST:PORT, or a port that cannot be listened on.
+    """
+    host, _, port_text = text.rpartition(":")
+    host = host.strip("[]")
+    if not host or not port_text.isdecimal() or not 1 <= int(port_text) <= 65534:
+        raise UserError(
+            f"--serve {text!r} is not understood; use HOST:PORT, such as 127.0.0.1:9090, with a "
+            "port up to 65534: the next one carries the data"
+        )
+    first = int(port_text)
+    for port in (first, first + 1):
+        try:
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            with socket.create_server(found[4], family=found[0]):
+                pass
+        except OSError as error:
+            raise UserError(
+                f"--serve {text}: cannot listen on {host} port {port} ({error.strerror}); choose "
+                "another port (the page takes this one, the data the next)"
+            ) from error
+    return ServeAddress(str(found[4][0]), first)
+
+
+class WebServer:
+    """The process of one server, from the constructor to ``close``."""
+
+    def __init__(self, address: ServeAddress) -> None:
+        """Start it and wait until it listens; raises MavbridgeError if it does not."""
+        options = {
+            "--bind": address.host,
+            "--port": str(address.data_port),
+            "--web-viewer-port": str(address.port),
+            "--server-memory-limit": SERVER_MEMORY,
+        }
+        if address.host not in LOOPBACK:  # pages of other computers may not read the data else
+            options["--cors-allow-origin"] = f"http://*:{address.port}"
+        binary = _binary()
+        flags = [word for option in options.items() for word in option]
+        self._process: subprocess.Popen[bytes] = start_listening(
+            [sys.executable, "-c", _DIE_WITH_PARENT, str(binary), "--serve-web", *flags],
+            name="Rerun's web server",
+            host="127.0.0.1" if address.host in _ANY else address.host,
+            ports=(address.port, address.data_port),
+        )
+
+    def close(self) -> None:
+        """End it; pages that are open keep what they have."""
+        end(self._process)
+
+
+def _binary() -> Path:
+    """Rerun's program itself: its Python wrapper would die without ending it."""
+    spec = find_spec("rerun_cli")
+    if spec is None or spec.origin is None:
+        raise MavbridgeError("--serve needs Rerun's program, which is not installed: rerun_cli")
+    return Path(spec.origin).parent / "rerun"
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

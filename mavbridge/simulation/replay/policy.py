@@ -1,0 +1,246 @@
+"""The policy loop of a recorded flight once more: its bytes, its features, its sent sticks.
+
+``VehicleView``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and ``PolicyLoop`` run as
+in the flight, composed by ``build_bridge``. Taken from the recording: when a solve began and ended;
+what had reached the flight process by then (the stamps of the state and the newest image tell it);
+when packets arrived and what moment they tell about; and which sticks had been sent. Solves that
+returned no chunk are not in a recording, and are not repeated.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.records import FeatureFrame, FloatArray, Frame, Solve, Tick, VehicleState
+from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.flight.bridge import CameraPath, build_bridge
+from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.observation import observation_ages_ns
+from mavbridge.flight.vehicle_view import VehicleView
+from mavbridge.gate.chunks import Chunk
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.wire import Absence, GateStatus, GateTick
+from mavbridge.mavlink.codec.messages import Measurement
+from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.session.telemetry import TelemetryCollector
+from mavbridge.simulation.clock import SteppedClock
+from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource, flying_since
+from policy.protocol import Executable
+
+HELD_NS = 50 * NS_PER_MS
+"""Longest time for which the news that a flight began may have been on its way to the policy."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolvePair:
+    """A recorded solve, and the same one now."""
+
+    recorded: Solve
+    replayed: Solve | None
+    refusal: str | None = None
+    """Why there is none this time."""
+
+
+def replay_policy(
+    source: ReplaySource,
+    executable: Executable,
+    clock: SteppedClock,
+    features: Sequence[Sequence[FeatureFrame]],
+) -> Iterator[SolvePair]:
+    """Every recorded solve once more.
+
+    Args:
+        source: the flight.
+        executable: the policy, reset; it follows ``clock`` if it follows one at all.
+        clock: at a time before the flight.
+        features: of each camera of the contract, in order of exposure.
+    """
+    loop = _Loop(source, executable, clock)
+    news = _News(
+        source, loop.view, [_Shelf(f, c) for f, c in zip(features, loop.caches, strict=True)]
+    )
+    for number, solve in enumerate(source.solves):
+        if (missing := news.bring(solve, is_begin=number > 0 and solve.is_first)) is not None:
+            yield SolvePair(recorded=solve, replayed=None, refusal=missing)
+            continue
+        yield loop.repeat(solve)
+
+
+class _Loop:
+    """The policy loop and all around it, stepped for each recorded solve."""
+
+    def __init__(self, source: ReplaySource, executable: Executable, clock: SteppedClock) -> None:
+        contract = source.contract
+        self._clock = clock
+        self._now: Solve | None = None
+        self._solve: Solve | None = None
+        self._refusal: str | None = None
+        self._act = executable.act
+        span_ns = observation_ages_ns(contract)[0]
+        self.caches = [FeatureCache(span_ns=span_ns) for _ in contract.cameras]
+        bridge = build_bridge(
+            source.config,
+            replace(executable, act=self._timed_act),
+            clock=clock,
+            send=self._sent,
+            cameras=[CameraPath(camera=_NoCamera(), cache=c, clock=clock) for c in self.caches],
+            sinks=(),
+            watches_images=False,
+            watch_solve=self._keep,
+        )
+        self._policy = bridge.policy
+        self.view = bridge.view
+        autopilot = source.meta.autopilot or "none"
+        self.view.receive(GateStatus(autopilot, None, True, None, (), None, has_position=True))
+
+    def repeat(self, recorded: Solve) -> SolvePair:
+        """One step of the loop at the moment of a recorded one."""
+        self._now, self._solve, self._refusal = recorded, None, None
+        self._clock.sleep_until_ns(recorded.started_ns)
+        self._policy.step()
+        return SolvePair(recorded=recorded, replayed=self._solve, refusal=self._refusal)
+
+    def _timed_act(
+        self, encoded: FloatArray, states: FloatArray, history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        """Compute, and let the time pass that it took then.
+
+        A recorded solve that started afresh came after one without a chunk.
+        """
+        recorded = self._now
+        is_afresh = recorded is not None and recorded.elapsed_s is None
+        chunk = self._act(encoded, states, history, None if is_afresh else elapsed_s)
+        if recorded is not None:
+            self._clock.sleep_until_ns(recorded.computed_ns)
+        return chunk
+
+    def _sent(self, message: Chunk | Absence) -> None:
+        if isinstance(message, Absence):
+            self._refusal = message.reason
+
+    def _keep(self, solve: Solve) -> None:
+        self._solve = solve
+
+
+class _NoCamera:
+    """A ``Camera`` that is never read: the features are recorded."""
+
+    dropped_frames = 0
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        """No frame."""
+        return None
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class _Shelf:
+    """Features of one camera on their way into its cache."""
+
+    def __init__(self, features: Sequence[FeatureFrame], cache: FeatureCache) -> None:
+        self._features, self._cache = features, cache
+        self._places = {feature.frame_id: k for k, feature in enumerate(features)}
+        self._next = 0
+
+    def bring(self, frame_id: int) -> bool:
+        """Publish all up to this one; False: it is not there."""
+        place = self._places.get(frame_id)
+        if place is None:
+            return False
+        for feature in self._features[self._next : place + 1]:
+            self._cache.publish(feature)
+        self._next = max(self._next, place + 1)
+        return True
+
+
+class _News:
+    """What reached the flight process: packets, ticks of the gate, and features."""
+
+    def __init__(self, source: ReplaySource, view: VehicleView, shelves: Sequence[_Shelf]) -> None:
+        self._view = view
+        self._shelves = shelves
+        self._packets = [p for p in source.packets if p.happened_ns is not None]
+        self._stamps = _state_stamps(self._packets)
+        self._next_packet = 0
+        self._ticks = source.ticks
+        self._begins = flying_since(source.ticks)
+        self._next_tick = 0
+
+    def bring(self, solve: Solve, *, is_begin: bool) -> str | None:
+        """Deliver what this solve had seen; or say what the recording lacks."""
+        self._bring_ticks(solve.started_ns, is_begin=is_begin)
+        if not self._bring_packets(solve.state):
+            return "the recording lacks the packets of its state"
+        for shelf, frame_id in zip(self._shelves, solve.frame_ids[-1], strict=True):
+            if not shelf.bring(frame_id):
+                return f"the recording lacks the feature of frame {frame_id}"
+        return None
+
+    def _bring_ticks(self, now_ns: int, *, is_begin: bool) -> None:
+        """Ticks until now; the one that begins a flight comes with the solve that was the first."""
+        while self._next_tick < len(self._ticks):
+            tick = self._ticks[self._next_tick]
+            is_first = self._next_tick in self._begins
+            wait_ns = HELD_NS if is_first else 0
+            if is_first and is_begin:
+                wait_ns, is_begin = -HELD_NS, False
+            if tick.sent_ns > now_ns - wait_ns:
+                return
+            self._next_tick += 1
+            self._view.receive(_gate_tick(tick))
+
+    def _bring_packets(self, state: VehicleState) -> bool:
+        wanted = (state.attitude_ns, state.rate_ns, state.velocity_ns, state.specific_force_ns)
+        ends = np.flatnonzero((self._stamps[self._next_packet :] == wanted).all(axis=1))
+        if not len(ends):
+            return bool(self._next_packet and (self._stamps[self._next_packet - 1] == wanted).all())
+        end = self._next_packet + int(ends[0]) + 1
+        arrived = self._packets[self._next_packet : end]
+        self._next_packet = end
+        for _, group in groupby(arrived, key=lambda packet: packet.arrived_ns):
+            self._view.receive(
+                tuple(ForwardedPacket(p.arrived_ns, p.happened_ns or 0, p.data) for p in group)
+            )
+        return True
+
+
+def _state_stamps(
+    packets: Sequence[RecordedPacket],
+) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    """[N, 4]: attitude_ns, rate_ns, velocity_ns, specific_force_ns of a state after each packet."""
+    codec, telemetry = Codec(source_system=0, source_component=0), TelemetryCollector()
+    stamps = np.zeros((len(packets), 4), np.int64)
+    for number, packet in enumerate(packets):
+        for message in codec.decode_datagram(packet.data):
+            if isinstance(message.body, Measurement):
+                telemetry.receive(message.body, packet.arrived_ns, packet.happened_ns or 0)
+        now = telemetry.snapshot()
+        readings = (
+            *(now.ned_from_body_wxyz, now.rate_body_radps),
+            *(now.velocity_ned_mps, now.specific_force_body_mps2),
+        )
+        stamps[number] = [0 if reading is None else reading.happened_ns for reading in readings]
+    return stamps
+
+
+def _gate_tick(tick: Tick) -> GateTick:
+    """The gate's report that became this tick."""
+    return GateTick(
+        index=tick.index,
+        due_ns=tick.due_ns,
+        woke_ns=tick.woke_ns,
+        decided_ns=tick.decided_ns or tick.woke_ns,
+        sent_ns=tick.sent_ns,
+        missed_slots=tick.missed_slots,
+        is_slot=tick.is_slot,
+        is_coasting=tick.is_coasting,
+        chunk_serial=tick.chunk_serial,
+        trace=tick.trace,
+        sent=tick.sent,
+        phase=Phase(tick.phase),
+        reason=tick.release_reason or "",
+    )

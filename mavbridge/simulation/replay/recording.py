@@ -1,0 +1,175 @@
+"""All that a recorded flight holds for its replay."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from mavbridge.config.flight import FlyConfig
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.errors import UserError
+from mavbridge.core.records import FeatureFrame, Solve, Tick
+from mavbridge.mavlink.codec.frames import RawPacket, frame_at
+from mavbridge.recording import replay_rows, rows
+from mavbridge.recording.folder import PACKETS, SOLVES, TICKS, TLOG, features_of
+from mavbridge.recording.meta import FlightMeta, read_meta
+from mavbridge.recording.replay_rows import (
+    PacketStamp,
+    packet_key,
+    read_features,
+    read_packets,
+    read_solves,
+)
+from mavbridge.recording.settings import read_settings
+from mavbridge.recording.tables import read_table
+from policy.contract import Contract
+
+STAMP_NS = 10 * NS_PER_MS
+"""Most by which a packet's two stamps may differ: the log's are rounded to 4 us, and the clocks of
+user and system drift apart by less in an hour."""
+_STAMP_BYTES = 8
+
+
+class RecordedPacket(NamedTuple):
+    """A packet that came from the vehicle's side."""
+
+    arrived_ns: int
+    """Exact where the flight process got it, else rounded to 4 us."""
+    happened_ns: int | None
+    """None: the flight process did not get it."""
+    data: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaySource:
+    """One recorded flight."""
+
+    folder: Path
+    meta: FlightMeta
+    contract: Contract
+    config: FlyConfig
+    """Its flags, without those that reach outside of the flight: ``--set``, ``--forward``."""
+    ticks: tuple[Tick, ...]
+    solves: tuple[Solve, ...]
+    features: tuple[tuple[FeatureFrame, ...], ...]
+    """Of each camera of the contract; empty for a single-rate policy."""
+    packets: tuple[RecordedPacket, ...]
+    """In order of arrival."""
+    gaps: tuple[str, ...]
+    """What the recording has lost, in words: a replay may differ there."""
+
+
+def open_source(folder: Path) -> ReplaySource:
+    """Read a flight, finished or cut off.
+
+    Raises:
+        MavbridgeError: it is no recorded flight, or one that cannot be replayed.
+    """
+    meta = read_meta(folder)
+    settings = read_settings(folder)
+    if meta.contract is None:
+        raise UserError(f"{folder} was flown without a policy: there is nothing to replay")
+    config = settings.config
+    config = replace(
+        config,
+        link=replace(config.link, set=(), restore_params=False, forward="", gcs_sticks_win=False),
+        policy=replace(config.policy, dual_rate=meta.mode == "dual"),
+        record=None,
+    )
+    table = read_table(folder / TICKS, rows.TICKS, later=rows.LATER)
+    ticks = list(rows.read_ticks(table, meta.contract.action))
+    solve_rows = list(read_solves(read_table(folder / SOLVES, replay_rows.SOLVES), meta.contract))
+    if not ticks or not solve_rows:
+        raise UserError(
+            f"{folder} ended before its policy had computed anything: nothing to replay"
+        )
+    stamps = list(read_packets(read_table(folder / PACKETS, replay_rows.PACKETS)))
+    offset_ns, system = settings.wall_offset_ns, config.link.source_system
+    packets = list(_received(_log(folder / TLOG), stamps, offset_ns=offset_ns, own_system=system))
+    return ReplaySource(
+        folder=folder,
+        meta=meta,
+        contract=meta.contract,
+        config=config,
+        ticks=tuple(row.tick for row in ticks),
+        solves=tuple(row.solve for row in solve_rows),
+        features=_features(folder, meta, meta.contract),
+        packets=tuple(packets),
+        gaps=tuple(
+            f"{count} {what} are not in the recording"
+            for what, count in (
+                ("ticks", sum(row.dropped_before for row in ticks)),
+                ("solves", sum(row.dropped_before for row in solve_rows)),
+                ("packets", len(stamps) - sum(p.happened_ns is not None for p in packets)),
+            )
+            if count
+        ),
+    )
+
+
+def _features(
+    folder: Path, meta: FlightMeta, contract: Contract
+) -> tuple[tuple[FeatureFrame, ...], ...]:
+    if meta.mode != "dual":
+        return ()
+    return tuple(
+        tuple(read_features(read_table(folder / features_of(name), replay_rows.FEATURES)))
+        for name in (None, *contract.cameras[1:])
+    )
+
+
+def _log(path: Path) -> Iterator[tuple[int, RawPacket]]:
+    """Unix time in microseconds and packet of each whole record.
+
+    Raises:
+        UserError: the log cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}), and has the flight") from error
+    at = 0
+    while (packet := frame_at(data, at + _STAMP_BYTES)) is not None:
+        yield int.from_bytes(data[at : at + _STAMP_BYTES], "big"), packet
+        at += _STAMP_BYTES + len(packet.data)
+
+
+def _received(
+    log: Iterator[tuple[int, RawPacket]],
+    stamps: list[PacketStamp],
+    *,
+    offset_ns: int,
+    own_system: int,
+) -> Iterator[RecordedPacket]:
+    """Packets of others than ourselves, with the exact stamps of those that are in the table.
+
+    Both have the same order, so that each is looked for behind the last one that was found.
+    """
+    waiting = 0
+    latest_ns = 0
+    for stamp_us, packet in log:
+        if packet.source.system == own_system:
+            continue
+        rough_ns = 1000 * stamp_us - offset_ns
+        key = packet_key(packet.data)
+        found = None
+        while waiting < len(stamps) and stamps[waiting].arrived_ns < rough_ns - STAMP_NS:
+            waiting += 1  # the log has lost it
+        if waiting < len(stamps):
+            stamp = stamps[waiting]
+            is_same = (stamp.message_id, stamp.sequence) == key
+            if is_same and stamp.arrived_ns - rough_ns < STAMP_NS:
+                found, waiting = stamp, waiting + 1
+        arrived_ns = rough_ns if found is None else found.arrived_ns
+        latest_ns = max(latest_ns, arrived_ns)
+        yield RecordedPacket(latest_ns, found and found.happened_ns, packet.data)
+
+
+def flying_since(ticks: tuple[Tick, ...]) -> frozenset[int]:
+    """Places of the ticks with which the policy has taken the sticks."""
+    begins = {0} if ticks[0].phase == "flying" else set()
+    for number, (before, tick) in enumerate(pairwise(ticks), start=1):
+        if tick.phase == "flying" and before.phase != "flying":
+            begins.add(number)
+    return frozenset(begins)

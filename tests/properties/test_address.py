@@ -1,0 +1,117 @@
+"""Every spelling of an address leads to the same place, and anything else to the forms."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavbridge.core.address import (
+    FORMS,
+    LinkAddress,
+    SerialAddress,
+    TcpAddress,
+    UdpAddress,
+    parse_address,
+    parse_forward,
+    serial_baud,
+)
+from mavbridge.core.errors import UserError
+
+HOSTS = st.one_of(
+    st.ip_addresses(v=4).map(str), st.from_regex(r"[a-z][a-z0-9.-]{0,20}[a-z0-9]", fullmatch=True)
+).filter(lambda host: host not in ("udp", "tcp", "udpin", "udpout", "tcpout"))
+PORTS = st.integers(1, 65535)
+DEVICES = st.from_regex(
+    r"/dev/[A-Za-z][A-Za-z0-9._-]{0,12}(/[A-Za-z0-9._:-]{1,12})?", fullmatch=True
+)
+
+
+@given(HOSTS, PORTS)
+def test_both_spellings_of_a_network_address_are_one(host: str, port: int) -> None:
+    for kind, listens in (("udp", True), ("udpin", True), ("udpout", False)):
+        expected = UdpAddress(host, port, listens)
+        for spec in (
+            f"{kind}:{host}:{port}",
+            f"{kind}://{host}:{port}",
+            f"{kind}://{host}:{port}/",
+        ):
+            assert parse_address(spec) == expected
+    for spec in (f"tcp:{host}:{port}", f"tcp://{host}:{port}", f"tcpout://{host}:{port}"):
+        assert parse_address(spec) == TcpAddress(host, port)
+    assert parse_address(f"{host}:{port}") == UdpAddress(host, port, True)
+
+
+@given(HOSTS, PORTS)
+def test_a_ground_station_is_sent_to_where_the_vehicle_is_listened_for(
+    host: str, port: int
+) -> None:
+    for slashes in (":", "://"):
+        sends = host != "0.0.0.0"
+        if sends:
+            assert parse_forward(f"udp{slashes}{host}:{port}") == UdpAddress(host, port, False)
+        assert parse_forward(f"udpin{slashes}{host}:{port}") == UdpAddress(host, port, True)
+
+
+@given(DEVICES.filter(lambda name: not name.rpartition(":")[2].isdigit()), st.integers(1, 10**7))
+def test_a_serial_port_keeps_its_name_whatever_colons_it_has(device: str, baud: int) -> None:
+    specs = [f"{device},{baud}", f"serial://{device},{baud}", f"serial:{device},{baud}"]
+    if baud >= 1000:
+        specs += [f"serial://{device}:{baud}", f"{device}:{baud}"]
+    for spec in specs:
+        assert parse_address(spec) == SerialAddress(device, baud)
+        assert serial_baud(spec) == baud
+    assert parse_address(device) == SerialAddress(device, 57600)
+
+
+@given(st.text(max_size=30))
+def test_whatever_is_written_is_an_address_or_told_the_forms(text: str) -> None:
+    try:
+        address: LinkAddress = parse_address(text)
+    except UserError as refusal:
+        told = str(refusal)
+    else:
+        told = FORMS
+        assert isinstance(address, SerialAddress) or 0 < address.port < 65536
+    assert FORMS in told
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        ("udp://:14540", UdpAddress("0.0.0.0", 14540, True)),
+        ("udpin://:14540", UdpAddress("0.0.0.0", 14540, True)),
+        ("COM3,115200", SerialAddress("COM3", 115200)),
+        ("COM3:115200", SerialAddress("COM3", 115200)),
+        (
+            "/dev/serial/by-path/usb-0:1:1.0",
+            SerialAddress("/dev/serial/by-path/usb-0:1:1.0", 57600),
+        ),
+    ],
+)
+def test_special_spellings(spec: str, expected: LinkAddress) -> None:
+    assert parse_address(spec) == expected
+
+
+@pytest.mark.parametrize(
+    ("spec", "told"),
+    [
+        ("tcpin:0.0.0.0:5760", "does not listen on TCP"),
+        ("udpout://:14540", "not understood"),
+        ("udp:14550", "not understood"),
+        ("udp:host:70000", "not understood"),
+        ("//host:14550", "not understood"),
+        ("/dev/ttyACM0,fast", "not a baud rate"),
+        ("/dev/ttyACM0,0", "not a baud rate"),
+        ("http://host:80", "not understood"),
+    ],
+)
+def test_what_is_none_of_them_is_refused(spec: str, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        parse_address(spec)
+
+
+@pytest.mark.parametrize(
+    "spec", ["tcp:127.0.0.1:1", "127.0.0.1:14550", "/dev/ttyACM0", "", "udp://:1"]
+)
+def test_a_ground_station_is_reached_by_udp_alone(spec: str) -> None:
+    with pytest.raises(UserError, match="--forward"):
+        parse_forward(spec)

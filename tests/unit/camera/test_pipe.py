@@ -1,0 +1,227 @@
+"""A camera that is a program's output: cut into frames, stamped, ended and explained."""
+
+import os
+import shlex
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.fakes import FakeClock
+from helpers.stand import child_of
+from mavbridge.camera.open import check_camera, open_camera
+from mavbridge.camera.pipe import PipeCommand, PipeSource, parse_pipe
+from mavbridge.camera.pipe_frames import RAW_FORMATS, JpegCutter, RawCutter
+from mavbridge.core.clock import NS_PER_MS, MonotonicClock
+from mavbridge.core.errors import CameraError, UserError
+
+WIDTH, HEIGHT = 32, 16
+WRITER = """
+import sys, time
+out = sys.stdout.buffer
+def write(data):
+    out.write(data)
+    out.flush()
+"""
+
+
+def python(body: str) -> str:
+    """A command line that runs this Python program."""
+    return shlex.join([sys.executable, "-c", WRITER + body])
+
+
+def picture(level: int) -> np.ndarray:
+    rgb = np.full((HEIGHT, WIDTH, 3), level, np.uint8)
+    rgb[:, : WIDTH // 2, 0] = 200
+    return rgb
+
+
+def jpeg(level: int) -> bytes:
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(picture(level), cv2.COLOR_RGB2BGR))
+    return data.tobytes()
+
+
+def with_thumbnail(data: bytes) -> bytes:
+    """The same picture with another one in its header, as cameras write them."""
+    inner = jpeg(7)
+    return data[:2] + b"\xff\xe1" + (len(inner) + 2).to_bytes(2, "big") + inner + data[2:]
+
+
+@contextmanager
+def source(command: str) -> Iterator[PipeSource]:
+    opened = PipeSource(parse_pipe(command), MonotonicClock(), threading.Event())
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+# --- what is written
+
+
+@pytest.mark.parametrize(
+    ("text", "raw"),
+    [
+        ("{} -c 1", None),
+        ("640x480:rgb24:{} -c 1", (640, 480, "rgb24")),
+        ("640x480:nv12:{} -c 1", (640, 480, "nv12")),
+    ],
+)
+def test_a_command_is_split_without_a_shell(text: str, raw: tuple[int, int, str] | None) -> None:
+    command = parse_pipe(text.format(sys.executable) + " 'two words' $HOME")
+    assert command == PipeCommand((sys.executable, "-c", "1", "two words", "$HOME"), raw)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "names no program"),
+        ("640x480:rgb24:", "names no program"),
+        ("no-such-program -o -", "there is no program 'no-such-program'"),
+        ("640x480:rgb:cat", "'rgb' is no format .* rgb24"),
+        ("0x480:rgb24:cat", "0x480"),
+        ("33x16:nv12:cat", "even"),
+        ("cat 'half", "quotation"),
+    ],
+)
+def test_what_cannot_run_is_refused_before_anything_is_loaded(text: str, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        check_camera(f"pipe:{text}")
+
+
+# --- cutting
+
+
+@given(
+    st.lists(st.integers(0, 255), min_size=1, max_size=4),
+    st.lists(st.integers(1, 700), min_size=1, max_size=20),
+    st.booleans(),
+)
+def test_pictures_are_found_however_their_bytes_come(
+    levels: list[int], sizes: list[int], is_multipart: bool
+) -> None:
+    header = b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" if is_multipart else b""
+    frames = [with_thumbnail(jpeg(level)) for level in levels]
+    data = b"".join(header + frame for frame in frames)
+    cutter, found, at, number = JpegCutter(), [], 0, 0
+    while at < len(data):
+        size = sizes[number % len(sizes)]
+        cutter.put(data[at : at + size], number)
+        if (taken := cutter.take()) is not None:
+            found.append(taken[0])
+        at, number = at + size, number + 1
+    assert found[-1] == frames[-1]
+    assert set(found) <= set(frames)
+    assert cutter.rest() == ""
+
+
+def test_a_frame_is_as_old_as_its_first_byte_and_the_newest_wins() -> None:
+    for cutter, frames in (
+        (RawCutter(2, 2, RAW_FORMATS["gray"]), [b"abcd", b"efgh", b"ijkl"]),
+        (JpegCutter(), [jpeg(10), jpeg(20), jpeg(30)]),
+    ):
+        cutter.put(frames[0][:2], 1)
+        cutter.put(frames[0][2:] + frames[1][:2], 5)
+        assert cutter.take() == (frames[0], 1)
+        cutter.put(frames[1][2:] + frames[2], 9)
+        assert cutter.take() == (frames[2], 9)
+        assert not cutter.has_frame
+
+
+def test_every_raw_format_shows_the_colours() -> None:
+    rgb = picture(60)
+    yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_I420)
+    planes = yuv.reshape(-1)
+    luma, chroma = planes[: WIDTH * HEIGHT], planes[WIDTH * HEIGHT :].reshape(2, -1)
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    frames = {
+        "rgb24": rgb.tobytes(),
+        "bgr24": rgb[..., ::-1].tobytes(),
+        "yuv420p": yuv.tobytes(),
+        "nv12": luma.tobytes() + chroma.T.tobytes(),
+    }
+    for name, data in frames.items():
+        shown = RawCutter(WIDTH, HEIGHT, RAW_FORMATS[name]).decode(data)
+        assert np.abs(shown.astype(int) - rgb).max() <= 12, name
+    shown = RawCutter(WIDTH, HEIGHT, RAW_FORMATS["gray"]).decode(grey.tobytes())
+    assert np.array_equal(shown, np.repeat(grey[..., None], 3, axis=2))
+    shown = RawCutter(WIDTH, HEIGHT, RAW_FORMATS["yuyv422"]).decode(b"\x50\x80" * WIDTH * HEIGHT)
+    assert shown.shape == rgb.shape
+
+
+@pytest.mark.parametrize("data", [b"no pictures here " * 400, b"\xff\xd8junk"])
+def test_garbage_ends_in_a_clear_error(data: bytes) -> None:
+    with pytest.raises(CameraError, match="no MJPEG"):
+        JpegCutter().put(data, 0)
+
+
+# --- the program
+
+
+def test_frames_come_from_a_program(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(jpeg(40))
+    body = f"data = open({str(tmp_path / 'a.jpg')!r}, 'rb').read()\n"
+    camera = open_camera(
+        "pipe:" + python(body + "while True:\n    write(data)\n    time.sleep(0.01)"),
+        image_size=16,
+        clock=(clock := MonotonicClock()),
+        latency_ms=20,
+    )
+    try:
+        frame = camera.read(2_000 * NS_PER_MS)
+        assert frame is not None
+        assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
+        assert abs(int(frame.rgb[8, 24, 1]) - 40) < 6
+        assert frame.captured_ns <= clock.now_ns() - 20 * NS_PER_MS
+    finally:
+        camera.close()
+
+
+def test_a_program_faster_than_this_computer_still_gives_frames() -> None:
+    with source(f"{WIDTH}x{HEIGHT}:rgb24:cat /dev/zero") as opened:
+        for _ in range(3):
+            assert opened.next_image().rgb.shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize(
+    ("body", "raw", "told"),
+    [
+        ("sys.exit('no camera found')", "", "ended with status 1; it said: no camera found"),
+        ("write(b'x' * 9000); time.sleep(60)", "", "begins with 78 78 78"),
+        ("write(b'x' * 100)", "32x16:rgb24:", "last 100 bytes are no whole picture of 1536"),
+        ("write(b'\\xff\\xd8')", "", "its last picture was cut off"),
+    ],
+)
+def test_why_a_program_gives_no_more_frames_is_said(body: str, raw: str, told: str) -> None:
+    with source(raw + python(body)) as opened, pytest.raises(CameraError, match=told):
+        opened.next_image()
+
+
+def test_a_silent_program_is_told() -> None:
+    clock = FakeClock()
+    opened = PipeSource(parse_pipe(python("time.sleep(60)")), clock, threading.Event())
+    clock.advance_ns(11_000 * NS_PER_MS)
+    try:
+        with pytest.raises(CameraError, match="is silent"):
+            opened.next_image()
+    finally:
+        opened.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.parametrize("ignore", ["", "signal.signal(signal.SIGTERM, signal.SIG_IGN)"])
+def test_the_program_ends_with_the_camera(ignore: str) -> None:
+    mark = f"ends-with-{os.getpid()}-{len(ignore)}"
+    body = f"import signal  # {mark}\n{ignore}\nwhile True:\n    write(b'.' * 12); time.sleep(0.01)"
+    clock = MonotonicClock()
+    camera = open_camera(f"pipe:2x2:rgb24:{python(body)}", image_size=16, clock=clock)
+    pid = child_of(os.getpid(), mark.encode())
+    camera.close()
+    assert not Path(f"/proc/{pid}").exists()

@@ -1,0 +1,185 @@
+import io
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from helpers.factories import make_released_tick, make_state, make_tick
+from helpers.recordings import make_frame, make_meta, without_writer_process
+from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
+from mavbridge.commands.inspect.config import InspectConfig
+from mavbridge.commands.inspect.run import inspect
+from mavbridge.commands.inspect.tables import print_comparison, print_flight
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.course import CourseGate
+from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.records import Position, Tick
+from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.recording.flight_writer import FlightWriter
+from mavbridge.recording.meta import FlightMeta
+from policy.contract import Contract
+
+UNIX_START_S = 1_767_323_045
+"""2026-01-02T03:04:05 UTC, the start of ``make_meta``."""
+
+
+def write(
+    folder: Path,
+    ticks: list[Tick],
+    *,
+    frames: int = 10,
+    meta: FlightMeta | None = None,
+    finish: bool = True,
+) -> Path:
+    folder.mkdir()
+    with without_writer_process():
+        writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
+        for number in range(frames):
+            writer.frame(make_frame(number))
+        for tick in ticks:
+            writer.tick(tick)
+        if finish:
+            writer.finish(writer.meta)
+        else:
+            writer._flush()
+            writer.close()
+    return folder
+
+
+def flight_with_a_stall() -> list[Tick]:
+    """A second of flight; a release at 0.9 s, and before it two chunks that came 30 ms late."""
+    ticks = [make_released_tick(0, "not armed", phase="waiting")]
+    for index in range(1, 90):
+        tick = make_tick(index, phase="flying", position_ned_m=Position(0.1 * index, 0.0, -2.0))
+        if index == 50:
+            computed_ns = (tick.chunk_computed_ns or 0) + 9 * NS_PER_MS
+            tick = replace(tick, chunk_computed_ns=computed_ns, predict_ns=11 * NS_PER_MS)
+        ticks.append(tick)
+    ticks += [make_released_tick(i, "link lost", phase="released") for i in range(90, 100)]
+    return ticks
+
+
+def shown(flight: FlightAnalysis, *others: FlightAnalysis, width: int = 80) -> str:
+    console = Console(width=width, record=True, file=io.StringIO())
+    if others:
+        print_comparison([flight, *others], console)
+    else:
+        print_flight(flight, console)
+    return console.export_text()
+
+
+def test_one_flight_is_told_with_its_figures_causes_and_moments(tmp_path: Path) -> None:
+    flight = analyse(write(tmp_path / "flight", flight_with_a_stall()))
+    assert flight.stick_hz == 100
+    assert flight.report.sticks.sends == 89
+    assert flight.report.release_count == 1
+    assert flight.causes == (("the policy took long", 1),)
+    assert [moment.what for moment in flight.moments] == ["the policy's flight ended", "late chunk"]
+    assert flight.moments[0].t_s == pytest.approx(0.9)
+    text = shown(flight)
+    assert all(len(line) <= 80 for line in text.splitlines())
+    for expected in ("the policy took long (1)", "link lost", "9.0 ms late", "predict"):
+        assert expected in " ".join(text.split())
+
+
+def test_series_hold_what_was_sent_in_ned_axes(tmp_path: Path) -> None:
+    ticks = [make_tick(index, position_ned_m=Position(1, 2, -3)) for index in range(5)]
+    series = analyse(write(tmp_path / "flight", ticks)).series
+    assert series.t_s.tolist() == pytest.approx([0.0, 0.01, 0.02, 0.03, 0.04])
+    assert series.feature_age_ms.tolist() == pytest.approx([40.0] * 5)
+    assert series.state_age_ms.tolist() == pytest.approx([3.0] * 5)
+    assert series.lateness_ms.tolist() == pytest.approx([2.0] * 5)
+    assert series.position_ned_m[0].tolist() == [1, 2, -3]
+    assert series.roll_pitch_yaw_deg[0].tolist() == pytest.approx([0, 0, 0])
+
+
+def test_axes_of_ros_become_ned_axes(tmp_path: Path) -> None:
+    # Facing east, level, going east and up, turning left: yaw is 90 degrees in NED.
+    values = np.array([3, 0, 1, 1, 0, 0, 0, 0, 0, 0.5, 0, 0, 9.81], np.float32)
+    ticks = [make_tick(index, state=make_state(values=values)) for index in range(3)]
+    meta = make_meta(contract=Contract(state_frame="enu_flu"))
+    series = analyse(write(tmp_path / "flight", ticks, meta=meta)).series
+    assert series.velocity_ned_mps[0].tolist() == pytest.approx([0, 3, -1])
+    assert series.roll_pitch_yaw_deg[0].tolist() == pytest.approx([0, 0, 90], abs=1e-4)
+    assert series.rate_frd_dps[0].tolist() == pytest.approx([0, 0, -28.6479], abs=1e-3)
+
+
+def test_the_path_comes_from_the_telemetry_log_where_ticks_lack_it(tmp_path: Path) -> None:
+    folder = write(tmp_path / "flight", [make_tick(index) for index in range(100)])
+    codec = Codec(source_system=1, source_component=1)
+    dialect = codec._mav
+    with (folder / "link.tlog").open("wb") as log:
+        for step in range(10):
+            message = dialect.local_position_ned_encode(1000 + 100 * step, step, 0, -2, 1, 0, 0)
+            stamp_us = UNIX_START_S * 1_000_000 + 100_000 * step
+            log.write(struct.pack(">Q", stamp_us) + message.pack(dialect))
+        log.write(b"\0\0\0")  # cut off
+    track = analyse(folder).track
+    assert track is not None
+    assert track.source == "estimator"
+    assert track.t_s.tolist() == pytest.approx([0.1 * step for step in range(10)])
+    assert track.position_ned_m[:, 0].tolist() == list(range(10))
+
+
+def test_two_flights_side_by_side_mark_what_differs(tmp_path: Path) -> None:
+    first = analyse(write(tmp_path / "first", flight_with_a_stall()))
+    steady = [make_tick(index, predict_ns=4 * NS_PER_MS) for index in range(100)]
+    second = analyse(write(tmp_path / "second", steady, meta=make_meta(policy="toge")))
+    text = shown(first, second)
+    assert all(len(line) <= 80 for line in text.splitlines())
+    rows = {
+        line.split("│")[1].strip(): line.split("│") for line in text.splitlines() if "│" in line
+    }
+    assert [cell.strip() for cell in rows["policy"][2:5]] == ["scripted:hover", "toge", "differs"]
+    assert [cell.strip() for cell in rows["late chunks"][2:5]] == ["1", "0", "-100%"]
+    assert rows["predict, p50 [ms]"][4].strip() == "+100%"
+
+
+def test_a_flight_that_was_cut_off_is_shown_up_to_its_end(tmp_path: Path) -> None:
+    folder = write(tmp_path / "flight", flight_with_a_stall()[:50], frames=0, finish=False)
+    flight = analyse(folder)
+    assert not flight.meta.finished
+    assert len(flight.series.t_s) == 50
+    assert flight.images.latency_ms is None
+    assert "cut off" in shown(flight)
+
+
+def test_a_flight_without_any_tick_is_no_error(tmp_path: Path) -> None:
+    flight = analyse(write(tmp_path / "flight", [], frames=0))
+    assert flight.moments == flight.holders == ()
+    assert "no moment went wrong" in shown(flight)
+
+
+def test_gates_are_those_of_the_course(tmp_path: Path) -> None:
+    folder = write(tmp_path / "flight", [make_tick(0)], meta=make_meta(course_seed=3))
+    assert len(analyse(folder).gates) == 8
+    named = tmp_path / "gates.json"
+    named.write_text('{"gates": [{"center_ned_m": [1, 2, -3], "yaw_rad": 0.5, "size_m": 2}]}')
+    assert analyse(folder, gates=named).gates == (CourseGate(Position(1, 2, -3), 0.5, 2),)
+
+
+def test_the_viewer_gets_every_tick_and_image(tmp_path: Path) -> None:
+    folder = write(tmp_path / "flight", flight_with_a_stall(), frames=20)
+    out = tmp_path / "flight.rrd"
+    assert inspect([folder], InspectConfig(rerun=str(out))) == 0
+    assert out.stat().st_size > 10_000
+
+
+def test_the_figures_go_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write(tmp_path / "flight", flight_with_a_stall())
+    assert inspect([folder], InspectConfig(json=tmp_path / "figures.json")) == 0
+    (document,) = json.loads((tmp_path / "figures.json").read_text())
+    assert document["report"]["sticks"]["sends"] == 89
+    assert document["causes"] == {"the policy took long": 1}
+    assert "The worst moments" in capsys.readouterr().out
+
+
+def test_what_is_no_flight_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="one flight, or two"):
+        inspect([tmp_path] * 3, InspectConfig())
+    with pytest.raises(MavbridgeError, match="is empty"):
+        inspect([tmp_path], InspectConfig())

@@ -1,0 +1,161 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.factories import START_NS, make_state, make_vision_tick
+from mavbridge.config.flight import CameraConfig, FlyConfig, Limits, LinkConfig
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.rates import Rates
+from mavbridge.core.records import Solve
+from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.recording import replay_rows
+from mavbridge.recording.folder import SETTINGS
+from mavbridge.recording.replay_rows import (
+    packet_key,
+    read_features,
+    read_packets,
+    read_solves,
+)
+from mavbridge.recording.replay_tables import ReplayTables
+from mavbridge.recording.settings import (
+    ReplaySettings,
+    SettingsError,
+    read_settings,
+    write_settings,
+)
+from mavbridge.recording.tables import read_table
+from policy.contract import Contract
+
+CONTRACT = Contract()
+HEARTBEAT = bytes.fromhex("fd09000007010100000000000000020c51040300000000")
+
+
+def make_solve(serial: int) -> Solve:
+    random = np.random.default_rng(serial)
+    state = replace(
+        make_state(START_NS + serial),
+        values=random.random(13, np.float32),
+        extras=(0.1, 2.0),
+        extras_ns=START_NS - 5,
+    )
+    return Solve(
+        serial=serial,
+        started_ns=START_NS + 10 * serial,
+        computed_ns=START_NS + 10 * serial + 3,
+        is_first=serial == 1,
+        elapsed_s=None if serial == 1 else 0.1 / serial,
+        state=state,
+        states=random.random((1, *CONTRACT.state_shape), np.float32),
+        history=random.random((1, 4, 4), np.float32),
+        frame_ids=((serial,), (serial + 1,)),
+        image_ns=START_NS - serial,
+        first_ns=START_NS + serial,
+        step_ns=50_000_000,
+        actions=random.random((1, 16, 4), np.float32),
+    )
+
+
+def assert_same(solve: Solve, read: Solve) -> None:
+    for name in ("states", "history", "actions"):
+        assert getattr(solve, name).tobytes() == getattr(read, name).tobytes()
+        assert getattr(solve, name).shape == getattr(read, name).shape
+    assert solve.state.values.tobytes() == read.state.values.tobytes()
+    plain = [
+        replace(
+            each,
+            **dict.fromkeys(("states", "history", "actions"), solve.states),
+            state=replace(each.state, values=solve.states),
+        )
+        for each in (solve, read)
+    ]
+    assert str(plain[0]) == str(plain[1])
+
+
+@pytest.mark.parametrize("is_finished", [True, False])
+def test_solves_come_back_bit_for_bit_also_from_a_flight_that_was_cut_off(
+    tmp_path: Path, is_finished: bool
+) -> None:
+    tables = ReplayTables(tmp_path, ("front",), has_features=True)
+    solves = [make_solve(serial) for serial in (1, 2, 5)]
+    for solve in solves:
+        tables.solve(solve)
+    tables.flush()
+    if is_finished:
+        tables.finish()
+
+    rows = list(read_solves(read_table(tmp_path / "solves", replay_rows.SOLVES), CONTRACT))
+
+    assert [row.dropped_before for row in rows] == [0, 0, 2]
+    for solve, row in zip(solves, rows, strict=True):
+        assert_same(solve, row.solve)
+
+
+def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> None:
+    tables = ReplayTables(tmp_path, ("front", "down"), has_features=True)
+    value = np.array([[0.1, -1e-30, 3.0]], np.float32)
+    vision = replace(make_vision_tick(3), serial=0, feature=value)
+    tables.feature(vision)
+    tables.feature(replace(vision, camera=1, serial=2, fault="frozen", feature=-value))
+    tables.finish()
+
+    (front,) = read_features(read_table(tmp_path / "features", replay_rows.FEATURES))
+    down = read_table(tmp_path / "features_down", replay_rows.FEATURES)
+
+    assert front.value.tobytes() == value.tobytes()
+    assert front.value.shape == (1, 3)
+    assert (front.frame_id, front.captured_ns) == (vision.frame_id, vision.captured_ns)
+    assert down["fault"].to_pylist() == ["frozen"]
+    assert down["dropped_before"].to_pylist() == [2]
+
+
+def test_a_single_rate_flight_keeps_no_images_as_features(tmp_path: Path) -> None:
+    tables = ReplayTables(tmp_path, ("front",), has_features=False)
+    tables.feature(replace(make_vision_tick(1), feature=np.zeros((1, 3, 8, 8), np.float32)))
+    tables.finish()
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["packets.parquet", "solves.parquet"]
+
+
+def test_stamps_of_packets_name_the_packet_in_the_log(tmp_path: Path) -> None:
+    tables = ReplayTables(tmp_path, ("front",), has_features=True)
+    tables.packets.put((ForwardedPacket(7, 5, HEARTBEAT), ForwardedPacket(9, 9, HEARTBEAT)))
+    tables.finish()
+
+    first, second = read_packets(read_table(tmp_path / "packets", replay_rows.PACKETS))
+
+    assert first == (7, 5, 0, 7)
+    assert second == (9, 9, 0, 7)
+    assert packet_key(HEARTBEAT) == (0, 7)
+
+
+def test_every_setting_of_a_flight_comes_back(tmp_path: Path) -> None:
+    config = FlyConfig(
+        link=LinkConfig(connect="udp:1.2.3.4:5", set=("A=1",)),
+        policy=PolicyConfig(policy="toge:small", checkpoint=Path("my.safetensors"), head_steps=2),
+        camera=CameraConfig(camera=("front=0", "down=1")),
+        rates=Rates(visual_rate="auto:5:20"),
+        limits=Limits(tau=0.1),
+        record=tmp_path,
+    )
+    write_settings(tmp_path, ReplaySettings(config=config, wall_offset_ns=10**18))
+
+    assert read_settings(tmp_path) == ReplaySettings(config=config, wall_offset_ns=10**18)
+
+
+def test_a_flag_of_a_later_version_is_left_out_and_damage_is_named(tmp_path: Path) -> None:
+    settings = ReplaySettings(config=FlyConfig(), wall_offset_ns=1)
+    write_settings(tmp_path, settings)
+    document = json.loads((tmp_path / SETTINGS).read_text())
+    document["config"]["warp_speed"] = 9
+    (tmp_path / SETTINGS).write_text(json.dumps(document))
+    assert read_settings(tmp_path) == settings
+
+    (tmp_path / SETTINGS).write_text("{")
+    with pytest.raises(SettingsError, match="damaged"):
+        read_settings(tmp_path)
+    (tmp_path / SETTINGS).unlink()
+    with pytest.raises(SettingsError, match="older mavbridge"):
+        read_settings(tmp_path)
