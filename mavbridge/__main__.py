@@ -1,19 +1,26 @@
 """Entry point: expected errors are one message and their status; anything else is our bug."""
 
 import signal
+import sys
 from collections.abc import Sequence
 from functools import partial
 
-from rich.console import Console
-from rich.markup import escape
-
-from mavbridge.cli import cli
-from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.stopping import end_process
+from mavbridge.core.own_packages import hidden_package
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; by default that of the process."""
+    if (problem := hidden_package()) is not None:
+        sys.stderr.write(f"error: {problem}\n")
+        sys.exit(2)  # ExitCode.REFUSED, which cannot be imported yet
+    # Only now: these import the packages that may be hidden.
+    from rich.console import Console
+    from rich.markup import escape
+
+    from mavbridge.cli import cli
+    from mavbridge.core.errors import MavbridgeError
+    from mavbridge.core.stopping import end_process
+
     try:
         status = cli.meta(arguments)
     except KeyboardInterrupt:

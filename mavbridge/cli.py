@@ -14,6 +14,7 @@ from rich.text import Text
 
 import mavbridge
 from mavbridge.commands.bench.config import BenchConfig
+from mavbridge.commands.check.config import CheckConfig
 from mavbridge.commands.contract.config import ContractConfig
 from mavbridge.commands.demonstrate.config import DemonstrateConfig
 from mavbridge.commands.evaluate.config import EvaluateConfig
@@ -23,11 +24,13 @@ from mavbridge.commands.identify.config import IdentifyConfig
 from mavbridge.commands.imagine.config import EvaluateImaginationConfig, ImagineConfig
 from mavbridge.commands.inspect.config import InspectConfig
 from mavbridge.commands.record.config import RecordConfig
+from mavbridge.commands.replay.config import ReplayConfig
 from mavbridge.commands.serve.config import ServeConfig
 from mavbridge.commands.train.checks import prepare as prepare_training
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
 from mavbridge.core.errors import UserError
+from mavbridge.core.log import run_log
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
 from policy.foreign.websocket.kind import require_packages
@@ -68,6 +71,9 @@ cli = App(
     default_parameter=Parameter(show_default=_shown_default),
     error_formatter=_as_ours,
 )
+cli.register_install_completion_command(
+    help="Complete commands and flags in this shell (bash, zsh, fish), from its next start on."
+)
 cli.meta.error_formatter = _as_ours
 
 
@@ -81,6 +87,18 @@ def fly(config: FlyConfig | None = None) -> int:
     from mavbridge.flight.app import fly as run_flight
 
     return run_flight(config)
+
+
+@cli.command
+def check(config: CheckConfig | None = None) -> int:
+    """Say whether a flight could begin: give it the flags of the flight. --policy none and
+    --camera none leave those out. Exit status: 0 go, 3 no-go."""
+    if config is None or not config.flight.link.connect:
+        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
+    require_supported_system()
+    from mavbridge.commands.check.run import check as run_check
+
+    return run_check(config)
 
 
 @cli.command
@@ -104,6 +122,20 @@ def record(config: RecordConfig) -> int:
     from mavbridge.commands.record.run import record as run_recording
 
     return run_recording(config)
+
+
+@cli.command
+def replay(flight: Path, config: ReplayConfig | None = None) -> int:
+    """Compute a recorded flight once more, and compare the sticks; exit status 5: they differ.
+
+    Args:
+        flight: folder of a flight.
+        config: the settings.
+    """
+    require_extra("replay")
+    from mavbridge.commands.replay.run import replay as run_replay
+
+    return run_replay(flight, ReplayConfig() if config is None else config)
 
 
 @cli.command
@@ -171,7 +203,7 @@ def _needs_simulator(command: str) -> Iterator[None]:
         if error.name != "mujoco":
             raise
         raise UserError(
-            f"{command} needs the simulator's dynamics: pip install 'mavbridge[sitl]'"
+            f"{command}, which flies the simulator, needs mujoco: pip install mujoco"
         ) from error
 
 
@@ -268,12 +300,16 @@ def contract(source: Path, config: ContractConfig | None = None) -> int:
 def with_config(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
     config: Annotated[Path | None, Parameter(group=RARE)] = None,
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"), negative="", group=RARE)] = False,
+    log_file: Annotated[Path | None, Parameter(group=RARE)] = None,
 ) -> int:
     """Read the settings file, then the command line on top of it.
 
     Args:
         tokens: the rest of the command line.
         config: TOML file with flags as keys; flags given on the command line win.
+        verbose: show details: engine, vehicle, streams, parameters.
+        log_file: add what is shown, details and times to this file.
     """
     _check_command(tokens)
     cli.config = []
@@ -285,7 +321,8 @@ def with_config(
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise UserError(f"--config {config} is not TOML: {error}") from error
         cli.config = [Toml(config, use_commands_as_keys=False)]
-    status: int | None = cli(_current_spelling(tokens))
+    with run_log(log_file, verbose=verbose):
+        status: int | None = cli(_current_spelling(tokens))
     return status or 0
 
 

@@ -1,176 +1,25 @@
-"""Commands: ``python -m sitl`` flies, ``camera`` films another vehicle, ``course`` prints one."""
+"""Entry point of ``python -m sitl``: what is not installed is one message."""
 
-import argparse
-import math
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Sequence
 
-from sitl import UsageError
-from sitl.app import PilotOptions, print_status, run_vehicle
-from sitl.camera.follow import film_vehicle
-from sitl.camera.fpv import CameraOptions
-from sitl.clock import stop_on_signal
-from sitl.course.layout import course_to_json, make_course
-from sitl.pilot.axes import DEFAULT_AXES
-from sitl.pilot.choose import NAMES as PILOTS
-from sitl.vehicle.conditions import NOMINAL, random_conditions
-from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, VehicleConfig
+PACKAGES = {"mujoco": "mujoco", "cv2": "opencv-python-headless", "pymavlink": "pymavlink"}
+"""Names to import, each with the name to install it by."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code, 2 for a usage error."""
-    args = _parser().parse_args(argv)
+    """Run the command; returns the exit code, 2 for a usage error or a missing package."""
     try:
-        args.run(args)
-    except UsageError as error:
-        print_status(f"error: {error}")
+        from sitl.command_line import run
+    except ModuleNotFoundError as error:
+        if error.name not in PACKAGES:
+            raise
+        sys.stderr.write(
+            f"sitl: error: the simulated vehicle needs {error.name}: pip install "
+            f"{PACKAGES[error.name]}\n"
+        )
         return 2
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m sitl",
-        description="A simulated ArduCopter or PX4 that speaks MAVLink, with an FPV camera in "
-        "shared memory over a course of gates.",
-        allow_abbrev=False,
-    )
-    parser.set_defaults(run=_fly)
-    add = parser.add_argument
-    connect_help = "MAVLink: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeatable"
-    add("--connect", action="append", metavar="LINK", help=connect_help)
-    onboard_help = "such a link for a companion computer: PX4 gives it other streams"
-    add("--connect-onboard", action="append", metavar="LINK", help=onboard_help)
-    names = ("ardupilot", "px4")
-    add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
-    add(
-        "--report", type=Path, metavar="FILE", help="write a report (docs/formats/flight_report.md)"
-    )
-    add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
-    end_help = "stop one second after the last gate, or at a crash"
-    add("--end-with-course", action="store_true", help=end_help)
-    receiver_help = "RC receiver: throttle down, every stick centred, or none (default: idle; "
-    receiver_help += "none with PX4, which looks at one only if COM_RC_IN_MODE tells it to)"
-    add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
-    rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/rc_input.py)"
-    add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
-    pilot_help = "a gamepad, the keys of a window, or the expert over the course moves the receiver"
-    add("--pilot", choices=PILOTS, help=pilot_help)
-    axes_help = f"axes of the gamepad, a minus reverses one (default: {DEFAULT_AXES})"
-    add("--pilot-axes", default=DEFAULT_AXES, metavar="AXES", help=axes_help)
-    add("--pilot-speed", type=_POSITIVE, default=4.0, metavar="MPS", help="of the expert")
-    type_help = "MAV_TYPE of its heartbeats (default: 2, quadrotor)"
-    add("--vehicle-type", type=_MAV_TYPE, default=2, metavar="N", help=type_help)
-    conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
-    add("--conditions", type=_SEED, metavar="SEED", help=conditions_help)
-    _add_camera_flags(parser)
-    commands = parser.add_subparsers(title="other commands", metavar="COMMAND")
-    camera_help = "film the course from another vehicle's reported pose"
-    camera = commands.add_parser("camera", help=camera_help, allow_abbrev=False)
-    camera.set_defaults(run=_film)
-    follow_help = "its MAVLink link: udp:HOST:PORT or udpin: to listen, udpout: or tcp: to connect"
-    camera.add_argument("--follow", required=True, metavar="LINK", help=follow_help)
-    _add_camera_flags(camera)
-    course = commands.add_parser("course", help="print a course", allow_abbrev=False)
-    course.set_defaults(run=_print_course)
-    course.add_argument("--course", type=_SEED, default=0, metavar="SEED", help="default: 0")
-    course.add_argument("--json", action="store_true", help="print JSON instead of a table")
-    return parser
-
-
-def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--camera", type=_shm_name, metavar="shm:NAME", help="publish frames under this name")
-    add("--course", type=_SEED, default=0, metavar="SEED", help="seed of the gates (default: 0)")
-    size_help = "side of the square image (default: 224)"
-    add("--image-size", type=_IMAGE_SIZE, default=224, metavar="PIXELS", help=size_help)
-    add("--fps", type=_POSITIVE, default=30.0, metavar="HZ", help="frame rate (default: 30)")
-
-
-def _fly(args: argparse.Namespace) -> None:
-    links, onboard = args.connect or [], args.connect_onboard or []
-    if not links + onboard:
-        raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
-    conditions = NOMINAL if args.conditions is None else random_conditions(args.conditions)
-    if args.pilot and (args.rc_in or args.receiver):
-        raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
-    has_receiver = args.autopilot != "px4" or args.pilot
-    receiver = args.receiver or ("idle" if has_receiver else "none")
-    run_vehicle(
-        links + onboard,
-        VehicleConfig(
-            autopilot=args.autopilot,
-            onboard_links=frozenset(range(len(links), len(links + onboard))),
-            receiver=receiver != "none",
-            receiver_us=MID_RECEIVER_US if receiver == "mid" else IDLE_RECEIVER_US,
-            vehicle_type=args.vehicle_type,
-            conditions=conditions,
-        ),
-        make_course(args.course),
-        camera=None if args.camera is None else _camera(args),
-        rc_port=args.rc_in,
-        pilot=PilotOptions(args.pilot, args.pilot_axes, args.pilot_speed) if args.pilot else None,
-        report=args.report,
-        duration_s=args.duration,
-        end_with_course=args.end_with_course,
-    )
-
-
-def _film(args: argparse.Namespace) -> None:
-    if args.camera is None:
-        raise UsageError(
-            "camera --follow needs --camera shm:NAME, the name to publish frames under"
-        )
-    with stop_on_signal() as stop:
-        film_vehicle(args.follow, make_course(args.course), _camera(args), stop.is_set)
-
-
-def _camera(args: argparse.Namespace) -> CameraOptions:
-    return CameraOptions(shm_name=args.camera, image_size=args.image_size, fps=args.fps)
-
-
-def _print_course(args: argparse.Namespace) -> None:
-    course = make_course(args.course)
-    if args.json:
-        sys.stdout.write(course_to_json(course) + "\n")
-        return
-    sys.stdout.write("gate  north_m  east_m  up_m  yaw_deg  size_m\n")
-    for gate in course.gates:
-        north, east, down = gate.center_ned_m
-        sys.stdout.write(
-            f"{gate.index:4d}  {north:7.1f}  {east:6.1f}  {-down:4.1f}  "
-            f"{math.degrees(gate.yaw_rad):7.1f}  {gate.size_m:6.1f}\n"
-        )
-
-
-def _number(
-    parse: type[int] | type[float], low: float, high: float, wanted: str
-) -> Callable[[str], float]:
-    """A flag's type: a number within [low, high]."""
-
-    def convert(text: str) -> float:
-        with suppress(ValueError):
-            if low <= (value := parse(text)) <= high:
-                return value
-        raise argparse.ArgumentTypeError(f"must be {wanted}, got {text!r}")
-
-    return convert
-
-
-_POSITIVE = _number(float, sys.float_info.min, sys.float_info.max, "a positive number")
-_SEED = _number(int, 0, math.inf, "a whole number, 0 or more")
-_PORT = _number(int, 1, 65535, "a port, 1 to 65535")
-_MAV_TYPE = _number(int, 0, 255, "a number of MAV_TYPE, 0 to 255")
-_IMAGE_SIZE = _number(int, 16, 4096, "16 to 4096 pixels")
-
-
-def _shm_name(text: str) -> str:
-    prefix, _, name = text.partition(":")
-    if prefix != "shm" or not name or "/" in name:
-        raise argparse.ArgumentTypeError(f"must be shm:NAME, such as shm:fpv, got {text!r}")
-    return name
+    return run(argv)
 
 
 if __name__ == "__main__":

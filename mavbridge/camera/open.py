@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Callable
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 from mavbridge.camera.blank import BlankCamera
@@ -16,10 +15,11 @@ from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.errors import CameraError, UserError
+from mavbridge.core.extras import require_packages
 from mavbridge.core.ports import Camera
 
 STREAM_SCHEMES = ("rtsp://", "udp://", "tcp://", "http://", "https://")
-SCREEN_PACKAGES = ("mss", "Xlib")
+SCREEN_PACKAGES = {"mss": "mss", "Xlib": "python-xlib"}
 """The extra "screen"."""
 NO_CAMERA = "none"
 FORMS = (
@@ -46,11 +46,7 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
         parse_pipe(spec.partition(":")[2])
         return
     if kind == "screen":
-        missing = [name for name in SCREEN_PACKAGES if find_spec(name) is None]
-        if missing:
-            raise UserError(
-                f"--camera screen: needs the package {missing[0]}: pip install 'mavbridge[screen]'"
-            )
+        require_packages("--camera screen:", SCREEN_PACKAGES)
         return
     is_device = spec.startswith("/dev/video") or spec.isdecimal()
     is_known = kind == "shm" or spec == NO_CAMERA or spec.startswith(STREAM_SCHEMES) or is_device

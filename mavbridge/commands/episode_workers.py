@@ -181,7 +181,7 @@ def _fly_on_ray(
         if error.name != "ray":
             raise
         raise UserError(
-            "--ray needs the package ray: pip install 'mavbridge[cluster]', or use --workers alone "
+            "--ray needs the package ray: pip install ray, or use --workers alone "
             "to fly on processes of this machine"
         ) from error
     try:

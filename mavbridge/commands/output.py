@@ -1,6 +1,5 @@
 """Output that the commands share: tables, progress bars and figures."""
 
-import importlib.util
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from mavbridge.core.errors import UserError
+from mavbridge.core.extras import require_packages
 from mavbridge.core.files import require_writable
 
 PIPED_WIDTH = 120
@@ -52,8 +51,7 @@ def require_matplotlib(flag: str = "--plot") -> None:
     Raises:
         UserError: matplotlib is not installed.
     """
-    if importlib.util.find_spec("matplotlib") is None:
-        raise UserError(f"{flag} needs matplotlib: pip install 'mavbridge[bench]'")
+    require_packages(flag, {"matplotlib": "matplotlib"})
 
 
 def require_outputs(json: Path | None, plot: Path | None) -> None:

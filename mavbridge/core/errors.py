@@ -34,6 +34,8 @@ class ExitCode(IntEnum):
     ground or was disarmed under the policy."""
     FAULT = 4
     """The policy flew, and a fault ended its flight."""
+    DIFFERENT = 5
+    """A replay differs from its recording by more than the tolerance."""
 
 
 class UserError(MavbridgeError):

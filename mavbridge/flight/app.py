@@ -1,5 +1,6 @@
 """One real flight: starts the gate, opens what the flags name, stops all in reverse order."""
 
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -11,14 +12,15 @@ import cv2
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.camera.open import check_camera, open_camera, require_present
+from mavbridge.camera.open import open_camera
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, wall_offset_ns
-from mavbridge.core.course import read_gates
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError
-from mavbridge.core.files import empty_folders_removed, require_writable
+from mavbridge.core.files import empty_folders_removed
+from mavbridge.core.log import SAID
 from mavbridge.core.ports import Camera, TickSink
+from mavbridge.core.provenance import without_password
 from mavbridge.core.realtime import (
     prepare_to_die_first,
     settle_process,
@@ -27,13 +29,13 @@ from mavbridge.core.realtime import (
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
+from mavbridge.flight.checks import check_flight
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.observers import FlightObservers
-from mavbridge.flight.outcome import flight_verdict
+from mavbridge.flight.outcome import flight_verdict, log_link
 from mavbridge.flight.policies import (
-    check_configured_policy,
     load_configured_policy,
     looks_at_images,
 )
@@ -41,17 +43,14 @@ from mavbridge.flight.settings import effective_freshness, flight_settings, gate
 from mavbridge.flight.speed import require_speed
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Phase
-from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console
-from mavbridge.observe.rerun_server import serve_address
-from mavbridge.observe.rerun_target import check_target
-from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 from policy.contract import Contract
 from policy.preprocess import least_source_px
 from policy.protocol import Executable
 
+_log = logging.getLogger(__name__)
 JOIN_S = 2.0
 LEAST_HANG_NS = NS_PER_S
 """Silence of the policy, or of the encoder, after which the flight ends; the gate has released it
@@ -95,30 +94,12 @@ def fly(config: FlyConfig) -> int:
         )
         policy_life.enter_context(loaded)
         for note in (*loaded.notes, *require_speed(config, loaded)):
+            logging.getLogger(SAID).info("%s", note)
             console.print(Text(note, style="yellow"))
+        if (times := loaded.times) is not None:
+            act_ms, encode_ms = times.act_s * 1e3, times.encode_s * 1e3
+            _log.debug("a chunk takes %.2f ms here, an image %.2f ms", act_ms, encode_ms)
         return fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
-
-
-def check_flight(config: FlyConfig, clock: Clock) -> None:
-    """Refuse what takes no time to check: weights take seconds to load.
-
-    Raises:
-        MavbridgeError: a flag names something that cannot be opened, written or loaded.
-    """
-    make_transport(config.link.connect, clock)
-    for source in config.camera.sources:
-        check_camera(source, latency_ms=config.camera.camera_latency)
-    check_configured_policy(config.policy)
-    require_writable(config.report, "--report")
-    if config.serve:
-        serve_address(config.serve)
-    if config.gates is not None:
-        read_gates(config.gates)
-    if config.record is not None:
-        prepare_folder(config.record)
-    check_target(config.rerun)
-    for source in config.camera.sources:
-        require_present(source)
 
 
 def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate:
@@ -247,6 +228,7 @@ class _Flight:
             report=lambda line: console.print(Text(line)),
         )
         self._stack.callback(camera.close)
+        _log.debug("camera %s is open", without_password(source))
         return camera
 
     def run(self, stop: StopRequest) -> None:
@@ -394,6 +376,8 @@ class _Flight:
             elif view.phase is Phase.HOLDING:
                 holder = f"the gate (process {self._gate.pid})"
                 screen.show_message(f"{left}: {holder} goes on sending neutral sticks")
+        if summary is not None:
+            log_link(summary)
         if summary is not None and summary.dropped_messages:
             screen.show_message(
                 f"{summary.dropped_messages} messages of the gate did not fit into its queue: this "

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,10 +17,18 @@ from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import ObserverThread
 from mavbridge.core.ports import TickSink
+from mavbridge.core.provenance import (
+    command_line,
+    digests,
+    git_revision,
+    versions,
+    without_password,
+)
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.policies import policy_files
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.gate.wire import GateSummary
 from mavbridge.observe.rerun_flight import RerunView
@@ -30,6 +39,7 @@ from mavbridge.recording.tlog import TlogPipe
 from policy.protocol import Executable
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
+    from mavbridge.recording.meta import FlightMeta
     from mavbridge.recording.recorder import Recorder
 
 RERUN_CAPACITY = 1000
@@ -60,6 +70,7 @@ class FlightObservers:
         )
         self._viewer: ObserverThread | None = None
         self._recorder: Recorder | None = None
+        self._gate: GateProcess | None = None
         self.screen = FlightScreen(
             console, action_hz=action_hz, vision_hz=vision_hz, readonly=config.link.readonly
         )
@@ -143,7 +154,13 @@ class FlightObservers:
             visual_hz=self._loops.max_vision_hz,
             contract=self._executable.contract,
             seed=self._config.policy.seed,
+            command=command_line(),
+            versions=versions(),
+            git_revision=git_revision(),
+            policy_files=digests(policy_files(self._config.policy)),
+            cameras=self._camera_sources(),
         )
+        self._gate = gate
         try:
             self._recorder = Recorder(
                 self._config.record,
@@ -159,8 +176,26 @@ class FlightObservers:
 
     def close_recorder(self) -> None:
         """Finish the recording; after the gate has ended, so that it holds the release."""
-        if self._recorder is not None:
-            self._recorder.close(RECORDER_JOIN_S)
+        recorder, summary = self._recorder, self._gate.summary if self._gate else None
+        if recorder is None:
+            return
+        recorder.close(RECORDER_JOIN_S)
+        if recorder.meta.finished and summary is not None and self._config.record is not None:
+            self._write_parameters(recorder.meta, self._config.record, summary.params)
+
+    def _write_parameters(self, meta: "FlightMeta", folder: Path, params: dict[str, float]) -> None:
+        """Add to the meta data what the gate said at its end."""
+        from mavbridge.recording.meta import write_meta
+
+        try:
+            write_meta(folder, replace(meta, parameters=params))
+        except OSError as error:
+            self.screen.show_message(f"--record {folder}: {error.strerror}")
+
+    def _camera_sources(self) -> dict[str, str]:
+        names = self._executable.contract.cameras
+        sources = map(without_password, self._config.camera.sources_of(names))
+        return dict(zip(names, sources, strict=True))
 
     def finish(self, summary: GateSummary | None, autopilot: str | None) -> None:
         """Show the report, and write it where --report names a file, if a vehicle was found.

@@ -1,10 +1,13 @@
 """The exit status of a flight, and the sentence that explains it."""
 
+import logging
 from typing import NamedTuple
 
 from mavbridge.core.errors import ExitCode
 from mavbridge.core.stopping import StopRequest
 from mavbridge.gate.wire import GateSummary
+
+_log = logging.getLogger(__name__)
 
 
 class Verdict(NamedTuple):
@@ -43,3 +46,11 @@ def flight_verdict(
     if outcome.is_disarmed:
         return Verdict(ExitCode.NOT_FLOWN, "the vehicle was disarmed while the policy flew it")
     return Verdict(ExitCode.DONE)
+
+
+def log_link(summary: GateSummary) -> None:
+    """Log what came over the link, and the parameters that were read."""
+    for name, rate_hz in summary.link.messages_per_s:
+        _log.debug("received %s at %.1f Hz", name, rate_hz)
+    for name, value in sorted(summary.params.items()):
+        _log.debug("parameter %s = %g", name, value)

@@ -10,10 +10,14 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from policy.contract import Contract
+from policy.loading.builtin import SHIPPED
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
 
 STATELESS = ("toge", "resnet-unet", "onnx")
+FILE_KINDS = ("lerobot", "onnx", "torchscript")
+POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
+"""Of the files of a policy's folder."""
 
 
 def load_configured_policy(
@@ -56,6 +60,20 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
         image_size=wanted.image_size,
         seed=wanted.seed,
     )
+
+
+def policy_files(wanted: PolicyConfig) -> list[Path]:
+    """The files that make the policy what it is: weights, contract, graphs, a user's code."""
+    files = [path for path in (wanted.checkpoint, wanted.contract) if path is not None]
+    if wanted.kind == "toge" and not files and not wanted.allow_untrained:
+        files.append(SHIPPED)
+    named = wanted.policy.partition(":")[2] if wanted.kind in FILE_KINDS else wanted.kind
+    path = Path(named).expanduser()
+    if path.is_dir() and wanted.kind in FILE_KINDS:
+        files += sorted(each for each in path.iterdir() if each.suffix in POLICY_SUFFIXES)
+    elif path.is_file():
+        files.append(path)
+    return files
 
 
 def is_scripted(policy: PolicyConfig) -> bool:

@@ -1,5 +1,6 @@
 """The vehicle and the sticks as the flight process knows them, from the gate's messages."""
 
+import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from mavbridge.mavlink.codec.messages import LocalVelocity, Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 
+_log = logging.getLogger(__name__)
 POSITION_NS = NS_PER_S
 """Oldest position that a tick tells of; nothing is flown by it."""
 MAX_SOLVES = 256
@@ -129,6 +131,8 @@ class VehicleView:
             case GateTick():
                 self._receive_tick(message)
             case GateStatus():
+                if message[:4] != self.status[:4]:
+                    _log.debug("vehicle: %s, %s, armed %s, landed %s", *message[:4])
                 self.status = message
             case GateMessage(text):
                 self._texts.append(text)

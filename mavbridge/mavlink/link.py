@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
+from mavbridge.core.histogram import Histogram
 from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
@@ -229,6 +230,16 @@ class MavlinkLink:
     def is_release_owed(self) -> bool:
         """A release could not be sent: ``service`` sends it before everything else."""
         return self._sender.is_release_owed
+
+    def restart_counters(self) -> None:
+        """Count messages, losses and round trips from now on."""
+        self._counters = LinkCounters()
+        self._timesync.round_trips = Histogram()
+
+    @property
+    def vehicle(self) -> VehicleSession | None:
+        """The present session, to look at; None before the vehicle is found."""
+        return self._vehicle
 
     # --- the vehicle's parameters
 

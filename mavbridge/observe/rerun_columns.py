@@ -1,28 +1,29 @@
 """Columns of values on the viewer's timeline, and what varies fast as its spread over windows."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from itertools import groupby
+from typing import Any
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.observe.rerun_layout import Plot
 
-FloatColumn: TypeAlias = NDArray[np.float64]
 WINDOW_NS = NS_PER_S // 4
 
 
 class Columns:
     """Sends values to one recording on the timeline ``time``, which starts at ``start_ns``.
 
-    Each call is one ``send_columns``, which costs a tenth of one ``log`` per value.
+    Rows of plots are collected until ``flush``: a call of the SDK costs as much as a hundred rows.
     """
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self.stream = stream
         self.start_ns = 0
+        self._rows: dict[Plot, tuple[list[int], list[Sequence[float]]]] = {}
 
     def send(self, path: str, stamps_ns: Sequence[int], columns: Any) -> None:
         """Send one row for each stamp."""
@@ -30,11 +31,19 @@ class Columns:
         index = [rr.TimeColumn("time", duration=since_ns.astype("timedelta64[ns]"))]
         self.stream.send_columns(path, index, columns, strict=True)
 
-    def plot(self, plot: Plot, stamps_ns: Sequence[int], values: NDArray[Any]) -> None:
-        """Send a value for each stamp and series; NaN is a gap in the line."""
-        if len(stamps_ns):
-            columns = rr.Scalars.columns(scalars=values.reshape(-1, len(plot.series)))
-            self.send(plot.path, stamps_ns, columns)
+    def plot(self, plot: Plot, stamps_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> None:
+        """Keep a row for each stamp, a value for each series; NaN is a gap in its line."""
+        stamps, kept = self._rows.setdefault(plot, ([], []))
+        stamps += stamps_ns
+        kept += rows
+
+    def flush(self) -> None:
+        """Send the rows of all plots."""
+        for plot, (stamps_ns, rows) in self._rows.items():
+            if rows:
+                values = np.array(rows, dtype=np.float64)
+                self.send(plot.path, stamps_ns, rr.Scalars.columns(scalars=values))
+        self._rows.clear()
 
 
 class Spread:
@@ -66,16 +75,14 @@ class Spread:
             self._show(until_ns=self._stamps_ns[-1] + 1)
 
     def _show(self, until_ns: int) -> None:
-        count = int(np.searchsorted(self._stamps_ns, until_ns))
-        if not count:
-            return
-        stamps_ns = np.array(self._stamps_ns[:count])
-        values_ms = np.array(self._values_ns[:count]) / NS_PER_MS
+        count = bisect_left(self._stamps_ns, until_ns)
+        stamps_ns, values_ns = self._stamps_ns[:count], self._values_ns[:count]
         del self._stamps_ns[:count], self._values_ns[:count]
-        windows = (stamps_ns - self._columns.start_ns) // WINDOW_NS
-        edges = np.flatnonzero(np.diff(windows)) + 1
-        rows = [
-            (part.min(), part.max(), np.median(part), self._bound_ms)
-            for part in np.split(values_ms, edges)
-        ]
-        self._columns.plot(self._plot, stamps_ns[[*(edges - 1), -1]].tolist(), np.array(rows))
+        start_ns = self._columns.start_ns
+        pairs = zip(stamps_ns, values_ns, strict=True)
+        for _, window in groupby(pairs, key=lambda pair: (pair[0] - start_ns) // WINDOW_NS):
+            stamps, values = zip(*window, strict=True)
+            ordered = sorted(values)
+            middle = (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
+            row = [value / NS_PER_MS for value in (ordered[0], ordered[-1], middle)]
+            self._columns.plot(self._plot, stamps[-1:], [[*row, self._bound_ms]])

@@ -5,12 +5,12 @@ keep up, even at the end of the flight, so the caller is that thread, whose queu
 events and whose ``close`` has a deadline.
 """
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from textwrap import wrap
 
-import numpy as np
 import rerun as rr
 
 from mavbridge.core.clock import NS_PER_S
@@ -25,6 +25,9 @@ from mavbridge.observe.rerun_target import RerunRecording
 
 EVENT_CHARACTERS = 64
 """Longer texts go on in the next line: the viewer cuts them off at the edge of its panel."""
+
+BATCHES_OF_ROWS = 3
+"""Plots advance in steps of so many batches, the scene and the images with each."""
 
 
 class RerunView:
@@ -53,6 +56,7 @@ class RerunView:
         self._scene = SceneView(columns, flight)
         self._plan = PlanView(columns, flight)
         self._last_tick: Tick | None = None
+        self._batches = 0
 
     @property
     def url(self) -> str | None:
@@ -81,11 +85,15 @@ class RerunView:
                 self._timing.show_visions(of_camera)
             self._scene.show_images(of_camera)
         self._last_tick = ticks[-1] if ticks else self._last_tick
+        self._batches += 1
+        if self._batches % BATCHES_OF_ROWS == 0:
+            self._columns.flush()
 
     def close(self) -> None:
         """Deliver the rest; blocks until it is taken. Raises MavbridgeError: the viewer is gone."""
         self._open()
         self._timing.close()
+        self._columns.flush()
         self._recording.close()
 
     def _open(self) -> None:
@@ -101,7 +109,7 @@ class RerunView:
         """Begin the timeline; a gap at its start gives all plots the same axis."""
         self._columns.start_ns = start_ns
         for plot in (*layout.PLOTS, *layout.action_plots(self._flight.contract.action)):
-            self._columns.plot(plot, [start_ns], np.full(len(plot.series), np.nan))
+            self._columns.plot(plot, [start_ns], [(math.nan,) * len(plot.series)])
 
     def _show_plans(self, solves: Sequence[Solve], ticks: Sequence[Tick]) -> None:
         """Show plans of the policy while it flies, each from where the vehicle was."""
@@ -120,7 +128,7 @@ class RerunView:
             since_s = (tick.woke_ns - self._columns.start_ns) / NS_PER_S
             for text, level, color in _changes(last, tick):
                 for number, line in enumerate(wrap(text, EVENT_CHARACTERS) or [""]):
-                    margin = f"{since_s:6.2f} s  " if number == 0 else " " * 12
+                    margin = f"{since_s:6.2f} s  " if number == 0 else " " * 10
                     rows.append((margin + line, level, color))
                     stamps_ns.append(tick.woke_ns)
         if rows:
@@ -139,12 +147,12 @@ def _changes(before: Tick | None, now: Tick) -> Iterator[tuple[str, str, layout.
     """Text, level and colour of everything in this tick that is new to the user."""
     if before is None or before.activity != now.activity:
         if now.release_reason is None:
-            yield now.activity, "INFO", layout.GREEN if now.trace else layout.WHITE
+            yield now.activity, "INFO", layout.GREEN if now.trace else layout.GREY
         else:
             yield now.activity, "WARN", layout.ORANGE
     if now.mode is not None and (before is None or before.mode != now.mode):
-        yield f"mode {now.mode}", "INFO", layout.WHITE
+        yield f"mode {now.mode}", "INFO", layout.GREY
     if before is None or before.armed != now.armed:
-        yield "armed" if now.armed else "disarmed", "INFO", layout.WHITE
+        yield "armed" if now.armed else "disarmed", "INFO", layout.GREY
     for text in now.texts:
-        yield text, "INFO", layout.WHITE
+        yield text, "INFO", layout.GREY

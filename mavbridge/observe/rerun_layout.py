@@ -37,8 +37,9 @@ NEAR_EYE_M, FAR_EYE_M = (-3.0, 0.8, -1.3), (-16.0, 5.0, -11.0)
 """Places of eyes that follow: behind, to the right of and above the vehicle."""
 
 Rgb: TypeAlias = tuple[int, int, int]
+# All of them can be read on the dark and on the light ground that a browser asks for.
 BLUE, ORANGE, GREEN, RED = (86, 180, 233), (240, 160, 40), (60, 200, 140), (235, 80, 70)
-PINK, WHITE, GREY = (225, 120, 180), (235, 235, 235), (120, 120, 120)
+PINK, GREY = (225, 120, 180), (135, 135, 135)
 DARK_BLUE = (45, 95, 135)
 
 
@@ -118,19 +119,27 @@ PLOTS = (*BANDS, MISSED, DROPPED, RC, SPEED, HEIGHT)
 ACTION_SERIES = (
     Series("vehicle's echo", GREEN, width=4),  # first: drawn under the others
     Series("policy", PINK),
-    Series("smoothed", BLUE),
-    Series("sent", WHITE),
+    Series("sent", BLUE),
 )
+_UNITS = {"radps": "rad/s", "rad": "rad", "mps": "m/s"}
 _PLAN_SERIES = (Series("planned", ORANGE, width=1),)
 
 
 def action_plots(action: ActionKind) -> tuple[Plot, ...]:
     """One plot for each of the four numbers of an action of this kind."""
-    key = ": white sent, pink policy, orange plan" + (", green echo" if action == "sticks" else "")
+    key = ": blue sent, pink policy, orange plan" + (", green echo" if action == "sticks" else "")
     return tuple(
-        Plot(f"{action}/{name}", f"{name.replace('_', ' ').capitalize()}{key}", ACTION_SERIES)
+        Plot(f"{action}/{name}", f"{_titled(name)}{key}", ACTION_SERIES)
         for name in ACTION_CLASSES[action]._fields
     )
+
+
+def _titled(name: str) -> str:
+    """``yaw_rate_radps`` -> ``Yaw rate [rad/s]``."""
+    stem, _, unit = name.rpartition("_")
+    if unit not in _UNITS:
+        return name.capitalize()
+    return f"{stem.replace('_', ' ').capitalize()} [{_UNITS[unit]}]"
 
 
 def plan_plots(action: ActionKind) -> tuple[tuple[Plot, ...], ...]:

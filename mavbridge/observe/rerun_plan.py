@@ -41,9 +41,9 @@ class PlanView:
         lane = self._lanes[self._shown % len(self._lanes)]
         self._shown += 1
         stamps_ns = [solve.first_ns + number * step_ns for number in range(len(actions) + 1)]
-        rows = np.array([*actions, (math.nan,) * 4])  # the gap that ends this line
         for axis, plot in enumerate(lane):
-            self._columns.plot(plot, stamps_ns, rows[:, axis])
+            values = [*(action[axis] for action in actions), math.nan]  # the gap ends this line
+            self._columns.plot(plot, stamps_ns, [(value,) for value in values])
         path = planned_path(solve, actions, self._contract)
         if position is not None and path is not None:
             strips = rr.LineStrips3D.columns(strips=[path + np.array(position)])

@@ -4,8 +4,6 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
-import numpy as np
-
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Tick, VisionTick
 from mavbridge.core.vehicle import Action, Sticks
@@ -24,7 +22,7 @@ class TimingPlots:
     def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
         self._columns = columns
         slot_ns, chunk_ns = NS_PER_S / flight.stick_hz, NS_PER_S / flight.chunk_hz
-        self._vision_ns = NS_PER_S / flight.vision_hz
+        self._slot_ns, self._vision_ns = slot_ns, NS_PER_S / flight.vision_hz
         bounds_ns = {
             layout.IMAGE_AGE: _ns(flight.max_feature_age_s),
             layout.ATTITUDE_AGE: _ns(flight.max_state_age_s),
@@ -41,8 +39,7 @@ class TimingPlots:
         self._last_chunk: Tick | None = None
         self._last_started_ns: int | None = None
         self._last_channels: tuple[int, ...] | None = None
-        self._slots = self._missed_slots = 0
-        self._images = 0
+        self._missed_slots = self._images = 0
         self._first_dropped: int | None = None
 
     def show_ticks(self, ticks: Sequence[Tick]) -> None:
@@ -67,8 +64,9 @@ class TimingPlots:
         self._extend(layout.LATENESS, late_ns)
         self._show_chunks(ticks)
         self._missed_slots += sum(tick.missed_slots for tick in ticks)
-        self._slots += sum(tick.is_slot + tick.missed_slots for tick in ticks)
-        self._count(layout.MISSED, ticks[-1].woke_ns, self._missed_slots, self._slots)
+        last_ns = ticks[-1].woke_ns
+        slots = (last_ns - self._columns.start_ns) / self._slot_ns
+        self._count(layout.MISSED, last_ns, self._missed_slots, slots)
         self._show_channels(ticks)
 
     def _show_chunks(self, ticks: Sequence[Tick]) -> None:
@@ -97,7 +95,7 @@ class TimingPlots:
                 shown_us = tick.rc_channels_us[:width]
                 rows.append((tick.woke_ns, (*shown_us, *(math.nan,) * (width - len(shown_us)))))
         stamps_ns, values_us = zip(*rows, strict=True)
-        self._columns.plot(layout.RC, stamps_ns, np.array(values_us))
+        self._columns.plot(layout.RC, stamps_ns, values_us)
 
     def show_visions(self, visions: Sequence[VisionTick]) -> None:
         """Plot the images of one camera."""
@@ -118,8 +116,8 @@ class TimingPlots:
         self._images += len(visions)
         self._count(layout.DROPPED, ready_ns[-1], dropped, self._images + dropped)
 
-    def _count(self, plot: layout.Plot, stamp_ns: int, count: int, of_all: int) -> None:
-        self._columns.plot(plot, [stamp_ns], np.array([of_all * ALLOWED_SHARE, count]))
+    def _count(self, plot: layout.Plot, stamp_ns: int, count: int, of_all: float) -> None:
+        self._columns.plot(plot, [stamp_ns], [(of_all * ALLOWED_SHARE, count)])
 
     def _extend(self, plot: layout.Plot, values: Iterable[tuple[int, float]]) -> None:
         pairs = list(values)
@@ -132,7 +130,7 @@ class TimingPlots:
 
 
 class ActionPlots:
-    """Each number of the actions: as the policy put it out, smoothed, sent, and echoed."""
+    """Each number of the actions: as the policy put it out, as sent, and as echoed."""
 
     def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
         self._columns = columns
@@ -142,15 +140,13 @@ class ActionPlots:
     def show(self, ticks: Sequence[Tick]) -> None:
         """Plot all ticks."""
         stamps_ns = [tick.woke_ns for tick in ticks]
-        rows = np.array([self._row(tick) for tick in ticks], dtype=np.float64)
+        rows = [list(zip(*self._stages(tick), strict=True)) for tick in ticks]
         for axis, plot in enumerate(self._plots):
-            self._columns.plot(plot, stamps_ns, rows[:, :, axis])
+            self._columns.plot(plot, stamps_ns, [row[axis] for row in rows])
 
-    def _row(self, tick: Tick) -> tuple[Action, ...]:
+    def _stages(self, tick: Tick) -> tuple[Action, ...]:
         echo: Action = (tick.rc_sticks if self._is_sticks else None) or _GAP
-        trace = tick.trace
-        raw, smoothed = (_GAP, _GAP) if trace is None else (trace.raw, trace.smoothed)
-        return echo, raw, smoothed, tick.sent or _GAP
+        return echo, _GAP if tick.trace is None else tick.trace.raw, tick.sent or _GAP
 
 
 def _ns(limit_s: float | None) -> float | None:

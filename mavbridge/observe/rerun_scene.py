@@ -82,11 +82,11 @@ class SceneView:
         chase = rr.Transform3D.columns(translation=places, quaternion=turns)
         self._columns.send(layout.CHASE, stamps_ns, chase)
         self._columns.send(layout.VEHICLE, stamps_ns, rr.Transform3D.columns(quaternion=leans))
-        velocities = np.array([motion.velocity_ned_mps for motion in motions])
-        speeds = np.stack([np.hypot(velocities[:, 0], velocities[:, 1]), -velocities[:, 2]], axis=1)
+        velocities = [motion.velocity_ned_mps for motion in motions]
+        speeds = [(math.hypot(north, east), -down) for north, east, down in velocities]
         self._columns.plot(layout.SPEED, stamps_ns, speeds)
         heights = [math.nan if t.position_ned_m is None else -t.position_ned_m.down for t in shown]
-        self._columns.plot(layout.HEIGHT, stamps_ns, np.array(heights))
+        self._columns.plot(layout.HEIGHT, stamps_ns, [(height,) for height in heights])
 
     def _show_path(self, ticks: Sequence[Tick]) -> None:
         """Go on with the path from the last place of the batch before."""
@@ -143,7 +143,7 @@ def _airframe() -> rr.LineStrips3D:
     for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         tip = np.array([x * _ARM_M, y * _ARM_M, 0.0])
         strips += [np.array([np.zeros(3), tip]), circle + tip]
-        colors += [layout.RED if x > 0 else layout.WHITE] * 2
+        colors += [layout.RED if x > 0 else layout.GREY] * 2
     return rr.LineStrips3D(strips, colors=colors, radii=_PATH_RADIUS)
 
 

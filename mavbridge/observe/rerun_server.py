@@ -23,6 +23,7 @@ _ANY = ("0.0.0.0", "::")  # noqa: S104 - compared with, where the user asks for 
 _DIE_WITH_PARENT = """
 import ctypes, os, sys
 ctypes.CDLL(None).prctl(1, 15)  # PR_SET_PDEATHSIG, SIGTERM
+os.nice(10)  # the flight comes first
 os.execv(sys.argv[1], sys.argv[1:])
 """
 """Linux ends the server with the flight's process, also after a kill -9."""

@@ -63,9 +63,9 @@ class RerunRecording:
         except RuntimeError as error:
             raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
         finally:
-            self.stream.disconnect()
             if self._server is not None:
                 self._server.close()
+        self.stream.disconnect()
 
 
 def prepare_target(text: str) -> Path | str:

@@ -1,5 +1,6 @@
 """The terminal during a flight: one status line while flying, a table afterwards."""
 
+import logging
 import threading
 from collections import deque
 from contextlib import AbstractContextManager, ExitStack, nullcontext
@@ -11,6 +12,7 @@ from rich.text import Text
 
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.log import SAID, is_log_thread
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.observe.keyboard import ignore_job_control
@@ -18,6 +20,7 @@ from mavbridge.observe.output import PatientOutput, stray_lines_shown
 from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
 from mavbridge.observe.timing import TimingReport
 
+_said = logging.getLogger(SAID)
 RATE_WINDOW_S = 1.0
 ACTIVITY_SPACING_NS = NS_PER_S
 PLAIN_PERIOD_S = 5.0
@@ -97,7 +100,7 @@ class FlightScreen:
         if hint is not None and not self._console.is_terminal:
             self.show_message(hint)
         if isinstance(self._console.file, PatientOutput):
-            self._redirection.enter_context(stray_lines_shown(self.show_message))
+            self._redirection.enter_context(stray_lines_shown(self._show_stray))
         self._worker = Worker("mavbridge-terminal", self._run)
         self._worker.start()
 
@@ -148,8 +151,15 @@ class FlightScreen:
         self.show_message(tick.activity)
 
     def show_message(self, text: str) -> None:
-        """Show a message with the next refresh."""
+        """Show a message with the next refresh, and log it now."""
+        _said.info("%s", text)
         self._show(Text(text), soft_wrap=True)
+
+    def _show_stray(self, text: str) -> None:
+        """Show a line that somebody has printed; those of the log are in it already."""
+        if not is_log_thread():
+            _said.info("%s", text)
+        self._show(Text(text, style="dim"), soft_wrap=True)
 
     def show_status(self, text: str) -> None:
         """Show this as the status line from now on: the flight is over, and something goes on."""
@@ -160,6 +170,7 @@ class FlightScreen:
         if (table := timing_table(report)) is not None:
             self._show(table, soft_wrap=False)
         for verdict in verdicts(report):
+            _said.info("%s", verdict.plain if isinstance(verdict, Text) else verdict)
             self._show(verdict, soft_wrap=not self._console.is_terminal)
 
     def _show(self, what: RenderableType, *, soft_wrap: bool) -> None:

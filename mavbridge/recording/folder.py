@@ -1,9 +1,9 @@
 """The folder of one flight: names, and whether a flight may be written there. Imports no extra."""
 
-import importlib.util
 from pathlib import Path
 
 from mavbridge.core.errors import UserError
+from mavbridge.core.extras import require_packages
 
 META = "meta.json"
 TICKS = "ticks"
@@ -17,7 +17,7 @@ SETTINGS = "settings.json"
 
 
 EXTRA = ("av", "pyarrow")
-"""Packages of ``pip install 'mavbridge[record]'``."""
+"""Packages of the extra ``record``, by the names that they are imported and installed by."""
 
 
 def video_of(camera: str | None) -> str:
@@ -37,9 +37,7 @@ def features_of(camera: str | None) -> str:
 
 def require_extra(what: str) -> None:
     """Raise UserError if the extra is not installed; ``what`` needs it."""
-    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UserError(f"{what} needs {' and '.join(missing)}: pip install 'mavbridge[record]'")
+    require_packages(what, {name: name for name in EXTRA})
 
 
 def prepare_folder(folder: Path) -> None:

@@ -61,6 +61,18 @@ class FlightMeta:
     gates_passed: int | None = None
     conditions: dict[str, float] = field(default_factory=dict)
     """Physical quantities that were randomised, by name."""
+    command: tuple[str, ...] = ()
+    """Command line, word by word, without passwords."""
+    versions: dict[str, str] = field(default_factory=dict)
+    """Of mavbridge, Python, the system and the packages that matter, by name."""
+    git_revision: str | None = None
+    """Commit of the checkout that ran, with ``-dirty`` where files of it differed."""
+    policy_files: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the policy's files (weights, contract, code), by absolute path."""
+    cameras: dict[str, str] = field(default_factory=dict)
+    """Source of each camera, by its name in the contract."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """Parameters of the autopilot that matter to the flight, by name, as read from it."""
 
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:
@@ -117,6 +129,7 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
     try:
         if known.get("contract") is not None:
             known["contract"] = Contract.from_json(json.dumps(known["contract"]))
+        known["command"] = tuple(known.get("command", ()))
         meta = FlightMeta(**known)
     except (TypeError, ContractError) as error:
         raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error

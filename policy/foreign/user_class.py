@@ -39,6 +39,11 @@ def check_user_class(spec: str) -> None:
         _require_python_file(spec, where)
         return
     package = where.partition(".")[0]
+    if package in OUR_PACKAGES:
+        raise PolicyError(
+            f"--policy {spec}: {package} is a package of mavbridge; a file of that name flies by "
+            f"its path: --policy ./{package}.py:{spec.rpartition(':')[2]}"
+        )
     if package not in sys.modules and importlib.util.find_spec(package) is None:
         raise PolicyError(
             f"--policy {spec}: there is no module {package}; put its folder on PYTHONPATH or "

@@ -23,6 +23,7 @@ from pathlib import Path
 from policy.checkpoints.header import read_contract
 from policy.checkpoints.what_file import recognise
 from policy.contract import Contract
+from policy.engines.devices import require_devices
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError
 from policy.foreign.user_class import check_user_class, load_user_class
@@ -68,20 +69,18 @@ def check_request(request: PolicyRequest) -> None:
         checkpoint = builtin_checkpoint(request)
         if checkpoint is not None and (contract := read_contract(checkpoint)) is not None:
             _require_image_size(contract, request.image_size)
-        _require_devices(request)
     elif kind == LEROBOT:
         check_lerobot(request)
-        _require_devices(request)
     elif kind in SCHEMES:
         check_server(request.spec, request.contract_file, request.checkpoint)
     elif kind == ONNX:
         _require_image_size(check_onnx(request).description.interface.contract, request.image_size)
     elif kind == TORCHSCRIPT:
         _require_image_size(check_torchscript(request).interface.contract, request.image_size)
-        _require_devices(request)
     else:
         _require_no_path(request.spec)
         check_user_class(request.spec)
+    _require_devices(request)
 
 
 def read_policy_contract(request: PolicyRequest) -> Contract:
@@ -195,7 +194,6 @@ def _executable(
         return make_numpy_executable(policy, settings), ()
     from policy.engines.choose import choose_executable
 
-    _require_devices(request)
     return choose_executable(policy, request.engine, settings)
 
 
@@ -253,14 +251,6 @@ def _require_image_size(contract: Contract, image_size: int | None) -> None:
 
 
 def _require_devices(request: PolicyRequest) -> None:
-    wanted = {request.vision_device or request.device, request.action_device or request.device}
-    if wanted == {"cpu"}:
-        return
-    import torch
-
-    available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-    if torch.backends.mps.is_available():
-        available.append("mps")
-    for device in sorted(wanted):
-        if (device if device != "cuda" else "cuda:0") not in available:
-            raise PolicyError(f"device {device!r} is not available; this machine has {available}")
+    require_devices(
+        request.vision_device or request.device, request.action_device or request.device
+    )

@@ -55,9 +55,7 @@ def make_pilot(
     except ModuleNotFoundError as error:
         if error.name != "pygame":
             raise
-        raise UsageError(
-            f"--pilot {name} needs pygame-ce: pip install 'mavbridge[pilot]'"
-        ) from error
+        raise UsageError(f"--pilot {name} needs pygame: pip install pygame-ce") from error
     try:
         if name == "keyboard":
             return keyboard.KeyboardPilot(clock), keyboard.HELP

@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from rich.text import Text
@@ -28,6 +27,7 @@ from mavbridge.commands.bench.results import (
 )
 from mavbridge.commands.output import require_outputs, table_console
 from mavbridge.core.errors import UserError
+from mavbridge.core.extras import require_packages
 from mavbridge.core.stopping import INTERRUPTED
 
 ROOFLINE = "roofline f32"
@@ -82,8 +82,7 @@ def run_and_report(outputs: BenchOutputs, measure: Callable[[Effort], BenchResul
     """
     budget = None if outputs.check is None else read_budget(outputs.check)
     require_outputs(outputs.json, outputs.plot)
-    if find_spec("mujoco") is None:
-        raise UserError("bench needs the simulator's dynamics: pip install 'mavbridge[sitl]'")
+    require_packages("bench, which flies the simulator,", {"mujoco": "mujoco"})
     console = table_console()
     try:
         result = measure(QUICK if outputs.quick else FULL)

@@ -1,6 +1,5 @@
 """A policy of ours in, files that other programs read out, and proof that they are the same."""
 
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +7,7 @@ from rich.console import Console
 
 from mavbridge.commands.export_policy.config import ExportPolicyConfig
 from mavbridge.core.errors import UserError
+from mavbridge.core.extras import require_packages
 from policy.engines.choose import chunks_of_samples
 from policy.engines.parity import make_parity_samples, parity_failure
 from policy.foreign.export import export_onnx, export_torchscript
@@ -46,8 +46,7 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
 def _require_room(config: ExportPolicyConfig) -> None:
     """Refuse an output that would hurt something, or that nothing here can write."""
     if config.format == "onnx":
-        if importlib.util.find_spec("onnx") is None:
-            raise UserError("--format onnx needs the onnx package: pip install 'mavbridge[onnx]'")
+        require_packages("--format onnx", {"onnx": "onnx"})
         if config.out.is_file() or (config.out.is_dir() and any(config.out.iterdir())):
             raise UserError(f"--out {config.out} is taken: name a new or empty folder")
     elif config.out.exists() or not config.out.parent.is_dir():

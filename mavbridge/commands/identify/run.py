@@ -12,7 +12,8 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.files import require_writable
-from mavbridge.flight.app import check_flight, fly_executable
+from mavbridge.flight.app import fly_executable
+from mavbridge.flight.checks import check_flight
 from mavbridge.flight.policies import configured_contract
 from mavbridge.observe.output import flight_console
 from policy.contract import Contract

@@ -30,6 +30,7 @@ from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import open_flight
 from policy.checkpoints.world_model_file import load_world_model
+from policy.engines.devices import require_devices
 from policy.world_model.model import WorldModel
 
 SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
@@ -129,9 +130,10 @@ def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> Wor
     """Load a world model, by default the one that comes with mavbridge, onto a torch device.
 
     Raises:
-        UserError: none comes with mavbridge, or there is no such device.
-        PolicyError: the weights cannot be used, or not with so many steps.
+        UserError: none comes with mavbridge.
+        PolicyError: there is no such device, the weights cannot be used, or not with so many steps.
     """
+    require_devices(device)
     path = world_model or SHIPPED
     if world_model is None and not path.exists():
         raise UserError(
@@ -139,12 +141,7 @@ def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> Wor
         )
     model = load_world_model(path)
     model.config.schedule.ddim_steps(ddim_steps)  # refuses what it cannot do
-    try:
-        return model.to(torch.device(device)).eval()
-    except (RuntimeError, AssertionError) as error:
-        raise UserError(
-            f"--device {device} is not available: {str(error).splitlines()[0]}"
-        ) from error
+    return model.to(torch.device(device)).eval()
 
 
 def _make_decider(

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
-import torch
 from rich.console import Console
 from rich.text import Text
 
@@ -19,6 +18,7 @@ from policy.contract import Contract
 from policy.data.flight_data import FlightData, common_frame
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
+from policy.engines.devices import require_devices
 from policy.loading.builtin import builtin_config
 from policy.training.policy_run import Check, Network, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
@@ -37,7 +37,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
         UserError: a flag that cannot be used.
         PolicyError: flights, weights or a run that cannot be used.
     """
-    _require_device(settings.device)
+    require_devices(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
     check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
     check: Check | None = None
@@ -59,7 +59,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
 
 def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings) -> int:
     """Train a world model; see ``run_policy_training``."""
-    _require_device(settings.device)
+    require_devices(settings.device)
     config = WorldModelConfig(image_size=settings.image_size)
     flights = _read_flights(paths, settings)
     config = replace(config, contract=Contract(state_frame=common_frame(flights)))
@@ -144,9 +144,3 @@ def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightDa
         Console(stderr=True, highlight=False).print(note, soft_wrap=True)
     flights = [read_flight(folder) for folder in folders]
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]
-
-
-def _require_device(device: str) -> None:
-    available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-    if (device if device != "cuda" else "cuda:0") not in available:
-        raise UserError(f"--device {device} is not available; this machine has {available}")

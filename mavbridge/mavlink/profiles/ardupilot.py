@@ -16,6 +16,7 @@ from mavbridge.mavlink.profiles.profile import (
     ParamContext,
     Profile,
     StreamGroup,
+    WantedParam,
     optional_stream,
     setpoint_danger,
 )
@@ -129,6 +130,16 @@ class ArduPilot(Profile):
             yield from ardupilot_params.override_advice(values)
         elif context.output is not None:
             yield from ardupilot_params.setpoint_advice(values, context)
+
+    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """Failsafes and switches that make a flight safer."""
+        return ardupilot_params.hints(values, context)
+
+    def wanted_params(
+        self, values: Mapping[str, float], context: ParamContext
+    ) -> Iterator[WantedParam]:
+        """Those of overrides, or of setpoints."""
+        return ardupilot_params.wanted_params(values, context)
 
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None

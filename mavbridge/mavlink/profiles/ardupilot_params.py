@@ -8,7 +8,7 @@ from mavbridge.mavlink.codec.calibration import (
     RcCalibration,
     RcChannel,
 )
-from mavbridge.mavlink.profiles.profile import Danger, ParamContext
+from mavbridge.mavlink.profiles.profile import Danger, ParamContext, WantedParam
 
 STICKS = ("THROTTLE", "YAW", "PITCH", "ROLL")
 """RCMAP_* suffixes in the order of ``Sticks``."""
@@ -21,6 +21,8 @@ _IGNORE_OVERRIDES = 2
 """Bit 1 of RC_OPTIONS."""
 _THRUST_AS_THRUST = 8
 """Bit 3 of GUID_OPTIONS; without it the thrust of SET_ATTITUDE_TARGET is a climb rate."""
+_CONTINUE_LANDING = 8
+"""Bit 3 of FS_OPTIONS."""
 _LONGEST_S = 1.0
 """A longer time-out leaves the vehicle without a pilot for longer than necessary."""
 
@@ -187,3 +189,41 @@ def setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Itera
         )
     if context.output in ("attitude", "rates") and values.get("ATC_ANGLE_BOOST") == 0:
         yield "ATC_ANGLE_BOOST is 0: thrust is not raised when it leans, the policy has to do it"
+
+
+def hints(values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    """Failsafes and switches that make a flight safer."""
+    if context.output != "rc-override":
+        return
+    options = values.get("FS_OPTIONS")
+    lands_on = options is None or int(options) & _CONTINUE_LANDING
+    if context.has_receiver is False and options is not None and not lands_on:
+        yield (
+            f"FS_OPTIONS is {options:g}: without a receiver, a landing turns into RTL when the "
+            f"sticks end: --set FS_OPTIONS={int(options) | _CONTINUE_LANDING}"
+        )
+    if context.has_receiver and override_switch(values) is None:
+        yield (
+            "no RCn_OPTION is 46: a switch of the radio with it takes the sticks back in the "
+            "autopilot itself, whatever happens here"
+        )
+
+
+def wanted_params(values: Mapping[str, float], context: ParamContext) -> Iterator[WantedParam]:
+    """The parameters of overrides, or of setpoints, under the names that this firmware has."""
+    if context.output == "rc-override":
+        name = "SYSID_MYGCS" if "SYSID_MYGCS" in values else "MAV_GCS_SYSID"
+        yield WantedParam(name, f"{context.source_system}, our system id")
+        yield WantedParam("RC_OPTIONS", "bit 1 clear")
+        yield WantedParam("RC_OVERRIDE_TIME", f"0.5; above 0, at most {_LONGEST_S:g} s")
+        receiver = "" if context.has_receiver else ", without a receiver"
+        yield WantedParam("FS_THR_ENABLE", f"not 0{receiver}")
+        yield WantedParam("FS_OPTIONS", "any" if context.has_receiver else "24 (bit 3 set)")
+        if (switch := override_switch(values)) is not None:
+            yield WantedParam(f"RC{switch}_OPTION", "46, with its switch on")
+        return
+    yield WantedParam("GUID_TIMEOUT", f"0.5; at most {_LONGEST_S:g} s")
+    yield WantedParam("FS_THR_ENABLE", "not 0" if context.has_receiver else "0")
+    if context.output in ("attitude", "rates"):
+        yield WantedParam("GUID_OPTIONS", "bit 3 (8) set")
+        yield WantedParam("ATC_ANGLE_BOOST", "1, or as in training")

@@ -76,6 +76,13 @@ def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
         )
 
 
+class WantedParam(NamedTuple):
+    """A parameter that a flight depends on, and its value in words, for the user."""
+
+    name: str
+    should_be: str
+
+
 class ParamContext(NamedTuple):
     """Circumstances in which parameters are judged."""
 
@@ -164,6 +171,17 @@ class Profile(ABC):
     @abstractmethod
     def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
         """Warnings: they forbid no flight, but should be known before it."""
+
+    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """What could be set better for a flight, with the command; said by ``mavbridge check``
+        alone."""
+        return iter(())
+
+    @abstractmethod
+    def wanted_params(
+        self, values: Mapping[str, float], context: ParamContext
+    ) -> Iterator[WantedParam]:
+        """Parameters to show before a flight; whether a value will do, the methods above decide."""
 
     @abstractmethod
     def stick_curves(

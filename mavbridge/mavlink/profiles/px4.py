@@ -16,6 +16,7 @@ from mavbridge.mavlink.profiles.profile import (
     ParamContext,
     Profile,
     StreamGroup,
+    WantedParam,
     optional_stream,
     setpoint_danger,
 )
@@ -40,6 +41,8 @@ _FATAL_ACTIONS = {5: "terminate the flight", 6: "disarm"}
 """NAV_RCL_ACT."""
 _FATAL_OFFBOARD_ACTIONS = {6: "terminate the flight", 7: "disarm"}
 """COM_OBL_RC_ACT."""
+_EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4
+"""Values in COM_RCL_EXCEPT of modes in which the loss of sticks is no failsafe."""
 _LONGEST_S = 1.0
 _SHORTEST_S = 0.3
 """A gate on a busy computer may be late by a tenth of this; a link loses a few packets in a row."""
@@ -198,6 +201,44 @@ class Px4(Profile):
             yield f"{name} is {time_s:g}: a pause of our packets as short as that is a failsafe"
         if action is not None:
             yield f"{act_name} is {values[act_name]:g}: it would {action} if our packets stopped"
+
+    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+        """Losses of sticks that end other modes, and a gesture that arms."""
+        exceptions = values.get("COM_RCL_EXCEPT")
+        is_sticks = context.output == "manual-control"
+        bit, mode = (_EXCEPT_HOLD, "AUTO") if is_sticks else (_EXCEPT_OFFBOARD, "OFFBOARD")
+        if exceptions is not None and not int(exceptions) & bit:
+            yield (
+                f"COM_RCL_EXCEPT is {exceptions:g}: sticks that were there at arming and end later "
+                f"are a failsafe in {mode} modes too: --set COM_RCL_EXCEPT={int(exceptions) | bit}"
+            )
+        if is_sticks and values.get("MAN_ARM_GESTURE") == 1:
+            yield (
+                "MAN_ARM_GESTURE is 1: throttle down and full yaw for a second arms, which a "
+                "policy on the ground might do: --set MAN_ARM_GESTURE=0"
+            )
+        if not is_sticks and values.get("COM_OBL_RC_ACT") == 0:
+            yield (
+                "COM_OBL_RC_ACT is 0: when setpoints end it enters POSCTL if there are sticks, "
+                "else RTL: land with --set COM_OBL_RC_ACT=4, or hold with 5"
+            )
+
+    def wanted_params(
+        self, values: Mapping[str, float], context: ParamContext
+    ) -> Iterator[WantedParam]:
+        """Those of sticks, or of setpoints."""
+        time = f"0.5; {_SHORTEST_S:g} to {_LONGEST_S:g} s"
+        if context.output == "manual-control":
+            yield WantedParam("COM_RC_IN_MODE", "1, or 6 with a receiver")
+            yield WantedParam("COM_RC_LOSS_T", time)
+            yield WantedParam("NAV_RCL_ACT", "1, 2 or 3 (hold, return, land)")
+            yield WantedParam("COM_RCL_EXCEPT", f"bit {_EXCEPT_HOLD} set")
+            yield WantedParam("MAN_ARM_GESTURE", "0")
+            yield WantedParam("COM_DISARM_PRFLT", "longer than it takes to lift off")
+        else:
+            yield WantedParam("COM_OF_LOSS_T", time)
+            yield WantedParam("COM_OBL_RC_ACT", "4 or 5 (land, hold)")
+            yield WantedParam("COM_RCL_EXCEPT", f"bit {_EXCEPT_OFFBOARD} set")
 
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None

@@ -149,6 +149,14 @@ class VehicleCondition:
         return self._is_rc_plausible if self._is_rc_healthy is not False else False
 
     @property
+    def is_ready_to_arm(self) -> bool | None:
+        """The autopilot's own checks before arming are passed; None = it does not say."""
+        if self._system is None:
+            return None
+        system, bit = self._system[1], dialect.MAV_SYS_STATUS_PREARM_CHECK
+        return bool(system.healthy & bit) if system.present & bit else None
+
+    @property
     def has_seen_radio(self) -> bool:
         """Both messages that tell of a receiver have come."""
         return self.rc is not None and self._system is not None

@@ -211,7 +211,7 @@ class VehicleSession:
         """Nothing is left to put back, or no more can be done about it now."""
         return self._params.is_restored
 
-    def _unfinished(self, now_ns: int) -> str | None:
+    def unfinished(self, now_ns: int) -> str | None:
         """The step of the set-up that is not finished, or None."""
         if not self._params.is_read:
             return "reading the vehicle's parameters"
@@ -242,7 +242,7 @@ class VehicleSession:
             return "waiting for the vehicle's heartbeat"
         if now_ns - self.condition.heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
             return "the vehicle's heartbeat is lost"
-        if (unfinished := self._unfinished(now_ns)) is not None:
+        if (unfinished := self.unfinished(now_ns)) is not None:
             return unfinished
         return self._params.problem()
 
@@ -250,6 +250,11 @@ class VehicleSession:
         """The reason why it cannot be flown with the output now, or None."""
         if (forbidden := self._params.output_problem(self.status(now_ns))) is not None:
             return forbidden
+        return self.switch_problem
+
+    @property
+    def switch_problem(self) -> str | None:
+        """The override switch that keeps our sticks out, or None."""
         switch = self._params.override_switch
         if switch is not None and not self._is_switch_on:
             return f"the override switch (RC{switch}) is off: switch it on to fly"

@@ -1,15 +1,16 @@
 """The policy loop of a recorded flight once more: its bytes, its features, its sent sticks.
 
 ``VehicleView``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and ``PolicyLoop`` run as
-in the flight, composed by ``build_bridge``. Taken from the recording: when a solve began and ended;
-what had reached the flight process by then (the stamps of the state and the newest image tell it);
-when packets arrived and what moment they tell about; and which sticks had been sent. Solves that
-returned no chunk are not in a recording, and are not repeated.
+in the flight, composed by ``build_bridge``. Taken from the recording: when each solve began and
+ended; what had reached the flight process by then (the stamps of the state and the newest image
+tell it); when packets arrived and what moment they tell about; and which sticks had been sent.
+Solves that returned no chunk are not in a recording, and are not repeated.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Literal
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource, flying_since
 from policy.protocol import Executable
 
+_SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 HELD_NS = 50 * NS_PER_MS
 """Longest time for which the news that a flight began may have been on its way to the policy."""
 
@@ -48,7 +50,7 @@ def replay_policy(
     source: ReplaySource,
     executable: Executable,
     clock: SteppedClock,
-    features: Sequence[Sequence[FeatureFrame]],
+    features: Sequence[Iterable[FeatureFrame]],
 ) -> Iterator[SolvePair]:
     """Every recorded solve once more.
 
@@ -139,22 +141,20 @@ class _NoCamera:
 
 
 class _Shelf:
-    """Features of one camera on their way into its cache."""
+    """Features of one camera on their way into its cache; taken one by one, as they are needed."""
 
-    def __init__(self, features: Sequence[FeatureFrame], cache: FeatureCache) -> None:
-        self._features, self._cache = features, cache
-        self._places = {feature.frame_id: k for k, feature in enumerate(features)}
-        self._next = 0
+    def __init__(self, features: Iterable[FeatureFrame], cache: FeatureCache) -> None:
+        self._features, self._cache = iter(features), cache
+        self._next = next(self._features, None)
+        self._newest_id: int | None = None
 
     def bring(self, frame_id: int) -> bool:
         """Publish all up to this one; False: it is not there."""
-        place = self._places.get(frame_id)
-        if place is None:
-            return False
-        for feature in self._features[self._next : place + 1]:
-            self._cache.publish(feature)
-        self._next = max(self._next, place + 1)
-        return True
+        while self._next is not None and self._next.frame_id <= frame_id:
+            self._cache.publish(self._next)
+            self._newest_id = self._next.frame_id
+            self._next = next(self._features, None)
+        return self._newest_id == frame_id
 
 
 class _News:
@@ -195,10 +195,13 @@ class _News:
 
     def _bring_packets(self, state: VehicleState) -> bool:
         wanted = (state.attitude_ns, state.rate_ns, state.velocity_ns, state.specific_force_ns)
-        ends = np.flatnonzero((self._stamps[self._next_packet :] == wanted).all(axis=1))
-        if not len(ends):
-            return bool(self._next_packet and (self._stamps[self._next_packet - 1] == wanted).all())
-        end = self._next_packet + int(ends[0]) + 1
+        first, last = (
+            int(np.searchsorted(self._stamps[:, 0], state.attitude_ns, side)) for side in _SIDES
+        )
+        found = np.flatnonzero((self._stamps[first:last] == wanted).all(axis=1))
+        if not len(found):
+            return False
+        end = max(self._next_packet, first + int(found[0]) + 1)
         arrived = self._packets[self._next_packet : end]
         self._next_packet = end
         for _, group in groupby(arrived, key=lambda packet: packet.arrived_ns):

@@ -28,6 +28,8 @@ from policy.contract import Contract
 STAMP_NS = 10 * NS_PER_MS
 """Most by which a packet's two stamps may differ: the log's are rounded to 4 us, and the clocks of
 user and system drift apart by less in an hour."""
+LOOK_AHEAD = 64
+"""Rows of the table among which a packet of the log is looked for: the log may have lost some."""
 _STAMP_BYTES = 8
 
 
@@ -80,6 +82,8 @@ def open_source(folder: Path) -> ReplaySource:
     table = read_table(folder / TICKS, rows.TICKS, later=rows.LATER)
     ticks = list(rows.read_ticks(table, meta.contract.action))
     solve_rows = list(read_solves(read_table(folder / SOLVES, replay_rows.SOLVES), meta.contract))
+    if ticks and not meta.finished:  # cut off: what was sent before its last solves is not known
+        solve_rows = [row for row in solve_rows if row.solve.started_ns <= ticks[-1].tick.sent_ns]
     if not ticks or not solve_rows:
         raise UserError(
             f"{folder} ended before its policy had computed anything: nothing to replay"
@@ -156,11 +160,13 @@ def _received(
         found = None
         while waiting < len(stamps) and stamps[waiting].arrived_ns < rough_ns - STAMP_NS:
             waiting += 1  # the log has lost it
-        if waiting < len(stamps):
-            stamp = stamps[waiting]
-            is_same = (stamp.message_id, stamp.sequence) == key
-            if is_same and stamp.arrived_ns - rough_ns < STAMP_NS:
-                found, waiting = stamp, waiting + 1
+        for place in range(waiting, min(waiting + LOOK_AHEAD, len(stamps))):
+            stamp = stamps[place]
+            if stamp.arrived_ns - rough_ns >= STAMP_NS:
+                break
+            if (stamp.message_id, stamp.sequence) == key:
+                found, waiting = stamp, place + 1
+                break
         arrived_ns = rough_ns if found is None else found.arrived_ns
         latest_ns = max(latest_ns, arrived_ns)
         yield RecordedPacket(latest_ns, found and found.happened_ns, packet.data)

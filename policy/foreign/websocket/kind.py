@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 SCHEMES = ("ws", "wss")
 PACKAGES = ("msgpack", "websockets")
-"""Of ``pip install 'mavbridge[remote]'``."""
+"""Those of the extra ``remote``."""
 
 
 TERMS = (
@@ -38,7 +38,8 @@ def require_packages(what: str) -> None:
         PolicyError: a package of it is missing; ``what`` needs it.
     """
     if missing := [name for name in PACKAGES if find_spec(name) is None]:
-        raise PolicyError(f"{what} needs {' and '.join(missing)}: pip install 'mavbridge[remote]'")
+        names = " and ".join(missing), " ".join(missing)
+        raise PolicyError("{} needs {}: pip install {}".format(what, *names))
 
 
 def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) -> None:

@@ -1,10 +1,10 @@
+import importlib.util
 from io import StringIO
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from mavbridge.commands import output
 from mavbridge.commands.output import progress_bar, require_matplotlib
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
@@ -36,7 +36,7 @@ def test_a_flag_that_was_not_given_is_no_error() -> None:
 
 
 def test_a_figure_without_matplotlib_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     with pytest.raises(UserError, match=r"--plot needs matplotlib: pip install"):
         require_matplotlib()
 

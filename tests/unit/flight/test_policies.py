@@ -10,6 +10,7 @@ from mavbridge.flight.policies import (
     check_configured_policy,
     load_configured_policy,
     looks_at_images,
+    policy_files,
 )
 
 MINE = """
@@ -51,3 +52,19 @@ def test_black_frames_are_no_fault_of_a_policy_that_is_flown_without_a_camera(
 ) -> None:
     config = FlyConfig(policy=PolicyConfig(policy=policy), camera=CameraConfig(camera=(camera,)))
     assert looks_at_images(config) is looks
+
+
+def test_the_files_of_a_policy_are_those_that_make_it(tmp_path: Path) -> None:
+    for name in ("model.safetensors", "config.json", "README.md"):
+        (tmp_path / name).write_text("")
+    mine, contract = tmp_path / "mine.py", tmp_path / "contract.toml"
+    mine.write_text("")
+    folder = PolicyConfig(policy=f"lerobot:{tmp_path}", contract=contract)
+    assert {path.name for path in policy_files(folder)} == {
+        *("contract.toml", "model.safetensors", "config.json"),
+    }
+    assert policy_files(PolicyConfig(policy=f"{mine}:Mine")) == [mine]
+    assert policy_files(PolicyConfig(checkpoint=mine)) == [mine]
+    assert [path.name for path in policy_files(PolicyConfig())] == ["toge.safetensors"]
+    for nothing in ("scripted:hover", "ws://127.0.0.1:8000", "my_module:Mine"):
+        assert policy_files(PolicyConfig(policy=nothing)) == []

@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,18 +15,32 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
+from helpers.factories import (
+    START_NS,
+    make_released_tick,
+    make_state,
+    make_tick,
+    make_trace,
+    make_vision_tick,
+)
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.course import CourseGate
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import Event
+from mavbridge.core.records import Observed, Position, Solve
 from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
-from mavbridge.observe.rerun_flight import (
-    MAX_IMAGE_WIDTH,
+from mavbridge.flight.action_frames import action_frame
+from mavbridge.observe.rerun_flight import EVENT_CHARACTERS, RerunView
+from mavbridge.observe.rerun_layout import (
     PLOTS,
-    RerunView,
+    ViewedFlight,
     action_plots,
     flight_blueprint,
+    styles,
 )
+from mavbridge.observe.rerun_scene import MAX_IMAGE_WIDTH
+from policy.contract import Contract
+
+CAMERA = "/scene/chase/vehicle/front"
 
 
 class Recording:
@@ -43,18 +58,37 @@ class Recording:
                 values = column.cast("int64").to_pylist() if name == "time" else column.to_pylist()
                 entity.setdefault(name, []).extend(values)
 
+    def rows(self, path: str) -> list[list[float]]:
+        """All rows of an entity but the gap at the start of the timeline."""
+        return [list(row) for row in self.columns[f"/{path}"]["Scalars:scalars"]][1:]
+
     def values(self, path: str, series: int = 0) -> list[float]:
-        return [row[series] for row in self.columns[f"/{path}"]["Scalars:scalars"]]
+        return [row[series] for row in self.rows(path)]
 
     def times_ms(self, path: str) -> list[float]:
-        return [stamp_ns / NS_PER_MS for stamp_ns in self.columns[f"/{path}"]["time"]]
+        return [stamp_ns / NS_PER_MS for stamp_ns in self.columns[f"/{path}"]["time"]][1:]
 
     def events(self) -> list[str]:
         return [row[0] for row in self.columns["/events"]["TextLog:text"]]
 
 
-def show(path: Path, *batches: list[Event]) -> Recording:
-    view = RerunView(str(path), vision_hz=30)
+def viewed(contract: Contract | None = None, **changes: Any) -> ViewedFlight:
+    """A flight at the rates of the factories' events."""
+    contract = contract or Contract()
+    facts: dict[str, Any] = {
+        "vision_hz": 30.0,
+        "chunk_hz": 100.0,
+        "stick_hz": 100.0,
+        "contract": contract,
+        "max_state_age_s": 0.1,
+        "max_feature_age_s": 0.3,
+        "to_ned": action_frame(contract).to_gate,
+    }
+    return ViewedFlight(**(facts | changes))
+
+
+def show(path: Path, *batches: list[Observed], flight: ViewedFlight | None = None) -> Recording:
+    view = RerunView(str(path), flight or viewed())
     for batch in batches:
         view.consume(batch)
     view.close()
@@ -66,13 +100,26 @@ def rrd(tmp_path: Path) -> Path:
     return tmp_path / "flight.rrd"
 
 
-def test_ages_and_durations_are_milliseconds_on_both_timelines(rrd: Path) -> None:
-    seen = show(rrd, [make_tick(0), make_tick(1)], [make_tick(2)])
-    assert seen.times_ms("age") == [0.0, 10.0, 20.0]
-    assert seen.columns["/age"]["tick"] == [0, 1, 2]
-    assert seen.values("age", 0) == [40.0] * 3
-    assert seen.values("age", 1) == [3.0] * 3
-    assert seen.values("compute/action") == [2.0] * 3
+LEAST, MOST, MEDIAN, BOUND = range(4)
+
+
+def test_ages_are_spread_over_windows_in_milliseconds_beside_their_limits(rrd: Path) -> None:
+    late_ns = 60 * NS_PER_MS
+    ticks = [make_tick(index) for index in range(30)]
+    ticks[3] = make_tick(3, feature_captured_ns=ticks[3].sent_ns - late_ns)
+    seen = show(rrd, ticks[:10], ticks[10:])
+    assert seen.rows("age/image") == [[40, 60, 40, 300], [40, 40, 40, 300]]
+    assert seen.rows("age/attitude") == [[3, 3, 3, 100]] * 2
+    assert seen.times_ms("age/image") == [242, 292]  # the last value of each window
+
+
+def test_windows_do_not_depend_on_batches(tmp_path: Path) -> None:
+    ticks = [make_tick(index) for index in range(100)]
+    whole = show(tmp_path / "a.rrd", list(ticks))
+    parts = show(tmp_path / "b.rrd", *([tick] for tick in ticks))
+    assert whole.rows("age/image") == parts.rows("age/image")
+    assert whole.times_ms("age/image") == parts.times_ms("age/image")
+    assert len(whole.rows("age/image")) == 4
 
 
 def test_what_was_not_measured_is_a_gap_never_a_zero(rrd: Path) -> None:
@@ -80,31 +127,57 @@ def test_what_was_not_measured_is_a_gap_never_a_zero(rrd: Path) -> None:
         0, feature_captured_ns=None, state=None, rc_channels_us=(), rc_sticks=None
     )
     seen = show(rrd, [blind])
-    for path, series in (("age", 0), ("age", 1), ("compute/action", 0), ("period/action", 0)):
-        assert math.isnan(seen.values(path, series)[0]), path
+    for path in ("age/image", "age/attitude", "compute/chunk", "period/chunk", "jitter/sticks"):
+        assert seen.rows(path) == [], path
     for axis in Sticks._fields:
-        assert all(math.isnan(seen.values(f"sticks/{axis}", series)[0]) for series in range(6))
+        assert all(math.isnan(seen.values(f"sticks/{axis}", series)[0]) for series in range(3))
     assert all(math.isnan(seen.values("rc", channel)[0]) for channel in range(4))
 
 
-def test_periods_go_on_across_batches_and_only_slots_are_late(rrd: Path) -> None:
-    between = make_tick(5, is_slot=False)
-    seen = show(rrd, [make_tick(0), make_tick(1)], [make_tick(4, missed_slots=2)], [between])
-    assert math.isnan(seen.values("period/action")[0])
-    assert seen.values("period/action")[1:] == [10.0, 30.0, 10.0]
-    assert seen.values("lateness/sticks")[:3] == [2.0, 2.0, 2.0]
-    assert math.isnan(seen.values("lateness/sticks")[3])
-    assert seen.values("missed/action") == [0, 0, 2, 2]
+def test_limits_that_do_not_hold_are_not_drawn(rrd: Path) -> None:
+    flight = viewed(max_state_age_s=None, max_feature_age_s=None)
+    seen = show(rrd, [make_tick(0)], flight=flight)
+    assert math.isnan(seen.values("age/image", BOUND)[0])
+    assert seen.values("age/image", MEDIAN) == [40]
+
+
+def test_periods_of_chunks_go_on_across_batches_and_not_across_releases(rrd: Path) -> None:
+    repeated = make_tick(2, chunk_serial=1, chunk_computed_ns=make_tick(1).chunk_computed_ns)
+    released, again = make_released_tick(20), make_tick(21)
+    seen = show(rrd, [make_tick(0), make_tick(1), repeated], [make_tick(4)], [released, again])
+    assert seen.rows("period/chunk") == [[10, 30, 20, 10]]
+    assert seen.rows("compute/chunk") == [[2, 2, 2, 10]]
+
+
+def test_only_slots_are_late(rrd: Path) -> None:
+    between = make_tick(1, is_slot=False, sent_ns=make_tick(1).due_ns + 7 * NS_PER_MS)
+    seen = show(rrd, [make_tick(0), between])
+    assert seen.rows("jitter/sticks") == [[2, 2, 2, 10]]
+
+
+def test_missed_slots_add_up_from_zero_beside_what_is_allowed(rrd: Path) -> None:
+    seen = show(rrd, [make_tick(0)], [make_tick(4, missed_slots=3)], [make_tick(100)])
+    assert seen.values("missed/sticks", 1) == [0, 3, 3]
+    assert seen.values("missed/sticks", 0) == pytest.approx([0, 0.004, 0.1])
+
+
+def test_images_are_timed_against_their_period(rrd: Path) -> None:
+    frames = [make_vision_tick(number) for number in (1, 2)]
+    late = make_vision_tick(4)
+    seen = show(rrd, [make_tick(0), *frames], [late])
+    assert seen.rows("period/vision")[0] == pytest.approx([33.333, 66.667, 50, 33.333], abs=0.01)
+    assert seen.rows("jitter/vision")[0] == pytest.approx([0, 33.333, 16.667, 33.333], abs=0.01)
+    assert seen.rows("compute/vision")[0] == pytest.approx([20, 20, 20, 33.333], abs=0.01)
 
 
 def test_dropped_frames_start_from_zero(rrd: Path) -> None:
     first = make_vision_tick(1, dropped_frames=40)
     second, third = (make_vision_tick(k, dropped_frames=40 + k) for k in (2, 3))
-    seen = show(rrd, [make_tick(0), first, second], [third])
-    assert seen.values("missed/vision") == [0, 2, 3]
+    seen = show(rrd, [make_tick(0), first], [second, third])
+    assert seen.values("missed/vision", 1) == [0, 3]
 
 
-def test_every_stage_of_every_stick_has_its_series(rrd: Path) -> None:
+def test_what_becomes_of_every_stick_has_its_series(rrd: Path) -> None:
     stages = [
         Sticks(throttle=k + 0.125, yaw=k + 0.25, pitch=k + 0.5, roll=k + 0.75) for k in range(6)
     ]
@@ -112,21 +185,24 @@ def test_every_stage_of_every_stick_has_its_series(rrd: Path) -> None:
     trace = ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
     seen = show(rrd, [make_tick(0, trace=trace, sent=sent, rc_sticks=echo)])
     for axis, name in enumerate(Sticks._fields):
-        shown = [seen.values(f"sticks/{name}", series)[0] for series in range(6)]
-        assert shown == [stage[axis] for stage in stages]
+        shown = [seen.values(f"sticks/{name}", series)[0] for series in range(3)]
+        assert shown == [stage[axis] for stage in (echo, raw, sent)]
     names = seen.static["/sticks/roll"]["SeriesLines:names"][0]
-    assert names == ["vehicle's echo", "raw", "clipped", "slewed", "smoothed", "sent"]
+    assert names == ["vehicle's echo", "policy", "sent"]
 
 
 def test_centred_sticks_are_zeros_not_gaps(rrd: Path) -> None:
     centred = Sticks(0.0, 0.0, 0.0, 0.0)
     seen = show(rrd, [make_tick(0, trace=make_trace(centred), sent=centred, rc_sticks=centred)])
-    assert [seen.values("sticks/yaw", series)[0] for series in range(6)] == [0.0] * 6
+    assert [seen.values("sticks/yaw", series)[0] for series in range(3)] == [0.0] * 3
 
 
-def test_rc_echo_shows_four_channels(rrd: Path) -> None:
-    seen = show(rrd, [make_tick(0, rc_channels_us=(1100, 1200, 1300, 1400, 1500, 1600))])
-    assert seen.columns["/rc"]["Scalars:scalars"] == [[1100, 1200, 1300, 1400]]
+def test_rc_echo_shows_four_channels_as_they_change(rrd: Path) -> None:
+    moved = (1100, 1200, 1300, 1400, 1500, 1600)
+    later = [make_tick(index, rc_channels_us=moved) for index in (1, 2, 3, 4)]
+    seen = show(rrd, [make_tick(0), *later])
+    assert seen.rows("rc") == [[1500] * 4, [1100, 1200, 1300, 1400], [1100, 1200, 1300, 1400]]
+    assert seen.times_ms("rc") == [0, 10, 40]
 
 
 def test_events_are_transitions_across_batches(rrd: Path) -> None:
@@ -145,12 +221,21 @@ def test_events_are_transitions_across_batches(rrd: Path) -> None:
         "RELEASED: feature too old",
         "mode LAND",
     ]
-    assert seen.columns["/events"]["tick"] == [0, 0, 0, 2, 2, 4, 4]
+    stamps_ms = [stamp_ns // NS_PER_MS for stamp_ns in seen.columns["/events"]["time"]]
+    assert stamps_ms == [0, 0, 0, 20, 20, 40, 40]
 
 
 def test_an_uneventful_batch_logs_no_event(rrd: Path) -> None:
     seen = show(rrd, [make_tick(0)], [make_tick(1), make_tick(2)])
-    assert set(seen.columns["/events"]["tick"]) == {0}
+    assert set(seen.columns["/events"]["time"]) == {0}
+
+
+def test_a_long_text_goes_on_in_the_next_line(rrd: Path) -> None:
+    text = "RC_OVERRIDE_TIME is 3: " + "the vehicle would hold its sticks, " * 4
+    seen = show(rrd, [make_tick(0, texts=(text.strip(),))])
+    lines = [line for line in seen.events() if "armed" not in line]
+    assert max(map(len, lines)) <= EVENT_CHARACTERS + 10
+    assert " ".join(line[10:] for line in lines[2:]) == text.strip()
 
 
 def test_images_are_stamped_with_their_exposure_and_keep_their_colours(rrd: Path) -> None:
@@ -158,35 +243,183 @@ def test_images_are_stamped_with_their_exposure_and_keep_their_colours(rrd: Path
     rgb[:, :, 0] = 200  # red
     frames = [make_vision_tick(number, rgb=rgb) for number in (1, 2, 3)]
     seen = show(rrd, [make_tick(0), *frames])
-    assert seen.times_ms("camera") == pytest.approx([0, 33.333, 66.667], abs=0.001)
-    assert seen.times_ms("compute/vision") == pytest.approx([22, 55.333, 88.667], abs=0.001)
-    assert seen.values("compute/vision") == [20.0] * 3
-    encoded = np.array(seen.columns["/camera"]["EncodedImage:blob"][0][0], dtype=np.uint8)
-    bgr = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
-    assert bgr is not None
+    stamps_ms = [stamp_ns / NS_PER_MS for stamp_ns in seen.columns[CAMERA]["time"]]
+    assert stamps_ms == pytest.approx([0, 33.333, 66.667], abs=0.001)
+    bgr = image(seen.columns[CAMERA])
     assert bgr.shape == (48, 64, 3)
     assert bgr[24, 32] == pytest.approx([0, 0, 200], abs=6)
+
+
+def image(columns: dict[str, list[Any]]) -> np.ndarray[Any, Any]:
+    """The first image of an entity, as BGR."""
+    encoded = np.array(columns["EncodedImage:blob"][0][0], dtype=np.uint8)
+    bgr = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+    assert bgr is not None
+    return bgr
 
 
 def test_large_images_are_scaled_down_in_proportion(rrd: Path) -> None:
     frame = make_vision_tick(1, rgb=np.zeros((720, 1280, 3), dtype=np.uint8))
     seen = show(rrd, [frame])
-    encoded = np.array(seen.columns["/camera"]["EncodedImage:blob"][0][0], dtype=np.uint8)
-    bgr = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
-    assert bgr is not None
-    assert bgr.shape == (360, MAX_IMAGE_WIDTH, 3)
+    assert image(seen.columns[CAMERA]).shape == (360, MAX_IMAGE_WIDTH, 3)
+    resolution = seen.static[CAMERA]["Pinhole:resolution"][0][0]
+    assert list(resolution) == [MAX_IMAGE_WIDTH, 360]
 
 
-def test_frames_carry_the_index_of_the_tick_that_was_running(rrd: Path) -> None:
-    frames = [make_vision_tick(1), make_vision_tick(2)]  # ready 22 and 55 ms after tick 0 woke
-    seen = show(rrd, [*(make_tick(index) for index in range(6)), *frames])
-    assert seen.columns["/compute/vision"]["tick"] == [2, 5]
+def test_each_camera_hangs_below_the_vehicle_and_the_first_is_timed(rrd: Path) -> None:
+    contract = Contract(cameras=("front", "down"))
+    frames = [make_vision_tick(1), make_vision_tick(2, camera=1)]
+    seen = show(rrd, [make_tick(0), *frames], flight=viewed(contract))
+    down = CAMERA.replace("front", "down")
+    assert len(seen.columns[CAMERA]["time"]) == len(seen.columns[down]["time"]) == 1
+    axes = [list(seen.static[path]["Pinhole:camera_xyz"][0][0]) for path in (CAMERA, down)]
+    assert axes[0] != axes[1]
+    assert seen.values("missed/vision", 1) == [0]
+    assert len(seen.rows("compute/vision")) == 1
 
 
 def test_frames_before_the_first_tick_are_shown(rrd: Path) -> None:
     seen = show(rrd, [make_vision_tick(1)], [make_tick(0)])
-    assert seen.columns["/camera"]["tick"] == [0]
-    assert seen.times_ms("camera") == [0.0]
+    assert seen.columns[CAMERA]["time"] == [0]
+
+
+def rotated(columns: dict[str, list[Any]], vector: list[float]) -> list[float]:
+    """What the first rotation of an entity makes of a vector."""
+    x, y, z, w = columns["Transform3D:quaternion"][0][0]
+    axis, v = np.array([x, y, z]), np.array(vector)
+    turned = v + 2 * np.cross(axis, np.cross(axis, v) + w * v)
+    return [round(float(number), 4) for number in turned]
+
+
+R = math.sqrt(0.5)
+
+
+@pytest.mark.parametrize(
+    ("frame", "quaternion", "velocity"),
+    [
+        ("ned_frd", (R, 0.0, 0.0, R), (0.0, 3.0, -1.0)),  # heads and flies east, climbs
+        ("enu_flu", (1.0, 0.0, 0.0, 0.0), (3.0, 0.0, 1.0)),
+    ],
+)
+def test_the_pose_is_shown_in_ned_whatever_the_contracts_frame(
+    rrd: Path, frame: Any, quaternion: tuple[float, ...], velocity: tuple[float, ...]
+) -> None:
+    values = np.array((*velocity, *quaternion, *(0.0,) * 6), dtype=np.float32)
+    place = Position(4.0, 5.0, -6.0)
+    tick = make_tick(0, state=make_state(START_NS, values=values), position_ned_m=place)
+    seen = show(rrd, [tick], flight=viewed(Contract(state_frame=frame)))
+    chase = seen.columns["/scene/chase"]
+    assert list(chase["Transform3D:translation"][0][0]) == list(place)
+    assert rotated(chase, [1, 0, 0]) == [0, 1, 0]
+    assert rotated(seen.columns["/scene/chase/vehicle"], [0, 0, 1]) == [0, 0, 1]
+    assert seen.rows("motion/speed")[0] == pytest.approx([3, 1])
+    assert seen.rows("motion/height") == [[6]]
+
+
+def test_heading_moves_the_eye_and_the_lean_is_the_vehicles(rrd: Path) -> None:
+    yaw_rad, roll_rad = 0.8, 0.5
+    q = (
+        math.cos(yaw_rad / 2) * math.cos(roll_rad / 2),
+        math.cos(yaw_rad / 2) * math.sin(roll_rad / 2),
+        math.sin(yaw_rad / 2) * math.sin(roll_rad / 2),
+        math.sin(yaw_rad / 2) * math.cos(roll_rad / 2),
+    )
+    values = np.array((0, 0, 0, *q, *(0.0,) * 6), dtype=np.float32)
+    seen = show(rrd, [make_tick(0, state=make_state(START_NS, values=values))])
+    chase, vehicle = seen.columns["/scene/chase"], seen.columns["/scene/chase/vehicle"]
+    assert list(chase["Transform3D:translation"][0][0]) == [0, 0, 0]  # no position: at the origin
+    assert rotated(chase, [1, 0, 0]) == pytest.approx([math.cos(0.8), math.sin(0.8), 0], abs=1e-3)
+    assert rotated(vehicle, [0, 1, 0]) == pytest.approx([0, math.cos(0.5), math.sin(0.5)], abs=1e-3)
+    assert math.isnan(seen.values("motion/height")[0])
+
+
+def strips(seen: Recording, path: str) -> list[list[list[float]]]:
+    rows = seen.columns[f"/{path}"]["LineStrips3D:strips"]
+    return [[list(point) for point in strip] for row in rows for strip in row]
+
+
+def test_the_path_goes_on_from_batch_to_batch(rrd: Path) -> None:
+    ticks = [make_tick(3 * k, position_ned_m=Position(float(k), 0.0, 0.0)) for k in range(5)]
+    seen = show(rrd, list(ticks[:3]), list(ticks[3:]))
+    assert strips(seen, "scene/path") == [
+        [[0, 0, 0], [1, 0, 0], [2, 0, 0]],
+        [[2, 0, 0], [3, 0, 0], [4, 0, 0]],
+    ]
+
+
+def test_gates_stand_where_the_course_has_them(rrd: Path) -> None:
+    gate = CourseGate(Position(10.0, 2.0, -3.0), math.pi / 2, 2.0)  # flown through towards east
+    seen = show(rrd, [make_tick(0)], flight=viewed(gates=(gate,)))
+    corners = [list(point) for point in seen.static["/scene/gates"]["LineStrips3D:strips"][0][0]]
+    assert np.allclose(sorted(corners[:4]), [[9, 2, -4], [9, 2, -2], [11, 2, -4], [11, 2, -2]])
+    assert seen.static["/scene/gates"]["LineStrips3D:labels"] == [["1"]]
+
+
+def make_solve(serial: int, actions: list[list[float]], **changes: Any) -> Solve:
+    """The solve of tick ``serial``: a chunk with a step of 50 ms."""
+    first_ns = make_tick(serial).due_ns
+    values: dict[str, Any] = {
+        "serial": serial,
+        "started_ns": first_ns,
+        "computed_ns": first_ns + 2 * NS_PER_MS,
+        "is_first": False,
+        "elapsed_s": 0.01,
+        "state": make_state(first_ns),
+        "states": np.zeros((1, 13), np.float32),
+        "history": np.zeros((1, 4, 4), np.float32),
+        "frame_ids": ((1,),),
+        "image_ns": first_ns,
+        "first_ns": first_ns,
+        "step_ns": 50 * NS_PER_MS,
+        "actions": np.array([actions], np.float32),
+    }
+    return Solve(**(values | changes))
+
+
+def test_some_chunks_are_shown_over_the_time_that_they_are_for(rrd: Path) -> None:
+    actions = [[0.1 * k, 0.0, 0.0, 0.0] for k in range(8)]
+    solves = [make_solve(index, actions) for index in range(100)]
+    seen = show(rrd, [*(make_tick(index) for index in range(100)), *solves])
+    for lane, begins_ms in ((0, 0), (1, 230)):
+        entity = seen.columns[f"/sticks/throttle/plan/{lane}"]
+        stamps_ms = [stamp_ns / NS_PER_MS for stamp_ns in entity["time"]]
+        assert stamps_ms[:9] == [begins_ms + 50 * step for step in range(9)]
+        assert stamps_ms == sorted(stamps_ms)
+        values = [row[0] for row in entity["Scalars:scalars"]]
+        assert values[:8] == pytest.approx([0.1 * k for k in range(8)])
+        assert math.isnan(values[8])
+
+
+def test_chunks_that_nobody_flies_are_not_shown(rrd: Path) -> None:
+    seen = show(rrd, [make_released_tick(0), make_solve(0, [[0.0] * 4] * 8)])
+    assert "/sticks/throttle/plan/0" not in seen.columns
+
+
+def test_a_chunk_of_velocities_is_a_path_from_the_vehicle(rrd: Path) -> None:
+    contract = Contract(action="velocity")
+    tick = make_tick(0, position_ned_m=Position(1.0, 2.0, -3.0))
+    solve = make_solve(0, [[2.0, 0.0, -1.0, 0.0]] * 2)
+    seen = show(rrd, [tick, solve], flight=viewed(contract))
+    assert np.allclose(
+        strips(seen, "scene/planned"), [[[1, 2, -3], [1.1, 2, -3.05], [1.2, 2, -3.1]]]
+    )
+
+
+def test_sticks_become_the_path_of_the_leans_that_they_mean(rrd: Path) -> None:
+    contract = Contract(lean_dead_zone=0.0, throttle_dead_zone=0.0, full_lean_deg=45.0)
+    tick = make_tick(0, position_ned_m=Position(0.0, 0.0, 0.0))
+    forward = [[1.0, 0.0, 1.0, 0.0]] * 20  # full climb, 45 degrees nose down, for a second
+    seen = show(rrd, [tick, make_solve(0, forward)], flight=viewed(contract))
+    end = strips(seen, "scene/planned")[0][-1]
+    assert end == pytest.approx([9.81 / 2, 0, -contract.full_climb_mps], rel=0.06, abs=1e-6)
+
+
+def test_a_level_chunk_keeps_what_the_air_slows_down(rrd: Path) -> None:
+    tick = make_tick(0, position_ned_m=Position(0.0, 0.0, 0.0))
+    values = np.array((4.0, 0, 0, 1, 0, 0, 0, 0, 0, 0, -2.0, 0, -9.81), dtype=np.float32)
+    solve = make_solve(0, [[0.0] * 4] * 20, state=make_state(START_NS, values=values))
+    seen = show(rrd, [tick, solve])
+    assert strips(seen, "scene/planned")[0][-1] == pytest.approx([3.0, 0, 0], abs=0.06)
 
 
 def test_every_plot_names_and_colours_its_series(rrd: Path) -> None:
@@ -206,27 +439,35 @@ def test_the_file_opens_on_the_blueprint_and_no_recording_is_global(rrd: Path) -
 
 @pytest.mark.parametrize("action", get_args(ActionKind))
 def test_every_plot_is_in_the_blueprint(action: ActionKind) -> None:
-    shown = {
-        str(expression).strip("/")
-        for column in flight_blueprint(action).root_container.contents
-        for view in column.contents
-        for expression in (view.contents if isinstance(view.contents, list) else [])
-    }
-    assert shown == {plot.path for plot in (*PLOTS, *action_plots(action))}
+    def contents(node: Any) -> Iterator[str]:
+        found = getattr(node, "contents", ())
+        for child in found if isinstance(found, list | tuple) else ():
+            yield from [str(child)] if isinstance(child, str) else contents(child)
+
+    shown = [
+        str(text).strip("/*")
+        for text in contents(flight_blueprint(viewed(Contract(action=action))).root_container)
+    ]
+    for path, _ in styles(action):
+        assert any(path == entry or path.startswith(f"{entry}/") for entry in shown), path
+
+
+@pytest.mark.parametrize("action", get_args(ActionKind))
+def test_titles_fit_into_their_panels(action: ActionKind) -> None:
+    assert max(len(plot.title) for plot in (*PLOTS, *action_plots(action))) <= 64
 
 
 def test_an_unwritable_path_is_refused_before_the_flight(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
     with pytest.raises(UserError, match="cannot write --rerun"):
-        RerunView(str(tmp_path / "taken" / "f.rrd"), vision_hz=30)
+        RerunView(str(tmp_path / "taken" / "f.rrd"), viewed())
 
 
 def test_two_flights_in_one_process_do_not_mix(tmp_path: Path) -> None:
     first = show(tmp_path / "a.rrd", [make_tick(0)])
     second = show(tmp_path / "b.rrd", [make_tick(5)], [make_tick(6)])
-    assert first.columns["/age"]["tick"] == [0]
-    assert second.columns["/age"]["tick"] == [5, 6]
-    assert second.times_ms("age") == [0.0, 10.0]
+    assert first.times_ms("sticks/roll") == [0.0]
+    assert second.times_ms("sticks/roll") == [0.0, 10.0]
 
 
 FLIES_INTO_A_STALLED_VIEWER = """
@@ -234,8 +475,9 @@ import sys
 from helpers.factories import make_tick, make_vision_tick
 from mavbridge.core.observers import ObserverThread
 from mavbridge.observe.rerun_flight import RerunView
+from mavbridge.observe.rerun_layout import ViewedFlight
 
-view = RerunView(sys.argv[1], vision_hz=30)
+view = RerunView(sys.argv[1], ViewedFlight(vision_hz=30, chunk_hz=100, stick_hz=100))
 observer = ObserverThread("viewer", view, capacity=100)
 observer.emit(make_tick())
 observer.emit(make_vision_tick())

@@ -14,7 +14,7 @@ from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
-from mavbridge.recording.meta import FlightError
+from mavbridge.recording.meta import FlightError, read_meta, write_meta
 from mavbridge.recording.rows import LATER, TICKS, FrameTruth, TickLabels
 from mavbridge.recording.tlog import open_tlog_pipe
 from policy.contract import ACTION_TERMS, FLIGHT_TERMS, OBSERVATION_TERMS, Contract
@@ -258,5 +258,23 @@ def test_a_folder_that_cannot_take_a_flight_is_refused(
     with pytest.raises(UserError, match="cannot be written"):
         prepare_folder(Path("/proc/nowhere"))
     monkeypatch.setattr(names, "EXTRA", ("av", "no_such_module"))
-    with pytest.raises(UserError, match=r"needs no_such_module: pip install 'mavbridge\[record\]'"):
+    with pytest.raises(UserError, match=r"needs no_such_module: pip install no_such_module"):
         prepare_folder(tmp_path / "new")
+
+
+def test_what_ran_comes_back_and_older_flights_know_nothing_of_it(flight: Path) -> None:
+    meta = make_meta(
+        command=("mavbridge", "--arm"),
+        versions={"python": "3.12.1"},
+        git_revision="abc-dirty",
+        policy_files={"/w.safetensors": "00"},
+        cameras={"front": "0"},
+        parameters={"RC_OVERRIDE_TIME": 0.5},
+    )
+    write_meta(flight, meta)
+    assert read_meta(flight) == meta
+    document = json.loads((flight / "meta.json").read_text())
+    for key in ("command", "versions", "git_revision", "policy_files", "cameras", "parameters"):
+        del document[key]
+    (flight / "meta.json").write_text(json.dumps(document))
+    assert read_meta(flight) == make_meta()

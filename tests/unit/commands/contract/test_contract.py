@@ -185,7 +185,7 @@ def test_what_cannot_be_drafted_is_refused_and_nothing_is_written(
     folder = tmp_path / "source"
     prepare(folder)
     before = {path: path.read_bytes() for path in folder.rglob("*")}
-    assert status("contract", str(folder)) == 1
+    assert status("contract", str(folder)) == 2
     assert said in " ".join(capsys.readouterr().err.split())
     assert {path: path.read_bytes() for path in folder.rglob("*")} == before
 
@@ -194,5 +194,5 @@ def test_a_folder_that_is_no_dataset_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     policy = checkpoint(tmp_path / "policy")
-    assert status("contract", str(policy), "--dataset", str(tmp_path)) == 1
+    assert status("contract", str(policy), "--dataset", str(tmp_path)) == 2
     assert "not a LeRobot dataset" in capsys.readouterr().err

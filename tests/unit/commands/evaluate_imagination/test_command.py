@@ -163,7 +163,7 @@ def test_bad_input_is_one_message(evaluate: Evaluate, arguments: list[str], told
         part for key, value in defaults.items() if key not in arguments for part in (key, value)
     ]
     status, text = evaluate(*arguments, *given)
-    assert status == 1
+    assert status == 2
     assert told in text, text
 
 

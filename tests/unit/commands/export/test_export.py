@@ -297,7 +297,7 @@ def test_bad_input_is_one_message_and_leaves_nothing(
 ) -> None:
     prepare(tmp_path)
     before = sorted(path.name for path in tmp_path.iterdir())
-    assert status_of("export", tmp_path / "flights", "--out", tmp_path / "out") == 1
+    assert status_of("export", tmp_path / "flights", "--out", tmp_path / "out") == 2
     printed = capsys.readouterr().err
     assert says in printed
     assert "Traceback" not in printed

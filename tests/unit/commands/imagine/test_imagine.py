@@ -163,7 +163,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
 
     monkeypatch.setattr(run, "StreamedOutput", start)
     status, text = imagine("--out", str(out), "--n-iter", "100")
-    assert status == 1
+    assert status == 2
     assert "the writer process has died" in text
     assert "are readable" in text
 
@@ -200,7 +200,7 @@ def test_bad_input_is_one_message(
 ) -> None:
     out = () if "--out" in flags else ("--out", str(tmp_path / "a.mp4"))
     status, text = imagine(*flags, *out)
-    assert status == (2 if told == "pilot" else 1)  # 2: of the parser, not ours
+    assert status == 2
     assert told in text.replace("│ ", ""), text
     assert not (tmp_path / "a.mp4").exists()
     assert (folder / "taken.mp4").read_text() == "precious"
@@ -212,7 +212,7 @@ def test_no_world_model_is_shipped_yet(
     monkeypatch.setattr(run, "SHIPPED", folder / "nothing.safetensors")
     with pytest.raises(SystemExit) as stopped:
         main(["imagine", "--start", "flight", "--out", str(tmp_path / "a.mp4")])
-    assert stopped.value.code == 1
+    assert stopped.value.code == 2
     monkeypatch.setattr(run, "SHIPPED", folder / "world.safetensors")
     out = str(tmp_path / "b.mp4")
     flags = ["--start", "flight", "--out", out, "--n-iter", "1", "--no-decode-video"]

@@ -57,7 +57,7 @@ def test_a_flight_is_no_folder_for_flights(
     write_meta(tmp_path, make_meta())
     with pytest.raises(SystemExit) as stopped:
         main(["record", "--out", str(tmp_path), *CONNECT, "--camera", "shm:x"])
-    assert stopped.value.code == 1
+    assert stopped.value.code == 2
     assert "is a flight itself" in " ".join(capsys.readouterr().err.split())
 
 

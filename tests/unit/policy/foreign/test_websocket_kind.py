@@ -46,7 +46,7 @@ def test_flags_that_a_server_does_not_take(tmp_path: Path) -> None:
 
 def test_a_missing_package_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kind, "find_spec", lambda name: None if name == "msgpack" else object())
-    with pytest.raises(PolicyError, match=r"needs msgpack: pip install 'mavbridge\[remote\]'"):
+    with pytest.raises(PolicyError, match=r"needs msgpack: pip install msgpack"):
         check_server("ws://127.0.0.1:8000", None, None)
 
 

@@ -1,0 +1,1 @@
+"""``mavbridge check``: whether a flight could begin, without flying."""

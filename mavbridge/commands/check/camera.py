@@ -1,0 +1,206 @@
+"""Rows about the cameras: all of them are read at the same time, for two seconds."""
+
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from statistics import median
+
+from mavbridge.camera.image_watch import is_blank
+from mavbridge.camera.open import NO_CAMERA, open_camera
+from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.config.flight import CameraConfig
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.errors import CameraError, MavbridgeError
+from mavbridge.core.ports import Camera
+from mavbridge.core.workers import Worker
+
+MEASURE_S = 2.0
+_READ_NS = NS_PER_S // 2
+_JOIN_S = 5.0
+_ENOUGH = 0.9
+"""Share of the wanted rate."""
+_ON_ARRIVAL_MS = 1.0
+"""Frames younger than this when they are read were stamped as they came, not at their exposure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraNeeds:
+    """What the flight takes of one camera."""
+
+    name: str
+    """In the contract; empty for the only one."""
+    source: str
+    rate_hz: float
+    side_px: int
+    """Least side of its image."""
+    max_age_s: float
+    """Oldest image to act on."""
+    is_flown_by: bool = True
+    """A black image is a fault."""
+
+
+@dataclass(kw_only=True)
+class Seen:
+    """Frames of one camera in two seconds."""
+
+    captured_ns: list[int] = field(default_factory=list)
+    ages_ns: list[int] = field(default_factory=list)
+    """From the stamp to the read."""
+    height_px: int = 0
+    width_px: int = 0
+    is_blank: bool = False
+    dropped: int = 0
+    failure: str | None = None
+
+    @property
+    def rate_hz(self) -> float:
+        """By the stamps, of the frames that were not read as well."""
+        if len(self.captured_ns) < 2:
+            return 0.0
+        span_ns = self.captured_ns[-1] - self.captured_ns[0]
+        return (len(self.captured_ns) - 1 + self.dropped) * NS_PER_S / span_ns if span_ns else 0.0
+
+
+def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock) -> list[Row]:
+    """Open, read and close every camera; one that fails is a row."""
+    rows: list[Row] = []
+    with ExitStack() as stack:
+        opened: list[tuple[CameraNeeds, Camera]] = []
+        for need in needs:
+            try:
+                camera = _open(need, config, clock)
+            except MavbridgeError as error:
+                rows.append(_row(need, "not opened", verdict="no-go", advice=str(error)))
+                continue
+            stack.callback(camera.close)
+            opened.append((need, camera))
+        seen = _watch_all([camera for _, camera in opened], clock)
+        for (need, _), what in zip(opened, seen, strict=True):
+            rows += _judge(need, what, latency_ms=config.camera_latency)
+    return rows
+
+
+def _open(need: CameraNeeds, config: CameraConfig, clock: Clock) -> Camera:
+    return open_camera(
+        need.source,
+        image_size=need.side_px,
+        clock=clock,
+        timeout_s=config.camera_timeout,
+        latency_ms=config.camera_latency,
+    )
+
+
+def _watch_all(cameras: Sequence[Camera], clock: Clock) -> list[Seen]:
+    seen = [Seen() for _ in cameras]
+    workers = [
+        Worker(f"mavbridge-check-camera-{number}", partial(_watch, camera, what, clock))
+        for number, (camera, what) in enumerate(zip(cameras, seen, strict=True))
+    ]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.ends_within(MEASURE_S + _JOIN_S)
+        worker.join(_JOIN_S)
+    return seen
+
+
+def _watch(camera: Camera, seen: Seen, clock: Clock, stop: threading.Event) -> None:
+    until_ns = clock.now_ns() + round(MEASURE_S * NS_PER_S)
+    dropped_before = camera.dropped_frames
+    try:
+        while clock.now_ns() < until_ns and not stop.is_set():
+            frame = camera.read(_READ_NS)
+            if frame is None:
+                continue
+            seen.ages_ns.append(clock.now_ns() - frame.captured_ns)
+            seen.captured_ns.append(frame.captured_ns)
+            seen.height_px, seen.width_px = frame.rgb.shape[:2]
+            seen.is_blank = is_blank(frame.rgb)
+    except CameraError as error:
+        seen.failure = str(error)
+    seen.dropped = camera.dropped_frames - dropped_before
+
+
+def _judge(need: CameraNeeds, seen: Seen, *, latency_ms: float) -> list[Row]:
+    if need.source == NO_CAMERA:
+        return [_row(need, "none: black images", "a policy that looks at no image")]
+    if seen.failure is not None or not seen.captured_ns:
+        why = seen.failure or f"no frame came in {MEASURE_S:g} s"
+        return [_row(need, "stopped", verdict="no-go", advice=why)]
+    return [_rate_row(need, seen), _image_row(need, seen), _age_row(need, seen, latency_ms)]
+
+
+def _rate_row(need: CameraNeeds, seen: Seen) -> Row:
+    is_slow = seen.rate_hz < _ENOUGH * need.rate_hz
+    advice = (
+        f"the camera delivers {seen.rate_hz:.1f} images a second of {need.rate_hz:.3g}: more "
+        "light, a smaller image or another mode may help; or ask for fewer by --visual-rate"
+    )
+    return _row(
+        need,
+        f"{seen.rate_hz:.1f} Hz",
+        f"{need.rate_hz:.3g} Hz",
+        part="rate",
+        verdict="warn" if is_slow else "go",
+        advice=advice if is_slow else "",
+    )
+
+
+def _image_row(need: CameraNeeds, seen: Seen) -> Row:
+    advice = ""
+    if need.is_flown_by and min(seen.height_px, seen.width_px) < need.side_px:
+        advice = "the image is smaller than what the policy takes, and is enlarged for it"
+    if seen.is_blank:
+        advice = "the image is black or of one colour: is the lens covered?"
+    return _row(
+        need,
+        f"{seen.width_px}x{seen.height_px}",
+        f"{need.side_px} px a side or more",
+        part="image",
+        verdict="no-go" if seen.is_blank and need.is_flown_by else "warn" if advice else "go",
+        advice=advice,
+    )
+
+
+def _age_row(need: CameraNeeds, seen: Seen, latency_ms: float) -> Row:
+    ages_ms = sorted(age_ns / NS_PER_MS for age_ns in seen.ages_ns)
+    typical_ms, oldest_ms = median(ages_ms), ages_ms[-1]
+    steps_back = sum(b <= a for a, b in zip(seen.captured_ns, seen.captured_ns[1:], strict=False))
+    verdict: Verdict = "go"
+    advice = ""
+    if steps_back:
+        verdict, advice = "warn", f"{steps_back} stamps do not rise: their source does not count on"
+    elif typical_ms < _ON_ARRIVAL_MS and not latency_ms and not need.source.startswith("shm:"):
+        verdict = "warn"
+        advice = (
+            "frames are stamped as they arrive, so their true age is not known: measure the time "
+            "from exposure to arrival, and give it as --camera-latency MS"
+        )
+    if typical_ms / 1000 > need.max_age_s:
+        verdict = "no-go"
+        advice = f"images are older than the {need.max_age_s:g} s at which they may be acted on"
+    return _row(
+        need,
+        f"{typical_ms:.1f} ms, at most {oldest_ms:.1f}",
+        f"exposure stamps, under {need.max_age_s * 1000:.0f} ms",
+        part="age when read",
+        verdict=verdict,
+        advice=advice,
+    )
+
+
+def _row(
+    need: CameraNeeds,
+    found: str,
+    expected: str = "frames",
+    *,
+    part: str = "",
+    verdict: Verdict = "go",
+    advice: str = "",
+) -> Row:
+    name = " ".join(filter(None, (need.name or need.source, part)))
+    return Row(
+        area="camera", name=name, found=found, expected=expected, verdict=verdict, advice=advice
+    )

@@ -1,0 +1,163 @@
+"""Rows about the link: the vehicle, the rates that come, losses, round trips and clocks."""
+
+from collections.abc import Iterator, Mapping
+
+from mavbridge.commands.check.probe import ECHO_S, VehicleProbe
+from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.commands.check.terms import Terms
+from mavbridge.core.vehicle import LinkStats
+from mavbridge.mavlink.profiles.profile import StreamGroup
+from mavbridge.mavlink.session.vehicle import VehicleSession
+from policy.contract import Contract
+
+_ENOUGH = 0.9
+"""Share of the rate that was asked for."""
+_ECHO_HZ = 20.0
+"""The check of our sticks needs as many RC_CHANNELS a second."""
+_LOSSY, _TOO_LOSSY = 0.01, 0.1
+_SLOW_MS = 50.0
+"""Round trip from which the sticks are noticeably late."""
+_QUANTITIES = {
+    "ATTITUDE_QUATERNION": "attitude",
+    "LOCAL_POSITION_NED": "velocity",
+    "HIGHRES_IMU": "acceleration",
+    "RC_CHANNELS": "sticks (echo)",
+}
+
+
+def link_rows(
+    vehicle: VehicleSession, stats: LinkStats, terms: Terms, *, unfinished: str | None
+) -> Iterator[Row]:
+    """All of them but the echo test."""
+    yield _vehicle_row(vehicle, unfinished)
+    rates_hz = dict(stats.messages_per_s)
+    contract = terms.contract or Contract()
+    for group in terms.streams:
+        if not group.is_optional:
+            yield _rate_row(group, rates_hz, contract)
+    yield _optional_row(terms, rates_hz)
+    yield _loss_row(stats)
+    yield from _time_rows(stats)
+
+
+def _vehicle_row(vehicle: VehicleSession, unfinished: str | None) -> Row:
+    place = f"system {vehicle.identity.source.system} at {vehicle.identity.place}"
+    return _row(
+        "vehicle",
+        f"{vehicle.profile.name} {vehicle.version or '(no version)'}, {place}",
+        "ArduCopter or a PX4 multicopter",
+        "go" if unfinished is None else "no-go",
+        "" if unfinished is None else f"the set-up of the link did not finish: {unfinished}",
+    )
+
+
+def _rate_row(group: StreamGroup, rates_hz: Mapping[str, float], contract: Contract) -> Row:
+    name = _QUANTITIES.get(group.messages[0], group.messages[0])
+    rate_hz = max(rates_hz.get(message, 0.0) for message in group.messages)
+    least_hz = {
+        "attitude": 1 / contract.max_state_age_s,
+        "velocity": 1 / contract.max_velocity_age_s,
+        "acceleration": 1 / contract.max_velocity_age_s,
+        "sticks (echo)": _ECHO_HZ,
+    }.get(name, 0.0)
+    verdict, advice = _rate_verdict(name, rate_hz, least_hz, group.rate_hz)
+    return _row(name, f"{rate_hz:.1f} Hz", f"{group.rate_hz:.3g} Hz", verdict, advice)
+
+
+def _rate_verdict(
+    name: str, rate_hz: float, least_hz: float, asked_hz: float
+) -> tuple[Verdict, str]:
+    if rate_hz == 0.0 and name == "velocity":
+        return "no-go", (
+            "no velocity comes: the estimator has no position yet (some 40 s after the start, and "
+            "never without GPS or another source of position)"
+        )
+    if rate_hz < least_hz:
+        return "no-go", f"{name}: below {least_hz:.3g} Hz it is too old to act on between two"
+    if rate_hz < _ENOUGH * asked_hz:
+        return "warn", (
+            f"{name} comes at {rate_hz:.1f} Hz of {asked_hz:.3g}: a faster link (a higher baud "
+            "rate; on PX4 also MAV_n_RATE), another station that asks for other rates, or a lower "
+            "--action-rate"
+        )
+    return "go", ""
+
+
+def _optional_row(terms: Terms, rates_hz: Mapping[str, float]) -> Row:
+    watched = [group for group in terms.streams if group.is_optional and group.least_hz != 0.0]
+    silent = [group.messages[0] for group in watched if group.messages[0] not in rates_hz]
+    return _row(
+        "also watched",
+        f"{len(watched) - len(silent)} of {len(watched)} messages",
+        ", ".join(group.messages[0] for group in watched),
+        "warn" if silent else "go",
+        f"not sent: {', '.join(silent)}; the flight does without" if silent else "",
+    )
+
+
+def _loss_row(stats: LinkStats) -> Row:
+    lost = stats.lost_fraction or 0.0
+    verdict: Verdict = "no-go" if lost > _TOO_LOSSY else "warn" if lost > _LOSSY else "go"
+    bad = f", {stats.unusable_packets} unusable" if stats.unusable_packets else ""
+    return _row(
+        "loss",
+        f"{lost:.1%} of its messages{bad}",
+        f"under {_LOSSY:.0%}",
+        verdict,
+        ""
+        if verdict == "go"
+        else "messages of the vehicle get lost: look at cable, baud rate and "
+        "radio, and at other programs on its port",
+    )
+
+
+def _time_rows(stats: LinkStats) -> Iterator[Row]:
+    trip = stats.rtt_ms
+    is_slow = trip is None or trip.p50 > _SLOW_MS
+    yield _row(
+        "round trip",
+        "no answer" if trip is None else f"{trip.p50:.1f} ms, at most {trip.max:.1f}",
+        f"under {_SLOW_MS:.0f} ms",
+        "warn" if is_slow else "go",
+        "half of it is added to the age of every stick" if is_slow else "",
+    )
+    error_ms = stats.timesync_error_ms
+    yield _row(
+        "clocks (TIMESYNC)",
+        f"within {error_ms:.1f} ms" if error_ms is not None else "no answer",
+        "good: ages count from the vehicle's own stamps",
+        "go" if stats.is_timesync_good else "warn",
+        ""
+        if stats.is_timesync_good
+        else "the vehicle's stamps cannot be trusted: ages count from arrival, which hides delay",
+    )
+
+
+def echo_row(probe: VehicleProbe, terms: Terms) -> Row:
+    """Send neutral sticks, unless the vehicle is armed, and say whether it took them."""
+    name, expected = "echo test", f"our sticks from system {terms.context.source_system}"
+    if not terms.is_sticks:
+        text = "not sent: the vehicle shows setpoints only in their mode"
+        return _row(name, text, "actions that are sticks")
+    match probe.echo():
+        case "armed":
+            return _row(
+                name, "refused", expected, "no-go", "the vehicle is armed: disarm it for the test"
+            )
+        case "taken":
+            return _row(name, "taken, and released", expected)
+    return _row(
+        name,
+        f"not seen in {ECHO_S:g} s",
+        expected,
+        "no-go",
+        probe.echo_problem
+        or "the vehicle does not show our sticks: another station may "
+        "be overriding them, or it obeys another system id",
+    )
+
+
+def _row(name: str, found: str, expected: str, verdict: Verdict = "go", advice: str = "") -> Row:
+    return Row(
+        area="link", name=name, found=found, expected=expected, verdict=verdict, advice=advice
+    )

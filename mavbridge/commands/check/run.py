@@ -1,0 +1,99 @@
+"""``mavbridge check`` from its config to its exit status."""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+from rich.console import Console
+
+from mavbridge.camera.open import NO_CAMERA
+from mavbridge.commands.check.camera import CameraNeeds, camera_rows
+from mavbridge.commands.check.computer import computer_rows
+from mavbridge.commands.check.config import CheckConfig
+from mavbridge.commands.check.policy import NO_POLICY, PolicyFindings, check_policy
+from mavbridge.commands.check.rows import Row, as_document, overall
+from mavbridge.commands.check.table import print_check
+from mavbridge.commands.check.vehicle import check_vehicle
+from mavbridge.commands.output import print_status
+from mavbridge.config.flight import CameraConfig, FlyConfig
+from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.files import require_writable
+from mavbridge.flight.policies import looks_at_images
+from policy.contract import Contract
+from policy.preprocess import least_source_px
+
+NO_GO_STATUS = 3
+"""Exit status where a flight could not begin; 0 where it could, with warnings or without."""
+STDOUT = Path("-")
+
+
+def check(config: CheckConfig) -> int:
+    """Look at everything that a flight needs, print the table; returns the exit status.
+
+    Raises:
+        UserError: --json names a file that cannot be written.
+    """
+    is_on_stdout = config.json == STDOUT
+    if not is_on_stdout:
+        require_writable(config.json, "--json")
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    rows = check_all(config)
+    document = json.dumps(as_document(rows), indent=2) + "\n"
+    if config.json is not None and not is_on_stdout:
+        config.json.write_text(document)
+    print_check(rows, Console(stderr=is_on_stdout, highlight=False))
+    if is_on_stdout:
+        sys.stdout.write(document)
+    return NO_GO_STATUS if overall(rows) == "no-go" else 0
+
+
+def check_all(config: CheckConfig) -> list[Row]:
+    """All rows, in the order of the table."""
+    flight, clock = config.flight, MonotonicClock()
+    if flight.policy.policy != NO_POLICY:
+        print_status("loading the policy")
+    policy = check_policy(flight, clock)
+    try:
+        needs = _camera_needs(flight, policy)
+        camera_failure = []
+    except MavbridgeError as error:
+        needs = []
+        camera_failure = [
+            Row(area="camera", name="cameras", found="", verdict="no-go", advice=str(error))
+        ]
+    if needs:
+        print_status("watching the camera")
+    cameras = camera_rows(needs, flight.camera, clock)
+    print_status(f"listening to the vehicle on {flight.link.connect}")
+    vehicle = check_vehicle(flight, policy, clock, echo_test=config.echo_test)
+    return [*vehicle, *camera_failure, *cameras, *policy.rows, *computer_rows(flight.rates)]
+
+
+def _camera_needs(config: FlyConfig, policy: PolicyFindings) -> list[CameraNeeds]:
+    """What the flight needs of each camera; raises UserError where their names do not fit.
+
+    Without a policy only cameras that were named are looked at.
+    """
+    contract = policy.contract
+    if contract is None:
+        if config.camera == CameraConfig() or set(config.camera.sources) == {NO_CAMERA}:
+            return []
+        contract = Contract()
+        names, sources = config.camera.sources, config.camera.sources
+    else:
+        names, sources = contract.cameras, config.camera.sources_of(contract.cameras)
+    loops = config.rates.loops(is_dual=policy.is_dual, play_s=contract.play_s)
+    rates_hz = contract.camera_rates_hz or (loops.max_vision_hz,) * len(sources)
+    return [
+        CameraNeeds(
+            name=name if len(names) > 1 else "",
+            source=source,
+            rate_hz=min(rate_hz, loops.max_vision_hz),
+            side_px=least_source_px(contract),
+            max_age_s=contract.max_feature_age_s,
+            is_flown_by=looks_at_images(config),
+        )
+        for name, source, rate_hz in zip(names, sources, rates_hz, strict=False)
+    ]

@@ -1,0 +1,71 @@
+"""The table of the check, and below it what to do."""
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mavbridge.commands.check.rows import Row, Verdict, overall
+from mavbridge.commands.output import PIPED_WIDTH
+
+_STYLES: dict[Verdict, str] = {"go": "green", "warn": "yellow", "no-go": "bold red"}
+_FOOT = (
+    "Nothing was set, armed or steered. What a flight asks for was asked for as well: message "
+    "rates, which stay until the vehicle or another station changes them."
+)
+
+
+def print_check(rows: Sequence[Row], console: Console) -> None:
+    """Print all rows, then the reasons and cures of those that are not go, then the verdict."""
+    if not console.is_terminal:
+        console.width = PIPED_WIDTH
+    console.print(_table(rows))
+    for verdict in ("no-go", "warn"):
+        _print_reasons([row for row in rows if row.verdict == verdict], console)
+    console.print(Text(_FOOT, style="dim"))
+    console.print(_summary(rows))
+
+
+def _table(rows: Sequence[Row]) -> Table:
+    table = Table(pad_edge=False, box=None, padding=(0, 1), header_style="bold")
+    table.add_column("", no_wrap=True)
+    table.add_column("what", overflow="fold")
+    table.add_column("found", overflow="fold", ratio=3)
+    table.add_column("should be", overflow="fold", ratio=2, style="dim")
+    area = None
+    for row in rows:
+        if row.area != area:
+            area = row.area
+            table.add_row("", Text(area, style="bold underline"))
+        mark = Text(row.verdict, style=_STYLES[row.verdict])
+        table.add_row(mark, Text(row.name), Text(row.found), Text(row.expected))
+    return table
+
+
+def _print_reasons(rows: Sequence[Row], console: Console) -> None:
+    """Each reason once, with its rows' names, its text hanging under itself."""
+    names: dict[str, list[str]] = {}
+    for row in rows:
+        names.setdefault(row.advice, []).append(row.name)
+    if not names:
+        return
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    mark = Text(rows[0].verdict, style=_STYLES[rows[0].verdict])
+    for advice, whose in names.items():
+        grid.add_row(mark, Text.assemble((", ".join(whose), "bold"), f": {advice}"))
+    console.print()
+    console.print(grid)
+
+
+def _summary(rows: Sequence[Row]) -> Text:
+    verdict = overall(rows)
+    counts = {each: sum(row.verdict == each for row in rows) for each in _STYLES}
+    told = f"{counts['go']} go, {counts['warn']} to be warned of, {counts['no-go']} no-go"
+    word = "NO-GO" if verdict == "no-go" else "GO"
+    sets = dict.fromkeys(command for row in rows for command in row.commands)
+    flags = [flag for flag in sets if flag.startswith("--set")]
+    cure = f"\nfor one flight, add: {' '.join(flags)}" if flags else ""
+    return Text.assemble((word, _STYLES[verdict]), f": {told}{cure}")

@@ -1,0 +1,119 @@
+"""Rows about the vehicle's state: modes, radio, position, its own checks, and what it says."""
+
+from collections.abc import Iterator, Sequence
+
+from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.commands.check.terms import Terms
+from mavbridge.core.vehicle import LinkSnapshot, VehicleStatus
+from mavbridge.mavlink.session.vehicle import VehicleSession
+
+_TEXTS_SHOWN = 4
+
+
+def vehicle_rows(
+    vehicle: VehicleSession, snapshot: LinkSnapshot, terms: Terms, *, texts: Sequence[str]
+) -> Iterator[Row]:
+    """All of them; ``texts`` is what the vehicle and the link have said."""
+    yield from _mode_rows(terms)
+    if (status := snapshot.status) is not None:
+        yield _state_row(status)
+        yield _receiver_row(status)
+        yield _position_row(status)
+        if status.battery_problem is not None:
+            yield _row("battery", "low", "charged", "no-go", status.battery_problem)
+    if (is_ready := vehicle.condition.is_ready_to_arm) is not None:
+        yield _arming_row(is_ready=is_ready)
+    if vehicle.switch_problem is not None:
+        yield _row("override switch", "off", "on", "warn", vehicle.switch_problem)
+    yield from _text_rows(terms, texts)
+
+
+def _mode_rows(terms: Terms) -> Iterator[Row]:
+    names = terms.profile.modes.roles.names
+    wanted = () if terms.contract is None else terms.contract.modes
+    if not wanted:
+        return
+    present = [mode for mode in wanted if mode in names]
+    is_lacking = terms.mode is None
+    yield _row(
+        "modes",
+        ", ".join(present) or "none of them",
+        " or ".join(wanted),
+        "no-go" if is_lacking else "go",
+        f"the policy cannot fly in any mode of this vehicle: {', '.join(names)}"
+        if is_lacking
+        else "",
+    )
+
+
+def _state_row(status: VehicleStatus) -> Row:
+    found = f"{'armed' if status.armed else 'disarmed'} in {status.mode}"
+    if status.is_failsafe:
+        text = "a failsafe of the vehicle is active"
+        return _row("state", f"{found}, failsafe", "disarmed", "no-go", text)
+    if status.armed:
+        text = "it is armed: this check sends nothing that moves it"
+        return _row("state", found, "disarmed", "warn", text)
+    return _row("state", found, "disarmed, no failsafe")
+
+
+def _receiver_row(status: VehicleStatus) -> Row:
+    expected = "a pilot who can take over"
+    if status.has_receiver:
+        return _row("radio receiver", "there", expected)
+    return _row(
+        "radio receiver",
+        "none seen" if status.has_receiver is False else "not known",
+        expected,
+        "warn",
+        "without a receiver nobody takes over by stick, and neutral sticks go on after a flight "
+        "until the vehicle is disarmed or its mode is changed",
+    )
+
+
+def _position_row(status: VehicleStatus) -> Row:
+    if status.is_position_valid is None:
+        return _row("position", "the estimator does not say", "valid")
+    if status.is_position_valid:
+        return _row("position", "valid", "valid")
+    return _row(
+        "position",
+        "none",
+        "valid",
+        "warn",
+        "without a position, hold is LAND, and the autopilot does not take off by itself",
+    )
+
+
+def _arming_row(*, is_ready: bool) -> Row:
+    return _row(
+        "checks before arming",
+        "passed" if is_ready else "not passed",
+        "passed",
+        "go" if is_ready else "warn",
+        ""
+        if is_ready
+        else "the autopilot would refuse to arm now; it says why as PreArm texts, "
+        "also to a ground station",
+    )
+
+
+def _text_rows(terms: Terms, texts: Sequence[str]) -> Iterator[Row]:
+    """What was said besides the parameters' sentences, which have rows of their own."""
+    told = {sentence.text for sentence in terms.sentences()}
+    new = [text for text in texts if text not in told and not text.startswith("full ")]
+    for text in new[-_TEXTS_SHOWN:]:
+        is_own = text.startswith("vehicle: ")
+        is_quiet = is_own and "PreArm" not in text
+        name, said = ("it says", text.removeprefix("vehicle: ")) if is_own else ("link", text)
+        yield _row(name, "see below" if not is_quiet else said, "", *_judged(said, is_quiet))
+
+
+def _judged(said: str, is_quiet: bool) -> tuple[Verdict, str]:
+    return ("go", "") if is_quiet else ("warn", said)
+
+
+def _row(name: str, found: str, expected: str, verdict: Verdict = "go", advice: str = "") -> Row:
+    return Row(
+        area="vehicle", name=name, found=found, expected=expected, verdict=verdict, advice=advice
+    )

@@ -1,0 +1,1 @@
+"""``mavbridge replay``: a recorded flight through the flight's own code once more."""

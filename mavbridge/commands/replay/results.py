@@ -1,0 +1,133 @@
+"""What a replay came to, for a person and for a program."""
+
+import json
+from dataclasses import asdict, dataclass
+
+from rich.console import Console
+from rich.text import Text
+
+from mavbridge.commands.output import make_table
+from mavbridge.commands.replay.config import ReplayFrom
+from mavbridge.core.vehicle import ACTION_CLASSES
+from mavbridge.simulation.replay.compare import (
+    Deviation,
+    GateComparison,
+    PolicyComparison,
+    StickTraces,
+)
+from mavbridge.simulation.replay.recording import ReplaySource
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayResult:
+    """One replay."""
+
+    source: ReplaySource
+    chosen: ReplayFrom
+    engine: str | None
+    """On which the policy ran; None: it was not asked."""
+    policy: PolicyComparison | None
+    gate: GateComparison
+    """With the recorded chunks and settings."""
+    sticks: StickTraces
+    """With the new chunks and settings."""
+    tolerance: float | None
+    """None: something else was asked for, and no result is expected."""
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Why it is not equal, in words."""
+        found = []
+        if self.gate.first is not None:
+            found.append(f"the gate came out differently, first in the {self.gate.first}")
+        if self.tolerance is None:
+            return tuple(found)
+        for name, count in self.policy.missing.items() if self.policy else ():
+            found.append(f"{count} solves were not repeated: {name}")
+        for name, count in self.policy.inputs_differ.items() if self.policy else ():
+            found.append(f"{count} solves were given another input: {name}")
+        if self.policy is not None and self.tolerance == 0:
+            other = self.policy.solves - self.policy.equal_chunks
+            if other:
+                found.append(f"{other} of {self.policy.solves} chunks differ")
+        if self.sticks.deviation.most > self.tolerance:
+            found.append(
+                f"a stick is off by {self.sticks.deviation.most:.4g}, more than {self.tolerance:g}"
+            )
+        return tuple(found)
+
+    @property
+    def is_equal(self) -> bool:
+        """Equal within the tolerance, or nothing was expected."""
+        return not self.problems
+
+
+def print_replay(result: ReplayResult, console: Console) -> None:
+    """Tables, and a verdict in words."""
+    names = ACTION_CLASSES[result.source.contract.action]._fields
+    rows = []
+    if (policy := result.policy) is not None:
+        equal = f"{policy.equal_chunks} of {policy.solves} chunks"
+        rows.append(_row("policy: chunks", equal, policy.deviation))
+    gate = result.gate
+    same = f"{gate.steps - max(gate.differ.values(), default=0)} of {gate.steps} ticks"
+    rows.append(_row("gate: sticks, recorded chunks", same, gate.deviation))
+    if result.policy is not None or result.tolerance is None:
+        moved = result.sticks.deviation
+        rows.append(_row("sticks, these chunks and limits", "", moved))
+        rows.append(_row("the same, rms", "", Deviation(largest=moved.rms, rms=moved.rms)))
+    title = f"replay of {result.source.folder} from {result.chosen}"
+    header = ["largest difference", "equal", *names]
+    console.print(make_table(title, header, rows, left_columns=2))
+    recorded = f"recorded with {result.source.meta.policy} on {result.source.meta.engine}"
+    console.print(Text(recorded + (f", replayed on {result.engine}" if result.engine else "")))
+    for gap in result.source.gaps:
+        console.print(Text(f"note: {gap}", style="yellow"))
+    for problem in result.problems:
+        console.print(Text(f"different: {problem}", style="red"))
+    console.print(Text(_verdict(result), style="bold"))
+
+
+def _verdict(result: ReplayResult) -> str:
+    if not result.is_equal:
+        return "NOT EQUAL"
+    if result.tolerance is None:
+        return "the difference is what was asked for"
+    if result.tolerance == 0:
+        return "EQUAL, bit for bit"
+    return f"EQUAL within {result.tolerance:g} of full stick"
+
+
+def _row(name: str, equal: str, deviation: Deviation) -> list[str]:
+    return [name, equal, *(_figure(value) for value in deviation.largest)]
+
+
+def _figure(value: float) -> str:
+    return "0" if value == 0 else f"{value:.2g}"
+
+
+def to_json(result: ReplayResult) -> str:
+    """All figures."""
+    document = {
+        "flight": str(result.source.folder),
+        "from": result.chosen,
+        "recorded_engine": result.source.meta.engine,
+        "engine": result.engine,
+        "tolerance": result.tolerance,
+        "is_equal": result.is_equal,
+        "problems": result.problems,
+        "gaps": result.source.gaps,
+        "policy": None if result.policy is None else asdict(result.policy),
+        "gate": asdict(result.gate),
+        "sticks": asdict(result.sticks.deviation),
+    }
+    return json.dumps(_finite(document), indent=2) + "\n"
+
+
+def _finite(value: object) -> object:
+    """JSON has no infinity: null says that only one of the two was flown."""
+    if isinstance(value, dict):
+        return {name: _finite(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and value in (float("inf"),) else value

@@ -1,0 +1,230 @@
+"""The command: read the flight, compute it once more, say what differs."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from mavbridge.commands.output import print_status, require_outputs, table_console
+from mavbridge.commands.replay.config import ReplayConfig, ReplayFrom
+from mavbridge.commands.replay.results import ReplayResult, print_replay, to_json
+from mavbridge.config.flight import FlyConfig
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import ExitCode, UserError
+from mavbridge.core.records import FeatureFrame
+from mavbridge.flight.policies import is_scripted, load_configured_policy
+from mavbridge.flight.settings import flight_settings
+from mavbridge.gate.chunks import Chunk
+from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.folder import require_extra
+from mavbridge.simulation.clock import SteppedClock
+from mavbridge.simulation.replay.compare import (
+    PolicyComparison,
+    StickTraces,
+    compare_gate,
+    compare_policy,
+    gate_traces,
+    other_traces,
+)
+from mavbridge.simulation.replay.gate import (
+    GateStep,
+    chunk_of,
+    recorded_executable,
+    replay_gate,
+    replay_other,
+)
+from mavbridge.simulation.replay.policy import SolvePair, replay_policy
+from mavbridge.simulation.replay.recording import ReplaySource, open_source
+from policy.protocol import Executable
+
+VIDEO_TOLERANCE = 0.15
+"""Largest difference of a smoothed stick from the lossy video, in full deflections: twice what was
+measured, see docs/commands.md."""
+ENGINE_TOLERANCE = 0.05
+"""The same on another engine. A single chunk may differ by ``parity.MAX_STICK_ERROR``; a warm start
+builds on its last chunk, and was seen to add that up to 0.022."""
+CLOCK_TOLERANCE = 0.01
+"""The same of a scripted policy, which reads the clock while it computes: some 0.1 ms apart."""
+
+
+def replay(folder: Path, config: ReplayConfig) -> int:
+    """Compute a recorded flight once more; returns an ``ExitCode``.
+
+    Raises:
+        MavbridgeError: the flight cannot be read or replayed, or the policy not be loaded.
+    """
+    require_extra("replay")
+    require_outputs(config.json, config.plot)
+    source = open_source(folder)
+    chosen = _source_of(source, config)
+    print_status(f"replaying {len(source.ticks)} ticks of {folder} through the gate")
+    steps = replay_gate(source)
+    flown = replace(source, config=other_config(source.config, config))
+    executable = recorded_executable(flown)
+    chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
+    compared: PolicyComparison | None = None
+    if chosen != "chunks":
+        clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
+        with load_configured_policy(flown.config.policy, clock) as loaded:
+            executable = loaded.executable
+            pairs = _replayed(flown, executable, clock, chosen)
+        compared = compare_policy(pairs)
+        chunks = _other_chunks(executable, pairs)
+    is_same = compared is None or compared.equal_chunks == compared.solves
+    if is_same and not config.changes_limits:
+        traces = gate_traces(steps)
+    else:
+        traces = _other_traces(flown, executable, steps, chunks)
+    result = ReplayResult(
+        source=source,
+        chosen=chosen,
+        engine=executable.engine if compared else None,
+        policy=compared,
+        gate=compare_gate(steps),
+        sticks=traces,
+        tolerance=tolerance_of(
+            config,
+            chosen,
+            recorded_engine=source.meta.engine,
+            engine=executable.engine,
+            is_scripted=is_scripted(flown.config.policy),
+        ),
+    )
+    _write(result, config)
+    return ExitCode.DONE if result.is_equal else ExitCode.DIFFERENT
+
+
+def _source_of(source: ReplaySource, config: ReplayConfig) -> ReplayFrom:
+    """Where the policy's images come from; UserError where that is not in the recording."""
+    has_features = bool(source.features)
+    if config.source == "features" and not has_features:
+        raise UserError(
+            f"{source.folder} is of a single-rate policy, which has no features: use --from video"
+        )
+    if config.source != "auto":
+        return config.source
+    return "features" if has_features and not config.changes_encoder else "video"
+
+
+def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
+    """The flags of the flight, with those of the replay in their place."""
+    limits = {
+        field.name: getattr(asked, field.name)
+        for field in fields(flown.limits)
+        if getattr(asked, field.name, None) is not None
+    }
+    names = ("policy", "checkpoint", "contract", "num_diffusion_steps", "head_steps")
+    policy: dict[str, Any] = {
+        name: getattr(asked, name)
+        for name in (*names, "engine", "device")
+        if getattr(asked, name) is not None
+    }
+    if asked.policy is not None:  # weights and files of the flight are of another policy
+        policy = {"checkpoint": None, "contract": None} | policy
+    return replace(
+        flown,
+        limits=replace(flown.limits, **limits),
+        policy=replace(flown.policy, **policy),
+    )
+
+
+def tolerance_of(
+    config: ReplayConfig,
+    chosen: ReplayFrom,
+    *,
+    recorded_engine: str | None,
+    engine: str,
+    is_scripted: bool,
+) -> float | None:
+    """Largest difference of a stick that counts as equal; None: nothing is expected."""
+    if config.tolerance is not None:
+        return config.tolerance
+    if config.is_other_policy or config.changes_limits:
+        return None
+    if chosen == "video":
+        return VIDEO_TOLERANCE
+    if chosen == "chunks":
+        return 0.0
+    if engine != recorded_engine:
+        return ENGINE_TOLERANCE
+    return CLOCK_TOLERANCE if is_scripted else 0.0
+
+
+def _replayed(
+    source: ReplaySource, executable: Executable, clock: SteppedClock, chosen: ReplayFrom
+) -> list[SolvePair]:
+    contract = executable.contract
+    if contract.history_len != source.contract.history_len or (
+        contract.cameras != source.contract.cameras or contract.action != source.contract.action
+    ):
+        raise UserError(
+            "the policy has another contract than that of the flight: its cameras, its kind of "
+            "action and the length of its history must be the same"
+        )
+    if chosen == "features":
+        if contract.feature_dim != source.contract.feature_dim:
+            raise UserError(
+                f"the policy takes features of {contract.feature_dim} numbers, and the recorded "
+                f"ones have {source.contract.feature_dim}: use --from video"
+            )
+        features: Sequence[Iterable[FeatureFrame]] = source.features
+    else:
+        features = [
+            _encoded(source, executable, number, name)
+            for number, name in enumerate(source.contract.cameras)
+        ]
+    kind = "features" if chosen == "features" else "images of the video"
+    print_status(f"repeating {len(source.solves)} solves from {kind} on {executable.engine}")
+    return list(replay_policy(source, executable, clock, features))
+
+
+def _encoded(
+    source: ReplaySource, executable: Executable, number: int, name: str
+) -> Iterator[FeatureFrame]:
+    """The frames of one camera's video, encoded as they are taken: images are large."""
+    cv2.setNumThreads(1)
+    flight = open_flight(source.folder, name if number else None)
+    faults = {
+        each.frame_id: each.fault for each in (source.features[number] if source.features else ())
+    }
+    for row, rgb in zip(flight.frame_rows(), flight.images(), strict=True):
+        yield FeatureFrame(
+            frame_id=row.frame_id,
+            captured_ns=row.captured_ns,
+            ready_ns=row.ready_ns,
+            value=executable.encode(rgb, number).copy(),
+            fault=faults.get(row.frame_id),
+        )
+
+
+def _other_chunks(executable: Executable, pairs: Sequence[SolvePair]) -> dict[int, Chunk]:
+    """The new chunks, by the serial numbers of the recorded ones."""
+    return {
+        pair.recorded.serial: chunk_of(
+            replace(pair.replayed, serial=pair.recorded.serial), executable.contract
+        )
+        for pair in pairs
+        if pair.replayed is not None
+    }
+
+
+def _other_traces(
+    source: ReplaySource,
+    executable: Executable,
+    steps: Sequence[GateStep],
+    chunks: dict[int, Chunk],
+) -> StickTraces:
+    settings = flight_settings(source.config, executable)
+    return other_traces(steps, replay_other(steps, settings, chunks))
+
+
+def _write(result: ReplayResult, config: ReplayConfig) -> None:
+    print_replay(result, table_console())
+    if config.json is not None:
+        config.json.write_text(to_json(result))
+    if config.plot is not None:
+        from mavbridge.commands.replay.figure import make_figure
+
+        make_figure(result).savefig(config.plot)

@@ -1,0 +1,139 @@
+"""The log of a run, for ``--log-file`` and ``--verbose``: written by a thread of its own.
+
+Whoever logs never waits: records go through a bounded queue, and are dropped and counted when it is
+full. The logger SAID takes what the terminal has shown already.
+"""
+
+import logging
+import logging.handlers
+import queue
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.files import require_writable
+from mavbridge.core.provenance import command_line, git_revision, versions
+from mavbridge.core.workers import HungError, Worker
+
+SAID = "mavbridge.said"
+THREAD = "mavbridge-log"
+CAPACITY = 2000
+"""Records that may wait."""
+POLL_S = 0.1
+CLOSE_S = 2.0
+OURS = ("mavbridge", "policy")
+"""Loggers whose details are taken; of all others warnings."""
+_FORMAT = "%(asctime)s %(levelname)-7s %(name)s: %(message)s"
+
+_log = logging.getLogger(__name__)
+
+
+class _Queue(logging.handlers.QueueHandler):
+    """Takes records from any thread; drops and counts what does not fit."""
+
+    def __init__(self) -> None:
+        self.records: queue.Queue[logging.LogRecord] = queue.Queue(CAPACITY)
+        super().__init__(self.records)
+        self.dropped = 0
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Queue it, or drop and count it."""
+        try:
+            self.records.put_nowait(record)
+        except queue.Full:
+            self.dropped += 1
+
+
+class _File(logging.FileHandler):
+    """Raises OSError where it cannot write."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - of logging
+        """Let the thread decide; called while the error is handled."""
+        del record
+        raise
+
+
+class _Terminal(logging.Handler):
+    """Standard error as it is now: a flight redirects it to its screen."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print what has not been shown."""
+        if record.name != SAID:
+            sys.stderr.write(f"{record.getMessage()}\n")
+
+
+@contextmanager
+def run_log(file: Path | None, *, verbose: bool) -> Iterator[None]:
+    """Log to ``file``, and with ``verbose`` show details on the terminal, while the block runs.
+
+    With neither of them nothing is changed: Python's logging shows warnings.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    if file is None and not verbose:
+        yield
+        return
+    require_writable(file, "--log-file")
+    source, terminal = _Queue(), _Terminal(logging.DEBUG if verbose else logging.WARNING)
+    sinks: list[logging.Handler] = [terminal]
+    if file is not None:
+        sinks.append(_File(file, encoding="utf-8"))
+        sinks[-1].setFormatter(logging.Formatter(_FORMAT))
+    root, writer = logging.getLogger(), Worker(THREAD, lambda stop: _write(source, sinks, stop))
+    levels = {name: logging.getLogger(name).level for name in OURS}
+    for name in OURS:
+        logging.getLogger(name).setLevel(logging.DEBUG)
+    root.addHandler(source)
+    writer.start()
+    try:
+        _begin()
+        yield
+    except MavbridgeError as error:
+        logging.getLogger(SAID).error("%s", error)
+        raise
+    except Exception:
+        logging.getLogger(SAID).exception("a bug of mavbridge")
+        raise
+    finally:
+        root.removeHandler(source)
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
+        with suppress(HungError):  # the terminal's reader has stalled
+            writer.join(CLOSE_S)
+
+
+def is_log_thread() -> bool:
+    """Return whether this is the thread that writes the log: what it prints is logged already."""
+    return threading.current_thread().name == THREAD
+
+
+def _begin() -> None:
+    _log.info("command: %s", " ".join(command_line()))
+    _log.debug("versions: %s", ", ".join(f"{name} {text}" for name, text in versions().items()))
+    if (revision := git_revision()) is not None:
+        _log.debug("git revision: %s", revision)
+
+
+def _write(source: _Queue, sinks: list[logging.Handler], stop: threading.Event) -> None:
+    """Hand each record to the sinks that take it; a file that cannot be written is left out."""
+    while not (stop.is_set() and source.records.empty()):
+        try:
+            record = source.records.get(timeout=POLL_S)
+        except queue.Empty:
+            continue
+        for sink in tuple(sinks):
+            try:
+                if record.levelno >= sink.level:
+                    sink.handle(record)
+            except OSError as error:
+                sinks.remove(sink)
+                sys.stderr.write(f"the log ends here: {error}\n")
+    for sink in sinks:
+        if source.dropped:
+            text = f"{source.dropped} records were dropped"
+            sink.handle(logging.LogRecord(__name__, logging.WARNING, "", 0, text, None, None))
+        sink.close()

@@ -1,0 +1,80 @@
+"""What ran, for records and logs: command line, versions, the revision of the source, digests."""
+
+import hashlib
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import mavbridge
+from mavbridge.core.processes import IMPORT_ROOT
+
+PACKAGES = (
+    *("torch", "openvino", "numpy", "opencv-python-headless", "pymavlink", "pyserial"),
+    *("rerun-sdk", "safetensors", "pyarrow", "av", "websockets"),
+)
+"""Those that have a part in how a flight goes or in what is recorded."""
+GIT_TIMEOUT_S = 2.0
+_PASSWORD = re.compile(r"(?<=://)([^/@\s:]*):[^/@\s]*@")
+
+
+def command_line() -> tuple[str, ...]:
+    """The words of this process's command line, without the passwords in addresses."""
+    return tuple(without_password(word) for word in ("mavbridge", *sys.argv[1:]))
+
+
+def without_password(text: str) -> str:
+    """The text with ``***`` for the password of each address in it, as in ``rtsp://me:it@host``."""
+    return _PASSWORD.sub(r"\1:***@", text)
+
+
+def versions() -> dict[str, str]:
+    """Versions by name: ours, Python's, the system's, and those of the packages that are here."""
+    found = {
+        "mavbridge": mavbridge.__version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+    }
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def git_revision(root: Path = IMPORT_ROOT) -> str | None:
+    """Commit of the checkout that this mavbridge runs from, with ``-dirty`` where files differ.
+
+    None where ``root`` is no checkout, such as an installed wheel, or git is missing.
+    """
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40"]
+    try:
+        done = subprocess.run(
+            [*command, "--exclude=*"],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=GIT_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None if done.returncode == 0 else None
+
+
+def digests(files: Iterable[Path]) -> dict[str, str]:
+    """SHA-256 of each file by its absolute path; one that cannot be read is left out."""
+    found = {}
+    for path in files:
+        try:
+            with path.open("rb") as file:
+                found[str(path.resolve())] = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError:
+            continue
+    return found

@@ -1,0 +1,34 @@
+"""What a flight is refused for before anything slow is loaded."""
+
+from mavbridge.camera.open import check_camera, require_present
+from mavbridge.config.flight import FlyConfig
+from mavbridge.core.clock import Clock
+from mavbridge.core.course import read_gates
+from mavbridge.core.files import require_writable
+from mavbridge.flight.policies import check_configured_policy
+from mavbridge.mavlink.transport.sockets import make_transport
+from mavbridge.observe.rerun_server import serve_address
+from mavbridge.observe.rerun_target import check_target
+from mavbridge.recording.folder import prepare_folder
+
+
+def check_flight(config: FlyConfig, clock: Clock) -> None:
+    """Refuse what takes no time to check: weights take seconds to load.
+
+    Raises:
+        MavbridgeError: a flag names something that cannot be opened, written or loaded.
+    """
+    make_transport(config.link.connect, clock)
+    for source in config.camera.sources:
+        check_camera(source, latency_ms=config.camera.camera_latency)
+    check_configured_policy(config.policy)
+    require_writable(config.report, "--report")
+    if config.serve:
+        serve_address(config.serve)
+    if config.gates is not None:
+        read_gates(config.gates)
+    if config.record is not None:
+        prepare_folder(config.record)
+    check_target(config.rerun)
+    for source in config.camera.sources:
+        require_present(source)

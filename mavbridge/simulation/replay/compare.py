@@ -1,0 +1,207 @@
+"""What a replay came to, beside what was recorded. Values are compared bit for bit."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavbridge.core.vehicle import Action, ActionTrace
+from mavbridge.gate.gate import GateOutput
+from mavbridge.simulation.replay.gate import GateStep, same_action
+from mavbridge.simulation.replay.policy import SolvePair
+
+Array: TypeAlias = NDArray[np.float64]
+STAGES = ("raw", "clipped", "slewed", "smoothed")
+INPUTS = ("state", "stamps", "states", "history", "images", "elapsed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deviation:
+    """Largest and typical difference of each of the four numbers of an action."""
+
+    largest: tuple[float, ...]
+    rms: tuple[float, ...]
+
+    @property
+    def most(self) -> float:
+        """The largest of all four; infinite where a row has nothing to compare with."""
+        return max(self.largest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyComparison:
+    """Every solve once more."""
+
+    solves: int
+    missing: Mapping[str, int]
+    """Why solves were not repeated, or refused this time, and how many."""
+    inputs_differ: Mapping[str, int]
+    """Solves that were given something else, by input; those without any difference left out."""
+    equal_chunks: int
+    """Solves with the same chunk, bit for bit."""
+    deviation: Deviation
+    """Of all actions of all chunks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateComparison:
+    """Every pass of the gate once more, with the recorded chunks."""
+
+    steps: int
+    flown: int
+    """Passes in which the policy moved the sticks."""
+    differ: Mapping[str, int]
+    """Passes that came out differently: by phase, chunk, stage of the trace, and sent sticks."""
+    first: str | None
+    """The first difference, in words."""
+    deviation: Deviation
+    """Of the smoothed sticks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StickTraces:
+    """Smoothed sticks over the flight, recorded and replayed, [N, 4]; NaN where nobody flew."""
+
+    times_s: Array
+    """Since the first tick."""
+    recorded: Array
+    replayed: Array
+
+    @property
+    def deviation(self) -> Deviation:
+        """Where either of them was flown; infinite where only one was."""
+        difference = np.abs(self.replayed - self.recorded)
+        both_idle = np.isnan(self.recorded) & np.isnan(self.replayed)
+        difference = np.where(np.isnan(difference) & ~both_idle, np.inf, difference)
+        return deviation_of(difference[~both_idle.any(axis=1)])
+
+
+def deviation_of(difference: Array) -> Deviation:
+    """Of absolute differences [N, 4]."""
+    if not len(difference):
+        return Deviation(largest=(0.0,) * 4, rms=(0.0,) * 4)
+    return Deviation(
+        largest=tuple(difference.max(axis=0).tolist()),
+        rms=tuple(np.sqrt((difference**2).mean(axis=0)).tolist()),
+    )
+
+
+def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
+    """Inputs and results of all solves."""
+    missing: dict[str, int] = {}
+    inputs: dict[str, int] = {}
+    differences: list[Array] = []
+    solves = equal = 0
+    for pair in pairs:
+        solves += 1
+        if pair.replayed is None:
+            _count(missing, pair.refusal or "no chunk")
+            continue
+        for name in _other_inputs(pair):
+            _count(inputs, name)
+        one, other = pair.recorded.actions, pair.replayed.actions
+        if one.shape != other.shape:
+            _count(missing, f"its chunk has {other.shape[1]} actions instead of {one.shape[1]}")
+            continue
+        equal += one.tobytes() == other.tobytes()
+        differences.append(np.abs(one[0].astype(np.float64) - other[0]))
+    return PolicyComparison(
+        solves=solves,
+        missing=missing,
+        inputs_differ=inputs,
+        equal_chunks=equal,
+        deviation=deviation_of(np.concatenate([np.zeros((0, 4)), *differences])),
+    )
+
+
+def _count(counts: dict[str, int], name: str) -> None:
+    counts[name] = counts.get(name, 0) + 1
+
+
+def _other_inputs(pair: SolvePair) -> list[str]:
+    """Inputs that are not what they were."""
+    one, other = pair.recorded, pair.replayed
+    if other is None:
+        return []
+    stamps = [
+        (s.state.attitude_ns, s.state.rate_ns, s.state.velocity_ns, s.state.specific_force_ns)
+        for s in (one, other)
+    ]
+    is_same = {
+        "state": one.state.values.tobytes() == other.state.values.tobytes()
+        and one.state.extras == other.state.extras,
+        "stamps": stamps[0] == stamps[1]
+        and (one.image_ns, one.first_ns) == (other.image_ns, other.first_ns),
+        "states": one.states.tobytes() == other.states.tobytes(),
+        "history": one.history.tobytes() == other.history.tobytes(),
+        "images": one.frame_ids == other.frame_ids,
+        "elapsed": (one.is_first, one.elapsed_s) == (other.is_first, other.elapsed_s),
+    }
+    return [name for name in INPUTS if not is_same[name]]
+
+
+def compare_gate(steps: Sequence[GateStep]) -> GateComparison:
+    """Phases, chunks, the whole trace and the sent sticks of all passes.
+
+    The very first pass reads the settings, and decides nothing.
+    """
+    differ: dict[str, int] = {}
+    first: str | None = None
+    for number, step in enumerate(steps):
+        for name in _other_results(step):
+            _count(differ, name)
+            first = first or f"{name} of tick {number} ({step.recorded.phase})"
+    return GateComparison(
+        steps=len(steps),
+        flown=sum(step.recorded.trace is not None for step in steps),
+        differ=differ,
+        first=first,
+        deviation=gate_traces(steps).deviation,
+    )
+
+
+def _other_results(step: GateStep) -> list[str]:
+    one, other = step.recorded, step.replayed
+    if other is None:
+        is_told = one.trace is not None or one.sent is not None or one.is_slot
+        return ["ticks"] if is_told else []
+    found = []
+    if one.phase != other.phase.value:
+        found.append("phase")
+    if one.chunk_serial != other.chunk_serial:
+        found.append("chunk")
+    for stage in STAGES:
+        if not same_action(_stage(one.trace, stage), _stage(other.trace, stage)):
+            found.append(stage)
+    if not same_action(one.sent, other.sent):
+        found.append("sent")
+    return found
+
+
+def _stage(trace: ActionTrace | None, stage: str) -> Action | None:
+    return None if trace is None else getattr(trace, stage)
+
+
+def gate_traces(steps: Sequence[GateStep]) -> StickTraces:
+    """The recorded chunks through the gate."""
+    return _traces(steps, [step.replayed.trace if step.replayed else None for step in steps])
+
+
+def other_traces(steps: Sequence[GateStep], outputs: Iterable[GateOutput]) -> StickTraces:
+    """Other chunks, or other settings, through the gate."""
+    return _traces(steps, [output.trace for output in outputs])
+
+
+def _traces(steps: Sequence[GateStep], traces: Sequence[ActionTrace | None]) -> StickTraces:
+    begin_ns = steps[0].recorded.sent_ns
+    return StickTraces(
+        times_s=np.array([(step.recorded.sent_ns - begin_ns) / 1e9 for step in steps]),
+        recorded=np.array([_smoothed(step.recorded.trace) for step in steps], np.float64),
+        replayed=np.array([_smoothed(trace) for trace in traces], np.float32).astype(np.float64),
+    )
+
+
+def _smoothed(trace: ActionTrace | None) -> tuple[float, ...]:
+    return (np.nan,) * 4 if trace is None else tuple(trace.smoothed)

@@ -1,0 +1,86 @@
+"""Reads the project's Markdown: fenced blocks, the commands in them, links and pictures."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted(
+    [
+        ROOT / "README.md",
+        ROOT / "policy" / "weights" / "README.md",
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "examples").rglob("*.md"),
+    ]
+)
+_BLOCK = re.compile(
+    r"(?:^<!-- (?P<mark>[^\n]*) -->\n+)?^```(?P<kind>\w*)\n(?P<text>.*?)^```$", re.M | re.S
+)
+_INLINE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
+_LINK = re.compile(r"\]\(([^)\s]+)\)")
+_ASSIGNMENT = re.compile(r"[A-Z_]+=\S*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """A fenced block, with the HTML comment above it."""
+
+    page: str
+    """Relative to the project's folder."""
+    kind: str
+    """Language of the block; empty where it names none."""
+    mark: str
+    """Who runs it, as in ``run by tests/system/test_guides.py``; empty without such a comment."""
+    text: str
+
+
+def page_name(page: Path) -> str:
+    """Path of a page from the project's folder."""
+    return str(page.relative_to(ROOT))
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    """All fenced blocks of a page."""
+    for match in _BLOCK.finditer(page.read_text()):
+        yield Block(
+            page=page_name(page),
+            kind=match["kind"],
+            mark=match["mark"] or "",
+            text=match["text"],
+        )
+
+
+def command_lines(text: str) -> Iterator[list[str]]:
+    """Words of each command of a shell block, without environment, prompt and comments."""
+    for line in text.replace("\\\n", " ").splitlines():
+        try:
+            words = shlex.split(line.removeprefix("$ "), comments=True)
+        except ValueError:  # prose or TOML with an apostrophe
+            continue
+        while words and _ASSIGNMENT.fullmatch(words[0]):
+            del words[0]
+        if words:
+            yield words
+
+
+def inline_codes(page: Path) -> Iterator[str]:
+    """Every `word` between backticks, outside fenced blocks."""
+    yield from _INLINE.findall(_BLOCK.sub("", page.read_text()))
+
+
+def links(page: Path) -> Iterator[tuple[Path, str]]:
+    """File and anchor of each link and picture of a page that leads into the project."""
+    for target in _LINK.findall(_BLOCK.sub("", page.read_text())):
+        if "://" in target or target.startswith("mailto:"):
+            continue
+        name, _, anchor = target.partition("#")
+        yield (page.parent / name if name else page).resolve(), anchor
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", _BLOCK.sub("", page.read_text()), re.M)
+    texts = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {text.replace(" ", "-") for text in texts}

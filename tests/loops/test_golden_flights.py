@@ -1,0 +1,161 @@
+"""Golden flights: recorded once, reproduced by every later version of the code.
+
+If one of these tests fails, the flight or the gate now does something else with the same bytes,
+features and moments. Where that is meant, record the flight anew (tests/data/flights/README.md).
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.golden_flights import FLIGHTS, NAMES, golden, through_gate
+from mavbridge.commands.replay.run import CLOCK_TOLERANCE, ENGINE_TOLERANCE
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import Solve
+from mavbridge.flight.policies import load_configured_policy
+from mavbridge.flight.settings import flight_settings
+from mavbridge.simulation.clock import SteppedClock
+from mavbridge.simulation.replay.compare import (
+    PolicyComparison,
+    compare_gate,
+    compare_policy,
+    other_traces,
+)
+from mavbridge.simulation.replay.gate import (
+    chunk_of,
+    recorded_executable,
+    recorded_settings,
+    replay_other,
+)
+from mavbridge.simulation.replay.policy import replay_policy
+from mavbridge.simulation.replay.recording import ReplaySource
+from policy.protocol import Executable
+
+
+def stepped_clock(source: ReplaySource) -> SteppedClock:
+    return SteppedClock(source.solves[0].started_ns - NS_PER_S)
+
+
+@pytest.fixture
+def numpy_executable() -> Iterator[Executable]:
+    """The policy as a flight loads it."""
+    source = golden("numpy_px4")
+    spec = f"{FLIGHTS / 'numpy_policy.py'}:NumpyPolicy"
+    wanted = replace(source.config.policy, policy=spec)
+    with load_configured_policy(wanted, stepped_clock(source)) as loaded:
+        yield loaded.executable
+
+
+def repeated(source: ReplaySource, executable: Executable) -> PolicyComparison:
+    clock = stepped_clock(source)
+    return compare_policy(replay_policy(source, executable, clock, source.features))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_gate_reproduces_phases_traces_and_sent_sticks_bit_for_bit(name: str) -> None:
+    compared = compare_gate(through_gate(name))
+
+    assert compared.first is None
+    assert compared.differ == {}
+    assert compared.flown > 100
+    assert golden(name).gaps == ()
+
+
+def test_the_policy_loop_reproduces_every_input_and_chunk_bit_for_bit(
+    numpy_executable: Executable,
+) -> None:
+    compared = repeated(golden("numpy_px4"), numpy_executable)
+
+    assert compared.missing == {}
+    assert compared.inputs_differ == {}
+    assert compared.equal_chunks == compared.solves > 400
+
+
+def test_the_shipped_policy_gets_the_same_inputs_and_decides_the_same_on_any_engine() -> None:
+    """Bits of its chunks depend on the processor, so that they have a tolerance here."""
+    source = golden("toge_ardupilot")
+    clock = stepped_clock(source)
+    with load_configured_policy(source.config.policy, clock) as loaded:
+        pairs = list(replay_policy(source, loaded.executable, clock, source.features))
+    compared = compare_policy(pairs)
+
+    assert compared.missing == {}
+    assert compared.inputs_differ == {}
+    chunks = {
+        pair.recorded.serial: chunk_of(pair.replayed, source.contract)
+        for pair in pairs
+        if pair.replayed is not None
+    }
+    steps = through_gate("toge_ardupilot")
+    outputs = replay_other(steps, recorded_settings(source), chunks)
+    assert other_traces(steps, outputs).deviation.most < ENGINE_TOLERANCE
+
+
+def test_a_scripted_policy_differs_by_its_look_at_the_clock_alone() -> None:
+    source = golden("scripted_velocity_ardupilot")
+    clock = stepped_clock(source)
+    with load_configured_policy(source.config.policy, clock, starts_in_air=True) as loaded:
+        compared = compare_policy(replay_policy(source, loaded.executable, clock, source.features))
+
+    assert compared.inputs_differ == {}
+    assert compared.deviation.most < CLOCK_TOLERANCE
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_other_chunks_go_the_same_way_as_the_recorded_ones(name: str) -> None:
+    source, steps = golden(name), through_gate(name)
+    chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
+
+    traces = other_traces(steps, replay_other(steps, recorded_settings(source), chunks))
+
+    assert traces.deviation.most == 0
+
+
+def test_another_low_pass_moves_the_sticks() -> None:
+    source, steps = golden("numpy_px4"), through_gate("numpy_px4")
+    limits = replace(source.config.limits, tau=0.2)
+    config = replace(source.config, limits=limits)
+    chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
+
+    settings = flight_settings(config, recorded_executable(source))
+    traces = other_traces(steps, replay_other(steps, settings, chunks))
+
+    assert 0.005 < traces.deviation.most < 1
+
+
+def with_solve(source: ReplaySource, change: Callable[[Solve], Solve]) -> ReplaySource:
+    middle = len(source.solves) // 2
+    solves = list(source.solves)
+    solves[middle] = change(solves[middle])
+    return replace(source, solves=tuple(solves))
+
+
+def test_one_bit_of_one_history_is_noticed(
+    numpy_executable: Executable,
+) -> None:
+    def change(solve: Solve) -> Solve:
+        history = solve.history.copy()
+        history[0, -1, 0] = np.nextafter(history[0, -1, 0], np.float32(1))
+        return replace(solve, history=history)
+
+    compared = repeated(with_solve(golden("numpy_px4"), change), numpy_executable)
+
+    assert compared.inputs_differ == {"history": 1}
+    assert compared.equal_chunks == compared.solves
+
+
+def test_a_feature_that_was_lost_is_told_and_the_rest_repeated(
+    numpy_executable: Executable,
+) -> None:
+    source = golden("numpy_px4")
+    (features,) = source.features
+    lost = features[len(features) // 2]
+    without = tuple(each for each in features if each is not lost)
+
+    compared = repeated(replace(source, features=(without,)), numpy_executable)
+
+    reason = f"the recording lacks the feature of frame {lost.frame_id}"
+    assert compared.missing[reason] > 0
+    assert compared.solves - sum(compared.missing.values()) > 100

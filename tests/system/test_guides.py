@@ -1,0 +1,110 @@
+"""Runs the terminals of the guides against the bundled vehicle, on the firmware's own ports.
+
+docs/guides/ardupilot_sitl.md, docs/guides/px4_sitl.md and docs/guides/ground_station.md: what is
+typed there is run as it stands, but for free ports, folders of the test and a shorter flight. How
+well it flies is for other tests: this machine may be busy.
+"""
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from helpers.guides import ROOT, blocks, command_lines
+from mavbridge.core.processes import free_port
+from mavbridge.recording.flight_folder import open_flight
+
+pytestmark = pytest.mark.system
+
+TIMEOUT_S = 90.0
+STARTS = 3
+IN_CONTROL = "the policy has control"
+MARK = "run by tests/system/test_guides.py"
+
+
+@pytest.fixture
+def ports() -> dict[str, str]:
+    """Free ports in place of those in the guides."""
+    return {name: str(free_port()) for name in ("5762", "5763", "14540", "14550")}
+
+
+def typed(page: str) -> list[list[str]]:
+    """Words of the commands of a page that are marked as run here."""
+    marked = (block for block in blocks(ROOT / page) if block.mark == MARK)
+    return [words for block in marked for words in command_lines(block.text)]
+
+
+def here(words: Sequence[str], ports: dict[str, str], folder: Path) -> list[str]:
+    """The command with this test's ports, frames and folder, for three seconds of flight."""
+    line = "\n".join(words)
+    for port, free in ports.items():
+        line = re.sub(rf"(?<=:){port}$", free, line, flags=re.M)
+    line = line.replace("shm:fpv", f"shm:fpv-{ports['5762']}")
+    line = re.sub(r"(?<=^--duration\n)\d+", "3", line, flags=re.M)
+    line = re.sub(r"(?<=^--record\n)\S+", str(folder), line, flags=re.M)
+    program, *rest = line.split("\n")
+    if program == "mavbridge":
+        return [sys.executable, "-m", "mavbridge", *rest]
+    assert program == "python"
+    return [sys.executable, *rest]
+
+
+@contextmanager
+def running(command: Sequence[str]) -> Iterator[None]:
+    """A process beside the test, ended with the context."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(TIMEOUT_S)
+
+
+def fly(vehicle: Sequence[str], terminals: Sequence[Sequence[str]]) -> str:
+    """What the last terminal printed; the others run beside it, and the vehicle."""
+    with ExitStack() as stack:
+        for command in ([sys.executable, "-m", "sitl", *vehicle], *terminals[:-1]):
+            stack.enter_context(running(command))
+        flight = subprocess.run(
+            terminals[-1],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+    return flight.stdout + flight.stderr
+
+
+def fly_guide(page: str, vehicle: Sequence[str], ports: dict[str, str], folder: Path) -> Path:
+    """Fly until the policy had control once, anew where a busy machine prevented it."""
+    output = ""
+    for start in range(STARTS):
+        recording = folder / str(start)
+        output = fly(vehicle, [here(words, ports, recording) for words in typed(page)])
+        if IN_CONTROL in output:
+            return recording
+    raise AssertionError(output)
+
+
+def test_the_terminals_of_the_guide_to_ardupilot_fly(ports: dict[str, str], tmp_path: Path) -> None:
+    links = ["--connect", f"tcpin:127.0.0.1:{ports['5762']}"]
+    links += ["--connect", f"tcpin:127.0.0.1:{ports['5763']}"]
+    recording = fly_guide("docs/guides/ardupilot_sitl.md", links, ports, tmp_path)
+    assert any(True for _ in open_flight(recording).frame_rows())
+
+
+def test_the_terminals_of_the_guide_to_px4_fly(ports: dict[str, str], tmp_path: Path) -> None:
+    links = ["--autopilot", "px4", "--connect", f"udpout:127.0.0.1:{ports['14550']}"]
+    links += ["--connect-onboard", f"udpout:127.0.0.1:{ports['14540']}"]
+    recording = fly_guide("docs/guides/px4_sitl.md", links, ports, tmp_path)
+    assert any(True for _ in open_flight(recording).frame_rows())
+
+
+def test_the_forwarding_of_the_guide_flies(ports: dict[str, str], tmp_path: Path) -> None:
+    links = ["--connect", f"tcpin:127.0.0.1:{ports['5762']}"]
+    fly_guide("docs/guides/ground_station.md", links, ports, tmp_path)

@@ -1,0 +1,163 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from helpers.golden_flights import FLIGHTS, copied
+from mavbridge.commands.replay.config import ReplayConfig
+from mavbridge.commands.replay.run import (
+    ENGINE_TOLERANCE,
+    VIDEO_TOLERANCE,
+    other_config,
+    replay,
+    tolerance_of,
+)
+from mavbridge.config.flight import FlyConfig
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.errors import ExitCode, MavbridgeError, UserError
+from mavbridge.mavlink.codec.frames import frame_at
+from mavbridge.recording.folder import SETTINGS
+from mavbridge.simulation.replay.recording import open_source
+
+NUMPY = FLIGHTS / "numpy_px4"
+
+
+def test_the_recorded_chunks_through_the_gate_are_equal_bit_for_bit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = tmp_path / "replay.json"
+
+    assert replay(NUMPY, ReplayConfig(source="chunks", json=written)) == 0
+
+    assert "EQUAL, bit for bit" in capsys.readouterr().out
+    document = json.loads(written.read_text())
+    assert document["is_equal"] is True
+    assert document["gate"]["differ"] == {}
+    assert document["policy"] is None
+
+
+def test_a_gate_that_smooths_differently_is_found_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = copied("numpy_px4", tmp_path)
+    document = json.loads((folder / SETTINGS).read_text())
+    document["config"]["limits"]["tau"] = 0.051
+    (folder / SETTINGS).write_text(json.dumps(document))
+
+    assert replay(folder, ReplayConfig(source="chunks")) == ExitCode.DIFFERENT
+
+    shown = capsys.readouterr().out
+    assert "the gate came out differently, first in the raw of tick" in shown
+    assert "NOT EQUAL" in shown
+
+
+def test_another_limit_shows_its_effect_and_is_no_failure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "sticks.png"
+
+    assert replay(NUMPY, ReplayConfig(source="chunks", tau=0.2, plot=picture)) == 0
+
+    assert "the difference is what was asked for" in capsys.readouterr().out
+    assert picture.stat().st_size > 10_000
+
+
+def test_another_limit_fails_where_a_tolerance_is_asked_for() -> None:
+    config = ReplayConfig(source="chunks", tau=0.2, tolerance=0.001)
+
+    assert replay(NUMPY, config) == ExitCode.DIFFERENT
+
+
+def test_a_flight_of_an_older_version_is_refused_in_words(tmp_path: Path) -> None:
+    folder = copied("numpy_px4", tmp_path)
+    (folder / SETTINGS).unlink()
+
+    with pytest.raises(MavbridgeError, match="older mavbridge"):
+        replay(folder, ReplayConfig())
+
+
+def test_a_flight_whose_log_is_gone_is_refused_in_words(tmp_path: Path) -> None:
+    folder = copied("numpy_px4", tmp_path)
+    (folder / "link.tlog").unlink()
+
+    with pytest.raises(UserError, match=r"link\.tlog"):
+        replay(folder, ReplayConfig())
+
+
+def test_chunks_and_another_policy_exclude_each_other() -> None:
+    with pytest.raises(UserError, match="leave out the flags"):
+        ReplayConfig(source="chunks", engine="torch")
+
+
+def test_flags_of_the_replay_replace_those_of_the_flight_and_no_others() -> None:
+    flown = FlyConfig(policy=PolicyConfig(checkpoint=Path("a.pt"), seed=3, head_steps=1))
+
+    changed = other_config(flown, ReplayConfig(tau=0.1, head_steps=2))
+
+    assert changed.limits == replace(flown.limits, tau=0.1)
+    assert changed.policy == replace(flown.policy, head_steps=2)
+    other = other_config(flown, ReplayConfig(policy="scripted:hover"))
+    assert (other.policy.checkpoint, other.policy.seed) == (None, 3)
+
+
+@pytest.mark.parametrize(
+    ("config", "chosen", "engine", "expected"),
+    [
+        (ReplayConfig(), "features", "numpy", 0.0),
+        (ReplayConfig(), "features", "torch", ENGINE_TOLERANCE),
+        (ReplayConfig(), "video", "numpy", VIDEO_TOLERANCE),
+        (ReplayConfig(), "chunks", "torch", 0.0),
+        (ReplayConfig(checkpoint=Path("b.pt")), "video", "numpy", None),
+        (ReplayConfig(tau=0.1), "features", "numpy", None),
+        (ReplayConfig(tau=0.1, tolerance=0.3), "features", "numpy", 0.3),
+    ],
+)
+def test_what_counts_as_equal(
+    config: ReplayConfig, chosen: str, engine: str, expected: float | None
+) -> None:
+    found = tolerance_of(
+        config,
+        chosen,  # type: ignore[arg-type]
+        recorded_engine="numpy",
+        engine=engine,
+        is_scripted=False,
+    )
+    assert found == expected
+
+
+def test_of_a_flight_that_was_cut_off_the_solves_behind_its_last_tick_are_left_out(
+    tmp_path: Path,
+) -> None:
+    folder = copied("numpy_px4", tmp_path)
+    ticks = pq.read_table(folder / "ticks.parquet")
+    pq.write_table(ticks.slice(0, ticks.num_rows - 300), folder / "ticks.parquet")
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps(meta | {"finished": False}))
+
+    source = open_source(folder)
+
+    assert 100 < len(source.solves) < len(open_source(NUMPY).solves)
+    assert source.solves[-1].started_ns <= source.ticks[-1].sent_ns
+    assert replay(folder, ReplayConfig(source="chunks")) == ExitCode.DONE
+
+
+def test_a_packet_that_the_log_has_lost_is_told(tmp_path: Path) -> None:
+    folder = copied("numpy_px4", tmp_path)
+    log = (folder / "link.tlog").read_bytes()
+    middle, at = len(log) // 2, 0
+    kept = []
+    while (packet := frame_at(log, at + 8)) is not None:
+        end = at + 8 + len(packet.data)
+        if not at < middle <= end:
+            kept.append(log[at:end])
+        at = end
+    (folder / "link.tlog").write_bytes(b"".join(kept))
+
+    source = open_source(folder)
+
+    lost = len(open_source(NUMPY).packets) - len(source.packets)
+    assert lost in (0, 1)  # it may have been one of our own
+    assert source.gaps == ((f"{lost} packets are not in the recording",) if lost else ())

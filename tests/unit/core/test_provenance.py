@@ -1,0 +1,51 @@
+"""What a record says of the program that made it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mavbridge
+from mavbridge.core.provenance import command_line, digests, git_revision, versions
+
+
+def test_the_command_line_is_kept_without_passwords(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["--camera", "front=rtsp://me:se:cret@host:8554/x", "--connect", "udp:1.2.3.4:14550"]
+    monkeypatch.setattr(sys, "argv", ["/somewhere/__main__.py", *words])
+    kept = ("mavbridge", "--camera", "front=rtsp://me:***@host:8554/x", *words[2:])
+    assert command_line() == kept
+
+
+def test_versions_are_of_what_is_installed() -> None:
+    found = versions()
+    assert found["mavbridge"] == mavbridge.__version__
+    assert found["python"].startswith(f"{sys.version_info.major}.{sys.version_info.minor}")
+    assert {"torch", "numpy", "pymavlink"} <= set(found)
+
+
+def test_a_checkout_has_a_revision_and_any_other_folder_none(tmp_path: Path) -> None:
+    assert git_revision(tmp_path) is None
+    who = ("-c", "user.name=x", "-c", "user.email=x@example.org")
+    git = ("git", "-C", str(tmp_path))
+    try:
+        subprocess.run([*git, "init", "--quiet"], check=True, capture_output=True)
+    except FileNotFoundError:
+        pytest.skip("git is not installed")
+    (tmp_path / "a").write_text("1")
+    subprocess.run([*git, "add", "a"], check=True)
+    subprocess.run([*git, *who, "commit", "--quiet", "--message", "x"], check=True)
+    head = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True)
+    assert git_revision(tmp_path) == head.stdout.strip()
+    (tmp_path / "a").write_text("2")
+    assert git_revision(tmp_path) == f"{head.stdout.strip()}-dirty"
+    (tmp_path / "inside").mkdir()
+    assert git_revision(tmp_path / "inside") is None  # a package installed in somebody's project
+
+
+def test_digests_are_by_path(tmp_path: Path) -> None:
+    path = tmp_path / "weights"
+    path.write_bytes(b"abc")
+    assert digests([path, tmp_path / "missing"]) == {
+        str(path): "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    }

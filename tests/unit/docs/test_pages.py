@@ -1,0 +1,201 @@
+"""The pages against the program: commands parse, links lead somewhere, marks name real tests."""
+
+import re
+import subprocess
+from collections.abc import Iterator
+from itertools import takewhile
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from cyclopts.exceptions import CycloptsError, MissingArgumentError
+
+from helpers.guides import (
+    PAGES,
+    ROOT,
+    anchors,
+    blocks,
+    command_lines,
+    inline_codes,
+    links,
+    page_name,
+)
+from mavbridge.cli import cli
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.vehicle import Output
+from mavbridge.mavlink.profiles.ardupilot import ArduPilot
+from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.profiles.px4 import Px4
+from mavbridge.mavlink.session.params.bandwidth import received_bytes_per_s
+from sitl.__main__ import _parser as sitl_parser
+
+MARKED = [page for page in PAGES if page.parent.name == "guides" or page == ROOT / "README.md"]
+OUR_OUTPUT = "text"
+"""Language of a block that shows what appears, and holds no command."""
+NOT_RUN = "not run by a test"
+COMING = {"check", "inspect", "replay"}
+"""Commands that may be missing on the branch on which the pages were written."""
+
+
+def parse(words: list[str]) -> None:
+    """Parse one command line of ours without running it; others, such as pip, pass.
+
+    Raises:
+        CycloptsError, MavbridgeError, SystemExit, AssertionError: it would not start.
+    """
+    program, arguments = Path(words[0]).name, words[1:]
+    if program in ("python", "python3") and arguments[:1] == ["-m"]:
+        module, arguments = arguments[1], arguments[2:]
+        if module == "sitl":
+            sitl_parser().parse_args(arguments)
+        elif module == "mavbridge":
+            parse(["mavbridge", *arguments])
+        elif module.startswith("benchmarks."):
+            assert (ROOT / (module.replace(".", "/") + ".py")).exists(), module
+    elif program in ("python", "python3") and arguments and arguments[0].endswith(".py"):
+        assert (ROOT / arguments[0]).exists(), arguments[0]
+    elif program == "mavbridge":
+        parse_mavbridge(arguments)
+    elif program == "make":
+        parse_make(arguments)
+
+
+def parse_mavbridge(arguments: list[str]) -> None:
+    """Through both parsers, that of ``--config`` and that of the commands."""
+    if {"--help", "--version", "--install-completion"} & set(arguments):
+        return
+    _, outer, _ = cli.meta.parse_args(arguments, print_error=False, exit_on_error=False)
+    words = list(outer.args)
+    if words and not words[0].startswith("-"):
+        assert words[0] in cli, f"unknown command {words[0]}"
+    cli.parse_args(words, print_error=False, exit_on_error=False)
+
+
+def parse_make(arguments: list[str]) -> None:
+    """Targets and variables are those of our Makefile, but for PX4's own."""
+    makefile = (ROOT / "Makefile").read_text()
+    if arguments[0] == "px4_sitl":
+        return
+    for word in arguments:
+        name, is_variable, _ = word.partition("=")
+        found = rf"^{name} *\?=" if is_variable else rf"^{name}:"
+        assert re.search(found, makefile, re.M), f"make {word}"
+
+
+class Command(NamedTuple):
+    """One command line on a page."""
+
+    page: str
+    words: list[str]
+    is_whole: bool
+    """Of a block; a mention in the text may leave out what is required."""
+
+
+def all_commands() -> Iterator[Command]:
+    """Commands of all blocks and in the text; ``...`` begins one like the last one above it."""
+    for page in PAGES:
+        for block in blocks(page):
+            if block.kind in ("", "sh", "bash", "console"):
+                for words in command_lines(block.text):
+                    yield Command(page_name(page), words, is_whole=True)
+        begin: list[str] = []
+        for code in inline_codes(page):
+            for words in command_lines(code):
+                if words[:1] == ["..."] and words[1:2] and words[1].startswith("--"):
+                    words[:1] = begin
+                elif words[:2] != ["python", "-m"] and words[0] != "mavbridge":
+                    continue
+                else:
+                    words = ["udp:127.0.0.1:14550" if word == "..." else word for word in words]
+                    begin = list(
+                        takewhile(lambda word: word == "-m" or word[0] not in "-<.", words)
+                    )
+                yield Command(page_name(page), words, is_whole=False)
+
+
+def test_the_pages_hold_commands_of_both_programs() -> None:
+    programs = {tuple(command.words[:3]) for command in all_commands()}
+    assert ("python", "-m", "sitl") in programs
+    assert any(words[0] == "mavbridge" for words in programs)
+
+
+@pytest.mark.parametrize("page", [page_name(page) for page in PAGES])
+def test_every_command_on_a_page_parses(page: str) -> None:
+    for command in all_commands():
+        if command.page != page or COMING & set(command.words[1:2]) - set(cli):
+            continue
+        try:
+            parse(command.words)
+        except MissingArgumentError:
+            assert not command.is_whole, f"{page}: {' '.join(command.words)}"
+        except (CycloptsError, MavbridgeError, AssertionError, SystemExit) as error:
+            pytest.fail(f"{page}: {' '.join(command.words)}\n{type(error).__name__}: {error}")
+
+
+def test_an_unknown_flag_or_command_would_be_found() -> None:
+    for line in (
+        "mavbridge --conect udp:127.0.0.1:14550",
+        "mavbridge chekc --connect udp:127.0.0.1:14550",
+        "mavbridge --connect udp:127.0.0.1:14550 --arm --max-tilt high",
+        "python -m sitl --conect udpout:127.0.0.1:14550",
+        "make flyy",
+        "make fly COURS=1",
+        "python examples/no_such_policy.py",
+    ):
+        with pytest.raises((CycloptsError, AssertionError, SystemExit)):
+            parse(line.split())
+
+
+@pytest.mark.parametrize("page", [page_name(page) for page in PAGES])
+def test_every_link_and_picture_of_a_page_exists(page: str) -> None:
+    for target, anchor in links(ROOT / page):
+        assert target.exists(), f"{page}: {target} does not exist"
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors(target), f"{page}: {target.name} has no heading #{anchor}"
+
+
+def test_pages_that_the_code_names_exist() -> None:
+    tracked = ["git", "ls-files", "*.py", "Makefile", "*.toml"]
+    listed = subprocess.run(tracked, cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    for name in listed.stdout.split():
+        source = ROOT / name
+        for page in re.findall(r"\bdocs/[\w/]+\.(?:md|toml|conf)", source.read_text()):
+            assert (ROOT / page).exists() or page.startswith("docs/xyz"), f"{name} names {page}"
+
+
+@pytest.mark.parametrize("page", [page_name(page) for page in MARKED])
+def test_every_block_of_a_guide_says_who_runs_it(page: str) -> None:
+    for block in blocks(ROOT / page):
+        if block.kind == OUR_OUTPUT:
+            continue
+        start = block.text.splitlines()[0]
+        assert block.mark, f"{page}: no mark above the block that begins with {start!r}"
+        if NOT_RUN not in block.mark:
+            ran = re.fullmatch(r"(?:run|read) by (tests/\S+\.py)", block.mark)
+            assert ran, f"{page}: {block.mark!r} names no test"
+            test = (ROOT / ran[1]).read_text()
+            assert block.page in test, f"{ran[1]} does not read {block.page}"
+
+
+def test_every_page_is_in_the_index() -> None:
+    index = ROOT / "docs" / "README.md"
+    reached = {target for target, _ in links(index)} | {index}
+    pages = {page for page in PAGES if page.is_relative_to(ROOT / "docs")}
+    assert not {page_name(page) for page in pages - reached}
+
+
+@pytest.mark.parametrize("page", ["docs/guides/real_vehicle.md"])
+@pytest.mark.parametrize(
+    ("profile", "output", "name"),
+    [(ArduPilot(), "rc-override", "ArduPilot"), (Px4(), "manual-control", "PX4")],
+)
+def test_the_table_of_baud_rates_is_what_the_program_asks_for(
+    page: str, profile: Profile, output: Output, name: str
+) -> None:
+    for rate_hz in (100, 50):
+        groups = [*profile.streams(state_hz=rate_hz), profile.echo(output)]
+        streams = {group.messages[0]: group for group in groups}.values()
+        kilobytes = received_bytes_per_s(streams) / 1000
+        assert f"| {name}, {rate_hz} Hz | {kilobytes:.1f} kB/s |" in (ROOT / page).read_text()

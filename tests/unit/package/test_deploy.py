@@ -1,0 +1,125 @@
+"""What a package and a companion computer get."""
+
+import ctypes
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from mavbridge.camera.open import SCREEN_PACKAGES
+from mavbridge.cli import cli
+from mavbridge.config.flight import FlyConfig
+from mavbridge.recording.folder import EXTRA
+
+ROOT = Path(__file__).parents[3]
+DEPLOY = ROOT / "examples/deploy"
+PR_SET_CHILD_SUBREAPER = 36
+DEADLINE_S = 60
+
+
+def test_the_sample_settings_are_understood(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[FlyConfig] = []
+    monkeypatch.setattr("mavbridge.flight.app.fly", lambda config: seen.append(config) or 0)
+    with pytest.raises(SystemExit) as ended:
+        cli.meta(["--config", str(DEPLOY / "mavbridge.toml"), "--max-height", "20"])
+    assert ended.value.code == 0
+    (config,) = seen
+    assert config.link.connect == "/dev/ttyACM0,921600"
+    assert config.engage_channel == 8
+    assert not config.arm
+    assert config.camera.camera == ("/dev/video0",)
+    assert config.envelope.max_height == 20  # the command line wins
+
+
+def test_messages_name_the_packages_of_the_extras() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    names = {extra: {line.split(">")[0] for line in lines} for extra, lines in extras.items()}
+    assert names["record"] == set(EXTRA)
+    assert names["screen"] == set(SCREEN_PACKAGES.values())
+
+
+def test_the_simulator_says_what_it_lacks() -> None:
+    code = "import sys; sys.modules['mujoco'] = None; from sitl.__main__ import main; "
+    code += "sys.exit(main([]))"
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert ended.returncode == 2
+    assert ended.stderr == "sitl: error: the simulated vehicle needs mujoco: pip install mujoco\n"
+
+
+def test_the_wheel_holds_all_three_packages_and_nothing_else(tmp_path: Path) -> None:
+    tree = tmp_path / "tree"
+    tree.mkdir()
+    for name in ("mavbridge", "policy", "sitl"):
+        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "LICENSE", "docs/package.md"):
+        (tree / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tree / name)
+    command = "from setuptools.build_meta import build_wheel; print(build_wheel('..'))"
+    made = subprocess.run(
+        [sys.executable, "-c", command], cwd=tree, capture_output=True, text=True, check=False
+    )
+    assert made.returncode == 0, made.stderr
+    names = zipfile.ZipFile(tmp_path / made.stdout.split()[-1]).namelist()
+    info = {name for name in names if ".dist-info/" in name}
+    assert {name.split("/")[0] for name in set(names) - info} == {"mavbridge", "policy", "sitl"}
+    sources = {str(path.relative_to(tree)) for path in tree.rglob("*.py")}
+    assert {name for name in sources if not name.startswith("build/")} <= set(names)
+    assert "policy/weights/toge.safetensors" in names
+    assert any(name.endswith("licenses/LICENSE") for name in info)
+
+
+def become_subreaper() -> None:
+    """Orphans below become children of this process, as they become those of PID 1."""
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="containers are Linux")
+def test_the_init_of_a_container_outlives_the_flight_process_until_the_gate_has_ended(
+    tmp_path: Path,
+) -> None:
+    """The flight process ends at SIGTERM; its gate goes on until it is told to end."""
+    flight = tmp_path / "mavbridge"
+    flight.write_text(
+        "#!/bin/bash\ntrap 'exit 7' TERM\n"
+        f"(trap '' TERM; echo $BASHPID; read < {tmp_path}/end) &\necho $*\n"
+        "while true; do sleep 0.05; done\n"
+    )
+    flight.chmod(0o755)
+    os.mkfifo(tmp_path / "end")
+    init = subprocess.Popen(
+        ["/bin/bash", str(DEPLOY / "init.sh"), "--arm"],
+        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=become_subreaper,
+    )
+    assert init.stdout is not None
+    try:
+        lines = {init.stdout.readline().strip() for _ in range(2)}
+        assert "--arm" in lines
+        (gate,) = (int(line) for line in lines - {"--arm"})
+        init.send_signal(signal.SIGTERM)
+        with pytest.raises(subprocess.TimeoutExpired):
+            init.wait(1.0)
+        os.kill(gate, 0)  # it lives
+        (tmp_path / "end").write_text("now\n")
+        assert init.wait(DEADLINE_S) == 7
+    finally:
+        init.kill()
+        init.wait()
+        init.stdout.close()
