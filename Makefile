@@ -31,12 +31,13 @@ $(VENV)/installed: pyproject.toml constraints.txt
 
 fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy flying it over UDP
 	@mkdir -p out
+	@$(BIN)/python -m sitl course --course $(COURSE) --json > out/gates.json
 	@$(BIN)/python -m sitl --autopilot $(AUTOPILOT) --connect udpout:127.0.0.1:$(PORT) \
 		--camera shm:fpv-$(PORT) --course $(COURSE) --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --policy $(POLICY) \
 		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(FLAGS) \
-		--rerun out/flight.rrd --report out/report.json; status=$$?; \
+		--rerun out/flight.rrd --gates out/gates.json --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
 	echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \
 	exit $$status

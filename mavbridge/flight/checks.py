@@ -2,13 +2,15 @@
 
 from mavbridge.camera.open import check_camera, require_present
 from mavbridge.config.flight import FlyConfig
+from mavbridge.core.address import parse_address, parse_forward
 from mavbridge.core.clock import Clock
 from mavbridge.core.course import read_gates
+from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
-from mavbridge.flight.policies import check_configured_policy
+from mavbridge.flight.policies import check_configured_policy, require_images
 from mavbridge.mavlink.transport.sockets import make_transport
-from mavbridge.observe.rerun_server import serve_address
-from mavbridge.observe.rerun_target import check_target
+from mavbridge.observe.viewer.server import serve_address
+from mavbridge.observe.viewer.target import check_target
 from mavbridge.recording.folder import prepare_folder
 
 
@@ -19,9 +21,13 @@ def check_flight(config: FlyConfig, clock: Clock) -> None:
         MavbridgeError: a flag names something that cannot be opened, written or loaded.
     """
     make_transport(config.link.connect, clock)
+    forward = config.link.forward
+    if forward and parse_forward(forward) == parse_address(config.link.connect):
+        raise UserError(f"--forward {forward}: the vehicle has this one: name another port")
     for source in config.camera.sources:
         check_camera(source, latency_ms=config.camera.camera_latency)
     check_configured_policy(config.policy)
+    require_images(config)
     require_writable(config.report, "--report")
     if config.serve:
         serve_address(config.serve)

@@ -31,10 +31,10 @@ from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.policies import policy_files
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.gate.wire import GateSummary
-from mavbridge.observe.rerun_flight import RerunView
-from mavbridge.observe.rerun_layout import ViewedFlight
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
+from mavbridge.observe.viewer.flight import RerunView
+from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.recording.tlog import TlogPipe
 from policy.protocol import Executable
 

@@ -50,7 +50,7 @@ def flight_verdict(
 
 def log_link(summary: GateSummary) -> None:
     """Log what came over the link, and the parameters that were read."""
-    for name, rate_hz in summary.link.messages_per_s:
-        _log.debug("received %s at %.1f Hz", name, rate_hz)
-    for name, value in sorted(summary.params.items()):
-        _log.debug("parameter %s = %g", name, value)
+    rates = (f"{name} {rate_hz:.1f}" for name, rate_hz in summary.link.messages_per_s)
+    _log.debug("received, in Hz: %s", ", ".join(rates))
+    params = (f"{name}={value:g}" for name, value in sorted(summary.params.items()))
+    _log.debug("parameters: %s", ", ".join(params))

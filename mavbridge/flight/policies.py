@@ -9,6 +9,7 @@ from mavbridge.camera.open import NO_CAMERA
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
+from mavbridge.core.errors import UserError
 from policy.contract import Contract
 from policy.loading.builtin import SHIPPED
 from policy.loading.load import check_request, load_policy, read_policy_contract
@@ -18,6 +19,8 @@ STATELESS = ("toge", "resnet-unet", "onnx")
 FILE_KINDS = ("lerobot", "onnx", "torchscript")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
 """Of the files of a policy's folder."""
+SEEING = ("toge", "resnet-unet")
+"""Nets of ours: all of them fly by their images."""
 
 
 def load_configured_policy(
@@ -84,10 +87,23 @@ def is_scripted(policy: PolicyConfig) -> bool:
 def looks_at_images(config: FlyConfig) -> bool:
     """Return whether a frozen or a black image tells of a fault.
 
-    Without a camera a user's class is taken at its user's word; the built-in nets need images.
+    Without a camera a policy of the user's is taken at its user's word; our own nets need images.
     """
-    is_blind = set(config.camera.sources) == {NO_CAMERA} and not is_stateless(config.policy)
+    is_blind = _has_no_camera(config) and config.policy.kind not in SEEING
     return not is_blind and not is_scripted(config.policy)
+
+
+def require_images(config: FlyConfig) -> None:
+    """Refuse to fly a net of ours without a camera; raises UserError."""
+    if config.policy.kind in SEEING and _has_no_camera(config):
+        raise UserError(
+            f"--camera none: {config.policy.policy} flies by its images, so name its camera; "
+            "scripted programs, and policies of yours that look at no image, fly without one"
+        )
+
+
+def _has_no_camera(config: FlyConfig) -> bool:
+    return set(config.camera.sources) == {NO_CAMERA}
 
 
 def is_stateless(policy: PolicyConfig) -> bool:

@@ -4,6 +4,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby, takewhile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -20,6 +21,7 @@ _BLOCK = re.compile(
 )
 _INLINE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
+_SEPARATORS = ("&&", ";", "|", "&")
 _ASSIGNMENT = re.compile(r"[A-Z_]+=\S*")
 
 
@@ -53,21 +55,25 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def command_lines(text: str) -> Iterator[list[str]]:
-    """Words of each command of a shell block, without environment, prompt and comments."""
+    """Words of each command of a shell block, without environment, redirection and comments."""
     for line in text.replace("\\\n", " ").splitlines():
         try:
             words = shlex.split(line.removeprefix("$ "), comments=True)
         except ValueError:  # prose or TOML with an apostrophe
             continue
-        while words and _ASSIGNMENT.fullmatch(words[0]):
-            del words[0]
-        if words:
-            yield words
+        for is_separator, group in groupby(words, lambda word: word in _SEPARATORS):
+            command = [*takewhile(lambda word: word != ">", group)]
+            while command and _ASSIGNMENT.fullmatch(command[0]):
+                del command[0]
+            if command and not is_separator:
+                yield command
 
 
-def inline_codes(page: Path) -> Iterator[str]:
-    """Every `word` between backticks, outside fenced blocks."""
-    yield from _INLINE.findall(_BLOCK.sub("", page.read_text()))
+def inline_codes(page: Path) -> Iterator[tuple[str, bool]]:
+    """Each text between backticks outside fenced blocks; true in the first cell of a table."""
+    for line in _BLOCK.sub("", page.read_text()).splitlines():
+        for match in _INLINE.finditer(line):
+            yield match[1], line.startswith("|") and "|" not in line[1 : match.start()]
 
 
 def links(page: Path) -> Iterator[tuple[Path, str]]:

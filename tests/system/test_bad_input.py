@@ -48,6 +48,8 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         (["--connect", "udp:127.0.0.1:1", "--set", "RC_OVERRIDE_TIME"], "use NAME=VALUE"),
         (["--connect", "udp:127.0.0.1:1", "--accept-risk", "all"], "endless-override"),
         (["--connect", "udp:127.0.0.1:1", "--config", "none.toml"], "none.toml"),
+        (["--connect", "udp:127.0.0.1:1", "--serve", "9090"], "use HOST:PORT"),
+        (["--connect", "udp:127.0.0.1:1", "--gates", "none.json"], "--gates none.json"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "toge:medium"], "--allow-untrained"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "tog"], "tog"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "nowhere.at_all:Policy"], "nowhere"),
@@ -83,6 +85,8 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         (["--connect", "udp:127.0.0.1:1", "--tau"], "--tau requires an argument"),
         (["--connect", "udp:127.0.0.1:1", "--duration", "-5"], "between 0.1 and 86400"),
         (["evalute"], "did you mean evaluate?"),
+        (["--connect", "udp:127.0.0.1:1", "--forward", "udpin:127.0.0.1:1"], "name another port"),
+        (["--connect", "/dev/null,57600", "--policy=scripted", "--camera=none"], "no serial port"),
         (["--connect", "/dev/none,57600", "--policy", "scripted", "--camera", "none"], "no such"),
         (
             ["--connect", "bluetooth", "--policy", "scripted", "--camera", "shm:unused"],

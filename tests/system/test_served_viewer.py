@@ -15,10 +15,10 @@ import pytest
 from helpers.factories import make_tick, make_vision_tick
 from mavbridge.core.errors import UserError
 from mavbridge.core.processes import child_environment, end, free_port
-from mavbridge.observe.rerun_flight import RerunView
-from mavbridge.observe.rerun_layout import ViewedFlight
-from mavbridge.observe.rerun_process import listens
-from mavbridge.observe.rerun_server import ServeAddress, serve_address
+from mavbridge.observe.viewer.flight import RerunView
+from mavbridge.observe.viewer.layout import ViewedFlight
+from mavbridge.observe.viewer.process import listens
+from mavbridge.observe.viewer.server import ServeAddress, serve_address
 
 pytestmark = pytest.mark.system
 
@@ -101,8 +101,8 @@ def test_the_server_ends_with_the_view(address: ServeAddress) -> None:
 
 LEAVES_ITS_SERVER = """
 import os, sys
-from mavbridge.observe.rerun_process import listens
-from mavbridge.observe.rerun_server import WebServer, serve_address
+from mavbridge.observe.viewer.process import listens
+from mavbridge.observe.viewer.server import WebServer, serve_address
 
 WebServer(serve_address(sys.argv[1]))
 os.kill(os.getpid(), 9)

@@ -8,13 +8,13 @@ from functools import partial
 from statistics import median
 
 from mavbridge.camera.image_watch import is_blank
-from mavbridge.camera.open import NO_CAMERA, open_camera
+from mavbridge.camera.open import open_camera, require_present
 from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError
 from mavbridge.core.ports import Camera
-from mavbridge.core.workers import Worker
+from mavbridge.core.workers import HungError, Worker
 
 MEASURE_S = 2.0
 _READ_NS = NS_PER_S // 2
@@ -78,11 +78,12 @@ def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock
             opened.append((need, camera))
         seen = _watch_all([camera for _, camera in opened], clock)
         for (need, _), what in zip(opened, seen, strict=True):
-            rows += _judge(need, what, latency_ms=config.camera_latency)
+            rows += judge(need, what, latency_ms=config.camera_latency)
     return rows
 
 
 def _open(need: CameraNeeds, config: CameraConfig, clock: Clock) -> Camera:
+    require_present(need.source)
     return open_camera(
         need.source,
         image_size=need.side_px,
@@ -100,9 +101,12 @@ def _watch_all(cameras: Sequence[Camera], clock: Clock) -> list[Seen]:
     ]
     for worker in workers:
         worker.start()
-    for worker in workers:
+    for worker, what in zip(workers, seen, strict=True):
         worker.ends_within(MEASURE_S + _JOIN_S)
-        worker.join(_JOIN_S)
+        try:
+            worker.join(_JOIN_S)
+        except HungError as error:
+            what.failure = f"the camera hangs: {error}"
     return seen
 
 
@@ -123,9 +127,8 @@ def _watch(camera: Camera, seen: Seen, clock: Clock, stop: threading.Event) -> N
     seen.dropped = camera.dropped_frames - dropped_before
 
 
-def _judge(need: CameraNeeds, seen: Seen, *, latency_ms: float) -> list[Row]:
-    if need.source == NO_CAMERA:
-        return [_row(need, "none: black images", "a policy that looks at no image")]
+def judge(need: CameraNeeds, seen: Seen, *, latency_ms: float) -> list[Row]:
+    """Rows of one camera, by its frames; ``latency_ms`` is that of --camera-latency."""
     if seen.failure is not None or not seen.captured_ns:
         why = seen.failure or f"no frame came in {MEASURE_S:g} s"
         return [_row(need, "stopped", verdict="no-go", advice=why)]

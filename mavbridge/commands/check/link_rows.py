@@ -53,7 +53,7 @@ def _vehicle_row(vehicle: VehicleSession, unfinished: str | None) -> Row:
 
 def _rate_row(group: StreamGroup, rates_hz: Mapping[str, float], contract: Contract) -> Row:
     name = _QUANTITIES.get(group.messages[0], group.messages[0])
-    rate_hz = max(rates_hz.get(message, 0.0) for message in group.messages)
+    rate_hz = next((rates_hz[message] for message in group.messages if message in rates_hz), 0.0)
     least_hz = {
         "attitude": 1 / contract.max_state_age_s,
         "velocity": 1 / contract.max_velocity_age_s,

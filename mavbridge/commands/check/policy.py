@@ -1,5 +1,6 @@
 """Rows about the policy: whether it loads, its engine, its speed here, and what it expects."""
 
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -62,45 +63,42 @@ def _engine_row(loaded: LoadedPolicy) -> Row:
     )
 
 
-def _speed_rows(config: FlyConfig, loaded: LoadedPolicy) -> list[Row]:
+def _speed_rows(config: FlyConfig, loaded: LoadedPolicy) -> Iterator[Row]:
     """The share of each slot that a chunk and an image need, and what a flight says of it."""
-    contract, times = loaded.executable.contract, loaded.times
+    yield from _slot_rows(config, loaded)
+    expected = "within the ages of its contract"
     try:
         notes = require_speed(config, loaded)
-        verdict: Verdict = "go"
     except MavbridgeError as error:
-        notes, verdict = (str(error),), "no-go"
+        yield _row("speed", "too slow", "no-go", str(error), expected=expected)
+        return
     warnings = [note.removeprefix("warning: ") for note in notes if note.startswith("warning:")]
-    if verdict == "go" and warnings:
-        verdict = "warn"
+    if warnings:
+        yield _row("speed", "slower than asked", "warn", "; ".join(warnings), expected=expected)
+
+
+def _slot_rows(config: FlyConfig, loaded: LoadedPolicy) -> Iterator[Row]:
+    contract, times = loaded.executable.contract, loaded.times
     if times is None:
-        return [
-            _row("speed", "not measured: no chunk on a dummy sample", verdict, "; ".join(notes))
-        ]
+        yield _row("speed", "not measured: no chunk on a dummy sample")
+        return
     loops = config.rates.loops(is_dual=loaded.executable.dual_rate, play_s=contract.play_s)
     image_hz = min((loops.max_vision_hz, *contract.camera_rates_hz))
-    advice = "; ".join(notes if verdict == "no-go" else warnings)
-    rows: list[Row] = []
     for name, each_s, rate_hz in (
         ("a chunk", times.act_s, loops.action_hz),
         ("an image", times.encode_s, image_hz),
     ):
         share = each_s * rate_hz
-        is_tight = share > _BUSY and verdict == "go"
-        rows.append(
-            _row(
-                f"time for {name}",
-                f"{each_s * 1000:.1f} ms, {share:.0%} of its slot",
-                "warn" if is_tight else verdict if not rows else "go",
-                f"{name} leaves little of its slot: other programs will make it late"
-                if is_tight
-                else advice
-                if not rows
-                else "",
-                expected=f"under {_BUSY:.0%} of {1000 / rate_hz:.3g} ms ({rate_hz:.3g} Hz)",
-            )
+        is_tight = share > _BUSY
+        yield _row(
+            f"time for {name}",
+            f"{each_s * 1000:.1f} ms, {share:.0%} of its slot",
+            "warn" if is_tight else "go",
+            f"{name} leaves little of its slot: other programs will make it late"
+            if is_tight
+            else "",
+            expected=f"under {_BUSY:.0%} of {1000 / rate_hz:.3g} ms ({rate_hz:.3g} Hz)",
         )
-    return rows
 
 
 def _contract_rows(config: FlyConfig, executable: Executable) -> list[Row]:

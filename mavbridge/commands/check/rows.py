@@ -7,9 +7,7 @@ from typing import Literal, TypeAlias, TypedDict
 
 Area: TypeAlias = Literal["link", "vehicle", "parameters", "camera", "policy", "computer"]
 Verdict: TypeAlias = Literal["go", "warn", "no-go"]
-_FLAG = re.compile(
-    r"--set [A-Z0-9_]+=-?\d+(?:\.\d+)?|--source-system \d+|--connect [^ ,;]+:\d+|ulimit -\w \w+"
-)
+_FLAG = re.compile(r"--set [A-Z0-9_]+=-?\d+(?:\.\d+)?|--source-system \d+|ulimit -\w \w+")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

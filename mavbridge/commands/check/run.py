@@ -17,15 +17,13 @@ from mavbridge.commands.check.table import print_check
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, FlyConfig
-from mavbridge.core.clock import MonotonicClock
-from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.clock import Clock, MonotonicClock
+from mavbridge.core.errors import ExitCode, MavbridgeError
 from mavbridge.core.files import require_writable
-from mavbridge.flight.policies import looks_at_images
+from mavbridge.flight.policies import looks_at_images, require_images
 from policy.contract import Contract
 from policy.preprocess import least_source_px
 
-NO_GO_STATUS = 3
-"""Exit status where a flight could not begin; 0 where it could, with warnings or without."""
 STDOUT = Path("-")
 
 
@@ -46,7 +44,7 @@ def check(config: CheckConfig) -> int:
     print_check(rows, Console(stderr=is_on_stdout, highlight=False))
     if is_on_stdout:
         sys.stdout.write(document)
-    return NO_GO_STATUS if overall(rows) == "no-go" else 0
+    return ExitCode.NOT_FLOWN if overall(rows) == "no-go" else ExitCode.DONE
 
 
 def check_all(config: CheckConfig) -> list[Row]:
@@ -55,20 +53,24 @@ def check_all(config: CheckConfig) -> list[Row]:
     if flight.policy.policy != NO_POLICY:
         print_status("loading the policy")
     policy = check_policy(flight, clock)
-    try:
-        needs = _camera_needs(flight, policy)
-        camera_failure = []
-    except MavbridgeError as error:
-        needs = []
-        camera_failure = [
-            Row(area="camera", name="cameras", found="", verdict="no-go", advice=str(error))
-        ]
-    if needs:
-        print_status("watching the camera")
-    cameras = camera_rows(needs, flight.camera, clock)
+    cameras = _check_cameras(flight, policy, clock)
     print_status(f"listening to the vehicle on {flight.link.connect}")
     vehicle = check_vehicle(flight, policy, clock, echo_test=config.echo_test)
-    return [*vehicle, *camera_failure, *cameras, *policy.rows, *computer_rows(flight.rates)]
+    return [*vehicle, *cameras, *policy.rows, *computer_rows(flight.rates)]
+
+
+def _check_cameras(config: FlyConfig, policy: PolicyFindings, clock: Clock) -> list[Row]:
+    """Rows of every camera of the flight, or of the flags that do not fit the policy."""
+    try:
+        require_images(config)
+        needs = _camera_needs(config, policy)
+    except MavbridgeError as error:
+        found = " ".join(config.camera.sources)
+        return [Row(area="camera", name="cameras", found=found, verdict="no-go", advice=str(error))]
+    if not needs:
+        return [Row(area="camera", name="cameras", found="none", expected="none for this flight")]
+    print_status("watching the camera")
+    return camera_rows(needs, config.camera, clock)
 
 
 def _camera_needs(config: FlyConfig, policy: PolicyFindings) -> list[CameraNeeds]:
@@ -77,8 +79,10 @@ def _camera_needs(config: FlyConfig, policy: PolicyFindings) -> list[CameraNeeds
     Without a policy only cameras that were named are looked at.
     """
     contract = policy.contract
+    if set(config.camera.sources) == {NO_CAMERA}:
+        return []
     if contract is None:
-        if config.camera == CameraConfig() or set(config.camera.sources) == {NO_CAMERA}:
+        if config.camera == CameraConfig():
             return []
         contract = Contract()
         names, sources = config.camera.sources, config.camera.sources

@@ -11,7 +11,7 @@ from mavbridge.commands.output import PIPED_WIDTH
 
 _STYLES: dict[Verdict, str] = {"go": "green", "warn": "yellow", "no-go": "bold red"}
 _FOOT = (
-    "Nothing was set, armed or steered. What a flight asks for was asked for as well: message "
+    "Nothing was set, armed or flown. What a flight asks for was asked for as well: message "
     "rates, which stay until the vehicle or another station changes them."
 )
 
@@ -23,6 +23,7 @@ def print_check(rows: Sequence[Row], console: Console) -> None:
     console.print(_table(rows))
     for verdict in ("no-go", "warn"):
         _print_reasons([row for row in rows if row.verdict == verdict], console)
+    console.print()
     console.print(Text(_FOOT, style="dim"))
     console.print(_summary(rows))
 
@@ -55,7 +56,9 @@ def _print_reasons(rows: Sequence[Row], console: Console) -> None:
     grid.add_column(overflow="fold")
     mark = Text(rows[0].verdict, style=_STYLES[rows[0].verdict])
     for advice, whose in names.items():
-        grid.add_row(mark, Text.assemble((", ".join(whose), "bold"), f": {advice}"))
+        names_itself = advice.startswith(tuple(whose))
+        head = "" if names_itself else f"{', '.join(whose)}: "
+        grid.add_row(mark, Text.assemble((head, "bold"), advice))
     console.print()
     console.print(grid)
 
@@ -66,6 +69,6 @@ def _summary(rows: Sequence[Row]) -> Text:
     told = f"{counts['go']} go, {counts['warn']} to be warned of, {counts['no-go']} no-go"
     word = "NO-GO" if verdict == "no-go" else "GO"
     sets = dict.fromkeys(command for row in rows for command in row.commands)
-    flags = [flag for flag in sets if flag.startswith("--set")]
+    flags = [flag for flag in sets if flag.startswith("--")]
     cure = f"\nfor one flight, add: {' '.join(flags)}" if flags else ""
     return Text.assemble((word, _STYLES[verdict]), f": {told}{cure}")

@@ -48,12 +48,12 @@ def check_vehicle(
             probe.find()
             unfinished = probe.set_up()
             stats = probe.measure()
-            vehicle, snapshot = probe.find(), probe.snapshot()
+            vehicle, snapshot, texts = probe.find(), probe.snapshot(), list(probe.texts)
             terms = Terms.of(config, settings, policy.contract, vehicle, snapshot.status)
             rows += link_rows(vehicle, stats, terms, unfinished=unfinished)
             if echo_test:
                 rows.append(echo_row(probe, terms))
-            rows += vehicle_rows(vehicle, snapshot, terms, texts=probe.texts)
+            rows += vehicle_rows(vehicle, snapshot, terms, texts=texts)
             rows += param_rows(terms)
     except MavbridgeError as error:
         rows.append(_absent(error))

@@ -65,7 +65,7 @@ def imagine(config: ImagineConfig) -> int:
         stack.enter_context(torch_threads(free))
         on_frame: OnFrame = ignore_frame
         if config.rerun != "off":
-            from mavbridge.observe.rerun_rollout import RolloutView
+            from mavbridge.observe.viewer.rollout import RolloutView
 
             real = RealFrames(flight, model.config, start.newest_ns)
             view = stack.enter_context(closing(RolloutView(config.rerun, real=real.at)))

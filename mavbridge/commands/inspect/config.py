@@ -13,6 +13,8 @@ from mavbridge.config.groups import OUTPUT
 class InspectConfig:
     """What is made of recorded flights, besides the tables on the terminal."""
 
+    html: Path | None = None
+    """Write one page with the plots, the path, the worst moments and the video in it."""
     json: Path | None = None
     """Write the figures as JSON: a list with an object for each flight."""
     rerun: str = "off"

@@ -10,18 +10,24 @@ from pathlib import Path
 
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
 from mavbridge.commands.inspect.config import InspectConfig
+from mavbridge.commands.inspect.page import write_page
 from mavbridge.commands.inspect.tables import print_comparison, print_flight
-from mavbridge.commands.output import table_console
+from mavbridge.commands.output import print_status, table_console
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
-from mavbridge.core.records import Event, Observed, Tick, VisionTick
-from mavbridge.observe.rerun_flight import RerunView
-from mavbridge.observe.rerun_layout import ViewedFlight
+from mavbridge.core.records import Observed, Tick, VisionTick
+from mavbridge.flight.action_frames import action_frame
+from mavbridge.observe.viewer.flight import RerunView
+from mavbridge.observe.viewer.layout import ViewedFlight
+from mavbridge.recording import replay_rows
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.recording.folder import SOLVES
+from mavbridge.recording.tables import TableError, read_table
 from policy.contract import Contract
 
 MAX_FLIGHTS = 2
-BATCH_EVENTS = 256
+BATCH_EVENTS = 25
+"""A fifth of a second: the path in the viewer grows by batches."""
 
 
 def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
@@ -34,6 +40,7 @@ def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
         raise UserError(f"name one flight, or two to compare, not {len(flights)}")
     if config.rerun != "off" and len(flights) > 1:
         raise UserError("--rerun shows one flight: name only that one")
+    require_writable(config.html, "--html")
     require_writable(config.json, "--json")
     analyses = [analyse(folder, gates=config.gates) for folder in flights]
     console = table_console()
@@ -43,6 +50,9 @@ def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
         print_comparison(analyses, console)
     if config.json is not None:
         config.json.write_text(to_json(analyses))
+    if config.html is not None:
+        write_page(config.html, analyses)
+        print_status(f"wrote {config.html}")
     if config.rerun != "off":
         show_in_viewer(analyses[0], config.rerun)
     return 0
@@ -75,6 +85,9 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
             chunk_hz=meta.action_hz,
             stick_hz=flight.stick_hz,
             contract=contract,
+            max_state_age_s=contract.max_state_age_s + contract.play_s,
+            max_feature_age_s=contract.max_feature_age_s + contract.play_s,
+            to_ned=action_frame(contract).to_gate,
             gates=flight.gates,
         ),
     )
@@ -85,17 +98,31 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
 
 
 def _events(folder: Path) -> Iterator[Observed]:
-    """Ticks and images of the first camera in the order of time."""
+    """Ticks, solves and images of the first camera in the order of time."""
     recorded = open_flight(folder)
-    ticks: Iterator[Event] = (row.tick for row in recorded.tick_rows())
-    return heapq.merge(ticks, _images(recorded), key=_at_ns)
+    ticks: Iterator[Observed] = (row.tick for row in recorded.tick_rows())
+    return heapq.merge(ticks, _solves(recorded), _images(recorded), key=_at_ns)
 
 
-def _at_ns(event: Event) -> int:
-    return event.woke_ns if isinstance(event, Tick) else event.ready_ns
+def _at_ns(event: Observed) -> int:
+    if isinstance(event, Tick):
+        return event.woke_ns
+    return event.ready_ns if isinstance(event, VisionTick) else event.computed_ns
 
 
-def _images(recorded: RecordedFlight) -> Iterator[Event]:
+def _solves(recorded: RecordedFlight) -> Iterator[Observed]:
+    """None where the recording holds none: no policy flew, or it is an old one."""
+    if recorded.meta.contract is None:
+        return
+    try:
+        table = read_table(recorded.folder / SOLVES, replay_rows.SOLVES)
+    except TableError:
+        return
+    for row in replay_rows.read_solves(table, recorded.meta.contract):
+        yield row.solve
+
+
+def _images(recorded: RecordedFlight) -> Iterator[Observed]:
     dropped = 0
     pairs = zip(recorded.frame_rows(), recorded.images(), strict=True)
     for serial, (row, image) in enumerate(pairs):

@@ -13,7 +13,7 @@ from rich.text import Text
 
 import mavbridge
 from mavbridge.camera.image_watch import ImageWatch
-from mavbridge.camera.open import NO_CAMERA, check_camera, open_camera
+from mavbridge.camera.open import NO_CAMERA, check_camera, open_camera, require_present
 from mavbridge.commands.record.config import RecordConfig
 from mavbridge.commands.record.control import KEYS, KEYS_HINT, EpisodeControl, Orders, Seen
 from mavbridge.commands.record.disk import LEAST_S, DiskWatch
@@ -41,8 +41,8 @@ from mavbridge.gate.settings import GateSettings
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import Keyboard
 from mavbridge.observe.output import flight_console
-from mavbridge.observe.rerun_flight import RerunView
-from mavbridge.observe.rerun_layout import ViewedFlight
+from mavbridge.observe.viewer.flight import RerunView
+from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.recording.meta import FlightMeta
 from policy.contract import Contract
 from policy.protocol import Executable
@@ -74,6 +74,7 @@ def record(config: RecordConfig) -> int:
     check_camera(config.film.camera, latency_ms=config.film.camera_latency)
     if config.film.camera == NO_CAMERA:
         raise UserError("--camera none: there is nothing to learn from without images")
+    require_present(config.film.camera)
     prepare_out(config.out)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)
@@ -145,6 +146,7 @@ class _Session:
         viewer = self._open_viewer()
         self._gate = GateProcess(listening_gate(config, clock))
         stack.callback(self._gate.close)
+        self._gate.wait_until_open()
         camera = self._open_camera(console)
         self._episodes = Episodes(
             config.out,

@@ -232,13 +232,13 @@ class Px4(Profile):
             yield WantedParam("COM_RC_IN_MODE", "1, or 6 with a receiver")
             yield WantedParam("COM_RC_LOSS_T", time)
             yield WantedParam("NAV_RCL_ACT", "1, 2 or 3 (hold, return, land)")
-            yield WantedParam("COM_RCL_EXCEPT", f"bit {_EXCEPT_HOLD} set")
+            yield WantedParam("COM_RCL_EXCEPT", f"with {_EXCEPT_HOLD} in it")
             yield WantedParam("MAN_ARM_GESTURE", "0")
             yield WantedParam("COM_DISARM_PRFLT", "longer than it takes to lift off")
         else:
             yield WantedParam("COM_OF_LOSS_T", time)
             yield WantedParam("COM_OBL_RC_ACT", "4 or 5 (land, hold)")
-            yield WantedParam("COM_RCL_EXCEPT", f"bit {_EXCEPT_OFFBOARD} set")
+            yield WantedParam("COM_RCL_EXCEPT", f"with {_EXCEPT_OFFBOARD} in it")
 
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None

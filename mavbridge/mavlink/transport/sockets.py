@@ -306,6 +306,8 @@ class SerialTransport(_StreamTransport[serial.Serial]):
             return (
                 "no permission: join its group (sudo usermod -aG dialout $USER, then log in anew)"
             )
+        if code == errno.ENOTTY or "ioctl" in str(error):  # pyserial may keep the number to itself
+            return "it is no serial port"
         holder = device_holder(self._device)
         if holder or code in (errno.EBUSY, errno.EAGAIN):
             return f"it is in use{holder or '; stop the program that has it'}"

@@ -217,7 +217,7 @@ def _stop(before: Tick | None, tick: Tick) -> Ending | None:
     reason = tick.release_reason or ""
     if tick.phase != was and reason.startswith(_OWN_ENDINGS):
         return Ending(reason=reason, is_fault=not reason.startswith(_OWN_ENDINGS[0]))
-    if tick.phase == Phase.ENDED.value and was in ("waiting", "released"):
+    if tick.phase == Phase.ENDED.value != was:  # the second of two stops counts for nothing
         return Ending(reason="the flight was ended by a signal")
     return None
 

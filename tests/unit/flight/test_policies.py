@@ -6,11 +6,13 @@ import pytest
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.errors import UserError
 from mavbridge.flight.policies import (
     check_configured_policy,
     load_configured_policy,
     looks_at_images,
     policy_files,
+    require_images,
 )
 
 MINE = """
@@ -52,6 +54,20 @@ def test_black_frames_are_no_fault_of_a_policy_that_is_flown_without_a_camera(
 ) -> None:
     config = FlyConfig(policy=PolicyConfig(policy=policy), camera=CameraConfig(camera=(camera,)))
     assert looks_at_images(config) is looks
+
+
+@pytest.mark.parametrize("policy", ["toge", "toge:medium", "resnet-unet"])
+def test_a_net_of_ours_is_not_flown_without_a_camera(policy: str) -> None:
+    blind = CameraConfig(camera=("none",))
+    with pytest.raises(UserError, match="name its camera"):
+        require_images(FlyConfig(policy=PolicyConfig(policy=policy), camera=blind))
+
+
+@pytest.mark.parametrize("policy", ["scripted:square", "mine:Still", "onnx:folder"])
+def test_a_policy_that_may_be_blind_needs_no_camera(policy: str) -> None:
+    config = FlyConfig(policy=PolicyConfig(policy=policy), camera=CameraConfig(camera=("none",)))
+    require_images(config)
+    assert not looks_at_images(config)
 
 
 def test_the_files_of_a_policy_are_those_that_make_it(tmp_path: Path) -> None:

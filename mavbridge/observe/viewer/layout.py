@@ -39,7 +39,7 @@ NEAR_EYE_M, FAR_EYE_M = (-3.0, 0.8, -1.3), (-16.0, 5.0, -11.0)
 Rgb: TypeAlias = tuple[int, int, int]
 # All of them can be read on the dark and on the light ground that a browser asks for.
 BLUE, ORANGE, GREEN, RED = (86, 180, 233), (240, 160, 40), (60, 200, 140), (235, 80, 70)
-PINK, GREY = (225, 120, 180), (135, 135, 135)
+PINK, GREY = (225, 120, 180), (145, 145, 145)
 DARK_BLUE = (45, 95, 135)
 
 
@@ -174,10 +174,10 @@ def flight_blueprint(flight: ViewedFlight) -> rrb.Blueprint:
     """Initial layout of the viewer: where the vehicle is and what it is told, then the timing."""
     contract = flight.contract
     cameras = [
-        rrb.Spatial2DView(origin=path, name=f"Camera {name}" if number else "Camera")
-        for number, (path, name) in enumerate(
-            zip(camera_paths(contract.cameras), contract.cameras, strict=True)
+        rrb.Spatial2DView(
+            origin=path, name=f"Camera {name}" if len(contract.cameras) > 1 else "Camera"
         )
+        for path, name in zip(camera_paths(contract.cameras), contract.cameras, strict=True)
     ]
     place = rrb.Vertical(
         _scenes(flight.gates),
@@ -246,7 +246,7 @@ def _overlooking(gates: Sequence[CourseGate]) -> rrb.EyeControls3D:
     middle_m = (centers_m.min(axis=0) + centers_m.max(axis=0)) / 2
     reach_m = float(np.linalg.norm(centers_m - middle_m, axis=1).max())
     first_m = centers_m[1] / max(float(np.linalg.norm(centers_m[1])), 1e-6)
-    position_m = middle_m - 1.3 * reach_m * first_m + np.array([0.0, 0.0, -0.9 * reach_m])
+    position_m = middle_m - 1.6 * reach_m * first_m + np.array([0.0, 0.0, -0.9 * reach_m])
     return rrb.EyeControls3D(position=position_m, look_target=middle_m, eye_up=UP)
 
 

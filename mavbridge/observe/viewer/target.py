@@ -11,8 +11,8 @@ import rerun.blueprint as rrb
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.files import require_writable
-from mavbridge.observe.rerun_process import listens, start_listening
-from mavbridge.observe.rerun_server import WebServer, serve_address
+from mavbridge.observe.viewer.process import listens, start_listening
+from mavbridge.observe.viewer.server import WebServer, serve_address
 
 VIEWER_HOST = "127.0.0.1"
 VIEWER_PORT = 9876
@@ -60,12 +60,12 @@ class RerunRecording:
         """Deliver the rest and close; raises MavbridgeError if the viewer is gone."""
         try:
             self.stream.flush()
+            self.stream.disconnect()
         except RuntimeError as error:
             raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
         finally:
             if self._server is not None:
                 self._server.close()
-        self.stream.disconnect()
 
 
 def prepare_target(text: str) -> Path | str:

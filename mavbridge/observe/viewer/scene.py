@@ -11,10 +11,10 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.records import ImageArray, Position, Tick, VisionTick
 from mavbridge.core.rotation import Quaternion, heading_rad
-from mavbridge.observe import rerun_layout as layout
-from mavbridge.observe.rerun_columns import Columns
-from mavbridge.observe.rerun_layout import ViewedFlight
-from mavbridge.observe.rerun_motion import Motion
+from mavbridge.observe.viewer import layout
+from mavbridge.observe.viewer.columns import Columns
+from mavbridge.observe.viewer.layout import ViewedFlight
+from mavbridge.observe.viewer.motion import Motion
 
 JPEG_QUALITY = 85
 MAX_IMAGE_WIDTH = 640

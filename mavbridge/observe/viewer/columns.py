@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.observe.rerun_layout import Plot
+from mavbridge.observe.viewer.layout import Plot
 
 WINDOW_NS = NS_PER_S // 4
 

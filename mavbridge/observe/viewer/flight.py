@@ -15,13 +15,13 @@ import rerun as rr
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Observed, Solve, Tick, VisionTick
-from mavbridge.observe import rerun_layout as layout
-from mavbridge.observe.rerun_columns import Columns
-from mavbridge.observe.rerun_layout import ViewedFlight, flight_blueprint
-from mavbridge.observe.rerun_plan import PlanView
-from mavbridge.observe.rerun_plots import ActionPlots, TimingPlots
-from mavbridge.observe.rerun_scene import SceneView
-from mavbridge.observe.rerun_target import RerunRecording
+from mavbridge.observe.viewer import layout
+from mavbridge.observe.viewer.columns import Columns
+from mavbridge.observe.viewer.layout import ViewedFlight, flight_blueprint
+from mavbridge.observe.viewer.plan import PlanView
+from mavbridge.observe.viewer.plots import ActionPlots, TimingPlots
+from mavbridge.observe.viewer.scene import SceneView
+from mavbridge.observe.viewer.target import RerunRecording
 
 EVENT_CHARACTERS = 64
 """Longer texts go on in the next line: the viewer cuts them off at the edge of its panel."""

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.processes import end
-from mavbridge.observe.rerun_process import start_listening
+from mavbridge.observe.viewer.process import start_listening
 
 SERVER_MEMORY = "1GB"
 """Beyond this the server forgets its oldest data."""

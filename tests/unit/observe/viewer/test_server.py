@@ -3,7 +3,7 @@ import socket
 import pytest
 
 from mavbridge.core.errors import UserError
-from mavbridge.observe.rerun_server import ServeAddress, serve_address
+from mavbridge.observe.viewer.server import ServeAddress, serve_address
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mavbridge.core.records import ImageArray, RolloutFrame
-from mavbridge.observe.rerun_target import RerunRecording
+from mavbridge.observe.viewer.target import RerunRecording
 from policy.contract import ACTION_NAMES, QUATERNION, RATE, SPECIFIC_FORCE, STATE_NAMES, VELOCITY
 
 IMAGINED, REAL, STICKS = "imagined", "real", "sticks"

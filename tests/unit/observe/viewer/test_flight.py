@@ -29,15 +29,15 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import Observed, Position, Solve
 from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
 from mavbridge.flight.action_frames import action_frame
-from mavbridge.observe.rerun_flight import EVENT_CHARACTERS, RerunView
-from mavbridge.observe.rerun_layout import (
+from mavbridge.observe.viewer.flight import EVENT_CHARACTERS, RerunView
+from mavbridge.observe.viewer.layout import (
     PLOTS,
     ViewedFlight,
     action_plots,
     flight_blueprint,
     styles,
 )
-from mavbridge.observe.rerun_scene import MAX_IMAGE_WIDTH
+from mavbridge.observe.viewer.scene import MAX_IMAGE_WIDTH
 from policy.contract import Contract
 
 CAMERA = "/scene/chase/vehicle/front"
@@ -474,8 +474,8 @@ FLIES_INTO_A_STALLED_VIEWER = """
 import sys
 from helpers.factories import make_tick, make_vision_tick
 from mavbridge.core.observers import ObserverThread
-from mavbridge.observe.rerun_flight import RerunView
-from mavbridge.observe.rerun_layout import ViewedFlight
+from mavbridge.observe.viewer.flight import RerunView
+from mavbridge.observe.viewer.layout import ViewedFlight
 
 view = RerunView(sys.argv[1], ViewedFlight(vision_hz=30, chunk_hz=100, stick_hz=100))
 observer = ObserverThread("viewer", view, capacity=100)

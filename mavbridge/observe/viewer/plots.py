@@ -7,9 +7,9 @@ from itertools import pairwise
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Tick, VisionTick
 from mavbridge.core.vehicle import Action, Sticks
-from mavbridge.observe import rerun_layout as layout
-from mavbridge.observe.rerun_columns import Columns, Spread
-from mavbridge.observe.rerun_layout import ViewedFlight
+from mavbridge.observe.viewer import layout
+from mavbridge.observe.viewer.columns import Columns, Spread
+from mavbridge.observe.viewer.layout import ViewedFlight
 
 ALLOWED_SHARE = 0.001
 """Of slots and of images: what a minute at full rate may lose, by our own measure."""

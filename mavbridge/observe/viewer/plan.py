@@ -10,10 +10,10 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Position, Solve
 from mavbridge.core.rotation import heading_rad, roll_pitch_rad
 from mavbridge.core.vehicle import Action, Sticks, Velocity
-from mavbridge.observe import rerun_layout as layout
-from mavbridge.observe.rerun_columns import Columns
-from mavbridge.observe.rerun_layout import ViewedFlight
-from mavbridge.observe.rerun_motion import Motion
+from mavbridge.observe.viewer import layout
+from mavbridge.observe.viewer.columns import Columns
+from mavbridge.observe.viewer.layout import ViewedFlight
+from mavbridge.observe.viewer.motion import Motion
 from policy.contract import Contract
 
 GRAVITY_MPS2 = 9.81

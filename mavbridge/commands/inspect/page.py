@@ -1,0 +1,230 @@
+"""The page of ``mavbridge inspect --html``: one file with the figures, the plots and the video."""
+
+import html
+import json
+from base64 import b64encode
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavbridge.commands.inspect.analysis import FlightAnalysis
+from mavbridge.commands.inspect.series import FloatColumn, Series
+from mavbridge.core.errors import UserError
+from mavbridge.core.vehicle import Percentiles
+
+MAX_POINTS = 20_000
+"""Points of a line: four times the pixels of a wide screen. Longer flights keep both extremes."""
+MAX_VIDEO_BYTES = 40_000_000
+"""A larger video stays beside the page: browsers become slow with much more in one address."""
+BINS = 40
+_HERE = files("mavbridge.commands.inspect")
+
+
+def write_page(path: Path, flights: Sequence[FlightAnalysis]) -> None:
+    """Write one page that needs no other file and no network, with the flights side by side.
+
+    Raises:
+        UserError: the page cannot be written, or a video not be read.
+    """
+    title = "mavbridge: " + " and ".join(flight.folder.name for flight in flights)
+    try:
+        text = _HERE.joinpath("page.html").read_text()
+        for name, value in (
+            ("title", html.escape(title)),
+            ("css", _HERE.joinpath("page.css").read_text()),
+            ("script", _HERE.joinpath("page.js").read_text()),
+            ("data", page_data(flights)),
+        ):
+            text = text.replace("{{" + name + "}}", value)
+        path.write_text(text)
+    except OSError as error:
+        raise UserError(f"--html {path}: {error}") from error
+
+
+def page_data(flights: Sequence[FlightAnalysis]) -> str:
+    """The JSON in the page; no ``<`` is in it, so no name can end its element."""
+    return json.dumps([_flight(flight) for flight in flights]).replace("<", "\\u003c")
+
+
+def _flight(flight: FlightAnalysis) -> dict[str, Any]:
+    series = flight.series
+    return {
+        "name": str(flight.folder),
+        "facts": list(_facts(flight)),
+        "end_s": float(series.t_s[-1]) if len(series.t_s) else 0.0,
+        "t": _packed(_thinned_times(series.t_s)),
+        "plots": [plot for plot in _plots(flight) if plot["series"]],
+        "histograms": list(_histograms(series)),
+        "holders": [asdict(span) for span in flight.holders],
+        "moments": [asdict(moment) for moment in flight.moments],
+        "track": _track(flight),
+        "gates": [gate._asdict() for gate in flight.gates],
+        "video": _video(flight),
+    }
+
+
+def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
+    """Label, text, and whether it is bad news."""
+    report, meta = flight.report, flight.meta
+    sticks, action, vision = report.sticks, report.action, report.vision
+    yield "policy", f"{report.policy} on {report.engine}, {report.mode} rate", False
+    yield "vehicle", report.autopilot or "none", False
+    yield "when", f"{meta.started_at}, {report.duration_s:.1f} s", False
+    if meta.crash is not None:
+        yield "crashed", meta.crash, True
+    if not meta.finished:
+        yield "recording", "cut off: shown up to its last whole batch of rows", True
+    if meta.gates_passed is not None:
+        yield "course", f"{meta.gates_passed} gates passed", meta.success is False
+    missed = (
+        f"{sticks.missed_slots} of {sticks.slots} slots missed, {sticks.coasting_sends} coasting"
+    )
+    yield "sticks", f"{flight.stick_hz:g} Hz grid, {missed}", sticks.missed_slots > 0
+    for name, hz, target_hz, rest in (
+        ("chunks", action.rate_hz, action.target_hz, f"{action.late_chunks} late"),
+        ("images", vision.rate_hz, vision.target_hz, f"{vision.dropped_frames} dropped"),
+    ):
+        shown = "-" if hz is None else f"{hz:.1f}"
+        is_slow = hz is not None and hz < 0.9 * target_hz
+        yield name, f"{shown} of {target_hz:.4g} Hz, {rest}", is_slow
+    for name, measured in (
+        ("stick lateness", sticks.lateness_ms),
+        ("feature age", report.feature_age_ms),
+        ("attitude to wire", report.state_to_wire_ms),
+        ("exposure to feature", flight.images.latency_ms),
+    ):
+        if measured is not None:
+            yield name, _percentiles(measured), False
+    for cause, count in flight.causes:
+        yield "delayed", f"{count} times: {cause}", False
+
+
+def _percentiles(measured: Percentiles) -> str:
+    return f"p50 {measured.p50:.2f}, p99 {measured.p99:.2f}, most {measured.max:.2f} ms"
+
+
+def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
+    series = flight.series
+    is_sticks = series.action_names == ("throttle", "yaw", "pitch", "roll")
+    for axis, name in enumerate(series.action_names):
+        columns = {
+            "vehicle's echo": series.echo[:, axis] if is_sticks else np.array([np.nan]),
+            "raw": series.raw[:, axis],
+            "smoothed": series.smoothed[:, axis],
+            "sent": series.sent[:, axis],
+        }
+        limits = {"range": [-1.08, 1.08]} if is_sticks else {}
+        title = f"Stick: {name}" if is_sticks else name.replace("_", " ").capitalize()
+        yield _plot(title, "", columns) | limits
+    ages = {"feature": series.feature_age_ms, "attitude": series.state_age_ms}
+    yield _plot("Age when sent", "ms", ages) | {"fromZero": True}
+    lateness = {"sticks after their slot": series.lateness_ms}
+    yield _plot("Lateness", "ms", lateness) | {"fromZero": True}
+    for title, unit, names, values in (
+        ("Velocity", "m/s", ("north", "east", "down"), series.velocity_ned_mps),
+        ("Attitude", "deg", ("roll", "pitch", "yaw"), series.roll_pitch_yaw_deg),
+        ("Body rates", "deg/s", ("roll", "pitch", "yaw"), series.rate_frd_dps),
+    ):
+        yield _plot(title, unit, dict(zip(names, values.T, strict=True)))
+    yield _plot("Height above the origin", "m", {"height": -series.position_ned_m[:, 2]})
+
+
+def _plot(title: str, unit: str, columns: dict[str, FloatColumn]) -> dict[str, Any]:
+    """A plot of those columns that have any value."""
+    known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
+    return {
+        "title": title,
+        "unit": unit,
+        "series": [
+            {"name": name, "values": _packed(_thinned(values))} for name, values in known.items()
+        ],
+    }
+
+
+def _bin_size(count: int) -> int:
+    return -(-2 * count // MAX_POINTS) if count > MAX_POINTS else 1
+
+
+def _thinned_times(t_s: FloatColumn) -> FloatColumn:
+    """Times of ``_thinned`` values: two for each bin."""
+    size = _bin_size(len(t_s))
+    if size == 1:
+        return t_s
+    starts = np.arange(0, len(t_s), size)
+    kept: FloatColumn = t_s[
+        np.stack((starts, np.minimum(starts + size // 2, len(t_s) - 1)), axis=1).ravel()
+    ]
+    return kept
+
+
+def _thinned(values: FloatColumn) -> FloatColumn:
+    """The least and the greatest value of each bin, so that no spike is lost."""
+    size = _bin_size(len(values))
+    if size == 1:
+        return values
+    padded = np.pad(values, (0, -len(values) % size), constant_values=np.nan).reshape(-1, size)
+    least = np.where(np.isnan(padded), np.inf, padded).min(axis=1)
+    most = np.where(np.isnan(padded), -np.inf, padded).max(axis=1)
+    pairs = np.stack((least, most), axis=1).ravel()
+    return np.where(np.isfinite(pairs), pairs, np.nan)
+
+
+def _packed(values: FloatColumn) -> str:
+    """Little-endian float32 in base64, which a script reads without rounding text."""
+    return b64encode(values.astype("<f4").tobytes()).decode()
+
+
+def _histograms(series: Series) -> Iterator[dict[str, Any]]:
+    for title, values_ms in (
+        ("Stick lateness", series.lateness_ms),
+        ("Period of the slots", series.period_ms),
+        ("Age of the feature", series.feature_age_ms),
+        ("Age of the attitude", series.state_age_ms),
+    ):
+        known = values_ms[np.isfinite(values_ms)]
+        if not len(known):
+            continue
+        # To the 99.5th percentile and half as far again: the last bin takes what lies beyond.
+        edges = np.linspace(0, max(1.0, 1.5 * float(np.percentile(known, 99.5))), BINS + 1)
+        counts, _ = np.histogram(np.minimum(known, edges[-1]), bins=edges)
+        yield {
+            "title": title,
+            "unit": "ms",
+            "edges": [round(float(edge), 4) for edge in edges],
+            "counts": [int(count) for count in counts],
+        }
+
+
+def _track(flight: FlightAnalysis) -> dict[str, str] | None:
+    if flight.track is None:
+        return None
+    north, east, down = flight.track.position_ned_m[:: _bin_size(len(flight.track.t_s))].T
+    return {
+        "t": _packed(flight.track.t_s[:: _bin_size(len(flight.track.t_s))]),
+        "north": _packed(north),
+        "east": _packed(east),
+        "down": _packed(down),
+    }
+
+
+def _video(flight: FlightAnalysis) -> dict[str, Any] | None:
+    """The video itself, or a word on why it is not in the page; None without images."""
+    images = flight.images
+    if not len(images.exposed_s):
+        return None
+    size = images.video.stat().st_size
+    if size > MAX_VIDEO_BYTES:
+        text = (
+            f"{images.video.name} has {size / 1e6:.0f} MB, too much for a page: open it beside it"
+        )
+        return {"note": text}
+    data = b64encode(images.video.read_bytes()).decode()
+    return {
+        "source": f"data:video/mp4;base64,{data}",
+        "exposed_s": _packed(images.exposed_s),
+        "rate_hz": flight.meta.visual_hz,
+    }

@@ -1,0 +1,230 @@
+"""``mavbridge check`` against both firmwares of the simulated vehicle, on virtual time."""
+
+from dataclasses import replace
+from itertools import repeat
+from typing import Any
+
+import pytest
+
+from mavbridge.commands.check.policy import PolicyFindings
+from mavbridge.commands.check.rows import Row, overall
+from mavbridge.commands.check.vehicle import check_vehicle
+from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.mavlink.transport.sockets import Address
+from mavbridge.simulation.clock import SteppedClock
+from mavbridge.simulation.network import DelayedChannel, MemoryTransport
+from mavbridge.simulation.world import NOMINAL_VEHICLE, VehicleStepper
+from policy.contract import Contract
+from sitl.ardupilot.autopilot import Autopilot
+from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import AutopilotName
+
+OVERRIDE = 70
+"""RC_CHANNELS_OVERRIDE."""
+SAFE = {"RC_OVERRIDE_TIME": 0.5, "RC8_OPTION": 46}
+
+
+class Bench:
+    """A vehicle that stands on the ground, and the check's end of its link."""
+
+    def __init__(
+        self,
+        autopilot: AutopilotName = "ardupilot",
+        *,
+        receiver: bool = True,
+        params: dict[str, float] | None = None,
+    ) -> None:
+        self.clock = SteppedClock()
+        self.vehicle = SimulatedVehicle(
+            links=1,
+            boot_ns=self.clock.now_ns(),
+            config=replace(NOMINAL_VEHICLE, autopilot=autopilot, receiver=receiver),
+        )
+        for name, value in (params or {}).items():
+            assert self.vehicle.params.set(name, value), name
+        up, down = (DelayedChannel(self.clock, repeat(NS_PER_MS)) for _ in range(2))
+        self.transport = MemoryTransport(self.clock, to_vehicle=up, from_vehicle=down)
+        self.stepper = VehicleStepper(
+            self.clock, self.vehicle, self.clock.now_ns(), to_vehicle=up, from_vehicle=down
+        )
+
+    def arm(self) -> None:
+        """Somebody arms it, whatever its own checks say."""
+        assert isinstance(self.vehicle.ap, Autopilot)
+        assert self.vehicle.ap.arm(force=True)
+
+    def log_sent(self) -> list[tuple[int, bytes]]:
+        """Every packet to the vehicle from now on, with its time."""
+        sent: list[tuple[int, bytes]] = []
+        send = self.transport.send
+
+        def log(data: bytes, peer: Address | None = None) -> bool:
+            sent.append((self.clock.now_ns(), data))
+            return send(data, peer)
+
+        self.transport.send = log  # type: ignore[method-assign]
+        return sent
+
+    def check(
+        self, *, contract: Contract | None = None, echo_test: bool = False, **link: Any
+    ) -> dict[str, Row]:
+        """The rows by their names."""
+        config = FlyConfig(link=LinkConfig(connect="udp:127.0.0.1:1", **link))
+        rows = check_vehicle(
+            config,
+            PolicyFindings(contract=contract),
+            self.clock,
+            echo_test=echo_test,
+            transport=self.transport,
+        )
+        return {row.name: row for row in rows}
+
+
+def verdicts(rows: dict[str, Row]) -> dict[str, str]:
+    """The rows that are not go."""
+    return {name: row.verdict for name, row in rows.items() if row.verdict != "go"}
+
+
+def test_an_ardupilot_that_is_set_up_is_a_go() -> None:
+    bench = Bench(params=SAFE)
+    rows = bench.check(contract=Contract(), echo_test=True)
+
+    assert "no-go" not in verdicts(rows).values(), verdicts(rows)
+    assert rows["RC_OVERRIDE_TIME"].found == "0.5"
+    assert rows["modes"].found == "ALT_HOLD"
+    assert rows["radio receiver"].verdict == "go"
+    assert rows["echo test"].found == "taken, and released"
+    assert rows["clocks (TIMESYNC)"].verdict == "go"
+    for name in ("attitude", "velocity", "acceleration"):
+        assert float(rows[name].found.split()[0]) == pytest.approx(100, abs=2)
+
+
+@pytest.mark.parametrize("receiver", [True, False])
+def test_a_px4_is_told_what_its_sticks_cannot_do(receiver: bool) -> None:
+    bench = Bench("px4", receiver=receiver, params={"COM_RC_IN_MODE": 1})
+    rows = bench.check(contract=Contract(), echo_test=True)
+
+    assert "no-go" not in verdicts(rows).values(), verdicts(rows)
+    assert rows["modes"].found == "ALTCTL"
+    assert "sticks are mapped" in rows["full lean"].found
+    assert rows["full yaw rate"].verdict == "warn"
+    assert "202 deg/s" in rows["full yaw rate"].advice
+    assert rows["echo test"].found == "taken, and released"
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "params", "row", "command"),
+    [
+        ("ardupilot", {"RC_OVERRIDE_TIME": 0}, "RC_OVERRIDE_TIME", "--set RC_OVERRIDE_TIME=0.5"),
+        ("ardupilot", {"RC_OVERRIDE_TIME": -1}, "RC_OVERRIDE_TIME", "--set RC_OVERRIDE_TIME=0.5"),
+        ("ardupilot", {"RC_OPTIONS": 2}, "RC_OPTIONS", "--set RC_OPTIONS=0"),
+        ("ardupilot", {"MAV_GCS_SYSID": 42}, "MAV_GCS_SYSID", "--source-system 42"),
+        ("px4", {"COM_RC_IN_MODE": 0}, "COM_RC_IN_MODE", "--set COM_RC_IN_MODE=1"),
+    ],
+)
+def test_what_a_flight_refuses_is_a_no_go_with_the_command_that_mends_it(
+    autopilot: AutopilotName, params: dict[str, float], row: str, command: str
+) -> None:
+    rows = Bench(autopilot, params=params).check(contract=Contract())
+    assert rows[row].verdict == "no-go"
+    assert command in rows[row].commands
+
+
+def test_without_a_receiver_its_failsafes_count() -> None:
+    bench = Bench(receiver=False, params=SAFE | {"FS_THR_ENABLE": 0, "FS_OPTIONS": 16})
+    rows = bench.check(contract=Contract())
+    assert rows["radio receiver"].verdict == "warn"
+    assert rows["FS_THR_ENABLE"].verdict == "no-go"
+    assert rows["FS_OPTIONS"].commands == ("--set FS_OPTIONS=24",)
+    accepted = bench.check(contract=Contract(), accept_risk=("no-throttle-failsafe",))
+    assert accepted["FS_THR_ENABLE"].verdict == "warn"
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_a_policy_of_setpoints_has_parameters_of_its_own(autopilot: AutopilotName) -> None:
+    rows = Bench(autopilot).check(contract=Contract(action="rates"), echo_test=True)
+    timeout, mode = {"ardupilot": ("GUID_TIMEOUT", "GUIDED"), "px4": ("COM_OF_LOSS_T", "OFFBOARD")}[
+        autopilot
+    ]
+    assert timeout in rows
+    assert mode in rows["modes"].found
+    assert "hover thrust" in rows
+    assert "full lean" not in rows
+    assert rows["echo test"].verdict == "go"
+    assert rows["echo test"].found.startswith("not sent")
+
+
+def test_a_refused_setting_is_judged_as_the_flight_would_set_it() -> None:
+    bench = Bench(params={"RC_OVERRIDE_TIME": -1})
+    rows = bench.check(set=("RC_OVERRIDE_TIME=0.5",))
+    assert rows["RC_OVERRIDE_TIME"].verdict == "go"
+    assert rows["RC_OVERRIDE_TIME"].found == "-1; --set makes it 0.5"
+    assert bench.vehicle.params["RC_OVERRIDE_TIME"] == -1, "nothing was set"
+
+
+def test_a_vehicle_that_obeys_another_system_fails_the_echo_test() -> None:
+    rows = Bench(params={"MAV_GCS_SYSID": 42}).check(echo_test=True)
+    assert rows["echo test"].verdict == "no-go"
+    assert "--source-system 42" in rows["echo test"].commands
+
+
+def test_without_the_flag_nothing_is_sent_but_requests() -> None:
+    bench = Bench(params=SAFE)
+    sent = bench.log_sent()
+    bench.check(contract=Contract())
+    messages = {data[7] | data[8] << 8 for _, data in sent}
+    assert not messages & {69, OVERRIDE, 82, 84, 23, 253}, "nothing that moves, sets or announces"
+    commands = [int.from_bytes(data[38:40], "little") for _, data in sent if data[7] == 76]
+    assert set(commands) <= {511, 512}, "message rates and the version alone"
+
+
+def test_an_armed_vehicle_is_not_touched_by_the_echo_test() -> None:
+    bench = Bench(params=SAFE)
+    bench.clock.sleep_until_ns(bench.clock.now_ns() + 3 * NS_PER_S)
+    bench.arm()
+    rows = bench.check(echo_test=True)
+    assert rows["echo test"].verdict == "no-go"
+    assert "disarm it" in rows["echo test"].advice
+    assert rows["state"].verdict == "warn"
+
+
+def test_arming_in_the_middle_of_the_echo_test_ends_it_with_a_release() -> None:
+    bench = Bench(params={"MAV_GCS_SYSID": 42})  # so the test lasts
+    sent = bench.log_sent()
+    began_ns = bench.clock.now_ns()
+    bench.clock.schedule(began_ns + 9 * NS_PER_S, bench.arm)
+    rows = bench.check(echo_test=True)
+    assert rows["echo test"].found == "refused"
+    overrides = [data for _, data in sent if data[7] == OVERRIDE]
+    sticks = [overrides.index(data) for data in overrides if data[10:18] != bytes(8)]
+    assert sticks, "it had begun"
+    assert max(sticks) < len(overrides) - 1, "the last word is a release"
+    late = [at_ns for at_ns, data in sent if data[7] == OVERRIDE and data[10:18] != bytes(8)]
+    assert max(late) < began_ns + 9.2 * NS_PER_S
+
+
+def test_a_vehicle_that_is_absent_is_one_clear_no_go() -> None:
+    bench = Bench()
+    bench.stepper.watchers.clear()
+    bench.vehicle.take_outgoing = lambda link: b""  # type: ignore[method-assign]
+    began_ns = bench.clock.now_ns()
+    rows = bench.check(connect_timeout=3.0)
+    assert list(rows) == ["vehicle"]
+    assert rows["vehicle"].verdict == "no-go"
+    assert "heard nothing" in rows["vehicle"].advice
+    assert bench.clock.now_ns() - began_ns < 4 * NS_PER_S
+
+
+def test_no_policy_leaves_out_what_only_a_policy_knows() -> None:
+    rows = Bench(params=SAFE).check()
+    assert overall(list(rows.values())) != "no-go"
+    assert "modes" not in rows
+    assert "full lean" not in rows
+    assert "us, dead zone" in rows["RC3 throttle"].found
+
+
+def test_an_output_that_the_firmware_has_not_is_a_no_go() -> None:
+    rows = Bench().check(contract=Contract(), output="manual-control")
+    assert rows["vehicle"].verdict == "no-go"
+    assert "rc-override" in rows["vehicle"].advice

@@ -1,0 +1,53 @@
+"""A vehicle on the bench without a camera: checked, then flown by a policy that is blind."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from helpers.stand import STALLED, STARTS, TIMEOUT_S
+from mavbridge.core.errors import ExitCode
+from mavbridge.core.processes import child_environment, free_port, running
+
+pytestmark = pytest.mark.system
+BLIND = ("--policy", "scripted:hover", "--camera", "none")
+
+
+def run(*words: str) -> tuple[int, str]:
+    """Exit status and output of one command."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mavbridge", *words],
+        env=os.environ | child_environment() | {"COLUMNS": "200"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+    return done.returncode, done.stdout
+
+
+def test_a_vehicle_without_a_camera_is_checked_and_flown(tmp_path: Path) -> None:
+    port, report = free_port(), tmp_path / "check.json"
+    sitl = (sys.executable, "-m", "sitl", "--connect", f"udpout:127.0.0.1:{port}")
+    link = ("--connect", f"udp:127.0.0.1:{port}")
+    with running(*sitl, log=tmp_path / "sitl.log"):
+        for _ in range(STARTS):  # the estimator may need a while on a busy machine
+            status, told = run("check", *link, *BLIND, "--json", str(report))
+            if status == ExitCode.DONE:
+                break
+        assert status == ExitCode.DONE, told
+        rows = {row["name"]: row for row in json.loads(report.read_text())["rows"]}
+        assert rows["state"]["found"].startswith("disarmed")
+        assert rows["RC_OVERRIDE_TIME"]["commands"] == ["--set RC_OVERRIDE_TIME=0.5"]
+
+        for _ in range(STARTS):
+            status, told = run(*link, *BLIND, "--mode", "ALT_HOLD", "--arm", "--duration", "1")
+            if not any(text in told for text in STALLED):
+                break
+        assert status == ExitCode.DONE, told
+        assert "frozen" not in told
+        assert "black" not in told

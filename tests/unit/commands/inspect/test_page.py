@@ -1,0 +1,121 @@
+import base64
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers.factories import make_released_tick, make_tick
+from helpers.recordings import make_frame, make_meta, without_writer_process
+from mavbridge.commands.inspect import page
+from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
+from mavbridge.commands.inspect.page import page_data, write_page
+from mavbridge.core.course import CourseGate
+from mavbridge.core.records import Position
+from mavbridge.recording.flight_writer import FlightWriter
+
+NASTY = "</script><script>document.title = 'mine'</script><!--"
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+
+
+def flight(folder: Path, *, name: str = "scripted:hover", frames: int = 10) -> FlightAnalysis:
+    folder.mkdir()
+    with without_writer_process():
+        writer = FlightWriter(folder, make_meta(policy=name), pressure="offline")
+        for number in range(frames):
+            writer.frame(make_frame(number))
+        for index in range(40):
+            writer.tick(make_tick(index, position_ned_m=Position(0.1 * index, 1.0, -2.0)))
+        writer.tick(make_released_tick(40, NASTY, phase="released"))
+        writer.finish(writer.meta)
+    return replace(analyse(folder), gates=(CourseGate(Position(5, 0, -2), 0.1, 2.4),))
+
+
+def data_of(text: str) -> list[dict[str, Any]]:
+    """What a browser reads from the page."""
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    read: list[dict[str, Any]] = json.loads(found[1])
+    return read
+
+
+def unpacked(text: str) -> list[float]:
+    values: list[float] = np.frombuffer(base64.b64decode(text), "<f4").tolist()
+    return values
+
+
+def test_the_page_holds_the_flight_and_needs_nothing_else(tmp_path: Path) -> None:
+    analysis = flight(tmp_path / "flight")
+    write_page(tmp_path / "page.html", [analysis])
+    text = (tmp_path / "page.html").read_text()
+    assert not re.search(r"https?://|(src|href)=|@import|url\(", text)
+    assert "{{" not in text
+    (shown,) = data_of(text)
+    assert unpacked(shown["t"]) == pytest.approx(analysis.series.t_s.tolist())
+    plots = {plot["title"]: plot for plot in shown["plots"]}
+    (height,) = plots["Height above the origin"]["series"]
+    assert unpacked(height["values"])[:40] == pytest.approx([2.0] * 40)
+    assert [line["name"] for line in plots["Stick: yaw"]["series"]][-1] == "sent"
+    assert shown["gates"] == [{"center_ned_m": [5, 0, -2], "yaw_rad": 0.1, "size_m": 2.4}]
+    assert unpacked(shown["track"]["north"])[10] == pytest.approx(1.0)
+    video = base64.b64decode(shown["video"]["source"].partition(",")[2])
+    assert video == (tmp_path / "flight/camera.mp4").read_bytes()
+    assert sum(shown["histograms"][0]["counts"]) == 40
+
+
+def test_no_name_or_reason_leaves_its_place(tmp_path: Path) -> None:
+    write_page(tmp_path / "page.html", [flight(tmp_path / "flight", name=NASTY)])
+    text = (tmp_path / "page.html").read_text()
+    assert NASTY not in text
+    assert text.count("</script>") == 2
+    (shown,) = data_of(text)
+    assert shown["facts"][0][1].startswith(NASTY)
+    assert shown["moments"][0]["detail"] == NASTY
+
+
+def test_a_long_flight_is_thinned_and_keeps_every_spike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page, "MAX_POINTS", 10)
+    analysis = flight(tmp_path / "flight")
+    analysis.series.lateness_ms[17] = 99.0
+    (shown,) = json.loads(page_data([analysis]))
+    times = unpacked(shown["t"])
+    assert len(times) == 10
+    assert times == sorted(times)
+    (late,) = next(plot for plot in shown["plots"] if plot["title"] == "Lateness")["series"]
+    assert max(unpacked(late["values"])) == 99.0
+    assert len(unpacked(late["values"])) == len(times)
+
+
+def test_a_large_video_stays_beside_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page, "MAX_VIDEO_BYTES", 100)
+    (shown,) = json.loads(page_data([flight(tmp_path / "flight")]))
+    assert "camera.mp4 has 0 MB, too much for a page" in shown["video"]["note"]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed here")
+def test_a_browser_draws_it_to_the_end(tmp_path: Path) -> None:
+    flights = [
+        flight(tmp_path / "one"),
+        replace(flight(tmp_path / "two", name=NASTY, frames=0), track=None),
+    ]
+    write_page(tmp_path / "page.html", flights)
+    command = [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"]
+    command += ["--disable-background-networking", "--disable-sync", "--enable-logging=stderr"]
+    command += [f"--user-data-dir={tmp_path}/profile", "--dump-dom", f"file://{tmp_path}/page.html"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert 'data-drawn="2"' in ended.stdout  # set by the last line of the script
+    assert "CONSOLE" not in ended.stderr
+    assert "<title>mavbridge: one and two</title>" in ended.stdout
+    plots, bands, histograms, path = 10, 1, 4, 2
+    assert ended.stdout.count("<canvas") == 2 * (plots + bands + histograms) + path

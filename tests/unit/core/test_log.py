@@ -1,0 +1,93 @@
+"""The log of a run: what goes to the file, what to the terminal, and that nobody waits for it."""
+
+import logging
+import threading
+from pathlib import Path
+
+import pytest
+
+from mavbridge.core import log
+from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.log import SAID, run_log
+
+SPOKEN, DETAIL = logging.getLogger(SAID), logging.getLogger("mavbridge.somewhere")
+
+
+def speak() -> None:
+    SPOKEN.info("FLYING")
+    DETAIL.debug("a detail")
+    logging.getLogger("other.library").debug("chatter")
+    logging.getLogger("other.library").warning("trouble")
+
+
+def test_the_file_gets_all_of_ours_and_the_terminal_what_it_has_not_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "logs" / "run.log"
+    with run_log(path, verbose=True):
+        speak()
+    text, shown = path.read_text(), capsys.readouterr().err
+    for words in ("command: mavbridge", "versions: mavbridge", "FLYING", "a detail", "trouble"):
+        assert words in text
+    assert ("chatter" in text, "FLYING" in shown, "chatter" in shown) == (False, False, False)
+    assert "a detail\ntrouble\n" in shown
+    assert not [t for t in threading.enumerate() if t.name == log.THREAD]
+
+
+def test_without_verbose_the_terminal_shows_warnings_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with run_log(tmp_path / "run.log", verbose=False):
+        speak()
+    assert capsys.readouterr().err == "trouble\n"
+
+
+def test_runs_are_added_and_errors_are_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "run.log"
+    for _ in range(2):
+        with pytest.raises(PeerError), run_log(path, verbose=False):
+            raise PeerError("no vehicle")
+    assert path.read_text().count("ERROR   mavbridge.said: no vehicle") == 2
+
+
+def test_a_bug_is_logged_with_its_traceback(tmp_path: Path) -> None:
+    path = tmp_path / "run.log"
+    with pytest.raises(ZeroDivisionError), run_log(path, verbose=False):
+        _ = 1 / 0
+    assert "ZeroDivisionError: division by zero" in path.read_text()
+
+
+def test_a_file_that_cannot_be_written_is_refused() -> None:
+    with pytest.raises(UserError, match="--log-file"), run_log(Path("/proc/x/y"), verbose=False):
+        pass
+
+
+def test_what_does_not_fit_is_dropped_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(log, "CAPACITY", 5)
+    monkeypatch.setattr(log, "CLOSE_S", 30.0)
+    entered, leave = threading.Event(), threading.Event()
+
+    def hold(_record: logging.LogRecord) -> bool:
+        entered.set()
+        return leave.wait(30)
+
+    monkeypatch.setattr(log, "_begin", lambda: None)
+    monkeypatch.setattr(log._Terminal, "filter", lambda self, record: hold(record))
+    path = tmp_path / "run.log"
+    with run_log(path, verbose=True):
+        DETAIL.debug("first")
+        assert entered.wait(30)
+        for number in range(9):
+            DETAIL.debug("later %d", number)  # returns at once, also where there is no room
+        leave.set()
+    text = path.read_text()
+    assert "4 records were dropped" in text
+    assert ("later 4" in text, "later 5" in text) == (True, False)
+
+
+def test_without_a_flag_logging_stays_as_it_was() -> None:
+    before = list(logging.getLogger().handlers)
+    with run_log(None, verbose=False):
+        assert logging.getLogger().handlers == before
