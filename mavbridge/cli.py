@@ -129,7 +129,8 @@ def replay(flight: Path, config: ReplayConfig | None = None) -> int:
     """Compute a recorded flight once more, and compare the sticks; exit status 5: they differ.
 
     Args:
-        flight: folder of a flight.
+        flight: folder of a flight; or somebody else's telemetry log or LeRobot dataset, beside
+            which a policy decides.
         config: the settings.
     """
     require_extra("replay")

@@ -14,16 +14,26 @@ has_children() {
   return 1
 }
 
+# Before the start: a signal may come at once.
+asked= flight=
+trap 'asked=yes; [[ -z $flight ]] || kill -TERM "$flight" 2> /dev/null' TERM INT
 mavbridge "$@" &
 flight=$!
-trap 'kill -TERM "$flight" 2> /dev/null' TERM INT
+[[ -z $asked ]] || kill -TERM "$flight" 2> /dev/null
 
 # A signal interrupts the wait while the process is still there.
-while kill -0 "$flight" 2> /dev/null; do
+while :; do
   wait "$flight"
   status=$?
+  kill -0 "$flight" 2> /dev/null || break
 done
+# If it ended just after a signal, its own status is still to be had: 127 = that was it already.
+wait "$flight" 2> /dev/null
+again=$?
+((again == 127)) || status=$again
+
+# The gate ends by itself, some only when the vehicle is disarmed; the container's stop timeout is the limit.
 while has_children; do
   sleep 0.2
 done
-exit "${status:-1}"
+exit "$status"

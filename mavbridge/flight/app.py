@@ -311,15 +311,17 @@ class _Flight:
         if now_ns - self._looked_ns > STOPPED_NS:
             self._resumed_ns = now_ns
         self._looked_ns = now_ns
-        # Encoders wait for one another: the one that was asked first is the one that has hung.
-        encoders = sorted(
+        # Encoders wait for one another: the one that was asked first is the one that hangs.
+        camera, _ = min(
             zip(self._cameras, self._bridge.visions, strict=True),
-            key=lambda encoder: encoder[1].encoding_since_ns or now_ns,
+            key=lambda encoder: (encoder[1].encoding_since_ns or now_ns, encoder[1].alive_ns),
         )
-        watched = [(self._bridge.policy.alive_ns, "policy", self._hang_ns)]
-        for camera, loop in encoders:
-            name = f"encoder{self._named(camera, 'of camera ')}"
-            watched.append((loop.alive_ns, name, self._encoder_hang_ns))
+        silent_ns = min(vision.alive_ns for vision in self._bridge.visions)
+        encoder = f"encoder{self._named(camera, 'of camera ')}"
+        watched = (
+            (self._bridge.policy.alive_ns, "policy", self._hang_ns),
+            (silent_ns, encoder, self._encoder_hang_ns),
+        )
         for alive_ns, name, limit_ns in watched:
             idle_ns = now_ns - max(alive_ns, self._resumed_ns)
             if idle_ns > limit_ns:

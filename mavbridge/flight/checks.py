@@ -1,13 +1,13 @@
 """What a flight is refused for before anything slow is loaded."""
 
-from mavbridge.camera.open import check_camera, require_present
+from mavbridge.camera.open import check_camera
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import parse_address, parse_forward
 from mavbridge.core.clock import Clock
 from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
-from mavbridge.flight.policies import check_configured_policy, require_images
+from mavbridge.flight.policies import check_configured_policy, require_cameras, require_images
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.viewer.server import serve_address
 from mavbridge.observe.viewer.target import check_target
@@ -36,5 +36,4 @@ def check_flight(config: FlyConfig, clock: Clock) -> None:
     if config.record is not None:
         prepare_folder(config.record)
     check_target(config.rerun)
-    for source in config.camera.sources:
-        require_present(source)
+    require_cameras(config)

@@ -5,16 +5,17 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from mavbridge.camera.open import NO_CAMERA
+from mavbridge.camera.open import NO_CAMERA, require_present
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
-from mavbridge.core.errors import UserError
+from mavbridge.core.errors import CameraError, UserError
 from policy.contract import Contract
 from policy.loading.builtin import SHIPPED
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
 
+NO_IMAGE_ADVICE = "looks at no image: --camera none does without"
 STATELESS = ("toge", "resnet-unet", "onnx")
 FILE_KINDS = ("lerobot", "onnx", "torchscript")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
@@ -100,6 +101,17 @@ def require_images(config: FlyConfig) -> None:
             f"--camera none: {config.policy.policy} flies by its images, so name its camera; "
             "scripted programs, and policies of yours that look at no image, fly without one"
         )
+
+
+def require_cameras(config: FlyConfig) -> None:
+    """Refuse local cameras that are not plugged in; raises CameraError."""
+    for source in config.camera.sources:
+        try:
+            require_present(source)
+        except CameraError as error:
+            if looks_at_images(config):
+                raise
+            raise CameraError(f"{error}; {config.policy.policy} {NO_IMAGE_ADVICE}") from error
 
 
 def _has_no_camera(config: FlyConfig) -> bool:

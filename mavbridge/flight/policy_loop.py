@@ -173,20 +173,7 @@ class PolicyLoop:
                 predict_ns=done_ns - now_ns,
             )
         )
-        chunk = Chunk(
-            serial=self._serial,
-            attitude_ns=min(state.attitude_ns, state.rate_ns),
-            velocity_ns=min(
-                state.velocity_ns,
-                state.specific_force_ns,
-                state.velocity_ns if state.extras_ns is None else state.extras_ns,
-            ),
-            image_ns=observation.image_ns,
-            computed_ns=done_ns,
-            first_ns=state.attitude_ns,
-            step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
-            actions=self._settings.action_frame.to_gate(array[0]),
-        )
+        chunk = self._chunk(observation, array, done_ns)
         self._send(chunk)
         if self._watch is not None:
             is_first, self._is_reset = self._is_reset, False
@@ -207,6 +194,24 @@ class PolicyLoop:
                     actions=_kept(array),
                 )
             )
+
+    def _chunk(self, observation: Observation, actions: FloatArray, done_ns: int) -> Chunk:
+        """The chunk of a solve that was done by then, with the stamps of all that it came from."""
+        state = observation.state
+        return Chunk(
+            serial=self._serial,
+            attitude_ns=min(state.attitude_ns, state.rate_ns),
+            velocity_ns=min(
+                state.velocity_ns,
+                state.specific_force_ns,
+                state.velocity_ns if state.extras_ns is None else state.extras_ns,
+            ),
+            image_ns=observation.image_ns,
+            computed_ns=done_ns,
+            first_ns=state.attitude_ns,
+            step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
+            actions=self._settings.action_frame.to_gate(actions[0]),
+        )
 
 
 def _kept(array: FloatArray) -> FloatArray:

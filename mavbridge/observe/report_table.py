@@ -57,7 +57,9 @@ def verdicts(report: TimingReport) -> list[Text]:
     text = f"{sticks.target_hz:g} Hz grid, {missed}, {coasting}"
     lines = [_line("sticks", text, style if sticks.slots else _STYLE_BAD)]
     late = f"{_counted(action.late_chunks, 'late chunk')} of {action.chunks}"
-    dropped = f"{_counted(vision.dropped_frames, 'frame')} dropped by the camera"
+    dropped = "frames dropped by the camera not measured"
+    if vision.dropped_frames is not None:
+        dropped = f"{_counted(vision.dropped_frames, 'frame')} dropped by the camera"
     for name, loop, rest in (("action", action, late), ("vision", vision, dropped)):
         text = f"{shown_rate(loop.rate_hz)} Hz of {loop.target_hz:.4g} Hz, {rest}"
         lines.append(_line(name, text, rate_style(loop.rate_hz, loop.target_hz)))

@@ -60,7 +60,7 @@ class VisionReport:
     target_hz: float
     rate_hz: float | None
     frames: int
-    dropped_frames: int
+    dropped_frames: int | None
     """Dropped by the source since the first frame of the flight."""
     encode_ms: Percentiles | None
 
@@ -144,7 +144,8 @@ class FlightTiming:
         self._chunks.add(tick)
         if tick.trace is not None:
             self._add_ages(tick)
-        reason = None if tick.phase in ("waiting", "preparing") else tick.release_reason
+        is_before = tick.phase in ("waiting", "preparing")
+        reason = None if is_before else tick.release_reason or None
         if reason != self._last_reason:
             self._last_reason = reason
             if reason is None:

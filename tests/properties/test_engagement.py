@@ -56,6 +56,8 @@ class EngagementMachine(RuleBasedStateMachine):
             mode=chosen["mode"],
             engage_channel=chosen["engage_channel"],
         )
+        self.switch_is_low = False
+        """The switch was low, and has not been high since."""
         self.has_act = False
         """An explicit act has come since the sticks were last lost."""
         self.was_taken = False
@@ -70,9 +72,11 @@ class EngagementMachine(RuleBasedStateMachine):
     def step(self, act: Act | None = None, **changes: Any) -> Move:
         """One step; notes acts and losses as an observer of the facts would."""
         before, facts = self.vehicle.phase, self.vehicle.facts
-        is_high = changes.get("rc_channels_us", facts.rc_channels_us)[6] > 1800
-        if act == "engage" or (is_high and facts.rc_channels_us[6] < 1200):
+        switch_us = changes.get("rc_channels_us", facts.rc_channels_us)[6]
+        if act == "engage" or (switch_us > 1800 and self.switch_is_low):
             self.has_act = True
+        if not 1200 <= switch_us <= 1800:  # a switch of three positions passes through the middle
+            self.switch_is_low = switch_us < 1200
         is_mode = changes.get("mode", facts.mode)
         own, asked = self.vehicle.engagement._own_mode, self.vehicle.engagement._departure.mode
         if before is Phase.FLYING:

@@ -21,7 +21,16 @@ def test_a_benchmark_measures_engines_flight_and_link(
 ) -> None:
     monkeypatch.setattr(run, "QUICK", TINY)
     monkeypatch.chdir(tmp_path)
-    flags = ("--quick", "--policy", "scripted:hover", "--rate", "50", "--json", "out/bench.json")
+    flags = (
+        "--quick",
+        "--policy",
+        "scripted:hover",
+        "--single-rate",
+        "--rate",
+        "50",
+        "--json",
+        "out/bench.json",
+    )
     with pytest.raises(SystemExit) as stopped:
         main(["bench", *flags])
     captured = capsys.readouterr()

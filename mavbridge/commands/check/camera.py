@@ -15,6 +15,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError
 from mavbridge.core.ports import Camera
 from mavbridge.core.workers import HungError, Worker
+from mavbridge.flight.policies import NO_IMAGE_ADVICE
 
 MEASURE_S = 2.0
 _READ_NS = NS_PER_S // 2
@@ -72,7 +73,9 @@ def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock
             try:
                 camera = _open(need, config, clock)
             except MavbridgeError as error:
-                rows.append(_row(need, "not opened", verdict="no-go", advice=str(error)))
+                hint = "" if need.is_flown_by else f"; the policy {NO_IMAGE_ADVICE}"
+                advice = f"{error}{hint}"
+                rows.append(_row(need, "not opened", verdict="no-go", advice=advice))
                 continue
             stack.callback(camera.close)
             opened.append((need, camera))

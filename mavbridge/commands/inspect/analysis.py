@@ -1,32 +1,35 @@
 """What a recorded flight tells: figures, who held the sticks, and the moments that went worst."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from mavbridge.commands.inspect.delays import Delay, find_delays, is_gap
 from mavbridge.commands.inspect.holders import HolderSpan, holder_spans
-from mavbridge.commands.inspect.moments import Delay, Moment, find_delays, worst_moments
+from mavbridge.commands.inspect.moments import Moment, worst_moments
 from mavbridge.commands.inspect.series import FloatColumn, Series, make_series
+from mavbridge.commands.inspect.sources import flown_limits, read_arrivals
 from mavbridge.commands.inspect.track import Track, course_gates, read_track
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, read_gates
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.records import Tick, VisionTick
+from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import Percentiles
-from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
+from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.meta import FlightError, FlightMeta
 from mavbridge.recording.rows import FrameRow
-
-_NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Images:
     """When the images of one camera were exposed; row k is image k of its video."""
 
+    camera: str
+    """Its name in the contract."""
     video: Path
     exposed_s: FloatColumn
     """[M] seconds since the first tick."""
@@ -45,7 +48,8 @@ class FlightAnalysis:
     report: TimingReport
     """The figures of the table that ended the flight, but for those of the link."""
     series: Series
-    images: Images
+    cameras: tuple[Images, ...]
+    """Those of the contract, in its order; ``report`` speaks of the first one."""
     track: Track | None
     """None where no position is known."""
     gates: tuple[CourseGate, ...]
@@ -55,6 +59,11 @@ class FlightAnalysis:
     """Missed slots and late chunks, each with its cause, in the order of time."""
     moments: tuple[Moment, ...]
     """The ten worst, the worst one first."""
+
+    @property
+    def images(self) -> Images:
+        """Those of the first camera."""
+        return self.cameras[0]
 
     @property
     def causes(self) -> tuple[tuple[str, int], ...]:
@@ -72,24 +81,43 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         MavbridgeError: it is no recorded flight, or a damaged one.
     """
     flight = open_flight(folder)
+    _require_sound(flight)
     ticks = [row.tick for row in flight.tick_rows()]
     frames = list(flight.frame_rows())
     series = make_series(flight, ticks)
     stick_hz = _stick_hz(ticks, flight.meta)
-    delays = find_delays(ticks, stick_hz=stick_hz, action_hz=flight.meta.action_hz)
+    delays = find_delays(
+        ticks,
+        stick_hz=stick_hz,
+        action_hz=flight.meta.action_hz,
+        arrivals=read_arrivals(folder),
+    )
+    limits = flown_limits(folder, flight.meta.contract)
     return FlightAnalysis(
         folder=folder,
         meta=flight.meta,
         stick_hz=stick_hz,
         report=_report(flight, ticks, frames, stick_hz),
         series=series,
-        images=_images(flight, frames, series.start_ns),
+        cameras=tuple(_cameras(flight, frames, series.start_ns)),
         track=read_track(flight, series, frames),
         gates=course_gates(flight.meta.course_seed) if gates is None else read_gates(gates),
         holders=holder_spans(ticks, series.start_ns),
         delays=delays,
-        moments=worst_moments(flight, ticks, frames, delays),
+        moments=worst_moments(flight, ticks, frames, delays, limits),
     )
+
+
+def _require_sound(flight: RecordedFlight) -> None:
+    """Refuse facts with which nothing can be counted; raises FlightError."""
+    meta = flight.meta
+    for name in ("action_hz", "visual_hz"):
+        if getattr(meta, name) <= 0:
+            raise FlightError(f"{flight.folder}: {name} of meta.json is no rate above zero")
+    for name in ("course_seed", "ticks_dropped", "frames_dropped", "packets_dropped"):
+        value = getattr(meta, name)
+        if value is not None and (not isinstance(value, int) or value < 0):
+            raise FlightError(f"{flight.folder}: {name} of meta.json is {value!r}, no whole number")
 
 
 def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
@@ -105,44 +133,75 @@ def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
 def _report(
     flight: RecordedFlight, ticks: list[Tick], frames: list[FrameRow], stick_hz: float
 ) -> TimingReport:
-    """Count the rows as they were counted in flight."""
+    """Count the rows as they were counted in flight, but for what only a flight knows."""
     meta = flight.meta
     timing = FlightTiming(stick_hz=stick_hz, action_hz=meta.action_hz, vision_hz=meta.visual_hz)
-    dropped = 0
-    for serial, frame in enumerate(frames):
-        dropped += frame.dropped_before
-        timing.emit(
-            VisionTick(
-                serial=serial,
-                frame_id=frame.frame_id,
-                captured_ns=frame.captured_ns,
-                started_ns=frame.captured_ns,
-                ready_ns=frame.ready_ns,
-                dropped_frames=dropped,
-                rgb=_NO_IMAGE,
-            )
-        )
-    for tick in ticks:
+    for tick in _with_gaps(ticks):
         timing.emit(tick)
-    losses = (meta.ticks_dropped, meta.frames_dropped, meta.packets_dropped)
     report = timing.report(
         mode=meta.mode,
         engine=meta.engine or "an engine that is not known",
         policy=meta.policy or meta.source,
         autopilot=meta.autopilot,
         link=None,
-        observer_drops=ObserverDrops(rerun=None, recorder=sum(loss or 0 for loss in losses)),
+        observer_drops=ObserverDrops(rerun=None, recorder=_losses(flight)),
     )
-    # A recording has no stamp for the start of an encoding: ``Images.latency_ms`` is measured.
-    return replace(report, vision=replace(report.vision, encode_ms=None))
+    return replace(report, vision=_vision(frames, meta.visual_hz))
 
 
-def _images(flight: RecordedFlight, frames: list[FrameRow], start_ns: int) -> Images:
+def _with_gaps(ticks: Sequence[Tick]) -> Iterator[Tick]:
+    """The ticks, and one without sticks wherever the recorder has lost some: nothing is measured
+    across such a gap."""
+    yield from ticks[:1]
+    for last, tick in pairwise(ticks):
+        if is_gap(last, tick):
+            yield replace(last, trace=None)
+        yield tick
+
+
+def _losses(flight: RecordedFlight) -> int:
+    """What the recorder has lost; of a recording that was cut off, up to its last row."""
+    meta = flight.meta
+    counts = (meta.ticks_dropped, meta.frames_dropped, meta.packets_dropped)
+    if any(count is not None for count in counts):
+        return sum(count or 0 for count in counts)
+    tables = (flight.ticks, flight.frames)
+    return sum(sum(table.column("dropped_before").to_pylist()) for table in tables)
+
+
+def _vision(frames: Sequence[FrameRow], visual_hz: float) -> VisionReport:
+    """Images by their exposures, with those that only the recorder has lost.
+
+    A recording knows neither what the camera dropped nor when an encoding began.
+    """
+    count = sum(1 + frame.dropped_before for frame in frames)
+    rate_hz: float | None = None
+    if len(frames) > 1 and (span_ns := frames[-1].captured_ns - frames[0].captured_ns) > 0:
+        intervals = count - 1 - frames[0].dropped_before
+        rate_hz = round(intervals * NS_PER_S / span_ns, 3)
+    return VisionReport(
+        target_hz=visual_hz, rate_hz=rate_hz, frames=count, dropped_frames=None, encode_ms=None
+    )
+
+
+def _cameras(flight: RecordedFlight, frames: Sequence[FrameRow], start_ns: int) -> Iterator[Images]:
+    contract = flight.meta.contract
+    names = ("front",) if contract is None else contract.cameras
+    yield _images(names[0], flight, frames, start_ns)
+    for name in names[1:]:
+        other = open_flight(flight.folder, name)
+        yield _images(name, other, list(other.frame_rows()), start_ns)
+
+
+def _images(
+    camera: str, flight: RecordedFlight, frames: Sequence[FrameRow], start_ns: int
+) -> Images:
     latency = Histogram()
     for frame in frames:
         latency.add(frame.ready_ns - frame.captured_ns)
     exposed_ns = np.array([frame.captured_ns for frame in frames], np.int64)
     return Images(
+        camera=camera,
         video=flight.folder / flight.video,
         exposed_s=(exposed_ns - start_ns) / NS_PER_S,
         latency_ms=latency.percentiles_ms(),

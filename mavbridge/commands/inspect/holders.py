@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
@@ -21,7 +22,7 @@ class HolderSpan:
     end_s: float
     holder: Holder
     reason: str
-    """Why the policy did not fly; empty while it did."""
+    """Why the policy did not fly, for most of the time; empty while it did."""
 
 
 def holder_of(tick: Tick) -> Holder:
@@ -34,20 +35,23 @@ def holder_of(tick: Tick) -> Holder:
 
 
 def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]:
-    """Stretches in the order of time; a new reason while nothing is sent does not begin one."""
+    """Stretches in the order of time; a new reason does not begin one, the longest one is told."""
     spans: list[HolderSpan] = []
-    for number, tick in enumerate(ticks):
-        at_s = (tick.woke_ns - start_ns) / NS_PER_S
-        end_s = at_s
-        if number + 1 < len(ticks):
-            end_s = (ticks[number + 1].woke_ns - start_ns) / NS_PER_S
-        holder = holder_of(tick)
-        if spans and spans[-1].holder == holder:
-            last = spans[-1]
-            spans[-1] = HolderSpan(
-                start_s=last.start_s, end_s=end_s, holder=holder, reason=last.reason
-            )
-        else:
+    at = 0
+    for holder, group in groupby(ticks, holder_of):
+        first = at
+        lasted_ns: dict[str, int] = {}
+        for tick in group:
+            at += 1
+            end_ns = ticks[min(at, len(ticks) - 1)].woke_ns
             reason = "" if tick.trace is not None else tick.release_reason or ""
-            spans.append(HolderSpan(start_s=at_s, end_s=end_s, holder=holder, reason=reason))
+            lasted_ns[reason] = lasted_ns.get(reason, 0) + end_ns - tick.woke_ns
+        spans.append(
+            HolderSpan(
+                start_s=(ticks[first].woke_ns - start_ns) / NS_PER_S,
+                end_s=(end_ns - start_ns) / NS_PER_S,
+                holder=holder,
+                reason=max(lasted_ns, key=lasted_ns.__getitem__),
+            )
+        )
     return tuple(spans)

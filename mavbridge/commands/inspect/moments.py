@@ -1,43 +1,31 @@
-"""What went wrong in a recorded flight, when, and why."""
+"""The moments of a recorded flight that went worst, and what happened in them."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Literal
+from dataclasses import dataclass, replace
+from itertools import groupby, pairwise
 
+from mavbridge.commands.inspect.delays import Delay
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick
-from mavbridge.observe.timing import LATE_PERIODS
+from mavbridge.gate.chunks import FreshnessLimits
+from mavbridge.gate.engagement import OPERATOR
+from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import FrameRow
 
-Cause = Literal[
-    "the gate woke late",
-    "sending took long",
-    "the policy took long",
-    "the attitude came late",
-    "the policy loop began late",
-]
 MOMENTS = 10
 APART_S = 0.25
-"""Of moments that are closer together, the worst one is told."""
-RELEASE_MS = 10_000.0
-"""Weight of a release that nobody asked for: worse than any delay."""
+"""Moments that are closer together are told as one."""
+CRASH_MS, END_MS = 20_000.0, 10_000.0
+"""Weights of a crash, and of an end that nobody had planned: worse than any delay."""
 IMAGE_PERIODS = 2.0
 """A gap between two exposures beyond this many periods is worth telling."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Delay:
-    """A late chunk, or missed slots in a row."""
-
-    at_ns: int
-    what: Literal["late chunk", "missed slots"]
-    count: int
-    """Slots that were missed; 1 for a chunk."""
-    delay_ms: float
-    """Time beyond the period."""
-    cause: Cause
+LEAST_MS = 1.0
+"""Coasting that ends sooner, by a chunk between two slots, is not told."""
+PLANNED_ENDS = frozenset(
+    {"the flight is over", "the flight was ended by a signal", "the vehicle has landed", OPERATOR}
+)
+"""Reasons of releases with which nothing went wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,102 +41,91 @@ class Moment:
     """Figures and cause, as a phrase."""
 
 
-def find_delays(ticks: Sequence[Tick], *, stick_hz: float, action_hz: float) -> tuple[Delay, ...]:
-    """Missed slots and late chunks while the policy flew, in the order of time."""
-    slot_ns, chunk_ns = NS_PER_S / stick_hz, NS_PER_S / action_hz
-    found = [*_missed_slots(ticks, slot_ns), *_late_chunks(ticks, chunk_ns)]
-    return tuple(sorted(found, key=lambda delay: delay.at_ns))
-
-
-def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[Delay]:
-    for last, tick in pairwise(ticks):
-        if last.trace is None or tick.trace is None or not tick.missed_slots:
-            continue
-        is_slow_send = last.sent_ns - last.woke_ns > slot_ns / 2
-        yield Delay(
-            at_ns=tick.woke_ns,
-            what="missed slots",
-            count=tick.missed_slots,
-            delay_ms=max(0.0, tick.sent_ns - last.sent_ns - slot_ns) / NS_PER_MS,
-            cause="sending took long" if is_slow_send else "the gate woke late",
-        )
-
-
-def _late_chunks(ticks: Sequence[Tick], chunk_ns: float) -> Iterator[Delay]:
-    last: Tick | None = None
-    for tick in ticks:
-        if tick.trace is None or tick.chunk_serial is None or tick.chunk_computed_ns is None:
-            last = None
-            continue
-        if last is not None and last.chunk_serial == tick.chunk_serial:
-            continue
-        if last is not None and (delay := _late_chunk(last, tick, chunk_ns)) is not None:
-            yield delay
-        last = tick
-
-
-def _late_chunk(last: Tick, tick: Tick, chunk_ns: float) -> Delay | None:
-    """A chunk beyond ``LATE_PERIODS`` after the one before, and the first stage that was late."""
-    if None in (last.chunk_serial, tick.chunk_serial, last.chunk_computed_ns):
-        return None
-    count = (tick.chunk_serial or 0) - (last.chunk_serial or 0)
-    period_ns = (tick.chunk_computed_ns or 0) - (last.chunk_computed_ns or 0)
-    if count < 1 or period_ns / count <= LATE_PERIODS * chunk_ns:
-        return None
-    cause: Cause = "the policy loop began late"
-    if (tick.predict_ns or 0) > chunk_ns:
-        cause = "the policy took long"
-    elif last.state is not None and tick.state is not None:
-        apart_ns = tick.state.attitude_ns - last.state.attitude_ns
-        if apart_ns / count > LATE_PERIODS * chunk_ns:
-            cause = "the attitude came late"
-    return Delay(
-        at_ns=tick.woke_ns,
-        what="late chunk",
-        count=1,
-        delay_ms=(period_ns / count - chunk_ns) / NS_PER_MS,
-        cause=cause,
-    )
-
-
 def worst_moments(
     flight: RecordedFlight,
     ticks: Sequence[Tick],
     frames: Sequence[FrameRow],
     delays: Sequence[Delay],
+    limits: FreshnessLimits | None = None,
 ) -> tuple[Moment, ...]:
-    """The ``MOMENTS`` worst, at least ``APART_S`` apart, the worst one first."""
+    """The ``MOMENTS`` worst, at least ``APART_S`` apart, the worst one first.
+
+    ``limits`` are the ages at which chunks were flown; None: not known.
+    """
     if not ticks:
         return ()
     start_ns = ticks[0].woke_ns
     found = [
-        *_releases(ticks, start_ns),
+        *_crash(flight, ticks),
+        *_ends(ticks, start_ns),
         *_delay_moments(delays, start_ns),
-        *_coasting(ticks, start_ns),
-        *_oldest_image(ticks, start_ns),
+        *_coasting(ticks, limits),
+        *_old_images(ticks, start_ns),
         *_image_gaps(flight, frames, ticks),
         *_rows_lost(flight, start_ns),
     ]
-    chosen: list[Moment] = []
+    groups: list[list[Moment]] = []
     for moment in sorted(found, key=lambda moment: -moment.severity_ms):
-        if all(abs(moment.t_s - other.t_s) >= APART_S for other in chosen):
-            chosen.append(moment)
-    return tuple(chosen[:MOMENTS])
+        near = [group for group in groups if abs(moment.t_s - group[0].t_s) < APART_S]
+        if not near:
+            groups.append([moment])
+        elif all(moment.what != other.what for other in near[0]):
+            near[0].append(moment)
+    return tuple(_told_together(group) for group in groups[:MOMENTS])
+
+
+def _told_together(group: Sequence[Moment]) -> Moment:
+    """The worst of close moments, with the worst one of each other kind in its detail."""
+    worst, *others = group
+    phrases = [worst.detail, *(f"{other.what}: {other.detail}" for other in others)]
+    return replace(worst, detail="; ".join(phrases))
 
 
 def _since_s(at_ns: int, start_ns: int) -> float:
     return (at_ns - start_ns) / NS_PER_S
 
 
-def _releases(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
-    for last, tick in pairwise(ticks):
-        if last.trace is not None and tick.trace is None:
+def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
+    """When the ticks show a crash; of a recording that was cut off nobody has said so yet."""
+    if flight.meta.finished and flight.meta.crash is None:
+        return
+    watch = CrashWatch()
+    for tick in ticks:
+        watch.see(tick)
+        if watch.reason is not None:
             yield Moment(
-                t_s=_since_s(tick.woke_ns, start_ns),
-                what="the policy's flight ended",
-                severity_ms=RELEASE_MS,
-                detail=tick.release_reason or "no reason was recorded",
+                t_s=_since_s(tick.woke_ns, ticks[0].woke_ns),
+                what="crash",
+                severity_ms=CRASH_MS,
+                detail=watch.reason,
             )
+            return
+
+
+def _ends(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
+    for last, tick in pairwise(ticks):
+        reason = tick.release_reason
+        is_planned = reason in PLANNED_ENDS or (tick.phase == "ended" and not reason)
+        if last.trace is None or tick.trace is not None or is_planned:
+            continue
+        yield Moment(
+            t_s=_since_s(tick.woke_ns, start_ns),
+            what="the policy's flight ended",
+            severity_ms=END_MS,
+            detail=f"{reason or 'no reason was recorded'}{_ages(last)}",
+        )
+
+
+def _ages(tick: Tick) -> str:
+    """What the sticks of a tick came from, as the end of a phrase."""
+    parts = []
+    if tick.state is not None:
+        age_ms = (tick.sent_ns - tick.state.attitude_ns) / NS_PER_MS
+        parts.append(f"an attitude of {age_ms:.0f} ms ago")
+    if tick.feature_captured_ns is not None:
+        age_ms = (tick.sent_ns - tick.feature_captured_ns) / NS_PER_MS
+        parts.append(f"an image of {age_ms:.0f} ms ago")
+    return f"; its last sticks were by {' and '.join(parts)}" if parts else ""
 
 
 def _delay_moments(delays: Sequence[Delay], start_ns: int) -> Iterator[Moment]:
@@ -164,51 +141,74 @@ def _delay_moments(delays: Sequence[Delay], start_ns: int) -> Iterator[Moment]:
         )
 
 
-def _coasting(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
-    began: Tick | None = None
-    for tick in ticks:
-        if tick.is_coasting and tick.trace is not None:
-            began = began or tick
-        elif began is not None:
-            lasted_ms = (tick.woke_ns - began.woke_ns) / NS_PER_MS
-            yield Moment(
-                t_s=_since_s(began.woke_ns, start_ns),
-                what="coasting",
-                severity_ms=lasted_ms,
-                detail=f"for {lasted_ms:.0f} ms no chunk came that could be flown",
-            )
-            began = None
+def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator[Moment]:
+    """Sends along a chunk that was too old, up to the first send that was not."""
+    at = 0
+    for is_coasting, group in groupby(ticks, lambda tick: tick.is_coasting and bool(tick.trace)):
+        run = list(group)
+        at += len(run)
+        if not is_coasting:
+            continue
+        end_ns = ticks[at].woke_ns if at < len(ticks) else run[-1].sent_ns
+        lasted_ms = (end_ns - run[0].woke_ns) / NS_PER_MS
+        if lasted_ms < LEAST_MS:
+            continue
+        yield Moment(
+            t_s=_since_s(run[0].woke_ns, ticks[0].woke_ns),
+            what="coasting",
+            severity_ms=lasted_ms,
+            detail=f"for {lasted_ms:.0f} ms along an old chunk: {_staleness(run[0], limits)}",
+        )
 
 
-def _oldest_image(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
-    """The sticks with the oldest image, where it is twice as old as usual."""
-    ages = [
+def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
+    """Why the chunk of a tick was too old; the order is that of the gate's own check."""
+    state = tick.state
+    if limits is not None and state is not None:
+        ages = (
+            ("attitude", state.attitude_ns, limits.state_ns),
+            ("velocity", state.velocity_ns, limits.velocity_ns),
+            ("image", tick.feature_captured_ns, limits.feature_ns),
+            ("chunk", tick.chunk_computed_ns, limits.chunk_ns),
+        )
+        decided_ns = tick.sent_ns if tick.decided_ns is None else tick.decided_ns
+        for name, happened_ns, limit_ns in ages:
+            if happened_ns is not None and decided_ns - happened_ns > limit_ns:
+                age_ms = (decided_ns - happened_ns) / NS_PER_MS
+                return f"its {name} was {age_ms:.0f} ms old, beyond {limit_ns / NS_PER_MS:.0f} ms"
+    return "no newer one came in time"
+
+
+def _old_images(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
+    """Of each stretch of sticks by images twice as old as usual, the ones by the oldest."""
+    aged = [
         (tick.sent_ns - tick.feature_captured_ns, tick)
         for tick in ticks
         if tick.trace is not None and tick.feature_captured_ns is not None
     ]
-    if not ages:
+    if not aged:
         return
-    usual_ns = sorted(age_ns for age_ns, _ in ages)[len(ages) // 2]
-    age_ns, tick = max(ages, key=lambda pair: pair[0])
-    if age_ns > 2 * usual_ns:
-        yield Moment(
-            t_s=_since_s(tick.woke_ns, start_ns),
-            what="old image",
-            severity_ms=(age_ns - usual_ns) / NS_PER_MS,
-            detail=f"sticks by an image of {age_ns / NS_PER_MS:.0f} ms ago",
-        )
+    usual_ns = sorted(age_ns for age_ns, _ in aged)[len(aged) // 2]
+    for is_old, group in groupby(aged, lambda pair: pair[0] > 2 * usual_ns):
+        if is_old:
+            age_ns, tick = max(group, key=lambda pair: pair[0])
+            yield Moment(
+                t_s=_since_s(tick.woke_ns, start_ns),
+                what="old image",
+                severity_ms=(age_ns - usual_ns) / NS_PER_MS,
+                detail=f"sticks by an image of {age_ns / NS_PER_MS:.0f} ms ago",
+            )
 
 
 def _image_gaps(
     flight: RecordedFlight, frames: Sequence[FrameRow], ticks: Sequence[Tick]
 ) -> Iterator[Moment]:
-    """Gaps between exposures from the first tick to the last."""
+    """Gaps between exposures from the first tick to the last, without those of the recorder."""
     period_ms = 1000 / flight.meta.visual_hz
     for last, frame in pairwise(frames):
         gap_ms = (frame.captured_ns - last.captured_ns) / NS_PER_MS
         is_in_flight = ticks[0].woke_ns <= frame.captured_ns <= ticks[-1].woke_ns
-        if gap_ms > IMAGE_PERIODS * period_ms and is_in_flight:
+        if gap_ms > IMAGE_PERIODS * period_ms and is_in_flight and not frame.dropped_before:
             yield Moment(
                 t_s=_since_s(frame.captured_ns, ticks[0].woke_ns),
                 what="gap between images",
@@ -227,5 +227,6 @@ def _rows_lost(flight: RecordedFlight, start_ns: int) -> Iterator[Moment]:
                 t_s=_since_s(at_ns, start_ns),
                 what="rows lost",
                 severity_ms=lost_ms,
-                detail=f"{count} ticks before this are not in the recording: the disk was slow",
+                detail=f"{count} ticks before this are not in the recording: the recorder fell "
+                "behind",
             )

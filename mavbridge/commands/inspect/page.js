@@ -67,7 +67,7 @@ function axes(c, width, height, box, x, y) {
   c.textAlign = "center";
   for (const value of steps(x.low, x.high, Math.max(2, width / 90))) {
     const at = x.at(value);
-    if (at > box.left + 4 && at < box.right - 8) c.fillText(shown(value), at, height - 5);
+    if (at > box.left + 4 && at < box.right - 14) c.fillText(shown(value), at, height - 5);
   }
 }
 
@@ -83,6 +83,13 @@ class Timeline {
     this.window = [0, end];
     this.cursor = null;
     this.listeners = [];
+    this.players = [];
+  }
+  /** Goes to a moment, also where a video plays, and shows a second on either side. */
+  jump(t) {
+    for (const player of this.players) player.pause();
+    this.cursor = t;
+    this.zoom(Math.max(t - 1, 0), Math.min(t + 1, this.end));
   }
   look(t) { this.cursor = t; this.tell(); }
   zoom(from, to) { this.window = [from, to]; this.tell(); }
@@ -152,6 +159,7 @@ class Plot {
     const x = scaleOf(from, to, box.left, box.right);
     const y = scaleOf(...this.range(first, last), box.bottom, box.top);
     axes(c, width, this.height, box, x, y);
+    c.fillText("s", box.right - 3, this.height - 5);
     c.save();
     c.beginPath(); c.rect(box.left, 0, box.right - box.left, this.height); c.clip();
     for (const limit of this.plot.limits || []) {
@@ -159,7 +167,10 @@ class Plot {
       c.beginPath(); c.moveTo(box.left, y.at(limit)); c.lineTo(box.right, y.at(limit)); c.stroke();
       c.setLineDash([]);
     }
-    this.values.forEach((values, number) => this.line(c, values, color(number), first, last, x, y));
+    this.values.forEach((values, number) => {
+      c.lineWidth = this.plot.series[number].width || 1.4;
+      this.line(c, values, color(number), first, last, x, y);
+    });
     if (this.timeline.cursor !== null) {
       c.strokeStyle = css("--ink"); c.lineWidth = 1;
       const at = x.at(this.timeline.cursor);
@@ -169,7 +180,7 @@ class Plot {
     this.tellValues();
   }
   line(c, values, stroke, first, last, x, y) {
-    c.strokeStyle = stroke; c.lineWidth = 1.4; c.lineJoin = "round";
+    c.strokeStyle = stroke; c.lineJoin = "round";
     c.beginPath();
     let column = null, low = 0, high = 0, isDown = false;
     const flush = () => {
@@ -276,7 +287,7 @@ class Path {
     this.points = Array.from(n, (_, k) => [e[k], n[k], -d[k]]);
     this.gates = flight.gates.map((gate) => this.corners(gate));
     const pair = add(parent, "div", undefined, "pair");
-    this.canvases = ["From above, north is up [m]", "Path: drag to turn it"].map((title) => {
+    this.canvases = ["From above [m]: north is up, east is right", "Path: drag to turn it"].map((title) => {
       const side = add(pair, "div");
       add(side, "h2", title);
       return add(add(side, "div"), "canvas");
@@ -352,6 +363,7 @@ function addVideo(parent, video, timeline) {
   const player = add(parent, "video");
   player.controls = true; player.muted = true; player.preload = "auto";
   player.src = video.source;
+  timeline.players.push(player);
   const exposed = floats(video.exposed_s);
   timeline.listeners.push(() => {
     if (timeline.cursor === null || !player.paused) return;
@@ -375,10 +387,7 @@ function addMoments(parent, moments, timeline) {
     row.dataset.t = moment.t_s;
     row.tabIndex = 0;
     for (const text of [moment.t_s.toFixed(2), moment.what, moment.detail]) add(row, "td", text);
-    const go = () => {
-      timeline.cursor = moment.t_s;
-      timeline.zoom(Math.max(moment.t_s - 1, 0), Math.min(moment.t_s + 1, timeline.end));
-    };
+    const go = () => timeline.jump(moment.t_s);
     row.addEventListener("click", go);
     row.addEventListener("keydown", (event) => { if (event.key === "Enter") go(); });
   }

@@ -21,6 +21,9 @@ MAX_POINTS = 20_000
 MAX_VIDEO_BYTES = 40_000_000
 """A larger video stays beside the page: browsers become slow with much more in one address."""
 BINS = 40
+ECHO = "vehicle's echo"
+ECHO_WIDTH, LINE_WIDTH = 5.0, 1.4
+"""Pixels. The echo lies under the sticks, and shows on both sides of them where they agree."""
 _HERE = files("mavbridge.commands.inspect")
 
 
@@ -47,7 +50,9 @@ def write_page(path: Path, flights: Sequence[FlightAnalysis]) -> None:
 
 def page_data(flights: Sequence[FlightAnalysis]) -> str:
     """The JSON in the page; no ``<`` is in it, so no name can end its element."""
-    return json.dumps([_flight(flight) for flight in flights]).replace("<", "\\u003c")
+    return json.dumps([_flight(flight) for flight in flights], allow_nan=False).replace(
+        "<", "\\u003c"
+    )
 
 
 def _flight(flight: FlightAnalysis) -> dict[str, Any]:
@@ -86,7 +91,7 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     yield "sticks", f"{flight.stick_hz:g} Hz grid, {missed}", sticks.missed_slots > 0
     for name, hz, target_hz, rest in (
         ("chunks", action.rate_hz, action.target_hz, f"{action.late_chunks} late"),
-        ("images", vision.rate_hz, vision.target_hz, f"{vision.dropped_frames} dropped"),
+        ("images", vision.rate_hz, vision.target_hz, f"{vision.frames} in all"),
     ):
         shown = "-" if hz is None else f"{hz:.1f}"
         is_slow = hz is not None and hz < 0.9 * target_hz
@@ -100,7 +105,7 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
         if measured is not None:
             yield name, _percentiles(measured), False
     for cause, count in flight.causes:
-        yield "delayed", f"{count} times: {cause}", False
+        yield "delayed", f"{cause} ({count})", False
 
 
 def _percentiles(measured: Percentiles) -> str:
@@ -112,7 +117,7 @@ def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
     is_sticks = series.action_names == ("throttle", "yaw", "pitch", "roll")
     for axis, name in enumerate(series.action_names):
         columns = {
-            "vehicle's echo": series.echo[:, axis] if is_sticks else np.array([np.nan]),
+            ECHO: series.echo[:, axis] if is_sticks else np.array([np.nan]),
             "raw": series.raw[:, axis],
             "smoothed": series.smoothed[:, axis],
             "sent": series.sent[:, axis],
@@ -122,8 +127,9 @@ def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
         yield _plot(title, "", columns) | limits
     ages = {"feature": series.feature_age_ms, "attitude": series.state_age_ms}
     yield _plot("Age when sent", "ms", ages) | {"fromZero": True}
-    lateness = {"sticks after their slot": series.lateness_ms}
-    yield _plot("Lateness", "ms", lateness) | {"fromZero": True}
+    if np.nanmax(series.lateness_ms, initial=0.0) > 0:  # none in simulated time
+        lateness = {"sticks after their slot": series.lateness_ms}
+        yield _plot("Lateness", "ms", lateness) | {"fromZero": True}
     for title, unit, names, values in (
         ("Velocity", "m/s", ("north", "east", "down"), series.velocity_ned_mps),
         ("Attitude", "deg", ("roll", "pitch", "yaw"), series.roll_pitch_yaw_deg),
@@ -140,7 +146,12 @@ def _plot(title: str, unit: str, columns: dict[str, FloatColumn]) -> dict[str, A
         "title": title,
         "unit": unit,
         "series": [
-            {"name": name, "values": _packed(_thinned(values))} for name, values in known.items()
+            {
+                "name": name,
+                "values": _packed(_thinned(values)),
+                "width": ECHO_WIDTH if name == ECHO else LINE_WIDTH,
+            }
+            for name, values in known.items()
         ],
     }
 

@@ -11,18 +11,18 @@ from pathlib import Path
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
 from mavbridge.commands.inspect.config import InspectConfig
 from mavbridge.commands.inspect.page import write_page
+from mavbridge.commands.inspect.sources import flown_limits, recorded_solves
 from mavbridge.commands.inspect.tables import print_comparison, print_flight
 from mavbridge.commands.output import print_status, table_console
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
-from mavbridge.core.records import Observed, Tick, VisionTick
+from mavbridge.core.records import Observed, Solve, Tick, VisionTick
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
-from mavbridge.recording import replay_rows
+from mavbridge.observe.viewer.target import check_target
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-from mavbridge.recording.folder import SOLVES
-from mavbridge.recording.tables import TableError, read_table
 from policy.contract import Contract
 
 MAX_FLIGHTS = 2
@@ -42,6 +42,7 @@ def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
         raise UserError("--rerun shows one flight: name only that one")
     require_writable(config.html, "--html")
     require_writable(config.json, "--json")
+    check_target(config.rerun)
     analyses = [analyse(folder, gates=config.gates) for folder in flights]
     console = table_console()
     if len(analyses) == 1:
@@ -65,7 +66,10 @@ def to_json(analyses: Sequence[FlightAnalysis]) -> str:
             "folder": str(flight.folder),
             "stick_hz": flight.stick_hz,
             "report": asdict(flight.report),
-            "image_latency_ms": flight.images.latency_ms and asdict(flight.images.latency_ms),
+            "image_latency_ms": {
+                images.camera: images.latency_ms and asdict(images.latency_ms)
+                for images in flight.cameras
+            },
             "causes": dict(flight.causes),
             "holders": [asdict(span) for span in flight.holders],
             "moments": [asdict(moment) for moment in flight.moments],
@@ -78,6 +82,7 @@ def to_json(analyses: Sequence[FlightAnalysis]) -> str:
 def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
     """Send the whole recording to the viewer of live flights."""
     meta, contract = flight.meta, flight.meta.contract or Contract()
+    limits = flown_limits(flight.folder, meta.contract)
     view = RerunView(
         target,
         ViewedFlight(
@@ -85,44 +90,39 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
             chunk_hz=meta.action_hz,
             stick_hz=flight.stick_hz,
             contract=contract,
-            max_state_age_s=contract.max_state_age_s + contract.play_s,
-            max_feature_age_s=contract.max_feature_age_s + contract.play_s,
+            max_state_age_s=None if limits is None else limits.state_ns / NS_PER_S,
+            max_feature_age_s=None if limits is None else limits.feature_ns / NS_PER_S,
             to_ned=action_frame(contract).to_gate,
             gates=flight.gates,
         ),
     )
     with closing(view):
-        events = _events(flight.folder)
+        events = _events(flight.folder, meta.contract)
         while batch := list(islice(events, BATCH_EVENTS)):
             view.consume(batch)
 
 
-def _events(folder: Path) -> Iterator[Observed]:
-    """Ticks, solves and images of the first camera in the order of time."""
-    recorded = open_flight(folder)
-    ticks: Iterator[Observed] = (row.tick for row in recorded.tick_rows())
-    return heapq.merge(ticks, _solves(recorded), _images(recorded), key=_at_ns)
+def _events(folder: Path, contract: Contract | None) -> Iterator[Observed]:
+    """Ticks, solves, and the images of all cameras, in the order of time."""
+    first = open_flight(folder)
+    others = () if contract is None else contract.cameras[1:]
+    cameras = [first, *(open_flight(folder, name) for name in others)]
+    ticks: Iterator[Observed] = (row.tick for row in first.tick_rows())
+    images = [_images(recorded, number) for number, recorded in enumerate(cameras)]
+    return heapq.merge(ticks, recorded_solves(folder, contract), *images, key=_at_ns)
 
 
 def _at_ns(event: Observed) -> int:
-    if isinstance(event, Tick):
-        return event.woke_ns
-    return event.ready_ns if isinstance(event, VisionTick) else event.computed_ns
+    match event:
+        case Tick():
+            return event.woke_ns
+        case VisionTick():
+            return event.ready_ns
+        case Solve():
+            return event.computed_ns
 
 
-def _solves(recorded: RecordedFlight) -> Iterator[Observed]:
-    """None where the recording holds none: no policy flew, or it is an old one."""
-    if recorded.meta.contract is None:
-        return
-    try:
-        table = read_table(recorded.folder / SOLVES, replay_rows.SOLVES)
-    except TableError:
-        return
-    for row in replay_rows.read_solves(table, recorded.meta.contract):
-        yield row.solve
-
-
-def _images(recorded: RecordedFlight) -> Iterator[Observed]:
+def _images(recorded: RecordedFlight, camera: int) -> Iterator[Observed]:
     dropped = 0
     pairs = zip(recorded.frame_rows(), recorded.images(), strict=True)
     for serial, (row, image) in enumerate(pairs):
@@ -135,4 +135,5 @@ def _images(recorded: RecordedFlight) -> Iterator[Observed]:
             ready_ns=row.ready_ns,
             dropped_frames=dropped,
             rgb=image,
+            camera=camera,
         )

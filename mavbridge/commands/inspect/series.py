@@ -7,6 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mavbridge.commands.inspect.delays import is_gap
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick
 from mavbridge.recording.flight_folder import RecordedFlight
@@ -116,11 +117,15 @@ def _feature_age_ns(tick: Tick) -> int | None:
 
 
 def _periods_ms(ticks: Sequence[Tick]) -> FloatColumn:
-    """Time between the sends of two slots of which the policy flew both."""
+    """Time between the sends of two slots of which the policy flew both, and no tick was lost."""
     periods_ns: list[int | None] = []
     last_ns: int | None = None
+    before: Tick | None = None
     for tick in ticks:
         is_flown = tick.trace is not None
+        if before is not None and is_gap(before, tick):
+            last_ns = None
+        before = tick
         periods_ns.append(None)
         if is_flown and tick.is_slot:
             periods_ns[-1] = None if last_ns is None else tick.sent_ns - last_ns

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -10,7 +11,7 @@ from rich.text import Text
 from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.holders import HolderSpan
 from mavbridge.core.vehicle import Percentiles
-from mavbridge.observe.report_table import timing_table, verdicts
+from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
 
 HOLDERS_SHOWN = 12
 NOTABLE = 0.1
@@ -41,16 +42,17 @@ def print_flight(flight: FlightAnalysis, console: Console) -> None:
         console.print(line)
     if (table := timing_table(flight.report)) is not None:
         console.print(table)
-    for line in verdicts(flight.report):
+    for line in _pilot_lines(flight) if flight.meta.source == "pilot" else verdicts(flight.report):
         console.print(line)
-    if flight.images.latency_ms is not None:
-        latency = flight.images.latency_ms
-        text = f"p50 {latency.p50:.1f}, p99 {latency.p99:.1f} ms from exposure to feature"
-        console.print(Text.assemble(("images   ", "bold"), text))
+    for images in flight.cameras:
+        if (latency := images.latency_ms) is not None:
+            text = f"p50 {latency.p50:.1f}, p99 {latency.p99:.1f} ms from exposure to feature"
+            name = f"{images.camera}: " if len(flight.cameras) > 1 else ""
+            console.print(Text.assemble(("images   ", "bold"), name + text))
     if flight.causes:
         causes = ", ".join(f"{cause} ({count})" for cause, count in flight.causes)
         console.print(Text.assemble(("causes   ", "bold"), (causes, "yellow")))
-    console.print(_holders_table(flight.holders))
+    console.print(_holders_table(flight))
     console.print(_moments_table(flight))
 
 
@@ -71,6 +73,23 @@ def _facts(flight: FlightAnalysis) -> Iterator[Text]:
         yield Text(f"highest {heights_m.max():.1f} m, path of {path_length_m(flight):.0f} m")
 
 
+def _pilot_lines(flight: FlightAnalysis) -> Iterator[Text]:
+    """What takes the place of the loops' verdicts where no policy flew."""
+    t_s, vision = flight.series.t_s, flight.report.vision
+    rows_hz = (len(t_s) - 1) / t_s[-1] if len(t_s) > 1 and t_s[-1] > 0 else None
+    known = np.isfinite(flight.series.echo[:, 0])
+    share = f", the pilot's sticks known in {known.mean():.1%} of them" if len(known) else ""
+    for name, rate_hz, target_hz, rest in (
+        ("rows", rows_hz, flight.meta.action_hz, share),
+        ("vision", vision.rate_hz, vision.target_hz, ""),
+    ):
+        text = f"{shown_rate(rate_hz)} Hz of {target_hz:.4g} Hz{rest}"
+        yield Text.assemble((f"{name:9}", "bold"), (text, rate_style(rate_hz, target_hz)))
+    if flight.report.observer_drops.recorder:
+        text = f"missed {flight.report.observer_drops.recorder} events"
+        yield Text.assemble((f"{'recorder':9}", "bold"), (text, "yellow"))
+
+
 def path_length_m(flight: FlightAnalysis) -> float:
     """Length of the flown path; 0 where no position is known."""
     if flight.track is None:
@@ -80,7 +99,9 @@ def path_length_m(flight: FlightAnalysis) -> float:
     return float(((steps**2).sum(axis=1) ** 0.5).sum())
 
 
-def _holders_table(spans: Sequence[HolderSpan]) -> Table:
+def _holders_table(flight: FlightAnalysis) -> Table:
+    spans = flight.holders
+    is_expert = flight.meta.source == "demonstration"
     table = Table(title="Who held the sticks", title_justify="left")
     for name in ("from s", "to s"):
         table.add_column(name, justify="right")
@@ -88,7 +109,8 @@ def _holders_table(spans: Sequence[HolderSpan]) -> Table:
     table.add_column("why the policy did not fly")
     shown = spans if len(spans) <= HOLDERS_SHOWN else _longest(spans)
     for span in shown:
-        table.add_row(f"{span.start_s:.2f}", f"{span.end_s:.2f}", span.holder, Text(span.reason))
+        holder = "expert" if is_expert and span.holder == "policy" else span.holder
+        table.add_row(f"{span.start_s:.2f}", f"{span.end_s:.2f}", holder, Text(span.reason))
     if len(shown) < len(spans):
         table.caption = f"the {len(shown)} longest of {len(spans)}"
     return table
@@ -112,7 +134,7 @@ def _moments_table(flight: FlightAnalysis) -> Table | Text:
 
 
 def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> None:
-    """Two flights side by side; differences of a tenth and more are marked."""
+    """Two flights side by side; a tenth and more is marked as better or worse."""
     first, second = flights
     table = Table(title="Two flights", title_justify="left")
     table.add_column("", no_wrap=True)
@@ -170,10 +192,11 @@ def _difference(figure: Figure, one: float | None, other: float | None) -> Text:
         is_notable, shown = True, f"{other - one:+.{figure.digits}f}"
     else:
         is_notable, shown = abs(other / one - 1) >= NOTABLE, f"{other / one - 1:+.0%}"
-    style = ""
-    if is_notable and figure.more_is_better is not None:
-        style = "green" if (other > one) == figure.more_is_better else "red"
-    return Text(shown, style=style)
+    if not is_notable or figure.more_is_better is None:
+        return Text(shown)
+    if (other > one) == figure.more_is_better:
+        return Text(f"{shown} better", style="green")
+    return Text(f"{shown} worse", style="red")
 
 
 def _percentile(
@@ -195,7 +218,7 @@ def _percentile(
 FIGURES = (
     Figure("duration", "s", lambda f: f.report.duration_s, more_is_better=None),
     Figure("flown by the policy", "s", lambda f: f.report.sticks.flying_s, more_is_better=None),
-    Figure("sticks", "1/s", lambda f: f.report.sticks.rate_hz, more_is_better=True),
+    Figure("sticks", "1/s", lambda f: f.report.sticks.rate_hz, more_is_better=None),
     Figure("chunks", "1/s", lambda f: f.report.action.rate_hz, more_is_better=True),
     Figure("images", "1/s", lambda f: f.report.vision.rate_hz, more_is_better=True),
     Figure("missed slots", "", lambda f: f.report.sticks.missed_slots, 0),

@@ -9,6 +9,7 @@ import cv2
 
 from mavbridge.commands.output import print_status, require_outputs, table_console
 from mavbridge.commands.replay.config import ReplayConfig, ReplayFrom
+from mavbridge.commands.replay.others import replay_dataset, replay_log
 from mavbridge.commands.replay.results import ReplayResult, print_replay, to_json
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S
@@ -37,6 +38,7 @@ from mavbridge.simulation.replay.gate import (
 )
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
+from policy.data.lerobot import is_lerobot
 from policy.protocol import Executable
 
 VIDEO_TOLERANCE = 0.15
@@ -52,11 +54,19 @@ CLOCK_TOLERANCE = 0.01
 def replay(folder: Path, config: ReplayConfig) -> int:
     """Compute a recorded flight once more; returns an ``ExitCode``.
 
+    ``folder`` may be a recording of somebody else, see ``others``.
+
     Raises:
         MavbridgeError: the flight cannot be read or replayed, or the policy not be loaded.
     """
     require_extra("replay")
     require_outputs(config.json, config.plot)
+    if folder.is_file():
+        return replay_log(folder, other_config(FlyConfig(), config), config)
+    if config.video is not None:
+        raise UserError(f"--video belongs to a telemetry log, and {folder} is none")
+    if is_lerobot(folder):
+        return replay_dataset(folder, other_config(FlyConfig(), config), config)
     source = open_source(folder)
     chosen = _source_of(source, config)
     print_status(f"replaying {len(source.ticks)} ticks of {folder} through the gate")

@@ -127,9 +127,17 @@ def replay_gate(source: ReplaySource) -> list[GateStep]:
 def _keep_link(
     link: MavlinkLink, clock: SteppedClock, transport: "_RecordedTransport", until_ns: int
 ) -> None:
-    """Let the link receive and ask between two ticks, as it did: at each arrival, or soon."""
+    """Let the link receive and ask between two ticks, as it did: at each arrival, or soon.
+
+    It asks just before each arrival as well, since that may be the answer: a vehicle that is chosen
+    a moment later than then would not be listened to yet.
+    """
     while clock.now_ns() < until_ns:
         arrival_ns = transport.next_arrival_ns or until_ns
+        if arrival_ns - 1 > clock.now_ns():
+            clock.sleep_until_ns(min(arrival_ns - 1, clock.now_ns() + PREPARE_NS, until_ns))
+            if clock.now_ns() < until_ns:
+                link.service()
         clock.sleep_until_ns(min(arrival_ns, clock.now_ns() + PREPARE_NS, until_ns))
         if clock.now_ns() < until_ns:
             link.poll()

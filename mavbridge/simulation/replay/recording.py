@@ -10,7 +10,8 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FeatureFrame, Solve, Tick
-from mavbridge.mavlink.codec.frames import RawPacket, frame_at
+from mavbridge.mavlink.codec.frames import RawPacket
+from mavbridge.mavlink.codec.tlog import read_tlog
 from mavbridge.recording import replay_rows, rows
 from mavbridge.recording.folder import PACKETS, SOLVES, TICKS, TLOG, features_of
 from mavbridge.recording.meta import FlightMeta, read_meta
@@ -30,7 +31,6 @@ STAMP_NS = 10 * NS_PER_MS
 user and system drift apart by less in an hour."""
 LOOK_AHEAD = 64
 """Rows of the table among which a packet of the log is looked for: the log may have lost some."""
-_STAMP_BYTES = 8
 
 
 class RecordedPacket(NamedTuple):
@@ -90,7 +90,9 @@ def open_source(folder: Path) -> ReplaySource:
         )
     stamps = list(read_packets(read_table(folder / PACKETS, replay_rows.PACKETS)))
     offset_ns, system = settings.wall_offset_ns, config.link.source_system
-    packets = list(_received(_log(folder / TLOG), stamps, offset_ns=offset_ns, own_system=system))
+    packets = list(
+        _received(read_tlog(folder / TLOG), stamps, offset_ns=offset_ns, own_system=system)
+    )
     return ReplaySource(
         folder=folder,
         meta=meta,
@@ -121,22 +123,6 @@ def _features(
         tuple(read_features(read_table(folder / features_of(name), replay_rows.FEATURES)))
         for name in (None, *contract.cameras[1:])
     )
-
-
-def _log(path: Path) -> Iterator[tuple[int, RawPacket]]:
-    """Unix time in microseconds and packet of each whole record.
-
-    Raises:
-        UserError: the log cannot be read.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror}), and has the flight") from error
-    at = 0
-    while (packet := frame_at(data, at + _STAMP_BYTES)) is not None:
-        yield int.from_bytes(data[at : at + _STAMP_BYTES], "big"), packet
-        at += _STAMP_BYTES + len(packet.data)
 
 
 def _received(

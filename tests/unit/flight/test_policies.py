@@ -6,12 +6,13 @@ import pytest
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import MonotonicClock
-from mavbridge.core.errors import UserError
+from mavbridge.core.errors import CameraError, UserError
 from mavbridge.flight.policies import (
     check_configured_policy,
     load_configured_policy,
     looks_at_images,
     policy_files,
+    require_cameras,
     require_images,
 )
 
@@ -84,3 +85,13 @@ def test_the_files_of_a_policy_are_those_that_make_it(tmp_path: Path) -> None:
     assert [path.name for path in policy_files(PolicyConfig())] == ["toge.safetensors"]
     for nothing in ("scripted:hover", "ws://127.0.0.1:8000", "my_module:Mine"):
         assert policy_files(PolicyConfig(policy=nothing)) == []
+
+
+@pytest.mark.parametrize(("policy", "is_hinted"), [("scripted:hover", True), ("toge", False)])
+def test_a_camera_that_is_not_there_is_needed_only_by_who_looks(
+    policy: str, is_hinted: bool
+) -> None:
+    camera = CameraConfig(camera=("/dev/video987",))
+    with pytest.raises(CameraError, match="not there") as caught:
+        require_cameras(FlyConfig(policy=PolicyConfig(policy=policy), camera=camera))
+    assert ("--camera none" in str(caught.value)) is is_hinted

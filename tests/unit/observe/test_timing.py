@@ -271,3 +271,9 @@ def test_json_says_null_for_what_was_not_measured() -> None:
     for key in ("feature_age_ms", "state_age_ms", "state_to_wire_ms"):
         assert document[key] is None
     assert document["action"]["rate_hz"] is None
+
+
+def test_an_empty_reason_is_no_release() -> None:
+    """A read-only flight has one before the policy has begun."""
+    begin = make_released_tick(0, "", phase="released")
+    assert timed(begin, make_tick(1, sent=None)).release_count == 0

@@ -25,6 +25,7 @@ DEADLINE_S = 60
 
 def test_the_sample_settings_are_understood(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[FlyConfig] = []
+    monkeypatch.setattr(cli, "config", cli.config)  # --config sets it, for all who parse later
     monkeypatch.setattr("mavbridge.flight.app.fly", lambda config: seen.append(config) or 0)
     with pytest.raises(SystemExit) as ended:
         cli.meta(["--config", str(DEPLOY / "mavbridge.toml"), "--max-height", "20"])
@@ -61,6 +62,25 @@ def test_the_simulator_says_what_it_lacks() -> None:
     assert ended.stderr == "sitl: error: the simulated vehicle needs mujoco: pip install mujoco\n"
 
 
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash is installed here")
+def test_bash_completes_commands_and_flags(tmp_path: Path) -> None:
+    home = {"HOME": str(tmp_path), "SHELL": "/bin/bash", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-P", "-m", "mavbridge", "--install-completion"]
+    installed = subprocess.run(
+        command, env=os.environ | home, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert installed.returncode == 0, installed.stderr
+    (script,) = (
+        path for path in tmp_path.rglob("*") if path.is_file() and path.stem == "mavbridge"
+    )
+    asked = f"""source {script}
+        COMP_WORDS=(mavbridge inspect --ht); COMP_CWORD=2
+        _mavbridge mavbridge --ht inspect; echo "${{COMPREPLY[@]}}"
+        """
+    reply = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=True)
+    assert reply.stdout.split() == ["--html"]
+
+
 def test_the_wheel_holds_all_three_packages_and_nothing_else(tmp_path: Path) -> None:
     tree = tmp_path / "tree"
     tree.mkdir()
@@ -79,7 +99,8 @@ def test_the_wheel_holds_all_three_packages_and_nothing_else(tmp_path: Path) -> 
     assert {name.split("/")[0] for name in set(names) - info} == {"mavbridge", "policy", "sitl"}
     sources = {str(path.relative_to(tree)) for path in tree.rglob("*.py")}
     assert {name for name in sources if not name.startswith("build/")} <= set(names)
-    assert "policy/weights/toge.safetensors" in names
+    page = {f"mavbridge/commands/inspect/page.{end}" for end in ("html", "css", "js")}
+    assert {"policy/weights/toge.safetensors", *page} <= set(names)
     assert any(name.endswith("licenses/LICENSE") for name in info)
 
 
@@ -97,7 +118,7 @@ def test_the_init_of_a_container_outlives_the_flight_process_until_the_gate_has_
     flight.write_text(
         "#!/bin/bash\ntrap 'exit 7' TERM\n"
         f"(trap '' TERM; echo $BASHPID; read < {tmp_path}/end) &\necho $*\n"
-        "while true; do sleep 0.05; done\n"
+        "for ((k = 0; k < 1200; k++)); do sleep 0.05; done\n"
     )
     flight.chmod(0o755)
     os.mkfifo(tmp_path / "end")

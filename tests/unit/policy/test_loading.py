@@ -208,8 +208,9 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("scripted:yaw", {"engine": "openvino"}, "computes in numpy"),
         ("resnet-unet", {"allow_untrained": True, "num_diffusion_steps": 101}, r"1\.\.100"),
         ("no_such_module:Policy", {}, "there is no module no_such_module"),
-        ("policy.contract:Nothing", {}, "no class Nothing"),
-        ("policy.contract:STATE_DIM", {}, "no class STATE_DIM"),
+        ("json.decoder:Nothing", {}, "no class Nothing"),
+        ("policy:Mine", {}, "a file of that name flies by its path: --policy ./policy.py:Mine"),
+        ("json.decoder:FLAGS", {}, "no class FLAGS"),
     ],
 )
 def test_refusals_say_what_to_do(spec: str, changes: dict[str, Any], message: str) -> None:

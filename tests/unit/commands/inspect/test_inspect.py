@@ -1,7 +1,9 @@
 import io
 import json
+import shutil
 import struct
 from dataclasses import replace
+from inspect import getsource as inspect_source
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +14,23 @@ from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.recordings import make_frame, make_meta, without_writer_process
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
 from mavbridge.commands.inspect.config import InspectConfig
+from mavbridge.commands.inspect.moments import PLANNED_ENDS
+from mavbridge.commands.inspect.run import _events as events_of
 from mavbridge.commands.inspect.run import inspect
 from mavbridge.commands.inspect.tables import print_comparison, print_flight
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.records import Position, Tick
+from mavbridge.core.records import Position, Tick, VisionTick
+from mavbridge.flight import app
+from mavbridge.gate import engagement, envelope
 from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 from policy.contract import Contract
 
+GOLDEN = Path(__file__).parents[3] / "data/flights"
 UNIX_START_S = 1_767_323_045
 """2026-01-02T03:04:05 UTC, the start of ``make_meta``."""
 
@@ -135,8 +143,8 @@ def test_two_flights_side_by_side_mark_what_differs(tmp_path: Path) -> None:
         line.split("│")[1].strip(): line.split("│") for line in text.splitlines() if "│" in line
     }
     assert [cell.strip() for cell in rows["policy"][2:5]] == ["scripted:hover", "toge", "differs"]
-    assert [cell.strip() for cell in rows["late chunks"][2:5]] == ["1", "0", "-100%"]
-    assert rows["predict, p50 [ms]"][4].strip() == "+100%"
+    assert [cell.strip() for cell in rows["late chunks"][2:5]] == ["1", "0", "-100% better"]
+    assert rows["predict, p50 [ms]"][4].strip() == "+100% worse"
 
 
 def test_a_flight_that_was_cut_off_is_shown_up_to_its_end(tmp_path: Path) -> None:
@@ -183,3 +191,165 @@ def test_what_is_no_flight_is_refused(tmp_path: Path) -> None:
         inspect([tmp_path] * 3, InspectConfig())
     with pytest.raises(MavbridgeError, match="is empty"):
         inspect([tmp_path], InspectConfig())
+
+
+def moments_of(folder: Path, ticks: list[Tick], **changes: object) -> list[tuple[str, str]]:
+    flight = analyse(write(folder, ticks, frames=0, meta=make_meta(**changes)))
+    return [(moment.what, moment.detail) for moment in flight.moments]
+
+
+def test_a_planned_end_is_no_bad_moment_and_any_other_end_is(tmp_path: Path) -> None:
+    flown = [make_tick(index) for index in range(50)]
+    for reason in sorted(PLANNED_ENDS):
+        ticks = [*flown, make_released_tick(50, reason, phase="leaving")]
+        assert moments_of(tmp_path / reason, ticks) == []
+    ((what, detail),) = moments_of(
+        tmp_path / "fault", [*flown, make_released_tick(50, "link lost", phase="leaving")]
+    )
+    assert what == "the policy's flight ended"
+    assert detail == (
+        "link lost; its last sticks were by an attitude of 3 ms ago and an image of 40 ms ago"
+    )
+
+
+def test_reasons_of_planned_ends_are_those_of_the_gate() -> None:
+    sources = [inspect_source(module) for module in (engagement, envelope, app)]
+    for reason in PLANNED_ENDS:
+        assert any(f'"{reason}"' in source for source in sources)
+
+
+def test_coasting_is_told_with_its_reason_even_where_the_recording_ends(tmp_path: Path) -> None:
+    ticks = [make_tick(index) for index in range(50)]
+    old = {"state": ticks[49].state, "chunk_serial": 49, "is_coasting": True}
+    old["chunk_computed_ns"] = ticks[49].chunk_computed_ns
+    ticks += [make_tick(index, **old) for index in range(61, 65)]
+    ticks = [replace(tick, serial=serial) for serial, tick in enumerate(ticks)]
+    told = dict(moments_of(tmp_path / "flight", ticks))
+    assert told["coasting"] == (
+        "for 32 ms along an old chunk: its attitude was 123 ms old, beyond 100 ms"
+    )
+
+
+def test_close_moments_are_told_as_one(tmp_path: Path) -> None:
+    ticks = [make_tick(index) for index in range(100)]
+    image_ns = ticks[50].sent_ns - 200 * NS_PER_MS
+    ticks[50] = replace(
+        ticks[50],
+        feature_captured_ns=image_ns,
+        chunk_computed_ns=(ticks[50].chunk_computed_ns or 0) + 9 * NS_PER_MS,
+        predict_ns=11 * NS_PER_MS,
+    )
+    ((what, detail),) = moments_of(tmp_path / "flight", ticks)
+    assert what == "old image"
+    assert detail == (
+        "sticks by an image of 200 ms ago; late chunk: 9.0 ms late: the policy took long"
+    )
+
+
+def test_a_crash_is_a_moment_with_its_time(tmp_path: Path) -> None:
+    ticks = [make_tick(index) for index in range(100)]
+    ticks[60] = replace(ticks[60], texts=("vehicle: Crash: Disarming",))
+    flight = analyse(
+        write(tmp_path / "flight", ticks, frames=0, meta=make_meta(crash="the vehicle said so"))
+    )
+    assert [(moment.what, moment.t_s) for moment in flight.moments] == [("crash", 0.6)]
+
+
+def test_what_the_recorder_has_lost_is_neither_jitter_nor_the_cameras(tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    with without_writer_process():
+        writer = FlightWriter(folder, make_meta(), pressure="offline")
+        for number in (*range(10), *range(15, 30)):
+            writer.frame(make_frame(number))
+        for index in (*range(50), *range(550, 600)):
+            writer.tick(make_tick(index))
+        writer._flush()
+        writer.close()
+    flight = analyse(folder)
+    assert flight.report.sticks.rate_hz == pytest.approx(100)
+    assert flight.report.sticks.flying_s == pytest.approx(0.98)
+    assert np.nanmax(flight.series.period_ms) == pytest.approx(10)
+    assert flight.report.vision.rate_hz == pytest.approx(30, abs=0.01)
+    assert flight.report.vision.dropped_frames is None
+    assert flight.report.observer_drops.recorder == 505
+    assert [moment.what for moment in flight.moments] == ["rows lost"]
+    assert "not measured" in shown(flight)
+
+
+def test_all_cameras_are_told_and_shown(tmp_path: Path) -> None:
+    contract = Contract(cameras=("front", "down"))
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    with without_writer_process():
+        writer = FlightWriter(folder, make_meta(contract=contract), pressure="offline")
+        for number in range(6):
+            writer.frame(make_frame(number))
+        for number in range(4):
+            writer.frame(make_frame(number, camera=1))
+        for index in range(20):
+            writer.tick(make_tick(index))
+        writer.finish(writer.meta)
+    flight = analyse(folder)
+    assert [(each.camera, len(each.exposed_s)) for each in flight.cameras] == [
+        ("front", 6),
+        ("down", 4),
+    ]
+    assert "down: p50" in shown(flight)
+    events = list(events_of(folder, contract))
+    images = [event for event in events if isinstance(event, VisionTick)]
+    assert [image.camera for image in images].count(1) == 4
+    assert inspect([folder], InspectConfig(rerun=str(tmp_path / "flight.rrd"))) == 0
+
+
+@pytest.mark.parametrize(
+    "damage", [{"action_hz": 0}, {"visual_hz": -1}, {"course_seed": "7"}, {"ticks_dropped": "9"}]
+)
+def test_facts_that_nothing_can_be_counted_with_are_refused_by_name(
+    tmp_path: Path, damage: dict[str, object]
+) -> None:
+    folder = write(tmp_path / "flight", [make_tick(0)])
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps(meta | damage))
+    with pytest.raises(MavbridgeError, match=f"{next(iter(damage))} of meta.json"):
+        analyse(folder)
+
+
+@pytest.mark.parametrize("target", ["nonsense", "connect=http://127.0.0.1:1"])
+def test_a_viewer_that_is_none_is_refused_before_a_flight_is_read(
+    tmp_path: Path, target: str
+) -> None:
+    with pytest.raises(MavbridgeError, match="--rerun"):
+        inspect([tmp_path / "nowhere"], InspectConfig(rerun=target))
+
+
+def test_a_pilots_flight_is_judged_by_its_rows_alone(tmp_path: Path) -> None:
+    ticks = [make_released_tick(k, "the pilot flies", phase="released") for k in range(100)]
+    ticks[10:20] = [replace(tick, rc_sticks=None) for tick in ticks[10:20]]
+    meta = make_meta(source="pilot", policy=None, engine=None)
+    text = shown(analyse(write(tmp_path / "flight", ticks, frames=30, meta=meta)))
+    assert "100.0 Hz of 100 Hz, the pilot's sticks known in 90.0% of them" in text
+    assert "30.0 Hz of 30 Hz" in text
+    assert "no moment went wrong" in text
+    for word in ("slot", "chunk", "released"):
+        assert word not in text.replace("the pilot flies", "")
+
+
+@pytest.mark.parametrize("name", ["numpy_px4", "scripted_velocity_ardupilot", "toge_ardupilot"])
+def test_recorded_flights_are_told_as_their_columns_have_it(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / name
+    shutil.copytree(GOLDEN / name, folder)  # which leave out the images
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps(meta | {"frames": 0}))
+    flight = analyse(folder)
+    ticks = [row.tick for row in open_flight(folder).tick_rows()]
+    flown = [tick for tick in ticks if tick.trace is not None]
+    assert flight.report.sticks.sends == len(flown) > 100
+    assert sum(count for _, count in flight.causes) == (
+        flight.report.action.late_chunks + flight.report.sticks.missed_slots
+    )
+    assert "the attitude or the policy loop was late" not in dict(flight.causes)
+    held_s = sum(s.end_s - s.start_s for s in flight.holders if s.holder == "policy")
+    assert held_s == pytest.approx(flight.report.sticks.flying_s, abs=0.05)
+    assert (flight.series.sent[np.isfinite(flight.series.sent[:, 0])]).shape[1] == 4
+    assert all(len(line) <= 80 for line in shown(flight).splitlines()[1:])

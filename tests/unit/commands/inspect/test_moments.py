@@ -1,8 +1,12 @@
+from dataclasses import replace
+
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from helpers.factories import START_NS, TICK_NS, make_released_tick, make_state, make_tick
+from mavbridge.commands.inspect.delays import Arrivals, find_delays
 from mavbridge.commands.inspect.holders import holder_spans
-from mavbridge.commands.inspect.moments import find_delays
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import NEUTRAL
@@ -22,26 +26,61 @@ def late(index: int, by_ms: int, **changes: object) -> Tick:
     return make_tick(index, woke_ns=at_ns, sent_ns=at_ns + 2 * NS_PER_MS, **changes)
 
 
+def stamps(*after_start_ms: float) -> NDArray[np.int64]:
+    return START_NS + np.array([round(ms * NS_PER_MS) for ms in after_start_ms], np.int64)
+
+
+def arrivals(**late_ms: float) -> Arrivals:
+    """Attitudes 1 ms before each tick, which arrive at once; ``a10=9``: tick 10's 9 ms later."""
+    happened_ms = [10 * index - 1 for index in range(20)]
+    arrived_ms = [ms + late_ms.get(f"a{index}", 0) for index, ms in enumerate(happened_ms)]
+    return Arrivals(stamps(*happened_ms), stamps(*arrived_ms))
+
+
 @pytest.mark.parametrize(
-    ("changes", "cause"),
+    ("changes", "known", "cause"),
     [
-        ({"predict_ns": 15 * NS_PER_MS}, "the policy took long"),
-        ({"state": make_state(START_NS + 10 * TICK_NS + 8 * NS_PER_MS)}, "the attitude came late"),
-        ({}, "the policy loop began late"),
+        ({"predict_ns": 15 * NS_PER_MS}, arrivals(), "the policy took long"),
+        ({}, arrivals(a10=10), "the attitude came late"),
+        ({}, arrivals(), "the policy loop began late"),
+        # A loop that began late, and took the newest attitude then, had older ones to begin with.
+        (
+            {"state": make_state(START_NS + 10 * TICK_NS + 8 * NS_PER_MS)},
+            Arrivals(stamps(89, 99, 108), stamps(89, 99, 108)),
+            "the policy loop began late",
+        ),
+        ({}, None, "the attitude or the policy loop was late"),
+        ({}, Arrivals(stamps(89), stamps(89)), "the attitude or the policy loop was late"),
     ],
 )
-def test_a_late_chunk_is_put_down_to_the_first_stage_that_was_late(
-    changes: dict[str, object], cause: str
+def test_a_late_chunk_is_put_down_to_the_stage_that_cost_most(
+    changes: dict[str, object], known: Arrivals | None, cause: str
 ) -> None:
     ticks = [*flown(10), late(10, 9, **changes), *(make_tick(index) for index in range(11, 15))]
-    (delay,) = find_delays(ticks, stick_hz=100, action_hz=100)
+    (delay,) = find_delays(ticks, stick_hz=100, action_hz=100, arrivals=known)
     assert (delay.what, delay.cause) == ("late chunk", cause)
     assert delay.delay_ms == pytest.approx(9)
 
 
+def test_a_chunk_after_a_long_solve_is_late_by_that_solve() -> None:
+    # The solve of tick 10 begins on time and takes 32 ms; the next one has to wait for it.
+    first = make_tick(10, chunk_computed_ns=START_NS + 132 * NS_PER_MS, predict_ns=32 * NS_PER_MS)
+    held = [replace(first, serial=10 + k, woke_ns=first.woke_ns + k * TICK_NS) for k in range(4)]
+    after = late(11, 38, serial=14, chunk_computed_ns=START_NS + 150 * NS_PER_MS)
+    delays = find_delays(
+        [*flown(10), *held, after], stick_hz=100, action_hz=100, arrivals=arrivals()
+    )
+    assert [delay.cause for delay in delays] == ["the policy took long"] * 2
+
+
 def test_a_chunk_that_a_newer_one_overtook_is_not_late() -> None:
-    ticks = [*flown(5), make_tick(6), make_tick(7)]
+    ticks = [*flown(5), make_tick(6, serial=5), make_tick(7, serial=6)]
     assert find_delays(ticks, stick_hz=100, action_hz=100) == ()
+
+
+def test_nothing_is_said_about_ticks_that_the_recorder_has_lost() -> None:
+    after = make_tick(60, missed_slots=1, chunk_serial=7)
+    assert find_delays([*flown(5), after], stick_hz=100, action_hz=100) == ()
 
 
 @pytest.mark.parametrize(
@@ -51,7 +90,9 @@ def test_missed_slots_are_put_down_to_the_send_before_or_to_the_wake_up(
     sending_ms: int, cause: str
 ) -> None:
     slow = make_tick(4, sent_ns=START_NS + 4 * TICK_NS + sending_ms * NS_PER_MS)
-    after = make_tick(7, missed_slots=2, chunk_serial=4, chunk_computed_ns=slow.chunk_computed_ns)
+    after = make_tick(
+        7, serial=5, missed_slots=2, chunk_serial=4, chunk_computed_ns=slow.chunk_computed_ns
+    )
     (delay,) = find_delays([*flown(4), slow, after], stick_hz=100, action_hz=100)
     assert (delay.what, delay.count, delay.cause) == ("missed slots", 2, cause)
 
@@ -83,3 +124,11 @@ def test_who_held_the_sticks_when() -> None:
 def test_a_policy_that_only_looks_on_holds_nothing() -> None:
     (span,) = holder_spans([make_tick(0, sent=None), make_tick(1, sent=None)], START_NS)
     assert span.holder == "read-only"
+
+
+def test_of_several_reasons_the_one_that_lasted_is_told() -> None:
+    reasons = ["no heartbeat", *["taking off"] * 5, "no chunk"]
+    ticks = [make_released_tick(k, reason, phase="preparing") for k, reason in enumerate(reasons)]
+    (span,) = holder_spans(ticks, START_NS)
+    assert (span.holder, span.reason) == ("pilot", "taking off")
+    assert span.end_s == pytest.approx(0.06)

@@ -77,7 +77,7 @@ def test_no_name_or_reason_leaves_its_place(tmp_path: Path) -> None:
     assert text.count("</script>") == 2
     (shown,) = data_of(text)
     assert shown["facts"][0][1].startswith(NASTY)
-    assert shown["moments"][0]["detail"] == NASTY
+    assert shown["moments"][0]["detail"].startswith(NASTY)
 
 
 def test_a_long_flight_is_thinned_and_keeps_every_spike(

@@ -1,0 +1,167 @@
+"""Missed slots and late chunks of a recorded flight, each with its cause."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.records import Tick
+from mavbridge.observe.timing import LATE_PERIODS
+
+Stamps: TypeAlias = NDArray[np.int64]
+Cause = Literal[
+    "the gate woke late",
+    "sending took long",
+    "the policy took long",
+    "the attitude came late",
+    "the policy loop began late",
+    "the attitude or the policy loop was late",
+]
+"""The last one where the recording lacks the arrivals, without which nobody can tell."""
+
+
+class Arrivals(NamedTuple):
+    """Attitudes of the vehicle, in the order in which they were measured."""
+
+    happened_ns: Stamps
+    """[K] as in ``VehicleState.attitude_ns``."""
+    arrived_ns: Stamps
+    """[K] at this computer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delay:
+    """A late chunk, or missed slots in a row."""
+
+    at_ns: int
+    what: Literal["late chunk", "missed slots"]
+    count: int
+    """Slots that were missed; 1 for a chunk."""
+    delay_ms: float
+    """Time beyond the period."""
+    cause: Cause
+
+
+class _Solve(NamedTuple):
+    """The computation of the chunk that a tick flew."""
+
+    serial: int
+    started_ns: int
+    computed_ns: int
+    attitude_ns: int | None
+
+
+def is_gap(last: Tick, tick: Tick) -> bool:
+    """The recording lacks ticks between these two neighbours."""
+    return tick.serial != last.serial + 1
+
+
+def find_delays(
+    ticks: Sequence[Tick], *, stick_hz: float, action_hz: float, arrivals: Arrivals | None = None
+) -> tuple[Delay, ...]:
+    """Missed slots and late chunks while the policy flew, in the order of time.
+
+    Nothing is said about the time between two ticks that the recorder has lost.
+    """
+    slot_ns, chunk_ns = NS_PER_S / stick_hz, NS_PER_S / action_hz
+    found = [*_missed_slots(ticks, slot_ns), *_late_chunks(ticks, chunk_ns, arrivals)]
+    return tuple(sorted(found, key=lambda delay: delay.at_ns))
+
+
+def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[Delay]:
+    for last, tick in pairwise(ticks):
+        is_flown = last.trace is not None and tick.trace is not None
+        if not is_flown or not tick.missed_slots or is_gap(last, tick):
+            continue
+        is_slow_send = last.sent_ns - last.woke_ns > slot_ns / 2
+        yield Delay(
+            at_ns=tick.woke_ns,
+            what="missed slots",
+            count=tick.missed_slots,
+            delay_ms=max(0.0, tick.sent_ns - last.sent_ns - slot_ns) / NS_PER_MS,
+            cause="sending took long" if is_slow_send else "the gate woke late",
+        )
+
+
+def _late_chunks(
+    ticks: Sequence[Tick], chunk_ns: float, arrivals: Arrivals | None
+) -> Iterator[Delay]:
+    """Chunks beyond ``LATE_PERIODS`` after the one before."""
+    before: Tick | None = None
+    last: _Solve | None = None
+    for tick in ticks:
+        if before is not None and is_gap(before, tick):
+            last = None
+        before, solve = tick, _solve_of(tick)
+        if solve is None or last is None or solve.serial <= last.serial:
+            if solve is None or last is None or solve.serial < last.serial:
+                last = solve
+            continue
+        # Chunks in between, which newer ones overtook before any send, were not late.
+        count = solve.serial - last.serial
+        period_ns = (solve.computed_ns - last.computed_ns) / count
+        if period_ns > LATE_PERIODS * chunk_ns:
+            yield Delay(
+                at_ns=tick.woke_ns,
+                what="late chunk",
+                count=1,
+                delay_ms=(period_ns - chunk_ns) / NS_PER_MS,
+                cause=_cause(last, solve, chunk_ns, arrivals),
+            )
+        last = solve
+
+
+def _solve_of(tick: Tick) -> _Solve | None:
+    if tick.trace is None or tick.chunk_serial is None or tick.chunk_computed_ns is None:
+        return None
+    return _Solve(
+        serial=tick.chunk_serial,
+        started_ns=tick.chunk_computed_ns - (tick.predict_ns or 0),
+        computed_ns=tick.chunk_computed_ns,
+        attitude_ns=None if tick.state is None else tick.state.attitude_ns,
+    )
+
+
+def _cause(last: _Solve, solve: _Solve, chunk_ns: float, arrivals: Arrivals | None) -> Cause:
+    """The stage that cost most of the delay.
+
+    A solve may start a period after the last one, when that has ended and a new attitude is there.
+    """
+    due_ns = last.started_ns + (solve.serial - last.serial) * chunk_ns
+    free_ns = max(due_ns, last.computed_ns)
+    longer_ns = (solve.computed_ns - solve.started_ns) - (last.computed_ns - last.started_ns)
+    solving_ns = max(0, longer_ns) + free_ns - due_ns
+    waiting_ns = max(0.0, solve.started_ns - free_ns)
+    if solving_ns >= waiting_ns:
+        return "the policy took long"
+    arrived_ns = _arrival_ns(arrivals, last, solve, chunk_ns)
+    if arrived_ns is None:
+        return "the attitude or the policy loop was late"
+    attitude_ns = min(waiting_ns, max(0.0, arrived_ns - free_ns))
+    loop_ns = waiting_ns - attitude_ns
+    if solving_ns >= max(attitude_ns, loop_ns):
+        return "the policy took long"
+    return "the attitude came late" if attitude_ns > loop_ns else "the policy loop began late"
+
+
+def _arrival_ns(
+    arrivals: Arrivals | None, last: _Solve, solve: _Solve, chunk_ns: float
+) -> int | None:
+    """When the first attitude came that could have started a solve; None: not recorded.
+
+    It is newer than the last solve's by half a period: the loop takes one that comes a quarter
+    before its time, and its time may follow a late solve by half a period.
+    """
+    if arrivals is None or last.attitude_ns is None or solve.attitude_ns is None:
+        return None
+    usable_ns = min(last.attitude_ns + round(chunk_ns / 2), solve.attitude_ns)
+    number = int(np.searchsorted(arrivals.happened_ns, usable_ns))
+    if number == len(arrivals.happened_ns):
+        return None
+    if int(arrivals.happened_ns[number]) > solve.attitude_ns:
+        return None  # the one that was used is not in the table: its row was lost
+    return int(arrivals.arrived_ns[number])
