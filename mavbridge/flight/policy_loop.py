@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.records import FloatArray, Solve, VehicleState
-from mavbridge.core.vehicle import Release
+from mavbridge.core.vehicle import Action, Release
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import Observation, ObservationSource
@@ -173,7 +173,14 @@ class PolicyLoop:
                 predict_ns=done_ns - now_ns,
             )
         )
-        chunk = self._chunk(observation, array, done_ns)
+        chunk = make_chunk(
+            self._serial,
+            state,
+            self._settings.action_frame.to_gate(array[0]),
+            image_ns=observation.image_ns,
+            computed_ns=done_ns,
+            step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
+        )
         self._send(chunk)
         if self._watch is not None:
             is_first, self._is_reset = self._is_reset, False
@@ -195,23 +202,37 @@ class PolicyLoop:
                 )
             )
 
-    def _chunk(self, observation: Observation, actions: FloatArray, done_ns: int) -> Chunk:
-        """The chunk of a solve that was done by then, with the stamps of all that it came from."""
-        state = observation.state
-        return Chunk(
-            serial=self._serial,
-            attitude_ns=min(state.attitude_ns, state.rate_ns),
-            velocity_ns=min(
-                state.velocity_ns,
-                state.specific_force_ns,
-                state.velocity_ns if state.extras_ns is None else state.extras_ns,
-            ),
-            image_ns=observation.image_ns,
-            computed_ns=done_ns,
-            first_ns=state.attitude_ns,
-            step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
-            actions=self._settings.action_frame.to_gate(actions[0]),
-        )
+
+def make_chunk(
+    serial: int,
+    state: VehicleState,
+    actions: tuple[Action, ...],
+    *,
+    image_ns: int,
+    computed_ns: int,
+    step_ns: int,
+) -> Chunk:
+    """The chunk of a solve from ``state``, with the oldest stamp of each input that it came from.
+
+    Args:
+        serial: its number.
+        state: the newest that the policy was given; the first action acts at its attitude.
+        actions: what the policy returned, in NED and FRD axes.
+        image_ns: exposure of the oldest among the newest images of all cameras.
+        computed_ns: end of the solve.
+        step_ns: time from one action to the next.
+    """
+    velocity_ns = min(state.velocity_ns, state.specific_force_ns)
+    return Chunk(
+        serial=serial,
+        attitude_ns=min(state.attitude_ns, state.rate_ns),
+        velocity_ns=velocity_ns if state.extras_ns is None else min(velocity_ns, state.extras_ns),
+        image_ns=image_ns,
+        computed_ns=computed_ns,
+        first_ns=state.attitude_ns,
+        step_ns=step_ns,
+        actions=actions,
+    )
 
 
 def _kept(array: FloatArray) -> FloatArray:

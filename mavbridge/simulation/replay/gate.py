@@ -16,6 +16,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import Solve, Tick
 from mavbridge.core.vehicle import Action, Command, Decision, LinkSnapshot
 from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.policy_loop import make_chunk
 from mavbridge.flight.settings import flight_settings, link_settings
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.departure import Ending
@@ -55,17 +56,13 @@ class GateStep:
 
 def chunk_of(solve: Solve, contract: Contract) -> Chunk:
     """The chunk that the policy loop makes of a solve."""
-    state = solve.state
-    oldest_ns = min(state.velocity_ns, state.specific_force_ns)
-    return Chunk(
-        serial=solve.serial,
-        attitude_ns=min(state.attitude_ns, state.rate_ns),
-        velocity_ns=oldest_ns if state.extras_ns is None else min(oldest_ns, state.extras_ns),
+    return make_chunk(
+        solve.serial,
+        solve.state,
+        action_frame(contract).to_gate(solve.actions[0]),
         image_ns=solve.image_ns,
         computed_ns=solve.computed_ns,
-        first_ns=solve.first_ns,
         step_ns=solve.step_ns,
-        actions=action_frame(contract).to_gate(solve.actions[0]),
     )
 
 
