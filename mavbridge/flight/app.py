@@ -311,7 +311,7 @@ class _Flight:
         if now_ns - self._looked_ns > STOPPED_NS:
             self._resumed_ns = now_ns
         self._looked_ns = now_ns
-        # Encoders wait for one another: the one that was asked first is the one that hangs.
+        # Encoders wait for one another: the one that computes is the one that hangs.
         camera, _ = min(
             zip(self._cameras, self._bridge.visions, strict=True),
             key=lambda encoder: (encoder[1].encoding_since_ns or now_ns, encoder[1].alive_ns),

@@ -1,5 +1,6 @@
 """The loops of the flight process, composed once for a real vehicle and for the simulation."""
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -156,6 +157,7 @@ def _vision_loops(
     is_airborne: Callable[[], bool],
 ) -> tuple[VisionLoop, ...]:
     """The loop of each camera, with its rate and its sink; ``watch`` judges images, if given."""
+    encoder_lock = threading.Lock()
     return tuple(
         VisionLoop(
             camera=path.camera,
@@ -164,6 +166,7 @@ def _vision_loops(
             sink=sink,
             clock=path.clock,
             period_ns=rate.period_ns,
+            encoder_lock=encoder_lock,
             image_watch=None if watch is None else _image_watch(watch),
             is_airborne=is_airborne,
             number=number,

@@ -30,6 +30,7 @@ class VisionLoop:
         sink: TickSink,
         clock: Clock,
         period_ns: Callable[[], int],
+        encoder_lock: threading.Lock,
         image_watch: ImageWatch | None = None,
         is_airborne: Callable[[], bool] = lambda: False,
         number: int = 0,
@@ -43,6 +44,8 @@ class VisionLoop:
             sink: gets a tick for every feature.
             clock: time of the start and end of the encoding.
             period_ns: shortest time between two encoded frames, asked for each of them.
+            encoder_lock: held while encoding; loops that share a policy share it, because no
+                policy has to be ready for two threads.
             image_watch: judges each encoded frame; None where the policy looks at no image, or the
                 renderer draws none.
             is_airborne: whether the policy flies and the vehicle is known not to be landed; a
@@ -51,6 +54,7 @@ class VisionLoop:
         """
         self._camera = camera
         self._number = number
+        self._encoder_lock = encoder_lock
         self._encode = encode
         self._cache = cache
         self._sink = sink
@@ -64,7 +68,8 @@ class VisionLoop:
         self.alive_ns = clock.now_ns()
         """When the last step ended; read by another thread."""
         self.encoding_since_ns: int | None = None
-        """When the encoding in progress was asked for; read by another thread."""
+        """When the encoding in progress began; None while waiting for the lock. Read by another
+        thread."""
 
     def run(self, stop: threading.Event) -> None:
         """Encode until told to stop; raises CameraError if the camera has died."""
@@ -86,9 +91,10 @@ class VisionLoop:
         if self._image_watch is not None:
             is_airborne = self._is_airborne()
             fault = self._image_watch.check(frame.rgb, captured_ns, is_airborne=is_airborne)
-        self.encoding_since_ns = self._clock.now_ns()
-        value = self._encode(frame.rgb)
-        self.encoding_since_ns = None
+        with self._encoder_lock:
+            self.encoding_since_ns = self._clock.now_ns()
+            value = self._encode(frame.rgb)
+            self.encoding_since_ns = None
         value.setflags(write=False)
         ready_ns = self._clock.now_ns()
         feature = FeatureFrame(

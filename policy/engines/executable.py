@@ -1,6 +1,5 @@
 """Shared by all engines: a policy becomes an ``Executable``, tried once before it flies."""
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -160,15 +159,11 @@ def assemble(
     Raises:
         PolicyError: a function failed on the sample, or returned the wrong shape or no numbers.
     """
-    one_at_a_time = threading.Lock()  # each camera has a thread, and no policy must be ready for it
 
     def encode_rgb(rgb: NDArray[np.uint8], camera: int = 0, /) -> FloatArray:
         with user_code(f"{settings.name} failed on an image"):
             image = image_to_input(rgb, contract)
-            if not encode:
-                return image
-            with one_at_a_time:
-                return encode[camera](image)
+            return encode[camera](image) if encode else image
 
     def act_on(
         encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None

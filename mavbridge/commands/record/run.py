@@ -194,6 +194,7 @@ class _Session:
             sink=sink,
             clock=self._clock,
             period_ns=lambda: frame_ns,
+            encoder_lock=threading.Lock(),
             image_watch=ImageWatch(max_frozen_s=MAX_FROZEN_S, max_black_s=MAX_BLACK_S),
             is_airborne=lambda: self._view.status.armed and self._view.status.is_landed is False,
         )

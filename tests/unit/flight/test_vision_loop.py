@@ -1,5 +1,7 @@
 """The vision loop tells with each feature what is wrong with its image."""
 
+import threading
+
 import numpy as np
 
 from helpers.fakes import START_NS, FakeClock, ListSink
@@ -44,6 +46,7 @@ def faults(*, picture, image_watch, airborne_from_ns=START_NS, seconds=4):
         sink=sink,
         clock=clock,
         period_ns=lambda: FRAME_NS,
+        encoder_lock=threading.Lock(),
         image_watch=image_watch,
         is_airborne=lambda: clock.now_ns() >= airborne_from_ns,
     )
@@ -95,3 +98,40 @@ def test_a_black_image_is_a_fault_on_the_ground_too():
 
 def test_without_a_watch_nothing_is_a_fault():
     assert faults(picture=np.zeros_like(SCENE), image_watch=None) == (None, [])
+
+
+def test_of_two_loops_with_one_lock_only_the_one_that_computes_is_encoding():
+    clock, lock = FakeClock(), threading.Lock()
+    seen = []
+
+    def make_loop(encode):
+        return VisionLoop(
+            camera=StillCamera(clock, np.zeros((8, 8, 3), np.uint8)),
+            encode=encode,
+            cache=FeatureCache(),
+            sink=ListSink(),
+            clock=clock,
+            period_ns=lambda: FRAME_NS,
+            encoder_lock=lock,
+        )
+
+    def encode_second(rgb):
+        seen.append((first.encoding_since_ns, second.encoding_since_ns))
+        return np.zeros((1, 8), np.float32)
+
+    def encode_first(rgb):
+        waiting.start()
+        waiting.join(0.05)  # the other cannot end before this one has
+        seen.append((first.encoding_since_ns, second.encoding_since_ns))
+        return np.zeros((1, 8), np.float32)
+
+    first, second = make_loop(encode_first), make_loop(encode_second)
+    waiting = threading.Thread(target=second.step)
+    first.step()
+    waiting.join(10)
+    assert not waiting.is_alive()
+    (a, nothing), (nothing_either, b) = seen
+    assert a is not None
+    assert b is not None
+    assert nothing is None
+    assert nothing_either is None
