@@ -13,14 +13,13 @@ from typing import Any
 import pytest
 
 from helpers.flight_logs import logged_overrides
-from helpers.relay import Override
-from helpers.stand import flight
-from helpers.vehicle_record import Aftermath, aftermath, note
+from sitl.faults.record import Aftermath, aftermath
+from sitl.faults.relay import Override
+from sitl.faults.stage import faulty_policy, staged
 
 pytestmark = pytest.mark.system
 
 FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")
-POLICIES = "helpers.user_policies:"
 RELEASE = Override(0, 0, 0, 0)
 DEATH_LIMIT_MS = 150
 """The aim on a machine of its own is 60 ms."""
@@ -35,7 +34,6 @@ END_S = 15
 
 def assert_safe(report: Any, fault: str, receiver: str, at_ns: int, limit_ms: float) -> Aftermath:
     measured = aftermath(report, at_ns, receiver)
-    note(fault, receiver, measured, final=report["final"]["mode"])
     assert measured.safe_ms <= limit_ms
     assert not measured.flew_again
     assert report["refused_messages"] == 0
@@ -50,8 +48,8 @@ def test_a_killed_flight_process_leaves_a_safe_vehicle(
     policy: str, receiver: str, tmp_path: Path
 ) -> None:
     recording = tmp_path / "recording"
-    with flight(tmp_path, "--receiver", receiver, renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + policy, "--record", str(recording))
+    with staged(tmp_path, "--receiver", receiver, renders=False) as flying:
+        flying.start(*FLY, "--policy", faulty_policy(policy), "--record", str(recording))
         flying.wait_for_lean()
         assert flying.gate.peak_memory_mb() < 60
         at_ns = flying.kill(signal.SIGKILL)
@@ -71,8 +69,8 @@ def test_a_killed_flight_process_leaves_a_safe_vehicle(
 
 
 def test_a_segfault_of_the_policy_leaves_a_safe_vehicle(tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + "Segfaulting")
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
+        flying.start(*FLY, "--policy", faulty_policy("Segfaulting"))
         flying.wait_for_lean()
         at_ns = flying.fault_ns()
         assert flying.gate.has_ended(END_S)
@@ -82,13 +80,13 @@ def test_a_segfault_of_the_policy_leaves_a_safe_vehicle(tmp_path: Path) -> None:
 
 
 def test_without_a_receiver_neutral_goes_on_until_the_vehicle_is_disarmed(tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "none", renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + "Leaning")
+    with staged(tmp_path, "--receiver", "none", renders=False) as flying:
+        flying.start(*FLY, "--policy", faulty_policy("Leaning"))
         flying.wait_for_lean()
         at_ns = flying.kill(signal.SIGKILL)
         assert not flying.gate.has_ended(2.5)
         second = subprocess.run(
-            [*flying.command(tmp_path / "second.json"), "--policy", POLICIES + "Leaning"],
+            [*flying.command(tmp_path / "second.json"), "--policy", faulty_policy("Leaning")],
             env=flying.environment(),
             capture_output=True,
             text=True,
@@ -119,8 +117,8 @@ def test_a_stopped_flight_process_loses_the_sticks_for_good(
     number: signal.Signals, receiver: str, policy: str, limit_ms: float, tmp_path: Path
 ) -> None:
     """SIGTSTP is Ctrl-Z, which the terminal sends to the whole process group."""
-    with flight(tmp_path, "--receiver", receiver, renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + policy)
+    with staged(tmp_path, "--receiver", receiver, renders=False) as flying:
+        flying.start(*FLY, "--policy", faulty_policy(policy))
         flying.wait_for_lean()
         at_ns = flying.kill_group(number)
         flying.observe(1.5 + limit_ms / 1e3)
@@ -138,8 +136,8 @@ def test_a_stopped_flight_process_loses_the_sticks_for_good(
 
 
 def test_a_hang_that_holds_the_interpreter_leaves_a_safe_vehicle(tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + "HangingNatively")
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
+        flying.start(*FLY, "--policy", faulty_policy("HangingNatively"))
         flying.wait_for_lean()
         at_ns = flying.fault_ns()
         flying.observe(2.0)
@@ -160,8 +158,8 @@ def test_a_hang_that_holds_the_interpreter_leaves_a_safe_vehicle(tmp_path: Path)
 def test_a_policy_that_hangs_ends_the_flight_with_a_message(
     policy: str, limit_ms: float, told: str, tmp_path: Path
 ) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + policy)
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
+        flying.start(*FLY, "--policy", faulty_policy(policy))
         flying.wait_for_lean()
         at_ns = flying.fault_ns()
         assert flying.gate.has_ended(END_S)
@@ -176,8 +174,8 @@ def test_a_policy_that_hangs_ends_the_flight_with_a_message(
 def test_what_is_not_a_number_never_reaches_the_wire(
     policy: str, receiver: str, tmp_path: Path
 ) -> None:
-    with flight(tmp_path, "--receiver", receiver, renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + policy)
+    with staged(tmp_path, "--receiver", receiver, renders=False) as flying:
+        flying.start(*FLY, "--policy", faulty_policy(policy))
         flying.wait_for_lean()
         at_ns = flying.fault_ns()
         flying.observe(2.0)
@@ -192,8 +190,8 @@ def test_what_is_not_a_number_never_reaches_the_wire(
 
 
 def test_a_policy_that_is_too_slow_is_refused_before_it_flies(tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
-        status, output = flying.fly(*FLY, "--policy", POLICIES + "Slow")
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
+        status, output = flying.fly(*FLY, "--policy", faulty_policy("Slow"))
     assert status == 2, output
     assert re.search(r"Slow is too slow: a chunk takes 9\d\d ms here.* of its contract", output)
     assert flying.vehicle_report()["armed_s"] == 0
@@ -202,14 +200,14 @@ def test_a_policy_that_is_too_slow_is_refused_before_it_flies(tmp_path: Path) ->
 
 @pytest.mark.parametrize("pause_s", [1.2, 30.0])
 def test_a_camera_without_images_loses_the_sticks_for_good(pause_s: float, tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY, "--policy", POLICIES + "Leaning")
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
+        flying.start(*FLY, "--policy", faulty_policy("Leaning"))
         flying.wait_for_lean()
         assert flying.camera is not None
-        at_ns = flying.camera.pause()
+        at_ns = flying.camera.show("gone")
         if pause_s < 10:
             flying.observe(pause_s)
-            flying.camera.resume()
+            flying.camera.show("none")
             flying.observe(1.5)
             flying.kill(signal.SIGINT)
         status, output = flying.end()

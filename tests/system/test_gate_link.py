@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.relay import Override, Relay
-from helpers.stand import ORDERLY, Flight, flight
-from helpers.vehicle_record import NUDGE_US, aftermath, is_safe, note, write_row
 from mavbridge.core.processes import free_port
-from sitl.faults import LinkFaults
+from sitl.faults.link import LinkFaults
+from sitl.faults.record import NUDGE_US, aftermath, is_safe
+from sitl.faults.relay import Override, Relay
+from sitl.faults.stage import ORDERLY, Stage, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 
-FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy", "helpers.user_policies:Leaning")
+FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy", faulty_policy("Leaning"))
 CLEAR = LinkFaults()
 NOTICE_LIMIT_MS = 800
 """The echo must have been constant for 0.4 s; then the gate leaves the flight."""
@@ -41,7 +41,7 @@ def mode_commands(relay: Relay, at_ns: int) -> int:
     return len(sets) + len(relay.sent_since(at_ns, "SET_MODE"))
 
 
-def end_in_order(flying: Flight) -> str:
+def end_in_order(flying: Stage) -> str:
     flying.kill_group(signal.SIGINT)
     status, output = flying.end()
     assert status in ORDERLY, output
@@ -51,7 +51,7 @@ def end_in_order(flying: Flight) -> str:
 @pytest.mark.parametrize("receiver", ["mid", "none"])
 @pytest.mark.parametrize("ways", ["to_bridge", "to_vehicle", "both"])
 def test_a_silent_link_ends_the_flight_for_good(ways: str, receiver: str, tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", receiver, renders=False) as flying:
+    with staged(tmp_path, "--receiver", receiver, renders=False) as flying:
         flying.start(*FLY)
         flying.wait_for_lean()
         relay = flying.relay
@@ -65,7 +65,6 @@ def test_a_silent_link_ends_the_flight_for_good(ways: str, receiver: str, tmp_pa
         end_in_order(flying)
     measured = aftermath(flying.vehicle_report(), at_ns, receiver)
     noticed = noticed_ms(relay, at_ns)
-    note(f"silent 3 s: {ways}", receiver, measured, noticed_ms=noticed)
     assert noticed <= NOTICE_LIMIT_MS
     assert not measured.flew_again
     if ways == "to_bridge":
@@ -75,7 +74,7 @@ def test_a_silent_link_ends_the_flight_for_good(ways: str, receiver: str, tmp_pa
 @pytest.mark.parametrize("steps", [1, 20])
 def test_a_delay_that_begins_in_flight_is_noticed(steps: int, tmp_path: Path) -> None:
     """Where it grows in steps, every packet looks fresh: only the vehicle's clock tells the age."""
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
         flying.start(*FLY)
         flying.wait_for_lean()
         began_ns = None
@@ -89,8 +88,6 @@ def test_a_delay_that_begins_in_flight_is_noticed(steps: int, tmp_path: Path) ->
     assert began_ns is not None
     measured = aftermath(flying.vehicle_report(), began_ns, "mid")
     noticed = noticed_ms(flying.relay, began_ns)
-    fault = "200 ms of delay each way" + (" in steps" if steps > 1 else "")
-    note(fault, "mid", measured, noticed_ms=noticed)
     assert noticed <= NOTICE_LIMIT_MS
     assert measured.safe_ms <= noticed + 350
     assert not measured.flew_again
@@ -99,7 +96,7 @@ def test_a_delay_that_begins_in_flight_is_noticed(steps: int, tmp_path: Path) ->
 
 def test_the_pilots_mode_is_honoured_and_a_lossy_link_flies_on(tmp_path: Path) -> None:
     """First 20 % of loss, duplicates and reordering, then the pilot takes over and gives back."""
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
         flying.start(*FLY)
         flying.wait_for_lean()
         relay = flying.relay
@@ -125,11 +122,8 @@ def test_the_pilots_mode_is_honoured_and_a_lossy_link_flies_on(tmp_path: Path) -
     ]
     assert lossy
     assert not any(is_safe(entry, "mid", "ALT_HOLD") for entry in lossy)
-    write_row({"fault": "20 % loss", "receiver": "mid", "flies_on": True})
     sticks = [sent for sent in relay.sent if sent.at_ns > taken_ns and sent.is_command]
     last_ms = max([(sent.at_ns - taken_ns) / 1e6 for sent in sticks], default=0.0)
-    measured = aftermath(report, taken_ns, "mid")
-    note("pilot: LOITER", "mid", measured, last_stick_ms=last_ms)
     assert last_ms <= TAKEOVER_LIMIT_MS
     assert mode_commands(relay, taken_ns) == 0
     assert any(
@@ -140,7 +134,7 @@ def test_the_pilots_mode_is_honoured_and_a_lossy_link_flies_on(tmp_path: Path) -
 
 def test_a_joystick_on_our_system_id_is_noticed(tmp_path: Path) -> None:
     """At 50 Hz each of the two has the vehicle for a while, a hundred times a second."""
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
         flying.start(*FLY)
         flying.wait_for_lean()
         sticks = Override(roll=1400, pitch=1500, throttle=1500, yaw=1500)
@@ -150,7 +144,6 @@ def test_a_joystick_on_our_system_id_is_noticed(tmp_path: Path) -> None:
             flying.relay.move_joystick(sticks)
         output = end_in_order(flying)
     last_ms = max((sent.at_ns - began_ns) / 1e6 for sent in flying.relay.sent if sent.is_command)
-    write_row({"fault": "joystick at 50 Hz", "receiver": "mid", "last_stick_ms": last_ms})
     assert last_ms <= NOTICE_LIMIT_MS
     assert mode_commands(flying.relay, began_ns) == 0
     assert "overrid" in output
@@ -171,8 +164,8 @@ class Transmitter:
 def test_only_the_engage_switch_engages_where_the_pilot_arms(tmp_path: Path) -> None:
     transmitter = Transmitter(port := free_port())
     flags = ("--receiver", "idle", "--rc-in", str(port))
-    with flight(tmp_path, *flags, renders=False) as flying:
-        policy = ("--policy", "helpers.user_policies:Leaning")
+    with staged(tmp_path, *flags, renders=False) as flying:
+        policy = ("--policy", faulty_policy("Leaning"))
         flying.start("--dual-rate", "--engage-channel", "7", *policy)
         relay = flying.relay
         assert flying.wait_for("not engaged: press e, use the engage switch")
@@ -194,7 +187,6 @@ def test_only_the_engage_switch_engages_where_the_pilot_arms(tmp_path: Path) -> 
     armed = [entry for entry in report["sticks"] if entry["armed"]]
     assert report["start_ns"] + armed[0]["t_s"] * 1e9 > armed_ns
     measured = aftermath(report, off_ns, "idle")
-    note("engage switch low", "idle", measured)
     assert measured.safe_ms <= TAKEOVER_LIMIT_MS
     assert not measured.flew_again
     assert mode_commands(relay, 0) == 0

@@ -12,7 +12,8 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.link.messages import BUILDERS
 from sitl.ardupilot.link.streams import Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.faults import FaultyLink, LinkFaults, Reboot, SensorFreeze, VehicleFaults
+from sitl.faults.link import FaultyLink, LinkFaults
+from sitl.faults.vehicle import Reboot, SensorFreeze, VehicleFaults
 from sitl.simulated_vehicle import SimulatedVehicle
 
 

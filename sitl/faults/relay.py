@@ -1,25 +1,34 @@
 """A relay on loopback between the vehicle and the bridge: it records, and it breaks the link."""
 
+import math
 import socket
 import threading
-import time
 from collections.abc import Callable
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sitl.faults import FaultyLink, LinkFaults
+from sitl.clock import NS_PER_S, Clock
+from sitl.faults.link import FaultyLink, LinkFaults
+from sitl.faults.record import NEUTRAL_US, NUDGE_US
 
-NS_PER_S = 1_000_000_000
+Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 FOREVER_NS = 1 << 62
 PILOTS_STATION = 42
 """System id of another ground station than the bridge's 255."""
 BRIDGE = 255
 VEHICLE = (1, 1)
-COPTER_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "LOITER": 5}
+COPTER_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "LOITER": 5, "RTL": 6, "LAND": 9}
+PX4_MODES = {"ALTCTL": (2, 0), "POSCTL": (3, 0), "AUTO.LOITER": (4, 3), "AUTO.LAND": (4, 6)}
+"""Main mode and sub-mode of PX4's ``custom_mode``, as MAV_CMD_DO_SET_MODE takes them."""
 FORCE = 21196
 """MAV_CMD_COMPONENT_ARM_DISARM disarms in the air with this."""
+JOIN_S = 5.0
+IGNORED_US = 65535
+NEUTRAL_Z = 500
+Rewrite = Callable[[Message], bool]
+"""Changes a message of the vehicle in place; False drops it."""
 
 
 class Override(NamedTuple):
@@ -35,10 +44,11 @@ class Sent(NamedTuple):
     """A message of the bridge as it came to the relay, before any fault."""
 
     at_ns: int
-    message: Any
+    message: Message
 
     @property
     def name(self) -> str:
+        """The message's type."""
         name: str = self.message.get_type()
         return name
 
@@ -49,9 +59,48 @@ class Sent(NamedTuple):
 
     @property
     def override(self) -> Override | None:
+        """The sticks of an RC_CHANNELS_OVERRIDE."""
         if self.name != "RC_CHANNELS_OVERRIDE":
             return None
         return Override(*(getattr(self.message, f"chan{k}_raw") for k in range(1, 5)))
+
+    @property
+    def steers(self) -> bool:
+        """Is a message of sticks, whatever they say."""
+        return self.name in ("RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL")
+
+    @property
+    def climbs(self) -> bool:
+        """The throttle is above the middle, as only a policy's is."""
+        if (sticks := self.override) is not None:
+            return NEUTRAL_US[2] < sticks.throttle < IGNORED_US
+        return self.name == "MANUAL_CONTROL" and bool(self.message.z > NEUTRAL_Z)
+
+    @property
+    def leans(self) -> bool:
+        """Steers to a side, ahead or around, as only a policy does."""
+        if (sticks := self.override) is not None:
+            turned = (sticks.roll, sticks.pitch, sticks.yaw)
+            centre = (NEUTRAL_US[0], NEUTRAL_US[1], NEUTRAL_US[3])
+            return any(
+                us not in (0, IGNORED_US) and abs(us - middle) > NUDGE_US
+                for us, middle in zip(turned, centre, strict=True)
+            )
+        if self.name == "MANUAL_CONTROL":
+            message = self.message
+            return bool(max(abs(message.x), abs(message.y), abs(message.r)) > 2 * NUDGE_US)
+        return False
+
+    @property
+    def is_within_limits(self) -> bool:
+        """No stick beyond what the message's definition, or a transmitter, has."""
+        if (sticks := self.override) is not None:
+            return all(us in (0, IGNORED_US) or 1000 <= us <= 2000 for us in sticks)
+        if self.name == "MANUAL_CONTROL":
+            message = self.message
+            turned = max(abs(message.x), abs(message.y), abs(message.r))
+            return bool(turned <= 1000 and 0 <= message.z <= 1000)
+        return True
 
 
 class _Way:
@@ -78,15 +127,17 @@ class _Way:
 class Relay:
     """Passes datagrams between the vehicle and the bridge, and keeps what the bridge sends."""
 
-    def __init__(self, bridge_port: int) -> None:
+    def __init__(self, bridge_port: int, clock: Clock) -> None:
         self.bridge_port = bridge_port
+        self._clock = clock
         self._bridge = ("127.0.0.1", bridge_port)
         self._vehicle: tuple[str, int] | None = None
         self._to_vehicle, self._to_bridge = _Way(), _Way()
+        self._rewrite: Rewrite | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
-        self._mav = dialect.MAVLink(None)
-        self._mav.robust_parsing = True
+        self._mav = _parser(BRIDGE)
+        self._vehicles = _parser(VEHICLE[0])
         self._station = dialect.MAVLink(None, srcSystem=PILOTS_STATION, srcComponent=190)
         self._joystick = dialect.MAVLink(None, srcSystem=BRIDGE, srcComponent=190)
         self._stop = threading.Event()
@@ -103,7 +154,7 @@ class Relay:
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        self._thread.join(5)
+        self._thread.join(JOIN_S)
         self._socket.close()
 
     def forget(self) -> None:
@@ -117,23 +168,29 @@ class Relay:
         self, *, to_vehicle: LinkFaults | None = None, to_bridge: LinkFaults | None = None
     ) -> int:
         """Change the link from now on; returns the moment. None leaves a direction as it is."""
-        at_ns = time.monotonic_ns()
+        at_ns = self._clock.now_ns()
         if to_vehicle is not None:
             self._to_vehicle.impair(to_vehicle)
         if to_bridge is not None:
             self._to_bridge.impair(to_bridge)
         return at_ns
 
-    def inject(self, message: Any, station: Any = None) -> int:
+    def rewrite(self, change: Rewrite | None) -> int:
+        """Let every message of the vehicle pass through ``change``; returns the moment."""
+        self._rewrite = change
+        return self._clock.now_ns()
+
+    def inject(self, message: Message, station: Message = None) -> int:
         """Send a message to the vehicle as another ground station; returns the moment."""
-        assert self._vehicle is not None
-        at_ns = time.monotonic_ns()
+        if self._vehicle is None:
+            raise ValueError("the vehicle has not been heard yet")
+        at_ns = self._clock.now_ns()
         self._socket.sendto(message.pack(station or self._station), self._vehicle)
         return at_ns
 
     def move_joystick(self, sticks: Override) -> int:
         """Another program overrides with the bridge's own system id; returns the moment."""
-        channels = (*sticks, *[65535] * 4)
+        channels = (*sticks, *[IGNORED_US] * 4)
         message = dialect.MAVLink_rc_channels_override_message(*VEHICLE, *channels)
         return self.inject(message, self._joystick)
 
@@ -144,7 +201,8 @@ class Relay:
 
     def set_mode(self, mode: str) -> int:
         """The pilot changes the mode at another station."""
-        return self.command(dialect.MAV_CMD_DO_SET_MODE, 1, COPTER_MODES[mode])
+        custom = PX4_MODES.get(mode, ()) or (COPTER_MODES[mode],)
+        return self.command(dialect.MAV_CMD_DO_SET_MODE, 1, *custom)
 
     def arm(self) -> int:
         """The pilot arms at another station."""
@@ -165,22 +223,35 @@ class Relay:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            now_ns = time.monotonic_ns()
+            now_ns = self._clock.now_ns()
             due_ns = min(self._to_vehicle.due_ns, self._to_bridge.due_ns)
             self._socket.settimeout(min(max((due_ns - now_ns) / NS_PER_S, 1e-4), 0.2))
             try:
                 data, sender = self._socket.recvfrom(65536)
             except (TimeoutError, ConnectionError):
                 data, sender = b"", None
-            now_ns = time.monotonic_ns()
+            now_ns = self._clock.now_ns()
             if sender == self._bridge:
                 self._to_vehicle.pass_on(data, now_ns)
             elif sender is not None:
                 self._vehicle = sender
-                self._to_bridge.pass_on(data, now_ns)
+                if data := self._rewritten(data):
+                    self._to_bridge.pass_on(data, now_ns)
             self._deliver(now_ns)
             if sender == self._bridge:
                 self._record(data, now_ns)
+
+    def _rewritten(self, data: bytes) -> bytes:
+        change = self._rewrite
+        if change is None:
+            return data
+        kept = bytearray()
+        for message in self._vehicles.parse_buffer(data) or ():
+            if change(message):
+                self._vehicles.seq = message.get_seq()
+                self._vehicles.srcComponent = message.get_srcComponent()
+                kept += message.pack(self._vehicles)
+        return bytes(kept)
 
     def _deliver(self, now_ns: int) -> None:
         for packet in self._to_bridge.arrived(now_ns):
@@ -196,6 +267,18 @@ class Relay:
                 self.sent.append(sent)
                 if (sticks := sent.override) is not None:
                     self.overrides.append(sticks)
-                    if sticks.throttle > 1500:  # the policy climbs
-                        self.has_flown.set()
+                if sent.climbs:
+                    self.has_flown.set()
             self._news.notify_all()
+
+
+def _parser(system: int) -> Message:
+    parser = dialect.MAVLink(None, srcSystem=system)
+    parser.robust_parsing = True
+    return parser
+
+
+def set_fields(message: Message, **values: float) -> None:
+    """Change fields of a received message, so that packing it again sends them."""
+    for name, value in values.items():
+        setattr(message, name, value if math.isnan(value) else type(getattr(message, name))(value))

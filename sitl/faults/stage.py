@@ -5,37 +5,49 @@ import os
 import select
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from helpers.frame_feed import FrameFeed
-from helpers.relay import Relay
-from mavbridge.core.processes import free_port
+from sitl.clock import Clock
+from sitl.faults.camera import FrameFeed
+from sitl.faults.record import VehicleReport
+from sitl.faults.relay import Relay
 
 TIMEOUT_S = 90.0
 STARTS = 3
-LEAN_US = 1650
 LEANING = 30
-"""Sticks beyond that, in a row: the policy holds its lean."""
+"""Steering messages that lean, in a row: the policy holds its lean."""
 STALLED = ("no attitude from the vehicle", "no chunk of the policy that may be flown")
 ORDERLY = (0, 4)
 """Exit statuses of a flight that ended in order; 4: a busy machine made the gate end it before."""
-MARK = "MAVBRIDGE_TEST_MARK"
-"""Environment variable: the file into which ``helpers.user_policies`` writes when its fault
-begins."""
+MARK = "SITL_FAULT_MARK"
+"""Environment variable: the file into which a policy of the catalogue writes the moment, in ns of
+CLOCK_MONOTONIC, when its fault begins."""
+PIPE_BLOCK = 4096
+CATALOGUE = Path(__file__).parent / "catalogue"
+
+
+def faulty_policy(name: str) -> str:
+    """A class of ``catalogue/policies.py`` as the bridge takes it, by ``--policy``."""
+    return f"{CATALOGUE / 'policies.py'}:{name}"
+
+
+class StageError(Exception):
+    """A flight did not get as far as its fault, or did not end."""
 
 
 class Process:
     """A process of which nobody here is the parent, such as the gate of a killed bridge."""
 
-    def __init__(self, pid: int) -> None:
+    def __init__(self, pid: int, clock: Clock) -> None:
         self.pid = pid
+        self._clock = clock
         self._fd = os.pidfd_open(pid)
 
     def has_ended(self, timeout_s: float) -> bool:
@@ -44,12 +56,13 @@ class Process:
 
     def kill(self, number: signal.Signals) -> int:
         """Send a signal; returns the moment."""
-        at_ns = time.monotonic_ns()
+        at_ns = self._clock.now_ns()
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._fd, number)
         return at_ns
 
     def peak_memory_mb(self) -> float:
+        """Largest resident set so far."""
         status = Path(f"/proc/{self.pid}/status").read_text()
         (line,) = [line for line in status.splitlines() if line.startswith("VmHWM:")]
         return int(line.split()[1]) / 1024
@@ -60,13 +73,14 @@ class Process:
         os.close(self._fd)
 
 
-class Flight:
+class Stage:
     """One bridge against one simulated vehicle."""
 
     def __init__(self, folder: Path, relay: Relay, shm: str, vehicle: tuple[str, ...]) -> None:
         """``vehicle`` are the flags of the simulated vehicle, which starts at once."""
         self.folder = folder
         self.relay = relay
+        self.clock = Clock()
         self._shm = shm
         self._vehicle_flags = vehicle
         self.cameras: tuple[str, ...] = ()
@@ -112,20 +126,24 @@ class Flight:
         return [*command, *cameras, "--report", str(report)]
 
     def environment(self) -> dict[str, str]:
-        folder = str(Path(__file__).parents[1])
-        return os.environ | {"PYTHONPATH": folder, "COLUMNS": "200", MARK: str(self._mark)}
+        """Ours, with a terminal of 200 columns and a place for the mark of a policy's fault."""
+        return os.environ | {"COLUMNS": "200", MARK: str(self._mark)}
 
     @property
     def _mark(self) -> Path:
         return self.folder / "mark"
 
     def _read(self) -> None:
-        assert self._bridge is not None
-        assert self._bridge.stdout is not None
-        for line in self._bridge.stdout:
+        bridge = self._running()
+        for line in bridge.stdout or ():
             with self._news:
                 self._lines.append(line)
                 self._news.notify_all()
+
+    def _running(self) -> subprocess.Popen[str]:
+        if self._bridge is None:
+            raise StageError("the bridge has not been started")
+        return self._bridge
 
     def wait_for(self, text: str) -> bool:
         """The bridge has said this."""
@@ -139,21 +157,24 @@ class Flight:
 
         Where a busy machine made the gate end the flight before, both start anew.
         """
-        rows = self.relay.overrides
+        sent = self.relay.sent
 
         def is_leaning() -> bool:
-            return len(rows) > LEANING and min(row.roll for row in rows[-LEANING:]) > LEAN_US
+            steering = [row for row in sent[-8 * LEANING :] if row.steers][-LEANING:]
+            return len(steering) == LEANING and all(row.leans for row in steering)
 
         def is_over() -> bool:
-            return self.relay.has_flown.is_set() and rows[-1].throttle <= 1500
+            last = next((row for row in reversed(sent) if row.steers), None)
+            return self.relay.has_flown.is_set() and last is not None and not last.climbs
 
         for _ in range(STARTS):
-            assert self.relay.wait_until(lambda: is_leaning() or is_over(), TIMEOUT_S), self._text
-            assert self.gate.pid
+            if not self.relay.wait_until(lambda: is_leaning() or is_over(), TIMEOUT_S):
+                raise StageError(f"the policy has not flown:\n{self._text}")
+            self.gate.has_ended(0)  # finds it while its parent lives
             if is_leaning():
                 return
             self._start_over()
-        raise AssertionError(self._text)
+        raise StageError(f"the flight ended {STARTS} times before its fault:\n{self._text}")
 
     def fly(self, *flags: str) -> tuple[int, str]:
         """Start a bridge that ends by itself; its exit status and everything that it printed.
@@ -187,15 +208,11 @@ class Flight:
 
     def fill_output(self) -> None:
         """Fill the pipe that nobody reads, so that the bridge's next write to it would wait."""
-        assert self._bridge is not None
-        pipe = f"/proc/{self.bridge_pid}/fd/1"
-        fd = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
-        with suppress(BlockingIOError):
-            while True:
-                os.write(fd, b"." * 4096)
-        with suppress(BlockingIOError):
-            while True:
-                os.write(fd, b".")
+        fd = os.open(f"/proc/{self.bridge_pid}/fd/1", os.O_WRONLY | os.O_NONBLOCK)
+        for block in (PIPE_BLOCK, 1):
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(fd, b"." * block)
         os.close(fd)
 
     def observe(self, seconds: float) -> None:
@@ -204,42 +221,43 @@ class Flight:
 
     def fault_ns(self) -> int:
         """When the policy's own fault began; waits for it."""
-        assert self.relay.wait_until(self._mark.exists, TIMEOUT_S), self._text
+        if not self.relay.wait_until(self._mark.exists, TIMEOUT_S):
+            raise StageError(f"the policy's fault has not begun:\n{self._text}")
         return int(self._mark.read_text())
 
     @property
     def bridge_pid(self) -> int:
-        assert self._bridge is not None
-        return self._bridge.pid
+        """The flight process."""
+        return self._running().pid
 
     @property
     def gate(self) -> Process:
         """The gate process; the first call must come while the bridge lives."""
         if self._gate is None:
-            self._gate = Process(child_of(self.bridge_pid, b"mavbridge.gate"))
+            self._gate = Process(child_of(self.bridge_pid, b"mavbridge.gate"), self.clock)
         return self._gate
 
     def kill(self, number: signal.Signals) -> int:
         """Send a signal to the bridge alone; returns the moment."""
-        assert self._bridge is not None
-        at_ns = time.monotonic_ns()
-        self._bridge.send_signal(number)
+        at_ns = self.clock.now_ns()
+        self._running().send_signal(number)
         return at_ns
 
     def kill_group(self, number: signal.Signals) -> int:
         """Send a signal as a terminal does, to the whole process group; returns the moment."""
-        at_ns = time.monotonic_ns()
-        os.killpg(self.bridge_pid, number)
+        at_ns = self.clock.now_ns()
+        with suppress(ProcessLookupError):
+            os.killpg(self.bridge_pid, number)
         return at_ns
 
     def end(self) -> tuple[int, str]:
         """Exit status and everything that the bridge printed."""
-        assert self._bridge is not None
+        bridge = self._running()
         try:
-            self._bridge.wait(TIMEOUT_S)
+            bridge.wait(TIMEOUT_S)
         finally:
             self.close()
-        return self._bridge.returncode, self._text
+        return bridge.returncode, self._text
 
     def close(self) -> None:
         """Free everything, and end what a failed test has left."""
@@ -263,34 +281,47 @@ class Flight:
         self._vehicle.wait(TIMEOUT_S)
 
     def report(self) -> Any:
+        """The bridge's, of ``--report``."""
         return json.loads((self.folder / "report.json").read_text())
 
-    def vehicle_report(self) -> Any:
-        """Only after the ``flight`` block, which ends the vehicle."""
-        return json.loads((self.folder / "fc.json").read_text())
+    def vehicle_report(self) -> VehicleReport:
+        """Only after the ``staged`` block, which ends the vehicle."""
+        return cast(VehicleReport, json.loads((self.folder / "fc.json").read_text()))
 
 
 @contextmanager
-def flight(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[Flight]:
-    """A vehicle and a relay, ready for ``Flight.start``; both end with the block.
+def staged(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[Stage]:
+    """A vehicle and a relay, ready for ``Stage.start``; both end with the block.
 
-    Without ``renders`` the camera shows noise, costs nothing and can be paused.
+    Without ``renders`` the camera shows noise, costs nothing and can be spoilt.
     """
-    bridge_port = free_port()
+    bridge_port = _free_port()
     shm = f"test-{bridge_port}-{os.getpid()}"
+    clock = Clock()
     with ExitStack() as stack:
-        relay = stack.enter_context(Relay(bridge_port))
+        relay = stack.enter_context(Relay(bridge_port, clock))
         filming = ("--camera", f"shm:{shm}") if renders else ()
-        flying = Flight(folder, relay, shm, (*filming, *vehicle_flags))
-        stack.callback(flying.end_vehicle)
+        stage = Stage(folder, relay, shm, (*filming, *vehicle_flags))
+        stack.callback(stage.end_vehicle)
         if not renders:
-            flying.camera = stack.enter_context(FrameFeed(shm))
-        stack.callback(flying.close)
-        yield flying
+            stage.camera = stack.enter_context(FrameFeed(shm, clock))
+        stack.callback(stage.close)
+        yield stage
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
 
 
 def child_of(parent_pid: int, text: bytes) -> int:
-    """The child process whose command line contains a text."""
+    """The child process whose command line contains a text.
+
+    Raises:
+        StageError: it has no such child.
+    """
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
@@ -299,4 +330,4 @@ def child_of(parent_pid: int, text: bytes) -> int:
             continue
         if parent == parent_pid and text in command:
             return int(entry.name)
-    raise AssertionError(f"process {parent_pid} has no child with {text!r} in its command line")
+    raise StageError(f"process {parent_pid} has no child with {text!r} in its command line")

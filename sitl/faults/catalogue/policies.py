@@ -1,4 +1,7 @@
-"""Policies as a user might write them, with what can go wrong in them."""
+"""Policies as a user might write them, with what can go wrong in them.
+
+The bridge loads this file; the simulator does not.
+"""
 
 import ctypes
 import os
@@ -105,8 +108,8 @@ class Deliberate(Leaning):
 
 
 def mark_fault() -> None:
-    """Tell the test when the fault began."""
-    path = Path(os.environ["MAVBRIDGE_TEST_MARK"])
+    """Tell the catalogue when the fault began."""
+    path = Path(os.environ["SITL_FAULT_MARK"])
     draft = path.with_suffix(".draft")
     draft.write_text(str(time.monotonic_ns()))
     draft.rename(path)

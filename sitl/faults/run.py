@@ -1,0 +1,86 @@
+"""Flies a scenario by real processes, and judges it by the vehicle's own record."""
+
+import signal
+import tempfile
+from pathlib import Path
+
+from sitl.faults.record import NoVerdictError
+from sitl.faults.scenario import Scenario, Variant
+from sitl.faults.stage import Stage, StageError, faulty_policy, staged
+from sitl.faults.stalls import StallWatch
+from sitl.faults.verdict import Verdict, find_failures
+
+FLY = ("--dual-rate", "--arm")
+SETTLE_S = 1.0
+"""After the last step: what must not come back has time to."""
+END_S = 20.0
+MOST_STALL_MS = 30.0
+"""A computer that stood still for longer during a run proves nothing about its times."""
+RUNS = 3
+
+
+def fly_scenario(scenario: Scenario, variant: Variant, *, slack_ms: float = 0.0) -> Verdict:
+    """Fly a scenario, and judge it; on a computer that stood still meanwhile, up to ``RUNS`` times.
+
+    Args:
+        scenario: the fault.
+        variant: the vehicle.
+        slack_ms: added to the limits, for a computer that others use.
+    """
+    for run in range(1, RUNS + 1):
+        verdict = _fly_once(scenario, variant, slack_ms)
+        verdict.runs = run
+        if verdict.passed or verdict.stall_ms <= MOST_STALL_MS:
+            break
+    return verdict
+
+
+def _fly_once(scenario: Scenario, variant: Variant, slack_ms: float) -> Verdict:
+    verdict = Verdict(scenario=scenario.name, variant=variant)
+    vehicle = ("--autopilot", variant.autopilot, "--receiver", variant.receiver)
+    with tempfile.TemporaryDirectory(prefix="faults-") as name, StallWatch() as stalls:
+        folder = Path(name)
+        flags = [flag.format(folder=folder) for flag in scenario.flags]
+        policy = faulty_policy(scenario.policy)
+        try:
+            with staged(folder, *vehicle, renders=False) as stage:
+                stage.start(*FLY, "--mode", variant.mode, "--policy", policy, *flags)
+                if scenario.outcome == "refused":
+                    at_ns, leans = 0, False
+                    verdict.exit, verdict.output = stage.end()
+                else:
+                    at_ns = _perform(scenario, stage)
+                    leans = _leans(stage)
+                    _end(scenario, stage, verdict)
+            verdict.failures += find_failures(verdict, scenario, stage, at_ns, leans, slack_ms)
+        except (StageError, NoVerdictError) as error:
+            verdict.failures.append(str(error))
+        verdict.stall_ms = stalls.longest_ms
+    return verdict
+
+
+def _perform(scenario: Scenario, stage: Stage) -> int:
+    """Carry the steps out; returns the moment of the fault."""
+    stage.wait_for_lean()
+    moments = [step.perform(stage) for step in scenario.steps]
+    stage.observe(SETTLE_S)
+    return next(moment for moment in moments if moment is not None)
+
+
+def _leans(stage: Stage) -> bool:
+    """The newest sticks are still the policy's."""
+    return next(sent.leans for sent in reversed(stage.relay.sent) if sent.steers)
+
+
+def _end(scenario: Scenario, stage: Stage, verdict: Verdict) -> None:
+    """Let everything end; neutral sticks that go on for want of a receiver end by a disarming."""
+    gate = stage.gate
+    stage.kill_group(signal.SIGCONT)
+    stage.kill_group(signal.SIGINT)
+    if -signal.SIGKILL in scenario.exits:
+        stage.kill(signal.SIGKILL)
+    stage.observe(SETTLE_S)
+    stage.relay.disarm()
+    if not gate.has_ended(END_S):
+        verdict.failures.append(f"the gate still runs {END_S:.0f} s after the end")
+    verdict.exit, verdict.output = stage.end()
