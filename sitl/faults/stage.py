@@ -21,7 +21,7 @@ from sitl.faults.relay import Relay
 
 TIMEOUT_S = 90.0
 STARTS = 3
-LEANING = 30
+LEANING = 100
 """Steering messages that lean, in a row: the policy holds its lean."""
 STALLED = ("no attitude from the vehicle", "no chunk of the policy that may be flown")
 ORDERLY = (0, 4)
@@ -160,7 +160,7 @@ class Stage:
         sent = self.relay.sent
 
         def is_leaning() -> bool:
-            steering = [row for row in sent[-8 * LEANING :] if row.steers][-LEANING:]
+            steering = [row for row in sent[-3 * LEANING :] if row.steers][-LEANING:]
             return len(steering) == LEANING and all(row.leans for row in steering)
 
         def is_over() -> bool:

@@ -60,7 +60,7 @@ class Leaning(Climbing):
     """Takes off, then leans, turns and climbs; ``misbehave`` is called once it leans steadily."""
 
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
-    lean_calls, fault_calls = 60, 160
+    lean_calls, fault_calls = 120, 260
     """Calls into the flight after which it leans, and after which its fault begins."""
 
     def __init__(self) -> None:
