@@ -160,8 +160,7 @@ class Stage:
         sent = self.relay.sent
 
         def is_leaning() -> bool:
-            steering = [row for row in sent[-3 * LEANING :] if row.steers][-LEANING:]
-            return len(steering) == LEANING and all(row.leans for row in steering)
+            return self.relay.is_leaning(LEANING)
 
         def is_over() -> bool:
             last = next((row for row in reversed(sent) if row.steers), None)
@@ -295,7 +294,7 @@ def staged(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[
 
     Without ``renders`` the camera shows noise, costs nothing and can be spoilt.
     """
-    bridge_port = _free_port()
+    bridge_port = free_port()
     shm = f"test-{bridge_port}-{os.getpid()}"
     clock = Clock()
     with ExitStack() as stack:
@@ -309,7 +308,8 @@ def staged(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[
         yield stage
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A UDP port of the loopback that nobody uses now."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
