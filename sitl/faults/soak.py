@@ -46,7 +46,7 @@ FAULTS = (
     Fault("silence of both", (Link(loss=1.0), Wait(s=1.5), Link()), True),
     Fault("the pilot's mode", (Pilot(act="mode", mode="LOITER"),), True),
     Fault("images gone", (Images(show="gone"), Wait(s=1.0), Images(show="none")), True),
-    Fault("images frozen", (Images(show="frozen"), Wait(s=1.5), Images(show="none")), True),
+    Fault("images frozen", (Images(show="frozen"), Wait(s=3.0), Images(show="none")), True),
     Fault(
         "stopped",
         (Signal(name="SIGSTOP", to="group"), Wait(s=1.0), Signal(name="SIGCONT", to="group")),
