@@ -194,14 +194,14 @@ def test_local_position_streams_and_the_estimator_tells_whether_it_is_one(px4):
     assert flags & horizontal == horizontal
 
 
-def test_arming_is_an_event_and_to_a_ground_station_a_text(px4):
-    px4.get_ready(ALTCTL)
-    px4.seen.clear()
-    assert px4.arm() == ACCEPTED
+def test_arming_is_an_event_and_to_a_ground_station_a_text(px4_armable):
+    px4_armable.get_ready(ALTCTL)
+    px4_armable.seen.clear()
+    assert px4_armable.arm() == ACCEPTED
 
-    assert px4.hears("Armed by external command")
-    px4.fly(0.5)
-    events = named(px4.seen, f"UNKNOWN_{EVENT}")
+    assert px4_armable.hears("Armed by external command")
+    px4_armable.fly(0.5)
+    events = named(px4_armable.seen, f"UNKNOWN_{EVENT}")
     assert ARMED_BY in [event_id(m) for m in events]
 
 
@@ -222,12 +222,13 @@ def test_the_old_set_mode_message_is_acknowledged_as_the_command(px4):
     assert px4.mode() == custom(ALTCTL)
 
 
-def test_texts_need_a_ground_station(px4):
+def test_texts_need_a_ground_station(px4_armable):
     # A link that had a heartbeat keeps its ground station: only a fresh one can show this.
-    if not hasattr(px4.peer, "vehicle"):
+    if px4_armable.is_external:
         pytest.skip("an external vehicle has heard ground stations already")
-    silent = Px4Companion(px4.peer, is_gcs=False)
-    px4.peer.vehicle.reboot()
+    silent = Px4Companion(px4_armable.peer, is_gcs=False)
+    silent.may_arm = True
+    px4_armable.peer.vehicle.reboot()
     silent.advance(6.0)
     silent.set_mode(ALTCTL)
     silent.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1)
