@@ -145,6 +145,8 @@ class Autopilot:
             return "RC not found"
         if self.radio_failsafe.active:
             return "Radio failsafe on"
+        if self.gcs_failsafe.active:
+            return "GCS failsafe on"
         throttle_us = self.rc.channels_us[self.rc.index_of("THROTTLE")]
         if self.params["FS_THR_ENABLE"] and throttle_us < self.params["FS_THR_VALUE"]:
             return "Throttle below failsafe"

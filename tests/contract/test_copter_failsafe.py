@@ -72,16 +72,24 @@ def test_overrides_are_contact_with_the_ground_station_and_heartbeats_of_others_
     assert "GCS Failsafe Cleared" in texts(flying.hold(1.0))
 
 
-def test_the_ground_stations_failsafe_drops_overrides(flying):
+def test_the_ground_stations_failsafe_drops_overrides_and_stays_when_switched_off(flying):
     flying.set_param("RC_OVERRIDE_TIME", 10.0)
     flying.set_param("FS_GCS_TIMEOUT", 2.0)
     flying.set_param("FS_GCS_ENABLE", 1)
     heartbeat(flying)
     flying.hold(0.5, roll=1600, thr=1500)
 
-    messages = flying.advance(3.0)
+    assert last(flying.advance(2.8), "RC_CHANNELS").chan1_raw == 1500
+    flying.set_param("FS_GCS_ENABLE", 0)
+    messages = []
+    for _ in range(8):
+        heartbeat(flying)
+        messages += flying.hold(0.1)
 
-    assert last(messages, "RC_CHANNELS").chan1_raw == 1500
+    assert last(messages, "HEARTBEAT").system_status == mav.MAV_STATE_CRITICAL
+    flying.set_param("FS_GCS_ENABLE", 1)
+    heartbeat(flying)
+    assert "GCS Failsafe Cleared" in texts(flying.hold(0.8))
 
 
 def test_lost_ground_station_in_guided_returns(flying):
@@ -90,10 +98,12 @@ def test_lost_ground_station_in_guided_returns(flying):
     heartbeat(flying)
     assert flying.set_mode(GUIDED_NOGPS) == ACCEPTED
 
-    messages = flying.advance(3.2)
+    messages = flying.advance(2.8)
 
     assert "GCS Failsafe" in texts(messages)
     assert modes(messages)[-1] == RTL
+    heartbeat(flying)
+    assert "GCS Failsafe Cleared" in texts(flying.hold(0.8))
 
 
 def in_the_air(companion):

@@ -26,7 +26,7 @@ def offboard(px4_flying):
     px4_flying.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 250)
     px4_flying.stream_setpoint(velocity_target(), 0.3)
     assert px4_flying.set_mode(OFFBOARD) == ACCEPTED
-    px4_flying.stream_setpoint(velocity_target(), 2.0)
+    px4_flying.stream_setpoint(velocity_target(), 1.0)
     return px4_flying
 
 
@@ -160,7 +160,7 @@ def test_the_vehicle_takes_off_and_holds_by_itself(px4_grounded):
         20.0,
         lambda _: px4_grounded.sticks(MID),
     )
-    messages = px4_grounded.fly(4.0)
+    messages = px4_grounded.fly(3.0)
 
     height = ground - named(messages, "LOCAL_POSITION_NED")[-1].z
     assert px4_grounded.mode() == custom(LOITER)

@@ -240,6 +240,13 @@ class Px4Companion(Companion):
             (packed,) = struct.unpack("<f", struct.pack("<i", int(value)))
         self.set_param(name, packed)
 
+    def refill_delay(self) -> None:
+        """Give the failsafe its full delay again, of which earlier ones have spent some.
+
+        PX4 does so when any parameter changes.
+        """
+        self.change("COM_FAIL_ACT_T", 5.001)
+
     def restore(self) -> None:
         """Leave the vehicle in the air in Hold, or disarmed on the ground."""
         flies = self.in_the_air
