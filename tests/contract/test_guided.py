@@ -163,13 +163,13 @@ def test_a_stream_that_stops_is_held_and_resumes_at_once(flying, mode):
 
 @pytest.mark.parametrize(
     ("options", "thrust", "climb_mps"),
-    [(0, 0.5, 0.0), (0, 0.6, 0.5), (0, 0.0, -1.5), (8, 1.0, 5.0)],
+    [(0, 0.5, 0.0), (0, 0.6, 0.5), (0, 0.0, -1.5), (8, 1.0, 3.0)],
 )
 def test_thrust_is_a_climb_rate_unless_an_option_says_otherwise(flying, options, thrust, climb_mps):
     in_the_air(flying, GUIDED_NOGPS)
     flying.set_param("GUID_OPTIONS", options)
 
-    messages = stream(flying, attitude(thrust=thrust), 1.0 if options else 3.0)
+    messages = stream(flying, attitude(thrust=thrust), 0.6 if options else 2.5)
 
     climb = -speed_ned(messages)[2]
     assert climb > climb_mps if options else climb == pytest.approx(climb_mps, abs=0.15)

@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.px4_companion import (
     ACCEPTED,
+    LAND,
     LOITER,
     MID,
     OFFBOARD,
@@ -37,6 +38,10 @@ def crossings_ms(samples, begin_ms, start, target):
         reached = (t for t, v in samples if (v - start) / (target - start) >= share)
         times.append(next(reached) - begin_ms)
     return times
+
+
+def has_said(text):
+    return lambda messages: any(text in m.text for m in named(messages, "STATUSTEXT"))
 
 
 def heading(px4):
@@ -148,7 +153,7 @@ def test_the_position_target_echoes_a_velocity(offboard):
     assert math.degrees(echo.yaw_rate) == pytest.approx(20.0, abs=0.5)
 
 
-def test_the_vehicle_takes_off_and_holds_by_itself(px4_grounded):
+def test_the_vehicle_takes_off_holds_and_lands_by_itself(px4_grounded):
     px4_grounded.track()
     px4_grounded.get_ready(LOITER)
     ground = named(px4_grounded.seen, "LOCAL_POSITION_NED")[-1].z
@@ -165,3 +170,12 @@ def test_the_vehicle_takes_off_and_holds_by_itself(px4_grounded):
     height = ground - named(messages, "LOCAL_POSITION_NED")[-1].z
     assert px4_grounded.mode() == custom(LOITER)
     assert height == pytest.approx(2.5, abs=0.8)
+
+    assert px4_grounded.set_mode(LAND) == ACCEPTED
+    px4_grounded.until(has_said("Landing detected"), 20.0, lambda _: px4_grounded.sticks(MID))
+    disarmed = has_said("Disarmed by landing")
+    took_s, _ = px4_grounded.until(disarmed, 5.0, lambda _: px4_grounded.sticks(MID))
+
+    assert 1.7 <= took_s <= 2.6
+    px4_grounded.fly(0.5)
+    assert px4_grounded.mode() == custom(LOITER), "the last one that can arm"

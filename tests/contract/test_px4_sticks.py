@@ -5,11 +5,11 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.contract_peers import REBOOT_FORCE
 from helpers.px4_companion import (
     ACCEPTED,
     ACRO,
     ALTCTL,
-    LAND,
     LOITER,
     MID,
     POSCTL,
@@ -67,10 +67,11 @@ def test_sticks_for_another_system_are_ignored(px4):
 def test_the_echo_comes_at_the_senders_rate_and_stops_when_the_sticks_are_lost(px4):
     px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 250)
     px4.fly(0.5)
-    sent = echoes(px4.fly(2.0))
-    px4.advance(1.0)
+    sent = []
+    messages = px4.repeat(lambda at_s: sent.append(at_s) or px4.sticks(MID), 2.0)
+    messages += px4.advance(1.0)
 
-    assert len(sent) == pytest.approx(100, abs=6)
+    assert len(echoes(messages)) == pytest.approx(len(sent), abs=6)
     assert not echoes(px4.advance(1.0))
 
 
@@ -181,6 +182,17 @@ def test_who_does_not_take_off_is_disarmed(px4_armable):
     assert 3.8 <= took_s <= 5.5
 
 
+def test_a_reboot_is_denied_while_armed_even_by_force(px4_armable):
+    px4_armable.get_ready(ALTCTL)
+    assert px4_armable.arm() == ACCEPTED
+    px4_armable.fly(0.2)
+
+    reboot = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+    assert px4_armable.command(reboot, 1) == mav.MAV_RESULT_DENIED
+    assert px4_armable.command(reboot, 1, 0, 0, 0, 0, REBOOT_FORCE) == mav.MAV_RESULT_DENIED
+    assert px4_armable.command(reboot, 0) == ACCEPTED, "which asks for nothing"
+
+
 def test_an_odd_arm_value_is_not_answered(px4_armable):
     px4_armable.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 2, *[0] * 6))
     acks = named(px4_armable.advance(0.5), "COMMAND_ACK")
@@ -236,25 +248,6 @@ def test_a_lean_comes_an_eighth_of_a_second_after_the_stick(px4_flying):
         px4_flying.fly(1.5)
 
     assert sorted(lags_ms)[1] == pytest.approx(143, abs=25)
-
-
-def test_landing_disarms_two_seconds_after_the_touchdown(px4_expendable):
-    px4_expendable.set_mode(LAND)
-    px4_expendable.until(
-        lambda m: any("Landing detected" in x.text for x in named(m, "STATUSTEXT")),
-        60.0,
-        lambda _: px4_expendable.sticks(MID),
-    )
-
-    took_s, _ = px4_expendable.until(
-        lambda m: any("Disarmed by landing" in x.text for x in named(m, "STATUSTEXT")),
-        4.0,
-        lambda _: px4_expendable.sticks(MID),
-    )
-
-    assert 1.7 <= took_s <= 2.4
-    px4_expendable.fly(0.5)
-    assert px4_expendable.mode() == ALTCTL[0] << 16, "the last one that can arm"
 
 
 def test_in_flight_only_a_forced_disarm_works(px4_expendable):

@@ -5,7 +5,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import ARM, GCS, Companion, last, named
+from helpers.contract_peers import ARM, GCS, Companion, named
 
 STABILIZE, ACRO, ALT_HOLD, GUIDED, LOITER, RTL, LAND = 0, 1, 2, 4, 5, 6, 9
 POSHOLD, BRAKE, GUIDED_NOGPS = 16, 17, 20
@@ -96,7 +96,7 @@ class CopterCompanion(Companion):
         assert self.arm() == ACCEPTED, self.texts()
         assert self.command(mav.MAV_CMD_NAV_TAKEOFF, *[0] * 6, height_m) == ACCEPTED
         for _ in range(150):
-            if last(self.hold(0.1), "LOCAL_POSITION_NED").z < 1.0 - height_m:
+            if any(m.z < 1.0 - height_m for m in named(self.hold(0.1), "LOCAL_POSITION_NED")):
                 return
         raise AssertionError("the vehicle does not take off")
 

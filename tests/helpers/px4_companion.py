@@ -18,7 +18,7 @@ EVENT, CURRENT_MODE = 410, 436
 STICK_HZ = 50
 VELOCITY_AND_YAW_RATE = 0x5C7
 HOVER_THRUST = 0.484
-LOWEST_M, HIGHEST_M, STILL_MPS = 5.0, 12.0, 0.3
+LOWEST_M, HIGHEST_M, STILL_MPS = 5.0, 40.0, 0.3
 
 
 class Modes(NamedTuple):
@@ -175,22 +175,21 @@ class Px4Companion(Companion):
         self.track()
         if self.in_the_air:
             self.fly(0.1)
-            assert self.set_mode(POSCTL) == ACCEPTED
         else:
             self.get_ready(ALTCTL)
             assert self.arm() == ACCEPTED
             is_up = lambda m: any(p.z < -6.0 for p in named(m, "LOCAL_POSITION_NED"))  # noqa: E731
             self.until(is_up, 25.0, lambda _: self.sticks((0, 0, 1000, 0)))
-            self.fly(0.1)
-            assert self.set_mode(POSCTL) == ACCEPTED
         self._settle()
         assert self.set_mode(mode) == ACCEPTED
         self.fly(0.1)
         self.seen.clear()
 
     def _settle(self) -> None:
-        """In POSCTL: brake, and come to a height of 5 to 12 m."""
-        for _ in range(600):
+        """In POSCTL: brake, and come to a height of 5 to 40 m."""
+        for count in range(600):
+            if count % 100 == 0:  # again, if a starved computer has lost the sticks meanwhile
+                assert self.set_mode(POSCTL) == ACCEPTED
             states = named(self.fly(0.1, (0, 0, self._climb_stick(), 0)), "LOCAL_POSITION_NED")
             speed_mps = max(abs(v) for m in states[-1:] for v in (m.vx, m.vy, m.vz))
             if self._climb_stick() == MID[2] and speed_mps < STILL_MPS:
