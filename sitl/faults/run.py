@@ -6,8 +6,9 @@ from pathlib import Path
 
 from sitl.faults.record import NoVerdictError
 from sitl.faults.scenario import Scenario, Variant
-from sitl.faults.stage import Stage, StageError, faulty_policy, staged
+from sitl.faults.stage import Stage, StageError, faulty_policy, free_port, staged
 from sitl.faults.stalls import StallWatch
+from sitl.faults.transmitter import Transmitter
 from sitl.faults.verdict import Verdict, find_failures
 
 FLY = ("--dual-rate", "--arm")
@@ -37,16 +38,25 @@ def fly_scenario(scenario: Scenario, variant: Variant, *, slack_ms: float = 0.0)
 
 def _fly_once(scenario: Scenario, variant: Variant, slack_ms: float) -> Verdict:
     verdict = Verdict(scenario=scenario.name, variant=variant)
-    vehicle = ("--autopilot", variant.autopilot, "--receiver", variant.receiver)
+    vehicle: tuple[str, ...] = ("--autopilot", variant.autopilot, "--receiver", variant.receiver)
+    transmitter = Transmitter(free_port(), variant.receiver) if scenario.transmitter else None
+    if transmitter is not None:
+        vehicle += transmitter.flags
     with tempfile.TemporaryDirectory(prefix="faults-") as name, StallWatch() as stalls:
         folder = Path(name)
         flags = [flag.format(folder=folder) for flag in scenario.flags]
         policy = faulty_policy(scenario.policy)
         try:
             with staged(folder, *vehicle, renders=False) as stage:
+                stage.transmitter = transmitter
+                if scenario.before or transmitter:
+                    stage.prepare = lambda: _prepare(scenario, stage)
                 stage.start(*FLY, "--mode", variant.mode, "--policy", policy, *flags)
                 if scenario.outcome == "refused":
                     at_ns, leans = 0, False
+                    if scenario.steps:
+                        _perform(scenario, stage)
+                        stage.kill_group(signal.SIGINT)
                     verdict.exit, verdict.output = stage.end()
                 else:
                     at_ns = _perform(scenario, stage)
@@ -59,12 +69,21 @@ def _fly_once(scenario: Scenario, variant: Variant, slack_ms: float) -> Verdict:
     return verdict
 
 
+def _prepare(scenario: Scenario, stage: Stage) -> None:
+    """Bring the vehicle into the state in which the bridge shall find it."""
+    if stage.transmitter is not None:
+        stage.transmitter.switch_on()
+    for step in scenario.before:
+        step.perform(stage)
+
+
 def _perform(scenario: Scenario, stage: Stage) -> int:
-    """Carry the steps out; returns the moment of the fault."""
-    stage.wait_for_lean()
+    """Carry the steps out; returns the moment of the fault, 0 if none of them is one."""
+    if scenario.outcome != "refused":
+        stage.wait_for_lean()
     moments = [step.perform(stage) for step in scenario.steps]
     stage.observe(SETTLE_S)
-    return next(moment for moment in moments if moment is not None)
+    return next((moment for moment in moments if moment is not None), 0)
 
 
 def _leans(stage: Stage) -> bool:

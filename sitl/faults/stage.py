@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
@@ -18,6 +18,7 @@ from sitl.clock import Clock
 from sitl.faults.camera import FrameFeed
 from sitl.faults.record import VehicleReport
 from sitl.faults.relay import Relay
+from sitl.faults.transmitter import Transmitter
 
 TIMEOUT_S = 90.0
 STARTS = 3
@@ -95,6 +96,15 @@ class Stage:
         self._gate: Process | None = None
         self.camera: FrameFeed | None = None
         """The camera, where the vehicle has none of its own."""
+        self.transmitter: Transmitter | None = None
+        """The pilot's, where it can be moved."""
+        self.prepare: Callable[[], object] | None = None
+        """Called before each start of the bridge, when the vehicle has been heard."""
+
+    @property
+    def is_px4(self) -> bool:
+        """The vehicle's firmware is PX4, not ArduPilot."""
+        return "px4" in self._vehicle_flags
 
     def _start_vehicle(self) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "sitl", "--report", str(self.folder / "fc.json")]
@@ -104,6 +114,10 @@ class Stage:
     def start(self, *flags: str, is_read: bool = True) -> None:
         """Start the bridge in a process group of its own; its output is read, or never."""
         self._flags, self._is_read = flags, is_read
+        if self.prepare is not None:
+            if not self.relay.has_heard.wait(TIMEOUT_S):
+                raise StageError("the vehicle has sent nothing")
+            self.prepare()
         self._bridge = subprocess.Popen(
             [*self.command(self.folder / "report.json"), *flags],
             stdin=subprocess.DEVNULL,
@@ -196,6 +210,7 @@ class Stage:
         self._vehicle.kill()
         self._vehicle.wait(TIMEOUT_S)
         self.relay.forget()
+        self.relay.has_heard.clear()
         if "--record" in self._flags:
             shutil.rmtree(self._flags[self._flags.index("--record") + 1])
         self._lines.append("--- starting over: the machine was too busy to fly\n")
@@ -295,7 +310,7 @@ def staged(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[
 
     Without ``renders`` the camera shows noise, costs nothing and can be spoilt.
     """
-    bridge_port = _free_port()
+    bridge_port = free_port()
     shm = f"test-{bridge_port}-{os.getpid()}"
     clock = Clock()
     with ExitStack() as stack:
@@ -309,7 +324,8 @@ def staged(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[
         yield stage
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A UDP port of this computer that nobody uses now."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

@@ -12,6 +12,7 @@ from sitl.faults import camera
 from sitl.faults.link import LinkFaults
 from sitl.faults.relay import Message, Override, set_fields
 from sitl.faults.stage import Stage
+from sitl.faults.steps_vehicle import ClockStep, RadioLost, SetParam, Switch
 
 REBOOT_IN_FLIGHT = 20190226
 """Sixth parameter of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with which ArduPilot reboots while armed."""
@@ -138,10 +139,10 @@ class Joystick:
     def perform(self, stage: Stage) -> int:
         """Returns the moment of the first."""
         sticks = Override(roll=self.roll_us, pitch=1500, throttle=1500, yaw=1500)
-        began_ns = stage.relay.move_joystick(sticks)
+        began_ns = stage.relay.move_joystick(sticks, is_manual=stage.is_px4)
         for _ in range(round(self.s * self.hz)):
             stage.observe(1 / self.hz)
-            stage.relay.move_joystick(sticks)
+            stage.relay.move_joystick(sticks, is_manual=stage.is_px4)
         return began_ns
 
 
@@ -168,7 +169,19 @@ class Terminal:
 
 
 Step: TypeAlias = (
-    Wait | PolicyFault | Signal | Link | Messages | Pilot | Joystick | Images | Terminal
+    Wait
+    | PolicyFault
+    | Signal
+    | Link
+    | Messages
+    | Pilot
+    | Joystick
+    | Images
+    | Terminal
+    | ClockStep
+    | SetParam
+    | Switch
+    | RadioLost
 )
 KINDS: dict[str, Callable[..., Step]] = {
     "wait": Wait,
@@ -180,6 +193,10 @@ KINDS: dict[str, Callable[..., Step]] = {
     "joystick": Joystick,
     "images": Images,
     "terminal": Terminal,
+    "clock": ClockStep,
+    "param": SetParam,
+    "switch": Switch,
+    "radio": RadioLost,
 }
 """Steps by the key ``do`` of a scenario."""
 Made = TypeVar("Made")

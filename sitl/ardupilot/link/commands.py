@@ -15,6 +15,8 @@ DENIED: int = mav.MAV_RESULT_DENIED
 UNSUPPORTED: int = mav.MAV_RESULT_UNSUPPORTED
 FAILED: int = mav.MAV_RESULT_FAILED
 FORCE = 21196.0  # param 2 of ARM_DISARM that overrules every check (MAVLink common.xml)
+FORCED_REBOOT = 20190226.0
+"""Param 6 of PREFLIGHT_REBOOT_SHUTDOWN with which ArduCopter reboots in the air too."""
 UINT16_MAX = 65535
 
 Params7: TypeAlias = tuple[float, ...]  # param1..7 of a command, the first at index 0
@@ -97,7 +99,7 @@ def _send(message_id: int) -> Handler:
 def _reboot(params: Params7, ap: Autopilot, link: MavlinkEndpoint) -> int:
     if params[0] != 1.0:
         return UNSUPPORTED
-    if ap.armed:
+    if ap.armed and params[5] != FORCED_REBOOT:
         return FAILED
     link.reboot_requested = True
     return ACCEPTED

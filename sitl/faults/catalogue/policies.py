@@ -61,7 +61,10 @@ class Leaning(Climbing):
 
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
     lean_calls, fault_calls = 120, 260
-    """Calls into the flight after which it leans, and after which its fault begins."""
+    """Calls into the flight after which it leans, and after which its fault begins; those on the
+    ground after the first of them do not count."""
+    least_climb_mps = 0.3
+    """From here on it has left the ground: PX4 takes 2.4 s for that."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -78,6 +81,8 @@ class Leaning(Climbing):
         if self._flown is None or self._flown < 0:
             return chunk
         self._flown += 1
+        if self._flown == self.lean_calls and -state[..., 2].min() < self.least_climb_mps:
+            self._flown -= 1
         if self._flown > self.lean_calls:
             chunk[:] = (0.3, 0.25, 0.0, 0.5)
         if self._flown > self.fault_calls:
