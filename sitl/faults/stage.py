@@ -12,13 +12,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, TypeAlias, cast
 
 from sitl.clock import Clock
 from sitl.faults.camera import FrameFeed
 from sitl.faults.record import VehicleReport
 from sitl.faults.relay import Relay
 from sitl.faults.transmitter import Transmitter
+from sitl.faults.viewer import Viewer
 
 TIMEOUT_S = 90.0
 STARTS = 3
@@ -32,6 +33,9 @@ MARK = "SITL_FAULT_MARK"
 CLOCK_MONOTONIC, when its fault begins."""
 PIPE_BLOCK = 4096
 CATALOGUE = Path(__file__).parent / "catalogue"
+MEMORY = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
+ProcessName: TypeAlias = Literal["flight", "gate", "recorder"]
+"""``recorder`` is the process that writes the video of a recording."""
 
 
 def faulty_policy(name: str) -> str:
@@ -96,6 +100,14 @@ class Stage:
         self._gate: Process | None = None
         self.camera: FrameFeed | None = None
         """The camera, where the vehicle has none of its own."""
+        self.viewer: Viewer | None = None
+        self.variables: dict[str, str] = {}
+        """More of the bridge's environment."""
+        self.memory: set[str] = set()
+        """Shared memory that it has had, by name; see ``wait_for_lean``."""
+        self.temporary = folder / "temporary"
+        """Where it makes temporary files."""
+        self.temporary.mkdir()
         self.transmitter: Transmitter | None = None
         """The pilot's, where it can be moved."""
         self.prepare: Callable[[], object] | None = None
@@ -141,7 +153,8 @@ class Stage:
 
     def environment(self) -> dict[str, str]:
         """Ours, with a terminal of 200 columns and a place for the mark of a policy's fault."""
-        return os.environ | {"COLUMNS": "200", MARK: str(self._mark)}
+        ours = {"COLUMNS": "200", MARK: str(self._mark), "TMPDIR": str(self.temporary)}
+        return os.environ | ours | self.variables
 
     @property
     def _mark(self) -> Path:
@@ -186,6 +199,7 @@ class Stage:
                 raise StageError(f"the policy has not flown:\n{self._text}")
             self.gate.has_ended(0)  # finds it while its parent lives
             if is_leaning():
+                self.memory |= mapped_memory(self.bridge_pid)
                 return
             self._start_over()
         raise StageError(f"the flight ended {STARTS} times before its fault:\n{self._text}")
@@ -251,6 +265,38 @@ class Stage:
         if self._gate is None:
             self._gate = Process(child_of(self.bridge_pid, b"mavbridge.gate"), self.clock)
         return self._gate
+
+    def recorder(self) -> Process:
+        """The process that writes the video of a recording."""
+        return Process(self.pid_of("recorder"), self.clock)
+
+    def pid_of(self, name: ProcessName) -> int:
+        """Process id, while the bridge lives."""
+        if name == "recorder":
+            return child_of(self.bridge_pid, b"spawn_main")
+        return self.gate.pid if name == "gate" else self.bridge_pid
+
+    def processes(self) -> list[tuple[int, str]]:
+        """Id and command of every process of the bridge that still runs."""
+        mark, found = f"{MARK}={self._mark}".encode(), []
+        for entry in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                if mark in (entry / "environ").read_bytes().split(b"\0"):
+                    command = (entry / "cmdline").read_bytes().replace(b"\0", b" ")
+                    found.append((int(entry.name), command.decode(errors="replace").strip()))
+        return found
+
+    def last_lean_ns(self) -> int:
+        """When the policy's last stick left, once others have followed it; waits for that."""
+        sent = self.relay.sent
+
+        def is_over() -> bool:
+            steering = [row for row in sent[-3 * LEANING :] if row.steers]
+            return bool(steering) and not any(row.leans for row in steering[-LEANING // 10 :])
+
+        if not self.relay.wait_until(is_over, TIMEOUT_S):
+            raise StageError(f"the policy goes on flying:\n{self._text}")
+        return [row.at_ns for row in sent if row.leans][-1]
 
     def kill(self, number: signal.Signals) -> int:
         """Send a signal to the bridge alone; returns the moment."""
@@ -330,6 +376,13 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def mapped_memory(pid: int) -> set[str]:
+    """Names in ``MEMORY`` that a process has mapped, also those that are removed already."""
+    maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    paths = [Path(line.split()[5]) for line in maps if f" {MEMORY}/" in line]
+    return {path.name for path in paths}
 
 
 def child_of(parent_pid: int, text: bytes) -> int:

@@ -131,7 +131,7 @@ def test_an_exception_in_the_policy_gives_the_sticks_back(tmp_path: Path) -> Non
     assert status == 4
     assert_released(flying.relay.overrides)
     assert "RuntimeError: the user's policy is broken" in output
-    assert "user_policies.py" in output  # where, for the person who wrote it
+    assert "policies.py" in output  # where, for the person who wrote it
     assert "Traceback" not in output
 
 
