@@ -3,7 +3,8 @@
 import threading
 from collections.abc import Set
 
-from sitl.faults.stage import MEMORY, Stage
+from sitl.faults.processes import MEMORY
+from sitl.faults.stage import Stage
 
 WAIT_S = 10.0
 """A recorder's writer ends after the processes that fed it."""

@@ -7,9 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from sitl.faults.leftovers import leftovers, thread_names
+from sitl.faults.processes import StageError
 from sitl.faults.record import NoVerdictError
 from sitl.faults.scenario import Scenario, Variant
-from sitl.faults.stage import CATALOGUE, Stage, StageError, faulty_policy, free_port, staged
+from sitl.faults.stage import CATALOGUE, Stage, faulty_policy, free_port, staged
 from sitl.faults.stalls import StallWatch
 from sitl.faults.steps import Terminal
 from sitl.faults.transmitter import Transmitter

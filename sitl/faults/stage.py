@@ -2,7 +2,6 @@
 
 import json
 import os
-import select
 import shutil
 import signal
 import socket
@@ -16,6 +15,7 @@ from typing import Any, Literal, TypeAlias, cast
 
 from sitl.clock import Clock
 from sitl.faults.camera import FrameFeed
+from sitl.faults.processes import Process, StageError, child_of, mapped_memory, processes_with
 from sitl.faults.record import VehicleReport
 from sitl.faults.relay import Relay
 from sitl.faults.transmitter import Transmitter
@@ -33,7 +33,6 @@ MARK = "SITL_FAULT_MARK"
 CLOCK_MONOTONIC, when its fault begins."""
 PIPE_BLOCK = 4096
 CATALOGUE = Path(__file__).parent / "catalogue"
-MEMORY = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
 ProcessName: TypeAlias = Literal["flight", "gate", "recorder"]
 """``recorder`` is the process that writes the video of a recording."""
 
@@ -41,41 +40,6 @@ ProcessName: TypeAlias = Literal["flight", "gate", "recorder"]
 def faulty_policy(name: str) -> str:
     """A class of ``catalogue/policies.py`` as the bridge takes it, by ``--policy``."""
     return f"{CATALOGUE / 'policies.py'}:{name}"
-
-
-class StageError(Exception):
-    """A flight did not get as far as its fault, or did not end."""
-
-
-class Process:
-    """A process of which nobody here is the parent, such as the gate of a killed bridge."""
-
-    def __init__(self, pid: int, clock: Clock) -> None:
-        self.pid = pid
-        self._clock = clock
-        self._fd = os.pidfd_open(pid)
-
-    def has_ended(self, timeout_s: float) -> bool:
-        """Wait for its end; a zombie has ended."""
-        return bool(select.select([self._fd], [], [], timeout_s)[0])
-
-    def kill(self, number: signal.Signals) -> int:
-        """Send a signal; returns the moment."""
-        at_ns = self._clock.now_ns()
-        with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._fd, number)
-        return at_ns
-
-    def peak_memory_mb(self) -> float:
-        """Largest resident set so far."""
-        status = Path(f"/proc/{self.pid}/status").read_text()
-        (line,) = [line for line in status.splitlines() if line.startswith("VmHWM:")]
-        return int(line.split()[1]) / 1024
-
-    def close(self) -> None:
-        """End it if it still runs."""
-        self.kill(signal.SIGKILL)
-        os.close(self._fd)
 
 
 class Stage:
@@ -278,13 +242,7 @@ class Stage:
 
     def processes(self) -> list[tuple[int, str]]:
         """Id and command of every process of the bridge that still runs."""
-        mark, found = f"{MARK}={self._mark}".encode(), []
-        for entry in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                if mark in (entry / "environ").read_bytes().split(b"\0"):
-                    command = (entry / "cmdline").read_bytes().replace(b"\0", b" ")
-                    found.append((int(entry.name), command.decode(errors="replace").strip()))
-        return found
+        return processes_with(f"{MARK}={self._mark}")
 
     def last_lean_ns(self) -> int:
         """When the policy's last stick left, once others have followed it; waits for that."""
@@ -376,27 +334,3 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
-
-
-def mapped_memory(pid: int) -> set[str]:
-    """Names in ``MEMORY`` that a process has mapped, also those that are removed already."""
-    maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
-    paths = [Path(line.split()[5]) for line in maps if f" {MEMORY}/" in line]
-    return {path.name for path in paths}
-
-
-def child_of(parent_pid: int, text: bytes) -> int:
-    """The child process whose command line contains a text.
-
-    Raises:
-        StageError: it has no such child.
-    """
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            command = (entry / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if parent == parent_pid and text in command:
-            return int(entry.name)
-    raise StageError(f"process {parent_pid} has no child with {text!r} in its command line")
