@@ -68,25 +68,32 @@ class NoVerdictError(Exception):
 
 
 def aftermath(
-    report: VehicleReport, at_ns: int, receiver: Receiver, mode: str = "ALT_HOLD"
+    report: VehicleReport,
+    at_ns: int,
+    receiver: Receiver,
+    mode: str = "ALT_HOLD",
+    others_us: tuple[int, ...] = (),
 ) -> Aftermath:
     """Read the sticks of a vehicle that flew in ``mode`` under the policy at ``at_ns``.
+
+    ``others_us`` are four sticks of somebody else, which are safe as well.
 
     Raises:
         NoVerdictError: it did not fly then, or was never safe after it.
     """
+    how = (receiver, mode, others_us)
     fault_s = (at_ns - report["start_ns"]) / 1e9
     entries = [entry for entry in report["sticks"] if entry["t_s"] >= fault_s]
     before = [entry for entry in report["sticks"] if entry["t_s"] < fault_s][-1:]
-    if not before or is_safe(before[0], receiver, mode):
+    if not before or is_safe(before[0], *how):
         raise NoVerdictError(f"the policy does not fly at {fault_s:.3f} s: {before}")
     first = last = None
     for previous, entry in zip([*before, *entries], entries, strict=False):
-        if is_safe(entry, receiver, mode) and not is_safe(previous, receiver, mode):
+        if is_safe(entry, *how) and not is_safe(previous, *how):
             first, last = first or entry["t_s"], entry["t_s"]
     if first is None or last is None:
         raise NoVerdictError("the vehicle was never safe after the fault")
-    if not is_safe(entries[-1], receiver, mode):
+    if not is_safe(entries[-1], *how):
         raise NoVerdictError(f"the vehicle is not safe at the end: {entries[-1]}")
     changed = next((entry for entry in entries if entry["mode"] != mode), None)
     return Aftermath(
@@ -98,9 +105,11 @@ def aftermath(
     )
 
 
-def is_safe(entry: StickEntry, receiver: Receiver, mode: str) -> bool:
-    """Neutral sticks, the receiver's, out of the mode of the flight, or disarmed."""
-    allowed = {NEUTRAL_US, RECEIVER_US.get(receiver, NEUTRAL_US)}
+def is_safe(
+    entry: StickEntry, receiver: Receiver, mode: str, others_us: tuple[int, ...] = ()
+) -> bool:
+    """Neutral sticks, the receiver's, somebody else's, out of the flight's mode, or disarmed."""
+    allowed = {NEUTRAL_US, RECEIVER_US.get(receiver, NEUTRAL_US), others_us or NEUTRAL_US}
     is_stick = any(
         all(abs(a - b) <= NUDGE_US for a, b in zip(entry["us"], us, strict=True)) for us in allowed
     )

@@ -19,12 +19,21 @@ PILOTS_STATION = 42
 """System id of another ground station than the bridge's 255."""
 BRIDGE = 255
 VEHICLE = (1, 1)
-COPTER_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "LOITER": 5, "RTL": 6, "LAND": 9}
-PX4_MODES = {"ALTCTL": (2, 0), "POSCTL": (3, 0), "AUTO.LOITER": (4, 3), "AUTO.LAND": (4, 6)}
+COPTER_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "LOITER": 5, "RTL": 6, "LAND": 9, "BRAKE": 17}
+PX4_MODES = {
+    "ALTCTL": (2, 0),
+    "POSCTL": (3, 0),
+    "AUTO.LOITER": (4, 3),
+    "AUTO.RTL": (4, 5),
+    "AUTO.LAND": (4, 6),
+    "STABILIZED": (7, 0),
+}
 """Main mode and sub-mode of PX4's ``custom_mode``, as MAV_CMD_DO_SET_MODE takes them."""
 FORCE = 21196
 """MAV_CMD_COMPONENT_ARM_DISARM disarms in the air with this."""
 JOIN_S = 5.0
+UNREADABLE = ("BAD_DATA", "UNKNOWN")
+"""Types of what pymavlink's dialect does not have, such as PX4's CURRENT_MODE and EVENT."""
 IGNORED_US = 65535
 NEUTRAL_Z = 500
 Rewrite = Callable[[Message], bool]
@@ -56,6 +65,11 @@ class Sent(NamedTuple):
     def is_command(self) -> bool:
         """Sticks of the policy, or neutral; no release."""
         return self.override is not None and any(self.override)
+
+    @property
+    def holds(self) -> bool:
+        """Sticks of anything, also neutral ones; no release."""
+        return self.is_command or self.name == "MANUAL_CONTROL"
 
     @property
     def override(self) -> Override | None:
@@ -133,7 +147,7 @@ class Relay:
         self._bridge = ("127.0.0.1", bridge_port)
         self._vehicle: tuple[str, int] | None = None
         self._to_vehicle, self._to_bridge = _Way(), _Way()
-        self._rewrite: Rewrite | None = None
+        self._rewrites: tuple[Rewrite, ...] = ()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._mav = _parser(BRIDGE)
@@ -146,6 +160,8 @@ class Relay:
         self.sent: list[Sent] = []
         self.overrides: list[Override] = []
         self.has_flown = threading.Event()
+        self.has_heard = threading.Event()
+        """The vehicle has sent something: it can be sent to."""
         self.port: int = self._socket.getsockname()[1]
 
     def __enter__(self) -> "Relay":
@@ -187,9 +203,9 @@ class Relay:
             self._to_bridge.impair(to_bridge)
         return at_ns
 
-    def rewrite(self, change: Rewrite | None) -> int:
-        """Let every message of the vehicle pass through ``change``; returns the moment."""
-        self._rewrite = change
+    def rewrite(self, change: Rewrite) -> int:
+        """Let every message of the vehicle pass through ``change`` too; returns the moment."""
+        self._rewrites = (*self._rewrites, change)
         return self._clock.now_ns()
 
     def inject(self, message: Message, station: Message = None) -> int:
@@ -200,10 +216,18 @@ class Relay:
         self._socket.sendto(message.pack(station or self._station), self._vehicle)
         return at_ns
 
-    def move_joystick(self, sticks: Override) -> int:
-        """Another program overrides with the bridge's own system id; returns the moment."""
+    def move_joystick(self, sticks: Override, *, is_manual: bool = False) -> int:
+        """Another program sends sticks with the bridge's own system id; returns the moment.
+
+        ``is_manual``: as MANUAL_CONTROL, which PX4 takes, instead of overrides.
+        """
         channels = (*sticks, *[IGNORED_US] * 4)
-        message = dialect.MAVLink_rc_channels_override_message(*VEHICLE, *channels)
+        message: Message = dialect.MAVLink_rc_channels_override_message(*VEHICLE, *channels)
+        if is_manual:
+            roll, pitch, throttle, yaw = (2 * (us - 1500) for us in sticks)
+            message = dialect.MAVLink_manual_control_message(
+                VEHICLE[0], -pitch, roll, NEUTRAL_Z + throttle // 2, yaw, 0
+            )
         return self.inject(message, self._joystick)
 
     def command(self, number: int, *params: float) -> int:
@@ -247,6 +271,7 @@ class Relay:
                 self._to_vehicle.pass_on(data, now_ns)
             elif sender is not None:
                 self._vehicle = sender
+                self.has_heard.set()
                 if data := self._rewritten(data):
                     self._to_bridge.pass_on(data, now_ns)
             self._deliver(now_ns)
@@ -254,12 +279,14 @@ class Relay:
                 self._record(data, now_ns)
 
     def _rewritten(self, data: bytes) -> bytes:
-        change = self._rewrite
-        if change is None:
+        changes = self._rewrites
+        if not changes:
             return data
         kept = bytearray()
         for message in self._vehicles.parse_buffer(data) or ():
-            if change(message):
+            if message.get_type().startswith(UNREADABLE):
+                kept += message.get_msgbuf()
+            elif all(change(message) for change in changes):
                 self._vehicles.seq = message.get_seq()
                 self._vehicles.srcComponent = message.get_srcComponent()
                 kept += message.pack(self._vehicles)

@@ -28,6 +28,8 @@ class Scenario:
     """One line for a reader."""
     steps: tuple[Step, ...]
     """The first that is more than a wait is the fault."""
+    before: tuple[Step, ...] = ()
+    """Carried out on the vehicle before the bridge starts."""
     outcome: Outcome
     limit_ms: float = 0.0
     """From the fault until the vehicle is safe by its own record; only for ``loses``. A fault that
@@ -42,10 +44,20 @@ class Scenario:
     """Allowed first mode after the fault; empty: any, also none."""
     receivers: list[Receiver] = field(default_factory=lambda: ["mid", "none"])
     autopilots: list[AutopilotName] = field(default_factory=lambda: ["ardupilot", "px4"])
+    others_us: list[int] = field(default_factory=list)
+    """Four sticks of somebody else, who may share the vehicle with the policy until the limit."""
+    is_silent: bool = False
+    """No stick at all may follow the last one of the policy, not even a neutral one."""
+    transmitter: bool = False
+    """The pilot has one, which steps can move; its switches are on at the start."""
     policy: str = "Leaning"
     """Class in ``catalogue/policies.py``."""
     flags: list[str] = field(default_factory=list)
-    """More flags of the bridge; ``{folder}`` is a folder for the files of this run."""
+    """More flags of the bridge; ``{folder}`` is a folder for the files of this run, ``{viewer}`` a
+    viewer's address for ``--rerun``."""
+    environment: dict[str, str] = field(default_factory=dict)
+    """More variables for the bridge; ``{folder}`` as above, ``{catalogue}`` that of the scenarios,
+    ``{path}`` the PYTHONPATH so far."""
     untested: str = ""
     """Why the tests leave it out; empty: they fly it."""
 
@@ -109,5 +121,6 @@ def _read(path: Path) -> Iterator[Scenario]:
         raise UsageError(f"{path}: {error}") from error
     for name, table in tables.items():
         where = f"{path}: [{name}]"
-        steps = tuple(make_step(step, where) for step in table.pop("steps", []))
-        yield make(Scenario, {"name": name, "group": path.stem, "steps": steps, **table}, where)
+        for key in ("steps", "before"):
+            table[key] = tuple(make_step(step, where) for step in table.get(key, []))
+        yield make(Scenario, {"name": name, "group": path.stem, **table}, where)

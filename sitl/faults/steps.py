@@ -11,7 +11,9 @@ from sitl import UsageError
 from sitl.faults import camera
 from sitl.faults.link import LinkFaults
 from sitl.faults.relay import Message, Override, set_fields
-from sitl.faults.stage import Stage
+from sitl.faults.stage import ProcessName, Stage
+from sitl.faults.steps_host import HOST_KINDS, HostStep
+from sitl.faults.steps_vehicle import ClockStep, RadioLost, SetParam, Switch
 
 REBOOT_IN_FLIGHT = 20190226
 """Sixth parameter of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with which ArduPilot reboots while armed."""
@@ -42,12 +44,14 @@ class Signal:
     """Send a signal to a process."""
 
     name: str
-    to: Literal["flight", "group", "gate"] = "flight"
+    to: ProcessName | Literal["group"] = "flight"
     """``group`` is the flight process with its children, as a terminal sends it."""
 
     def perform(self, stage: Stage) -> int:
         """Returns the moment."""
         number = signal.Signals[self.name]
+        if self.to == "recorder":
+            return stage.recorder().kill(number)
         kill = {"flight": stage.kill, "group": stage.kill_group, "gate": stage.gate.kill}[self.to]
         return kill(number)
 
@@ -138,10 +142,10 @@ class Joystick:
     def perform(self, stage: Stage) -> int:
         """Returns the moment of the first."""
         sticks = Override(roll=self.roll_us, pitch=1500, throttle=1500, yaw=1500)
-        began_ns = stage.relay.move_joystick(sticks)
+        began_ns = stage.relay.move_joystick(sticks, is_manual=stage.is_px4)
         for _ in range(round(self.s * self.hz)):
             stage.observe(1 / self.hz)
-            stage.relay.move_joystick(sticks)
+            stage.relay.move_joystick(sticks, is_manual=stage.is_px4)
         return began_ns
 
 
@@ -168,7 +172,20 @@ class Terminal:
 
 
 Step: TypeAlias = (
-    Wait | PolicyFault | Signal | Link | Messages | Pilot | Joystick | Images | Terminal
+    Wait
+    | PolicyFault
+    | Signal
+    | Link
+    | Messages
+    | Pilot
+    | Joystick
+    | Images
+    | Terminal
+    | ClockStep
+    | SetParam
+    | Switch
+    | RadioLost
+    | HostStep
 )
 KINDS: dict[str, Callable[..., Step]] = {
     "wait": Wait,
@@ -180,6 +197,11 @@ KINDS: dict[str, Callable[..., Step]] = {
     "joystick": Joystick,
     "images": Images,
     "terminal": Terminal,
+    "clock": ClockStep,
+    "param": SetParam,
+    "switch": Switch,
+    "radio": RadioLost,
+    **HOST_KINDS,
 }
 """Steps by the key ``do`` of a scenario."""
 Made = TypeVar("Made")

@@ -61,9 +61,11 @@ def find_failures(
             failures.append("the policy has lost the sticks")
     else:
         variant = verdict.variant
-        measured = aftermath(report, at_ns, variant.receiver, variant.mode)
+        others = tuple(scenario.others_us)
+        measured = aftermath(report, at_ns, variant.receiver, variant.mode, others)
         verdict.aftermath = measured
-        verdict.last_stick_ms = ([row.at_ns for row in sent if row.leans][-1] - at_ns) / 1e6
+        policys = [row.at_ns for row in sent if (row.holds if scenario.is_silent else row.leans)]
+        verdict.last_stick_ms = (policys[-1] - at_ns) / 1e6
         failures += _too_late(measured, verdict.last_stick_ms, scenario, slack_ms)
     return failures
 
@@ -92,14 +94,15 @@ def _too_late(
     measured: Aftermath, last_stick_ms: float, scenario: Scenario, slack_ms: float
 ) -> list[str]:
     failures = []
-    if measured.safe_ms > scenario.limit_ms + slack_ms:
-        failures.append(f"safe after {measured.safe_ms:.0f} ms, not {scenario.limit_ms:.0f}")
+    safe_ms = measured.final_safe_ms if scenario.others_us else measured.safe_ms
+    if safe_ms > scenario.limit_ms + slack_ms:
+        failures.append(f"safe after {safe_ms:.0f} ms, not {scenario.limit_ms:.0f}")
     if last_stick_ms > scenario.last_stick_limit_ms + slack_ms:
         limit_ms = scenario.last_stick_limit_ms
         failures.append(
             f"last stick of the policy after {last_stick_ms:.0f} ms, not {limit_ms:.0f}"
         )
-    if measured.flew_again:
+    if measured.flew_again and not scenario.others_us:
         failures.append(f"the policy flew again, until {measured.final_safe_ms:.0f} ms")
     if scenario.modes and measured.mode not in scenario.modes:
         failures.append(f"mode {measured.mode}, not {' or '.join(scenario.modes)}")
