@@ -31,9 +31,13 @@ class FlownVehicle:
         self.armed = True
         self.is_landed: bool | None = False
         self.has_receiver: bool | None = False
+        self.is_known = True
+        """It has sent a heartbeat since its session began."""
 
-    def status(self, _now_ns: int) -> VehicleStatus:
+    def status(self, _now_ns: int) -> VehicleStatus | None:
         """The status that was set."""
+        if not self.is_known:
+            return None
         return VehicleStatus(
             mode=self.mode,
             armed=self.armed,

@@ -168,6 +168,23 @@ def test_the_last_sticks_are_neutral_ones_where_nobody_elses_are_flown(
     assert (message.x, message.y, message.z, message.r) == last
 
 
+@pytest.mark.parametrize(("has_receiver", "is_levelled"), [(False, True), (True, False)])
+def test_a_session_that_starts_over_in_the_air_still_ends_with_neutral_sticks(
+    has_receiver: bool, is_levelled: bool
+) -> None:
+    """A reboot may be but a wrong stamp: what was known of the vehicle before it counts."""
+    flight = px4_flight()
+    flight.vehicle.mode, flight.vehicle.has_receiver = "ALTCTL", has_receiver
+    assert flight.status.mode == "ALTCTL"
+    flight.send(Sticks(0.3, 0.2, 0.5, -0.5))
+    flight.output.restart()
+    flight.vehicle.is_known = False
+    packet = flight.output.release_packet(flight.session, flight.now_ns)
+    assert (packet is not None) is is_levelled
+    for message in flight.end.read(packet or b""):
+        assert (message.x, message.y, message.z, message.r) == (0, 0, 500, 0)
+
+
 def test_the_pilots_sticks_are_those_that_px4_shows_without_ours() -> None:
     flight = px4_flight()
     assert flight.status.rc_sticks is None
