@@ -31,6 +31,7 @@ class FlownVehicle:
         self.armed = True
         self.is_landed: bool | None = False
         self.has_receiver: bool | None = False
+        self.is_failsafe = False
         self.is_known = True
         """It has sent a heartbeat since its session began."""
 
@@ -43,6 +44,7 @@ class FlownVehicle:
             armed=self.armed,
             is_landed=self.is_landed,
             has_receiver=self.has_receiver,
+            is_failsafe=self.is_failsafe,
         )
 
 
