@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from sitl import UsageError
+from sitl.faults.processes import StageError
 from sitl.faults.run import fly_scenario
 from sitl.faults.scenario import Scenario, Variant, load_catalogue
 from sitl.faults.soak import make_summary, soak
@@ -41,7 +42,10 @@ def add_soak_command(commands: "argparse._SubParsersAction[argparse.ArgumentPars
 
 def _soak(args: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
-        result = soak(args.minutes, args.seed, Path(folder), print)
+        try:
+            result = soak(args.minutes, args.seed, Path(folder), print)
+        except StageError as error:
+            raise UsageError(f"the soak could not go on: {error}") from error
     print(make_summary(result))
     if result.failures:
         raise UsageError("the soak has failed")
