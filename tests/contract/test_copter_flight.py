@@ -52,13 +52,13 @@ def test_arming_twice_is_accepted(armable):
 
 @pytest.mark.parametrize(("throttle_us", "disarms"), [(1000, True), (1500, False)])
 def test_who_does_not_take_off_is_disarmed_with_the_throttle_down(armable, throttle_us, disarms):
-    armable.set_param("DISARM_DELAY", 2)
+    armable.set_param("DISARM_DELAY", 1)
     armable.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
     armable.get_ready(ALT_HOLD)
     assert armable.arm() == ACCEPTED
-    armable.hold(1.0, thr=throttle_us)
+    armable.hold(0.3, thr=throttle_us)
 
-    armed = [is_armed(m) for m in named(armable.hold(3.0, thr=throttle_us), "HEARTBEAT")]
+    armed = [is_armed(m) for m in named(armable.hold(2.5, thr=throttle_us), "HEARTBEAT")]
 
     assert armed[0]
     assert armed[-1] != disarms

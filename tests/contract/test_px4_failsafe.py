@@ -238,6 +238,7 @@ def test_offboard_needs_more_than_one_setpoint_a_second(px4_flying, hz, stays):
             due_s[0] += 1.0 / hz
             px4_flying.send(attitude_target())
 
+    px4_flying.repeat(send, 0.1)  # a CURRENT_MODE of before may still be on its way
     messages = px4_flying.repeat(send, 4.0)
 
     modes = {m.custom_mode for m in modes_in(messages)}
