@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sitl import UsageError
+from sitl.faults.carriers import CarrierName
 from sitl.faults.record import Receiver
 from sitl.faults.stage import CATALOGUE
 from sitl.faults.steps import Step, make, make_step
@@ -50,6 +51,10 @@ class Scenario:
     """No stick at all may follow the last one of the policy, not even a neutral one."""
     transmitter: bool = False
     """The pilot has one, which steps can move; its switches are on at the start."""
+    carrier: CarrierName = "udp"
+    """The bridge's link."""
+    baud: int = 115_200
+    """Of a serial port."""
     policy: str = "Leaning"
     """Class in ``catalogue/policies.py``."""
     flags: list[str] = field(default_factory=list)
