@@ -13,7 +13,7 @@ from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import stop_on_signal
 from sitl.course.layout import course_to_json, make_course
-from sitl.faults.command import add_faults_command
+from sitl.faults.command import add_faults_command, add_soak_command
 from sitl.pilot.axes import DEFAULT_AXES
 from sitl.pilot.choose import NAMES as PILOTS
 from sitl.vehicle.conditions import NOMINAL, random_conditions
@@ -79,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     course.add_argument("--course", type=_SEED, default=0, metavar="SEED", help="default: 0")
     course.add_argument("--json", action="store_true", help="print JSON instead of a table")
     add_faults_command(commands)
+    add_soak_command(commands)
     return parser
 
 

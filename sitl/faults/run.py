@@ -125,7 +125,7 @@ def _perform(scenario: Scenario, stage: Stage) -> int:
 
 def _leans(stage: Stage) -> bool:
     """The newest sticks are still the policy's."""
-    return next(sent.leans for sent in reversed(stage.relay.sent) if sent.steers)
+    return stage.relay.is_leaning(1)
 
 
 def _end(scenario: Scenario, stage: Stage, verdict: Verdict) -> None:

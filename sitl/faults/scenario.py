@@ -49,6 +49,8 @@ class Scenario:
     """Four sticks of somebody else, who may share the vehicle with the policy until the limit."""
     is_silent: bool = False
     """No stick at all may follow the last one of the policy, not even a neutral one."""
+    releases: bool = True
+    """The bridge can still give an ArduPilot with a receiver its sticks back."""
     transmitter: bool = False
     """The pilot has one, which steps can move; its switches are on at the start."""
     carrier: CarrierName = "udp"

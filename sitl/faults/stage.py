@@ -151,8 +151,7 @@ class Stage:
         sent = self.relay.sent
 
         def is_leaning() -> bool:
-            steering = [row for row in sent[-3 * LEANING :] if row.steers][-LEANING:]
-            return len(steering) == LEANING and all(row.leans for row in steering)
+            return self.relay.is_leaning(LEANING)
 
         def is_over() -> bool:
             last = next((row for row in reversed(sent) if row.steers), None)
@@ -332,7 +331,11 @@ def staged(
 
 
 def free_port() -> int:
+<<<<<<< HEAD
     """A UDP port of this computer that nobody uses now."""
+=======
+    """A UDP port of the loopback that nobody uses now."""
+>>>>>>> wip
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

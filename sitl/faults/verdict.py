@@ -67,6 +67,9 @@ def find_failures(
         policys = [row.at_ns for row in sent if (row.holds if scenario.is_silent else row.leans)]
         verdict.last_stick_ms = (policys[-1] - at_ns) / 1e6
         failures += _too_late(measured, verdict.last_stick_ms, scenario, slack_ms)
+        has_release = variant.autopilot == "ardupilot" and variant.receiver != "none"
+        if has_release and scenario.releases and any(stage.relay.overrides[-1]):
+            failures.append(f"the last sticks are no release: {stage.relay.overrides[-1]}")
     return failures
 
 

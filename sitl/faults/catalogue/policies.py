@@ -100,6 +100,21 @@ class Leaning(Climbing):
         return self._flown == self.fault_calls + 1
 
 
+class Wandering(Climbing):
+    """Takes off, then leans to this side and that for ever, at the same height."""
+
+    contract = Leaning.contract
+    climb_calls, turn_calls = 300, 400
+
+    def predict_fast(
+        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
+    ) -> Array:
+        chunk = super().predict_fast(feature, state, action_history, num_diffusion_steps)
+        side = 1.0 if self._calls // self.turn_calls % 2 else -1.0
+        chunk[:] = (0.5 if self._calls < self.climb_calls else 0.0, 0.2, 0.0, 0.4 * side)
+        return chunk
+
+
 class Deliberate(Leaning):
     """Makes two chunks a second, in 0.3 s each, and is meant to play one for a second."""
 
