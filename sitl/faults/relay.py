@@ -1,15 +1,18 @@
 """A relay on loopback between the vehicle and the bridge: it records, and it breaks the link."""
 
 import math
+import select
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import count, islice
 from typing import Any, NamedTuple, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sitl.clock import NS_PER_S, Clock
+from sitl.faults.carriers import LOOPBACK, Carrier
 from sitl.faults.link import FaultyLink, LinkFaults
 from sitl.faults.record import NEUTRAL_US, NUDGE_US
 
@@ -139,17 +142,18 @@ class _Way:
 
 
 class Relay:
-    """Passes datagrams between the vehicle and the bridge, and keeps what the bridge sends."""
+    """Passes packets between the vehicle and the bridge, and keeps what the bridge sends."""
 
-    def __init__(self, bridge_port: int, clock: Clock) -> None:
-        self.bridge_port = bridge_port
+    def __init__(self, carrier: Carrier, clock: Clock) -> None:
+        """``carrier`` leads to the bridge; the relay closes it."""
+        self.carrier = carrier
         self._clock = clock
-        self._bridge = ("127.0.0.1", bridge_port)
         self._vehicle: tuple[str, int] | None = None
         self._to_vehicle, self._to_bridge = _Way(), _Way()
         self._rewrites: tuple[Rewrite, ...] = ()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", 0))
+        self._socket.bind((LOOPBACK, 0))
+        self._socket.setblocking(False)
         self._mav = _parser(BRIDGE)
         self._vehicles = _parser(VEHICLE[0])
         self._station = dialect.MAVLink(None, srcSystem=PILOTS_STATION, srcComponent=190)
@@ -172,6 +176,7 @@ class Relay:
         self._stop.set()
         self._thread.join(JOIN_S)
         self._socket.close()
+        self.carrier.close()
 
     def forget(self) -> int:
         """Forget the flight so far: another one begins. Returns how many overrides it had."""
@@ -261,22 +266,34 @@ class Relay:
         while not self._stop.is_set():
             now_ns = self._clock.now_ns()
             due_ns = min(self._to_vehicle.due_ns, self._to_bridge.due_ns)
-            self._socket.settimeout(min(max((due_ns - now_ns) / NS_PER_S, 1e-4), 0.2))
-            try:
-                data, sender = self._socket.recvfrom(65536)
-            except (TimeoutError, ConnectionError):
-                data, sender = b"", None
+            longest_s = min(max((due_ns - now_ns) / NS_PER_S, 1e-4), self.carrier.wait_s)
+            select.select([self._socket, *self.carrier.descriptors()], [], [], longest_s)
             now_ns = self._clock.now_ns()
-            if sender == self._bridge:
-                self._to_vehicle.pass_on(data, now_ns)
-            elif sender is not None:
-                self._vehicle = sender
-                self.has_heard.set()
-                if data := self._rewritten(data):
-                    self._to_bridge.pass_on(data, now_ns)
+            messages = self._take_bridges(now_ns)
+            self._take_vehicles(now_ns)
             self._deliver(now_ns)
-            if sender == self._bridge:
-                self._record(data, now_ns)
+            if messages:
+                self._record(messages, now_ns)
+
+    def _take_bridges(self, now_ns: int) -> list[Message]:
+        """Put what the bridge has sent on the way to the vehicle; a stream's as whole packets."""
+        taken: list[Message] = []
+        for data in self.carrier.receive():
+            messages = self._mav.parse_buffer(data) or []
+            whole = [message.get_msgbuf() for message in messages]
+            for packet in whole if self.carrier.is_stream else [data]:
+                self._to_vehicle.pass_on(bytes(packet), now_ns)
+            taken += messages
+        return taken
+
+    def _take_vehicles(self, now_ns: int) -> None:
+        try:
+            data, self._vehicle = self._socket.recvfrom(65536)
+        except (BlockingIOError, ConnectionError):
+            return
+        self.has_heard.set()
+        if data := self._rewritten(data):
+            self._to_bridge.pass_on(data, now_ns)
 
     def _rewritten(self, data: bytes) -> bytes:
         changes = self._rewrites
@@ -294,14 +311,15 @@ class Relay:
 
     def _deliver(self, now_ns: int) -> None:
         for packet in self._to_bridge.arrived(now_ns):
-            self._socket.sendto(packet, self._bridge)
+            self.carrier.send(packet)
         for packet in self._to_vehicle.arrived(now_ns):
             if self._vehicle is not None:
-                self._socket.sendto(packet, self._vehicle)
+                with suppress(BlockingIOError, ConnectionError):
+                    self._socket.sendto(packet, self._vehicle)
 
-    def _record(self, data: bytes, now_ns: int) -> None:
+    def _record(self, messages: list[Message], now_ns: int) -> None:
         with self._news:
-            for message in self._mav.parse_buffer(data) or ():
+            for message in messages:
                 sent = Sent(now_ns, message)
                 self.sent.append(sent)
                 if (sticks := sent.override) is not None:

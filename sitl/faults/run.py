@@ -6,6 +6,8 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
+from sitl.clock import Clock
+from sitl.faults.carriers import Carrier, SerialCarrier, TcpCarrier
 from sitl.faults.leftovers import leftovers, thread_names
 from sitl.faults.processes import StageError
 from sitl.faults.record import NoVerdictError
@@ -53,7 +55,9 @@ def _fly_once(scenario: Scenario, variant: Variant, slack_ms: float) -> Verdict:
         policy = faulty_policy(scenario.policy)
         try:
             with ExitStack() as stack:
-                stage = stack.enter_context(staged(folder, *vehicle, renders=False))
+                stage = stack.enter_context(
+                    staged(folder, *vehicle, renders=False, carrier=_carrier(scenario))
+                )
                 stage.transmitter = transmitter
                 flags = _equip(stage, scenario, stack)
                 if scenario.before or transmitter:
@@ -77,6 +81,16 @@ def _fly_once(scenario: Scenario, variant: Variant, slack_ms: float) -> Verdict:
             verdict.failures.append(str(error))
         verdict.stall_ms = stalls.longest_ms
     return verdict
+
+
+def _carrier(scenario: Scenario) -> Carrier | None:
+    match scenario.carrier:
+        case "udp":
+            return None
+        case "tcp":
+            return TcpCarrier()
+        case "serial":
+            return SerialCarrier(scenario.baud, Clock())
 
 
 def _equip(stage: Stage, scenario: Scenario, stack: ExitStack) -> tuple[str, ...]:

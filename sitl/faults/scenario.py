@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sitl import UsageError
+from sitl.faults.carriers import CarrierName
 from sitl.faults.record import Receiver
 from sitl.faults.stage import CATALOGUE
 from sitl.faults.steps import Step, make, make_step
@@ -52,6 +53,10 @@ class Scenario:
     """The bridge can still give an ArduPilot with a receiver its sticks back."""
     transmitter: bool = False
     """The pilot has one, which steps can move; its switches are on at the start."""
+    carrier: CarrierName = "udp"
+    """The bridge's link."""
+    baud: int = 115_200
+    """Of a serial port."""
     policy: str = "Leaning"
     """Class in ``catalogue/policies.py``."""
     flags: list[str] = field(default_factory=list)

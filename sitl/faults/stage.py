@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeAlias, cast
 
 from sitl.clock import Clock
 from sitl.faults.camera import FrameFeed
+from sitl.faults.carriers import Carrier, UdpCarrier
 from sitl.faults.processes import Process, StageError, child_of, mapped_memory, processes_with
 from sitl.faults.record import VehicleReport
 from sitl.faults.relay import Relay
@@ -109,8 +110,7 @@ class Stage:
 
     def command(self, report: Path) -> list[str]:
         """A bridge for this vehicle, without any flag of its flight."""
-        address = f"udp:127.0.0.1:{self.relay.bridge_port}"
-        command = [sys.executable, "-m", "mavbridge", "--connect", address]
+        command = [sys.executable, "-m", "mavbridge", "--connect", self.relay.carrier.address]
         sources = [f"{name}=shm:{self._shm}" for name in self.cameras] or [f"shm:{self._shm}"]
         cameras = [flag for source in sources for flag in ("--camera", source)]
         return [*command, *cameras, "--report", str(report)]
@@ -308,16 +308,19 @@ class Stage:
 
 
 @contextmanager
-def staged(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[Stage]:
+def staged(
+    folder: Path, *vehicle_flags: str, renders: bool = True, carrier: Carrier | None = None
+) -> Iterator[Stage]:
     """A vehicle and a relay, ready for ``Stage.start``; both end with the block.
 
-    Without ``renders`` the camera shows noise, costs nothing and can be spoilt.
+    Without ``renders`` the camera shows noise, costs nothing and can be spoilt. ``carrier`` leads
+    from the relay to the bridge; None: UDP.
     """
-    bridge_port = free_port()
-    shm = f"test-{bridge_port}-{os.getpid()}"
+    port = free_port()
+    shm = f"test-{port}-{os.getpid()}"
     clock = Clock()
     with ExitStack() as stack:
-        relay = stack.enter_context(Relay(bridge_port, clock))
+        relay = stack.enter_context(Relay(carrier or UdpCarrier(port), clock))
         filming = ("--camera", f"shm:{shm}") if renders else ()
         stage = Stage(folder, relay, shm, (*filming, *vehicle_flags))
         stack.callback(stage.end_vehicle)

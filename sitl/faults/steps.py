@@ -9,10 +9,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl import UsageError
 from sitl.faults import camera
-from sitl.faults.link import LinkFaults
 from sitl.faults.relay import Message, Override, set_fields
 from sitl.faults.stage import ProcessName, Stage
 from sitl.faults.steps_host import HOST_KINDS, HostStep
+from sitl.faults.steps_link import LINK_KINDS, LinkStep
 from sitl.faults.steps_vehicle import ClockStep, RadioLost, SetParam, Switch
 
 REBOOT_IN_FLIGHT = 20190226
@@ -54,32 +54,6 @@ class Signal:
             return stage.recorder().kill(number)
         kill = {"flight": stage.kill, "group": stage.kill_group, "gate": stage.gate.kill}[self.to]
         return kill(number)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Link:
-    """Break the link from now on; without faults it is whole again."""
-
-    way: Literal["both", "to_vehicle", "to_bridge"] = "both"
-    loss: float = 0.0
-    duplicate: float = 0.0
-    corrupt: float = 0.0
-    reorder: float = 0.0
-    delay_ms: float = 0.0
-
-    def perform(self, stage: Stage) -> int:
-        """Returns the moment."""
-        faults = LinkFaults(
-            loss=self.loss,
-            duplicate=self.duplicate,
-            corrupt=self.corrupt,
-            reorder=self.reorder,
-            delay_ms=self.delay_ms,
-        )
-        return stage.relay.impair(
-            to_vehicle=None if self.way == "to_bridge" else faults,
-            to_bridge=None if self.way == "to_vehicle" else faults,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +149,6 @@ Step: TypeAlias = (
     Wait
     | PolicyFault
     | Signal
-    | Link
     | Messages
     | Pilot
     | Joystick
@@ -186,12 +159,12 @@ Step: TypeAlias = (
     | Switch
     | RadioLost
     | HostStep
+    | LinkStep
 )
 KINDS: dict[str, Callable[..., Step]] = {
     "wait": Wait,
     "policy": PolicyFault,
     "signal": Signal,
-    "link": Link,
     "messages": Messages,
     "pilot": Pilot,
     "joystick": Joystick,
@@ -202,6 +175,7 @@ KINDS: dict[str, Callable[..., Step]] = {
     "switch": Switch,
     "radio": RadioLost,
     **HOST_KINDS,
+    **LINK_KINDS,
 }
 """Steps by the key ``do`` of a scenario."""
 Made = TypeVar("Made")
