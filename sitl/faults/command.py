@@ -3,12 +3,14 @@
 import argparse
 import os
 import platform
+import tempfile
 from datetime import UTC, datetime
 from pathlib import Path
 
 from sitl import UsageError
 from sitl.faults.run import fly_scenario
 from sitl.faults.scenario import Scenario, Variant, load_catalogue
+from sitl.faults.soak import make_summary, soak
 from sitl.faults.table import make_line, make_page
 from sitl.faults.verdict import Verdict
 
@@ -24,6 +26,23 @@ def add_faults_command(commands: "argparse._SubParsersAction[argparse.ArgumentPa
     add("--autopilot", choices=("ardupilot", "px4"), help="only with this firmware")
     add("--receiver", choices=("idle", "mid", "none"), help="only with this receiver")
     add("--out", type=Path, metavar="FILE", help="write the page of results, in Markdown")
+
+
+def add_soak_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command and its flags."""
+    soak_help = "fly for a long time with a random fault every few seconds, and look for leaks"
+    parser = commands.add_parser("soak", help=soak_help, allow_abbrev=False)
+    parser.set_defaults(run=_soak)
+    parser.add_argument("--minutes", type=float, default=60.0, metavar="N", help="default: 60")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the faults' order")
+
+
+def _soak(args: argparse.Namespace) -> None:
+    with tempfile.TemporaryDirectory(prefix="soak-") as folder:
+        result = soak(args.minutes, args.seed, Path(folder), print)
+    print(make_summary(result))
+    if result.failures:
+        raise UsageError("the soak has failed")
 
 
 def _fly_catalogue(args: argparse.Namespace) -> None:

@@ -4,7 +4,7 @@ import math
 import socket
 import threading
 from collections.abc import Callable
-from itertools import count
+from itertools import count, islice
 from typing import Any, NamedTuple, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -173,12 +173,24 @@ class Relay:
         self._thread.join(JOIN_S)
         self._socket.close()
 
-    def forget(self) -> None:
-        """Forget the flight so far: another one begins."""
+    def forget(self) -> int:
+        """Forget the flight so far: another one begins. Returns how many overrides it had."""
         with self._news:
+            count = len(self.overrides)
             self.sent.clear()
             self.overrides.clear()
             self.has_flown.clear()
+            return count
+
+    def newest_steering(self, rows: int) -> list[Sent]:
+        """The newest messages of sticks, at most so many, newest last."""
+        newest = islice((sent for sent in reversed(self.sent) if sent.steers), rows)
+        return list(newest)[::-1]
+
+    def is_leaning(self, rows: int) -> bool:
+        """As many messages of sticks lean, in a row, up to now."""
+        steering = self.newest_steering(rows)
+        return len(steering) == rows and all(sent.leans for sent in steering)
 
     def impair(
         self, *, to_vehicle: LinkFaults | None = None, to_bridge: LinkFaults | None = None

@@ -1,15 +1,21 @@
 """Flies a scenario by real processes, and judges it by the vehicle's own record."""
 
+import os
 import signal
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
+from sitl.faults.leftovers import leftovers, thread_names
+from sitl.faults.processes import StageError
 from sitl.faults.record import NoVerdictError
 from sitl.faults.scenario import Scenario, Variant
-from sitl.faults.stage import Stage, StageError, faulty_policy, free_port, staged
+from sitl.faults.stage import CATALOGUE, Stage, faulty_policy, free_port, staged
 from sitl.faults.stalls import StallWatch
+from sitl.faults.steps import Terminal
 from sitl.faults.transmitter import Transmitter
 from sitl.faults.verdict import Verdict, find_failures
+from sitl.faults.viewer import Viewer
 
 FLY = ("--dual-rate", "--arm")
 SETTLE_S = 1.0
@@ -43,15 +49,18 @@ def _fly_once(scenario: Scenario, variant: Variant, slack_ms: float) -> Verdict:
     if transmitter is not None:
         vehicle += transmitter.flags
     with tempfile.TemporaryDirectory(prefix="faults-") as name, StallWatch() as stalls:
-        folder = Path(name)
-        flags = [flag.format(folder=folder) for flag in scenario.flags]
+        folder, threads = Path(name), thread_names()
         policy = faulty_policy(scenario.policy)
         try:
-            with staged(folder, *vehicle, renders=False) as stage:
+            with ExitStack() as stack:
+                stage = stack.enter_context(staged(folder, *vehicle, renders=False))
                 stage.transmitter = transmitter
+                flags = _equip(stage, scenario, stack)
                 if scenario.before or transmitter:
                     stage.prepare = lambda: _prepare(scenario, stage)
-                stage.start(*FLY, "--mode", variant.mode, "--policy", policy, *flags)
+                flags = ("--mode", variant.mode, "--policy", policy, *flags)
+                is_read = not any(isinstance(step, Terminal) for step in scenario.steps)
+                stage.start(*FLY, *flags, is_read=is_read)
                 if scenario.outcome == "refused":
                     at_ns, leans = 0, False
                     if scenario.steps:
@@ -63,10 +72,24 @@ def _fly_once(scenario: Scenario, variant: Variant, slack_ms: float) -> Verdict:
                     leans = _leans(stage)
                     _end(scenario, stage, verdict)
             verdict.failures += find_failures(verdict, scenario, stage, at_ns, leans, slack_ms)
+            verdict.failures += [f"it left {rest}" for rest in leftovers(stage, threads)]
         except (StageError, NoVerdictError) as error:
             verdict.failures.append(str(error))
         verdict.stall_ms = stalls.longest_ms
     return verdict
+
+
+def _equip(stage: Stage, scenario: Scenario, stack: ExitStack) -> tuple[str, ...]:
+    """Give a flight the variables and the viewer that it names; returns its flags."""
+    path = os.environ.get("PYTHONPATH", "")
+    stage.variables = {
+        name: value.format(folder=stage.folder, catalogue=CATALOGUE, path=path)
+        for name, value in scenario.environment.items()
+    }
+    if any("{viewer}" in flag for flag in scenario.flags):
+        stage.viewer = stack.enter_context(Viewer())
+    viewer = stage.viewer.target if stage.viewer else ""
+    return tuple(flag.format(folder=stage.folder, viewer=viewer) for flag in scenario.flags)
 
 
 def _prepare(scenario: Scenario, stage: Stage) -> None:
@@ -88,7 +111,7 @@ def _perform(scenario: Scenario, stage: Stage) -> int:
 
 def _leans(stage: Stage) -> bool:
     """The newest sticks are still the policy's."""
-    return next(sent.leans for sent in reversed(stage.relay.sent) if sent.steers)
+    return stage.relay.is_leaning(1)
 
 
 def _end(scenario: Scenario, stage: Stage, verdict: Verdict) -> None:

@@ -53,7 +53,11 @@ class Scenario:
     policy: str = "Leaning"
     """Class in ``catalogue/policies.py``."""
     flags: list[str] = field(default_factory=list)
-    """More flags of the bridge; ``{folder}`` is a folder for the files of this run."""
+    """More flags of the bridge; ``{folder}`` is a folder for the files of this run, ``{viewer}`` a
+    viewer's address for ``--rerun``."""
+    environment: dict[str, str] = field(default_factory=dict)
+    """More variables for the bridge; ``{folder}`` as above, ``{catalogue}`` that of the scenarios,
+    ``{path}`` the PYTHONPATH so far."""
     untested: str = ""
     """Why the tests leave it out; empty: they fly it."""
 

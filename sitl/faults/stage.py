@@ -2,7 +2,6 @@
 
 import json
 import os
-import select
 import shutil
 import signal
 import socket
@@ -12,13 +11,15 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, TypeAlias, cast
 
 from sitl.clock import Clock
 from sitl.faults.camera import FrameFeed
+from sitl.faults.processes import Process, StageError, child_of, mapped_memory, processes_with
 from sitl.faults.record import VehicleReport
 from sitl.faults.relay import Relay
 from sitl.faults.transmitter import Transmitter
+from sitl.faults.viewer import Viewer
 
 TIMEOUT_S = 90.0
 STARTS = 3
@@ -32,46 +33,13 @@ MARK = "SITL_FAULT_MARK"
 CLOCK_MONOTONIC, when its fault begins."""
 PIPE_BLOCK = 4096
 CATALOGUE = Path(__file__).parent / "catalogue"
+ProcessName: TypeAlias = Literal["flight", "gate", "recorder"]
+"""``recorder`` is the process that writes the video of a recording."""
 
 
 def faulty_policy(name: str) -> str:
     """A class of ``catalogue/policies.py`` as the bridge takes it, by ``--policy``."""
     return f"{CATALOGUE / 'policies.py'}:{name}"
-
-
-class StageError(Exception):
-    """A flight did not get as far as its fault, or did not end."""
-
-
-class Process:
-    """A process of which nobody here is the parent, such as the gate of a killed bridge."""
-
-    def __init__(self, pid: int, clock: Clock) -> None:
-        self.pid = pid
-        self._clock = clock
-        self._fd = os.pidfd_open(pid)
-
-    def has_ended(self, timeout_s: float) -> bool:
-        """Wait for its end; a zombie has ended."""
-        return bool(select.select([self._fd], [], [], timeout_s)[0])
-
-    def kill(self, number: signal.Signals) -> int:
-        """Send a signal; returns the moment."""
-        at_ns = self._clock.now_ns()
-        with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._fd, number)
-        return at_ns
-
-    def peak_memory_mb(self) -> float:
-        """Largest resident set so far."""
-        status = Path(f"/proc/{self.pid}/status").read_text()
-        (line,) = [line for line in status.splitlines() if line.startswith("VmHWM:")]
-        return int(line.split()[1]) / 1024
-
-    def close(self) -> None:
-        """End it if it still runs."""
-        self.kill(signal.SIGKILL)
-        os.close(self._fd)
 
 
 class Stage:
@@ -96,6 +64,14 @@ class Stage:
         self._gate: Process | None = None
         self.camera: FrameFeed | None = None
         """The camera, where the vehicle has none of its own."""
+        self.viewer: Viewer | None = None
+        self.variables: dict[str, str] = {}
+        """More of the bridge's environment."""
+        self.memory: set[str] = set()
+        """Shared memory that it has had, by name; see ``wait_for_lean``."""
+        self.temporary = folder / "temporary"
+        """Where it makes temporary files."""
+        self.temporary.mkdir()
         self.transmitter: Transmitter | None = None
         """The pilot's, where it can be moved."""
         self.prepare: Callable[[], object] | None = None
@@ -141,7 +117,8 @@ class Stage:
 
     def environment(self) -> dict[str, str]:
         """Ours, with a terminal of 200 columns and a place for the mark of a policy's fault."""
-        return os.environ | {"COLUMNS": "200", MARK: str(self._mark)}
+        ours = {"COLUMNS": "200", MARK: str(self._mark), "TMPDIR": str(self.temporary)}
+        return os.environ | ours | self.variables
 
     @property
     def _mark(self) -> Path:
@@ -174,8 +151,7 @@ class Stage:
         sent = self.relay.sent
 
         def is_leaning() -> bool:
-            steering = [row for row in sent[-3 * LEANING :] if row.steers][-LEANING:]
-            return len(steering) == LEANING and all(row.leans for row in steering)
+            return self.relay.is_leaning(LEANING)
 
         def is_over() -> bool:
             last = next((row for row in reversed(sent) if row.steers), None)
@@ -186,6 +162,7 @@ class Stage:
                 raise StageError(f"the policy has not flown:\n{self._text}")
             self.gate.has_ended(0)  # finds it while its parent lives
             if is_leaning():
+                self.memory |= mapped_memory(self.bridge_pid)
                 return
             self._start_over()
         raise StageError(f"the flight ended {STARTS} times before its fault:\n{self._text}")
@@ -251,6 +228,32 @@ class Stage:
         if self._gate is None:
             self._gate = Process(child_of(self.bridge_pid, b"mavbridge.gate"), self.clock)
         return self._gate
+
+    def recorder(self) -> Process:
+        """The process that writes the video of a recording."""
+        return Process(self.pid_of("recorder"), self.clock)
+
+    def pid_of(self, name: ProcessName) -> int:
+        """Process id, while the bridge lives."""
+        if name == "recorder":
+            return child_of(self.bridge_pid, b"spawn_main")
+        return self.gate.pid if name == "gate" else self.bridge_pid
+
+    def processes(self) -> list[tuple[int, str]]:
+        """Id and command of every process of the bridge that still runs."""
+        return processes_with(f"{MARK}={self._mark}")
+
+    def last_lean_ns(self) -> int:
+        """When the policy's last stick left, once others have followed it; waits for that."""
+        sent = self.relay.sent
+
+        def is_over() -> bool:
+            steering = [row for row in sent[-3 * LEANING :] if row.steers]
+            return bool(steering) and not any(row.leans for row in steering[-LEANING // 10 :])
+
+        if not self.relay.wait_until(is_over, TIMEOUT_S):
+            raise StageError(f"the policy goes on flying:\n{self._text}")
+        return [row.at_ns for row in sent if row.leans][-1]
 
     def kill(self, number: signal.Signals) -> int:
         """Send a signal to the bridge alone; returns the moment."""
@@ -325,25 +328,8 @@ def staged(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[
 
 
 def free_port() -> int:
-    """A UDP port of this computer that nobody uses now."""
+    """A UDP port of the loopback that nobody uses now."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
-
-
-def child_of(parent_pid: int, text: bytes) -> int:
-    """The child process whose command line contains a text.
-
-    Raises:
-        StageError: it has no such child.
-    """
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            command = (entry / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if parent == parent_pid and text in command:
-            return int(entry.name)
-    raise StageError(f"process {parent_pid} has no child with {text!r} in its command line")

@@ -11,7 +11,8 @@ from sitl import UsageError
 from sitl.faults import camera
 from sitl.faults.link import LinkFaults
 from sitl.faults.relay import Message, Override, set_fields
-from sitl.faults.stage import Stage
+from sitl.faults.stage import ProcessName, Stage
+from sitl.faults.steps_host import HOST_KINDS, HostStep
 from sitl.faults.steps_vehicle import ClockStep, RadioLost, SetParam, Switch
 
 REBOOT_IN_FLIGHT = 20190226
@@ -43,12 +44,14 @@ class Signal:
     """Send a signal to a process."""
 
     name: str
-    to: Literal["flight", "group", "gate"] = "flight"
+    to: ProcessName | Literal["group"] = "flight"
     """``group`` is the flight process with its children, as a terminal sends it."""
 
     def perform(self, stage: Stage) -> int:
         """Returns the moment."""
         number = signal.Signals[self.name]
+        if self.to == "recorder":
+            return stage.recorder().kill(number)
         kill = {"flight": stage.kill, "group": stage.kill_group, "gate": stage.gate.kill}[self.to]
         return kill(number)
 
@@ -182,6 +185,7 @@ Step: TypeAlias = (
     | SetParam
     | Switch
     | RadioLost
+    | HostStep
 )
 KINDS: dict[str, Callable[..., Step]] = {
     "wait": Wait,
@@ -197,6 +201,7 @@ KINDS: dict[str, Callable[..., Step]] = {
     "param": SetParam,
     "switch": Switch,
     "radio": RadioLost,
+    **HOST_KINDS,
 }
 """Steps by the key ``do`` of a scenario."""
 Made = TypeVar("Made")

@@ -12,8 +12,9 @@ import pytest
 from helpers.flight_logs import logged_overrides
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from sitl.faults.processes import child_of
 from sitl.faults.relay import Override
-from sitl.faults.stage import ORDERLY, child_of, faulty_policy, staged
+from sitl.faults.stage import ORDERLY, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 
@@ -131,7 +132,7 @@ def test_an_exception_in_the_policy_gives_the_sticks_back(tmp_path: Path) -> Non
     assert status == 4
     assert_released(flying.relay.overrides)
     assert "RuntimeError: the user's policy is broken" in output
-    assert "user_policies.py" in output  # where, for the person who wrote it
+    assert "policies.py" in output  # where, for the person who wrote it
     assert "Traceback" not in output
 
 

@@ -194,6 +194,7 @@ def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -
         faults.append(held.fault(now_ms * MS))
     assert faults[:-1] == [None] * (2 * MAX_REFUSED - 1)
     assert "unusable" in (faults[-1] or "")
+    assert "not finite" in (faults[-1] or "")
 
 
 def test_an_older_chunk_never_replaces_a_newer_one() -> None:
