@@ -8,12 +8,12 @@ import time
 from pathlib import Path
 
 import pytest
+from sitl.faults.processes import Process
 
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.gate.settings import GateSettings
 from mavbridge.mavlink.settings import LinkSettings
 from sitl.clock import Clock
-from sitl.faults.processes import Process
 from sitl.faults.record import aftermath
 from sitl.faults.relay import Override
 from sitl.faults.stage import ORDERLY, faulty_policy, staged
