@@ -3,6 +3,8 @@
 import argparse
 import os
 import platform
+import signal
+import sys
 import tempfile
 from datetime import UTC, datetime
 from pathlib import Path
@@ -52,6 +54,8 @@ def _fly_catalogue(args: argparse.Namespace) -> None:
         for scenario in chosen:
             print(f"{scenario.group:8s} {scenario.name:24s} {scenario.what}")
         return
+    # An exit by this signal ends the processes of the present flight too.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     verdicts: list[Verdict] = []
     for scenario in chosen:
         for variant in scenario.variants:

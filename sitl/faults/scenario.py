@@ -48,6 +48,8 @@ class Scenario:
     """Four sticks of somebody else, who may share the vehicle with the policy until the limit."""
     is_silent: bool = False
     """A takeover: no request for a mode may follow, and beyond the limit no stick of any kind."""
+    releases: bool = True
+    """The bridge can still give an ArduPilot with a receiver its sticks back."""
     transmitter: bool = False
     """The pilot has one, which steps can move; its switches are on at the start."""
     policy: str = "Leaning"

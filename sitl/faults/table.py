@@ -25,6 +25,7 @@ Written by `python -m sitl faults --out docs/faults.md` on {date}: {machine}.
 COLUMNS = """| fault | vehicle | must | safe, ms | last stick, ms | then | exit |
 |---|---|---|---|---|---|---|
 """
+SHOWN_STALL_MS = 10.0
 MUST = {
     "loses": "lose the sticks",
     "keeps": "fly on",
@@ -55,6 +56,8 @@ def make_line(verdict: Verdict) -> str:
         parts += [f"safe {measured.safe_ms:7.1f} ms", f"last stick {verdict.last_stick_ms:7.1f} ms"]
         parts.append(f"{measured.mode or '-'}, {measured.most_lean_deg:.0f} deg")
     parts.append(f"exit {verdict.exit}")
+    if not verdict.passed and verdict.stall_ms > SHOWN_STALL_MS:
+        parts.append(f"the computer stood still for {verdict.stall_ms:.0f} ms")
     if verdict.runs > 1:
         parts.append(f"run {verdict.runs}")
     parts.append("ok" if verdict.passed else "FAILED: " + "; ".join(verdict.failures))

@@ -69,6 +69,9 @@ def find_failures(
         if scenario.is_silent and any(row.asks_mode and row.at_ns > at_ns for row in sent):
             failures.append("it asks for a mode after a takeover")
         failures += _too_late(measured, verdict.last_stick_ms, scenario, slack_ms)
+        has_release = variant.autopilot == "ardupilot" and variant.receiver != "none"
+        if has_release and scenario.releases and any(stage.relay.overrides[-1]):
+            failures.append(f"the last sticks are no release: {stage.relay.overrides[-1]}")
     return failures
 
 

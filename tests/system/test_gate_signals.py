@@ -8,12 +8,12 @@ import time
 from pathlib import Path
 
 import pytest
-from sitl.faults.processes import Process
 
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.gate.settings import GateSettings
 from mavbridge.mavlink.settings import LinkSettings
 from sitl.clock import Clock
+from sitl.faults.processes import Process
 from sitl.faults.record import aftermath
 from sitl.faults.relay import Override
 from sitl.faults.stage import ORDERLY, faulty_policy, staged
@@ -25,55 +25,6 @@ RELEASE = Override(0, 0, 0, 0)
 END_LIMIT_MS = 400
 """A main thread that shows the state five times a second hears of the signal at once."""
 END_S = 15
-
-
-@pytest.mark.parametrize(
-    ("number", "receiver"),
-    [(signal.SIGINT, "mid"), (signal.SIGHUP, "idle")],
-)
-def test_a_signal_to_the_process_group_ends_the_flight_in_order(
-    number: signal.Signals, receiver: str, tmp_path: Path
-) -> None:
-    with staged(tmp_path, "--receiver", receiver, renders=False) as flying:
-        flying.start(*FLY)
-        flying.wait_for_lean()
-        at_ns = flying.kill_group(number)
-        status, output = flying.end()
-    assert status in ORDERLY, output
-    assert flying.relay.overrides[-1] == RELEASE
-    measured = aftermath(flying.vehicle_report(), at_ns, receiver)
-    assert measured.safe_ms <= END_LIMIT_MS
-    assert not measured.flew_again
-    assert measured.mode is None
-    assert "still armed in ALT_HOLD" in output
-
-
-def test_a_gate_that_is_told_to_end_gives_the_sticks_back_first(tmp_path: Path) -> None:
-    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY)
-        flying.wait_for_lean()
-        at_ns = flying.gate.kill(signal.SIGTERM)
-        status, output = flying.end()
-    assert "the gate was told to end" in output
-    assert status in ORDERLY, output
-    assert flying.relay.overrides[-1] == RELEASE
-    measured = aftermath(flying.vehicle_report(), at_ns, "mid")
-    assert measured.safe_ms <= END_LIMIT_MS
-
-
-@pytest.mark.parametrize("receiver", ["mid", "none"])
-def test_the_flight_process_says_so_when_the_gate_was_killed(receiver: str, tmp_path: Path) -> None:
-    """What remains then is the autopilot's own timeout, 3 s by default, or the radio failsafe."""
-    with staged(tmp_path, "--receiver", receiver, renders=False) as flying:
-        flying.start(*FLY)
-        flying.wait_for_lean()
-        at_ns = flying.gate.kill(signal.SIGKILL)
-        status, output = flying.end()
-        flying.observe(3.2)
-    assert status == 4, output
-    assert "the gate process has died" in output
-    measured = aftermath(flying.vehicle_report(), at_ns, receiver)
-    assert measured.safe_ms <= 3300
 
 
 def test_a_terminal_that_nobody_reads_does_not_hold_up_the_end(tmp_path: Path) -> None:
