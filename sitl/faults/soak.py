@@ -11,12 +11,15 @@ from typing import NamedTuple
 from pymavlink import mavutil
 
 from sitl.clock import NS_PER_S
-from sitl.faults.stage import ORDERLY, STARTS, Stage, StageError, faulty_policy, free_port, staged
+from sitl.faults.processes import StageError
+from sitl.faults.stage import ORDERLY, STARTS, Stage, faulty_policy, free_port, staged
 from sitl.faults.steps import Images, Joystick, Link, Messages, Pilot, Signal, Step, Wait
-from sitl.faults.transmitter import HIGH_US, LOW_US, Transmitter
+from sitl.faults.transmitter import Transmitter
 from sitl.faults.usage import Usage, growth, read_usage
 
 POLICY = "Wandering"
+SWITCH, LOW_US, HIGH_US = 7, 1000, 2000
+"""Channel that engages, and its positions."""
 SETTLE_S = 1.5
 """From the end of a fault until the policy must have lost the sticks."""
 QUIET_NS = NS_PER_S // 2
@@ -90,12 +93,12 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
     """
     result = SoakResult(minutes=minutes)
     port = free_port()
-    transmitter = Transmitter(port)
+    transmitter = Transmitter(port, "mid")
     recording = folder / "recording"
     with staged(folder, "--receiver", "mid", "--rc-in", str(port), renders=False) as stage:
         stage.start(
             "--dual-rate", "--mode", "ALT_HOLD", "--policy", faulty_policy(POLICY),
-            "--engage-channel", "7", "--record", str(recording),
+            "--engage-channel", str(SWITCH), "--record", str(recording),
         )  # fmt: skip
         _engage_first(stage, transmitter)
         usages = _fly(stage, transmitter, result, minutes, random.Random(seed), report)  # noqa: S311
@@ -119,11 +122,11 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
 def _engage_first(stage: Stage, transmitter: Transmitter) -> None:
     if not stage.wait_for("not engaged: press e, use the engage switch"):
         raise StageError("the bridge is not ready to engage")
-    transmitter.send(switch_us=LOW_US)
+    transmitter.move(SWITCH, LOW_US)
     stage.relay.set_mode("ALT_HOLD")
     stage.relay.arm()
     stage.observe(SETTLE_S)
-    transmitter.send(switch_us=HIGH_US)
+    transmitter.move(SWITCH, HIGH_US)
     stage.wait_for_lean()
 
 
@@ -166,11 +169,11 @@ def _fly(
 def _engage_again(stage: Stage, transmitter: Transmitter) -> None:
     """The pilot turns the switch off and on, as often as a busy machine needs."""
     for _ in range(STARTS):
-        transmitter.send(switch_us=LOW_US)
+        transmitter.move(SWITCH, LOW_US)
         stage.observe(SETTLE_S)
         stage.relay.set_mode("ALT_HOLD")
         stage.observe(0.5)
-        transmitter.send(switch_us=HIGH_US)
+        transmitter.move(SWITCH, HIGH_US)
         if stage.relay.wait_until(lambda: stage.relay.is_leaning(LEANING_ROWS), ENGAGE_S):
             return
     raise StageError("the policy did not get the sticks back by the switch")

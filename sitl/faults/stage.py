@@ -328,11 +328,7 @@ def staged(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[
 
 
 def free_port() -> int:
-<<<<<<< HEAD
-    """A UDP port of this computer that nobody uses now."""
-=======
     """A UDP port of the loopback that nobody uses now."""
->>>>>>> wip
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
