@@ -8,6 +8,7 @@ from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.flight.policies import check_configured_policy, require_cameras, require_images
+from mavbridge.mavlink.transport.signing_files import read_key
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.viewer.server import serve_address
 from mavbridge.observe.viewer.target import check_target
@@ -24,6 +25,8 @@ def check_flight(config: FlyConfig, clock: Clock) -> None:
     forward = config.link.forward
     if forward and parse_forward(forward) == parse_address(config.link.connect):
         raise UserError(f"--forward {forward}: the vehicle has this one: name another port")
+    if config.link.signing_key_file is not None:
+        read_key(config.link.signing_key_file)
     for source in config.camera.sources:
         check_camera(source, latency_ms=config.camera.camera_latency)
     check_configured_policy(config.policy)

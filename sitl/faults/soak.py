@@ -19,7 +19,7 @@ from sitl.faults.usage import Usage, growth, read_usage
 
 POLICY = "Wandering"
 SWITCH, LOW_US, HIGH_US = 7, 1000, 2000
-"""Channel that engages, and its positions."""
+"""Channel of the engage switch, and its ends."""
 SETTLE_S = 1.5
 """From the end of a fault until the policy must have lost the sticks."""
 QUIET_NS = NS_PER_S // 2
@@ -49,7 +49,7 @@ FAULTS = (
     Fault("silence of both", (Link(loss=1.0), Wait(s=1.5), Link()), True),
     Fault("the pilot's mode", (Pilot(act="mode", mode="LOITER"),), True),
     Fault("images gone", (Images(show="gone"), Wait(s=1.0), Images(show="none")), True),
-    Fault("images frozen", (Images(show="frozen"), Wait(s=1.5), Images(show="none")), True),
+    Fault("images frozen", (Images(show="frozen"), Wait(s=3.0), Images(show="none")), True),
     Fault(
         "stopped",
         (Signal(name="SIGSTOP", to="group"), Wait(s=1.0), Signal(name="SIGCONT", to="group")),
@@ -92,10 +92,9 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
         report: is given a line for a person now and then.
     """
     result = SoakResult(minutes=minutes)
-    port = free_port()
-    transmitter = Transmitter(port, "mid")
+    transmitter = Transmitter(free_port(), "mid")
     recording = folder / "recording"
-    with staged(folder, "--receiver", "mid", "--rc-in", str(port), renders=False) as stage:
+    with staged(folder, "--receiver", "mid", *transmitter.flags, renders=False) as stage:
         stage.start(
             "--dual-rate", "--mode", "ALT_HOLD", "--policy", faulty_policy(POLICY),
             "--engage-channel", str(SWITCH), "--record", str(recording),

@@ -235,5 +235,7 @@ def make_step(table: dict[str, Any], where: str) -> Step:
 
 
 def _measured(message: Message) -> list[str]:
-    """Fields of a message that are measurements, not its time."""
-    return [name for name in message.get_fieldnames() if not name.startswith("time")]
+    """Numbers of a message that are measurements, not its time."""
+    names: list[str] = message.get_fieldnames()
+    numbers = [name for name in names if isinstance(getattr(message, name), int | float)]
+    return [name for name in numbers if not name.startswith("time")]

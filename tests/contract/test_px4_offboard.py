@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.px4_companion import (
     ACCEPTED,
+    LAND,
     LOITER,
     MID,
     OFFBOARD,
@@ -20,15 +21,14 @@ from helpers.px4_companion import (
 
 
 @pytest.fixture
-def offboard(px4):
+def offboard(px4_flying):
     """Some metres up in OFFBOARD, holding its place without sticks."""
-    px4.change("COM_RCL_EXCEPT", 4)
-    px4.take_off()
-    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 250)
-    px4.stream_setpoint(velocity_target(), 0.3)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED
-    px4.stream_setpoint(velocity_target(), 2.0)
-    return px4
+    px4_flying.change("COM_RCL_EXCEPT", 4)
+    px4_flying.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 250)
+    px4_flying.stream_setpoint(velocity_target(), 0.3)
+    assert px4_flying.set_mode(OFFBOARD) == ACCEPTED
+    px4_flying.stream_setpoint(velocity_target(), 1.0)
+    return px4_flying
 
 
 def crossings_ms(samples, begin_ms, start, target):
@@ -38,6 +38,10 @@ def crossings_ms(samples, begin_ms, start, target):
         reached = (t for t, v in samples if (v - start) / (target - start) >= share)
         times.append(next(reached) - begin_ms)
     return times
+
+
+def has_said(text):
+    return lambda messages: any(text in m.text for m in named(messages, "STATUSTEXT"))
 
 
 def heading(px4):
@@ -149,20 +153,29 @@ def test_the_position_target_echoes_a_velocity(offboard):
     assert math.degrees(echo.yaw_rate) == pytest.approx(20.0, abs=0.5)
 
 
-def test_the_vehicle_takes_off_and_holds_by_itself(px4):
-    px4.track()
-    px4.get_ready(LOITER)
-    ground = named(px4.seen, "LOCAL_POSITION_NED")[-1].z
-    assert px4.set_mode(TAKEOFF) == ACCEPTED
-    assert px4.arm() == ACCEPTED
+def test_the_vehicle_takes_off_holds_and_lands_by_itself(px4_grounded):
+    px4_grounded.track()
+    px4_grounded.get_ready(LOITER)
+    ground = named(px4_grounded.seen, "LOCAL_POSITION_NED")[-1].z
+    assert px4_grounded.set_mode(TAKEOFF) == ACCEPTED
+    assert px4_grounded.arm() == ACCEPTED
 
-    px4.until(
+    px4_grounded.until(
         lambda m: any(x.landed_state == 2 for x in named(m, "EXTENDED_SYS_STATE")),
         20.0,
-        lambda _: px4.sticks(MID),
+        lambda _: px4_grounded.sticks(MID),
     )
-    messages = px4.fly(4.0)
+    messages = px4_grounded.fly(3.0)
 
     height = ground - named(messages, "LOCAL_POSITION_NED")[-1].z
-    assert px4.mode() == custom(LOITER)
+    assert px4_grounded.mode() == custom(LOITER)
     assert height == pytest.approx(2.5, abs=0.8)
+
+    assert px4_grounded.set_mode(LAND) == ACCEPTED
+    px4_grounded.until(has_said("Landing detected"), 20.0, lambda _: px4_grounded.sticks(MID))
+    disarmed = has_said("Disarmed by landing")
+    took_s, _ = px4_grounded.until(disarmed, 5.0, lambda _: px4_grounded.sticks(MID))
+
+    assert 1.7 <= took_s <= 2.6
+    px4_grounded.fly(0.5)
+    assert px4_grounded.mode() == custom(LOITER), "the last one that can arm"

@@ -100,18 +100,19 @@ class Leaning(Climbing):
         return self._flown == self.fault_calls + 1
 
 
-class Wandering(Climbing):
-    """Takes off, then leans to this side and that for ever, at the same height."""
+class Wandering(Leaning):
+    """Climbs for two seconds, then leans to this side and that for ever, at the same height."""
 
-    contract = Leaning.contract
-    climb_calls, turn_calls = 300, 400
+    climb_calls, turn_calls = 200, 400
 
     def predict_fast(
         self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
     ) -> Array:
-        chunk = super().predict_fast(feature, state, action_history, num_diffusion_steps)
-        side = 1.0 if self._calls // self.turn_calls % 2 else -1.0
-        chunk[:] = (0.5 if self._calls < self.climb_calls else 0.0, 0.2, 0.0, 0.4 * side)
+        chunk = Climbing.predict_fast(self, feature, state, action_history, num_diffusion_steps)
+        if self._flown is not None and self._flown >= 0:
+            self._flown += 1
+            side = 1.0 if self._flown // self.turn_calls % 2 else -1.0
+            chunk[:] = (0.5 if self._flown < self.climb_calls else 0.0, 0.2, 0.0, 0.4 * side)
         return chunk
 
 
