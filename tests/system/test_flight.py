@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sitl.faults.processes import child_of
 
 from helpers.flight_logs import logged_overrides
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from sitl.faults.processes import child_of
 from sitl.faults.relay import Override
 from sitl.faults.stage import ORDERLY, faulty_policy, staged
 
