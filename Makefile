@@ -15,7 +15,7 @@ PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist loadfile
 
-.PHONY: fly check test lint bench clean
+.PHONY: fly check test lint bench fuzz clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -56,6 +56,11 @@ test: .venv-peers/installed check  ## all of lint, then every test
 
 bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
 	$(BIN)/python -m benchmarks.compare --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
+
+FUZZ_DATAGRAMS ?= 10000000
+FUZZ_SEED ?=
+fuzz: $(VENV)/installed  ## hostile datagrams on all cores: FUZZ_DATAGRAMS=N, FUZZ_SEED=N repeats a run
+	PYTHONPATH=.:tests $(BIN)/python -m fuzz --datagrams $(FUZZ_DATAGRAMS) $(if $(FUZZ_SEED),--seed $(FUZZ_SEED))
 
 clean:  ## forget the environments and outputs
 	rm -rf $(VENV) .venv-peers out
