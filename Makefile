@@ -16,7 +16,7 @@ PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist loadfile
 
-.PHONY: fly check test lint bench faults soak clean
+.PHONY: fly check test lint bench faults fuzz soak clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -63,6 +63,11 @@ faults: $(VENV)/installed  ## every fault of the catalogue with every vehicle; w
 
 soak: $(VENV)/installed  ## SOAK_MINUTES of a flight with a random fault every few seconds
 	$(BIN)/python -m sitl soak --minutes $(SOAK_MINUTES)
+
+FUZZ_DATAGRAMS ?= 10000000
+FUZZ_SEED ?=
+fuzz: $(VENV)/installed  ## hostile datagrams on all cores: FUZZ_DATAGRAMS=N, FUZZ_SEED=N repeats a run
+	PYTHONPATH=.:tests $(BIN)/python -m fuzz --datagrams $(FUZZ_DATAGRAMS) $(if $(FUZZ_SEED),--seed $(FUZZ_SEED))
 
 clean:  ## forget the environments and outputs
 	rm -rf $(VENV) .venv-peers out
