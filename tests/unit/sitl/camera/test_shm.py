@@ -102,3 +102,12 @@ def test_a_frame_without_pixels_is_refused(name):
 def test_a_frame_of_another_kind_is_refused(publisher, image):
     with pytest.raises(ValueError, match="want uint8"):
         publisher.publish(image, captured_ns=1)
+
+
+def test_a_frame_that_is_not_whole_stays_marked_as_being_written(publisher, name):
+    publisher.publish(grey(1), 5, is_whole=False)
+    (sequence,) = struct.unpack_from("<q", raw(name), 64 + STRIDE)
+    assert sequence == 1
+    publisher.publish(grey(2), 6)
+    (sequence,) = struct.unpack_from("<q", raw(name), 64 + 2 * STRIDE)
+    assert sequence == 2
