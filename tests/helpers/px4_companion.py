@@ -245,12 +245,12 @@ class Px4Companion(Companion):
             (packed,) = struct.unpack("<f", struct.pack("<i", int(value)))
         self.set_param(name, packed)
 
-    def refill_delay(self) -> None:
+    def refill_delay(self, seconds: float = 5.001) -> None:
         """Give the failsafe its full delay again, of which earlier ones have spent some.
 
-        PX4 does so when any parameter changes.
+        PX4 does so when any parameter changes; so it is not exactly the default of 5 s.
         """
-        self.change("COM_FAIL_ACT_T", 5.001)
+        self.change("COM_FAIL_ACT_T", seconds)
 
     def restore(self) -> None:
         """Leave the vehicle in the air in Hold, or disarmed on the ground."""
