@@ -104,10 +104,12 @@ def test_a_frame_of_another_kind_is_refused(publisher, image):
         publisher.publish(image, captured_ns=1)
 
 
-def test_a_frame_that_is_not_whole_stays_marked_as_being_written(publisher, name):
-    publisher.publish(grey(1), 5, is_whole=False)
+def test_frames_that_are_not_whole_stay_marked_as_being_written(publisher, name):
+    for number in range(1, 6):  # the fifth is in the slot of the first again
+        publisher.publish(grey(number), number, is_whole=False)
     (sequence,) = struct.unpack_from("<q", raw(name), 64 + STRIDE)
     assert sequence == 1
-    publisher.publish(grey(2), 6)
-    (sequence,) = struct.unpack_from("<q", raw(name), 64 + 2 * STRIDE)
+    for number in range(6, 10):
+        publisher.publish(grey(number), number)
+    (sequence,) = struct.unpack_from("<q", raw(name), 64 + STRIDE)
     assert sequence == 2
