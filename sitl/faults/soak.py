@@ -13,7 +13,8 @@ from pymavlink import mavutil
 from sitl.clock import NS_PER_S
 from sitl.faults.processes import StageError
 from sitl.faults.stage import ORDERLY, STARTS, Stage, faulty_policy, free_port, staged
-from sitl.faults.steps import Images, Joystick, Link, Messages, Pilot, Signal, Step, Wait
+from sitl.faults.steps import Images, Joystick, Messages, Pilot, Signal, Step, Wait
+from sitl.faults.steps_link import Link
 from sitl.faults.transmitter import Transmitter
 from sitl.faults.usage import Usage, growth, read_usage
 
