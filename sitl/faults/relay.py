@@ -275,7 +275,7 @@ class Relay:
             now_ns = self._clock.now_ns()
             due_ns = min(self._to_vehicle.due_ns, self._to_bridge.due_ns)
             longest_s = min(max((due_ns - now_ns) / NS_PER_S, 1e-4), self.carrier.wait_s)
-            select.select([self._socket, *self.carrier.descriptors()], [], [], longest_s)
+            select.select([self._socket.fileno(), *self.carrier.descriptors()], [], [], longest_s)
             now_ns = self._clock.now_ns()
             messages = self._take_bridges(now_ns)
             self._take_vehicles(now_ns)
