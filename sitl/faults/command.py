@@ -6,6 +6,7 @@ import platform
 import signal
 import sys
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -28,6 +29,7 @@ def add_faults_command(commands: "argparse._SubParsersAction[argparse.ArgumentPa
     add("--list", action="store_true", help="print the catalogue")
     add("--autopilot", choices=("ardupilot", "px4"), help="only with this firmware")
     add("--receiver", choices=("idle", "mid", "none"), help="only with this receiver")
+    add("--jobs", type=int, default=1, metavar="N", help="flights at once (default: 1)")
     add("--out", type=Path, metavar="FILE", help="write the page of results, in Markdown")
 
 
@@ -60,14 +62,19 @@ def _fly_catalogue(args: argparse.Namespace) -> None:
         return
     # An exit by this signal ends the processes of the present flight too.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    flights = [
+        (scenario, variant)
+        for scenario in chosen
+        for variant in scenario.variants
+        if _is_wanted(variant, args.autopilot, args.receiver)
+    ]
     verdicts: list[Verdict] = []
-    for scenario in chosen:
-        for variant in scenario.variants:
-            if _is_wanted(variant, args.autopilot, args.receiver):
-                verdicts.append(fly_scenario(scenario, variant))
-                print(make_line(verdicts[-1]), flush=True)
-                if not verdicts[-1].passed:
-                    print(verdicts[-1].output, flush=True)
+    with ProcessPoolExecutor(args.jobs) as pool:
+        for verdict in pool.map(fly_scenario, *zip(*flights, strict=True)):
+            verdicts.append(verdict)
+            print(make_line(verdict), flush=True)
+            if not verdict.passed:
+                print(verdict.output, flush=True)
     failed = sum(not verdict.passed for verdict in verdicts)
     if args.out is not None:
         date = datetime.now(UTC).date().isoformat()
