@@ -293,6 +293,10 @@ def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -
         faults.append(held.fault(now_ms * MS))
     assert faults[:-1] == [None] * (2 * MAX_REFUSED - 1)
     assert "unusable" in (faults[-1] or "")
+    assert "not finite" in (faults[-1] or "")
+    assert held.problem(now_ms * MS) == faults[-1], "nor may the next flight begin at once"
+    held.offer(chunk(99, now_ms + 1000), (now_ms + 1000) * MS)
+    assert "unusable" not in (held.problem((now_ms + 1000) * MS) or "")
 
 
 def test_an_older_chunk_never_replaces_a_newer_one() -> None:

@@ -1,5 +1,6 @@
 """The gate as a whole, without I/O: what leaves at which moment."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -595,3 +596,18 @@ def test_neutral_velocities_on_the_way_in_are_not_those_of_an_earlier_flight() -
     entering = gate.step(1020, gate.chunk(1020, fast), act="engage")
     assert gate.gate.phase is Phase.PREPARING
     assert entering.decision == Command(action=Velocity(0.0, 0.0, 0.0, 0.0))
+
+
+def test_a_flight_by_velocities_begins_within_their_limits_whatever_the_vehicle_says() -> None:
+    """One wrong reading would be asked for, and 20 s later still for most of it."""
+    limits = LimitSettings(speed_mps=8.0, climb_mps=3.0, accel_mps2=5.0).of("velocity")
+    gate = Stepped(
+        meaning=ActionMeaning(kind="velocity"), smoothing=Smoothing(limits=limits, tau_s=0.0)
+    )
+    gate.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (3.4e38, 0.0, -90.0)))
+    gate.engaged(sticks=Velocity(0.0, 0.0, 0.0, 0.0))
+    first = gate.decisions[0]
+    assert isinstance(first, Command)
+    assert isinstance(first.action, Velocity)
+    assert math.hypot(first.action.x_mps, first.action.y_mps) <= 8.0
+    assert abs(first.action.z_mps) <= 3.0
