@@ -11,11 +11,12 @@ POLICY ?= toge
 FLAGS ?=
 # Firmware of the simulated vehicle: ardupilot or px4.
 AUTOPILOT ?= ardupilot
+SOAK_MINUTES ?= 60
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist loadfile
 
-.PHONY: fly check test lint bench fuzz clean
+.PHONY: fly check test lint bench faults fuzz soak clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -56,6 +57,12 @@ test: .venv-peers/installed check  ## all of lint, then every test
 
 bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
 	$(BIN)/python -m benchmarks.compare --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
+
+faults: $(VENV)/installed  ## every fault of the catalogue with every vehicle; writes docs/faults.md
+	$(BIN)/python -m sitl faults --out docs/faults.md
+
+soak: $(VENV)/installed  ## SOAK_MINUTES of a flight with a random fault every few seconds
+	$(BIN)/python -m sitl soak --minutes $(SOAK_MINUTES)
 
 FUZZ_DATAGRAMS ?= 10000000
 FUZZ_SEED ?=

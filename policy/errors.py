@@ -42,13 +42,14 @@ class NoChunkError(PolicyError):
 def user_code(doing: str) -> Iterator[None]:
     """Turn any exception of a user's policy into a ``PolicyError`` with its file and line.
 
-    The message begins with ``doing``; an exception that is a ``PolicyError`` already passes.
+    The message begins with ``doing``; an exception that is a ``PolicyError`` already passes. A
+    ``sys.exit`` is one as well: it would end the flight silently, with a status of its own.
     """
     try:
         yield
     except PolicyError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         theirs = [
             frame
             for frame in traceback.extract_tb(error.__traceback__)

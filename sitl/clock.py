@@ -22,6 +22,11 @@ class Clock:
             time.sleep(left_ns / NS_PER_S)
 
 
+def wall_ns() -> int:
+    """Unix time, for what a protocol wants it for."""
+    return time.time_ns()
+
+
 def monotonic_from_wall_ns(wall_ns: int) -> int:
     """Convert a recent CLOCK_REALTIME stamp, such as the kernel's of a datagram."""
     return time.monotonic_ns() - (time.time_ns() - wall_ns)

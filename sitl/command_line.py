@@ -1,4 +1,4 @@
-"""Commands: ``python -m sitl`` flies, ``camera`` films another vehicle, ``course`` prints one."""
+"""Commands: ``python -m sitl`` flies; ``camera``, ``course`` and ``faults`` do what they say."""
 
 import argparse
 import math
@@ -11,12 +11,23 @@ from sitl import UsageError
 from sitl.app import PilotOptions, print_status, run_vehicle
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
-from sitl.clock import stop_on_signal
+from sitl.clock import NS_PER_S, stop_on_signal, wall_ns
 from sitl.course.layout import course_to_json, make_course
+from sitl.faults.command import add_faults_command, add_soak_command
 from sitl.pilot.axes import DEFAULT_AXES
 from sitl.pilot.choose import NAMES as PILOTS
 from sitl.vehicle.conditions import NOMINAL, random_conditions
-from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, VehicleConfig
+from sitl.vehicle.config import (
+    IDLE_RECEIVER_US,
+    MID_RECEIVER_US,
+    SigningKey,
+    VehicleConfig,
+)
+
+KEY_BYTES = 32
+EPOCH_2015_NS = 1_420_070_400 * NS_PER_S
+"""Unix time from which timestamps of MAVLink 2 signing count."""
+SIGNING_TICK_NS = 10_000
 
 
 def run(argv: Sequence[str] | None = None) -> int:
@@ -63,6 +74,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--pilot-speed", type=_POSITIVE, default=4.0, metavar="MPS", help="of the expert")
     type_help = "MAV_TYPE of its heartbeats (default: 2, quadrotor)"
     add("--vehicle-type", type=_MAV_TYPE, default=2, metavar="N", help=type_help)
+    key_help = "sign with this key (MAVLink 2): a file of 32 bytes or 64 hexadecimal digits"
+    add("--signing-key-file", type=Path, metavar="FILE", help=key_help)
     conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
     add("--conditions", type=_SEED, metavar="SEED", help=conditions_help)
     _add_camera_flags(parser)
@@ -77,6 +90,8 @@ def _parser() -> argparse.ArgumentParser:
     course.set_defaults(run=_print_course)
     course.add_argument("--course", type=_SEED, default=0, metavar="SEED", help="default: 0")
     course.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    add_faults_command(commands)
+    add_soak_command(commands)
     return parser
 
 
@@ -106,6 +121,7 @@ def _fly(args: argparse.Namespace) -> None:
             receiver=receiver != "none",
             receiver_us=MID_RECEIVER_US if receiver == "mid" else IDLE_RECEIVER_US,
             vehicle_type=args.vehicle_type,
+            signing=args.signing_key_file and _signing_key(args.signing_key_file),
             conditions=conditions,
         ),
         make_course(args.course),
@@ -116,6 +132,18 @@ def _fly(args: argparse.Namespace) -> None:
         duration_s=args.duration,
         end_with_course=args.end_with_course,
     )
+
+
+def _signing_key(path: Path) -> SigningKey:
+    try:
+        data = path.read_bytes()
+        key = data if len(data) == KEY_BYTES else bytes.fromhex(data.decode().strip())
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--signing-key-file {path}: {error}") from error
+    if len(key) != KEY_BYTES:
+        raise UsageError(f"--signing-key-file {path}: want {KEY_BYTES} bytes, got {len(key)}")
+    since_2015_ns = wall_ns() - EPOCH_2015_NS
+    return SigningKey(key, since_2015_ns // SIGNING_TICK_NS)
 
 
 def _film(args: argparse.Namespace) -> None:

@@ -158,6 +158,9 @@ class LinkConfig:
     """Share the link with a ground station: udp:HOST:PORT sends to it, udpin:HOST:PORT listens."""
     gcs_sticks_win: Annotated[bool, Parameter(negative="")] = False
     """The sticks of the ground station of --forward take over for good once they are moved."""
+    signing_key_file: Annotated[Path | None, Parameter(show_default=False)] = None
+    """Sign every packet, and take only signed ones (MAVLink 2): a file with the vehicle's key, 32
+    bytes or 64 hexadecimal digits, which only you may read."""
     set: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """NAME=VALUE: set a parameter of the vehicle before arming, put the old value back at the end;
     may be given more than once."""

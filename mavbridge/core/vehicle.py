@@ -287,6 +287,8 @@ class LinkStats:
     """The vehicle showed our sticks in RC_CHANNELS; None = no stick was sent."""
     unusable_packets: int = 0
     """Corrupt, cut off, or holding NaN."""
+    refused_signatures: int = 0
+    """Packets without a signature, with a wrong or a replayed one, where signing is on."""
     vehicle_clock_offset_ns: int | None = None
     """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
     is_timesync_good: bool = False

@@ -202,11 +202,13 @@ class FlightObservers:
 
         Without one nothing is kept of the flight.
         """
-        if autopilot is not None:
-            self._report(summary, autopilot)
-        else:
-            self._discard()
-        self.screen.close(SCREEN_CLOSE_S)
+        try:
+            if autopilot is not None:
+                self._report(summary, autopilot)
+            else:
+                self._discard()
+        finally:  # whatever is raised is printed only then
+            self.screen.close(SCREEN_CLOSE_S)
 
     def _discard(self) -> None:
         """Remove the files of a flight that found no vehicle; both are closed."""
@@ -232,4 +234,7 @@ class FlightObservers:
         if recorder is not None:
             self.screen.show_message(recorder.summary())
         if self._config.report is not None:
-            self._config.report.write_text(report_json(report))
+            try:
+                self._config.report.write_text(report_json(report))
+            except OSError as error:  # a full disk, no more open files
+                self.screen.show_message(f"--report {self._config.report}: {error.strerror}")

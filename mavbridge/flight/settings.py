@@ -18,7 +18,7 @@ from mavbridge.gate.limits import LimitSettings
 from mavbridge.gate.preparation import PreparationSettings
 from mavbridge.gate.settings import GateSettings
 from mavbridge.gate.smoothing import Smoothing
-from mavbridge.mavlink.settings import LinkSettings
+from mavbridge.mavlink.settings import LinkSettings, SigningFiles
 from policy.contract import Contract
 from policy.protocol import Executable
 
@@ -151,6 +151,9 @@ def link_settings(
     ``folder`` remembers the old values of parameters, None: nothing is looked up there, and
     ``--set`` is an error.
     """
+    signing = None
+    if config.signing_key_file is not None:
+        signing = SigningFiles(key_file=config.signing_key_file, state_folder=state_folder())
     return LinkSettings(
         connect=config.connect,
         source_system=config.source_system,
@@ -166,6 +169,7 @@ def link_settings(
         restore_params=config.restore_params,
         accepted_risks=config.accept_risk,
         state_folder=folder,
+        signing=signing,
     )
 
 

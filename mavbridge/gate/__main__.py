@@ -24,9 +24,11 @@ from mavbridge.gate.wire import (
     decode_to_gate,
     encode_from_gate,
 )
+from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.forwarding import Forwarding
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import make_transport
 
 SETTINGS_TIMEOUT_S = 5.0
@@ -62,7 +64,24 @@ def main() -> None:
 
 
 def _run(settings: GateSettings, port: SocketPort, received: list[bytes]) -> None:
-    clock = MonotonicClock()
+    clock, files = MonotonicClock(), settings.link.signing
+    if files is None:
+        _fly(settings, port, received, clock, None)
+        return
+    store = SigningStore(files, clock)
+    with store as signing:
+        if store.problem is not None:
+            port.send(encode_from_gate(GateMessage(store.problem)))
+        _fly(settings, port, received, clock, signing)
+
+
+def _fly(
+    settings: GateSettings,
+    port: SocketPort,
+    received: list[bytes],
+    clock: MonotonicClock,
+    signing: Signing | None,
+) -> None:
     log = station = None
     if settings.tlog_fd is not None:
         log = PacketPipe(settings.tlog_fd, wall_offset_ns=settings.wall_offset_ns)
@@ -77,6 +96,7 @@ def _run(settings: GateSettings, port: SocketPort, received: list[bytes]) -> Non
         packet_log=log,
         forward=lambda p: loop.forward(p),
         ground_station=station,
+        signing=signing,
     )
     loop = GateLoop(clock, link, port, received=received, lead_ns=LEAD_NS)
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(Ending(reason="the gate was told to end")))

@@ -105,6 +105,8 @@ class ChunkBuffer:
         self._period_ns = period_ns
         self.grace_ns = max(LEAST_GRACE_NS, GRACE_PERIODS * period_ns)
         self._refused_ns: deque[int] = deque(maxlen=MAX_REFUSED)
+        self._malformation: str | None = None
+        """What was wrong with the last malformed chunk."""
         self._refusal: str | None = None
         """Why the newest chunk was not taken; None if it was."""
         self.newest: Chunk | None = None
@@ -125,6 +127,7 @@ class ChunkBuffer:
         self._refusal = self._malformed(chunk)
         if self._refusal is not None:
             self._refused_ns.append(now_ns)
+            self._malformation = self._refusal
             return False
         self._solve_ns = chunk.computed_ns - chunk.attitude_ns
         self._slow = self._slow + 1 if self._solve_ns > self._limits.state_ns else 0
@@ -197,7 +200,8 @@ class ChunkBuffer:
         refused = self._refused_ns
         if len(refused) < MAX_REFUSED or now_ns - refused[0] >= window_ns:
             return None
-        return f"the policy returned {MAX_REFUSED} unusable chunks within a short time"
+        many = f"the policy returned {MAX_REFUSED} unusable chunks within a short time"
+        return f"{many}: {self._malformation}"
 
     def action_at(self, at_ns: int) -> Action | None:
         """The action that acts at a time; None beyond the horizon of the newest chunk."""

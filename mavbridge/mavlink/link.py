@@ -30,6 +30,7 @@ from mavbridge.mavlink.codec.messages import (
     Timesync,
 )
 from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.outputs.sender import ActionSender
 from mavbridge.mavlink.session.commands import ModeAndArm
 from mavbridge.mavlink.session.discovery import Namesakes, VehicleDiscovery, VehicleIdentity
@@ -67,11 +68,16 @@ class MavlinkLink:
         packet_log: PacketLog | None = None,
         forward: Callable[[ForwardedPacket], None] | None = None,
         ground_station: Forwarding | None = None,
+        signing: Signing | None = None,
     ) -> None:
         self._clock = clock
         self._config = config
         self._forward = forward
-        self._codec = Codec(source_system=config.source_system, source_component=SOURCE_COMPONENT)
+        self._codec = Codec(
+            source_system=config.source_system,
+            source_component=SOURCE_COMPONENT,
+            signing=signing,
+        )
         self._connection = Connection(transport, self._codec, clock, packet_log)
         self._station = ground_station
         self._connection.tap = ground_station.pass_on if ground_station else None
@@ -216,6 +222,7 @@ class MavlinkLink:
             self._timesync,
             echo_confirmed=output is not None and output.was_confirmed,
             unusable_packets=self._codec.bad_data_count,
+            refused_signatures=self._codec.refused_signatures,
             saturated={} if output is None else output.saturated,
         )
 

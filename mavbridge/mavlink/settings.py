@@ -7,6 +7,16 @@ from mavbridge.core.vehicle import Risk
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SigningFiles:
+    """Files of MAVLink 2 signing."""
+
+    key_file: Path
+    """Readable by its owner alone; the settings never hold the key itself."""
+    state_folder: Path
+    """Keeps the timestamps, which must never step back."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
     """The vehicle and how to reach it."""
 
@@ -40,6 +50,8 @@ class LinkSettings:
     accepted_risks: tuple[Risk, ...] = ()
     state_folder: Path | None = None
     """Where the old values of parameters are remembered; None: nowhere, and nothing is set."""
+    signing: SigningFiles | None = None
+    """Sign what is sent, and take only what is signed."""
 
     def __post_init__(self) -> None:
         """Refuse to set what could not be remembered."""

@@ -145,6 +145,8 @@ class Autopilot:
             return "RC not found"
         if self.radio_failsafe.active:
             return "Radio failsafe on"
+        if self.gcs_failsafe.active:
+            return "GCS failsafe on"
         throttle_us = self.rc.channels_us[self.rc.index_of("THROTTLE")]
         if self.params["FS_THR_ENABLE"] and throttle_us < self.params["FS_THR_VALUE"]:
             return "Throttle below failsafe"
@@ -283,8 +285,8 @@ class Autopilot:
         return self.control.wants_takeoff(self.mode, sticks)
 
     def _is_idle(self, sticks: Sticks) -> bool:
-        """On the ground for DISARM_DELAY; in GUIDED only the pilot's throttle at its end counts."""
-        if self.mode.is_guided and not (self.rc.found and sticks.throttle == 0.0):
+        """On the ground for DISARM_DELAY with the throttle at its end; centred is not idle."""
+        if not (self.rc.found and sticks.throttle == 0.0):
             self._idle_since_ns = self.now_ns
         delay_s = self.params["DISARM_DELAY"]
         return delay_s > 0.0 and self._has_held(self._idle_since_ns, delay_s * NS_PER_S)

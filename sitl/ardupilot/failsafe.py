@@ -52,14 +52,17 @@ class GcsFailsafe:
         self._last_contact_ns = now_ns
 
     def update(self, now_ns: int) -> bool:
-        """Check the timer where it is due; True if ``active`` has changed."""
-        if now_ns < self._due_ns:
+        """Check the timer where it is due; True if ``active`` has changed.
+
+        Switched off while it is active it stays so, and arming is refused until the next boot or
+        until it is switched on again and hears the ground station.
+        """
+        if now_ns < self._due_ns or not self._params["FS_GCS_ENABLE"]:
             return False
         self._due_ns = now_ns + GCS_CHECK_PERIOD_NS
         was_active = self.active
         self.active = (
-            self._params["FS_GCS_ENABLE"] != 0.0
-            and self._last_contact_ns is not None
+            self._last_contact_ns is not None
             and now_ns - self._last_contact_ns > self._params["FS_GCS_TIMEOUT"] * NS_PER_S
         )
         return self.active != was_active

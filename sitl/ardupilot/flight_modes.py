@@ -10,7 +10,7 @@ from sitl.ardupilot.params import Params
 from sitl.ardupilot.sticks import Sticks
 from sitl.rotation import Quat, Vec3, to_euler, wrap_pi
 from sitl.vehicle.control import HeightController, mix, thrust_for
-from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
+from sitl.vehicle.dynamics import BodyState
 
 STOPPED = (0.0, 0.0, 0.0, 0.0)
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
@@ -21,7 +21,7 @@ RTL_ARRIVED_M = 1.0
 POSITION_GAIN_PER_S = 0.8
 VELOCITY_GAIN_PER_S = 2.0
 TRAINER_GAIN_PER_S = 5.0
-HOLD_ACCEL_MPS2 = 2.5  # braking and holding lean by at most 14 degrees, as LOITER was measured to
+HOLD_ACCEL_MPS2 = 2.5  # braking and holding lean by at most 14 degrees, as LOITER and LAND did
 HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the position of that moment is held
 
 
@@ -193,8 +193,7 @@ class FlightControl:
             elif -down > self._params["RTL_ALT"] / 100.0 - RTL_ARRIVED_M:
                 speed = min(RTL_SPEED_MPS, POSITION_GAIN_PER_S * distance)
                 wanted_n, wanted_e = -north / distance * speed, -east / distance * speed
-        limit = GRAVITY_MPS2 * math.tan(math.radians(self._params["ANGLE_MAX"] / 100.0))
-        return _lean_towards(wanted_n, wanted_e, body, limit)
+        return _lean_towards(wanted_n, wanted_e, body, HOLD_ACCEL_MPS2)
 
     def _lean_to_hold(self, body: BodyState) -> tuple[float, float]:
         """Lean that stops the vehicle, and then keeps it where it came to rest."""

@@ -46,8 +46,15 @@ class FramePublisher:
         self._frame_id = 0
         self._lock = threading.Lock()
 
-    def publish(self, rgb: NDArray[np.uint8], captured_ns: int) -> None:
+    @property
+    def path(self) -> Path:
+        """The file that readers map."""
+        return self._path
+
+    def publish(self, rgb: NDArray[np.uint8], captured_ns: int, *, is_whole: bool = True) -> None:
         """Copy a frame [height, width, 3] uint8 and make it the newest.
+
+        One that is not whole stays marked as being written, as by a writer that stops meanwhile.
 
         Raises:
             ValueError: another shape or type than announced, or closed before.
@@ -58,13 +65,13 @@ class FramePublisher:
             raise ValueError("publish after close")
         self._frame_id += 1
         fields = self._fields[self._frame_id % SLOTS]
-        fields[SEQ] += 1
+        fields[SEQ] |= 1  # odd: being written
         self._memory_barrier()
         fields[FRAME_ID] = self._frame_id
         fields[CAPTURED_NS] = captured_ns
         self._pixels[self._frame_id % SLOTS][:] = rgb
         self._memory_barrier()
-        fields[SEQ] += 1
+        fields[SEQ] += is_whole
         self._memory_barrier()
         self._header[NEWEST] = self._frame_id
 

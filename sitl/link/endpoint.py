@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
 from sitl.link.framing import Framing, Message
+from sitl.vehicle.config import SigningKey
 
 PARAM_PERIOD_NS = 4 * NS_PER_MS
 MAX_STATUSTEXT = 50
@@ -48,10 +49,13 @@ class VehicleEndpoint(Framing, Generic[Ap]):
     """Sends for one autopilot of a firmware; its constructor ends with the first ``_serve``."""
 
     def __init__(
-        self, builders: Mapping[int, Callable[[Ap], Message | None]], id_param: str
+        self,
+        builders: Mapping[int, Callable[[Ap], Message | None]],
+        id_param: str,
+        signing: SigningKey | None,
     ) -> None:
         """``id_param`` is the firmware's parameter of the vehicle's system id."""
-        super().__init__()
+        super().__init__(signing)
         self._builders = builders
         self._id_param = id_param
 

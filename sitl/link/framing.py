@@ -5,17 +5,23 @@ from typing import Any, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from sitl.vehicle.config import SigningKey
+
 Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 
 
 class Framing:
     """Bytes in, messages out; messages in, bytes out. A restart of the vehicle leaves it alone."""
 
-    def __init__(self) -> None:
+    def __init__(self, signing: SigningKey | None) -> None:
         self.bad_frames = 0
-        """Garbage, truncated frames and wrong checksums."""
+        """Garbage, truncated frames and wrong checksums; with a key also wrong signatures."""
         self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=mav.MAV_COMP_ID_AUTOPILOT1)
         self._mav.robust_parsing = True
+        if signing is not None:
+            self._mav.signing.secret_key = signing.key
+            self._mav.signing.timestamp = signing.timestamp
+            self._mav.signing.sign_outgoing = True
         self._outgoing = bytearray()
 
     def parse(self, data: bytes) -> Iterator[Message]:

@@ -2,7 +2,8 @@
 
 Lost sticks latch: a Hold of COM_FAIL_ACT_T, then the action of NAV_RCL_ACT, whatever the sticks do
 meanwhile. The delay is a budget that shrinks in such a Hold and comes back at a quarter of that
-speed. A lost stream does not latch: its action ends when the stream is back.
+speed, or at once when any parameter changes. A lost stream does not latch: its action ends when
+the stream is back.
 """
 
 from enum import Enum
@@ -40,6 +41,7 @@ class LostSticks:
         self._params = params
         self.phase = Phase.NONE
         self._spent_s = 0.0
+        self._param_changes = params.changes
 
     @property
     def active(self) -> bool:
@@ -72,6 +74,8 @@ class LostSticks:
 
     def update(self, dt_ns: int) -> bool:
         """Count the time; True when the Hold is over and the action begins."""
+        if self._params.changes != self._param_changes:
+            self._param_changes, self._spent_s = self._params.changes, 0.0
         if self.phase is not Phase.HOLDING:
             self._spent_s = max(0.0, self._spent_s - REFILL * dt_ns / NS_PER_S)
             return False

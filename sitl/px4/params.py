@@ -117,6 +117,8 @@ class Params:
             values["RC_CHAN_CNT"] = 8
         self._values = {name: _float32(values[name]) for name in sorted(values)}
         self.names: tuple[str, ...] = tuple(self._values)
+        self.changes = 0
+        """How often a value has changed: PX4 tells its modules, not which one."""
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
@@ -132,12 +134,14 @@ class Params:
         if name in _INTEGERS:
             if not -_INT32_LIMIT <= value < _INT32_LIMIT:
                 return False
-            self._values[name] = int(value)
-            return True
-        try:
-            self._values[name] = _float32(value)
-        except OverflowError:
-            return False
+            new: float = int(value)
+        else:
+            try:
+                new = _float32(value)
+            except OverflowError:
+                return False
+        self.changes += new != self._values[name]
+        self._values[name] = new
         return True
 
     def kind(self, name: str) -> int:

@@ -30,6 +30,15 @@ class Battery(NamedTuple):
     """The firmware's battery failsafe has fired; this vehicle reports it and flies on."""
 
 
+class SigningKey(NamedTuple):
+    """MAVLink 2 signing of every link."""
+
+    key: bytes
+    """32 bytes."""
+    timestamp: int
+    """Of the first packet, in units of 10 us since 2015."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleConfig:
     """Differences between one simulated vehicle and another."""
@@ -52,5 +61,7 @@ class VehicleConfig:
     station's."""
     link_bytes_ps: float = 4_000_000.0
     """Bandwidth that PX4 believes each link to have; too little slows its streams silently."""
+    signing: SigningKey | None = None
+    """Sign everything, and refuse what is not signed with this key."""
     conditions: Conditions = NOMINAL
     """Airframe, air and sensors; `sitl.camera.fpv.FpvRenderer` takes those of the camera."""

@@ -1,71 +1,210 @@
-"""Peers of the contract suite: the simulator in process on a stepped clock, or a real one by UDP.
+"""Which flight controller the suite runs against, and in which state a test finds it.
 
-``MAVBRIDGE_TEST_PEER=udp:HOST:PORT`` (a port of ours that the peer sends to) puts that ArduCopter
-through the same suite, in real time; ``MAVBRIDGE_TEST_PX4_PEER`` does the same for a PX4.
+``MAVBRIDGE_TEST_PEER`` names a real one; without it that is the simulator, in process on a stepped
+clock and new for each test. docs/guides/contract_suite.md says what the suite does to a vehicle.
 """
 
 import os
 from collections.abc import Iterator
-from contextlib import closing
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import Companion, MockPeer, UdpPeer
+from helpers.contract_peers import Companion, ExternalPeer, MockPeer, Peer
+from helpers.copter_companion import CopterCompanion
 from helpers.px4_companion import Px4Companion
-from sitl.vehicle.config import VehicleConfig
+from sitl.vehicle.config import AutopilotName, VehicleConfig
 
-PEER_VARIABLE, PX4_PEER_VARIABLE = "MAVBRIDGE_TEST_PEER", "MAVBRIDGE_TEST_PX4_PEER"
+PEER, ALLOW, RECEIVER = (
+    "MAVBRIDGE_TEST_PEER",
+    "MAVBRIDGE_TEST_ALLOW",
+    "MAVBRIDGE_TEST_RECEIVER",
+)
+PERMISSIONS = ("ground", "arm", "fly")
+"""What tests may do to a real flight controller; each allows what is before it, too."""
+COPTER_FIXTURES = ("companion", "armable", "grounded", "flying", "expendable", "without_receiver")
+PX4_FIXTURES = ("px4", "px4_armable", "px4_grounded", "px4_flying", "px4_expendable")
+FIRMWARES = {
+    mav.MAV_AUTOPILOT_ARDUPILOTMEGA: COPTER_FIXTURES,
+    mav.MAV_AUTOPILOT_PX4: PX4_FIXTURES,
+}
+FOUND_WITHIN_S = 30.0
 
 
-def peer_by_udp(variable: str) -> UdpPeer:
-    """The flight controller that the environment names; skips without one."""
-    url = os.environ.get(variable)
-    if url is None:
-        pytest.skip(f"{variable} names no flight controller")
-    _, host, port = url.split(":")
-    return UdpPeer((host, int(port)))
+class ExternalVehicle:
+    """The flight controller that the environment names."""
+
+    def __init__(self) -> None:
+        address, _, baud = os.environ[PEER].partition(",")
+        self.peer = ExternalPeer(address, int(baud or 115_200))
+        heartbeat = Companion(self.peer).find("HEARTBEAT", FOUND_WITHIN_S)
+        if heartbeat is None:
+            pytest.exit(f"{PEER}={os.environ[PEER]}: no heartbeat within {FOUND_WITHIN_S:.0f} s")
+        self.fixtures = FIRMWARES.get(heartbeat.autopilot, ())
+        self.has_receiver = os.environ.get(RECEIVER, "idle") != "none"
+        self.permission = os.environ.get(ALLOW, "ground")
+        if self.permission not in PERMISSIONS:
+            pytest.exit(f"{ALLOW}={self.permission}: one of {', '.join(PERMISSIONS)}")
+
+    def runs(self, fixtures: list[str]) -> bool:
+        """The tests of its firmware, and only those for its kind of receiver."""
+        if "without_receiver" in fixtures:
+            return not self.has_receiver and "without_receiver" in self.fixtures
+        is_for_it = self.has_receiver or "px4" in self.fixtures
+        return is_for_it and bool(set(fixtures) & set(self.fixtures))
 
 
-@pytest.fixture(params=["mock", *(["external"] if PEER_VARIABLE in os.environ else [])])
-def companion(request: pytest.FixtureRequest) -> Iterator[Companion]:
-    """A companion that has heard the vehicle; the vehicle has a receiver with idle sticks."""
-    if request.param == "mock":
-        companion = Companion(MockPeer(VehicleConfig()))
-        companion.wait("HEARTBEAT")
-        yield companion
+EXTERNAL = pytest.StashKey[ExternalVehicle]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if PEER in os.environ:
+        config.stash[EXTERNAL] = ExternalVehicle()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if EXTERNAL in config.stash:
+        config.stash[EXTERNAL].peer.close()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """A real vehicle runs the tests of its firmware: on the ground first, then in one flight."""
+    if EXTERNAL not in config.stash:
         return
-    with closing(peer_by_udp(PEER_VARIABLE)) as peer:
-        companion = Companion(peer)
-        companion.wait("HEARTBEAT", timeout_s=30.0)
-        yield companion
+    external = config.stash[EXTERNAL]
+    own = [item for item in items if external.runs(getattr(item, "fixturenames", []))]
+    config.hook.pytest_deselected(items=[item for item in items if item not in own])
+    items[:] = sorted(own, key=_stage)
+
+
+def _stage(item: pytest.Item) -> int:
+    names: list[str] = getattr(item, "fixturenames", [])
+    kinds = ("armable", "grounded", "flying", "expendable")
+    return 1 + max((n for n, kind in enumerate(kinds) if any(kind in f for f in names)), default=-1)
+
+
+def _peer(request: pytest.FixtureRequest, autopilot: AutopilotName, *, receiver: bool) -> Peer:
+    if EXTERNAL in request.config.stash:
+        return request.config.stash[EXTERNAL].peer
+    return MockPeer(VehicleConfig(autopilot=autopilot, receiver=receiver))
+
+
+def _need(request: pytest.FixtureRequest, permission: str) -> None:
+    external = request.config.stash.get(EXTERNAL, None)
+    if external is None or PERMISSIONS.index(external.permission) >= PERMISSIONS.index(permission):
+        return
+    pytest.skip(f"it would {permission}: {ALLOW}={permission} allows that")
+
+
+def _on_the_ground(companion: Companion) -> None:
+    if companion.is_external and companion.in_the_air:
+        companion.come_down()
+
+
+@pytest.fixture
+def copter(request: pytest.FixtureRequest) -> Iterator[CopterCompanion]:
+    """An ArduCopter that has been heard, as the test before has left it."""
+    receiver = "without_receiver" not in request.fixturenames
+    companion = CopterCompanion(_peer(request, "ardupilot", receiver=receiver))
+    companion.peer.advance(0) if companion.is_external else companion.wait("HEARTBEAT")
+    yield companion
+    if companion.is_external:
         companion.restore()
 
 
 @pytest.fixture
-def external_companion() -> Iterator[Companion]:
-    """A companion of the external peer; skips without one."""
-    with closing(peer_by_udp(PEER_VARIABLE)) as peer:
-        yield Companion(peer)
+def companion(copter: CopterCompanion) -> CopterCompanion:
+    """A companion of an ArduCopter on the ground, whose receiver has idle sticks; never arms."""
+    _on_the_ground(copter)
+    return copter
 
 
 @pytest.fixture
-def companion_without_receiver() -> Companion:
-    """As ``companion``, but the vehicle never had a receiver (an external one cannot lose its)."""
-    companion = Companion(MockPeer(VehicleConfig(receiver=False)))
-    companion.wait("HEARTBEAT")
-    return companion
+def armable(request: pytest.FixtureRequest, copter: CopterCompanion) -> CopterCompanion:
+    """As ``companion``, for tests that arm and stay on the ground."""
+    _need(request, "arm")
+    _on_the_ground(copter)
+    copter.may_arm = True
+    return copter
 
 
-@pytest.fixture(params=["mock", *(["external"] if PX4_PEER_VARIABLE in os.environ else [])])
-def px4(request: pytest.FixtureRequest) -> Iterator[Px4Companion]:
-    """A ground station of a PX4 without a receiver, on the ground."""
-    if request.param == "mock":
-        companion = Px4Companion(MockPeer(VehicleConfig(autopilot="px4", receiver=False)))
-        companion.wait("HEARTBEAT")
-        yield companion
-        return
-    with closing(peer_by_udp(PX4_PEER_VARIABLE)) as peer:
-        companion = Px4Companion(peer)
-        companion.wait("HEARTBEAT", timeout_s=30.0)
-        yield companion
+@pytest.fixture
+def grounded(request: pytest.FixtureRequest, copter: CopterCompanion) -> CopterCompanion:
+    """As ``armable``, for tests that take off."""
+    _need(request, "fly")
+    _on_the_ground(copter)
+    copter.may_arm = True
+    return copter
+
+
+@pytest.fixture
+def flying(request: pytest.FixtureRequest, copter: CopterCompanion) -> CopterCompanion:
+    """An ArduCopter some metres up, still, in ALT_HOLD, under neutral overrides."""
+    _need(request, "fly")
+    copter.may_arm = True
+    copter.fly_up()
+    return copter
+
+
+@pytest.fixture
+def expendable(flying: CopterCompanion) -> CopterCompanion:
+    """As ``flying``, for tests that end the flight."""
+    return flying
+
+
+@pytest.fixture
+def without_receiver(request: pytest.FixtureRequest, copter: CopterCompanion) -> CopterCompanion:
+    """As ``grounded``, but the vehicle never had a receiver."""
+    _need(request, "fly")
+    copter.may_arm = True
+    return copter
+
+
+@pytest.fixture
+def px4_vehicle(request: pytest.FixtureRequest) -> Iterator[Px4Companion]:
+    """A PX4 without a receiver that has been heard, as the test before has left it."""
+    companion = Px4Companion(_peer(request, "px4", receiver=False))
+    companion.peer.advance(0) if companion.is_external else companion.wait("HEARTBEAT")
+    yield companion
+    if companion.is_external:
         companion.restore()
+
+
+@pytest.fixture
+def px4(px4_vehicle: Px4Companion) -> Px4Companion:
+    """A ground station of a PX4 on the ground; never arms."""
+    _on_the_ground(px4_vehicle)
+    return px4_vehicle
+
+
+@pytest.fixture
+def px4_armable(request: pytest.FixtureRequest, px4_vehicle: Px4Companion) -> Px4Companion:
+    """As ``px4``, for tests that arm and stay on the ground."""
+    _need(request, "arm")
+    _on_the_ground(px4_vehicle)
+    px4_vehicle.may_arm = True
+    return px4_vehicle
+
+
+@pytest.fixture
+def px4_grounded(request: pytest.FixtureRequest, px4_vehicle: Px4Companion) -> Px4Companion:
+    """As ``px4_armable``, for tests that take off."""
+    _need(request, "fly")
+    _on_the_ground(px4_vehicle)
+    px4_vehicle.may_arm = True
+    return px4_vehicle
+
+
+@pytest.fixture
+def px4_flying(request: pytest.FixtureRequest, px4_vehicle: Px4Companion) -> Px4Companion:
+    """A PX4 some metres up, still, in ALTCTL, under centred sticks."""
+    _need(request, "fly")
+    px4_vehicle.may_arm = True
+    px4_vehicle.fly_up()
+    return px4_vehicle
+
+
+@pytest.fixture
+def px4_expendable(px4_flying: Px4Companion) -> Px4Companion:
+    """As ``px4_flying``, for tests that end the flight."""
+    return px4_flying

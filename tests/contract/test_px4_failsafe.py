@@ -40,18 +40,20 @@ def send_mid(px4):
 
 
 @pytest.mark.parametrize(("gap_s", "fails"), [(0.3, False), (0.5, False), (0.8, True)])
-def test_a_short_gap_is_forgiven(px4, gap_s, fails):
-    px4.take_off()
+def test_a_short_gap_is_forgiven(px4_flying, gap_s, fails):
+    px4_flying.refill_delay()
+    px4_flying.fly(0.1)
 
-    px4.advance(gap_s)
+    px4_flying.advance(gap_s)
 
-    assert px4.hears(HOLD_TEXT, 1.0, send_mid(px4)) == fails
+    assert px4_flying.hears(HOLD_TEXT, 1.0, send_mid(px4_flying)) == fails
 
 
-def test_lost_sticks_are_held_then_hold_then_return(px4):
-    px4.take_off()
-    px4.fly(1.0, LEANING)
-    held_s, messages = px4.until(
+def test_lost_sticks_are_held_then_hold_then_return(px4_flying):
+    px4_flying.refill_delay()
+    px4_flying.fly(0.1)
+    px4_flying.fly(1.0, LEANING)
+    held_s, messages = px4_flying.until(
         lambda m: any(x.custom_mode == custom(LOITER) for x in modes_in(m)), 2.0
     )
     leans = [math.degrees(m.roll) for m in named(messages, "ATTITUDE")]
@@ -59,102 +61,113 @@ def test_lost_sticks_are_held_then_hold_then_return(px4):
     assert 0.55 <= held_s <= 0.8
     assert min(leans) > 20.0, "the last stick is held until then"
     assert modes_in(messages)[-1].intended_custom_mode == custom(ALTCTL)
-    assert 4.5 <= goes_to(px4, RTL, 7.0) <= 5.5
-    px4.advance(0.5)
-    texts = px4.texts()
+    assert 4.5 <= goes_to(px4_flying, RTL, 7.0) <= 5.5
+    px4_flying.advance(0.5)
+    texts = px4_flying.texts()
     assert "Failsafe activated: entering Hold for 5 seconds" in texts
     assert "Failsafe activated" in texts
 
 
-def test_the_heartbeat_of_a_failsafe_is_critical(px4):
-    px4.take_off()
-    px4.advance(0.9)
+def test_the_heartbeat_of_a_failsafe_is_critical(px4_flying):
+    px4_flying.refill_delay()
+    px4_flying.fly(0.1)
+    px4_flying.advance(0.9)
 
-    heartbeat = px4.wait("HEARTBEAT")
+    heartbeat = px4_flying.wait("HEARTBEAT")
 
     assert (heartbeat.custom_mode, heartbeat.system_status) == (custom(LOITER), 5)
 
 
-def test_returning_sticks_do_not_give_the_mode_back(px4):
-    px4.take_off()
-    goes_to(px4, LOITER, 2.0)
+def test_returning_sticks_do_not_give_the_mode_back(px4_flying):
+    px4_flying.refill_delay(2.0)
+    px4_flying.fly(0.1)
+    goes_to(px4_flying, LOITER, 2.0)
 
-    assert goes_to(px4, RTL, 7.0, send_mid(px4)) <= 5.5
-    px4.fly(1.0)
-    assert px4.mode() == custom(RTL)
-
-
-def test_a_mode_command_ends_the_failsafe(px4):
-    px4.take_off()
-    goes_to(px4, LOITER, 2.0)
-
-    assert px4.set_mode(ALTCTL) == REJECTED, "it needs sticks"
-    assert px4.set_mode(LOITER) == ACCEPTED
-    px4.advance(5.5)
-    assert px4.mode() == custom(LOITER)
-    px4.fly(0.3)
-    assert px4.set_mode(ALTCTL) == ACCEPTED
-    px4.fly(0.2)
-    assert px4.mode() == custom(ALTCTL)
+    assert goes_to(px4_flying, RTL, 7.0, send_mid(px4_flying)) <= 2.6
+    px4_flying.fly(1.0)
+    assert px4_flying.mode() == custom(RTL)
 
 
-def test_moving_the_sticks_takes_the_return_over_in_posctl(px4):
-    px4.take_off()
-    goes_to(px4, RTL, 8.0)
-    px4.fly(0.5)
+def test_a_mode_command_ends_the_failsafe(px4_flying):
+    px4_flying.refill_delay(2.0)
+    px4_flying.fly(0.1)
+    goes_to(px4_flying, LOITER, 2.0)
+
+    assert px4_flying.set_mode(ALTCTL) == REJECTED, "it needs sticks"
+    assert px4_flying.set_mode(LOITER) == ACCEPTED
+    px4_flying.advance(2.5)
+    assert px4_flying.mode() == custom(LOITER)
+    px4_flying.fly(0.3)
+    assert px4_flying.set_mode(ALTCTL) == ACCEPTED
+    px4_flying.fly(0.2)
+    assert px4_flying.mode() == custom(ALTCTL)
+
+
+def test_moving_the_sticks_takes_the_return_over_in_posctl(px4_flying):
+    px4_flying.refill_delay(1.0)
+    px4_flying.fly(0.1)
+    goes_to(px4_flying, RTL, 8.0)
+    px4_flying.fly(0.5)
 
     def ramp(elapsed_s: float) -> None:
-        px4.sticks((0, min(1000, int(1000 * elapsed_s / 0.5)), 500, 0))
+        px4_flying.sticks((0, min(1000, int(1000 * elapsed_s / 0.5)), 500, 0))
 
-    assert goes_to(px4, POSCTL, 1.0, ramp) < 0.6
-    px4.fly(0.3, (0, 1000, 500, 0))
-    events = [event_id(m) for m in named(px4.seen, f"UNKNOWN_{EVENT}")]
+    assert goes_to(px4_flying, POSCTL, 1.0, ramp) < 0.6
+    px4_flying.fly(0.3, (0, 1000, 500, 0))
+    events = [event_id(m) for m in named(px4_flying.seen, f"UNKNOWN_{EVENT}")]
     assert TOOK_OVER_IN_FAILSAFE in events, "an event, but no text"
 
 
-def test_the_delay_is_a_budget(px4):
-    px4.take_off()
-    goes_to(px4, LOITER, 2.0)
-    goes_to(px4, RTL, 7.0)
-    px4.fly(0.5)
-    assert px4.set_mode(ALTCTL) == ACCEPTED
-    px4.fly(1.0)
+@pytest.mark.parametrize("refills", [False, True])
+def test_the_delay_is_a_budget_that_a_changed_parameter_fills(px4_flying, refills):
+    px4_flying.refill_delay(2.0)
+    px4_flying.fly(0.1)
+    goes_to(px4_flying, LOITER, 2.0)
+    goes_to(px4_flying, RTL, 5.0)
+    px4_flying.fly(0.5)
+    assert px4_flying.set_mode(ALTCTL) == ACCEPTED
+    px4_flying.fly(0.5)
+    if refills:
+        px4_flying.change("MPC_LAND_SPEED", 0.8)
+    px4_flying.fly(0.5)
 
-    goes_to(px4, LOITER, 2.0)
+    goes_to(px4_flying, LOITER, 2.0)
 
-    assert goes_to(px4, RTL, 4.0) <= 2.5
-
-
-def test_the_loss_time_is_a_parameter(px4):
-    px4.change("COM_RC_LOSS_T", 2.0)
-    px4.take_off()
-
-    assert 1.9 <= goes_to(px4, LOITER, 4.0) <= 2.4
+    took_s = goes_to(px4_flying, RTL, 5.0)
+    assert 1.7 <= took_s <= 2.4 if refills else took_s <= 1.2
 
 
-def test_sticks_that_were_never_there_are_not_missed(px4):
-    px4.track()
-    px4.get_ready(LOITER)
-    px4.advance(1.0)
-    px4.stream_setpoint(attitude_target(thrust=0.0), 0.3)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED
-    assert px4.arm() == ACCEPTED
-    px4.stream_setpoint(attitude_target(thrust=0.6), 4.0)
+def test_the_loss_time_is_a_parameter(px4_flying):
+    px4_flying.refill_delay()
+    px4_flying.fly(0.1)
+    px4_flying.change("COM_RC_LOSS_T", 2.0)
+    px4_flying.fly(0.2)
 
-    assert px4.mode() == custom(OFFBOARD)
-    assert not [text for text in px4.texts() if "Failsafe" in text]
+    assert 1.9 <= goes_to(px4_flying, LOITER, 4.0) <= 2.4
+
+
+def test_sticks_that_were_never_there_are_not_missed(px4_grounded):
+    px4_grounded.track()
+    px4_grounded.get_ready(LOITER)
+    px4_grounded.advance(1.0)
+    px4_grounded.stream_setpoint(attitude_target(thrust=0.0), 0.3)
+    assert px4_grounded.set_mode(OFFBOARD) == ACCEPTED
+    assert px4_grounded.arm() == ACCEPTED
+    px4_grounded.stream_setpoint(attitude_target(thrust=0.6), 4.0)
+
+    assert px4_grounded.mode() == custom(OFFBOARD)
+    assert not [text for text in px4_grounded.texts() if "Failsafe" in text]
 
 
 @pytest.mark.parametrize(("excepted", "stays"), [(0, False), (4, True)])
-def test_lost_sticks_matter_in_offboard_unless_excepted(px4, excepted, stays):
-    px4.change("COM_RCL_EXCEPT", excepted)
-    px4.take_off()
-    px4.stream_setpoint(attitude_target(), 0.2)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED
+def test_lost_sticks_matter_in_offboard_unless_excepted(px4_flying, excepted, stays):
+    px4_flying.change("COM_RCL_EXCEPT", excepted)
+    px4_flying.stream_setpoint(attitude_target(), 0.2)
+    assert px4_flying.set_mode(OFFBOARD) == ACCEPTED
 
-    px4.stream_setpoint(attitude_target(), 2.0)
+    px4_flying.stream_setpoint(attitude_target(), 2.0)
 
-    assert (px4.mode() == custom(OFFBOARD)) == stays
+    assert (px4_flying.mode() == custom(OFFBOARD)) == stays
 
 
 def both(px4, message):
@@ -165,85 +178,83 @@ def both(px4, message):
     return send
 
 
-def test_offboard_needs_a_setpoint_in_flight(px4):
-    px4.take_off()
+def test_offboard_needs_a_setpoint_in_flight(px4_flying):
 
+    px4_flying.fly(1.2)  # a setpoint of the flight before may still count
     text = "Switching to Offboard is currently not available"
-    assert px4.set_mode(OFFBOARD) == REJECTED
-    assert not px4.hears(text, 1.2, send_mid(px4)), "only a ground station is told"
-    assert px4.set_mode(OFFBOARD, component_id=mav.MAV_COMP_ID_MISSIONPLANNER) == REJECTED
-    assert px4.hears(text, 2.0, send_mid(px4))
-    px4.send(attitude_target())
-    px4.advance(0.3)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED, "one setpoint within a second is enough"
+    assert px4_flying.set_mode(OFFBOARD) == REJECTED
+    assert not px4_flying.hears(text, 1.2, send_mid(px4_flying)), "only a ground station is told"
+    assert px4_flying.set_mode(OFFBOARD, component_id=mav.MAV_COMP_ID_MISSIONPLANNER) == REJECTED
+    assert px4_flying.hears(text, 2.0, send_mid(px4_flying))
+    px4_flying.send(attitude_target())
+    px4_flying.advance(0.3)
+    assert px4_flying.set_mode(OFFBOARD) == ACCEPTED, "one setpoint within a second is enough"
 
 
-def test_a_lost_stream_leaves_offboard_and_its_return_brings_it_back(px4):
-    px4.take_off()
-    px4.repeat(both(px4, attitude_target(10.0)), 0.3)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED
-    messages = px4.repeat(both(px4, attitude_target(10.0)), 1.5)
+def test_a_lost_stream_leaves_offboard_and_its_return_brings_it_back(px4_flying):
+    px4_flying.repeat(both(px4_flying, attitude_target(10.0)), 0.3)
+    assert px4_flying.set_mode(OFFBOARD) == ACCEPTED
+    messages = px4_flying.repeat(both(px4_flying, attitude_target(10.0)), 1.5)
     assert math.degrees(named(messages, "ATTITUDE")[-1].roll) == pytest.approx(10.0, abs=1.0)
 
-    assert 0.95 <= goes_to(px4, POSCTL, 2.0, send_mid(px4)) <= 1.25
-    assert modes_in(px4.fly(1.0))[-1].intended_custom_mode == custom(OFFBOARD)
-    assert goes_to(px4, OFFBOARD, 1.0, both(px4, attitude_target())) < 0.2
+    assert 0.95 <= goes_to(px4_flying, POSCTL, 2.0, send_mid(px4_flying)) <= 1.25
+    assert modes_in(px4_flying.fly(1.0))[-1].intended_custom_mode == custom(OFFBOARD)
+    assert goes_to(px4_flying, OFFBOARD, 1.0, both(px4_flying, attitude_target())) < 0.2
 
 
-def test_without_sticks_a_lost_stream_returns_at_once(px4):
-    px4.track()
-    px4.get_ready(LOITER)
-    px4.advance(1.0)
-    px4.stream_setpoint(attitude_target(thrust=0.0), 0.3)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED
-    assert px4.arm() == ACCEPTED
-    px4.stream_setpoint(attitude_target(thrust=0.65), 4.0)
+def test_without_sticks_a_lost_stream_returns_at_once(px4_grounded):
+    px4_grounded.track()
+    px4_grounded.get_ready(LOITER)
+    px4_grounded.advance(1.0)
+    px4_grounded.stream_setpoint(attitude_target(thrust=0.0), 0.3)
+    assert px4_grounded.set_mode(OFFBOARD) == ACCEPTED
+    assert px4_grounded.arm() == ACCEPTED
+    px4_grounded.stream_setpoint(attitude_target(thrust=0.65), 4.0)
 
-    assert 0.95 <= goes_to(px4, RTL, 2.0) <= 1.25
-    assert px4.hears("Failsafe activated")
-
-
-def test_a_mode_command_keeps_a_stream_from_pulling_back(px4):
-    px4.take_off()
-    px4.repeat(both(px4, attitude_target()), 0.3)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED
-    px4.repeat(both(px4, attitude_target()), 0.5)
-    assert px4.command(mav.MAV_CMD_DO_SET_MODE, 1, *LOITER, system_id=42) == ACCEPTED
-
-    px4.repeat(both(px4, attitude_target()), 1.0)
-
-    assert px4.mode() == custom(LOITER)
+    assert 0.95 <= goes_to(px4_grounded, RTL, 2.0) <= 1.25
+    assert px4_grounded.hears("Failsafe activated")
 
 
-@pytest.mark.parametrize(("hz", "stays"), [(1.25, True), (0.8, False)])
-def test_offboard_needs_more_than_one_setpoint_a_second(px4, hz, stays):
-    px4.take_off()
-    px4.repeat(both(px4, attitude_target()), 0.3)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED
+def test_a_mode_command_keeps_a_stream_from_pulling_back(px4_flying):
+    px4_flying.repeat(both(px4_flying, attitude_target()), 0.3)
+    assert px4_flying.set_mode(OFFBOARD) == ACCEPTED
+    px4_flying.repeat(both(px4_flying, attitude_target()), 0.5)
+    assert px4_flying.command(mav.MAV_CMD_DO_SET_MODE, 1, *LOITER, system_id=42) == ACCEPTED
+
+    px4_flying.repeat(both(px4_flying, attitude_target()), 1.0)
+
+    assert px4_flying.mode() == custom(LOITER)
+
+
+@pytest.mark.parametrize(("hz", "stays"), [(1.5, True), (0.8, False)])
+def test_offboard_needs_more_than_one_setpoint_a_second(px4_flying, hz, stays):
+    px4_flying.repeat(both(px4_flying, attitude_target()), 0.3)
+    assert px4_flying.set_mode(OFFBOARD) == ACCEPTED
     due_s = [0.0]
 
     def send(elapsed_s: float) -> None:
-        px4.sticks(MID)
+        px4_flying.sticks(MID)
         if elapsed_s >= due_s[0]:
             due_s[0] += 1.0 / hz
-            px4.send(attitude_target())
+            px4_flying.send(attitude_target())
 
-    messages = px4.repeat(send, 4.0)
+    px4_flying.repeat(send, 0.1)  # a CURRENT_MODE of before may still be on its way
+    messages = px4_flying.repeat(send, 4.0)
 
     modes = {m.custom_mode for m in modes_in(messages)}
     assert (modes == {custom(OFFBOARD)}) == stays
 
 
 @pytest.mark.parametrize(("ramp_s", "takes_over"), [(0.6, True), (1.5, False), (0.0, False)])
-def test_a_fast_ramp_of_the_sticks_takes_over_and_a_jump_does_not(px4, ramp_s, takes_over):
-    px4.take_off(LOITER)
-    px4.fly(0.5)
+def test_a_fast_ramp_of_the_sticks_takes_over_and_a_jump_does_not(px4_flying, ramp_s, takes_over):
+    assert px4_flying.set_mode(LOITER) == ACCEPTED
+    px4_flying.fly(0.5)
 
     def ramp(elapsed_s: float) -> None:
         share = 1.0 if elapsed_s >= ramp_s else elapsed_s / ramp_s
-        px4.sticks((0, int(1000 * share), 500, 0))
+        px4_flying.sticks((0, int(1000 * share), 500, 0))
 
-    px4.repeat(ramp, 1.8)
+    px4_flying.repeat(ramp, 1.8)
 
-    assert px4.hears("Pilot took over using sticks", 0.5) == takes_over
-    assert px4.mode() == custom(POSCTL if takes_over else LOITER)
+    assert px4_flying.hears("Pilot took over using sticks", 0.5) == takes_over
+    assert px4_flying.mode() == custom(POSCTL if takes_over else LOITER)

@@ -42,9 +42,9 @@ def test_heartbeats_stay_at_one_hertz_whatever_is_asked_or_changes(px4):
         params = (1, *mode, 0, 0, 0, 0)
         px4.send(mav.MAVLink_command_long_message(1, 1, mav.MAV_CMD_DO_SET_MODE, 0, *params))
 
-    messages = px4.repeat(change_modes, 5.0, hz=5)
+    messages = px4.repeat(change_modes, 3.0, hz=5)
 
-    assert len(named(messages, "HEARTBEAT")) == pytest.approx(5, abs=1)
+    assert len(named(messages, "HEARTBEAT")) == pytest.approx(3, abs=1)
 
 
 def test_current_mode_tells_a_change_at_once_and_twice_a_second_otherwise(px4):
@@ -79,23 +79,23 @@ def test_the_version_comes_on_request(px4):
         (mav.MAVLINK_MSG_ID_ATTITUDE, 200, 115, 130),
         (mav.MAVLINK_MSG_ID_HIGHRES_IMU, 250, 200, 251),
         (mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 250, 110, 126),
-        (mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 50, 48, 52),
+        (mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 50, 44, 56),  # by arrival: it has no stamp
     ],
 )
 def test_state_comes_at_the_rate_asked_for_up_to_its_topics(
     px4, message_id, asked_hz, low_hz, high_hz
 ):
     assert px4.stream(message_id, asked_hz) == ACCEPTED
-    px4.advance(1.0)
+    px4.advance(0.3)
     name = mav.mavlink_map[message_id].msgname
-    messages = named(px4.repeat(lambda _: None, 3.0), name)
+    messages = named(px4.repeat(lambda _: None, 2.0), name)
 
     if hasattr(messages[0], "time_usec"):
         span_s = (messages[-1].time_usec - messages[0].time_usec) / 1e6
     elif hasattr(messages[0], "time_boot_ms"):
         span_s = (messages[-1].time_boot_ms - messages[0].time_boot_ms) / 1e3
     else:
-        span_s = 3.0
+        span_s = 2.0
 
     assert low_hz <= (len(messages) - 1) / span_s <= high_hz
 
@@ -152,7 +152,8 @@ def test_what_is_addressed_to_others_gets_no_answer(px4, system, component):
     params = (mav.MAVLINK_MSG_ID_ATTITUDE, 10_000, *[0] * 5)
     px4.send(mav.MAVLink_command_long_message(system, component, SET_INTERVAL, 0, *params))
 
-    assert not named(px4.advance(0.5), "COMMAND_ACK")
+    acks = named(px4.advance(0.5), "COMMAND_ACK")
+    assert SET_INTERVAL not in [m.command for m in acks]
 
 
 def test_an_integer_travels_as_its_bytes(px4):
@@ -194,14 +195,14 @@ def test_local_position_streams_and_the_estimator_tells_whether_it_is_one(px4):
     assert flags & horizontal == horizontal
 
 
-def test_arming_is_an_event_and_to_a_ground_station_a_text(px4):
-    px4.get_ready(ALTCTL)
-    px4.seen.clear()
-    assert px4.arm() == ACCEPTED
+def test_arming_is_an_event_and_to_a_ground_station_a_text(px4_armable):
+    px4_armable.get_ready(ALTCTL)
+    px4_armable.seen.clear()
+    assert px4_armable.arm() == ACCEPTED
 
-    assert px4.hears("Armed by external command")
-    px4.fly(0.5)
-    events = named(px4.seen, f"UNKNOWN_{EVENT}")
+    assert px4_armable.hears("Armed by external command")
+    px4_armable.fly(0.5)
+    events = named(px4_armable.seen, f"UNKNOWN_{EVENT}")
     assert ARMED_BY in [event_id(m) for m in events]
 
 
@@ -222,12 +223,13 @@ def test_the_old_set_mode_message_is_acknowledged_as_the_command(px4):
     assert px4.mode() == custom(ALTCTL)
 
 
-def test_texts_need_a_ground_station(px4):
+def test_texts_need_a_ground_station(px4_armable):
     # A link that had a heartbeat keeps its ground station: only a fresh one can show this.
-    if not hasattr(px4.peer, "vehicle"):
+    if px4_armable.is_external:
         pytest.skip("an external vehicle has heard ground stations already")
-    silent = Px4Companion(px4.peer, is_gcs=False)
-    px4.peer.vehicle.reboot()
+    silent = Px4Companion(px4_armable.peer, is_gcs=False)
+    silent.may_arm = True
+    px4_armable.peer.vehicle.reboot()
     silent.advance(6.0)
     silent.set_mode(ALTCTL)
     silent.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1)

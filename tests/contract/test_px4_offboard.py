@@ -7,12 +7,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.px4_companion import (
     ACCEPTED,
-    LOITER,
-    MID,
     OFFBOARD,
-    TAKEOFF,
     attitude_target,
-    custom,
     named,
     rate_target,
     velocity_target,
@@ -20,15 +16,14 @@ from helpers.px4_companion import (
 
 
 @pytest.fixture
-def offboard(px4):
+def offboard(px4_flying):
     """Some metres up in OFFBOARD, holding its place without sticks."""
-    px4.change("COM_RCL_EXCEPT", 4)
-    px4.take_off()
-    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 250)
-    px4.stream_setpoint(velocity_target(), 0.3)
-    assert px4.set_mode(OFFBOARD) == ACCEPTED
-    px4.stream_setpoint(velocity_target(), 2.0)
-    return px4
+    px4_flying.change("COM_RCL_EXCEPT", 4)
+    px4_flying.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 250)
+    px4_flying.stream_setpoint(velocity_target(), 0.3)
+    assert px4_flying.set_mode(OFFBOARD) == ACCEPTED
+    px4_flying.stream_setpoint(velocity_target(), 1.0)
+    return px4_flying
 
 
 def crossings_ms(samples, begin_ms, start, target):
@@ -147,22 +142,3 @@ def test_the_position_target_echoes_a_velocity(offboard):
 
     assert (echo.vx, echo.vy, echo.vz) == pytest.approx((1.0, -0.5, -0.2), abs=0.01)
     assert math.degrees(echo.yaw_rate) == pytest.approx(20.0, abs=0.5)
-
-
-def test_the_vehicle_takes_off_and_holds_by_itself(px4):
-    px4.track()
-    px4.get_ready(LOITER)
-    ground = named(px4.seen, "LOCAL_POSITION_NED")[-1].z
-    assert px4.set_mode(TAKEOFF) == ACCEPTED
-    assert px4.arm() == ACCEPTED
-
-    px4.until(
-        lambda m: any(x.landed_state == 2 for x in named(m, "EXTENDED_SYS_STATE")),
-        20.0,
-        lambda _: px4.sticks(MID),
-    )
-    messages = px4.fly(4.0)
-
-    height = ground - named(messages, "LOCAL_POSITION_NED")[-1].z
-    assert px4.mode() == custom(LOITER)
-    assert height == pytest.approx(2.5, abs=0.8)

@@ -5,11 +5,11 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.contract_peers import REBOOT_FORCE
 from helpers.px4_companion import (
     ACCEPTED,
     ACRO,
     ALTCTL,
-    LAND,
     LOITER,
     MID,
     POSCTL,
@@ -67,10 +67,11 @@ def test_sticks_for_another_system_are_ignored(px4):
 def test_the_echo_comes_at_the_senders_rate_and_stops_when_the_sticks_are_lost(px4):
     px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 250)
     px4.fly(0.5)
-    sent = echoes(px4.fly(2.0))
-    px4.advance(1.0)
+    sent = []
+    messages = px4.repeat(lambda at_s: sent.append(at_s) or px4.sticks(MID), 2.0)
+    messages += px4.advance(1.0)
 
-    assert len(sent) == pytest.approx(100, abs=6)
+    assert len(echoes(messages)) == pytest.approx(len(sent), abs=6)
     assert not echoes(px4.advance(1.0))
 
 
@@ -94,25 +95,25 @@ def test_overrides_are_no_sticks(px4):
 
 
 @pytest.mark.parametrize("mode", [STAB, ACRO, ALTCTL, POSCTL])
-def test_without_sticks_their_modes_do_not_arm(px4, mode):
-    px4.get_ready(LOITER)
-    px4.advance(1.0)
-    assert px4.set_mode(mode) == ACCEPTED, "disarmed, every mode is taken"
-    px4.seen.clear()
+def test_without_sticks_their_modes_do_not_arm(px4_armable, mode):
+    px4_armable.get_ready(LOITER)
+    px4_armable.advance(1.0)
+    assert px4_armable.set_mode(mode) == ACCEPTED, "disarmed, every mode is taken"
+    px4_armable.seen.clear()
 
-    assert px4.arm() == REJECTED
-    assert px4.hears("Arming denied: Resolve system health failures first")
+    assert px4_armable.arm() == REJECTED
+    assert px4_armable.hears("Arming denied: Resolve system health failures first")
 
 
-def test_hold_arms_without_sticks_and_return_does_not(px4):
-    px4.get_ready(LOITER)
-    px4.advance(1.0)
+def test_hold_arms_without_sticks_and_return_does_not(px4_armable):
+    px4_armable.get_ready(LOITER)
+    px4_armable.advance(1.0)
 
-    assert px4.arm() == ACCEPTED
-    assert px4.command(ARM, 1) == ACCEPTED, "arming twice"
-    assert px4.command(ARM, 0) == ACCEPTED
-    px4.set_mode(RTL)
-    assert px4.arm() == REJECTED
+    assert px4_armable.arm() == ACCEPTED
+    assert px4_armable.command(ARM, 1) == ACCEPTED, "arming twice"
+    assert px4_armable.command(ARM, 0) == ACCEPTED
+    px4_armable.set_mode(RTL)
+    assert px4_armable.arm() == REJECTED
 
 
 @pytest.mark.parametrize(
@@ -129,64 +130,73 @@ def test_hold_arms_without_sticks_and_return_does_not(px4):
         (POSCTL, 700, REJECTED),
     ],
 )
-def test_arming_needs_a_low_throttle(px4, mode, z, result):
-    px4.get_ready(mode)
+def test_arming_needs_a_low_throttle(px4_armable, mode, z, result):
+    px4_armable.get_ready(mode)
     sticks = (500, -500, z, 0)  # the others may be anywhere
-    px4.fly(0.3, sticks)
-    px4.seen.clear()
+    px4_armable.fly(0.3, sticks)
+    px4_armable.seen.clear()
 
-    assert px4.arm() == result
-    denied = px4.hears(
-        "Arming denied: throttle not in safe position", 0.7, lambda _: px4.sticks(sticks)
+    assert px4_armable.arm() == result
+    denied = px4_armable.hears(
+        "Arming denied: throttle not in safe position", 0.7, lambda _: px4_armable.sticks(sticks)
     )
     assert denied == (result == REJECTED)
 
 
-def test_throttle_down_and_full_yaw_arms_and_disarms(px4):
-    px4.get_ready(POSCTL)
-    px4.seen.clear()
-    px4.fly(0.8, (0, 0, 0, 1000))
-    assert "Armed by stick gesture" not in px4.texts()
+def test_throttle_down_and_full_yaw_arms_and_disarms(px4_armable):
+    px4_armable.get_ready(POSCTL)
+    px4_armable.seen.clear()
+    px4_armable.fly(0.8, (0, 0, 0, 1000))
+    assert "Armed by stick gesture" not in px4_armable.texts()
 
-    assert px4.hears("Armed by stick gesture", 1.5, lambda _: px4.sticks((0, 0, 0, 1000)))
-    px4.seen.clear()
+    assert px4_armable.hears(
+        "Armed by stick gesture", 1.5, lambda _: px4_armable.sticks((0, 0, 0, 1000))
+    )
+    px4_armable.seen.clear()
 
-    assert px4.hears("Disarmed by stick gesture", 2.5, lambda _: px4.sticks((0, 0, 0, -1000)))
-
-
-def test_a_lean_is_no_gesture(px4):
-    px4.get_ready(POSCTL)
-    px4.seen.clear()
-
-    px4.fly(1.6, (500, 500, 0, 1000))
-
-    assert "Armed by stick gesture" not in px4.texts()
-
-
-def test_who_does_not_take_off_is_disarmed(px4):
-    px4.get_ready(ALTCTL)
-    assert px4.arm() == ACCEPTED
-
-    took_s, _ = px4.until(
-        lambda m: any("Disarmed" in x.text for x in named(m, "STATUSTEXT")),
-        14.0,
-        lambda _: px4.sticks(MID),
+    assert px4_armable.hears(
+        "Disarmed by stick gesture", 2.5, lambda _: px4_armable.sticks((0, 0, 0, -1000))
     )
 
-    assert 9.8 <= took_s <= 11.5
+
+def test_a_lean_is_no_gesture(px4_armable):
+    px4_armable.get_ready(POSCTL)
+    px4_armable.seen.clear()
+
+    px4_armable.fly(1.6, (500, 500, 0, 1000))
+
+    assert "Armed by stick gesture" not in px4_armable.texts()
 
 
-def test_in_flight_only_a_forced_disarm_works(px4):
-    px4.take_off()
+def test_who_does_not_take_off_is_disarmed(px4_armable):
+    px4_armable.change("COM_DISARM_PRFLT", 4.0)
+    px4_armable.get_ready(ALTCTL)
+    assert px4_armable.arm() == ACCEPTED
 
-    assert px4.command(ARM, 0) == REJECTED
-    assert px4.hears("Disarming denied: not landed", 2.0, lambda _: px4.sticks(MID))
-    assert px4.command(ARM, 0, 21196, system_id=42) == ACCEPTED
+    took_s, _ = px4_armable.until(
+        lambda m: any("Disarmed" in x.text for x in named(m, "STATUSTEXT")),
+        8.0,
+        lambda _: px4_armable.sticks(MID),
+    )
+
+    assert 3.8 <= took_s <= 5.5
 
 
-def test_an_odd_arm_value_is_not_answered(px4):
-    px4.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 2, *[0] * 6))
-    assert not named(px4.advance(0.5), "COMMAND_ACK")
+def test_a_reboot_is_denied_while_armed_even_by_force(px4_armable):
+    px4_armable.get_ready(ALTCTL)
+    assert px4_armable.arm() == ACCEPTED
+    px4_armable.fly(0.2)
+
+    reboot = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+    assert px4_armable.command(reboot, 1) == mav.MAV_RESULT_DENIED
+    assert px4_armable.command(reboot, 1, 0, 0, 0, 0, REBOOT_FORCE) == mav.MAV_RESULT_DENIED
+    assert px4_armable.command(reboot, 0) == ACCEPTED, "which asks for nothing"
+
+
+def test_an_odd_arm_value_is_not_answered(px4_armable):
+    px4_armable.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 2, *[0] * 6))
+    acks = named(px4_armable.advance(0.5), "COMMAND_ACK")
+    assert ARM not in [m.command for m in acks]
 
 
 @pytest.mark.parametrize(
@@ -198,20 +208,18 @@ def test_an_odd_arm_value_is_not_answered(px4):
         ((500, 0, 500, 0), "pitch", -19.3),
     ],
 )
-def test_altctl_leans_by_the_tangent(px4, sticks, axis, expected_deg):
-    px4.take_off()
+def test_altctl_leans_by_the_tangent(px4_flying, sticks, axis, expected_deg):
 
-    attitude = named(px4.fly(1.5, sticks), "ATTITUDE")[-1]
+    attitude = named(px4_flying.fly(1.5, sticks), "ATTITUDE")[-1]
 
     assert math.degrees(getattr(attitude, axis)) == pytest.approx(expected_deg, abs=1.0)
 
 
 @pytest.mark.parametrize(("r", "expected_degps"), [(100, 0.0), (500, 34.5), (1000, 145.0)])
-def test_yaw_has_a_dead_zone_and_an_expo(px4, r, expected_degps):
-    px4.take_off()
-    px4.fly(1.5, (0, 0, 500, r))
+def test_yaw_has_a_dead_zone_and_an_expo(px4_flying, r, expected_degps):
+    px4_flying.fly(1.5, (0, 0, 500, r))
 
-    attitudes = named(px4.fly(0.5, (0, 0, 500, r)), "ATTITUDE")
+    attitudes = named(px4_flying.fly(0.5, (0, 0, 500, r)), "ATTITUDE")
     turned = math.remainder(attitudes[-1].yaw - attitudes[0].yaw, 2 * math.pi)
     span_s = (attitudes[-1].time_boot_ms - attitudes[0].time_boot_ms) / 1e3
 
@@ -219,46 +227,33 @@ def test_yaw_has_a_dead_zone_and_an_expo(px4, r, expected_degps):
 
 
 @pytest.mark.parametrize(("z", "low_mps", "high_mps"), [(550, -0.25, 0.25), (750, 0.45, 0.95)])
-def test_throttle_is_a_climb_rate_with_a_dead_zone(px4, z, low_mps, high_mps):
-    px4.take_off()
+def test_throttle_is_a_climb_rate_with_a_dead_zone(px4_flying, z, low_mps, high_mps):
 
-    messages = px4.fly(2.5, (0, 0, z, 0))
+    messages = px4_flying.fly(2.5, (0, 0, z, 0))
 
     positions = named(messages, "LOCAL_POSITION_NED")[-25:]
     climb_mps = -sum(m.vz for m in positions) / len(positions)
     assert low_mps <= climb_mps <= high_mps
 
 
-def test_a_lean_comes_an_eighth_of_a_second_after_the_stick(px4):
-    px4.take_off()
-    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 250)
-    px4.fly(1.0)
+def test_a_lean_comes_an_eighth_of_a_second_after_the_stick(px4_flying):
+    px4_flying.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 250)
+    px4_flying.fly(1.0)
     lags_ms = []
     for _ in range(3):
-        begin_ms = named(px4.seen, "ATTITUDE")[-1].time_boot_ms
-        attitudes = named(px4.fly(1.0, (0, 500, 500, 0)), "ATTITUDE")
+        begin_ms = named(px4_flying.seen, "ATTITUDE")[-1].time_boot_ms
+        attitudes = named(px4_flying.fly(0.5, (0, 500, 500, 0)), "ATTITUDE")
         lags_ms.append(next(m.time_boot_ms for m in attitudes if m.roll > math.radians(2.0)))
         lags_ms[-1] -= begin_ms
-        px4.fly(2.0)
+        px4_flying.fly(1.5)
 
     assert sorted(lags_ms)[1] == pytest.approx(143, abs=25)
 
 
-def test_landing_disarms_two_seconds_after_the_touchdown(px4):
-    px4.take_off()
-    px4.set_mode(LAND)
-    px4.until(
-        lambda m: any("Landing detected" in x.text for x in named(m, "STATUSTEXT")),
-        60.0,
-        lambda _: px4.sticks(MID),
-    )
+def test_in_flight_only_a_forced_disarm_works(px4_expendable):
 
-    took_s, _ = px4.until(
-        lambda m: any("Disarmed by landing" in x.text for x in named(m, "STATUSTEXT")),
-        4.0,
-        lambda _: px4.sticks(MID),
+    assert px4_expendable.command(ARM, 0) == REJECTED
+    assert px4_expendable.hears(
+        "Disarming denied: not landed", 2.0, lambda _: px4_expendable.sticks(MID)
     )
-
-    assert 1.7 <= took_s <= 2.4
-    px4.fly(0.5)
-    assert px4.mode() == ALTCTL[0] << 16, "the last one that can arm"
+    assert px4_expendable.command(ARM, 0, 21196, system_id=42) == ACCEPTED

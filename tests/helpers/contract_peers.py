@@ -1,10 +1,10 @@
-"""Peers of the contract suite and what talks to them: a simulated vehicle here, or one by UDP."""
+"""Flight controllers of the contract suite, and who talks to them."""
 
-import socket
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import pytest
+from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock
@@ -13,6 +13,9 @@ from sitl.vehicle.config import VehicleConfig
 
 GCS = 255
 TICK_NS = 5 * NS_PER_MS
+ARM = mav.MAV_CMD_COMPONENT_ARM_DISARM
+FORCE = 21196
+REBOOT_FORCE = 20190226
 
 
 class Peer(Protocol):
@@ -50,27 +53,23 @@ class MockPeer:
         return taken
 
 
-class UdpPeer:
-    """A flight controller that sends to a UDP port of ours."""
+class ExternalPeer:
+    """A flight controller at an address of pymavlink: ``udp:127.0.0.1:14550``, ``/dev/ttyACM0``."""
 
-    def __init__(self, address: tuple[str, int]) -> None:
+    def __init__(self, address: str, baud: int = 115_200) -> None:
         self._clock = Clock()
-        self._peer: tuple[str, int] | None = None
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(address)
-        self._socket.setblocking(False)
+        self._link = mavutil.mavlink_connection(address, baud=baud)
 
     def now_ns(self) -> int:
         return self._clock.now_ns()
 
     def send(self, data: bytes) -> None:
-        if self._peer is not None:
-            self._socket.sendto(data, self._peer)
+        self._link.write(data)
 
     def advance(self, duration_ns: int) -> bytes:
         """Reads every few milliseconds: a second of telemetry is more than a socket holds."""
         end_ns = self._clock.now_ns() + duration_ns
-        taken = b""
+        taken = self._read()
         while (now_ns := self._clock.now_ns()) < end_ns:
             self._clock.sleep_until_ns(min(end_ns, now_ns + TICK_NS))
             taken += self._read()
@@ -78,15 +77,12 @@ class UdpPeer:
 
     def _read(self) -> bytes:
         taken = b""
-        while True:
-            try:
-                data, self._peer = self._socket.recvfrom(65535)
-            except BlockingIOError:
-                return taken
-            taken += data
+        while data := self._link.recv(65_535):
+            taken += bytes(data)
+        return taken
 
     def close(self) -> None:
-        self._socket.close()
+        self._link.close()
 
 
 class Companion:
@@ -94,106 +90,142 @@ class Companion:
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
-        self._mav = mav.MAVLink(None, srcComponent=191)
+        self.may_arm = False
+        """Set by the fixtures of tests that say that they arm; without it arming is not sent."""
+        self.seen: list[Any] = []
+        """Everything that came since it was last cleared."""
+        self._unread: list[Any] = []
+        self._mav = mav.MAVLink(None, srcComponent=mav.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._mav.robust_parsing = True
-        self._changed_params: dict[str, float] = {}
+        self._changed_params: dict[str, tuple[int, float]] = {}
+        self._streams: set[int] = set()
 
     def send(self, message: Any, *, system_id: int = GCS) -> None:
+        is_arming = getattr(message, "command", 0) == ARM and message.param1 == 1
+        assert self.may_arm or not is_arming, "ask for the fixture of a test that arms"
         self._mav.srcSystem = system_id
         self.peer.send(message.pack(self._mav))
 
     def advance(self, seconds: float) -> list[Any]:
+        """Let time pass; what came meanwhile, and what `wait` has left."""
         data = self.peer.advance(round(seconds * NS_PER_S))
-        return self._mav.parse_buffer(data) or []
+        # Component 0 stands for what pymavlink's dialect does not know: those come as raw bytes.
+        new = [m for m in self._mav.parse_buffer(data) or [] if m.get_srcComponent() in (0, 1)]
+        self.seen += new
+        messages, self._unread = self._unread + new, []
+        return messages
+
+    def find(
+        self, name: str, timeout_s: float = 3.0, where: Callable[[Any], bool] = lambda _: True
+    ) -> Any | None:
+        """The next message of that name; None without one."""
+        end_ns = self.peer.now_ns() + round(timeout_s * NS_PER_S)
+        while self.peer.now_ns() < end_ns:
+            messages = self.advance(TICK_NS / NS_PER_S)
+            for index, message in enumerate(messages):
+                if message.get_type() == name and where(message):
+                    self._unread = messages[index + 1 :]
+                    return message
+        return None
 
     def wait(
         self, name: str, timeout_s: float = 3.0, where: Callable[[Any], bool] = lambda _: True
     ) -> Any:
         """The next message of that name; the test fails without one."""
-        end_ns = self.peer.now_ns() + round(timeout_s * NS_PER_S)
-        while self.peer.now_ns() < end_ns:
-            for message in self.advance(TICK_NS / NS_PER_S):
-                if message.get_type() == name and where(message):
-                    return message
-        return pytest.fail(f"no such {name} within {timeout_s} s")
+        message = self.find(name, timeout_s, where)
+        return message or pytest.fail(f"no such {name} within {timeout_s} s")
 
     def command(self, number: int, *params: float, system_id: int = GCS) -> int:
-        """Send a command; the result in its ack."""
+        """Send a command, again where its ack is lost; the result in the ack."""
         padded = (*params, *[0.0] * (7 - len(params)))
-        self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *padded), system_id=system_id)
-        ack = self.wait("COMMAND_ACK", where=lambda m: m.command == number)
-        return int(ack.result)
+        for attempt in range(3):
+            message = mav.MAVLink_command_long_message(1, 1, number, attempt, *padded)
+            self.send(message, system_id=system_id)
+            ack = self.find("COMMAND_ACK", 1.0, lambda m: m.command == number)
+            if ack is not None:
+                return int(ack.result)
+        return pytest.fail(f"command {number} is not acknowledged")
+
+    def request(self, message_id: int, name: str) -> Any:
+        """A message by MAV_CMD_REQUEST_MESSAGE."""
+        for _ in range(3):
+            params = (message_id, *[0.0] * 6)
+            number = mav.MAV_CMD_REQUEST_MESSAGE
+            self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *params))
+            message = self.find(name, 1.0)
+            if message is not None:
+                return message
+        return pytest.fail(f"no {name} on request")
 
     def stream(self, message_id: int, rate_hz: float) -> int:
+        """Ask for a rate; the end of the test takes it back."""
+        self._streams.add(message_id)
         return self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, int(1e6 / rate_hz))
 
-    def set_mode(self, number: int) -> int:
-        return self.command(mav.MAV_CMD_DO_SET_MODE, 1, number)
-
     def arm(self) -> int:
-        return self.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+        return self.command(ARM, 1)
 
-    def override(self, *channels_us: int, system_id: int = GCS, target: int = 1) -> None:
-        """RC_CHANNELS_OVERRIDE; channels 1-8 that are not given are ignored."""
-        primary = (*channels_us, *[65535] * (8 - len(channels_us)))[:8]
-        aux = (*channels_us[8:], *[0] * (10 - len(channels_us[8:])))
-        message = mav.MAVLink_rc_channels_override_message(target, 0, *primary, *aux)
-        self.send(message, system_id=system_id)
+    @property
+    def is_external(self) -> bool:
+        """The vehicle is not the one of ``sitl``."""
+        return isinstance(self.peer, ExternalPeer)
 
-    def hold(
-        self,
-        seconds: float,
-        *,
-        roll: int = 1500,
-        pitch: int = 1500,
-        thr: int = 1500,
-        yaw: int = 1500,
-    ) -> list[Any]:
-        """Hold the sticks by overrides at 50 Hz; what came in meanwhile."""
-        messages = []
-        for _ in range(round(seconds * 50.0)):
-            self.override(roll, pitch, thr, yaw)
-            messages += self.advance(0.02)
-        return messages
+    @property
+    def in_the_air(self) -> bool:
+        """The vehicle is not on the ground, by its own word."""
+        message_id = mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE
+        state = self.request(message_id, "EXTENDED_SYS_STATE").landed_state
+        return bool(state != mav.MAV_LANDED_STATE_ON_GROUND)
 
-    def channels(self) -> tuple[int, ...]:
-        """Channels that the vehicle uses; needs RC_CHANNELS to be streamed."""
-        message = self.wait("RC_CHANNELS")
-        return tuple(getattr(message, f"chan{n}_raw") for n in range(1, 17))
+    def come_down(self) -> None:
+        """Be on the ground and disarmed: in the air, by falling. Only a simulated one may fly."""
+        self.command(ARM, 0, FORCE)
+        for _ in range(50):
+            if not self.in_the_air:
+                break
+            self.advance(0.2)
 
     def get_param(self, name: str) -> float:
-        self.send(mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
-        return float(self.wait("PARAM_VALUE", where=lambda m: m.param_id == name).param_value)
+        return float(self.read_param(name).param_value)
+
+    def read_param(self, name: str) -> Any:
+        """PARAM_VALUE as it came."""
+        for _ in range(3):
+            self.send(mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
+            message = self.find("PARAM_VALUE", 1.0, lambda m: m.param_id == name)
+            if message is not None:
+                return message
+        return pytest.fail(f"no parameter {name}")
 
     def set_param(self, name: str, value: float) -> float:
-        self._changed_params.setdefault(name, self.get_param(name))
-        return self._write_param(name, value)
+        """Set a parameter until the end of the test; the value that it has then."""
+        old = self.read_param(name)
+        self._changed_params.setdefault(name, (old.param_type, old.param_value))
+        return self.write_param(name, old.param_type, value)
 
-    def get_ready(self, mode: int) -> None:
-        """Wait until arming is possible, with throttle down and the rest centred; do not arm."""
-        for _ in range(60):
-            self.send(mav.MAVLink_command_long_message(1, 1, 512, 0, 1, 0, 0, 0, 0, 0, 0))
-            # A vehicle that has just booted may lose the request.
-            health = [
-                m.onboard_control_sensors_health
-                for m in self.hold(1.0, thr=1000)
-                if m.get_type() == "SYS_STATUS"
-            ]
-            if health and health[-1] & mav.MAV_SYS_STATUS_PREARM_CHECK:
-                break
-        assert self.set_mode(mode) == mav.MAV_RESULT_ACCEPTED
+    def write_param(self, name: str, kind: int, value: float) -> float:
+        """PARAM_SET with a value as it goes on the wire."""
+        self.send(mav.MAVLink_param_set_message(1, 1, name.encode(), value, kind))
+        return float(self.wait("PARAM_VALUE", where=lambda m: m.param_id == name).param_value)
 
     def restore(self) -> None:
-        """Leave the vehicle on the ground with the parameters that it had."""
-        self.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196)
-        for name, value in self._changed_params.items():
-            self._write_param(name, value)
-        self.override(*[0] * 8)
-        self.advance(0.1)
+        """Give parameters and streams of the vehicle back as they were."""
+        for name, (kind, value) in self._changed_params.items():
+            self.write_param(name, kind, value)
+        for message_id in self._streams:
+            self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 0)
 
-    def _write_param(self, name: str, value: float) -> float:
-        message = mav.MAVLink_param_set_message(
-            1, 1, name.encode(), value, mav.MAV_PARAM_TYPE_REAL32
-        )
-        self.send(message)
-        return float(self.wait("PARAM_VALUE", where=lambda m: m.param_id == name).param_value)
+
+def named(messages: list[Any], name: str) -> list[Any]:
+    """Those of that name, in their order."""
+    return [message for message in messages if message.get_type() == name]
+
+
+def last(messages: list[Any], name: str) -> Any:
+    """The newest of that name."""
+    return named(messages, name)[-1]
+
+
+def is_armed(heartbeat: Any) -> bool:
+    """The motors may turn."""
+    return bool(heartbeat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)

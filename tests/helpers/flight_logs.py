@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pymavlink import mavutil
 
-from helpers.relay import Override
+from sitl.faults.relay import Override
 
 
 def logged_overrides(path: Path) -> Iterator[Override]:

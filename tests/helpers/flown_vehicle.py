@@ -31,14 +31,20 @@ class FlownVehicle:
         self.armed = True
         self.is_landed: bool | None = False
         self.has_receiver: bool | None = False
+        self.is_failsafe = False
+        self.is_known = True
+        """It has sent a heartbeat since its session began."""
 
-    def status(self, _now_ns: int) -> VehicleStatus:
+    def status(self, _now_ns: int) -> VehicleStatus | None:
         """The status that was set."""
+        if not self.is_known:
+            return None
         return VehicleStatus(
             mode=self.mode,
             armed=self.armed,
             is_landed=self.is_landed,
             has_receiver=self.has_receiver,
+            is_failsafe=self.is_failsafe,
         )
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import GCS, TICK_NS, Companion, Peer
+from helpers.contract_peers import ARM, GCS, TICK_NS, Companion, Peer, named
 from sitl.clock import NS_PER_S
 
 ACCEPTED, REJECTED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_TEMPORARILY_REJECTED
@@ -18,6 +18,7 @@ EVENT, CURRENT_MODE = 410, 436
 STICK_HZ = 50
 VELOCITY_AND_YAW_RATE = 0x5C7
 HOVER_THRUST = 0.484
+LOWEST_M, HIGHEST_M, STILL_MPS = 5.0, 40.0, 0.3
 
 
 class Modes(NamedTuple):
@@ -30,10 +31,6 @@ class Modes(NamedTuple):
 
 def custom(mode: tuple[int, int]) -> int:
     return mode[0] << 16 | mode[1] << 24
-
-
-def named(messages: list[Any], name: str) -> list[Any]:
-    return [message for message in messages if message.get_type() == name]
 
 
 def modes_in(messages: list[Any]) -> list[Modes]:
@@ -90,17 +87,12 @@ class Px4Companion(Companion):
         super().__init__(peer)
         self._is_gcs = is_gcs
         self._heartbeat_due_ns = peer.now_ns()
-        self._changed: dict[str, tuple[int, float]] = {}
-        self.seen: list[Any] = []
-        """Everything that came since it was last cleared."""
 
     def advance(self, seconds: float) -> list[Any]:
         if self._is_gcs and self.peer.now_ns() >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = self.peer.now_ns() + NS_PER_S
             self.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3))
-        messages = super().advance(seconds)
-        self.seen += messages
-        return messages
+        return super().advance(seconds)
 
     def set_mode(
         self, mode: tuple[int, int], *, component_id: int = mav.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -149,13 +141,6 @@ class Px4Companion(Companion):
                 return (self.peer.now_ns() - start_ns) / NS_PER_S, messages
         raise AssertionError(f"not within {within_s} s")
 
-    def request(self, message_id: int, name: str) -> Any:
-        """A message by MAV_CMD_REQUEST_MESSAGE."""
-        params = (message_id, *[0.0] * 6)
-        number = mav.MAV_CMD_REQUEST_MESSAGE
-        self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *params))
-        return self.wait(name)
-
     def mode(self) -> int:
         """The mode that flies, by CURRENT_MODE."""
         name = f"UNKNOWN_{CURRENT_MODE}"
@@ -171,30 +156,57 @@ class Px4Companion(Companion):
         ):
             assert self.stream(message_id, hz) == ACCEPTED
 
-    def get_ready(self, mode: tuple[int, int]) -> None:  # type: ignore[override]
+    def get_ready(self, mode: tuple[int, int]) -> None:
         """Wait until the vehicle may be armed in a mode, with sticks centred; do not arm."""
         self.fly(0.2)
         assert self.set_mode(mode) == ACCEPTED
-        for _ in range(60):
-            messages = self.fly(1.0)
-            heartbeats = named(messages, "HEARTBEAT")
-            if any(m.system_status == mav.MAV_STATE_STANDBY for m in heartbeats):
+        for _ in range(600):
+            heartbeats = named(self.fly(0.1), "HEARTBEAT")
+            if any(
+                m.system_status == mav.MAV_STATE_STANDBY and m.custom_mode == custom(mode)
+                for m in heartbeats
+            ):
                 return
         raise AssertionError("the vehicle does not get ready to arm")
 
-    def take_off(self, mode: tuple[int, int] = ALTCTL) -> None:
-        """Some metres up, level and still; then the mode."""
+    def fly_up(self, mode: tuple[int, int] = ALTCTL) -> None:
+        """Some metres up, level and still, with sticks centred; then the mode."""
+        self.sticks(MID)
         self.track()
-        self.get_ready(ALTCTL)
-        assert self.arm() == ACCEPTED
-        self.until(
-            lambda m: any(p.z < -6.0 for p in named(m, "LOCAL_POSITION_NED")),
-            25.0,
-            lambda _: self.sticks((0, 0, 1000, 0)),
-        )
-        self.fly(3.0)
-        assert self.set_mode(mode) == ACCEPTED
+        if not self.in_the_air:
+            self.get_ready(ALTCTL)
+            assert self.arm() == ACCEPTED
+            is_up = lambda m: any(p.z < -6.0 for p in named(m, "LOCAL_POSITION_NED"))  # noqa: E731
+            self.until(is_up, 25.0, lambda _: self.sticks((0, 0, 1000, 0)))
+        self._settle()
+        self._take(mode)
+        self.fly(0.1)
         self.seen.clear()
+
+    def _settle(self) -> None:
+        """In POSCTL: brake, and come to a height of 5 to 40 m."""
+        for count in range(600):
+            if count % 100 == 0:  # again, if a starved computer has lost the sticks meanwhile
+                self._take(POSCTL)
+            states = named(self.fly(0.1, (0, 0, self._climb_stick(), 0)), "LOCAL_POSITION_NED")
+            speed_mps = max(abs(v) for m in states[-1:] for v in (m.vx, m.vy, m.vz))
+            if self._climb_stick() == MID[2] and speed_mps < STILL_MPS:
+                return
+        raise AssertionError("the vehicle does not come to rest")
+
+    def _take(self, mode: tuple[int, int]) -> None:
+        """A mode with sticks, which is refused until they have come for a while."""
+        for _ in range(20):
+            self.fly(0.1)
+            if self.set_mode(mode) == ACCEPTED:
+                return
+        raise AssertionError(f"the mode {mode} is refused: {self.texts()}")
+
+    def _climb_stick(self) -> int:
+        height_m = -named(self.seen, "LOCAL_POSITION_NED")[-1].z
+        if LOWEST_M <= height_m <= HIGHEST_M:
+            return MID[2]
+        return 1000 if height_m < LOWEST_M else 0
 
     def hears(
         self, text: str, within_s: float = 2.0, send: Callable[[float], None] = lambda _: None
@@ -227,28 +239,27 @@ class Px4Companion(Companion):
 
     def change(self, name: str, value: float) -> None:
         """Set a parameter of either type until the end of the test."""
-        self.send(mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
-        old = self.wait("PARAM_VALUE", where=lambda m: m.param_id == name)
-        self._changed.setdefault(name, (old.param_type, old.param_value))
+        kind = self.read_param(name).param_type
         packed = value
-        if old.param_type == mav.MAV_PARAM_TYPE_INT32:
+        if kind == mav.MAV_PARAM_TYPE_INT32:
             (packed,) = struct.unpack("<f", struct.pack("<i", int(value)))
-        self._write(name, old.param_type, packed)
+        self.set_param(name, packed)
+
+    def refill_delay(self, seconds: float = 5.001) -> None:
+        """Give the failsafe its full delay again, of which earlier ones have spent some.
+
+        PX4 does so when any parameter changes; so it is not exactly the default of 5 s.
+        """
+        self.change("COM_FAIL_ACT_T", seconds)
 
     def restore(self) -> None:
-        """Leave the vehicle disarmed on the ground with the parameters that it had."""
-        self.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196)
-        for name, (kind, packed) in self._changed.items():
-            self._write(name, kind, packed)
-        self.set_mode(LOITER)
-        for _ in range(20):
-            message_id = mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE
-            state = self.request(message_id, "EXTENDED_SYS_STATE")
-            if state.landed_state == mav.MAV_LANDED_STATE_ON_GROUND:
-                break
-            self.advance(0.5)
-        self.advance(2.0)
-
-    def _write(self, name: str, kind: int, packed: float) -> None:
-        self.send(mav.MAVLink_param_set_message(1, 1, name.encode(), packed, kind))
-        self.wait("PARAM_VALUE", where=lambda m: m.param_id == name)
+        """Leave the vehicle in the air in Hold, or disarmed on the ground."""
+        flies = self.in_the_air
+        if flies:
+            self.set_mode(LOITER)
+        self.sticks(MID)
+        super().restore()
+        if not flies:
+            self.command(ARM, 0)
+            self.set_mode(LOITER)
+        self.sticks(MID)

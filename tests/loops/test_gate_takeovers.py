@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from helpers.gate_flights import GateFlight, climbing_first, hovering, leaning
-from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import MID_RECEIVER_US
@@ -196,3 +196,52 @@ def test_a_link_with_a_fifth_of_its_packets_lost_is_flown() -> None:
     flight.run(10)
 
     assert flight.phase is Phase.FLYING, flight.describe()
+
+
+def by_parameter(flight: GateFlight) -> None:
+    flight.station(lambda mav: mav.param_set_encode(1, 1, b"FS_THR_ENABLE", 0.0, 9), system=42)
+    index = flight.vehicle.params.names.index("FS_THR_ENABLE")
+    flight.vehicle.server.links[0].send_param(index)  # ArduPilot tells every link
+
+
+def by_clock(flight: GateFlight) -> None:
+    """It goes back, which looks like a reboot."""
+    flight.ap.boot_ns += 5 * NS_PER_S
+
+
+@pytest.mark.parametrize(
+    ("take", "mode"),
+    [
+        (by_mode, "LOITER"),
+        (lambda flight: flight.pilot_mode(Mode.STABILIZE), "STABILIZE"),
+        (by_parameter, "ALT_HOLD"),
+        (by_clock, "ALT_HOLD"),
+    ],
+)
+def test_without_a_receiver_no_takeover_leaves_a_lean_behind(
+    take: Callable[[GateFlight], None], mode: str
+) -> None:
+    """A release alone keeps the last sticks there: for 1 s, or for ever with FS_THR_ENABLE 0."""
+    flight = GateFlight(climbing_then_leaning, receiver_us=None, arm=True).take_off(5)
+    assert flight.record()[-1]["lean_deg"] > 10
+    before_ns = flight.clock.now_ns()
+    take(flight)
+    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=0.2)
+    given_ns, given_s = flight.clock.now_ns(), flight.record()[-1]["t_s"]
+    flight.run(0.9)
+
+    assert flight.modes[-1] == mode
+    assert not flight.modes_asked(before_ns)
+    overrides = [us for _, us in flight.overrides(given_ns - MS)]
+    (roll, pitch, _, yaw), *releases = overrides
+    assert (roll, pitch, yaw) == (1500, 1500, 1500)
+    assert len(releases) > 10
+    assert set(releases) == {(0, 0, 0, 0)}
+    sticks = [entry["us"] for entry in flight.record(given_s + 0.02)]
+    assert sticks
+    assert all(us[0] == us[1] == us[3] == 1500 for us in sticks)
+
+
+def climbing_then_leaning(t_s: float) -> tuple[float, float, float, float]:
+    """For a takeoff of five seconds that ends in a lean."""
+    return (0.7, 0.0, 0.0, 0.0) if t_s < 3 else (0.2, 0.0, 0.0, 0.5)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from helpers.frame_feed import FrameFeed
 from mavbridge.__main__ import main
 from mavbridge.core.processes import free_port
+from sitl.clock import Clock
+from sitl.faults.camera import FrameFeed
 
 pytestmark = pytest.mark.system
 
@@ -159,7 +160,7 @@ def video(tmp_path: Path) -> Path:
 def camera() -> Iterator[str]:
     """One that delivers frames for as long as the test lasts."""
     name = f"test-{os.getpid()}-bad-input"
-    with FrameFeed(name):
+    with FrameFeed(name, Clock()):
         yield f"shm:{name}"
 
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from helpers.stand import flight
 from mavbridge.recording.flight_folder import open_flight
+from sitl.faults.stage import faulty_policy, staged
 
 pytestmark = pytest.mark.system
 
@@ -13,10 +13,10 @@ FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")
 
 
 def test_two_cameras_feed_one_policy(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
+    with staged(tmp_path) as flying:
         flying.cameras = ("down", "front")  # their order is the contract's, not this one
         folder = tmp_path / "recording"
-        flags = ("--policy", "helpers.user_policies:TwoEyed", "--duration", "4")
+        flags = ("--policy", faulty_policy("TwoEyed"), "--duration", "4")
         status, output = flying.fly(*FLY, *flags, "--record", str(folder))
     assert status == 0, output
     front, down = open_flight(folder), open_flight(folder, "down")
@@ -29,9 +29,9 @@ def test_two_cameras_feed_one_policy(tmp_path: Path) -> None:
 
 
 def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
+    with staged(tmp_path) as flying:
         flying.cameras = ("front", "down")
-        status, output = flying.fly(*FLY, "--policy", "helpers.user_policies:HangingBelow")
+        status, output = flying.fly(*FLY, "--policy", faulty_policy("HangingBelow"))
     assert status == 4
     assert "the image feature is older than 300 ms" in output
     assert "the encoder of camera down has hung" in output
@@ -39,8 +39,8 @@ def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
 
 
 def test_a_camera_without_its_name_is_refused(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
-        status, output = flying.fly(*FLY, "--policy", "helpers.user_policies:TwoEyed")
+    with staged(tmp_path) as flying:
+        status, output = flying.fly(*FLY, "--policy", faulty_policy("TwoEyed"))
     assert status == 2, output
     assert "give --camera front=SOURCE --camera down=SOURCE" in output
     assert flying.relay.overrides == []

@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 
 from helpers.flight_logs import logged_overrides
-from helpers.relay import Override
-from helpers.stand import ORDERLY, child_of, flight
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from sitl.faults.processes import child_of
+from sitl.faults.relay import Override
+from sitl.faults.stage import ORDERLY, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 
@@ -60,7 +61,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     """Takes off, holds its altitude, ends after its duration; recorded, with a viewer's file."""
     folder = tmp_path_factory.mktemp("flight")
     recording = folder / "recording"
-    with flight(folder) as flying:
+    with staged(folder) as flying:
         flags = ("--record", str(recording), "--rerun", str(recording / "flight.rrd"))
         status, output = flying.fly(*FLY, "--policy", "scripted:hover", "--duration", "8", *flags)
     assert status == 0, output
@@ -114,7 +115,7 @@ def test_the_recording_is_what_happened(flown: Flown) -> None:
 
 
 def test_a_signal_gives_the_sticks_back(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
+    with staged(tmp_path) as flying:
         flying.start(*FLY, "--policy", "scripted:hover")
         assert flying.relay.has_flown.wait(60)
         flying.kill(signal.SIGTERM)
@@ -126,17 +127,17 @@ def test_a_signal_gives_the_sticks_back(tmp_path: Path) -> None:
 
 
 def test_an_exception_in_the_policy_gives_the_sticks_back(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
-        status, output = flying.fly(*FLY, "--policy", "helpers.user_policies:Exploding")
+    with staged(tmp_path) as flying:
+        status, output = flying.fly(*FLY, "--policy", faulty_policy("Exploding"))
     assert status == 4
     assert_released(flying.relay.overrides)
     assert "RuntimeError: the user's policy is broken" in output
-    assert "user_policies.py" in output  # where, for the person who wrote it
+    assert "policies.py" in output  # where, for the person who wrote it
     assert "Traceback" not in output
 
 
 def test_somebody_elses_arming_is_not_engaging(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
+    with staged(tmp_path) as flying:
         flying.start("--dual-rate", "--policy", "scripted:hover")
         assert flying.wait_for("not engaged: press e, use the engage switch, or --arm")
         flying.relay.set_mode("ALT_HOLD")
@@ -150,7 +151,7 @@ def test_somebody_elses_arming_is_not_engaging(tmp_path: Path) -> None:
 
 
 def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
+    with staged(tmp_path) as flying:
         status, output = flying.fly(
             "--dual-rate", "--head-steps", "2", "--readonly", "--duration", "2"
         )
@@ -164,8 +165,8 @@ def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:
 
 
 def test_a_policy_without_a_fast_path_flies_single_rate_after_a_warning(tmp_path: Path) -> None:
-    with flight(tmp_path) as flying:
-        flags = ("--policy", "helpers.user_policies:SingleRate", "--dual-rate", "--readonly")
+    with staged(tmp_path) as flying:
+        flags = ("--policy", faulty_policy("SingleRate"), "--dual-rate", "--readonly")
         status, output = flying.fly(*flags, "--duration", "1")
     assert status == 0, output
     report = flying.report()
@@ -176,7 +177,7 @@ def test_a_policy_without_a_fast_path_flies_single_rate_after_a_warning(tmp_path
 
 def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
     folder = tmp_path / "recording"
-    with flight(tmp_path) as flying:
+    with staged(tmp_path) as flying:
         flying.start(*FLY, "--policy", "scripted:square", "--record", str(folder))
         assert flying.relay.has_flown.wait(60)
         flying.kill(signal.SIGKILL)
@@ -194,7 +195,7 @@ def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
 
 def test_a_killed_writer_does_not_touch_the_flight(tmp_path: Path) -> None:
     folder = tmp_path / "recording"
-    with flight(tmp_path) as flying:
+    with staged(tmp_path) as flying:
         flags = ("--policy", "scripted:square", "--duration", "2", "--record", str(folder))
         flying.start(*FLY, *flags)
         assert flying.relay.has_flown.wait(60)

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.relay import COPTER_MODES
-from helpers.stand import ORDERLY, TIMEOUT_S, Flight, flight
+from sitl.faults.relay import COPTER_MODES
+from sitl.faults.stage import ORDERLY, TIMEOUT_S, Stage, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 
-FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy", "helpers.user_policies:Leaning")
+FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy", faulty_policy("Leaning"))
 
 
 class Station:
@@ -87,7 +87,7 @@ def station() -> Iterator[Station]:
         yield station
 
 
-def end_in_order(flying: Flight) -> str:
+def end_in_order(flying: Stage) -> str:
     flying.kill_group(signal.SIGINT)
     status, output = flying.end()
     assert status in ORDERLY, output
@@ -97,7 +97,7 @@ def end_in_order(flying: Flight) -> str:
 def test_it_reads_parameters_slows_nothing_down_and_changes_the_mode(
     station: Station, tmp_path: Path
 ) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
         flying.start(*FLY, "--forward", station.flag)
         flying.wait_for_lean()
         assert station.param("RC_OVERRIDE_TIME") == 3.0
@@ -121,7 +121,7 @@ def test_it_reads_parameters_slows_nothing_down_and_changes_the_mode(
 
 
 def test_its_sticks_win_once_they_are_moved_and_for_good(station: Station, tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
         flying.start(*FLY, "--forward", station.flag, "--gcs-sticks-win")
         flying.wait_for_lean()
         assert station.param("RC_OVERRIDE_TIME") == 3.0

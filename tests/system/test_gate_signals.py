@@ -9,76 +9,26 @@ from pathlib import Path
 
 import pytest
 
-from helpers.relay import Override
-from helpers.stand import ORDERLY, Process, flight
-from helpers.vehicle_record import aftermath, note, write_row
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.gate.settings import GateSettings
 from mavbridge.mavlink.settings import LinkSettings
+from sitl.clock import Clock
+from sitl.faults.processes import Process
+from sitl.faults.record import aftermath
+from sitl.faults.relay import Override
+from sitl.faults.stage import ORDERLY, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 
-FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy", "helpers.user_policies:Leaning")
+FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy", faulty_policy("Leaning"))
 RELEASE = Override(0, 0, 0, 0)
 END_LIMIT_MS = 400
 """A main thread that shows the state five times a second hears of the signal at once."""
 END_S = 15
 
 
-@pytest.mark.parametrize(
-    ("number", "receiver"),
-    [(signal.SIGINT, "mid"), (signal.SIGHUP, "idle")],
-)
-def test_a_signal_to_the_process_group_ends_the_flight_in_order(
-    number: signal.Signals, receiver: str, tmp_path: Path
-) -> None:
-    with flight(tmp_path, "--receiver", receiver, renders=False) as flying:
-        flying.start(*FLY)
-        flying.wait_for_lean()
-        at_ns = flying.kill_group(number)
-        status, output = flying.end()
-    assert status in ORDERLY, output
-    assert flying.relay.overrides[-1] == RELEASE
-    measured = aftermath(flying.vehicle_report(), at_ns, receiver)
-    note(number.name, receiver, measured)
-    assert measured.safe_ms <= END_LIMIT_MS
-    assert not measured.flew_again
-    assert measured.mode is None
-    assert "still armed in ALT_HOLD" in output
-
-
-def test_a_gate_that_is_told_to_end_gives_the_sticks_back_first(tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY)
-        flying.wait_for_lean()
-        at_ns = flying.gate.kill(signal.SIGTERM)
-        status, output = flying.end()
-    assert "the gate was told to end" in output
-    assert status in ORDERLY, output
-    assert flying.relay.overrides[-1] == RELEASE
-    measured = aftermath(flying.vehicle_report(), at_ns, "mid")
-    note("SIGTERM to the gate", "mid", measured)
-    assert measured.safe_ms <= END_LIMIT_MS
-
-
-@pytest.mark.parametrize("receiver", ["mid", "none"])
-def test_the_flight_process_says_so_when_the_gate_was_killed(receiver: str, tmp_path: Path) -> None:
-    """What remains then is the autopilot's own timeout, 3 s by default, or the radio failsafe."""
-    with flight(tmp_path, "--receiver", receiver, renders=False) as flying:
-        flying.start(*FLY)
-        flying.wait_for_lean()
-        at_ns = flying.gate.kill(signal.SIGKILL)
-        status, output = flying.end()
-        flying.observe(3.2)
-    assert status == 4, output
-    assert "the gate process has died" in output
-    measured = aftermath(flying.vehicle_report(), at_ns, receiver)
-    note("kill -9 of the gate", receiver, measured)
-    assert measured.safe_ms <= 3300
-
-
 def test_a_terminal_that_nobody_reads_does_not_hold_up_the_end(tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
         flying.start(*FLY, is_read=False)
         flying.wait_for_lean()
         flying.fill_output()
@@ -90,13 +40,12 @@ def test_a_terminal_that_nobody_reads_does_not_hold_up_the_end(tmp_path: Path) -
     assert status in ORDERLY
     assert ended_s < 10
     measured = aftermath(flying.vehicle_report(), at_ns, "mid")
-    note("SIGTERM, output not read", "mid", measured, ended_s=ended_s)
     assert measured.safe_ms <= END_LIMIT_MS
     assert flying.relay.overrides[-1] == RELEASE
 
 
 def test_without_a_receiver_the_end_is_a_landing(tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "none", renders=False) as flying:
+    with staged(tmp_path, "--receiver", "none", renders=False) as flying:
         flying.start(*FLY, "--duration", "2")
         flying.wait_for_lean()
         status, output = flying.end()
@@ -127,14 +76,11 @@ def test_the_gate_starts_at_once_and_stays_small() -> None:
         vehicle.bind(("127.0.0.1", 0))
         vehicle.settimeout(START_LIMIT_S)
         address = f"udpout:127.0.0.1:{vehicle.getsockname()[1]}"
-        started_ns = time.monotonic_ns()
         gate = GateProcess(GateSettings(link=LinkSettings(connect=address)))
         try:
             vehicle.recv(1024)  # its heartbeat
-            started_s = (time.monotonic_ns() - started_ns) / 1e9
-            peak_mb = Process(gate.pid).peak_memory_mb()
+            peak_mb = Process(gate.pid, Clock()).peak_memory_mb()
         finally:
             gate.close()
             assert gate.wait(5)
-    write_row({"fault": "gate start", "started_s": started_s, "peak_mb": peak_mb})
     assert peak_mb < 60

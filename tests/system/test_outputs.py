@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from helpers.relay import Sent
-from helpers.stand import Flight, flight
+from sitl.faults.relay import Sent
+from sitl.faults.stage import Stage, staged
 
 pytestmark = pytest.mark.system
 
@@ -33,7 +33,7 @@ def is_flown(sent: Sent) -> bool:
     return False
 
 
-def wait_for_a_leg(flying: Flight) -> None:
+def wait_for_a_leg(flying: Stage) -> None:
     """The square has begun."""
     sent = flying.relay.sent
     assert flying.relay.wait_until(lambda: bool(sent), TIMEOUT_S)
@@ -41,7 +41,7 @@ def wait_for_a_leg(flying: Flight) -> None:
     assert flying.relay.wait_until(lambda: is_flown(sent[-1]), TIMEOUT_S)
 
 
-def sent_last(flying: Flight) -> Sent:
+def sent_last(flying: Stage) -> Sent:
     """The newest action that left the gate."""
     names = ("MANUAL_CONTROL", "SET_POSITION_TARGET_LOCAL_NED")
     return next(sent for sent in reversed(flying.relay.sent) if sent.name in names)
@@ -55,14 +55,14 @@ def mode_ms(report: Any, at_ns: int, mode: str) -> float:
     return float((changes[0]["t_s"] - at_s) * 1e3)
 
 
-def last_flown_ms(flying: Flight, at_ns: int) -> float:
+def last_flown_ms(flying: Stage, at_ns: int) -> float:
     """Until the last message that told the vehicle to move; negative: before the moment."""
     flown = [sent.at_ns for sent in flying.relay.sent if is_flown(sent)]
     return (flown[-1] - at_ns) / 1e6
 
 
 def test_px4s_sticks_when_the_flight_process_is_killed(tmp_path: Path) -> None:
-    with flight(tmp_path, "--autopilot", "px4", renders=False) as flying:
+    with staged(tmp_path, "--autopilot", "px4", renders=False) as flying:
         flying.start("--dual-rate", "--arm", "--policy", "scripted:square")
         wait_for_a_leg(flying)
         at_ns = flying.kill(signal.SIGKILL)
@@ -80,7 +80,7 @@ def test_px4s_sticks_when_the_flight_process_is_killed(tmp_path: Path) -> None:
 
 
 def test_px4s_offboard_when_the_flight_process_is_stopped(tmp_path: Path) -> None:
-    with flight(tmp_path, "--autopilot", "px4", renders=False) as flying:
+    with staged(tmp_path, "--autopilot", "px4", renders=False) as flying:
         flying.start("--dual-rate", "--arm", *TAKEOFF)
         wait_for_a_leg(flying)
         at_ns = flying.kill(signal.SIGSTOP)
@@ -98,7 +98,7 @@ def test_px4s_offboard_when_the_flight_process_is_stopped(tmp_path: Path) -> Non
 
 
 def test_ardupilots_guided_when_the_flight_process_is_killed(tmp_path: Path) -> None:
-    with flight(tmp_path, "--receiver", "mid", renders=False) as flying:
+    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
         flying.start("--dual-rate", "--arm", *TAKEOFF)
         wait_for_a_leg(flying)
         at_ns = flying.kill(signal.SIGKILL)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers.stand import flight
+from sitl.faults.stage import staged
 
 pytestmark = pytest.mark.system
 
@@ -59,7 +59,7 @@ MAIN, VISION, ACTION = "MainThread", "mavbridge-vision", "mavbridge-policy"
 
 def test_a_file_of_the_users_flies_after_a_takeoff_and_lives_by_the_guide(tmp_path: Path) -> None:
     (tmp_path / "turning.py").write_text(POLICY)
-    with flight(tmp_path) as flying:
+    with staged(tmp_path) as flying:
         flags = ("--mode", "ALT_HOLD", "--arm", "--takeoff", "4", "--duration", "12")
         status, output = flying.fly(
             "--dual-rate", *flags, "--policy", f"{tmp_path}/turning.py:Turning"

@@ -17,6 +17,7 @@ from mavbridge.core.vehicle import ActionMeaning
 from mavbridge.flight.settings import action_meaning, gate_settings
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.settings import LinkSettings
+from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import Transport, make_transport
 
 
@@ -37,7 +38,10 @@ def check_vehicle(
     try:
         with ExitStack() as stack:
             transport = transport or make_transport(settings.connect, clock)
-            link = MavlinkLink(transport, clock, settings)
+            signing = None
+            if settings.signing is not None:
+                signing = stack.enter_context(SigningStore(settings.signing, clock))
+            link = MavlinkLink(transport, clock, settings, signing=signing)
             stack.callback(link.close)
             meaning = ActionMeaning()  # without a policy, sticks as they are
             if policy.contract is not None:

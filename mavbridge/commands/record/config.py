@@ -24,6 +24,9 @@ class ListenConfig:
     MAVSDK writes it: udpin://0.0.0.0:14540, serial:///dev/ttyACM0:921600."""
     forward: Annotated[str, Parameter(show_default=False)] = ""
     """Share the link with a ground station: udp:HOST:PORT sends to it, udpin:HOST:PORT listens."""
+    signing_key_file: Annotated[Path | None, Parameter(show_default=False)] = None
+    """Sign every packet, and take only signed ones (MAVLink 2): a file with the vehicle's key, 32
+    bytes or 64 hexadecimal digits, which only you may read."""
     target_system: Annotated[int, Parameter(group=RARE)] = 0
     """System id of the vehicle; 0 = the only one on the link."""
     connect_timeout: Annotated[float, Parameter(group=RARE)] = 30.0
@@ -35,6 +38,7 @@ class ListenConfig:
         return LinkConfig(
             connect=self.connect,
             forward=self.forward,
+            signing_key_file=self.signing_key_file,
             target_system=self.target_system,
             connect_timeout=self.connect_timeout,
             readonly=True,

@@ -13,13 +13,12 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.mavlink.codec.messages import Endpoint, ReceivedMessage
 from mavbridge.mavlink.codec.readers import READERS, UnusableError
+from mavbridge.mavlink.codec.signing import SIGNATURE_BYTES, SIGNED
 
 _MAVLINK_2 = 0xFD
 _HEADER = struct.Struct("<BBBBBBBHB")
 """Marker, payload length, incompatible and compatible flags, sequence, system, component, id."""
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
-_SIGNED, _SIGNATURE_BYTES = 1, 13
-"""Incompatible flag of a signed packet, and what it has behind the checksum."""
 _OVERRIDE = dialect.MAVLink_rc_channels_override_message
 _OVERRIDE_PAYLOAD = struct.Struct("<8H2B")
 """Channels 1 to 8, target system and component; channels 9 to 18 are zeros, which are cut off."""
@@ -72,7 +71,9 @@ _LAYOUTS |= _MISSING_LAYOUTS
 
 
 def decode_state_packet(data: bytes) -> ReceivedMessage | None:
-    """Decode one whole, unsigned, sound and usable packet of a state message; otherwise None.
+    """Decode one whole, sound and usable packet of a state message; otherwise None.
+
+    A signature is left to the caller.
 
     Also one of a message that pymavlink's dialect lacks.
     """
@@ -85,11 +86,9 @@ def decode_state_packet(data: bytes) -> ReceivedMessage | None:
     layout = _LAYOUTS.get(number)
     if layout is None or start != _MAVLINK_2:
         return None
-    sealed = data
-    if incompatible:
-        if incompatible != _SIGNED or number not in _MISSING_LAYOUTS:
-            return None
-        sealed = data[:-_SIGNATURE_BYTES]  # without a key nobody can check it
+    if incompatible not in (0, SIGNED):
+        return None
+    sealed = data[:-SIGNATURE_BYTES] if incompatible else data
     if len(sealed) != _HEADER_BYTES + length + _CHECKSUM_BYTES or length > layout.payload.size:
         return None
     if _checksum(sealed[1:-_CHECKSUM_BYTES], layout.crc_extra) != sealed[-_CHECKSUM_BYTES:]:

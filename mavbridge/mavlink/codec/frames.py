@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 from mavbridge.mavlink.codec.messages import Endpoint
+from mavbridge.mavlink.codec.signing import SIGNATURE_BYTES, SIGNED
 
 _V1, _V2 = 0xFE, 0xFD
-_V1_HEADER, _V2_HEADER, _CHECKSUM, _SIGNATURE = 6, 10, 2, 13
-_SIGNED = 0x01
+_V1_HEADER, _V2_HEADER, _CHECKSUM = 6, 10, 2
 
 
 class RawPacket(NamedTuple):
@@ -47,7 +47,7 @@ def frame_at(data: bytes, at: int) -> RawPacket | None:
     else:
         system, component = data[at + 5 : at + 7]
         message_id = int.from_bytes(data[at + 7 : at + 10], "little")
-        end += _SIGNATURE if data[at + 2] & _SIGNED else 0
+        end += SIGNATURE_BYTES if data[at + 2] & SIGNED else 0
     if end > len(data):
         return None
     payload = data[at + header : at + header + length]

@@ -22,6 +22,7 @@ from mavbridge.mavlink.codec.messages import (
     StreamRequest,
 )
 from mavbridge.mavlink.codec.readers import READERS, UnusableError
+from mavbridge.mavlink.codec.signing import Signing, is_signed
 
 RELEASE_US = 0
 """RC_CHANNELS_OVERRIDE ch 1-8: give the channel back to the receiver."""
@@ -73,11 +74,17 @@ def _unread(name: str, packet: bytes) -> ReceivedMessage:
 class Codec:
     """One MAVLink 2 endpoint without I/O: owns the parser state and the sending sequence."""
 
-    def __init__(self, *, source_system: int, source_component: int) -> None:
+    def __init__(
+        self, *, source_system: int, source_component: int, signing: Signing | None = None
+    ) -> None:
         self.source = Endpoint(source_system, source_component)
         self._mav = dialect.MAVLink(None, srcSystem=source_system, srcComponent=source_component)
         self._mav.robust_parsing = True
         self.bad_data_count = 0
+        self.signing = signing
+        """Signs what is sent and judges what comes; None: neither."""
+        self.hears_signed = False
+        """A packet came with a signature that nobody here can judge, for want of a key."""
         self._text_id = 0
 
     def forget_partial(self) -> None:
@@ -98,14 +105,15 @@ class Codec:
         if data[:1] in _PACKET_STARTS:
             self.forget_partial()
             if (state := decode_state_packet(data)) is not None:
-                yield state
+                if self._is_admitted(state.packet):
+                    yield state
                 return
             try:
                 message = self._mav.decode(bytearray(data))  # in half the time of the parser
             except dialect.MAVError:
                 yield from self.decode(data)
             else:
-                yield self._read(message)
+                yield from self._read(message)
         elif self._mav.buf_len():
             yield from self.decode(data)
         else:
@@ -117,13 +125,29 @@ class Codec:
             if message.get_type() == "BAD_DATA":
                 self.bad_data_count += 1
             else:
-                yield self._read(message)
+                yield from self._read(message)
 
-    def _read(self, message: dialect.MAVLink_message) -> ReceivedMessage:
+    @property
+    def refused_signatures(self) -> int:
+        """Packets that were not taken for what their signature was, or was not."""
+        return sum(self.signing.refused.values()) if self.signing is not None else 0
+
+    def _is_admitted(self, packet: bytes) -> bool:
+        if self.signing is not None:
+            return self.signing.accepts(packet)
+        self.hears_signed = self.hears_signed or is_signed(packet)
+        return True
+
+    def _read(self, message: dialect.MAVLink_message) -> Iterator[ReceivedMessage]:
+        """The message, if its signature admits it."""
+        packet = bytes(message.get_msgbuf())
+        if self._is_admitted(packet):
+            yield self._decoded(message, packet)
+
+    def _decoded(self, message: dialect.MAVLink_message, packet: bytes) -> ReceivedMessage:
         name = message.get_type()
         if isinstance(message, dialect.MAVLink_unknown):
-            data = bytes(message.data)
-            return decode_state_packet(data) or _unread(name, data)
+            return decode_state_packet(packet) or _unread(name, packet)
         reader = READERS.get(name)
         try:
             body = None if reader is None else reader(message)
@@ -131,13 +155,16 @@ class Codec:
             self.bad_data_count += 1
             body = None
         source = Endpoint(message.get_srcSystem(), message.get_srcComponent())
-        packet = bytes(message.get_msgbuf())
         return ReceivedMessage(source, message.get_seq(), name, body, packet)
 
     def _pack(self, message: dialect.MAVLink_message) -> bytes:
         data: bytes = message.pack(self._mav)
+        return self._sealed(data, message.crc_extra)
+
+    def _sealed(self, packet: bytes, crc_extra: int) -> bytes:
+        """The packet as it leaves, with the sequence number used up."""
         self._mav.seq = (self._mav.seq + 1) % 256
-        return data
+        return packet if self.signing is None else self.signing.sign(packet, crc_extra)
 
     def encode_heartbeat(self, kind: int | None = None) -> bytes:
         """HEARTBEAT of a MAV_TYPE; None: an onboard controller, which no vehicle mistakes for a
@@ -170,9 +197,8 @@ class Codec:
         channels_us = [IGNORE_US] * 8
         for channel, value_us in zip(calibration.channels, values_us, strict=True):
             channels_us[channel.number - 1] = value_us
-        data = pack_override(self.source, self._mav.seq, target, channels_us)
-        self._mav.seq = (self._mav.seq + 1) % 256
-        return data
+        packet = pack_override(self.source, self._mav.seq, target, channels_us)
+        return self._sealed(packet, dialect.MAVLink_rc_channels_override_message.crc_extra)
 
     def encode_manual_control(self, target_system: int, sticks: ManualControl) -> bytes:
         """MANUAL_CONTROL.

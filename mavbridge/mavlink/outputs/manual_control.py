@@ -57,6 +57,8 @@ class ManualControlOutput(StickOutput):
         """Arrival of the sticks that it acts on, and these."""
         self._pilot: Sticks | None = None
         """The same while it acted on none of ours."""
+        self._status: VehicleStatus | None = None
+        """The vehicle's last one, also after its session has started over."""
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note what has left."""
@@ -86,6 +88,7 @@ class ManualControlOutput(StickOutput):
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
     ) -> VehicleStatus | None:
         """The status with the sticks that are shown by MANUAL_CONTROL, and never by RC_CHANNELS."""
+        self._status = status or self._status
         if status is not None and self._shown is not None:
             arrived_ns, sticks = self._shown
             status = replace(
@@ -95,8 +98,12 @@ class ManualControlOutput(StickOutput):
 
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """Level once more in a mode that follows sticks, unless a receiver has some of its own;
-        where the throttle is thrust, with the last one."""
-        status = vehicle.status(now_ns)
+        where the throttle is thrust, with the last one.
+
+        A vehicle whose session starts over has no status yet. Its reboot may be but a wrong stamp,
+        and without this packet it would fly on with the policy's last sticks for COM_RC_LOSS_T.
+        """
+        status = vehicle.status(now_ns) or self._status
         if status is None or status.has_receiver or status.mode not in _MODES:
             return None
         z = self._last.z if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2

@@ -83,6 +83,10 @@ class ActionOutput(ABC):
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Take an echo, if this is one."""
 
+    def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
+        """What goes ahead of the releases, by their spacing; None: nothing has to."""
+        return None
+
     @abstractmethod
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """One of ``releases``; None: there is nothing to take back."""

@@ -61,6 +61,7 @@ class ActionSender:
         if vehicle is None or output is None:
             return None
         if isinstance(decision, Release):
+            self._level(output, vehicle)
             output.released()
             if self._release.is_due(self._clock.now_ns()):
                 self.try_release()
@@ -74,10 +75,21 @@ class ActionSender:
         output.sent(encoded, vehicle, self._clock.now_ns())
         return encoded.action
 
+    def _level(self, output: ActionOutput, vehicle: VehicleSession) -> None:
+        """Send what goes ahead of the first release, where the output has it."""
+        if self._release.left < output.releases:
+            return  # not the first
+        now_ns = self._clock.now_ns()
+        encoded = output.last_sticks(vehicle, now_ns)
+        if encoded is not None and self._connection.send(encoded.packet):
+            output.sent(encoded, vehicle, now_ns)
+            self._release.tried(now_ns, is_sent=True)
+
     def release_once(self) -> None:
         """Send one release if any is left, and none after it: somebody else has the sticks."""
         if self._release.left and self.output is not None:
-            self.send(Release("somebody else has the sticks"))
+            self.output.released()
+            self.try_release()
             self._release.left = 0
 
     def try_release(self) -> bool:

@@ -48,6 +48,7 @@ class LinkCounters:
         *,
         echo_confirmed: bool | None,
         unusable_packets: int,
+        refused_signatures: int = 0,
         saturated: Mapping[str, int],
     ) -> LinkStats:
         """The totals so far; ``saturated`` is how often each stick asked for too much."""
@@ -65,6 +66,7 @@ class LinkCounters:
             sent_overrides=self.sent,
             echo_confirmed=echo_confirmed if self.sent else None,
             unusable_packets=unusable_packets,
+            refused_signatures=refused_signatures,
             saturated=tuple((name, n / self.sent) for name, n in sorted(saturated.items())),
             vehicle_clock_offset_ns=timesync.offset_ns,
             is_timesync_good=timesync.is_good,

@@ -8,12 +8,28 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.codec.signing import Refusal
 from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDownError
 
 REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 2 * NS_PER_MS
 """Longest stretch of reading: a flood must not keep the gate from its next slot. What is
 left stays with the kernel, which drops what it cannot hold."""
+
+
+SIGNED_VEHICLE = (
+    "the vehicle signs its packets, and may ignore ours: give its key by --signing-key-file"
+)
+REFUSALS: dict[Refusal, str] = {
+    "unsigned": "refusing packets without a signature: the vehicle does not sign (give it the key "
+    "of --signing-key-file), or somebody else sends on this link",
+    "wrong key": "refusing packets signed with another key than that of --signing-key-file",
+    "replayed": "refusing signed packets that are not newer than those before them: replayed, "
+    "doubled or overtaken on the way",
+    "clock behind": "refusing signed packets of a sender that is new here, with timestamps of more "
+    "than a minute ago: its clock is behind (a vehicle has the time from GPS, or from the tool "
+    "that gave it its key), ours is ahead, or they are replayed",
+}
 
 
 class PacketLog(Protocol):
@@ -48,6 +64,7 @@ class Connection:
         """Gets everything that comes from the peer, as it came; must neither wait nor raise."""
         self.texts: list[str] = []
         """Messages for the user, until `take_texts`."""
+        self._told: list[str] = []
         self._was_open = False
         self._open(clock.now_ns())
 
@@ -100,10 +117,22 @@ class Connection:
                     if self._log is not None:
                         self._log.put(Packet(arrived_ns, message.packet))
                     yield message, arrived_ns, sender
+                self._notice_signatures()
                 if self._clock.now_ns() - now_ns > DRAIN_BUDGET_NS:
                     return
         except TransportDownError as error:
             self._lose(error, self._clock.now_ns())
+
+    def _notice_signatures(self) -> None:
+        """Tell the user, once each, of packets whose signatures do not fit."""
+        signing = self._codec.signing
+        if signing is None:
+            reasons = [SIGNED_VEHICLE] if self._codec.hears_signed else []
+        else:
+            reasons = [REFUSALS[refusal] for refusal in signing.refused]
+        for text in reasons[len(self._told) :]:
+            self._told.append(text)
+            self.texts.append(text)
 
     def send(self, data: bytes) -> bool:
         """Send one packet; False: it was not sent."""

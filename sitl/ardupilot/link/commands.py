@@ -15,6 +15,7 @@ DENIED: int = mav.MAV_RESULT_DENIED
 UNSUPPORTED: int = mav.MAV_RESULT_UNSUPPORTED
 FAILED: int = mav.MAV_RESULT_FAILED
 FORCE = 21196.0  # param 2 of ARM_DISARM that overrules every check (MAVLink common.xml)
+FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: also while armed (ArduPilot)
 UINT16_MAX = 65535
 
 Params7: TypeAlias = tuple[float, ...]  # param1..7 of a command, the first at index 0
@@ -95,10 +96,10 @@ def _send(message_id: int) -> Handler:
 
 
 def _reboot(params: Params7, ap: Autopilot, link: MavlinkEndpoint) -> int:
-    if params[0] != 1.0:
-        return UNSUPPORTED
-    if ap.armed:
+    if ap.armed and params[5] != FORCE_REBOOT:
         return FAILED
+    if params[0] not in (1.0, 3.0):
+        return UNSUPPORTED
     link.reboot_requested = True
     return ACCEPTED
 

@@ -19,7 +19,7 @@ class MavlinkEndpoint(VehicleEndpoint[Autopilot]):
     """
 
     def __init__(self, ap: Autopilot) -> None:
-        super().__init__(BUILDERS, "MAV_SYSID")
+        super().__init__(BUILDERS, "MAV_SYSID", ap.config.signing)
         self.reboot_requested = False
         self.restart(ap)
 

@@ -87,6 +87,11 @@ def _terminate(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int:
     return ACCEPTED
 
 
+def _reboot(params: Params7, _ap: Autopilot, _link: MavlinkEndpoint) -> int:
+    """Zero asks for nothing; a reboot is refused while armed, and always in SITL."""
+    return ACCEPTED if math.isfinite(params[0]) and int(params[0]) == 0 else DENIED
+
+
 def _go(mode: Mode) -> Handler:
     return lambda _params, ap, _link: _to_mode(mode, ap)
 
@@ -96,7 +101,7 @@ _HANDLERS: dict[int, Handler] = {
     mav.MAV_CMD_NAV_LAND: _go(Mode.AUTO_LAND),
     mav.MAV_CMD_NAV_TAKEOFF: _takeoff,
     mav.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
-    mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: lambda _params, _ap, _link: DENIED,  # as PX4 in SITL
+    mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     mav.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     mav.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
     mav.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,

@@ -16,7 +16,7 @@ class MavlinkEndpoint(VehicleEndpoint[Autopilot]):
     """A link to a ground station, or to a companion computer, which gets other streams."""
 
     def __init__(self, ap: Autopilot, *, is_onboard: bool) -> None:
-        super().__init__(BUILDERS, "MAV_SYS_ID")
+        super().__init__(BUILDERS, "MAV_SYS_ID", ap.config.signing)
         self.heard: set[tuple[int, int]] = set()
         """Systems and components that have sent on this link."""
         self._is_onboard = is_onboard

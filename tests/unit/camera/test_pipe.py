@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.fakes import FakeClock
-from helpers.stand import child_of
 from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.camera.pipe import PipeCommand, PipeSource, parse_pipe
 from mavbridge.camera.pipe_frames import RAW_FORMATS, JpegCutter, RawCutter
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
+from sitl.faults.processes import child_of
 
 WIDTH, HEIGHT = 32, 16
 WRITER = """

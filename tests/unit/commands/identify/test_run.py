@@ -9,6 +9,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.flight.policies import configured_contract
 from policy.contract import Contract
 from policy.scripted.programs import doublet_length_s
+from sitl.faults.stage import faulty_policy
 
 
 def test_the_flight_is_the_users_with_the_doublet_in_place_of_the_policy() -> None:
@@ -44,5 +45,5 @@ def test_the_contract_is_that_of_the_policy_of_the_flags() -> None:
     assert configured_contract(PolicyConfig()).action == "sticks"
     rates = configured_contract(PolicyConfig(policy="scripted:square:rates"))
     assert rates.action == "rates"
-    own = configured_contract(PolicyConfig(policy="helpers.user_policies:SingleRate"))
+    own = configured_contract(PolicyConfig(policy=faulty_policy("SingleRate")))
     assert own.action == "sticks"

@@ -109,6 +109,39 @@ def test_what_the_vehicle_cannot_do_is_told_once_and_counted() -> None:
     assert flight.output.saturated == {"throttle": 100}
 
 
+# --- overrides
+
+
+@pytest.mark.parametrize(
+    ("changes", "throttle_us"),
+    [
+        ({}, 1500),
+        ({"mode": "RTL"}, 1500),
+        ({"mode": "STABILIZE"}, 1700),  # where the middle of the throttle is thrust
+        ({"has_receiver": True}, None),  # it has the sticks as soon as ours are released
+        ({"armed": False}, None),
+        ({"is_failsafe": True}, 1500),  # one that only warns
+        ({"is_failsafe": True, "mode": "RTL"}, None),  # it would fire again
+    ],
+)
+def test_level_sticks_go_ahead_of_a_release_that_would_keep_ours(
+    changes: dict[str, Any], throttle_us: int | None
+) -> None:
+    flight = copter_flight()
+    for name, value in changes.items():
+        setattr(flight.vehicle, name, value)
+    flight.send(Sticks(throttle=0.5, yaw=0.2, pitch=0.5, roll=-0.5))
+    encoded = flight.output.last_sticks(flight.session, flight.now_ns)
+    if throttle_us is None:
+        assert encoded is None
+        return
+    assert encoded is not None
+    message: Any = flight.message(encoded)
+    roll, pitch, throttle, yaw = (getattr(message, f"chan{n}_raw") for n in (1, 2, 3, 4))
+    assert (roll, pitch, yaw) == (1500, 1500, 1500)
+    assert throttle == pytest.approx(throttle_us, abs=8)
+
+
 # --- MANUAL_CONTROL
 
 
@@ -166,6 +199,23 @@ def test_the_last_sticks_are_neutral_ones_where_nobody_elses_are_flown(
     assert packet is not None
     ((message),) = flight.end.read(packet)
     assert (message.x, message.y, message.z, message.r) == last
+
+
+@pytest.mark.parametrize(("has_receiver", "is_levelled"), [(False, True), (True, False)])
+def test_a_session_that_starts_over_in_the_air_still_ends_with_neutral_sticks(
+    has_receiver: bool, is_levelled: bool
+) -> None:
+    """A reboot may be but a wrong stamp: what was known of the vehicle before it counts."""
+    flight = px4_flight()
+    flight.vehicle.mode, flight.vehicle.has_receiver = "ALTCTL", has_receiver
+    assert flight.status.mode == "ALTCTL"
+    flight.send(Sticks(0.3, 0.2, 0.5, -0.5))
+    flight.output.restart()
+    flight.vehicle.is_known = False
+    packet = flight.output.release_packet(flight.session, flight.now_ns)
+    assert (packet is not None) is is_levelled
+    for message in flight.end.read(packet or b""):
+        assert (message.x, message.y, message.z, message.r) == (0, 0, 500, 0)
 
 
 def test_the_pilots_sticks_are_those_that_px4_shows_without_ours() -> None:

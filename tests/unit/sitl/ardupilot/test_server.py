@@ -12,7 +12,8 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.link.messages import BUILDERS
 from sitl.ardupilot.link.streams import Streams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.faults import FaultyLink, LinkFaults, Reboot, SensorFreeze, VehicleFaults
+from sitl.faults.link import FaultyLink, LinkFaults
+from sitl.faults.vehicle import Reboot, SensorFreeze, VehicleFaults
 from sitl.simulated_vehicle import SimulatedVehicle
 
 
@@ -143,7 +144,7 @@ def test_nan_in_a_message_is_refused_and_counted(station):
         (mav.MAV_CMD_REQUEST_MESSAGE, (331,), mav.MAV_RESULT_FAILED),
         (mav.MAV_CMD_GET_HOME_POSITION, (math.nan,) * 7, mav.MAV_RESULT_ACCEPTED),
         (mav.MAV_CMD_NAV_LAND, (math.nan,) * 7, mav.MAV_RESULT_ACCEPTED),
-        (mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (3,), mav.MAV_RESULT_UNSUPPORTED),
+        (mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (2,), mav.MAV_RESULT_UNSUPPORTED),
         (mav.MAV_CMD_NAV_TAKEOFF, (), mav.MAV_RESULT_FAILED),
     ],
 )
@@ -223,6 +224,15 @@ def test_reboot_is_refused_when_armed_and_else_restarts_the_clock(station):
     station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
     attitude = named(station.run(0.1), "ATTITUDE")[-1]
     assert attitude.time_boot_ms < 500
+
+
+def test_a_forced_reboot_ends_a_flight_too(station):
+    station.run(2.0)
+    station.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196)
+    reboot = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+    assert station.command(reboot, 1, 0, 0, 0, 0, 20190226) == mav.MAV_RESULT_ACCEPTED
+    assert not station.vehicle.ap.armed
+    assert station.vehicle.ap.uptime_ns < NS_PER_S
 
 
 def test_prearm_health_waits_for_the_estimator_but_not_for_the_sticks(station):

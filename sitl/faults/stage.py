@@ -2,71 +2,55 @@
 
 import json
 import os
-import select
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias, cast
 
-from helpers.frame_feed import FrameFeed
-from helpers.relay import Relay
-from mavbridge.core.processes import free_port
+from sitl.clock import Clock
+from sitl.faults.camera import FrameFeed
+from sitl.faults.carriers import Carrier, UdpCarrier
+from sitl.faults.processes import Process, StageError, child_of, mapped_memory, processes_with
+from sitl.faults.record import VehicleReport
+from sitl.faults.relay import Relay
+from sitl.faults.transmitter import Transmitter
+from sitl.faults.viewer import Viewer
 
 TIMEOUT_S = 90.0
 STARTS = 3
-LEAN_US = 1650
-LEANING = 30
-"""Sticks beyond that, in a row: the policy holds its lean."""
+LEANING = 100
+"""Steering messages that lean, in a row: the policy holds its lean."""
 STALLED = ("no attitude from the vehicle", "no chunk of the policy that may be flown")
 ORDERLY = (0, 4)
 """Exit statuses of a flight that ended in order; 4: a busy machine made the gate end it before."""
-MARK = "MAVBRIDGE_TEST_MARK"
-"""Environment variable: the file into which ``helpers.user_policies`` writes when its fault
-begins."""
+MARK = "SITL_FAULT_MARK"
+"""Environment variable: the file into which a policy of the catalogue writes the moment, in ns of
+CLOCK_MONOTONIC, when its fault begins."""
+PIPE_BLOCK = 4096
+CATALOGUE = Path(__file__).parent / "catalogue"
+ProcessName: TypeAlias = Literal["flight", "gate", "recorder"]
+"""``recorder`` is the process that writes the video of a recording."""
 
 
-class Process:
-    """A process of which nobody here is the parent, such as the gate of a killed bridge."""
-
-    def __init__(self, pid: int) -> None:
-        self.pid = pid
-        self._fd = os.pidfd_open(pid)
-
-    def has_ended(self, timeout_s: float) -> bool:
-        """Wait for its end; a zombie has ended."""
-        return bool(select.select([self._fd], [], [], timeout_s)[0])
-
-    def kill(self, number: signal.Signals) -> int:
-        """Send a signal; returns the moment."""
-        at_ns = time.monotonic_ns()
-        with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._fd, number)
-        return at_ns
-
-    def peak_memory_mb(self) -> float:
-        status = Path(f"/proc/{self.pid}/status").read_text()
-        (line,) = [line for line in status.splitlines() if line.startswith("VmHWM:")]
-        return int(line.split()[1]) / 1024
-
-    def close(self) -> None:
-        """End it if it still runs."""
-        self.kill(signal.SIGKILL)
-        os.close(self._fd)
+def faulty_policy(name: str) -> str:
+    """A class of ``catalogue/policies.py`` as the bridge takes it, by ``--policy``."""
+    return f"{CATALOGUE / 'policies.py'}:{name}"
 
 
-class Flight:
+class Stage:
     """One bridge against one simulated vehicle."""
 
     def __init__(self, folder: Path, relay: Relay, shm: str, vehicle: tuple[str, ...]) -> None:
         """``vehicle`` are the flags of the simulated vehicle, which starts at once."""
         self.folder = folder
         self.relay = relay
+        self.clock = Clock()
         self._shm = shm
         self._vehicle_flags = vehicle
         self.cameras: tuple[str, ...] = ()
@@ -81,6 +65,23 @@ class Flight:
         self._gate: Process | None = None
         self.camera: FrameFeed | None = None
         """The camera, where the vehicle has none of its own."""
+        self.viewer: Viewer | None = None
+        self.variables: dict[str, str] = {}
+        """More of the bridge's environment."""
+        self.memory: set[str] = set()
+        """Shared memory that it has had, by name; see ``wait_for_lean``."""
+        self.temporary = folder / "temporary"
+        """Where it makes temporary files."""
+        self.temporary.mkdir()
+        self.transmitter: Transmitter | None = None
+        """The pilot's, where it can be moved."""
+        self.prepare: Callable[[], object] | None = None
+        """Called before each start of the bridge, when the vehicle has been heard."""
+
+    @property
+    def is_px4(self) -> bool:
+        """The vehicle's firmware is PX4, not ArduPilot."""
+        return "px4" in self._vehicle_flags
 
     def _start_vehicle(self) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "sitl", "--report", str(self.folder / "fc.json")]
@@ -90,6 +91,10 @@ class Flight:
     def start(self, *flags: str, is_read: bool = True) -> None:
         """Start the bridge in a process group of its own; its output is read, or never."""
         self._flags, self._is_read = flags, is_read
+        if self.prepare is not None:
+            if not self.relay.has_heard.wait(TIMEOUT_S):
+                raise StageError("the vehicle has sent nothing")
+            self.prepare()
         self._bridge = subprocess.Popen(
             [*self.command(self.folder / "report.json"), *flags],
             stdin=subprocess.DEVNULL,
@@ -105,27 +110,31 @@ class Flight:
 
     def command(self, report: Path) -> list[str]:
         """A bridge for this vehicle, without any flag of its flight."""
-        address = f"udp:127.0.0.1:{self.relay.bridge_port}"
-        command = [sys.executable, "-m", "mavbridge", "--connect", address]
+        command = [sys.executable, "-m", "mavbridge", "--connect", self.relay.carrier.address]
         sources = [f"{name}=shm:{self._shm}" for name in self.cameras] or [f"shm:{self._shm}"]
         cameras = [flag for source in sources for flag in ("--camera", source)]
         return [*command, *cameras, "--report", str(report)]
 
     def environment(self) -> dict[str, str]:
-        folder = str(Path(__file__).parents[1])
-        return os.environ | {"PYTHONPATH": folder, "COLUMNS": "200", MARK: str(self._mark)}
+        """Ours, with a terminal of 200 columns and a place for the mark of a policy's fault."""
+        ours = {"COLUMNS": "200", MARK: str(self._mark), "TMPDIR": str(self.temporary)}
+        return os.environ | ours | self.variables
 
     @property
     def _mark(self) -> Path:
         return self.folder / "mark"
 
     def _read(self) -> None:
-        assert self._bridge is not None
-        assert self._bridge.stdout is not None
-        for line in self._bridge.stdout:
+        bridge = self._running()
+        for line in bridge.stdout or ():
             with self._news:
                 self._lines.append(line)
                 self._news.notify_all()
+
+    def _running(self) -> subprocess.Popen[str]:
+        if self._bridge is None:
+            raise StageError("the bridge has not been started")
+        return self._bridge
 
     def wait_for(self, text: str) -> bool:
         """The bridge has said this."""
@@ -139,21 +148,24 @@ class Flight:
 
         Where a busy machine made the gate end the flight before, both start anew.
         """
-        rows = self.relay.overrides
+        sent = self.relay.sent
 
         def is_leaning() -> bool:
-            return len(rows) > LEANING and min(row.roll for row in rows[-LEANING:]) > LEAN_US
+            return self.relay.is_leaning(LEANING)
 
         def is_over() -> bool:
-            return self.relay.has_flown.is_set() and rows[-1].throttle <= 1500
+            last = next((row for row in reversed(sent) if row.steers), None)
+            return self.relay.has_flown.is_set() and last is not None and not last.climbs
 
         for _ in range(STARTS):
-            assert self.relay.wait_until(lambda: is_leaning() or is_over(), TIMEOUT_S), self._text
-            assert self.gate.pid
+            if not self.relay.wait_until(lambda: is_leaning() or is_over(), TIMEOUT_S):
+                raise StageError(f"the policy has not flown:\n{self._text}")
+            self.gate.has_ended(0)  # finds it while its parent lives
             if is_leaning():
+                self.memory |= mapped_memory(self.bridge_pid)
                 return
             self._start_over()
-        raise AssertionError(self._text)
+        raise StageError(f"the flight ended {STARTS} times before its fault:\n{self._text}")
 
     def fly(self, *flags: str) -> tuple[int, str]:
         """Start a bridge that ends by itself; its exit status and everything that it printed.
@@ -175,6 +187,7 @@ class Flight:
         self._vehicle.kill()
         self._vehicle.wait(TIMEOUT_S)
         self.relay.forget()
+        self.relay.has_heard.clear()
         if "--record" in self._flags:
             shutil.rmtree(self._flags[self._flags.index("--record") + 1])
         self._lines.append("--- starting over: the machine was too busy to fly\n")
@@ -187,15 +200,11 @@ class Flight:
 
     def fill_output(self) -> None:
         """Fill the pipe that nobody reads, so that the bridge's next write to it would wait."""
-        assert self._bridge is not None
-        pipe = f"/proc/{self.bridge_pid}/fd/1"
-        fd = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
-        with suppress(BlockingIOError):
-            while True:
-                os.write(fd, b"." * 4096)
-        with suppress(BlockingIOError):
-            while True:
-                os.write(fd, b".")
+        fd = os.open(f"/proc/{self.bridge_pid}/fd/1", os.O_WRONLY | os.O_NONBLOCK)
+        for block in (PIPE_BLOCK, 1):
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(fd, b"." * block)
         os.close(fd)
 
     def observe(self, seconds: float) -> None:
@@ -204,42 +213,69 @@ class Flight:
 
     def fault_ns(self) -> int:
         """When the policy's own fault began; waits for it."""
-        assert self.relay.wait_until(self._mark.exists, TIMEOUT_S), self._text
+        if not self.relay.wait_until(self._mark.exists, TIMEOUT_S):
+            raise StageError(f"the policy's fault has not begun:\n{self._text}")
         return int(self._mark.read_text())
 
     @property
     def bridge_pid(self) -> int:
-        assert self._bridge is not None
-        return self._bridge.pid
+        """The flight process."""
+        return self._running().pid
 
     @property
     def gate(self) -> Process:
         """The gate process; the first call must come while the bridge lives."""
         if self._gate is None:
-            self._gate = Process(child_of(self.bridge_pid, b"mavbridge.gate"))
+            self._gate = Process(child_of(self.bridge_pid, b"mavbridge.gate"), self.clock)
         return self._gate
+
+    def recorder(self) -> Process:
+        """The process that writes the video of a recording."""
+        return Process(self.pid_of("recorder"), self.clock)
+
+    def pid_of(self, name: ProcessName) -> int:
+        """Process id, while the bridge lives."""
+        if name == "recorder":
+            return child_of(self.bridge_pid, b"spawn_main")
+        return self.gate.pid if name == "gate" else self.bridge_pid
+
+    def processes(self) -> list[tuple[int, str]]:
+        """Id and command of every process of the bridge that still runs."""
+        return processes_with(f"{MARK}={self._mark}")
+
+    def last_lean_ns(self) -> int:
+        """When the policy's last stick left, once others have followed it; waits for that."""
+        sent = self.relay.sent
+
+        def is_over() -> bool:
+            steering = [row for row in sent[-3 * LEANING :] if row.steers]
+            return bool(steering) and not any(row.leans for row in steering[-LEANING // 10 :])
+
+        if not self.relay.wait_until(is_over, TIMEOUT_S):
+            raise StageError(f"the policy goes on flying:\n{self._text}")
+        return [row.at_ns for row in sent if row.leans][-1]
 
     def kill(self, number: signal.Signals) -> int:
         """Send a signal to the bridge alone; returns the moment."""
-        assert self._bridge is not None
-        at_ns = time.monotonic_ns()
-        self._bridge.send_signal(number)
+        at_ns = self.clock.now_ns()
+        self._running().send_signal(number)
         return at_ns
 
     def kill_group(self, number: signal.Signals) -> int:
         """Send a signal as a terminal does, to the whole process group; returns the moment."""
-        at_ns = time.monotonic_ns()
-        os.killpg(self.bridge_pid, number)
+        at_ns = self.clock.now_ns()
+        with suppress(ProcessLookupError):
+            os.killpg(self.bridge_pid, number)
         return at_ns
 
     def end(self) -> tuple[int, str]:
         """Exit status and everything that the bridge printed."""
-        assert self._bridge is not None
+        bridge = self._running()
         try:
-            self._bridge.wait(TIMEOUT_S)
+            bridge.wait(TIMEOUT_S)
         finally:
             self.close()
-        return self._bridge.returncode, self._text
+        return bridge.returncode, self._text
 
     def close(self) -> None:
         """Free everything, and end what a failed test has left."""
@@ -263,40 +299,40 @@ class Flight:
         self._vehicle.wait(TIMEOUT_S)
 
     def report(self) -> Any:
+        """The bridge's, of ``--report``."""
         return json.loads((self.folder / "report.json").read_text())
 
-    def vehicle_report(self) -> Any:
-        """Only after the ``flight`` block, which ends the vehicle."""
-        return json.loads((self.folder / "fc.json").read_text())
+    def vehicle_report(self) -> VehicleReport:
+        """Only after the ``staged`` block, which ends the vehicle."""
+        return cast(VehicleReport, json.loads((self.folder / "fc.json").read_text()))
 
 
 @contextmanager
-def flight(folder: Path, *vehicle_flags: str, renders: bool = True) -> Iterator[Flight]:
-    """A vehicle and a relay, ready for ``Flight.start``; both end with the block.
+def staged(
+    folder: Path, *vehicle_flags: str, renders: bool = True, carrier: Carrier | None = None
+) -> Iterator[Stage]:
+    """A vehicle and a relay, ready for ``Stage.start``; both end with the block.
 
-    Without ``renders`` the camera shows noise, costs nothing and can be paused.
+    Without ``renders`` the camera shows noise, costs nothing and can be spoilt. ``carrier`` leads
+    from the relay to the bridge; None: UDP.
     """
-    bridge_port = free_port()
-    shm = f"test-{bridge_port}-{os.getpid()}"
+    port = free_port()
+    shm = f"test-{port}-{os.getpid()}"
+    clock = Clock()
     with ExitStack() as stack:
-        relay = stack.enter_context(Relay(bridge_port))
+        relay = stack.enter_context(Relay(carrier or UdpCarrier(port), clock))
         filming = ("--camera", f"shm:{shm}") if renders else ()
-        flying = Flight(folder, relay, shm, (*filming, *vehicle_flags))
-        stack.callback(flying.end_vehicle)
+        stage = Stage(folder, relay, shm, (*filming, *vehicle_flags))
+        stack.callback(stage.end_vehicle)
         if not renders:
-            flying.camera = stack.enter_context(FrameFeed(shm))
-        stack.callback(flying.close)
-        yield flying
+            stage.camera = stack.enter_context(FrameFeed(shm, clock))
+        stack.callback(stage.close)
+        yield stage
 
 
-def child_of(parent_pid: int, text: bytes) -> int:
-    """The child process whose command line contains a text."""
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            command = (entry / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if parent == parent_pid and text in command:
-            return int(entry.name)
-    raise AssertionError(f"process {parent_pid} has no child with {text!r} in its command line")
+def free_port() -> int:
+    """A UDP port of the loopback that nobody uses now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,7 +1,13 @@
-"""Policies as a user might write them, with what can go wrong in them."""
+"""Policies as a user might write them, with what can go wrong in them.
+
+The bridge loads this file; the simulator does not.
+"""
 
 import ctypes
 import os
+import resource
+import sys
+import threading
 import time
 from pathlib import Path
 
@@ -57,8 +63,11 @@ class Leaning(Climbing):
     """Takes off, then leans, turns and climbs; ``misbehave`` is called once it leans steadily."""
 
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
-    lean_calls, fault_calls = 60, 160
-    """Calls into the flight after which it leans, and after which its fault begins."""
+    lean_calls, fault_calls = 120, 260
+    """Calls into the flight after which it leans, and after which its fault begins; those on the
+    ground after the first of them do not count."""
+    least_climb_mps = 0.3
+    """From here on it has left the ground: PX4 takes 2.4 s for that."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -75,6 +84,8 @@ class Leaning(Climbing):
         if self._flown is None or self._flown < 0:
             return chunk
         self._flown += 1
+        if self._flown == self.lean_calls and -state[..., 2].min() < self.least_climb_mps:
+            self._flown -= 1
         if self._flown > self.lean_calls:
             chunk[:] = (0.3, 0.25, 0.0, 0.5)
         if self._flown > self.fault_calls:
@@ -87,6 +98,22 @@ class Leaning(Climbing):
     @property
     def has_begun(self) -> bool:
         return self._flown == self.fault_calls + 1
+
+
+class Wandering(Leaning):
+    """Climbs for two seconds, then leans to this side and that for ever, at the same height."""
+
+    climb_calls, turn_calls = 200, 400
+
+    def predict_fast(
+        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
+    ) -> Array:
+        chunk = Climbing.predict_fast(self, feature, state, action_history, num_diffusion_steps)
+        if self._flown is not None and self._flown >= 0:
+            self._flown += 1
+            side = 1.0 if self._flown // self.turn_calls % 2 else -1.0
+            chunk[:] = (0.5 if self._flown < self.climb_calls else 0.0, 0.2, 0.0, 0.4 * side)
+        return chunk
 
 
 class Deliberate(Leaning):
@@ -105,8 +132,8 @@ class Deliberate(Leaning):
 
 
 def mark_fault() -> None:
-    """Tell the test when the fault began."""
-    path = Path(os.environ["MAVBRIDGE_TEST_MARK"])
+    """Tell the catalogue when the fault began."""
+    path = Path(os.environ["SITL_FAULT_MARK"])
     draft = path.with_suffix(".draft")
     draft.write_text(str(time.monotonic_ns()))
     draft.rename(path)
@@ -216,6 +243,115 @@ class Slow(Leaning):
         return super().predict_fast(feature, state, action_history, num_diffusion_steps)
 
 
+class SlowInFlight(Leaning):
+    """Each call takes 0.9 s from the fault on."""
+
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+        time.sleep(0.9)  # noqa: TID251 - the slow policy itself
+
+
+class Infinite(Leaning):
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+        chunk[..., 3] = np.inf
+
+
+class Misshapen(Leaning):
+    """Returns chunks without their first dimension."""
+
+    def predict_fast(
+        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
+    ) -> Array:
+        chunk = super().predict_fast(feature, state, action_history, num_diffusion_steps)
+        return chunk[0] if self._flown is not None and self._flown > self.fault_calls else chunk
+
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+
+
+class Erratic(Leaning):
+    """Every tenth of a second other sticks, each at one of its limits; on the whole it climbs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._random = np.random.default_rng(0)
+        self._sticks = np.zeros(4, np.float32)
+
+    def misbehave(self, chunk: Array) -> None:
+        if self._calls % 10 == 0 or self.has_begun:
+            self._sticks = self._random.choice([-1, 1], 4).astype(np.float32)
+            self._sticks[0] = self._random.choice([-1, 1, 1])
+        chunk[:] = self._sticks
+
+
 class Exploding(Leaning):
     def misbehave(self, chunk: Array) -> None:
+        mark_fault()
         raise RuntimeError("the user's policy is broken")
+
+
+class Leaving(Leaning):
+    """Ends its process, as it believes."""
+
+    def misbehave(self, chunk: Array) -> None:
+        mark_fault()
+        sys.exit()
+
+
+class Greedy(Leaning):
+    """Takes memory until there is none: no process gets more than it has and 64 MB."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._hoard: list[Array] = []
+
+    def misbehave(self, chunk: Array) -> None:
+        mark_fault()
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        limit = pages * resource.getpagesize() + (64 << 20)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        for kilobytes in (1024, 64, 4):
+            try:
+                while True:
+                    self._hoard.append(np.ones((kilobytes, 256), dtype=np.float32))
+            except MemoryError:
+                continue
+        raise MemoryError("the policy has none left")
+
+
+class Chatty(Leaning):
+    """Prints a page at each call."""
+
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+        for row in range(25):
+            print(f"{row:3d} {'the policy thinks aloud ' * 5}")  # noqa: T201
+
+
+class Hogging(Leaning):
+    """A thread of its own computes for ever, and gives the interpreter up only when told to."""
+
+    def misbehave(self, chunk: Array) -> None:
+        if self.has_begun:
+            mark_fault()
+            threading.Thread(target=self._compute, name="users-thread", daemon=True).start()
+
+    def _compute(self) -> None:
+        deadline_ns = time.monotonic_ns() + HANG_S * 10**9
+        while time.monotonic_ns() < deadline_ns:
+            pass
+
+
+class HoggingNatively(Hogging):
+    """That thread holds the interpreter for 0.4 s at a time."""
+
+    def _compute(self) -> None:
+        libc = ctypes.PyDLL(None)
+        for _ in range(HANG_S * 2):
+            libc.usleep(400_000)
+            time.sleep(0.1)  # noqa: TID251 - somebody else's turn

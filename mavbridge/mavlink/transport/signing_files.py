@@ -1,0 +1,124 @@
+"""The key of MAVLink 2 signing, and what of it must survive a restart, in files."""
+
+import hashlib
+import json
+import os
+import stat
+import threading
+from pathlib import Path
+
+from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
+from mavbridge.core.errors import UserError
+from mavbridge.mavlink.codec.signing import KEY_BYTES, TICK_NS, Signing, SigningState, Stream
+from mavbridge.mavlink.settings import SigningFiles
+
+SAVE_S = 10.0
+AHEAD_TICKS = 2 * round(SAVE_S) * NS_PER_S // TICK_NS
+"""Saved beyond the newest timestamp: what is used until the next save, and once more."""
+JOIN_S = 2.0
+_MADE = "make one with: (umask 077; openssl rand -hex 32 > FILE)"
+
+
+def read_key(path: Path) -> bytes:
+    """The 32 bytes of a key file, which holds them as they are, or as 64 hexadecimal digits.
+
+    Raises:
+        UserError: it cannot be read, others may read it, or it is no key.
+    """
+    try:
+        mode, data = path.stat().st_mode, path.read_bytes()
+    except OSError as error:
+        raise UserError(f"--signing-key-file {path}: {error.strerror}; {_MADE}") from error
+    if stat.S_IMODE(mode) & (stat.S_IRWXG | stat.S_IRWXO):
+        raise UserError(
+            f"--signing-key-file {path} may be used by others (mode {stat.S_IMODE(mode):03o}), who "
+            f"could then steer the vehicle: chmod 600 {path}, and think of a new key"
+        )
+    if len(data) == KEY_BYTES:
+        return data
+    try:
+        key = bytes.fromhex(data.decode("ascii").strip())
+    except ValueError:
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise UserError(
+            f"--signing-key-file {path} holds {len(data)} bytes, but a key is 32 bytes or 64 "
+            f"hexadecimal digits; {_MADE}, or from the passphrase of a ground station: "
+            "printf %s 'the words' | sha256sum | cut -c1-64"
+        )
+    return key
+
+
+class SigningStore:
+    """A ``Signing`` whose timestamps go on where an earlier process with this key has ended.
+
+    A thread of its own saves them, since a disk may take its time.
+    """
+
+    def __init__(self, files: SigningFiles, clock: Clock) -> None:
+        """Read the key and the state; nothing is written before the context begins.
+
+        Raises:
+            UserError: as ``read_key``; or the state is damaged.
+        """
+        key = read_key(files.key_file)
+        name = hashlib.sha256(b"name of the state of " + key).hexdigest()[:16]
+        self.path = files.state_folder / "signing" / f"{name}.json"
+        offset_ns = wall_offset_ns(clock)
+        self.signing = Signing(
+            key, unix_ns=lambda: clock.now_ns() + offset_ns, state=_read_state(self.path)
+        )
+        self.problem: str | None = None
+        """Why the timestamps cannot be kept."""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="mavbridge-signing", daemon=True)
+
+    def __enter__(self) -> Signing:
+        """Save for the first time, then every ten seconds."""
+        self._save()
+        self._thread.start()
+        return self.signing
+
+    def __exit__(self, *_: object) -> None:
+        """Save for the last time."""
+        self._stop.set()
+        self._thread.join(JOIN_S)
+        self._save()
+
+    def _run(self) -> None:
+        while not self._stop.wait(SAVE_S):
+            self._save()
+
+    def _save(self) -> None:
+        sent_ticks, heard = self.signing.state
+        streams = {"/".join(map(str, stream)): ticks for stream, ticks in heard.items()}
+        text = json.dumps({"sent_ticks": sent_ticks + AHEAD_TICKS, "heard_ticks": streams})
+        temporary = self.path.with_suffix(f".{os.getpid()}")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(text)
+            temporary.replace(self.path)
+        except OSError as error:
+            self.problem = (
+                f"timestamps of signed packets cannot be kept in {self.path} ({error.strerror}): "
+                "if the time of day steps back, the vehicle will ignore the next flight"
+            )
+
+
+def _read_state(path: Path) -> SigningState:
+    try:
+        document = json.loads(path.read_text())
+        streams = {_stream(name): int(ticks) for name, ticks in document["heard_ticks"].items()}
+        return SigningState(int(document["sent_ticks"]), streams)
+    except FileNotFoundError:
+        return SigningState()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"cannot read {path}, which keeps the timestamps of signed packets ({error}): remove "
+            "it if the time of day is right on this computer"
+        ) from error
+
+
+def _stream(name: str) -> Stream:
+    link_id, system, component = map(int, name.split("/"))
+    return link_id, system, component

@@ -1,0 +1,1 @@
+"""A catalogue of faults, flown by real processes and judged by the vehicle's own record."""

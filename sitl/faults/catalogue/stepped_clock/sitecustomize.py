@@ -1,0 +1,20 @@
+"""Steps wall time by an hour in every Python process that has this folder in PYTHONPATH.
+
+Only root could step the computer's own clock, and would do it to everybody. Python imports this
+module at its start; the step is there while the file of STEPPED_CLOCK is.
+"""
+
+import os
+import time
+
+STEP_S = 3600
+_path = os.environ["STEPPED_CLOCK"]
+_time, _time_ns = time.time, time.time_ns  # noqa: TID251 - they are what is replaced
+
+
+def _step_s() -> int:
+    return STEP_S if os.access(_path, os.F_OK) else 0
+
+
+time.time = lambda: _time() + _step_s()  # noqa: TID251
+time.time_ns = lambda: _time_ns() + _step_s() * 10**9  # noqa: TID251

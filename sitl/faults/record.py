@@ -1,0 +1,116 @@
+"""What the vehicle's report (docs/formats/flight_report.md) says of a fault at a known time."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, TypedDict
+
+Receiver = Literal["idle", "mid", "none"]
+Four = tuple[int, int, int, int]
+NEUTRAL_US: Four = (1500, 1500, 1500, 1500)
+RECEIVER_US: dict[Receiver, Four] = {"idle": (1500, 1500, 1000, 1500), "mid": NEUTRAL_US}
+"""Sticks of a receiver by its flag; ``none`` has no sticks."""
+NUDGE_US = 4
+"""Steps of one channel by which the bridge finds out whether the vehicle still hears it."""
+
+
+class StickEntry(TypedDict):
+    """An entry of ``sticks`` in the report."""
+
+    t_s: float
+    us: Four
+    mode: str
+    armed: bool
+    failsafe: bool
+    lean_deg: float
+    climb_mps: float
+
+
+class FinalState(TypedDict):
+    """How the vehicle was at the end of the report."""
+
+    mode: str
+    armed: bool
+    landed: bool
+
+
+class VehicleReport(TypedDict):
+    """Those keys of the report that judge a fault."""
+
+    start_ns: int
+    sticks: Sequence[StickEntry]
+    refused_messages: int
+    crashed: bool
+    armed_s: float
+    max_altitude_m: float
+    final: FinalState
+
+
+class Aftermath(NamedTuple):
+    """What happened to the vehicle after a fault."""
+
+    safe_ms: float
+    """Until the first entry with safe sticks or another mode."""
+    final_safe_ms: float
+    """The same, but from then on all entries are safe."""
+    mode: str | None
+    """The first other mode than that of the flight; None: it stayed."""
+    mode_s: float | None
+    """When it came."""
+    most_lean_deg: float
+
+    @property
+    def flew_again(self) -> bool:
+        """The policy's sticks came back."""
+        return self.final_safe_ms > self.safe_ms
+
+
+class NoVerdictError(Exception):
+    """The vehicle's record does not show what a verdict needs."""
+
+
+def aftermath(
+    report: VehicleReport,
+    at_ns: int,
+    receiver: Receiver,
+    mode: str = "ALT_HOLD",
+    others_us: tuple[int, ...] = (),
+) -> Aftermath:
+    """Read the sticks of a vehicle that flew in ``mode`` under the policy at ``at_ns``.
+
+    ``others_us`` are four sticks of somebody else, which are safe as well.
+
+    Raises:
+        NoVerdictError: it did not fly then, or was never safe after it.
+    """
+    how = (receiver, mode, others_us)
+    fault_s = (at_ns - report["start_ns"]) / 1e9
+    entries = [entry for entry in report["sticks"] if entry["t_s"] >= fault_s]
+    before = [entry for entry in report["sticks"] if entry["t_s"] < fault_s][-1:]
+    if not before or is_safe(before[0], *how):
+        raise NoVerdictError(f"the policy does not fly at {fault_s:.3f} s: {before}")
+    first = last = None
+    for previous, entry in zip([*before, *entries], entries, strict=False):
+        if is_safe(entry, *how) and not is_safe(previous, *how):
+            first, last = first or entry["t_s"], entry["t_s"]
+    if first is None or last is None:
+        raise NoVerdictError("the vehicle was never safe after the fault")
+    if not is_safe(entries[-1], *how):
+        raise NoVerdictError(f"the vehicle is not safe at the end: {entries[-1]}")
+    changed = next((entry for entry in entries if entry["mode"] != mode), None)
+    return Aftermath(
+        safe_ms=(first - fault_s) * 1e3,
+        final_safe_ms=(last - fault_s) * 1e3,
+        mode=changed["mode"] if changed else None,
+        mode_s=changed["t_s"] - fault_s if changed else None,
+        most_lean_deg=max(entry["lean_deg"] for entry in entries),
+    )
+
+
+def is_safe(
+    entry: StickEntry, receiver: Receiver, mode: str, others_us: tuple[int, ...] = ()
+) -> bool:
+    """Neutral sticks, the receiver's, somebody else's, out of the flight's mode, or disarmed."""
+    allowed = {NEUTRAL_US, RECEIVER_US.get(receiver, NEUTRAL_US), others_us or NEUTRAL_US}
+    is_stick = any(
+        all(abs(a - b) <= NUDGE_US for a, b in zip(entry["us"], us, strict=True)) for us in allowed
+    )
+    return is_stick or entry["mode"] != mode or not entry["armed"]

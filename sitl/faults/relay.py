@@ -1,0 +1,349 @@
+"""A relay on loopback between the vehicle and the bridge: it records, and it breaks the link."""
+
+import math
+import select
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import count, islice
+from typing import Any, NamedTuple, TypeAlias
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from sitl.clock import NS_PER_S, Clock
+from sitl.faults.carriers import LOOPBACK, Carrier
+from sitl.faults.link import FaultyLink, LinkFaults
+from sitl.faults.record import NEUTRAL_US, NUDGE_US
+
+Message: TypeAlias = Any  # a pymavlink message (the library has no types)
+FOREVER_NS = 1 << 62
+PILOTS_STATION = 42
+"""System id of another ground station than the bridge's 255."""
+BRIDGE = 255
+VEHICLE = (1, 1)
+COPTER_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "LOITER": 5, "RTL": 6, "LAND": 9, "BRAKE": 17}
+PX4_MODES = {
+    "ALTCTL": (2, 0),
+    "POSCTL": (3, 0),
+    "AUTO.LOITER": (4, 3),
+    "AUTO.RTL": (4, 5),
+    "AUTO.LAND": (4, 6),
+    "STABILIZED": (7, 0),
+}
+"""Main mode and sub-mode of PX4's ``custom_mode``, as MAV_CMD_DO_SET_MODE takes them."""
+FORCE = 21196
+"""MAV_CMD_COMPONENT_ARM_DISARM disarms in the air with this."""
+JOIN_S = 5.0
+UNREADABLE = ("BAD_DATA", "UNKNOWN")
+"""Types of what pymavlink's dialect does not have, such as PX4's CURRENT_MODE and EVENT."""
+IGNORED_US = 65535
+NEUTRAL_Z = 500
+Rewrite = Callable[[Message], bool]
+"""Changes a message of the vehicle in place; False drops it."""
+
+
+class Override(NamedTuple):
+    """The first four channels of one RC_CHANNELS_OVERRIDE, in us."""
+
+    roll: int
+    pitch: int
+    throttle: int
+    yaw: int
+
+
+class Sent(NamedTuple):
+    """A message of the bridge as it came to the relay, before any fault."""
+
+    at_ns: int
+    message: Message
+
+    @property
+    def name(self) -> str:
+        """The message's type."""
+        name: str = self.message.get_type()
+        return name
+
+    @property
+    def is_command(self) -> bool:
+        """Sticks of the policy, or neutral; no release."""
+        return self.override is not None and any(self.override)
+
+    @property
+    def asks_mode(self) -> bool:
+        """A request for a flight mode."""
+        is_command = self.name in ("COMMAND_LONG", "COMMAND_INT")
+        return self.name == "SET_MODE" or (
+            is_command and self.message.command == dialect.MAV_CMD_DO_SET_MODE
+        )
+
+    @property
+    def holds(self) -> bool:
+        """Sticks of anything, also neutral ones; no release."""
+        return self.is_command or self.name == "MANUAL_CONTROL"
+
+    @property
+    def override(self) -> Override | None:
+        """The sticks of an RC_CHANNELS_OVERRIDE."""
+        if self.name != "RC_CHANNELS_OVERRIDE":
+            return None
+        return Override(*(getattr(self.message, f"chan{k}_raw") for k in range(1, 5)))
+
+    @property
+    def steers(self) -> bool:
+        """Is a message of sticks, whatever they say."""
+        return self.name in ("RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL")
+
+    @property
+    def climbs(self) -> bool:
+        """The throttle is above the middle, as only a policy's is."""
+        if (sticks := self.override) is not None:
+            return NEUTRAL_US[2] < sticks.throttle < IGNORED_US
+        return self.name == "MANUAL_CONTROL" and bool(self.message.z > NEUTRAL_Z)
+
+    @property
+    def leans(self) -> bool:
+        """Steers to a side, ahead or around, as only a policy does."""
+        if (sticks := self.override) is not None:
+            turned = (sticks.roll, sticks.pitch, sticks.yaw)
+            centre = (NEUTRAL_US[0], NEUTRAL_US[1], NEUTRAL_US[3])
+            return any(
+                us not in (0, IGNORED_US) and abs(us - middle) > NUDGE_US
+                for us, middle in zip(turned, centre, strict=True)
+            )
+        if self.name == "MANUAL_CONTROL":
+            message = self.message
+            return bool(max(abs(message.x), abs(message.y), abs(message.r)) > 2 * NUDGE_US)
+        return False
+
+    @property
+    def is_within_limits(self) -> bool:
+        """No stick beyond what the message's definition, or a transmitter, has."""
+        if (sticks := self.override) is not None:
+            return all(us in (0, IGNORED_US) or 1000 <= us <= 2000 for us in sticks)
+        if self.name == "MANUAL_CONTROL":
+            message = self.message
+            turned = max(abs(message.x), abs(message.y), abs(message.r))
+            return bool(turned <= 1000 and 0 <= message.z <= 1000)
+        return True
+
+
+class _Way:
+    """One direction; a packet that is under way arrives whatever happens to later ones."""
+
+    def __init__(self) -> None:
+        self._seeds = count()
+        self._links = [FaultyLink(LinkFaults(), next(self._seeds))]
+
+    def impair(self, faults: LinkFaults) -> None:
+        self._links = [*self._links, FaultyLink(faults, next(self._seeds))]
+
+    def pass_on(self, packet: bytes, now_ns: int) -> None:
+        self._links[-1].send(packet, now_ns)
+
+    def arrived(self, now_ns: int) -> list[bytes]:
+        return [packet for link in self._links for packet in link.receive(now_ns)]
+
+    @property
+    def due_ns(self) -> int:
+        return min((link.due_ns or FOREVER_NS for link in self._links), default=FOREVER_NS)
+
+
+class Relay:
+    """Passes packets between the vehicle and the bridge, and keeps what the bridge sends."""
+
+    def __init__(self, carrier: Carrier, clock: Clock) -> None:
+        """``carrier`` leads to the bridge; the relay closes it."""
+        self.carrier = carrier
+        self._clock = clock
+        self._vehicle: tuple[str, int] | None = None
+        self._to_vehicle, self._to_bridge = _Way(), _Way()
+        self._rewrites: tuple[Rewrite, ...] = ()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((LOOPBACK, 0))
+        self._socket.setblocking(False)
+        self._mav = _parser(BRIDGE)
+        self._vehicles = _parser(VEHICLE[0])
+        self._station = dialect.MAVLink(None, srcSystem=PILOTS_STATION, srcComponent=190)
+        self._joystick = dialect.MAVLink(None, srcSystem=BRIDGE, srcComponent=190)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="relay")
+        self._news = threading.Condition()
+        self.sent: list[Sent] = []
+        self.overrides: list[Override] = []
+        self.has_flown = threading.Event()
+        self.has_heard = threading.Event()
+        """The vehicle has sent something: it can be sent to."""
+        self.port: int = self._socket.getsockname()[1]
+
+    def __enter__(self) -> "Relay":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(JOIN_S)
+        self._socket.close()
+        self.carrier.close()
+
+    def forget(self) -> int:
+        """Forget the flight so far: another one begins. Returns how many overrides it had."""
+        with self._news:
+            count = len(self.overrides)
+            self.sent.clear()
+            self.overrides.clear()
+            self.has_flown.clear()
+            return count
+
+    def newest_steering(self, rows: int) -> list[Sent]:
+        """The newest messages of sticks, at most so many, newest last."""
+        newest = islice((sent for sent in reversed(self.sent) if sent.steers), rows)
+        return list(newest)[::-1]
+
+    def is_leaning(self, rows: int) -> bool:
+        """As many messages of sticks lean, in a row, up to now."""
+        steering = self.newest_steering(rows)
+        return len(steering) == rows and all(sent.leans for sent in steering)
+
+    def impair(
+        self, *, to_vehicle: LinkFaults | None = None, to_bridge: LinkFaults | None = None
+    ) -> int:
+        """Change the link from now on; returns the moment. None leaves a direction as it is."""
+        at_ns = self._clock.now_ns()
+        if to_vehicle is not None:
+            self._to_vehicle.impair(to_vehicle)
+        if to_bridge is not None:
+            self._to_bridge.impair(to_bridge)
+        return at_ns
+
+    def rewrite(self, change: Rewrite) -> int:
+        """Let every message of the vehicle pass through ``change`` too; returns the moment."""
+        self._rewrites = (*self._rewrites, change)
+        return self._clock.now_ns()
+
+    def inject(self, message: Message, station: Message = None) -> int:
+        """Send a message to the vehicle as another ground station; returns the moment."""
+        if self._vehicle is None:
+            raise ValueError("the vehicle has not been heard yet")
+        at_ns = self._clock.now_ns()
+        self._socket.sendto(message.pack(station or self._station), self._vehicle)
+        return at_ns
+
+    def move_joystick(self, sticks: Override, *, is_manual: bool = False) -> int:
+        """Another program sends sticks with the bridge's own system id; returns the moment.
+
+        ``is_manual``: as MANUAL_CONTROL, which PX4 takes, instead of overrides.
+        """
+        channels = (*sticks, *[IGNORED_US] * 4)
+        message: Message = dialect.MAVLink_rc_channels_override_message(*VEHICLE, *channels)
+        if is_manual:
+            roll, pitch, throttle, yaw = (2 * (us - 1500) for us in sticks)
+            message = dialect.MAVLink_manual_control_message(
+                VEHICLE[0], -pitch, roll, NEUTRAL_Z + throttle // 2, yaw, 0
+            )
+        return self.inject(message, self._joystick)
+
+    def command(self, number: int, *params: float) -> int:
+        """Send a command to the vehicle as another ground station; returns the moment."""
+        padded = (*params, *[0.0] * (7 - len(params)))
+        return self.inject(dialect.MAVLink_command_long_message(*VEHICLE, number, 0, *padded))
+
+    def set_mode(self, mode: str) -> int:
+        """The pilot changes the mode at another station."""
+        custom = PX4_MODES.get(mode, ()) or (COPTER_MODES[mode],)
+        return self.command(dialect.MAV_CMD_DO_SET_MODE, 1, *custom)
+
+    def arm(self) -> int:
+        """The pilot arms at another station."""
+        return self.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+
+    def disarm(self) -> int:
+        """The pilot stops the motors at another station, in the air too."""
+        return self.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
+
+    def wait_until(self, condition: Callable[[], bool], timeout_s: float = 60.0) -> bool:
+        """Wait for something to become true of what the bridge has sent."""
+        with self._news:
+            return self._news.wait_for(condition, timeout_s)
+
+    def sent_since(self, at_ns: int, name: str) -> list[Sent]:
+        """Messages of this name that came after a moment."""
+        return [sent for sent in self.sent if sent.at_ns > at_ns and sent.name == name]
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            now_ns = self._clock.now_ns()
+            due_ns = min(self._to_vehicle.due_ns, self._to_bridge.due_ns)
+            longest_s = min(max((due_ns - now_ns) / NS_PER_S, 1e-4), self.carrier.wait_s)
+            select.select([self._socket.fileno(), *self.carrier.descriptors()], [], [], longest_s)
+            now_ns = self._clock.now_ns()
+            messages = self._take_bridges(now_ns)
+            self._take_vehicles(now_ns)
+            self._deliver(now_ns)
+            if messages:
+                self._record(messages, now_ns)
+
+    def _take_bridges(self, now_ns: int) -> list[Message]:
+        """Put what the bridge has sent on the way to the vehicle; a stream's as whole packets."""
+        taken: list[Message] = []
+        for data in self.carrier.receive():
+            messages = self._mav.parse_buffer(data) or []
+            whole = [message.get_msgbuf() for message in messages]
+            for packet in whole if self.carrier.is_stream else [data]:
+                self._to_vehicle.pass_on(bytes(packet), now_ns)
+            taken += messages
+        return taken
+
+    def _take_vehicles(self, now_ns: int) -> None:
+        try:
+            data, self._vehicle = self._socket.recvfrom(65536)
+        except (BlockingIOError, ConnectionError):
+            return
+        self.has_heard.set()
+        if data := self._rewritten(data):
+            self._to_bridge.pass_on(data, now_ns)
+
+    def _rewritten(self, data: bytes) -> bytes:
+        changes = self._rewrites
+        if not changes:
+            return data
+        kept = bytearray()
+        for message in self._vehicles.parse_buffer(data) or ():
+            if message.get_type().startswith(UNREADABLE):
+                kept += message.get_msgbuf()
+            elif all(change(message) for change in changes):
+                self._vehicles.seq = message.get_seq()
+                self._vehicles.srcComponent = message.get_srcComponent()
+                kept += message.pack(self._vehicles)
+        return bytes(kept)
+
+    def _deliver(self, now_ns: int) -> None:
+        for packet in self._to_bridge.arrived(now_ns):
+            self.carrier.send(packet)
+        for packet in self._to_vehicle.arrived(now_ns):
+            if self._vehicle is not None:
+                with suppress(BlockingIOError, ConnectionError):
+                    self._socket.sendto(packet, self._vehicle)
+
+    def _record(self, messages: list[Message], now_ns: int) -> None:
+        with self._news:
+            for message in messages:
+                sent = Sent(now_ns, message)
+                self.sent.append(sent)
+                if (sticks := sent.override) is not None:
+                    self.overrides.append(sticks)
+                if sent.climbs:
+                    self.has_flown.set()
+            self._news.notify_all()
+
+
+def _parser(system: int) -> Message:
+    parser = dialect.MAVLink(None, srcSystem=system)
+    parser.robust_parsing = True
+    return parser
+
+
+def set_fields(message: Message, **values: float) -> None:
+    """Change fields of a received message, so that packing it again sends them."""
+    for name, value in values.items():
+        setattr(message, name, value if math.isnan(value) else type(getattr(message, name))(value))

@@ -1,0 +1,211 @@
+"""One long flight with a fault every few seconds: what grows, and what is lost."""
+
+import json
+import random
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from pymavlink import mavutil
+
+from sitl.clock import NS_PER_S
+from sitl.faults.processes import StageError
+from sitl.faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
+from sitl.faults.steps import Images, Joystick, Messages, Pilot, Signal, Step, Wait
+from sitl.faults.steps_link import Link
+from sitl.faults.transmitter import Transmitter
+from sitl.faults.usage import Usage, growth, read_usage
+
+POLICY = "Wandering"
+SWITCH, LOW_US, HIGH_US = 7, 1000, 2000
+"""Channel of the engage switch, and its ends."""
+SETTLE_S = 1.5
+"""From the end of a fault until the policy must have lost the sticks."""
+QUIET_NS = NS_PER_S // 2
+"""Until the end of that nothing that leans may have left the bridge."""
+LEANING_ROWS = 50
+"""Messages of sticks that lean, in a row: the policy has the sticks."""
+MOST_GROWTH = {
+    "flight": Usage(rss_mb=40.0, descriptors=2, threads=0),
+    "gate": Usage(rss_mb=4.0, descriptors=1, threads=0),
+}
+"""Growth of a process that is no leak yet: allocators keep what they once had."""
+REPORT_EVERY = 20
+ENGAGE_S = 10.0
+ENGAGE_TRIES = 6
+
+
+class Fault(NamedTuple):
+    """A fault from which the pilot's switch gets the policy back."""
+
+    name: str
+    steps: tuple[Step, ...]
+    loses: bool
+    """The policy must lose the sticks; else it must keep them."""
+
+
+FAULTS = (
+    Fault("silence of the vehicle", (Link(way="to_bridge", loss=1.0), Wait(s=1.0), Link()), True),
+    Fault("silence of both", (Link(loss=1.0), Wait(s=1.5), Link()), True),
+    Fault("the pilot's mode", (Pilot(act="mode", mode="LOITER"),), True),
+    Fault("images gone", (Images(show="gone"), Wait(s=1.0), Images(show="none")), True),
+    Fault("images frozen", (Images(show="frozen"), Wait(s=3.0), Images(show="none")), True),
+    Fault(
+        "stopped",
+        (Signal(name="SIGSTOP", to="group"), Wait(s=1.0), Signal(name="SIGCONT", to="group")),
+        True,
+    ),
+    Fault("joystick on our id", (Joystick(hz=50, s=1.5),), True),
+    Fault(
+        "no attitude",
+        (Messages(names=["ATTITUDE", "ATTITUDE_QUATERNION"]), Wait(s=1.0), Messages(names=[])),
+        True,
+    ),
+    Fault("loss", (Link(loss=0.2, duplicate=0.2, reorder=0.2), Wait(s=3.0), Link()), False),
+    Fault("corruption", (Link(corrupt=0.2), Wait(s=2.0), Link()), False),
+)
+
+
+@dataclass(kw_only=True)
+class SoakResult:
+    """What the flight has shown."""
+
+    minutes: float
+    faults: dict[str, int] = field(default_factory=dict)
+    """How often each came."""
+    sent: int = 0
+    """Overrides and releases that left the bridge."""
+    growth: dict[str, Usage] = field(default_factory=dict)
+    """Of the flight process and of the gate, after they had settled."""
+    stalls: int = 0
+    """Faults that the policy should have survived, but a busy machine took the sticks from it."""
+    failures: list[str] = field(default_factory=list)
+
+
+def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None]) -> SoakResult:
+    """Fly for some minutes, with a random fault every few seconds.
+
+    Args:
+        minutes: of the flight.
+        seed: of the faults' order.
+        folder: empty; gets the recording.
+        report: is given a line for a person now and then.
+    """
+    result = SoakResult(minutes=minutes)
+    transmitter = Transmitter(free_port(), "mid")
+    recording = folder / "recording"
+    with staged(folder, "--receiver", "mid", *transmitter.flags, renders=False) as stage:
+        stage.start(
+            "--dual-rate", "--mode", "ALT_HOLD", "--policy", faulty_policy(POLICY),
+            "--engage-channel", str(SWITCH), "--record", str(recording),
+        )  # fmt: skip
+        if not stage.wait_for("not engaged: press e, use the engage switch"):
+            raise StageError("the bridge is not ready to engage")
+        stage.gate.has_ended(0)  # finds it while its parent lives
+        _engage(stage, transmitter)
+        usages = _fly(stage, transmitter, result, minutes, random.Random(seed), report)  # noqa: S311
+        stage.kill_group(signal.SIGINT)
+        stage.observe(SETTLE_S)
+        stage.relay.disarm()
+        stage.gate.has_ended(30.0)
+        status, output = stage.end()
+        result.sent += len(stage.relay.overrides)
+    if status not in ORDERLY or "Traceback" in output:
+        result.failures.append(f"exit status {status}:\n{output}")
+    result.growth = {name: growth(samples) for name, samples in usages.items()}
+    for name, grown in result.growth.items():
+        most = MOST_GROWTH[name]
+        if any(value > limit for value, limit in zip(grown, most, strict=True)):
+            result.failures.append(f"the {name} process grew by {grown}")
+    result.failures += _lost(recording, result)
+    return result
+
+
+def _fly(
+    stage: Stage,
+    transmitter: Transmitter,
+    result: SoakResult,
+    minutes: float,
+    chance: random.Random,
+    report: Callable[[str], None],
+) -> dict[str, list[Usage]]:
+    """Break the flight again and again; what the two processes held after each time."""
+    pids = {"flight": stage.bridge_pid, "gate": stage.gate.pid}
+    usages: dict[str, list[Usage]] = {name: [] for name in pids}
+    end_ns = stage.clock.now_ns() + round(minutes * 60 * NS_PER_S)
+    while stage.clock.now_ns() < end_ns:
+        fault = chance.choice(FAULTS)
+        result.faults[fault.name] = result.faults.get(fault.name, 0) + 1
+        for step in fault.steps:
+            step.perform(stage)
+        stage.observe(SETTLE_S)
+        quiet_ns = stage.clock.now_ns() - QUIET_NS
+        newest = stage.relay.newest_steering(LEANING_ROWS)
+        has_lost = not any(sent.leans for sent in newest if sent.at_ns > quiet_ns)
+        if fault.loses and not has_lost:
+            result.failures.append(f"{fault.name}: the policy kept the sticks")
+        if has_lost and not fault.loses:
+            result.stalls += 1  # a busy machine, or a loss that lasted: the flight ended in order
+        result.sent += stage.relay.forget()
+        if has_lost:
+            _engage(stage, transmitter)
+        for name, pid in pids.items():
+            usages[name].append(read_usage(pid))
+        if sum(result.faults.values()) % REPORT_EVERY == 0:
+            held = {name: usages[name][-1] for name in pids}
+            report(f"{sum(result.faults.values())} faults, {held}")
+    return usages
+
+
+def _engage(stage: Stage, transmitter: Transmitter) -> None:
+    """The pilot arms, and turns the switch off and on, as often as a busy machine needs."""
+    for _ in range(ENGAGE_TRIES):
+        transmitter.move(SWITCH, LOW_US)
+        stage.relay.set_mode("ALT_HOLD")
+        stage.relay.arm()
+        stage.observe(SETTLE_S)
+        transmitter.move(SWITCH, HIGH_US)
+        if stage.relay.wait_until(lambda: stage.relay.is_leaning(LEANING_ROWS), ENGAGE_S):
+            return
+    raise StageError("the policy did not get the sticks by the switch")
+
+
+def _lost(recording: Path, result: SoakResult) -> list[str]:
+    """Whatever the recording lacks."""
+    meta = json.loads((recording / "meta.json").read_text())
+    failures = [
+        f"{key} is {meta[key]}"
+        for key in ("ticks_dropped", "frames_dropped", "packets_dropped")
+        if meta[key] != 0
+    ]
+    if not meta["finished"]:
+        failures.append("the recording is not finished")
+    logged = _count_overrides(recording / "link.tlog")
+    if logged != result.sent:
+        failures.append(f"link.tlog has {logged} of {result.sent} overrides")
+    return failures
+
+
+def _count_overrides(path: Path) -> int:
+    log = mavutil.mavlogfile(str(path))
+    count = 0
+    while log.recv_match(type="RC_CHANNELS_OVERRIDE") is not None:
+        count += 1
+    log.f.close()
+    return count
+
+
+def make_summary(result: SoakResult) -> str:
+    """The result for a person, a few lines."""
+    lines = [f"{result.minutes:g} minutes, {result.sent} overrides and releases"]
+    lines += [f"{count:5d} times {name}" for name, count in sorted(result.faults.items())]
+    lines += [
+        f"{name}: {grown.rss_mb:+.1f} MB, {grown.descriptors:+d} descriptors, "
+        f"{grown.threads:+d} threads"
+        for name, grown in result.growth.items()
+    ]
+    if result.stalls:
+        lines.append(f"{result.stalls} times a fault to be survived ended the flight in order")
+    return "\n".join([*lines, *(f"FAILED: {failure}" for failure in result.failures)])

@@ -1,0 +1,111 @@
+"""Arming, sticks, landing and a forced reboot as measured on ArduCopter."""
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from helpers.contract_peers import ARM, FORCE, REBOOT_FORCE, is_armed, last, named
+from helpers.copter_companion import ACCEPTED, ALT_HOLD, FAILED, STABILIZE
+
+REBOOT = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+
+
+def arming_refusal(companion):
+    companion.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 1, *[0] * 6))
+    return companion.wait("STATUSTEXT", where=lambda m: m.text.startswith("Arm:")).text
+
+
+def test_arming_is_refused_with_throttle_up(armable):
+    armable.get_ready(STABILIZE)
+    armable.hold(0.1, thr=1300)
+
+    assert arming_refusal(armable) == "Arm: Throttle too high"
+
+
+@pytest.mark.parametrize(
+    ("sticks", "text"),
+    [
+        ({"roll": 1700}, "Arm: Roll (RC1) is not neutral"),
+        ({"pitch": 1300}, "Arm: Pitch (RC2) is not neutral"),
+        ({"yaw": 1700}, "Arm: Yaw (RC4) is not neutral"),
+    ],
+)
+def test_arming_is_refused_off_neutral(armable, sticks, text):
+    armable.get_ready(ALT_HOLD)
+    armable.hold(0.1, thr=1000, **sticks)
+
+    assert arming_refusal(armable) == text
+
+
+def test_arming_twice_is_accepted(armable):
+    armable.get_ready(ALT_HOLD)
+
+    assert armable.arm() == ACCEPTED
+    armable.hold(0.5, thr=1000)
+    assert armable.arm() == ACCEPTED
+
+
+@pytest.mark.parametrize(("throttle_us", "disarms"), [(1000, True), (1500, False)])
+def test_who_does_not_take_off_is_disarmed_with_the_throttle_down(armable, throttle_us, disarms):
+    armable.set_param("DISARM_DELAY", 1)
+    armable.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
+    armable.get_ready(ALT_HOLD)
+    assert armable.arm() == ACCEPTED
+    armable.hold(0.3, thr=throttle_us)
+
+    armed = [is_armed(m) for m in named(armable.hold(2.5, thr=throttle_us), "HEARTBEAT")]
+
+    assert armed[0]
+    assert armed[-1] != disarms
+
+
+def test_a_reboot_is_refused_while_armed(armable):
+    armable.get_ready(ALT_HOLD)
+    assert armable.arm() == ACCEPTED
+
+    assert armable.command(REBOOT, 1) == FAILED
+
+
+@pytest.mark.parametrize(
+    ("sticks", "field", "expected_deg"),
+    [
+        ({"roll": 1700}, "roll", 11.26),
+        ({"pitch": 1700}, "pitch", 11.27),
+        ({"roll": 1300}, "roll", -11.26),
+        ({"yaw": 1700}, "yawspeed", 77.8),
+    ],
+)
+def test_sticks_lean_and_turn_as_measured(flying, sticks, field, expected_deg):
+    attitudes = named(flying.hold(1.5, **sticks), "ATTITUDE")[-10:]
+
+    mean_rad = sum(getattr(m, field) for m in attitudes) / len(attitudes)
+    assert math.degrees(mean_rad) == pytest.approx(expected_deg, rel=0.04)
+
+
+def test_throttle_is_a_climb_rate_in_alt_hold(flying):
+    states = named(flying.hold(2.5, thr=1700), "LOCAL_POSITION_NED")[-10:]
+
+    assert -sum(m.vz for m in states) / len(states) == pytest.approx(0.64, abs=0.05)
+
+
+def test_in_flight_only_a_forced_disarm_works(expendable):
+    assert expendable.command(ARM, 0) == FAILED
+    assert expendable.command(ARM, 0, FORCE, system_id=42) == ACCEPTED
+    assert is_armed(last(expendable.seen, "HEARTBEAT"))
+    assert not is_armed(last(expendable.advance(0.5), "HEARTBEAT"))
+
+
+def test_a_forced_reboot_in_flight_leaves_it_disarmed_in_its_boot_mode(expendable):
+    before_ms = last(expendable.seen, "ATTITUDE").time_boot_ms
+
+    assert expendable.command(REBOOT, 1, 0, 0, 0, 0, REBOOT_FORCE) == ACCEPTED
+    expendable.advance(1.0)
+    expendable.seen.clear()
+    heartbeat = expendable.wait("HEARTBEAT", timeout_s=20.0)
+    assert expendable.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 20) == ACCEPTED
+    after_ms = expendable.wait("ATTITUDE", timeout_s=10.0).time_boot_ms
+
+    assert not is_armed(heartbeat)
+    assert heartbeat.custom_mode == STABILIZE
+    assert after_ms < before_ms

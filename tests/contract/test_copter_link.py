@@ -1,0 +1,207 @@
+"""ArduCopter's side of a link as measured on the firmware: identity, streams, clock, parameters."""
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from helpers.contract_peers import named
+from helpers.copter_companion import ACCEPTED, ALT_HOLD, DENIED, UNSUPPORTED
+
+
+def rate_hz(messages):
+    """By the messages' own stamps: a busy computer delays their arrival."""
+    stamps_s = [
+        m.time_usec / 1e6 if hasattr(m, "time_usec") else m.time_boot_ms / 1e3 for m in messages
+    ]
+    return (len(stamps_s) - 1) / (stamps_s[-1] - stamps_s[0])
+
+
+def test_heartbeat_names_a_quadrotor_with_ardupilot(companion):
+    heartbeat = companion.wait("HEARTBEAT")
+
+    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
+    assert heartbeat.type == mav.MAV_TYPE_QUADROTOR
+    assert heartbeat.autopilot == mav.MAV_AUTOPILOT_ARDUPILOTMEGA
+    assert heartbeat.get_msgbuf()[0] == 0xFD
+
+
+def test_the_version_comes_on_request(companion):
+    result = companion.command(
+        mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 100_000
+    )
+    version = companion.wait("AUTOPILOT_VERSION")
+
+    assert result == ACCEPTED
+    assert version.flight_sw_version >> 16 == 4 << 8 | 7
+    assert version.capabilities & mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+
+
+@pytest.mark.parametrize(
+    ("asked_hz", "got_us"),
+    [(100, 10_000), (150, 6_000), (200, 5_000), (250, 4_000), (320, 3_000), (7, 142_000)],
+)
+def test_intervals_are_cut_to_whole_milliseconds(companion, asked_hz, got_us):
+    assert companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, asked_hz) == ACCEPTED
+
+    companion.send(
+        mav.MAVLink_command_long_message(
+            1, 1, mav.MAV_CMD_GET_MESSAGE_INTERVAL, 0, mav.MAVLINK_MSG_ID_ATTITUDE, *[0] * 6
+        )
+    )
+    interval = companion.wait("MESSAGE_INTERVAL")
+
+    assert (interval.message_id, interval.interval_us) == (mav.MAVLINK_MSG_ID_ATTITUDE, got_us)
+
+
+@pytest.mark.parametrize(
+    "message_id",
+    [
+        mav.MAVLINK_MSG_ID_ATTITUDE,
+        mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+        mav.MAVLINK_MSG_ID_HIGHRES_IMU,
+        mav.MAVLINK_MSG_ID_RAW_IMU,
+        mav.MAVLINK_MSG_ID_SCALED_IMU2,
+        mav.MAVLINK_MSG_ID_RC_CHANNELS,
+        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
+    ],
+)
+def test_state_comes_at_the_rate_asked_for_by_its_own_stamps(companion, message_id):
+    companion.stream(message_id, 100)
+    name = mav.mavlink_map[message_id].msgname
+    companion.wait(name)
+
+    assert rate_hz(named(companion.advance(0.6), name)) == pytest.approx(100.0, rel=0.02)
+
+
+@pytest.mark.parametrize("asked_hz", [400, 500, 1000])
+def test_rates_above_the_cap_are_denied_and_the_old_one_stays(companion, asked_hz):
+    companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 50)
+
+    assert companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, asked_hz) == DENIED
+    attitudes = named(companion.advance(0.6), "ATTITUDE")
+
+    assert rate_hz(attitudes) == pytest.approx(50.0, rel=0.05)
+
+
+def test_a_denied_rate_says_why(companion):
+    companion.send(
+        mav.MAVLink_command_long_message(
+            1, 1, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, mav.MAVLINK_MSG_ID_ATTITUDE, 1000, *[0] * 5
+        )
+    )
+
+    text = companion.wait("STATUSTEXT", where=lambda m: "Requested rate" in m.text)
+
+    assert "too fast" in text.text
+
+
+@pytest.mark.parametrize(
+    "message_id", [mav.MAVLINK_MSG_ID_ODOMETRY, mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED_COV, 60_000]
+)
+def test_unknown_messages_are_denied(companion, message_id):
+    assert companion.stream(message_id, 10) == DENIED
+
+
+def test_interval_with_a_third_parameter_is_denied(companion):
+    command = mav.MAV_CMD_SET_MESSAGE_INTERVAL
+    assert companion.command(command, mav.MAVLINK_MSG_ID_ATTITUDE, 10_000, 1.0) == DENIED
+
+
+def test_interval_minus_one_stops(companion):
+    companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+    companion.wait("ATTITUDE")
+
+    companion.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, -1)
+
+    assert not [m for m in companion.advance(0.5) if m.get_type() == "ATTITUDE"]
+
+
+def test_data_streams_overrule_intervals(companion):
+    companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+
+    companion.send(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 25, 1))
+    companion.advance(0.1)
+    attitudes = named(companion.advance(1.0), "ATTITUDE")
+    companion.send(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 0, 0))
+
+    assert rate_hz(attitudes) == pytest.approx(25.0, rel=0.05)
+
+
+@pytest.mark.parametrize("number", [410, 510, 511, 512, 520, 60_000])
+def test_every_command_is_acknowledged(companion, number):
+    assert companion.command(number, 0, 0, 0.5) in range(10)
+
+
+def test_unknown_commands_are_unsupported(companion):
+    assert companion.command(65_000) == UNSUPPORTED
+
+
+def test_commands_are_taken_from_any_system(companion):
+    number = mav.MAV_CMD_SET_MESSAGE_INTERVAL
+    result = companion.command(number, mav.MAVLINK_MSG_ID_ATTITUDE, 10_000, system_id=42)
+    assert result == ACCEPTED
+
+
+def test_command_int_is_acknowledged_to_its_sender(companion):
+    companion.send(
+        mav.MAVLink_command_int_message(
+            1, 1, 0, mav.MAV_CMD_DO_SET_MODE, 0, 0, 1, ALT_HOLD, 0, 0, 0, 0, 0
+        ),
+        system_id=42,
+    )
+
+    ack = companion.wait("COMMAND_ACK")
+
+    assert (ack.result, ack.target_system, ack.target_component) == (ACCEPTED, 42, 191)
+
+
+@pytest.mark.parametrize("system_id", [255, 42, 1])
+def test_timesync_echoes_the_request_to_anybody(companion, system_id):
+    companion.send(mav.MAVLink_timesync_message(0, 123_456_789_012), system_id=system_id)
+
+    answer = companion.wait("TIMESYNC", where=lambda m: m.tc1 != 0)
+
+    assert answer.ts1 == 123_456_789_012
+    assert answer.tc1 > 0
+    assert answer.tc1 % 1000 == 0
+
+
+def test_timesync_and_telemetry_share_a_clock(companion):
+    companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
+    companion.send(mav.MAVLink_timesync_message(0, 1))
+    answer = companion.wait("TIMESYNC", where=lambda m: m.tc1 != 0)
+
+    attitude = companion.wait("ATTITUDE")
+
+    assert attitude.time_boot_ms - answer.tc1 / 1e6 == pytest.approx(10.0, abs=50.0)
+
+
+def test_params_are_read_and_written(companion):
+    assert companion.get_param("RC_OVERRIDE_TIME") == 3.0
+    assert companion.set_param("RC_OVERRIDE_TIME", 0.5) == 0.5
+    assert companion.get_param("RC_OVERRIDE_TIME") == 0.5
+
+
+def test_all_params_come_with_their_index(companion):
+    """A UDP link may lose some of a thousand in a row: those are asked for by their index."""
+    companion.send(mav.MAVLink_param_request_list_message(1, 1))
+    count = companion.wait("PARAM_VALUE").param_count
+    while companion.find("PARAM_VALUE", 0.5) is not None:
+        pass
+    seen = {m.param_index for m in named(companion.seen, "PARAM_VALUE")}
+    missing = set(range(count)) - seen
+    assert len(missing) <= count // 20
+
+    for index in missing:
+        companion.send(mav.MAVLink_param_request_read_message(1, 1, b"", index))
+        assert companion.wait("PARAM_VALUE").param_index == index
+
+
+@pytest.mark.parametrize("mission_type", [0, 1, 2])
+def test_there_is_no_mission(companion, mission_type):
+    companion.send(mav.MAVLink_mission_request_list_message(1, 1, mission_type))
+
+    count = companion.wait("MISSION_COUNT")
+
+    # Home is the first item of the mission once it is known: with a position, or after arming.
+    assert count.count <= (1 if mission_type == 0 else 0)
+    assert count.mission_type == mission_type

@@ -1,0 +1,162 @@
+"""A ground station or companion computer of an ArduCopter: overrides, modes, how to fly up."""
+
+import math
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from helpers.contract_peers import ARM, GCS, Companion, named
+
+STABILIZE, ACRO, ALT_HOLD, GUIDED, LOITER, RTL, LAND = 0, 1, 2, 4, 5, 6, 9
+POSHOLD, BRAKE, GUIDED_NOGPS = 16, 17, 20
+ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
+    mav.MAV_RESULT_ACCEPTED,
+    mav.MAV_RESULT_DENIED,
+    mav.MAV_RESULT_UNSUPPORTED,
+    mav.MAV_RESULT_FAILED,
+)
+VELOCITY_MASK = 1479
+HEIGHT_M = 8.0
+TOO_LOW_M, TOO_HIGH_M = 2.0, 15.0  # against the wanted height; a descent takes its time
+STILL_MPS = 0.25
+
+
+class CopterCompanion(Companion):
+    """As `Companion`, for ArduCopter."""
+
+    def set_mode(self, number: int) -> int:
+        return self.command(mav.MAV_CMD_DO_SET_MODE, 1, number)
+
+    def override(self, *channels_us: int, system_id: int = GCS, target: int = 1) -> None:
+        """RC_CHANNELS_OVERRIDE; channels 1-8 that are not given are ignored."""
+        primary = (*channels_us, *[65535] * (8 - len(channels_us)))[:8]
+        aux = (*channels_us[8:], *[0] * (10 - len(channels_us[8:])))
+        message = mav.MAVLink_rc_channels_override_message(target, 0, *primary, *aux)
+        self.send(message, system_id=system_id)
+
+    def hold(
+        self,
+        seconds: float,
+        *,
+        roll: int = 1500,
+        pitch: int = 1500,
+        thr: int = 1500,
+        yaw: int = 1500,
+    ) -> list[Any]:
+        """Hold the sticks by overrides at 50 Hz; what came in meanwhile."""
+        messages = []
+        for _ in range(round(seconds * 50.0)):
+            self.override(roll, pitch, thr, yaw)
+            messages += self.advance(0.02)
+        return messages
+
+    def channels(self) -> tuple[int, ...]:
+        """Channels that the vehicle uses; needs RC_CHANNELS to be streamed."""
+        message = self.wait("RC_CHANNELS")
+        return tuple(getattr(message, f"chan{n}_raw") for n in range(1, 17))
+
+    def get_ready(self, mode: int, *, needs_position: bool = False) -> None:
+        """Wait until arming is possible, with throttle down and the rest centred; do not arm."""
+        assert self.set_mode(mode) == ACCEPTED
+        self.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 20)
+        for _ in range(300):
+            params = (mav.MAVLINK_MSG_ID_SYS_STATUS, 0, 0, 0, 0, 0, 0)
+            self.send(mav.MAVLink_command_long_message(1, 1, 512, 0, *params))
+            messages = self.hold(0.2, thr=1000)
+            has_position = bool(named(messages, "LOCAL_POSITION_NED"))
+            health = [m.onboard_control_sensors_health for m in named(messages, "SYS_STATUS")]
+            is_healthy = health and health[-1] & mav.MAV_SYS_STATUS_PREARM_CHECK
+            if is_healthy and (has_position or not needs_position):
+                return
+        raise AssertionError(f"the vehicle does not get ready to arm: {self.texts()}")
+
+    def fly_up(self, mode: int = ALT_HOLD, height_m: float = HEIGHT_M) -> None:
+        """Be at a height, level and still, in this mode; neutral sticks have just been sent."""
+        for message_id in (
+            mav.MAVLINK_MSG_ID_ATTITUDE,
+            mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+            mav.MAVLINK_MSG_ID_RC_CHANNELS,
+        ):
+            self.stream(message_id, 50)
+        self.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
+        self.override(1500, 1500, 1500, 1500)
+        if self.in_the_air:
+            assert self.set_mode(GUIDED) == ACCEPTED
+        else:
+            self._take_off(height_m)
+        self._settle(height_m)
+        assert self.set_mode(mode) == ACCEPTED
+
+    def texts(self) -> list[str]:
+        """Status texts since ``seen`` was cleared."""
+        return [m.text for m in named(self.seen, "STATUSTEXT")]
+
+    def _take_off(self, height_m: float) -> None:
+        self.get_ready(GUIDED, needs_position=True)
+        assert self.arm() == ACCEPTED, self.texts()
+        assert self.command(mav.MAV_CMD_NAV_TAKEOFF, *[0] * 6, height_m) == ACCEPTED
+        for _ in range(150):
+            if any(m.z < 1.0 - height_m for m in named(self.hold(0.1), "LOCAL_POSITION_NED")):
+                return
+        raise AssertionError("the vehicle does not take off")
+
+    def _settle(self, height_m: float) -> None:
+        for _ in range(400):
+            self.override(1500, 1500, 1500, 1500)
+            for state in named(self.advance(0.05), "LOCAL_POSITION_NED")[-1:]:
+                too_low_m = height_m + state.z
+                speeds_mps = (abs(state.vx), abs(state.vy), abs(state.vz))
+                is_there = -TOO_HIGH_M < too_low_m < TOO_LOW_M
+                if is_there and max(speeds_mps) < STILL_MPS:
+                    return
+                up_mps = 0.0 if is_there else max(-2.5, min(2.5, too_low_m))
+                self.send(velocity(z=-up_mps))
+        raise AssertionError("the vehicle does not come to rest")
+
+    def come_down(self) -> None:
+        """As before, and the estimate of the height has got over the impact."""
+        super().come_down()
+        self.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 20)
+        for _ in range(15):
+            if all(abs(m.vz) < STILL_MPS for m in named(self.advance(1.0), "LOCAL_POSITION_NED")):
+                return
+
+    def restore(self) -> None:
+        """Leave the vehicle in the air in BRAKE, or on the ground with its receiver's sticks."""
+        flies = self.in_the_air
+        if flies:
+            self.set_mode(BRAKE)
+        super().restore()
+        if not flies:
+            self.command(ARM, 0)
+        self.override(*[0] * 8)
+        self.advance(0.02)
+
+
+def velocity(
+    x: float = 0.0,
+    y: float = 0.0,
+    z: float = 0.0,
+    *,
+    yaw_degps: float = 0.0,
+    frame: int = mav.MAV_FRAME_LOCAL_NED,
+) -> Any:
+    """SET_POSITION_TARGET_LOCAL_NED with a velocity in m/s and a yaw rate in deg/s alone."""
+    return mav.MAVLink_set_position_target_local_ned_message(
+        0,
+        1,
+        1,
+        frame,
+        VELOCITY_MASK,
+        0,
+        0,
+        0,
+        x,
+        y,
+        z,
+        0,
+        0,
+        0,
+        0,
+        math.radians(yaw_degps),
+    )

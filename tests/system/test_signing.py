@@ -1,0 +1,53 @@
+"""MAVLink 2 signing, in real processes, against a vehicle that signs by pymavlink."""
+
+import secrets
+from pathlib import Path
+
+import pytest
+
+from sitl.faults.stage import staged
+
+pytestmark = pytest.mark.system
+
+FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy", "scripted:hover")
+
+
+def make_key(folder: Path, name: str = "key") -> str:
+    path = folder / name
+    path.touch(mode=0o600)
+    path.write_text(secrets.token_hex(32) + "\n")
+    return str(path)
+
+
+def test_a_signed_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    key = make_key(tmp_path)
+    recording = tmp_path / "recording"
+    flags = ("--signing-key-file", key, "--duration", "4", "--record", str(recording))
+    with staged(tmp_path, "--signing-key-file", key, renders=False) as stage:
+        status, output = stage.fly(*FLY, *flags)
+    assert status == 0, output
+    assert stage.vehicle_report()["max_altitude_m"] > 0.5
+    assert stage.report()["link"]["refused_signatures"] == 0
+    assert all(sent.message.get_signed() for sent in stage.relay.sent)
+    assert list((tmp_path / "state").rglob("signing/*.json"))
+    digits = Path(key).read_text().strip()
+    written = [path for path in recording.rglob("*") if path.is_file()]
+    assert not [path for path in written if digits.encode() in path.read_bytes()]
+    assert digits not in output
+
+
+@pytest.mark.parametrize("ours", ["none", "another"])
+def test_a_vehicle_that_signs_with_another_key_is_recognised(
+    ours: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    flags = ("--signing-key-file", make_key(tmp_path, "ours")) if ours == "another" else ()
+    key = make_key(tmp_path)
+    with staged(tmp_path, "--signing-key-file", key, renders=False) as stage:
+        stage.start(*FLY, *flags, "--connect-timeout", "10", "--duration", "10")
+        told = "with another key than" if flags else "the vehicle signs its packets"
+        assert stage.wait_for(told)
+        stage.kill_group(2)
+        stage.end()
+    assert stage.vehicle_report()["armed_s"] == 0

@@ -1,0 +1,53 @@
+"""The end of a flight as its observers tell it."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from helpers.fakes import FakeClock
+from mavbridge.config.flight import FlyConfig
+from mavbridge.flight.observers import FlightObservers
+from policy.contract import Contract
+from policy.engines.executable import ExecutionSettings, make_numpy_executable
+
+
+class Hovering:
+    contract = Contract(arrays="numpy")
+
+    def predict(
+        self, image: np.ndarray, state: np.ndarray, history: np.ndarray, steps: int
+    ) -> np.ndarray:
+        return np.zeros((1, self.contract.horizon, 4), np.float32)
+
+
+def observers(report: Path, said: io.StringIO) -> FlightObservers:
+    executable = make_numpy_executable(
+        Hovering(), ExecutionSettings(name="hovering", dual_rate=False)
+    )
+    console = Console(file=said, width=200)
+    config = FlyConfig(report=report)
+    return FlightObservers(config, executable, clock=FakeClock(), console=console)
+
+
+def test_a_report_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    said = io.StringIO()
+    observers(tmp_path, said).finish(None, "ardupilot")
+    assert f"--report {tmp_path}: Is a directory" in said.getvalue()
+
+
+def test_the_terminal_is_given_back_even_if_the_report_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_report: object) -> None:
+        raise RuntimeError("a bug")
+
+    closed: list[float] = []
+    watching = observers(tmp_path / "report.json", io.StringIO())
+    monkeypatch.setattr(watching.screen, "show_report", fail)
+    monkeypatch.setattr(watching.screen, "close", closed.append)
+    with pytest.raises(RuntimeError, match="a bug"):
+        watching.finish(None, "ardupilot")
+    assert closed

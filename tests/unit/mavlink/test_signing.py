@@ -1,0 +1,176 @@
+"""Signatures against pymavlink's own, which is the other side here, and replays refused."""
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from helpers.wire import ARDUPILOT
+from mavbridge.mavlink.codec.messages import Endpoint, ParamWrite
+from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.codec.signing import EPOCH_NS, TICK_NS, Signing, SigningState
+
+KEY, OTHER_KEY = bytes(range(32)), bytes(32)
+NOW_NS = EPOCH_NS + 350_000_000 * 10**9
+NOW_TICKS = (NOW_NS - EPOCH_NS) // TICK_NS
+MINUTE_TICKS = 60 * 10**9 // TICK_NS
+TARGET = Endpoint(1, 1)
+
+
+class TimeOfDay:
+    def __init__(self, unix_ns):
+        self.unix_ns = unix_ns
+
+    def __call__(self):
+        return self.unix_ns
+
+
+def make_codec(key=KEY, *, day=None, state=None):
+    if key is None:
+        signing = None
+    else:
+        signing = Signing(key, unix_ns=day or TimeOfDay(NOW_NS), state=state or SigningState())
+    return Codec(source_system=255, source_component=191, signing=signing)
+
+
+def make_vehicle(key=KEY, *, ticks=NOW_TICKS, component=1, link_id=0):
+    vehicle = dialect.MAVLink(None, srcSystem=1, srcComponent=component)
+    vehicle.robust_parsing = True
+    if key is not None:
+        vehicle.signing.secret_key = key
+        vehicle.signing.timestamp = ticks
+        vehicle.signing.link_id = link_id
+        vehicle.signing.sign_outgoing = True
+    return vehicle
+
+
+def heartbeat(vehicle):
+    return bytes(vehicle.heartbeat_encode(2, 3, 0, 0, 4).pack(vehicle))
+
+
+def attitude(vehicle):
+    message = vehicle.attitude_quaternion_encode(1000, 1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3)
+    return bytes(message.pack(vehicle))
+
+
+def names(codec, *packets):
+    return [message.name for packet in packets for message in codec.decode_datagram(packet)]
+
+
+def timestamp(packet):
+    return int.from_bytes(packet[-12:-6], "little")
+
+
+def test_what_we_sign_is_what_pymavlink_accepts():
+    codec, vehicle = make_codec(), make_vehicle()
+    packets = [
+        codec.encode_heartbeat(),
+        codec.encode_override(TARGET, (1500, 1500, 1500, 1500), ARDUPILOT),
+        codec.encode_release(TARGET, ARDUPILOT),
+        codec.encode_request(TARGET, ParamWrite("RC_OVERRIDE_TIME", 0.5, 9)),
+        codec.encode_timesync(5),
+    ]
+    messages = [vehicle.decode(bytearray(packet)) for packet in packets]
+    assert [message.get_seq() for message in messages] == list(range(5))
+    assert all(message.get_signed() for message in messages)
+    assert messages[1].chan1_raw == 1500
+    assert messages[2].chan1_raw == 0
+    assert vehicle.signing.sig_count == 5
+
+
+def test_pymavlink_refuses_what_another_key_signed():
+    packet = make_codec(OTHER_KEY).encode_heartbeat()
+    with pytest.raises(dialect.MAVError, match=r"[Ii]nvalid signature"):
+        make_vehicle().decode(bytearray(packet))
+
+
+def test_what_pymavlink_signs_is_accepted_on_the_fast_way_and_on_the_other():
+    codec, vehicle = make_codec(), make_vehicle()
+    packets = heartbeat(vehicle), attitude(vehicle)
+    assert names(codec, *packets) == ["HEARTBEAT", "ATTITUDE_QUATERNION"]
+    assert codec.signing.accepted == 2
+    assert codec.refused_signatures == 0
+
+
+def test_a_stream_of_bytes_is_judged_packet_by_packet():
+    codec, vehicle, stranger = make_codec(), make_vehicle(), make_vehicle(None)
+    data = heartbeat(vehicle) + attitude(stranger) + attitude(vehicle)
+    assert [message.name for message in codec.decode(data)] == ["HEARTBEAT", "ATTITUDE_QUATERNION"]
+    assert codec.signing.refused == {"unsigned": 1}
+
+
+@pytest.mark.parametrize("make", [heartbeat, attitude])
+def test_refused_are_unsigned_wrongly_signed_and_replayed_packets(make):
+    codec, vehicle = make_codec(), make_vehicle()
+    genuine, later = make(vehicle), make(vehicle)
+    assert names(codec, make(make_vehicle(None)), make(make_vehicle(OTHER_KEY))) == []
+    assert len(names(codec, genuine, later)) == 2
+    assert names(codec, genuine, later) == []
+    assert codec.signing.refused == {"unsigned": 1, "wrong key": 1, "replayed": 2}
+    assert codec.refused_signatures == 4
+
+
+def test_a_changed_packet_with_a_mended_checksum_is_refused():
+    packet = bytearray(heartbeat(make_vehicle()))
+    packet[12] ^= 1
+    crc_extra = dialect.MAVLink_heartbeat_message.crc_extra
+    crc = dialect.x25crc(bytes(packet[1:-15]) + bytes((crc_extra,))).crc
+    packet[-15:-13] = crc.to_bytes(2, "little")
+    assert names(make_codec(None), bytes(packet)) == ["HEARTBEAT"]
+    codec = make_codec()
+    assert names(codec, bytes(packet)) == []
+    assert codec.signing.refused == {"wrong key": 1}
+
+
+def test_each_component_and_link_has_timestamps_of_its_own():
+    codec = make_codec()
+    first = heartbeat(make_vehicle(ticks=NOW_TICKS + 100))
+    camera = heartbeat(make_vehicle(ticks=NOW_TICKS, component=100))
+    other_link = heartbeat(make_vehicle(ticks=NOW_TICKS, link_id=3))
+    assert len(names(codec, first, camera, other_link)) == 3
+    assert names(codec, heartbeat(make_vehicle(ticks=NOW_TICKS + 99))) == []
+
+
+def test_a_new_stream_may_lag_by_a_minute():
+    codec = make_codec()
+    late_ticks = NOW_TICKS - MINUTE_TICKS
+    assert names(codec, heartbeat(make_vehicle(ticks=late_ticks - 1))) == []
+    assert codec.signing.refused == {"clock behind": 1}
+    assert len(names(codec, heartbeat(make_vehicle(ticks=late_ticks)))) == 1
+
+
+def test_a_known_stream_goes_on_where_it_was_however_late_its_clock_is():
+    """A vehicle without GPS goes on counting from where its last flight has ended."""
+    days_ago = NOW_TICKS - 3 * 24 * 60 * MINUTE_TICKS
+    codec = make_codec(state=SigningState(0, {(0, 1, 1): days_ago}))
+    assert names(codec, heartbeat(make_vehicle(ticks=days_ago))) == []
+    assert len(names(codec, heartbeat(make_vehicle(ticks=days_ago + 1)))) == 1
+    assert codec.signing.refused == {"replayed": 1}
+    assert codec.signing.state.heard_ticks == {(0, 1, 1): days_ago + 1}
+
+
+def test_a_radio_may_report_its_status_unsigned():
+    codec, radio = make_codec(), make_vehicle(None)
+    assert names(codec, bytes(radio.radio_status_encode(1, 1, 1, 1, 1, 1, 1).pack(radio)))
+
+
+def test_our_timestamps_follow_the_clock_and_never_step_back():
+    day = TimeOfDay(NOW_NS)
+    codec = make_codec(day=day)
+    first, second = timestamp(codec.encode_heartbeat()), timestamp(codec.encode_heartbeat())
+    assert (first, second) == (NOW_TICKS, NOW_TICKS + 1)
+    day.unix_ns += 10**9
+    assert timestamp(codec.encode_heartbeat()) == NOW_TICKS + 10**9 // TICK_NS
+    day.unix_ns -= 3600 * 10**9
+    assert timestamp(codec.encode_heartbeat()) == NOW_TICKS + 10**9 // TICK_NS + 1
+
+
+def test_after_a_restart_with_an_earlier_clock_timestamps_go_on():
+    codec = make_codec(day=TimeOfDay(EPOCH_NS - 1), state=SigningState(NOW_TICKS + 500))
+    assert timestamp(codec.encode_heartbeat()) == NOW_TICKS + 501
+
+
+def test_without_a_key_signed_packets_are_read_and_noticed():
+    codec = make_codec(None)
+    assert names(codec, attitude(make_vehicle(None))) == ["ATTITUDE_QUATERNION"]
+    assert not codec.hears_signed
+    assert names(codec, attitude(make_vehicle())) == ["ATTITUDE_QUATERNION"]
+    assert codec.hears_signed

@@ -1,0 +1,107 @@
+"""Key files that are refused, and timestamps that outlive a process."""
+
+import json
+
+import pytest
+
+from helpers.fakes import FakeClock
+from mavbridge.core.errors import UserError
+from mavbridge.mavlink.settings import SigningFiles
+from mavbridge.mavlink.transport.signing_files import AHEAD_TICKS, SigningStore, read_key
+
+KEY = bytes(range(32))
+
+
+def write_key(folder, data=KEY, mode=0o600):
+    path = folder / "key"
+    path.write_bytes(data)
+    path.chmod(mode)
+    return path
+
+
+def make_store(folder, data=KEY):
+    files = SigningFiles(key_file=write_key(folder, data), state_folder=folder / "state")
+    return SigningStore(files, FakeClock())
+
+
+@pytest.mark.parametrize(
+    "data", [KEY, KEY.hex().encode(), b" " + KEY.hex().upper().encode() + b"\n"]
+)
+def test_a_key_is_32_bytes_or_64_hexadecimal_digits(data, tmp_path):
+    assert read_key(write_key(tmp_path, data)) == KEY
+
+
+@pytest.mark.parametrize("data", [b"", KEY[1:], KEY + b"\n", KEY.hex()[1:].encode(), b"g" * 64])
+def test_anything_else_is_no_key(data, tmp_path):
+    with pytest.raises(UserError, match=r"32 bytes or 64 hexadecimal digits; make one with"):
+        read_key(write_key(tmp_path, data))
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o610])
+def test_a_key_that_others_may_use_is_refused(mode, tmp_path):
+    with pytest.raises(UserError, match=r"may be used by others .*: chmod 600"):
+        read_key(write_key(tmp_path, mode=mode))
+
+
+def test_a_key_that_is_not_there_is_refused_with_the_way_to_make_one(tmp_path):
+    with pytest.raises(UserError, match=r"No such file.*openssl rand -hex 32"):
+        read_key(tmp_path / "key")
+    with pytest.raises(UserError, match="Is a directory"):
+        read_key(tmp_path)
+
+
+def test_timestamps_go_on_after_a_restart_and_after_a_kill(tmp_path):
+    with (store := make_store(tmp_path)) as first:
+        saved = json.loads(store.path.read_text())["sent_ticks"]
+        assert saved == AHEAD_TICKS  # before anything is sent
+    with make_store(tmp_path) as second:
+        assert second.state.sent_ticks >= saved
+    assert first.state.sent_ticks < second.state.sent_ticks
+
+
+def test_each_key_has_a_state_of_its_own_that_does_not_tell_it(tmp_path):
+    with (store := make_store(tmp_path)), (other := make_store(tmp_path, bytes(32))):
+        assert store.path != other.path
+        assert KEY.hex() not in store.path.name + store.path.read_text()
+
+
+def test_what_was_heard_is_kept(tmp_path):
+    with (store := make_store(tmp_path)) as signing:
+        signing._heard[(0, 1, 1)] = 77
+    with make_store(tmp_path) as again:
+        assert dict(again.state.heard_ticks) == {(0, 1, 1): 77}
+    assert store.problem is None
+
+
+def test_a_damaged_state_is_told(tmp_path):
+    with (store := make_store(tmp_path)):
+        pass
+    for text in ("", "[]", '{"sent_ticks": 1}', '{"sent_ticks": 1, "heard_ticks": {"1": 2}}'):
+        store.path.write_text(text)
+        with pytest.raises(UserError, match=r"timestamps of signed packets .* remove it"):
+            make_store(tmp_path)
+
+
+def test_a_folder_that_cannot_be_written_is_told_and_survived(tmp_path):
+    (tmp_path / "state").write_text("a file where the folder should be")
+    with pytest.raises(UserError, match="Not a directory"):
+        make_store(tmp_path)
+    (tmp_path / "state").unlink()
+    store = make_store(tmp_path)
+    (tmp_path / "state").write_text("")
+    with store:
+        assert "cannot be kept" in store.problem
+
+
+def test_the_thread_saves_and_ends(tmp_path):
+    store = make_store(tmp_path)
+    with store:
+        assert store._thread.is_alive()
+        assert store._thread.name == "mavbridge-signing"
+    assert not store._thread.is_alive()
+
+
+def test_the_key_is_no_setting(tmp_path):
+    files = SigningFiles(key_file=write_key(tmp_path), state_folder=tmp_path)
+    assert KEY.hex() not in repr(files)
+    assert repr(KEY) not in repr(files)
