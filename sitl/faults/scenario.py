@@ -13,9 +13,10 @@ from sitl.faults.stage import CATALOGUE
 from sitl.faults.steps import Step, make, make_step
 from sitl.vehicle.config import AutopilotName
 
-Outcome = Literal["loses", "keeps", "refused"]
-"""The policy loses the sticks until the next explicit act, keeps them, or never gets them."""
-EXITS: dict[Outcome, list[int]] = {"loses": [4], "keeps": [0], "refused": [2]}
+Outcome = Literal["loses", "keeps", "either", "refused"]
+"""The policy loses the sticks until the next explicit act, keeps them, either of these as chance
+has it, or never gets them."""
+EXITS: dict[Outcome, list[int]] = {"loses": [4], "keeps": [0], "either": [0, 4], "refused": [2]}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,8 +56,8 @@ def find_failures(
     if scenario.outcome == "refused":
         if report["armed_s"] > 0 or any(row.leans for row in sent):
             failures.append("it flew")
-    elif scenario.outcome == "keeps":
-        if not leans:
+    elif scenario.outcome in ("keeps", "either"):
+        if not leans and scenario.outcome == "keeps":
             failures.append("the policy has lost the sticks")
     else:
         variant = verdict.variant
