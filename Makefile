@@ -16,7 +16,10 @@ PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist loadfile
 
-.PHONY: fly check test lint bench faults fuzz soak clean
+# Modules whose mutants are tried, as in MODULES=mavbridge/gate/gate.py; none = all of tests/mutation.toml.
+MODULES ?=
+
+.PHONY: fly check test lint bench faults fuzz mutants soak clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -57,6 +60,9 @@ test: .venv-peers/installed check  ## all of lint, then every test
 
 bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
 	$(BIN)/python -m benchmarks.compare --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
+
+mutants: $(VENV)/installed  ## small changes of the gate, each of which a test must notice; not part of test
+	$(BIN)/python -m benchmarks.mutants $(MODULES)
 
 faults: $(VENV)/installed  ## every fault of the catalogue with every vehicle; writes docs/faults.md
 	$(BIN)/python -m sitl faults --out docs/faults.md

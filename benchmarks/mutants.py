@@ -219,21 +219,23 @@ def _parts(code: CodeType) -> Iterator[CodeType]:
 
 
 def _report(verdicts: dict[str, Verdicts], reasons: dict[str, dict[str, str]]) -> bool:
-    """Print a row for each module, and the survivors; returns whether each has a reason."""
+    """Print a row for each module, and the survivors; returns whether each has a reason.
+
+    A reason counts for every mutant whose name begins with its key.
+    """
     is_good = True
     for module, found in verdicts.items():
-        known = reasons.get(module, {})
-        unknown = sorted(set(found.survived) - set(known))
-        total = len(found.killed) + len(found.survived)
-        excused = len(found.survived) - len(unknown)
+        keys = list(reasons.get(module, {}))
+        unknown = [n for n in sorted(found.survived) if not any(n.startswith(k) for k in keys)]
+        idle = [k for k in keys if not any(n.startswith(k) for n in found.survived)]
+        counts = (len(found.killed), len(found.survived) - len(unknown), len(unknown))
         sys.stdout.write(
-            f"{module}: {total} mutants, {len(found.killed)} killed, {excused} with a reason\n"
+            f"{module}: {sum(counts)} mutants, {counts[0]} killed, {counts[1]} with a reason, "
+            f"{counts[2]} without\n"
         )
-        for name in unknown:
-            sys.stdout.write(f"  SURVIVED {name}\n")
-        for name in sorted(set(known) - set(found.survived)):
-            sys.stdout.write(f"  has a reason, but did not survive: {name}\n")
-        is_good = is_good and set(known) == set(found.survived)
+        sys.stdout.writelines(f"  SURVIVED {name}\n" for name in unknown)
+        sys.stdout.writelines(f"  reason of none that survives: {key}\n" for key in idle)
+        is_good = is_good and not unknown and not idle
     return is_good
 
 

@@ -41,7 +41,7 @@ def mutants_of(source: str) -> Iterator[Mutant]:
     seen: dict[str, int] = {}
     for scope, path, node in _walk(tree, (), "", is_inside=False):
         for changed in _changes(node):
-            name = f"{scope}: {_shown(node)} -> {_shown(changed)}"
+            name = f"{scope}: {_difference(node, changed)}"
             seen[name] = seen.get(name, 0) + 1
             if seen[name] > 1:
                 name = f"{name} #{seen[name]}"
@@ -66,6 +66,8 @@ def _walk(
         for index, child in children:
             if not isinstance(child, ast.AST) or _is_text(child):
                 continue
+            if isinstance(child, ast.Assign) and isinstance(node, ast.ClassDef):
+                continue  # the values of an enumeration
             inner, inside = scope, is_inside
             if isinstance(child, ast.FunctionDef | ast.ClassDef) and not is_inside:
                 inner = f"{scope}.{child.name}".lstrip(".")
@@ -103,6 +105,15 @@ def _replaced(tree: ast.Module, path: _Path, changed: ast.AST) -> ast.Module:
     else:
         getattr(node, field)[index] = changed
     return ast.fix_missing_locations(whole)
+
+
+def _difference(node: ast.AST, changed: ast.AST) -> str:
+    if isinstance(node, ast.Call) and isinstance(changed, ast.Call):
+        kept = {keyword.arg for keyword in changed.keywords}
+        for keyword in node.keywords:
+            if keyword.arg not in kept:
+                return f"{ast.unparse(node.func)}(...) without {ast.unparse(keyword)}"
+    return f"{_shown(node)} -> {_shown(changed)}"
 
 
 def _shown(node: ast.AST) -> str:
