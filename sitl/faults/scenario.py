@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sitl import UsageError
-from sitl.faults.carriers import CarrierName
 from sitl.faults.record import Receiver
-from sitl.faults.stage import CATALOGUE
-from sitl.faults.steps import Step, make, make_step
+from sitl.faults.stage.carriers import CarrierName
+from sitl.faults.stage.stage import CATALOGUE
+from sitl.faults.steps.common import Step, make, make_step
 from sitl.vehicle.config import AutopilotName
 
 Outcome = Literal["loses", "keeps", "either", "refused"]

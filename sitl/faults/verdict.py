@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 
 from sitl.faults.record import Aftermath, VehicleReport, aftermath
-from sitl.faults.relay import Sent
 from sitl.faults.scenario import Scenario, Variant
-from sitl.faults.stage import Stage
+from sitl.faults.stage.relay import Sent
+from sitl.faults.stage.stage import Stage
 
 
 @dataclass(kw_only=True)

@@ -6,8 +6,8 @@ import tty
 import pytest
 
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock
-from sitl.faults.carriers import SerialCarrier
-from sitl.faults.link import FaultyLink, LinkFaults
+from sitl.faults.stage.carriers import SerialCarrier
+from sitl.faults.stage.link import FaultyLink, LinkFaults
 
 
 class SetClock(Clock):
