@@ -16,7 +16,10 @@ PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist loadfile
 
-.PHONY: fly check test lint bench faults soak clean
+# Modules whose mutants are tried, as in MODULES=mavbridge/gate/gate.py; none = all of tests/mutation.toml.
+MODULES ?=
+
+.PHONY: fly check test lint bench faults fuzz mutants soak clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -58,11 +61,20 @@ test: .venv-peers/installed check  ## all of lint, then every test
 bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
 	$(BIN)/python -m benchmarks.compare --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
 
+mutants: $(VENV)/installed  ## small changes of the gate, each of which a test must notice; not part of test
+	$(BIN)/python -m benchmarks.mutants $(MODULES)
+
 faults: $(VENV)/installed  ## every fault of the catalogue with every vehicle; writes docs/faults.md
 	$(BIN)/python -m sitl faults --out docs/faults.md
 
 soak: $(VENV)/installed  ## SOAK_MINUTES of a flight with a random fault every few seconds
 	$(BIN)/python -m sitl soak --minutes $(SOAK_MINUTES)
+
+FUZZ_DATAGRAMS ?= 10000000
+FUZZ_SEED ?=
+fuzz: $(VENV)/installed  ## hostile datagrams on all cores: FUZZ_DATAGRAMS=N, FUZZ_SEED=N repeats a run
+	PYTHONPATH=.:tests $(BIN)/python -m fuzz --datagrams $(FUZZ_DATAGRAMS) $(if $(FUZZ_SEED),--seed $(FUZZ_SEED))
+	GATE_EXAMPLES=1000 $(BIN)/pytest -q tests/properties/test_gate.py
 
 clean:  ## forget the environments and outputs
 	rm -rf $(VENV) .venv-peers out

@@ -149,6 +149,7 @@ class _Segment:
     """One mapped file."""
 
     def __init__(self, path: Path) -> None:
+        self._name = path.name
         try:
             with path.open("rb") as file:
                 self.status = os.fstat(file.fileno())
@@ -161,7 +162,10 @@ class _Segment:
         self._slots = np.frombuffer(self._map, _slot_type(width, height), SLOTS, HEADER_BYTES)
 
     def newest_id(self) -> int:
-        """Newest frame; 0 = none yet."""
+        """Newest frame; 0 = none yet. Raises CameraError where the file has shrunk."""
+        if self._map.size() < len(self._map):
+            # To read what is no longer there would end the process (SIGBUS).
+            raise CameraError(f"shm:{self._name}: its file has shrunk: start its writer again")
         newest_id = int(self._header[NEWEST])
         memory_barrier()
         return newest_id

@@ -6,7 +6,8 @@
     tcp:HOST:PORT    tcp://, tcpout://       connect
     /dev/ttyX,BAUD   serial:///dev/ttyX:BAUD serial port; 57600 baud where none is given
 
-Between the slashes of ``udp://`` and ``udpin://`` an empty host is every interface, as in MAVSDK.
+Between the slashes of ``udp://`` and ``udpin://`` an empty host is this computer alone; in MAVSDK
+it is every network, which is 0.0.0.0 here.
 """
 
 import re
@@ -24,6 +25,7 @@ FORWARD_FORMS = (
 )
 DEFAULT_BAUD = 57600
 EVERY_INTERFACE = "0.0.0.0"  # noqa: S104 - only where the user says so
+LOOPBACK = "127.0.0.1"
 _KINDS = ("udp", "udpin", "udpout", "tcp", "tcpout")
 _NETWORK = re.compile(rf"(?:({'|'.join(_KINDS)}):)?(//)?([^:/\s]*):(\d{{1,5}})/?", re.ASCII)
 _SERIAL = re.compile(r"(?:serial:(?://)?)?(/dev/[^,]+?|COM\d+)(?:,(.*)|:(\d{4,}))?")
@@ -88,9 +90,17 @@ def parse_forward(spec: str) -> UdpAddress:
     if found is None or found[0] not in ("udp", "udpin", "udpout"):
         raise UserError(f"--forward {spec!r} is not understood; use {FORWARD_FORMS}")
     kind, host, port = found
-    if kind != "udpin" and host == EVERY_INTERFACE:
+    if kind != "udpin" and (host == EVERY_INTERFACE or "//:" in spec):
         raise UserError(f"--forward {spec}: no host to send to; use {FORWARD_FORMS}")
     return UdpAddress(host, port, listens=kind == "udpin")
+
+
+def is_reachable(spec: str) -> bool:
+    """Other computers can send to the address of ``--connect``, or to where it connects."""
+    address = parse_address(spec)
+    if isinstance(address, SerialAddress):
+        return False
+    return not (address.host.startswith("127.") or address.host == "localhost")
 
 
 def serial_baud(spec: str) -> int | None:
@@ -119,5 +129,5 @@ def _network(spec: str) -> tuple[str, str, int] | None:
     if (is_url and not kind) or host in _KINDS:
         return None
     if not host and is_url and kind in ("udp", "udpin"):
-        host = EVERY_INTERFACE
+        host = LOOPBACK
     return (kind, host, port) if host else None

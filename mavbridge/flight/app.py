@@ -29,7 +29,7 @@ from mavbridge.core.realtime import (
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
-from mavbridge.flight.checks import check_flight
+from mavbridge.flight.checks import check_flight, signing_note
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.observation import observation_ages_ns
@@ -93,7 +93,9 @@ def fly(config: FlyConfig) -> int:
             config.policy, clock, starts_in_air=config.takeoff is not None
         )
         policy_life.enter_context(loaded)
-        for note in (*loaded.notes, *require_speed(config, loaded)):
+        unsigned = signing_note(config.link)
+        notes = (*loaded.notes, *require_speed(config, loaded), *([unsigned] if unsigned else []))
+        for note in notes:
             logging.getLogger(SAID).info("%s", note)
             console.print(Text(note, style="yellow"))
         if (times := loaded.times) is not None:

@@ -1,8 +1,8 @@
 """What a flight is refused for before anything slow is loaded."""
 
 from mavbridge.camera.open import check_camera
-from mavbridge.config.flight import FlyConfig
-from mavbridge.core.address import parse_address, parse_forward
+from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.core.address import is_reachable, parse_address, parse_forward
 from mavbridge.core.clock import Clock
 from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
@@ -13,6 +13,16 @@ from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.viewer.server import serve_address
 from mavbridge.observe.viewer.target import check_target
 from mavbridge.recording.folder import prepare_folder
+
+
+def signing_note(config: LinkConfig) -> str | None:
+    """Who else can steer the vehicle, for want of signatures; None: nobody on another computer."""
+    if config.signing_key_file is not None or not is_reachable(config.connect):
+        return None
+    return (
+        f"packets on {config.connect} are not signed: anybody on this network can steer the "
+        "vehicle; --signing-key-file signs them"
+    )
 
 
 def check_flight(config: FlyConfig, clock: Clock) -> None:

@@ -166,6 +166,8 @@ class ChunkBuffer:
     def problem(self, now_ns: int) -> str | None:
         """Why no flight may begin now, or None: a chunk must be fresh, by all limits."""
         chunk = self.newest
+        if (flood := self._malformed_lately(now_ns)) is not None:
+            return flood
         if chunk is None or now_ns > self._until_ns:
             return self._refusal or "no chunk from the policy yet"
         if len(self._gaps_ns) < LEAST_GAPS:
@@ -185,16 +187,21 @@ class ChunkBuffer:
 
     def fault(self, now_ns: int) -> str | None:
         """Why the flight must end now, or None: the grace is over, or too much was malformed."""
-        window_ns = max(REFUSED_WINDOW_NS, REFUSED_WINDOW_PERIODS * self._period_ns)
-        refused = self._refused_ns
-        if len(refused) == MAX_REFUSED and now_ns - refused[0] < window_ns:
-            many = f"the policy returned {MAX_REFUSED} unusable chunks within a short time"
-            return f"{many}: {self._malformation}"
+        if (flood := self._malformed_lately(now_ns)) is not None:
+            return flood
         if self.newest is None or now_ns > self._until_ns:
             bridged_ms = (self._until_ns - self._taken_ns) // NS_PER_MS
             late = f"no chunk of the policy that may be flown for {bridged_ms} ms"
             return late if self._refusal is None else f"{late}: {self._refusal}"
         return None
+
+    def _malformed_lately(self, now_ns: int) -> str | None:
+        window_ns = max(REFUSED_WINDOW_NS, REFUSED_WINDOW_PERIODS * self._period_ns)
+        refused = self._refused_ns
+        if len(refused) < MAX_REFUSED or now_ns - refused[0] >= window_ns:
+            return None
+        many = f"the policy returned {MAX_REFUSED} unusable chunks within a short time"
+        return f"{many}: {self._malformation}"
 
     def action_at(self, at_ns: int) -> Action | None:
         """The action that acts at a time; None beyond the horizon of the newest chunk."""

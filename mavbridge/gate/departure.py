@@ -92,9 +92,8 @@ class Departure:
     def step(self, facts: Facts) -> Move:
         """Neutral, and the mode until it is confirmed or refused."""
         is_confirmed = self.mode is None or facts.mode == self.mode
-        is_refused = self.mode is not None and facts.refused_mode == self.mode
         # No vehicle refuses to land: an answer that says so is a late one, to the mode before.
-        if is_refused and self.mode != facts.modes.land:
+        if self.mode is not None and facts.refused_mode == self.mode:
             self.mode = facts.modes.land or None
         elapsed_ns = facts.now_ns - self._began_ns
         self.is_done = self.is_done or elapsed_ns >= (

@@ -205,7 +205,7 @@ class Gate:
         before, self._hand = self._hand, hand
         if hand is Hand.NEUTRAL and before not in (Hand.POLICY, Hand.NEUTRAL):
             on_ground = before is Hand.IDLE
-            start = self._idle if on_ground else first_action(self._meaning, link.telemetry, None)
+            start = self._idle if on_ground else self._first(link, None)
             self._smoother.reset(start)  # what an earlier flight left in it counts no longer
         if hand is not Hand.POLICY or before is Hand.POLICY:
             return
@@ -219,7 +219,16 @@ class Gate:
         if status is not None and status.rc_arrived_ns is not None:
             is_fresh = now_ns - status.rc_arrived_ns <= PILOT_FRESH_NS
             pilot = status.pilot_sticks if is_fresh and before is None else None
-        self._smoother.reset(first_action(self._meaning, link.telemetry, pilot))
+        self._smoother.reset(self._first(link, pilot))
+
+    def _first(self, link: LinkSnapshot, pilot: Sticks | None) -> Action:
+        """Where the sticks are now; a velocity only as far as one may be asked for.
+
+        One that is wrong would go on for long: at 5 m/s^2 the way back from 100 m/s takes 20 s.
+        """
+        first = first_action(self._meaning, link.telemetry, pilot)
+        is_velocity = self._meaning.kind == "velocity"
+        return self._smoother.limits.clip(first) if is_velocity else first
 
     def _decide(
         self, move: Move, now_ns: int, *, is_thrust: bool

@@ -33,6 +33,7 @@ class ActionSmoother:
 
     def __init__(self, settings: Smoothing, start: Action) -> None:
         self._settings = settings
+        self.limits = settings.limits
         self._last_ns: int | None = None
         self._slewed = start
         self._smoothed = start
@@ -49,9 +50,9 @@ class ActionSmoother:
         if self._last_ns is not None:
             dt_s = min(max(now_ns - self._last_ns, 0) / NS_PER_S, self._settings.max_dt_s)
         self._last_ns = now_ns
-        clipped = self._settings.limits.clip(raw)
+        clipped = self.limits.clip(raw)
         before = self._slewed
-        slewed = self._settings.limits.approach(before, clipped, dt_s)
+        slewed = self.limits.approach(before, clipped, dt_s)
         smoothed = self._low_pass(before, slewed, dt_s)
         self._slewed, self._smoothed = slewed, smoothed
         return ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)

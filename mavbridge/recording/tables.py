@@ -10,6 +10,8 @@ import pyarrow.parquet as pq
 from mavbridge.core.errors import MavbridgeError
 
 READ_ERRORS = (pa.ArrowException, OSError)
+MAX_ROWS = 10_000_000
+"""A day at 100 Hz, and more: a small file can claim many more rows, and fill the memory."""
 _GROUP_ROWS = 2_048
 """Rows of a Parquet row group: twenty seconds of ticks. Encoding 16,384 at once took 27 MB."""
 
@@ -94,6 +96,9 @@ def read_table(stem: Path, schema: pa.Schema, *, later: Collection[str] = ()) ->
     path = parquet if parquet.exists() else stream
     try:
         if path is parquet:
+            rows = pq.read_metadata(parquet).num_rows
+            if rows > MAX_ROWS:
+                raise TableError(f"{path} has {rows} rows, more rows than a flight has")
             table = pq.read_table(parquet)
         elif stream.stat().st_size == 0:  # killed before the first batch
             table = schema.empty_table()

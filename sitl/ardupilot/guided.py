@@ -109,6 +109,16 @@ class GuidedControl:
         self._start(Submode.TAKEOFF, body)
         self._takeoff_height_m = height_m
 
+    def is_taking_off(self, body: BodyState) -> bool:
+        """`take_off` is under way: a tenth of its height missing, or still climbing fast.
+
+        Formula: ArduCopter's ``auto_takeoff``, less than half of WPNAV_SPEED_UP at the end.
+        """
+        if self.submode is not Submode.TAKEOFF:
+            return False
+        is_up = -body.position_ned_m[2] >= 0.9 * self._takeoff_height_m
+        return not is_up or -body.velocity_ned_mps[2] >= self._params["WPNAV_SPEED_UP"] / 200.0
+
     def lifts_off(self, now_ns: int, armed_ns: int) -> bool:
         """True once a landed vehicle has spun its motors up for a takeoff.
 

@@ -65,7 +65,7 @@ class FramePublisher:
             raise ValueError("publish after close")
         self._frame_id += 1
         fields = self._fields[self._frame_id % SLOTS]
-        fields[SEQ] += 1
+        fields[SEQ] |= 1  # odd: being written
         self._memory_barrier()
         fields[FRAME_ID] = self._frame_id
         fields[CAPTURED_NS] = captured_ns

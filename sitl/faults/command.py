@@ -6,10 +6,12 @@ import platform
 import signal
 import sys
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 
 from sitl import UsageError
+from sitl.faults.processes import StageError
 from sitl.faults.run import fly_scenario
 from sitl.faults.scenario import Scenario, Variant, load_catalogue
 from sitl.faults.soak import make_summary, soak
@@ -27,6 +29,7 @@ def add_faults_command(commands: "argparse._SubParsersAction[argparse.ArgumentPa
     add("--list", action="store_true", help="print the catalogue")
     add("--autopilot", choices=("ardupilot", "px4"), help="only with this firmware")
     add("--receiver", choices=("idle", "mid", "none"), help="only with this receiver")
+    add("--jobs", type=int, default=1, metavar="N", help="flights at once (default: 1)")
     add("--out", type=Path, metavar="FILE", help="write the page of results, in Markdown")
 
 
@@ -41,7 +44,10 @@ def add_soak_command(commands: "argparse._SubParsersAction[argparse.ArgumentPars
 
 def _soak(args: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
-        result = soak(args.minutes, args.seed, Path(folder), print)
+        try:
+            result = soak(args.minutes, args.seed, Path(folder), print)
+        except StageError as error:
+            raise UsageError(f"the soak could not go on: {error}") from error
     print(make_summary(result))
     if result.failures:
         raise UsageError("the soak has failed")
@@ -56,14 +62,19 @@ def _fly_catalogue(args: argparse.Namespace) -> None:
         return
     # An exit by this signal ends the processes of the present flight too.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    flights = [
+        (scenario, variant)
+        for scenario in chosen
+        for variant in scenario.variants
+        if _is_wanted(variant, args.autopilot, args.receiver)
+    ]
     verdicts: list[Verdict] = []
-    for scenario in chosen:
-        for variant in scenario.variants:
-            if _is_wanted(variant, args.autopilot, args.receiver):
-                verdicts.append(fly_scenario(scenario, variant))
-                print(make_line(verdicts[-1]), flush=True)
-                if not verdicts[-1].passed:
-                    print(verdicts[-1].output, flush=True)
+    with ProcessPoolExecutor(args.jobs) as pool:
+        for verdict in pool.map(fly_scenario, *zip(*flights, strict=True)):
+            verdicts.append(verdict)
+            print(make_line(verdict), flush=True)
+            if not verdict.passed:
+                print(verdict.output, flush=True)
     failed = sum(not verdict.passed for verdict in verdicts)
     if args.out is not None:
         date = datetime.now(UTC).date().isoformat()

@@ -70,6 +70,14 @@ class Sent(NamedTuple):
         return self.override is not None and any(self.override)
 
     @property
+    def asks_mode(self) -> bool:
+        """A request for a flight mode."""
+        is_command = self.name in ("COMMAND_LONG", "COMMAND_INT")
+        return self.name == "SET_MODE" or (
+            is_command and self.message.command == dialect.MAV_CMD_DO_SET_MODE
+        )
+
+    @property
     def holds(self) -> bool:
         """Sticks of anything, also neutral ones; no release."""
         return self.is_command or self.name == "MANUAL_CONTROL"

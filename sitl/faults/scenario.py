@@ -49,7 +49,7 @@ class Scenario:
     others_us: list[int] = field(default_factory=list)
     """Four sticks of somebody else, who may share the vehicle with the policy until the limit."""
     is_silent: bool = False
-    """No stick at all may follow the last one of the policy, not even a neutral one."""
+    """A takeover: no request for a mode may follow, and beyond the limit no stick of any kind."""
     releases: bool = True
     """The bridge can still give an ArduPilot with a receiver its sticks back."""
     transmitter: bool = False

@@ -12,7 +12,7 @@ from pymavlink import mavutil
 
 from sitl.clock import NS_PER_S
 from sitl.faults.processes import StageError
-from sitl.faults.stage import ORDERLY, STARTS, Stage, faulty_policy, free_port, staged
+from sitl.faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
 from sitl.faults.steps import Images, Joystick, Messages, Pilot, Signal, Step, Wait
 from sitl.faults.steps_link import Link
 from sitl.faults.transmitter import Transmitter
@@ -34,6 +34,7 @@ MOST_GROWTH = {
 """Growth of a process that is no leak yet: allocators keep what they once had."""
 REPORT_EVERY = 20
 ENGAGE_S = 10.0
+ENGAGE_TRIES = 6
 
 
 class Fault(NamedTuple):
@@ -100,7 +101,10 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
             "--dual-rate", "--mode", "ALT_HOLD", "--policy", faulty_policy(POLICY),
             "--engage-channel", str(SWITCH), "--record", str(recording),
         )  # fmt: skip
-        _engage_first(stage, transmitter)
+        if not stage.wait_for("not engaged: press e, use the engage switch"):
+            raise StageError("the bridge is not ready to engage")
+        stage.gate.has_ended(0)  # finds it while its parent lives
+        _engage(stage, transmitter)
         usages = _fly(stage, transmitter, result, minutes, random.Random(seed), report)  # noqa: S311
         stage.kill_group(signal.SIGINT)
         stage.observe(SETTLE_S)
@@ -117,17 +121,6 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
             result.failures.append(f"the {name} process grew by {grown}")
     result.failures += _lost(recording, result)
     return result
-
-
-def _engage_first(stage: Stage, transmitter: Transmitter) -> None:
-    if not stage.wait_for("not engaged: press e, use the engage switch"):
-        raise StageError("the bridge is not ready to engage")
-    transmitter.move(SWITCH, LOW_US)
-    stage.relay.set_mode("ALT_HOLD")
-    stage.relay.arm()
-    stage.observe(SETTLE_S)
-    transmitter.move(SWITCH, HIGH_US)
-    stage.wait_for_lean()
 
 
 def _fly(
@@ -157,7 +150,7 @@ def _fly(
             result.stalls += 1  # a busy machine, or a loss that lasted: the flight ended in order
         result.sent += stage.relay.forget()
         if has_lost:
-            _engage_again(stage, transmitter)
+            _engage(stage, transmitter)
         for name, pid in pids.items():
             usages[name].append(read_usage(pid))
         if sum(result.faults.values()) % REPORT_EVERY == 0:
@@ -166,17 +159,17 @@ def _fly(
     return usages
 
 
-def _engage_again(stage: Stage, transmitter: Transmitter) -> None:
-    """The pilot turns the switch off and on, as often as a busy machine needs."""
-    for _ in range(STARTS):
+def _engage(stage: Stage, transmitter: Transmitter) -> None:
+    """The pilot arms, and turns the switch off and on, as often as a busy machine needs."""
+    for _ in range(ENGAGE_TRIES):
         transmitter.move(SWITCH, LOW_US)
-        stage.observe(SETTLE_S)
         stage.relay.set_mode("ALT_HOLD")
-        stage.observe(0.5)
+        stage.relay.arm()
+        stage.observe(SETTLE_S)
         transmitter.move(SWITCH, HIGH_US)
         if stage.relay.wait_until(lambda: stage.relay.is_leaning(LEANING_ROWS), ENGAGE_S):
             return
-    raise StageError("the policy did not get the sticks back by the switch")
+    raise StageError("the policy did not get the sticks by the switch")
 
 
 def _lost(recording: Path, result: SoakResult) -> list[str]:

@@ -66,6 +66,8 @@ def find_failures(
         verdict.aftermath = measured
         policys = [row.at_ns for row in sent if (row.holds if scenario.is_silent else row.leans)]
         verdict.last_stick_ms = (policys[-1] - at_ns) / 1e6
+        if scenario.is_silent and any(row.asks_mode and row.at_ns > at_ns for row in sent):
+            failures.append("it asks for a mode after a takeover")
         failures += _too_late(measured, verdict.last_stick_ms, scenario, slack_ms)
         has_release = variant.autopilot == "ardupilot" and variant.receiver != "none"
         if has_release and scenario.releases and any(stage.relay.overrides[-1]):

@@ -49,7 +49,7 @@ def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KIND
     kind, _, rest = url.partition(":")
     host, _, port_text = rest.removeprefix("//").rpartition(":")
     if kind == "udpin" and rest.startswith("//:"):
-        host = "0.0.0.0"  # noqa: S104 - MAVSDK's spelling of every interface
+        host = "127.0.0.1"
     if kind not in kinds or not host or not port_text.isdecimal():
         wanted = ", ".join(f"{kind}:HOST:PORT" for kind in kinds)
         raise UsageError(f"link {url!r}: expected one of {wanted}")

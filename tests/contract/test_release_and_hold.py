@@ -17,10 +17,10 @@ def position(messages):
 
 
 def test_brake_stops_and_ignores_the_sticks(flying):
-    flying.hold(1.5, roll=1754)
+    flying.hold(1.0, roll=1754)
     assert flying.set_mode(BRAKE) == ACCEPTED
 
-    start = position(flying.hold(3.5, thr=1000))
+    start = position(flying.hold(3.0, thr=1000))
     end = position(flying.hold(2.0, roll=1900, pitch=1200, thr=1000, yaw=1700))
 
     assert math.dist(start, end) < 0.5
@@ -40,11 +40,11 @@ def test_sticks_given_to_an_idle_receiver_sink_in_the_pilots_modes(flying, mode,
 
 @pytest.mark.parametrize("mode", [LOITER, POSHOLD])
 def test_position_modes_stop_at_centred_sticks(flying, mode):
-    flying.hold(1.2, pitch=1300)
+    flying.hold(1.0, pitch=1300)
     assert flying.set_mode(mode) == ACCEPTED
 
-    start = position(flying.hold(4.0))
-    end = position(flying.hold(2.0))
+    start = position(flying.hold(3.7))
+    end = position(flying.hold(1.5))
 
     assert math.dist(start, end) < 0.5
 
@@ -55,4 +55,4 @@ def test_heartbeats_are_sent_as_often_as_asked(companion):
 
     messages = companion.advance(2.0)
 
-    assert sum(m.get_type() == "HEARTBEAT" for m in messages) == pytest.approx(20, abs=2)
+    assert sum(m.get_type() == "HEARTBEAT" for m in messages) == pytest.approx(20, abs=4)

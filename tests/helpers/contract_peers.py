@@ -224,3 +224,8 @@ def named(messages: list[Any], name: str) -> list[Any]:
 def last(messages: list[Any], name: str) -> Any:
     """The newest of that name."""
     return named(messages, name)[-1]
+
+
+def is_armed(heartbeat: Any) -> bool:
+    """The motors may turn."""
+    return bool(heartbeat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -153,6 +153,12 @@ class OutputFlight(GateFlight):
 
     def launch(self, mode: Any = None) -> "OutputFlight":
         """Hover armed under the pilot, with the link ready and the policy fresh."""
+        self.put_in_air()
+        self.until(lambda: self.reason.startswith("not engaged"), within_s=10)
+        return self
+
+    def put_in_air(self) -> None:
+        """Hover armed under the pilot, wherever the vehicle has been."""
         self.vehicle.launch(
             AirborneStart(
                 position_ned_m=(0.0, 0.0, -HEIGHT_M),
@@ -166,8 +172,6 @@ class OutputFlight(GateFlight):
             assert self.ardupilot.set_mode(ArduMode[self.mode])
         elif self.kind != "sticks":
             self._forget_sticks()
-        self.until(lambda: self.reason.startswith("not engaged"), within_s=10)
-        return self
 
     def _forget_sticks(self) -> None:
         """As if the vehicle had been armed without sticks: nobody has ever moved any."""

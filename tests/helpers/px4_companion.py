@@ -173,15 +173,13 @@ class Px4Companion(Companion):
         """Some metres up, level and still, with sticks centred; then the mode."""
         self.sticks(MID)
         self.track()
-        if self.in_the_air:
-            self.fly(0.1)
-        else:
+        if not self.in_the_air:
             self.get_ready(ALTCTL)
             assert self.arm() == ACCEPTED
             is_up = lambda m: any(p.z < -6.0 for p in named(m, "LOCAL_POSITION_NED"))  # noqa: E731
             self.until(is_up, 25.0, lambda _: self.sticks((0, 0, 1000, 0)))
         self._settle()
-        assert self.set_mode(mode) == ACCEPTED
+        self._take(mode)
         self.fly(0.1)
         self.seen.clear()
 
@@ -189,12 +187,20 @@ class Px4Companion(Companion):
         """In POSCTL: brake, and come to a height of 5 to 40 m."""
         for count in range(600):
             if count % 100 == 0:  # again, if a starved computer has lost the sticks meanwhile
-                assert self.set_mode(POSCTL) == ACCEPTED
+                self._take(POSCTL)
             states = named(self.fly(0.1, (0, 0, self._climb_stick(), 0)), "LOCAL_POSITION_NED")
             speed_mps = max(abs(v) for m in states[-1:] for v in (m.vx, m.vy, m.vz))
             if self._climb_stick() == MID[2] and speed_mps < STILL_MPS:
                 return
         raise AssertionError("the vehicle does not come to rest")
+
+    def _take(self, mode: tuple[int, int]) -> None:
+        """A mode with sticks, which is refused until they have come for a while."""
+        for _ in range(20):
+            self.fly(0.1)
+            if self.set_mode(mode) == ACCEPTED:
+                return
+        raise AssertionError(f"the mode {mode} is refused: {self.texts()}")
 
     def _climb_stick(self) -> int:
         height_m = -named(self.seen, "LOCAL_POSITION_NED")[-1].z
@@ -239,12 +245,12 @@ class Px4Companion(Companion):
             (packed,) = struct.unpack("<f", struct.pack("<i", int(value)))
         self.set_param(name, packed)
 
-    def refill_delay(self) -> None:
+    def refill_delay(self, seconds: float = 5.001) -> None:
         """Give the failsafe its full delay again, of which earlier ones have spent some.
 
-        PX4 does so when any parameter changes.
+        PX4 does so when any parameter changes; so it is not exactly the default of 5 s.
         """
-        self.change("COM_FAIL_ACT_T", 5.001)
+        self.change("COM_FAIL_ACT_T", seconds)
 
     def restore(self) -> None:
         """Leave the vehicle in the air in Hold, or disarmed on the ground."""

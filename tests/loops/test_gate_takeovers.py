@@ -200,6 +200,8 @@ def test_a_link_with_a_fifth_of_its_packets_lost_is_flown() -> None:
 
 def by_parameter(flight: GateFlight) -> None:
     flight.station(lambda mav: mav.param_set_encode(1, 1, b"FS_THR_ENABLE", 0.0, 9), system=42)
+    index = flight.vehicle.params.names.index("FS_THR_ENABLE")
+    flight.vehicle.server.links[0].send_param(index)  # ArduPilot tells every link
 
 
 def by_clock(flight: GateFlight) -> None:

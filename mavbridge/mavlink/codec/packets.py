@@ -11,6 +11,7 @@ from mavbridge.core.vehicle import Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
 from mavbridge.mavlink.codec.fast_path import decode_state_packet, pack_override
 from mavbridge.mavlink.codec.messages import (
+    STICK_END,
     CommandRequest,
     Endpoint,
     ManualControl,
@@ -32,12 +33,13 @@ _TEXT_BYTES = 50
 """Text of one STATUSTEXT; a longer one is sent as several with one id."""
 _TEXT_CHUNKS = 4
 
+MOST_DATAGRAM_BYTES = 4096
+"""Read of one datagram: more than any autopilot or router puts into one, and 2 ms of work if all of
+it is made to keep the parser busy; the largest that UDP takes would be 35 ms."""
 _PACKET_STARTS = (b"\xfd", b"\xfe")
 """MAVLink 2 and 1."""
 
 
-STICK_END = 1000
-"""MANUAL_CONTROL: x forward, y right and r, nose right, in -1000..1000, z up in 0..1000."""
 GESTURE_Z, MOST_LOW_R = 150, 800
 """PX4 arms and disarms by z < 100 with |r| > 900 for a second: both bounds with a margin."""
 MOST_LEAN_RAD = math.radians(85.0)
@@ -94,8 +96,12 @@ class Codec:
         """Messages of one datagram, which nearly always is one whole packet.
 
         What was left of an earlier datagram was then cut off, and must not swallow this one. A
-        datagram that starts otherwise may be the next piece of a forwarded serial stream.
+        datagram that starts otherwise may be the next piece of a forwarded serial stream. Of one
+        beyond ``MOST_DATAGRAM_BYTES`` the rest is not read.
         """
+        if len(data) > MOST_DATAGRAM_BYTES:
+            data = data[:MOST_DATAGRAM_BYTES]
+            self.bad_data_count += 1
         if data[:1] in _PACKET_STARTS:
             self.forget_partial()
             if (state := decode_state_packet(data)) is not None:

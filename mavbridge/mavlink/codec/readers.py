@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.rotation import quaternion_from_euler
 from mavbridge.mavlink.codec.messages import (
+    STICK_END,
     Altitude,
     Attitude,
     AttitudeTarget,
@@ -36,6 +37,11 @@ MG_TO_MPS2 = 9.80665e-3
 
 _TEXT_BYTES = 50
 """Text of one STATUSTEXT."""
+MOST_VALUE = 1e9
+"""Of an angle, a rate, a speed, a position or a force in SI units: far beyond any vehicle, and its
+square is still a number in the float32 with which policies compute."""
+UNPRINTABLE = "\N{REPLACEMENT CHARACTER}"
+"""Stands for control characters, with which a text could write into the user's terminal."""
 _HIGHRES_ACCEL_FIELDS = 0b111
 """fields_updated bits of xacc, yacc, zacc."""
 
@@ -44,8 +50,13 @@ class UnusableError(Exception):
     """A well-formed message with values that cannot be used."""
 
 
-def _require_finite(*values: float) -> None:
-    if not math.isfinite(sum(values)):  # NaN and infinity survive every sum
+def _require_finite(value: float) -> None:
+    if not math.isfinite(value):
+        raise UnusableError
+
+
+def _require_usable(*values: float) -> None:
+    if not max(map(abs, values)) <= MOST_VALUE or math.isnan(sum(values)):
         raise UnusableError
 
 
@@ -56,7 +67,7 @@ def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
 def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body:
     quaternion = (m.q1, m.q2, m.q3, m.q4)
     rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
-    _require_finite(*quaternion, *rate)
+    _require_usable(*quaternion, *rate)
     if not 0.9 < math.hypot(*quaternion) < 1.1:
         raise UnusableError
     return Attitude(True, 1000 * m.time_boot_ms, quaternion, rate)
@@ -64,21 +75,21 @@ def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body
 
 def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
     rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
-    _require_finite(m.roll, m.pitch, m.yaw, *rate)
+    _require_usable(m.roll, m.pitch, m.yaw, *rate)
     quaternion = quaternion_from_euler(m.roll, m.pitch, m.yaw)
     return Attitude(False, 1000 * m.time_boot_ms, quaternion, rate)
 
 
 def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:
-    _require_finite(m.vx, m.vy, m.vz)
+    _require_usable(m.vx, m.vy, m.vz)
     position = (m.x, m.y, m.z)
-    is_position = math.isfinite(sum(position))
+    is_position = all(abs(metres) <= MOST_VALUE for metres in position)  # false for NaN too
     velocity = (m.vx, m.vy, m.vz)
     return LocalVelocity(1000 * m.time_boot_ms, velocity, position if is_position else None)
 
 
 def _highres_imu(m: dialect.MAVLink_highres_imu_message) -> Body:
-    _require_finite(m.xacc, m.yacc, m.zacc)
+    _require_usable(m.xacc, m.yacc, m.zacc)
     if m.fields_updated & _HIGHRES_ACCEL_FIELDS != _HIGHRES_ACCEL_FIELDS:
         raise UnusableError
     return SpecificForce("HIGHRES_IMU", m.time_usec, (m.xacc, m.yacc, m.zacc))
@@ -104,6 +115,12 @@ def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
     return RcChannels(tuple(values)[: m.chancount or 18], 1000 * m.time_boot_ms)
 
 
+def _manual_control(m: dialect.MAVLink_manual_control_message) -> Body:
+    if not (all(abs(value) <= STICK_END for value in (m.x, m.y, m.r)) and 0 <= m.z <= STICK_END):
+        raise UnusableError  # 32767 is an axis that does not exist
+    return ManualControl(m.x, m.y, m.z, m.r)
+
+
 def _sys_status(m: dialect.MAVLink_sys_status_message) -> Body:
     present = m.onboard_control_sensors_present & m.onboard_control_sensors_enabled
     return SystemStatus(present, m.onboard_control_sensors_health, m.battery_remaining)
@@ -126,9 +143,10 @@ def _param_error(m: dialect.MAVLink_param_error_message) -> Body | None:
 
 
 def _status_text(m: dialect.MAVLink_statustext_message) -> Body:
-    # pymavlink has cut the zero bytes off.
-    is_full = m.id != 0 and len(m.text.encode("utf-8", "surrogateescape")) >= _TEXT_BYTES
-    return StatusText(m.text, m.id, m.chunk_seq, is_full)
+    # pymavlink has cut the zero bytes off, and made one character of each other byte.
+    is_full = m.id != 0 and len(m.text) >= _TEXT_BYTES
+    text = "".join(c if c.isprintable() else UNPRINTABLE for c in m.text)  # no terminal's codes
+    return StatusText(text, m.id, m.chunk_seq, is_full)
 
 
 def _attitude_target(m: dialect.MAVLink_attitude_target_message) -> Body | None:
@@ -162,7 +180,7 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
     "SCALED_IMU2": _scaled_imu,
     "RAW_IMU": _raw_imu,
     "RC_CHANNELS": _rc_channels,
-    "MANUAL_CONTROL": lambda m: ManualControl(m.x, m.y, m.z, m.r),
+    "MANUAL_CONTROL": _manual_control,
     "ATTITUDE_TARGET": _attitude_target,
     "POSITION_TARGET_LOCAL_NED": _velocity_target,
     "GLOBAL_POSITION_INT": lambda m: Altitude(

@@ -37,6 +37,8 @@ _NUDGE_LEVELS = 3
 hits the same level each time, and one lost packet never makes two levels look like one."""
 _PAUSE_NS = 100 * NS_PER_MS
 """After this long without a command of ours, an echo may rightly have been constant."""
+RESTART_STEP_US, RESTART_STAMPS = 1_000_000, 2
+"""A stamp this far back may be a late datagram; so many in a row are another clock."""
 _RETRY_NS = 3 * NS_PER_S
 """A fault stays known for this long after it was last seen."""
 
@@ -84,6 +86,7 @@ class EchoCheck:
         self._shown_us: int | None = None
         self._arrived_ns: int | None = None
         """Arrival of the last message that shows them."""
+        self._old_stamps = 0
         self._held: Shown | None = None
         self._held_since_us = 0
         self._held_samples = 0
@@ -146,9 +149,10 @@ class EchoCheck:
     def received(self, values: Shown, shown_us: int, now_ns: int) -> None:
         """Compare the values of one message, stamped ``shown_us`` by the vehicle.
 
-        Late and doubled datagrams are left out.
+        Late and doubled datagrams are left out; two in a row from long ago are a clock that has
+        restarted, or the end of one stamp that was wrong.
         """
-        if self._shown_us is not None and shown_us <= self._shown_us:
+        if self._is_late(shown_us):
             return
         if self.is_unshown(now_ns) and self._arrived_ns is not None:
             self._restart(now_ns)
@@ -170,6 +174,20 @@ class EchoCheck:
             self._fail("returned", now_ns)
         if self.confirmed:
             self._watch_change(values, shown_us, now_ns)
+
+    def _is_late(self, shown_us: int) -> bool:
+        """Older than the last one, and not of a clock that has restarted."""
+        if self._shown_us is None or shown_us > self._shown_us:
+            self._old_stamps = 0
+            return False
+        is_far_back = shown_us + RESTART_STEP_US < self._shown_us
+        self._old_stamps = self._old_stamps + 1 if is_far_back else 0
+        if self._old_stamps < RESTART_STAMPS:
+            return True
+        self._old_stamps, self._held = 0, None  # no stamp from before it is compared with new ones
+        self._returned_us.clear()
+        self._foreign_us.clear()
+        return False
 
     def _is_near(self, one: Shown, other: Shown) -> bool:
         return _is_within(self._rules.tolerance, one, other)

@@ -6,13 +6,8 @@ from typing import ClassVar
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Action, Output, StickGains, Sticks, VehicleStatus
-from mavbridge.mavlink.codec.messages import Body, ManualControl
-from mavbridge.mavlink.codec.packets import (
-    STICK_END,
-    Codec,
-    manual_control_of,
-    manual_control_sticks,
-)
+from mavbridge.mavlink.codec.messages import STICK_END, Body, ManualControl
+from mavbridge.mavlink.codec.packets import Codec, manual_control_of, manual_control_sticks
 from mavbridge.mavlink.outputs.echo import EchoFault, EchoRules
 from mavbridge.mavlink.outputs.output import Encoded
 from mavbridge.mavlink.outputs.sticks import StickOutput

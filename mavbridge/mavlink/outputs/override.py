@@ -80,14 +80,20 @@ class OverrideOutput(StickOutput):
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level ones for an armed vehicle without a receiver; where the throttle is thrust, with
-        the last one. None in a failsafe, which sticks might end."""
+        the last one.
+
+        None once a failsafe has chosen its mode: sticks clear a radio failsafe, and it would fire
+        again a second later, whatever mode the pilot has set by then.
+        """
         status, calibration = vehicle.status(now_ns) or self._status, self._calibration
         if status is None or calibration is None or not status.armed:
             return None
-        if status.has_receiver or status.is_failsafe:
+        roles = vehicle.profile.modes.roles
+        is_brought_down = status.is_failsafe and status.mode in (roles.hold, roles.land, roles.rtl)
+        if status.has_receiver or is_brought_down:
             return None
         throttle, yaw, pitch, roll = pwm_of(NEUTRAL, calibration)
-        if status.mode in vehicle.profile.modes.roles.thrust:
+        if status.mode in roles.thrust:
             throttle = self._last[0]
         pwm_us = (throttle, yaw, pitch, roll)
         packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)

@@ -13,6 +13,9 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 _CURVES_NS = 500 * NS_PER_MS
 """Parameters that the curves depend on count after this time at the latest; a mode at once."""
 
+_MOST_TOLD = 100
+"""Notes: they name values of parameters, which may change any number of times."""
+
 
 class StickOutput(ActionOutput):
     """Sticks, mapped so that they mean to the vehicle what they meant in the policy's training."""
@@ -78,7 +81,8 @@ class StickOutput(ActionOutput):
             self._curves_mode, self._curves_due_ns = mode, now_ns + _CURVES_NS
             self._curves = vehicle.profile.stick_curves(vehicle.known_params, mode, self._gains)
             for note in self._curves.notes:
-                if note not in self._told and vehicle.are_params_read:
+                is_new = note not in self._told and len(self._told) < _MOST_TOLD
+                if is_new and vehicle.are_params_read:
                     self._told.add(note)
                     self._new_notes.append(note)
         return self._curves

@@ -251,8 +251,9 @@ class Px4(Profile):
         return values.get("MPC_THR_HOVER")
 
     def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """MPC_Z_VEL_MAX_UP and _DN."""
-        return values.get("MPC_Z_VEL_MAX_UP", 3.0), values.get("MPC_Z_VEL_MAX_DN", 1.5)
+        """MPC_Z_VEL_MAX_UP and _DN; never below 0, which would turn one into the other."""
+        climb_mps = values.get("MPC_Z_VEL_MAX_UP", 3.0)
+        return max(climb_mps, 0.0), max(values.get("MPC_Z_VEL_MAX_DN", 1.5), 0.0)
 
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:
         """NAV_TAKEOFF, which is AUTO.TAKEOFF with a height above mean sea level.

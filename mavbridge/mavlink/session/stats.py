@@ -7,6 +7,10 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import LinkStats
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 
+_MOST_NAMES = 500
+"""More than the dialect has; messages that it lacks are named by their numbers, 16 million."""
+_REST = "others"
+
 
 class LinkCounters:
     """Messages and losses of the chosen vehicle."""
@@ -21,7 +25,8 @@ class LinkCounters:
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
         """Count one message; a gap in its 8-bit sequence is that many lost (modulo 256)."""
-        self._by_name[name] += 1
+        is_known = name in self._by_name or len(self._by_name) < _MOST_NAMES
+        self._by_name[name if is_known else _REST] += 1
         if self._last_sequence is not None:
             self._lost += (sequence - self._last_sequence - 1) % 256
         self._last_sequence = sequence

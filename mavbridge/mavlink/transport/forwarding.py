@@ -22,6 +22,11 @@ _MAX_DATAGRAM = 2048
 """Of the ground station: what is longer than any usual MTU is cut off, and is not MAVLink."""
 
 
+def _own_side(station: Address) -> Address:
+    """Where to send from: this computer alone, if the ground station runs on it."""
+    return ("127.0.0.1" if station[0].startswith("127.") else "", 0)
+
+
 class Forwarding:
     """The ground station's end; used by one thread, and never waits.
 
@@ -47,7 +52,7 @@ class Forwarding:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
-            self._socket.bind(address if parsed.listens else ("", 0))
+            self._socket.bind(address if parsed.listens else _own_side(address))
         except OSError as error:
             self._socket.close()
             raise UserError(

@@ -205,6 +205,8 @@ def _extended_sys_state(ap: Autopilot) -> Message:
         state = mav.MAV_LANDED_STATE_ON_GROUND
     elif ap.mode.lands:
         state = mav.MAV_LANDED_STATE_LANDING
+    elif ap.guided is not None and ap.guided.is_taking_off(ap.sensed):
+        state = mav.MAV_LANDED_STATE_TAKEOFF
     else:
         state = mav.MAV_LANDED_STATE_IN_AIR
     return mav.MAVLink_extended_sys_state_message(mav.MAV_VTOL_STATE_UNDEFINED, state)

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import NEUTRAL, Sticks
+from mavbridge.core.vehicle import NEUTRAL, BodyRates, Sticks
 from mavbridge.gate.chunks import (
     GRACE_PERIODS,
     LEAST_GRACE_NS,
@@ -80,6 +80,16 @@ def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve(
     assert "the newest 905 ms after its attitude" in (slow.slowness or "")
     slow.offer(chunk(10, 9100), 9100 * MS)
     assert slow.slowness is None
+    for serial in range(11, 10 + SLOW_CHUNKS):  # they count anew
+        slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 101) * MS), 0)
+    assert slow.slowness is None
+
+
+def test_solves_that_just_keep_the_limit_of_the_attitude_are_not_too_slow() -> None:
+    held = buffer()
+    for serial in range(1, SLOW_CHUNKS + 2):
+        held.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 100) * MS), 0)
+    assert held.slowness is None
 
 
 def test_a_contract_with_longer_limits_flies_it() -> None:
@@ -94,6 +104,14 @@ def test_without_a_new_chunk_it_coasts_for_the_grace_and_then_is_at_fault() -> N
     assert held.is_coasting(1021 * MS)
     assert held.fault(1100 * MS) is None
     assert "100 ms" in (held.fault(1100 * MS + 1) or "")
+
+
+def test_a_chunk_beyond_its_limits_coasts_although_the_next_one_is_not_due() -> None:
+    held = buffer(500)
+    assert not held.is_coasting(1000 * MS)
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert not held.is_coasting(1095 * MS)
+    assert held.is_coasting(1096 * MS)
 
 
 @pytest.mark.parametrize(("period_ms", "grace_ms"), [(2, 100), (10, 100), (33, 100), (500, 1500)])
@@ -129,6 +147,79 @@ def test_chunks_that_are_farther_apart_than_one_may_be_flown_begin_no_flight() -
         slow.offer(chunk(serial, now_ms), now_ms * MS)
     assert "come up to 500 ms apart, beyond the 195 ms" in (slow.problem(2000 * MS) or "")
     assert "ask for a higher rate" in (slow.problem(2000 * MS) or "")
+
+
+def began(period_ms: int, *gaps_ms: int, **changes: object) -> tuple[ChunkBuffer, int]:
+    """A buffer with chunks so far apart, the newest with changes, and the moment that it came."""
+    held, now_ms = buffer(period_ms), 1000
+    held.offer(chunk(1, now_ms), now_ms * MS)
+    for serial, gap_ms in enumerate(gaps_ms, start=2):
+        now_ms += gap_ms
+        last = changes if serial == len(gaps_ms) + 1 else {}
+        assert held.offer(chunk(serial, now_ms, **last), now_ms * MS)
+    return held, now_ms * MS
+
+
+def test_a_flight_may_begin_after_three_chunks_in_time() -> None:
+    for gaps_ms in ((), (10,)):
+        held, now_ns = began(10, *gaps_ms)
+        assert held.problem(now_ns) == "the policy has only just begun"
+    held, now_ns = began(10, 100, 10)  # as far apart as is bridged
+    assert held.problem(now_ns) is None
+
+
+@pytest.mark.parametrize("gaps_ms", [(101, 10), (10, 101)])
+def test_one_chunk_of_the_last_few_that_was_late_begins_no_flight(gaps_ms: tuple[int, ...]) -> None:
+    held, now_ns = began(10, *gaps_ms)
+    told = "come up to 101 ms apart, beyond the 100 ms that are bridged: it is too slow here"
+    assert told in (held.problem(now_ns) or "")
+    for serial in range(4, 11):  # the eighth gap after it forgets it
+        now_ns += 10 * MS
+        held.offer(chunk(serial, now_ns // MS), now_ns)
+    assert (held.problem(now_ns) is None) == (gaps_ms[0] == 101)
+
+
+def test_without_a_new_chunk_for_the_grace_no_flight_begins_although_its_limits_are_longer() -> (
+    None
+):
+    held, now_ns = began(10, 10, 10, attitude_ns=1020 * MS)
+    assert held.problem(now_ns + 100 * MS) is None
+    assert held.problem(now_ns + 100 * MS + 1) == "no chunk from the policy yet"
+
+
+@pytest.mark.parametrize(
+    ("age", "name", "limit_ms"),
+    [
+        ("attitude_ns", "attitude", 100),
+        ("velocity_ns", "velocity", 250),
+        ("image_ns", "image", 300),
+        ("computed_ns", "chunk", 300),
+    ],
+)
+def test_no_flight_begins_beyond_any_limit_of_age(age: str, name: str, limit_ms: int) -> None:
+    held, now_ns = began(10, 10, 10, **{age: (1020 - limit_ms + 50) * MS})
+    assert held.problem(now_ns + 50 * MS) is None
+    told = f"the {name} is {limit_ms} ms old, beyond {limit_ms} ms"
+    assert held.problem(now_ns + 50 * MS + 1) == told
+
+
+def test_where_there_never_was_a_chunk_there_is_a_fault_and_no_action() -> None:
+    assert buffer().fault(0) == "no chunk of the policy that may be flown for 0 ms"
+    assert buffer().action_at(0) is None
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "gap_ms", "is_fault"),
+    [(10, 249, True), (10, 250, False), (500, 1249, True), (500, 1250, False)],
+)
+def test_unusable_chunks_count_within_a_second_or_ten_periods(
+    period_ms: int, gap_ms: int, is_fault: bool
+) -> None:
+    held = buffer(period_ms)
+    for serial in range(1, MAX_REFUSED + 1):
+        held.offer(chunk(serial, 1000, actions=(NAN,)), serial * gap_ms * MS)
+    held.offer(chunk(9, MAX_REFUSED * gap_ms), MAX_REFUSED * gap_ms * MS)
+    assert (held.fault(MAX_REFUSED * gap_ms * MS) is not None) == is_fault
 
 
 ages = st.integers(0, 400).map(lambda ms: ms * MS)
@@ -175,7 +266,15 @@ def test_stale_chunks_that_keep_coming_do_not_prolong_the_grace() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"actions": (NAN,)}, {"actions": ()}, {"step_ns": 0}], ids=["nan", "none", "step"]
+    "changes",
+    [
+        {"actions": (NAN,)},
+        {"actions": (NEUTRAL, NAN, NEUTRAL)},
+        {"actions": (NEUTRAL, BodyRates(0.5, 0.0, 0.0, 0.0))},
+        {"actions": ()},
+        {"step_ns": 0},
+    ],
+    ids=["nan", "one-nan", "another-kind", "none", "step"],
 )
 def test_a_malformed_chunk_is_not_flown(changes: dict[str, object]) -> None:
     held = buffer()
@@ -195,12 +294,16 @@ def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -
     assert faults[:-1] == [None] * (2 * MAX_REFUSED - 1)
     assert "unusable" in (faults[-1] or "")
     assert "not finite" in (faults[-1] or "")
+    assert held.problem(now_ms * MS) == faults[-1], "nor may the next flight begin at once"
+    held.offer(chunk(99, now_ms + 1000), (now_ms + 1000) * MS)
+    assert "unusable" not in (held.problem((now_ms + 1000) * MS) or "")
 
 
 def test_an_older_chunk_never_replaces_a_newer_one() -> None:
     held = buffer()
     held.offer(chunk(2, 1000), 1000 * MS)
     assert not held.offer(chunk(1, 1001), 1001 * MS)
+    assert not held.offer(chunk(2, 1001), 1001 * MS)  # nor the same one twice
 
 
 def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:

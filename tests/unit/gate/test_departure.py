@@ -22,8 +22,12 @@ FAULT = {"chunk_fault": "no chunk"}
     ("facts", "choice", "mode"),
     [
         (MIDDLE, "auto", None),
+        (replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-0.2)), "auto", None),
+        (replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=0.21)), "auto", "BRAKE"),
         (IDLE_RECEIVER, "auto", "BRAKE"),
         (NO_RECEIVER, "auto", "BRAKE"),
+        (replace(MIDDLE, is_position_valid=False), "auto", None),
+        (replace(MIDDLE, is_position_valid=False), "rtl", "RTL"),
         (replace(NO_RECEIVER, is_position_valid=False), "auto", "LAND"),
         (MIDDLE, "hold", "BRAKE"),
         (MIDDLE, "land", "LAND"),
@@ -71,6 +75,18 @@ def test_a_refused_mode_becomes_land() -> None:
     moves = stepped.run(0.2, refused_mode="BRAKE")
     assert "LAND" in {move.mode for move in moves}
     assert stepped.step(mode="LAND", refused_mode=None).hand is Hand.RELEASE
+
+
+@pytest.mark.parametrize(("hold", "moves"), [("", 6), ("BRAKE", 6)])
+def test_where_the_vehicle_has_no_such_mode_the_receiver_gets_the_sticks(
+    hold: str, moves: int
+) -> None:
+    facts = replace(IDLE_RECEIVER, modes=replace(COPTER_MODES, hold=hold, land=""))
+    stepped = flying(facts)
+    stepped.step(**FAULT)
+    hands = [move.hand for move in stepped.run(0.1, refused_mode="BRAKE")]
+    assert hands[moves] is Hand.RELEASE
+    assert stepped.phase is Phase.RELEASING
 
 
 def test_a_late_refusal_does_not_stop_the_landing() -> None:
@@ -168,6 +184,30 @@ def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral(mode: str) ->
     assert stepped.step(mode="BRAKE").hand in (Hand.NEUTRAL, Hand.RELEASE)
 
 
+def test_where_the_throttle_is_thrust_it_stays_until_a_release_without_a_mode() -> None:
+    stepped = flying(replace(MIDDLE, mode="STABILIZE"), modes=("STABILIZE",))
+    moves = [stepped.step(**FAULT), *stepped.run(0.06)]
+    assert [move.hand for move in moves] == [Hand.LEVEL] * 5 + [Hand.RELEASE] * 2
+
+
+def test_a_mode_that_is_there_already_is_not_asked_for() -> None:
+    stepped = flying(replace(NO_RECEIVER, mode="BRAKE"), modes=("BRAKE",))
+    moves = [stepped.step(**FAULT), *stepped.run(1)]
+    assert {move.mode for move in moves} == {None}
+
+
+def test_an_unconfirmed_mode_is_not_asked_for_while_neutral_holds() -> None:
+    stepped = flying(NO_RECEIVER)
+    stepped.step(**FAULT)
+    stepped.run(3.1)
+    assert stepped.phase is Phase.HOLDING
+    assert {(move.hand, move.mode) for move in stepped.run(5)} == {(Hand.NEUTRAL, None)}
+
+
+def test_sticks_on_the_ground_end_in_neutral_as_in_the_air() -> None:
+    assert flying(replace(NO_RECEIVER, is_landed=True)).step(**FAULT).hand is Hand.NEUTRAL
+
+
 def test_a_stop_while_holding_after_a_fault_lands_as_a_normal_end_does() -> None:
     stepped = flying(NO_RECEIVER)
     stepped.step(**FAULT)
@@ -214,6 +254,13 @@ def test_setpoints_end_in_a_mode_that_holds_and_then_in_silence(
     ended = flying(facts, **rules)
     ended.engagement.stop(Ending(reason="over"))
     assert ended.step().mode == (hold if has_receiver else land)
+
+
+def test_setpoints_never_end_in_silence_alone_not_even_in_another_mode() -> None:
+    facts = replace(AIRBORNE, mode="LOITER")
+    departure = replace(SETPOINTS, on_fault="release")
+    stepped = flying(facts, departure=departure, modes=("LOITER",), is_setpoint=True)
+    assert stepped.step(**FAULT).mode == "BRAKE"
 
 
 def test_a_vehicle_that_does_not_answer_gets_no_more_setpoints_which_might_take_it_back() -> None:

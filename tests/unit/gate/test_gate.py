@@ -1,5 +1,6 @@
 """The gate as a whole, without I/O: what leaves at which moment."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from mavbridge.core.vehicle import (
     Decision,
     LinkSnapshot,
     ModeRoles,
+    Reading,
     Release,
     Sticks,
     Telemetry,
@@ -34,6 +36,8 @@ from mavbridge.gate.smoothing import Smoothing
 
 MS = NS_PER_MS
 WANTED = Sticks(0.4, 0.1, -0.2, 0.3)
+SLOW = stick_smoothing(max_slew_per_s=1.0, tau_s=0.0)
+PILOT = Sticks(0.1, 0.0, -0.3, 0.05)
 AGES = FreshnessLimits(
     state_ns=300 * MS, velocity_ns=300 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
 )
@@ -66,6 +70,9 @@ class Stepped:
         self.gate = Gate(settings, START_NS)
         self.status = replace(AIRBORNE_STATUS, **(status or {}))
         self.roles = roles
+        self.telemetry = Telemetry()
+        self.link: dict[str, Any] = {}
+        """What the link says besides the vehicle's status."""
         self.is_released = True
         self.serial = 0
         self.outputs: list[GateOutput] = []
@@ -95,13 +102,16 @@ class Stepped:
     ) -> GateOutput:
         now_ns = START_NS + round(at_ms * MS)
         self.status = replace(self.status, **({"rc_arrived_ns": now_ns} | changes))
-        link = LinkSnapshot(
-            telemetry=Telemetry(),
-            status=self.status,
-            problem=None,
-            echo_confirmed=True,
-            is_released=self.is_released,
-            modes=self.roles,
+        link = replace(
+            LinkSnapshot(
+                telemetry=self.telemetry,
+                status=self.status,
+                problem=None,
+                echo_confirmed=True,
+                is_released=self.is_released,
+                modes=self.roles,
+            ),
+            **self.link,
         )
         output = self.gate.step(now_ns, GateInput(link=link, chunk=chunk, act=act, stop=stop))
         if output.decision is not None:
@@ -109,7 +119,7 @@ class Stepped:
         self.outputs.append(output)
         return output
 
-    def engaged(self, *, at_ms: float = 30.0, sticks: Sticks = WANTED) -> "Stepped":
+    def engaged(self, *, at_ms: float = 30.0, sticks: Action = WANTED) -> "Stepped":
         """Three chunks in time, then the operator's key."""
         for k in range(3):
             self.step(at_ms - 30 + 10 * k, self.chunk(at_ms - 30 + 10 * k, sticks))
@@ -194,10 +204,115 @@ def test_the_next_step_is_due_at_the_next_slot() -> None:
     assert gate.gate.next_ns == START_NS + 40 * MS
 
 
+# --- what link and vehicle say
+
+
+LEFT = Command(action=NEUTRAL)
+
+
+@pytest.mark.parametrize(
+    ("link", "changes", "decision", "mode"),
+    [
+        ({"problem": "not heard", "is_overruled": True}, {}, Release("not heard"), None),
+        ({"problem": "no heartbeat"}, {}, LEFT, "BRAKE"),
+        ({"is_switched_off": True}, {}, Release("the pilot's override switch is off"), None),
+        ({"interruption": "rebooted"}, {}, Release("rebooted"), None),
+        ({}, {"is_failsafe": True}, Release("a failsafe of the vehicle is active (mode ALT_HOLD)"),
+         None),
+        ({"problem": "no heartbeat"}, {"is_position_valid": False}, LEFT, "LAND"),
+        ({"problem": "no heartbeat"}, {"has_receiver": True, "pilot_sticks": NEUTRAL}, LEFT, None),
+        ({"problem": "no heartbeat"}, {"has_receiver": True, "pilot_sticks": IDLE}, LEFT, "BRAKE"),
+    ],
+)  # fmt: skip
+def test_each_word_of_link_and_vehicle_counts(
+    link: dict[str, Any], changes: dict[str, Any], decision: Decision, mode: str | None
+) -> None:
+    gate = Stepped(status={"has_receiver": False, "pilot_sticks": None}).engaged()
+    gate.link = link
+    output = gate.step(31, **changes)
+    assert (output.decision, output.mode) == (decision, mode)
+
+
+def test_a_refused_mode_is_known() -> None:
+    gate = Stepped(status={"has_receiver": False}).engaged()
+    assert gate.step(31, stop=Ending(reason="dead", is_fault=True)).mode == "BRAKE"
+    gate.link = {"refused_mode": "BRAKE"}
+    assert gate.step(140).mode == "LAND"
+
+
+def test_a_vehicle_that_does_not_show_our_last_sticks_is_released_for_longer() -> None:
+    gate = Stepped().engaged()
+    gate.link = {"shows_last": False}
+    gate.step(31, mode="LOITER")
+    gate.is_released = False
+    assert gate.step(2000).phase is Phase.RELEASING
+    gate.link = {"shows_last": True}
+    assert gate.step(2010).phase is Phase.RELEASED
+
+
+def test_the_engage_switch_of_the_receiver_engages() -> None:
+    gate = Stepped(engage_channel=5)
+    for k in range(4):
+        gate.step(10 * k, gate.chunk(10 * k), rc_channels_us=(1500,) * 4 + (1000,))
+    gate.step(40, gate.chunk(40), rc_channels_us=(1500,) * 4 + (2000,))
+    assert gate.gate.phase is Phase.FLYING
+
+
+def test_the_envelope_ends_a_flight_as_a_fault() -> None:
+    gate = Stepped().engaged()
+    for at_ms in range(40, 740, 10):
+        gate.step(at_ms, gate.chunk(at_ms), battery_problem="the battery is at 8 %")
+    assert gate.gate.outcome.faults == 1
+    assert "the battery is at 8 %" in [output.reason for output in gate.outputs]
+
+
+def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:
+    gate = Stepped(arm=True, status={"armed": False})
+    for k in range(8):
+        gate.step(10 * k, gate.chunk(10 * k)._replace(attitude_ns=START_NS - 400 * MS))
+    assert "too slow for this computer" in (gate.gate.failure or "")
+
+
+def test_the_autopilots_takeoff_goes_by_the_height_above_the_place_of_arming() -> None:
+    gate = Stepped(
+        smoothing=SLOW,
+        arm=True,
+        takeoff_m=10.0,
+        status={"armed": False, "is_landed": True, "mode": "GUIDED", "pilot_sticks": PILOT},
+    )
+    for at_ms in range(0, 1030, 10):
+        output = gate.step(at_ms, gate.chunk(at_ms), position_ned_m=(0.0, 0.0, -2.0))
+    assert output.arm
+    asked = gate.step(1030, gate.chunk(1030), armed=True).takeoff_m
+    for at_ms in range(1040, 3100, 10):
+        asked = gate.step(at_ms, gate.chunk(at_ms), is_landed=asked is None).takeoff_m or asked
+    assert asked == 10.0
+    below = gate.step(3100, gate.chunk(3100), position_ned_m=(0.0, 0.0, -10.9))
+    above = gate.step(3110, gate.chunk(3110), position_ned_m=(0.0, 0.0, -11.1))
+    assert (below.mode, above.mode) == (None, "ALT_HOLD")
+    assert {below.decision, above.decision} == {Command(action=NEUTRAL)}
+    # The sticks were ours: the policy goes on from them, and not from the receiver's.
+    assert gate.step(3120, gate.chunk(3120), mode="ALT_HOLD").decision == Command(action=NEUTRAL)
+    assert gate.gate.phase is Phase.FLYING
+
+
+@pytest.mark.parametrize(("is_landed", "thrust"), [(True, 0.0), (False, 0.4), (None, 0.4)])
+def test_setpoints_end_idle_on_the_ground(is_landed: bool | None, thrust: float) -> None:
+    level = AttitudeThrust(0.4, 0.0, 0.0, 0.0)
+    gate = Stepped(
+        meaning=ActionMeaning(kind="attitude", hover_thrust=0.4),
+        smoothing=Smoothing(limits=LimitSettings().of("attitude"), tau_s=0.0),
+        status={"mode": "GUIDED", "is_landed": is_landed},
+        modes=("GUIDED",),
+        is_setpoint=True,
+        departure=DepartureSettings(is_setpoint=True),
+    )
+    gate.engaged(sticks=level)
+    assert gate.step(31, act="release").decision == Command(action=level._replace(thrust=thrust))
+
+
 # --- from where
 
-SLOW = stick_smoothing(max_slew_per_s=1.0, tau_s=0.0)
-PILOT = Sticks(0.1, 0.0, -0.3, 0.05)
 ECHO = Sticks(0.9, 0.9, 0.9, 0.9)
 
 
@@ -220,12 +335,14 @@ def test_without_known_sticks_it_starts_from_neutral_and_never_from_our_own_echo
     assert first_sticks(gate.engaged()) == NEUTRAL
 
 
-def test_sticks_that_were_seen_long_ago_are_not_known() -> None:
+@pytest.mark.parametrize(("age_ms", "first"), [(500, PILOT), (501, NEUTRAL), (None, NEUTRAL)])
+def test_sticks_that_were_seen_long_ago_are_not_known(age_ms: int | None, first: Sticks) -> None:
     gate = Stepped(smoothing=SLOW, status={"pilot_sticks": PILOT})
     for k in range(3):
         gate.step(570 + 10 * k, gate.chunk(570 + 10 * k))
-    gate.step(601, gate.chunk(601), act="engage", rc_arrived_ns=START_NS + 100 * MS)
-    assert first_sticks(gate) == NEUTRAL
+    arrived_ns = None if age_ms is None else START_NS + (601 - age_ms) * MS
+    gate.step(601, gate.chunk(601), act="engage", rc_arrived_ns=arrived_ns)
+    assert first_sticks(gate) == first
 
 
 def test_after_arming_it_starts_from_idle() -> None:
@@ -277,7 +394,17 @@ def test_beyond_the_horizon_neutral_bridges_the_rest_of_the_grace() -> None:
     assert sent[140].chunk_serial is None
 
 
+def test_a_chunk_that_comes_while_the_sticks_are_idle_sends_nothing_between_slots() -> None:
+    gate = Stepped(arm=True, status={"armed": False})
+    for at_ms in (0, 10, 20):
+        assert gate.step(at_ms, gate.chunk(at_ms)).decision == Command(action=IDLE)
+    assert gate.step(23, gate.chunk(23)).decision is None
+
+
 def test_coasting_is_told() -> None:
+    waiting = Stepped()
+    waiting.step(0, waiting.chunk(0))
+    assert not waiting.step(500).is_coasting  # nothing is flown
     gate = Stepped().engaged()
     told = {at_ms: gate.step(at_ms).is_coasting for at_ms in range(40, 100, 10)}
     assert told == {40: False, 50: False, 60: True, 70: True, 80: True, 90: True}
@@ -292,6 +419,33 @@ def test_where_the_throttle_is_thrust_it_stays_until_the_safe_mode_is_there() ->
     assert left.mode == "LAND"
     assert gate.step(40).decision == left.decision
     assert gate.step(50, mode="LAND").decision == Command(action=NEUTRAL)
+
+
+def test_a_throttle_that_is_thrust_stays_down_where_the_policy_never_had_it() -> None:
+    gate = Stepped(arm=True, modes=("STABILIZE",), status={"mode": "STABILIZE", "armed": False})
+    gate.step(0, gate.chunk(0))
+    assert gate.step(10, armed=True).decision == Command(action=IDLE)  # too few chunks to fly
+    left = gate.step(20, act="release")
+    assert (left.phase, left.decision) == (Phase.LEAVING, Command(action=IDLE))
+
+
+def test_the_policy_is_sampled_ahead_by_the_lag_of_the_low_pass() -> None:
+    gate = Stepped(smoothing=stick_smoothing(tau_s=0.05)).engaged()
+    ramp = gate.chunk(40)._replace(actions=tuple(Sticks(0.01 * k, 0, 0, 0) for k in range(16)))
+    trace = gate.step(40, ramp).trace  # from 37 ms on, 0.01 every 20 ms
+    assert trace is not None
+    assert trace.raw.throttle == pytest.approx(0.0265)
+
+
+def test_neutral_sticks_are_sent_at_once_but_the_horizon_is_left_within_the_limits() -> None:
+    gate = Stepped(smoothing=SLOW, status={"pilot_sticks": WANTED}).engaged()
+    gate.step(33, gate.chunk(33, actions=2))  # acts until 70
+    (before, beyond) = (gate.step(70).decision, gate.step(80).decision)
+    assert isinstance(before, Command)
+    assert isinstance(beyond, Command)
+    assert before.action == pytest.approx(WANTED)
+    assert beyond.action == pytest.approx((0.39, 0.09, -0.19, 0.29))
+    assert gate.step(81, act="release").decision == Command(action=NEUTRAL)
 
 
 def test_read_only_flies_as_if_it_sent() -> None:
@@ -364,6 +518,61 @@ def test_body_rates_are_bridged_by_a_level_attitude() -> None:
     assert gate.step(60, gate.chunk(60, turn)).decision == Command(action=turn)
 
 
+def test_the_level_attitude_that_bridges_body_rates_is_not_filtered_with_them() -> None:
+    turn = BodyRates(0.5, 1.0, 0.0, 0.0)
+    rates = Smoothing(limits=LimitSettings().of("rates"), tau_s=0.05)
+    gate = Stepped(meaning=ActionMeaning(kind="rates", hover_thrust=0.4), smoothing=rates)
+    gate.engaged(sticks=turn)
+    gate.step(40, gate.chunk(40, turn, actions=1))
+    assert gate.step(60).decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+
+
+def of_velocities(mode: str, **rules: Any) -> Stepped:
+    limits = LimitSettings(accel_mps2=5.0).of("velocity")
+    return Stepped(
+        meaning=ActionMeaning(kind="velocity"),
+        smoothing=Smoothing(limits=limits, tau_s=0.0),
+        status={"mode": mode},
+        roles=PX4_MODES,
+        modes=("OFFBOARD",),
+        is_setpoint=True,
+        departure=DepartureSettings(is_setpoint=True),
+        **rules,
+    )
+
+
+def test_a_velocity_is_braked_within_the_limit_of_acceleration() -> None:
+    gate = of_velocities("OFFBOARD")
+    gate.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (3.0, 0.0, 0.0)))
+    gate.engaged(sticks=Velocity(3.0, 0.0, 0.0, 0.0))
+    braking = gate.step(40, act="release").decision
+    assert isinstance(braking, Command)
+    assert braking.action == pytest.approx((2.95, 0.0, 0.0, 0.0))
+
+
+def test_neutral_velocities_on_the_way_in_begin_with_what_the_vehicle_does() -> None:
+    gate = of_velocities("ALTCTL")
+    gate.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (2.0, 0.0, 0.0)))
+    for at_ms in (0, 10, 20):
+        gate.step(at_ms, gate.chunk(at_ms, Velocity(0.0, 0.0, 0.0, 0.0)))
+    entering = gate.step(30, act="engage")
+    assert entering.phase is Phase.PREPARING
+    assert entering.decision == Command(action=Velocity(2.0, 0.0, 0.0, 0.0))
+    braking = gate.step(40).decision
+    assert isinstance(braking, Command)
+    assert braking.action == pytest.approx((1.95, 0.0, 0.0, 0.0))
+
+
+def test_a_velocity_that_was_idle_on_the_ground_ends_from_rest() -> None:
+    gate = of_velocities("OFFBOARD", arm=True)
+    gate.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (0.3, 0.0, 0.0)))  # it drifts
+    rest = Command(action=Velocity(0.0, 0.0, 0.0, 0.0))
+    assert gate.step(0, armed=False).decision == rest
+    assert gate.step(10, armed=True).decision == rest
+    left = gate.step(20, act="release", is_landed=False)
+    assert (left.phase, left.decision) == (Phase.LEAVING, rest)
+
+
 def test_a_chunk_of_another_kind_of_action_is_not_flown() -> None:
     gate = Stepped().engaged()
     gate.step(40, gate.chunk(40, BodyRates(0.5, 1.0, 0.0, 0.0)))
@@ -375,16 +584,7 @@ def test_a_chunk_of_another_kind_of_action_is_not_flown() -> None:
 
 
 def test_neutral_velocities_on_the_way_in_are_not_those_of_an_earlier_flight() -> None:
-    limits = LimitSettings(accel_mps2=5.0).of("velocity")
-    gate = Stepped(
-        meaning=ActionMeaning(kind="velocity"),
-        smoothing=Smoothing(limits=limits, tau_s=0.0),
-        status={"mode": "OFFBOARD"},
-        roles=PX4_MODES,
-        modes=("OFFBOARD",),
-        is_setpoint=True,
-        departure=DepartureSettings(is_setpoint=True),
-    )
+    gate = of_velocities("OFFBOARD")
     fast = Velocity(3.0, 0.0, 0.0, 0.0)
     gate.engaged(sticks=fast)
     for at_ms in range(40, 1000, 10):
@@ -396,3 +596,18 @@ def test_neutral_velocities_on_the_way_in_are_not_those_of_an_earlier_flight() -
     entering = gate.step(1020, gate.chunk(1020, fast), act="engage")
     assert gate.gate.phase is Phase.PREPARING
     assert entering.decision == Command(action=Velocity(0.0, 0.0, 0.0, 0.0))
+
+
+def test_a_flight_by_velocities_begins_within_their_limits_whatever_the_vehicle_says() -> None:
+    """One wrong reading would be asked for, and 20 s later still for most of it."""
+    limits = LimitSettings(speed_mps=8.0, climb_mps=3.0, accel_mps2=5.0).of("velocity")
+    gate = Stepped(
+        meaning=ActionMeaning(kind="velocity"), smoothing=Smoothing(limits=limits, tau_s=0.0)
+    )
+    gate.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (3.4e38, 0.0, -90.0)))
+    gate.engaged(sticks=Velocity(0.0, 0.0, 0.0, 0.0))
+    first = gate.decisions[0]
+    assert isinstance(first, Command)
+    assert isinstance(first.action, Velocity)
+    assert math.hypot(first.action.x_mps, first.action.y_mps) <= 8.0
+    assert abs(first.action.z_mps) <= 3.0

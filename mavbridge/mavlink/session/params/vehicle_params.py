@@ -17,6 +17,8 @@ from mavbridge.mavlink.settings import LinkSettings
 
 _AGAIN_NS = 2 * NS_PER_S
 """Between attempts to read parameters that the vehicle did not send."""
+_MOST_TOLD = 100
+"""Texts of advice in a session: they name values, which may change any number of times."""
 
 
 class VehicleParams:
@@ -46,7 +48,7 @@ class VehicleParams:
         )
         self._reader = ParamReader(profile.params)
         self._kinds: dict[str, int] = {}
-        """MAV_PARAM_TYPE of each parameter that was heard."""
+        """MAV_PARAM_TYPE of each parameter that matters and was heard."""
         self._has_asked_more = False
         self._again_ns = 0
         self._changes = TemporaryParams(
@@ -93,9 +95,10 @@ class VehicleParams:
             param = param.from_bytes()
         if not math.isfinite(param.value):
             return
-        self._kinds[param.name] = param.kind
         old = self._reader.values.get(param.name)
         self._reader.receive(param)
+        if param.name in self._reader.values:  # of no other name, as there may be any number
+            self._kinds[param.name] = param.kind
         self._changes.receive(param)
         if not self.is_read or old == self._reader.values.get(param.name):
             return
@@ -190,7 +193,7 @@ class VehicleParams:
             if danger.risk in self._config.accepted_risks:
                 texts.append(f"risk {danger.risk} is accepted: {danger.text}")
         for text in texts:
-            if text not in self._told:
+            if text not in self._told and len(self._told) < _MOST_TOLD:
                 self._told.add(text)
                 self._report(text)
 

@@ -120,7 +120,8 @@ def test_what_the_vehicle_cannot_do_is_told_once_and_counted() -> None:
         ({"mode": "STABILIZE"}, 1700),  # where the middle of the throttle is thrust
         ({"has_receiver": True}, None),  # it has the sticks as soon as ours are released
         ({"armed": False}, None),
-        ({"is_failsafe": True}, None),  # sticks would end it
+        ({"is_failsafe": True}, 1500),  # one that only warns
+        ({"is_failsafe": True, "mode": "RTL"}, None),  # it would fire again
     ],
 )
 def test_level_sticks_go_ahead_of_a_release_that_would_keep_ours(

@@ -226,6 +226,15 @@ def test_reboot_is_refused_when_armed_and_else_restarts_the_clock(station):
     assert attitude.time_boot_ms < 500
 
 
+def test_a_forced_reboot_ends_a_flight_too(station):
+    station.run(2.0)
+    station.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196)
+    reboot = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+    assert station.command(reboot, 1, 0, 0, 0, 0, 20190226) == mav.MAV_RESULT_ACCEPTED
+    assert not station.vehicle.ap.armed
+    assert station.vehicle.ap.uptime_ns < NS_PER_S
+
+
 def test_prearm_health_waits_for_the_estimator_but_not_for_the_sticks(station):
     def healthy():
         station.send(mav.MAVLink_command_long_message(1, 1, 512, 0, 1, *[0] * 6))

@@ -102,3 +102,14 @@ def test_a_frame_without_pixels_is_refused(name):
 def test_a_frame_of_another_kind_is_refused(publisher, image):
     with pytest.raises(ValueError, match="want uint8"):
         publisher.publish(image, captured_ns=1)
+
+
+def test_frames_that_are_not_whole_stay_marked_as_being_written(publisher, name):
+    for number in range(1, 6):  # the fifth is in the slot of the first again
+        publisher.publish(grey(number), number, is_whole=False)
+    (sequence,) = struct.unpack_from("<q", raw(name), 64 + STRIDE)
+    assert sequence == 1
+    for number in range(6, 10):
+        publisher.publish(grey(number), number)
+    (sequence,) = struct.unpack_from("<q", raw(name), 64 + STRIDE)
+    assert sequence == 2

@@ -1,0 +1,14 @@
+"""Hostile datagrams in flights of an ArduPilot vehicle; `make fuzz` feeds more of them."""
+
+import pytest
+
+from fuzz.link_target import HostileFlight
+from mavbridge.core.vehicle import ActionKind
+
+
+@pytest.mark.parametrize("kind", ["sticks", "attitude", "rates", "velocity"])
+def test_hostile_datagrams_neither_fly_nor_break_anything(kind: ActionKind) -> None:
+    flight = HostileFlight(1, "ardupilot", kind, share=1100)
+    flight.run(4500)
+    assert flight.fed >= 4500
+    assert flight.flights >= 1
