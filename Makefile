@@ -74,6 +74,7 @@ FUZZ_DATAGRAMS ?= 10000000
 FUZZ_SEED ?=
 fuzz: $(VENV)/installed  ## hostile datagrams on all cores: FUZZ_DATAGRAMS=N, FUZZ_SEED=N repeats a run
 	PYTHONPATH=.:tests $(BIN)/python -m fuzz --datagrams $(FUZZ_DATAGRAMS) $(if $(FUZZ_SEED),--seed $(FUZZ_SEED))
+	GATE_EXAMPLES=1000 $(BIN)/pytest -q tests/properties/test_gate.py
 
 clean:  ## forget the environments and outputs
 	rm -rf $(VENV) .venv-peers out

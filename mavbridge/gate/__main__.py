@@ -88,7 +88,7 @@ def _fly(
     transport = make_transport(settings.link.connect, clock)
     if settings.link.forward:
         wins = settings.link.gcs_sticks_win
-        station = Forwarding(settings.link.forward, clock, sticks_win=wins)
+        station = Forwarding(settings.link.forward, clock, sticks_win=wins, signing=signing)
     link = MavlinkLink(
         transport,
         clock,

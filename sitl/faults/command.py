@@ -11,10 +11,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from sitl import UsageError
-from sitl.faults.processes import StageError
 from sitl.faults.run import fly_scenario
 from sitl.faults.scenario import Scenario, Variant, load_catalogue
 from sitl.faults.soak import make_summary, soak
+from sitl.faults.stage.processes import StageError
 from sitl.faults.table import make_line, make_page
 from sitl.faults.verdict import Verdict
 

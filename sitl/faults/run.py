@@ -7,17 +7,17 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from sitl.clock import Clock
-from sitl.faults.carriers import Carrier, SerialCarrier, TcpCarrier
-from sitl.faults.leftovers import leftovers, thread_names
-from sitl.faults.processes import StageError
 from sitl.faults.record import NoVerdictError
 from sitl.faults.scenario import Scenario, Variant
-from sitl.faults.stage import CATALOGUE, Stage, faulty_policy, free_port, staged
-from sitl.faults.stalls import StallWatch
-from sitl.faults.steps import Terminal
-from sitl.faults.transmitter import Transmitter
+from sitl.faults.stage.carriers import Carrier, SerialCarrier, TcpCarrier
+from sitl.faults.stage.leftovers import leftovers, thread_names
+from sitl.faults.stage.processes import StageError
+from sitl.faults.stage.stage import CATALOGUE, Stage, faulty_policy, free_port, staged
+from sitl.faults.stage.stalls import StallWatch
+from sitl.faults.stage.transmitter import Transmitter
+from sitl.faults.stage.viewer import Viewer
+from sitl.faults.steps.common import Terminal
 from sitl.faults.verdict import Verdict, find_failures
-from sitl.faults.viewer import Viewer
 
 FLY = ("--dual-rate", "--arm")
 SETTLE_S = 1.0

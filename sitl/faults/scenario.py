@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sitl import UsageError
-from sitl.faults.carriers import CarrierName
 from sitl.faults.record import Receiver
-from sitl.faults.stage import CATALOGUE
-from sitl.faults.steps import Step, make, make_step
+from sitl.faults.stage.carriers import CarrierName
+from sitl.faults.stage.stage import CATALOGUE
+from sitl.faults.steps.common import Step, make, make_step
 from sitl.vehicle.config import AutopilotName
 
-Outcome = Literal["loses", "keeps", "refused"]
-"""The policy loses the sticks until the next explicit act, keeps them, or never gets them."""
-EXITS: dict[Outcome, list[int]] = {"loses": [4], "keeps": [0], "refused": [2]}
+Outcome = Literal["loses", "keeps", "either", "refused"]
+"""The policy loses the sticks until the next explicit act, keeps them, either of these as chance
+has it, or never gets them."""
+EXITS: dict[Outcome, list[int]] = {"loses": [4], "keeps": [0], "either": [0, 4], "refused": [2]}
 
 
 @dataclass(frozen=True, kw_only=True)

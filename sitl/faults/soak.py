@@ -11,11 +11,11 @@ from typing import NamedTuple
 from pymavlink import mavutil
 
 from sitl.clock import NS_PER_S
-from sitl.faults.processes import StageError
-from sitl.faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
-from sitl.faults.steps import Images, Joystick, Messages, Pilot, Signal, Step, Wait
-from sitl.faults.steps_link import Link
-from sitl.faults.transmitter import Transmitter
+from sitl.faults.stage.processes import StageError
+from sitl.faults.stage.stage import ORDERLY, Stage, faulty_policy, free_port, staged
+from sitl.faults.stage.transmitter import Transmitter
+from sitl.faults.steps.common import Images, Joystick, Messages, Pilot, Signal, Step, Wait
+from sitl.faults.steps.link import Link
 from sitl.faults.usage import Usage, growth, read_usage
 
 POLICY = "Wandering"

@@ -29,6 +29,7 @@ SHOWN_STALL_MS = 10.0
 MUST = {
     "loses": "lose the sticks",
     "keeps": "fly on",
+    "either": "fly on, or lose the sticks",
     "refused": "not fly",
 }
 

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 
 from sitl.faults.record import Aftermath, VehicleReport, aftermath
-from sitl.faults.relay import Sent
 from sitl.faults.scenario import Scenario, Variant
-from sitl.faults.stage import Stage
+from sitl.faults.stage.relay import Sent
+from sitl.faults.stage.stage import Stage
 
 
 @dataclass(kw_only=True)
@@ -56,8 +56,8 @@ def find_failures(
     if scenario.outcome == "refused":
         if report["armed_s"] > 0 or any(row.leans for row in sent):
             failures.append("it flew")
-    elif scenario.outcome == "keeps":
-        if not leans:
+    elif scenario.outcome in ("keeps", "either"):
+        if not leans and scenario.outcome == "keeps":
             failures.append("the policy has lost the sticks")
     else:
         variant = verdict.variant

@@ -5,7 +5,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import ARM, FORCE, REBOOT_FORCE, is_armed, last, named
+from helpers.contract_peers import ARM, REBOOT_FORCE, is_armed, last, named
 from helpers.copter_companion import ACCEPTED, ALT_HOLD, FAILED, STABILIZE
 
 REBOOT = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
@@ -87,13 +87,6 @@ def test_throttle_is_a_climb_rate_in_alt_hold(flying):
     states = named(flying.hold(2.5, thr=1700), "LOCAL_POSITION_NED")[-10:]
 
     assert -sum(m.vz for m in states) / len(states) == pytest.approx(0.64, abs=0.05)
-
-
-def test_in_flight_only_a_forced_disarm_works(expendable):
-    assert expendable.command(ARM, 0) == FAILED
-    assert expendable.command(ARM, 0, FORCE, system_id=42) == ACCEPTED
-    assert is_armed(last(expendable.seen, "HEARTBEAT"))
-    assert not is_armed(last(expendable.advance(0.5), "HEARTBEAT"))
 
 
 def test_a_forced_reboot_in_flight_leaves_it_disarmed_in_its_boot_mode(expendable):

@@ -5,7 +5,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import is_armed, last, named
+from helpers.contract_peers import ARM, FORCE, is_armed, last, named
 from helpers.copter_companion import (
     ACCEPTED,
     ALT_HOLD,
@@ -176,7 +176,7 @@ def test_thrust_is_a_climb_rate_unless_an_option_says_otherwise(flying, options,
     assert climb > climb_mps if options else climb == pytest.approx(climb_mps, abs=0.15)
 
 
-def test_a_thrust_lifts_off_and_sticks_do_nothing(grounded):
+def test_a_thrust_lifts_off_sticks_do_nothing_and_in_flight_only_a_forced_disarm_works(grounded):
     armed_on_the_ground(grounded, GUIDED_NOGPS)
     start_m = last(grounded.advance(0.2), "LOCAL_POSITION_NED").z
 
@@ -187,6 +187,12 @@ def test_a_thrust_lifts_off_and_sticks_do_nothing(grounded):
     assert start_m - last(messages, "LOCAL_POSITION_NED").z > 2.0
     assert abs(roll_deg(messages)) < 1.5
     assert abs(speed_ned(messages)[2]) < 0.3
+
+    grounded.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
+    assert grounded.command(ARM, 0) == FAILED
+    assert is_armed(grounded.wait("HEARTBEAT"))
+    assert grounded.command(ARM, 0, FORCE, system_id=42) == ACCEPTED
+    assert not is_armed(last(grounded.advance(0.5), "HEARTBEAT"))
 
 
 @pytest.mark.parametrize(

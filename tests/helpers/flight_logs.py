@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pymavlink import mavutil
 
-from sitl.faults.relay import Override
+from sitl.faults.stage.relay import Override
 
 
 def logged_overrides(path: Path) -> Iterator[Override]:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mavbridge.recording.flight_folder import open_flight
-from sitl.faults.stage import faulty_policy, staged
+from sitl.faults.stage.stage import faulty_policy, staged
 
 pytestmark = pytest.mark.system
 

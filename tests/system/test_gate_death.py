@@ -11,8 +11,8 @@ import pytest
 
 from helpers.flight_logs import logged_overrides
 from sitl.faults.record import Aftermath, Receiver, VehicleReport, aftermath
-from sitl.faults.relay import Override
-from sitl.faults.stage import faulty_policy, staged
+from sitl.faults.stage.relay import Override
+from sitl.faults.stage.stage import faulty_policy, staged
 
 pytestmark = pytest.mark.system
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sitl.faults.relay import COPTER_MODES
-from sitl.faults.stage import ORDERLY, TIMEOUT_S, Stage, faulty_policy, staged
+from sitl.faults.stage.relay import COPTER_MODES
+from sitl.faults.stage.stage import ORDERLY, TIMEOUT_S, Stage, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 

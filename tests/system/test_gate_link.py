@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from sitl.faults.link import LinkFaults
 from sitl.faults.record import NUDGE_US, aftermath
-from sitl.faults.relay import Relay
-from sitl.faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
-from sitl.faults.transmitter import Transmitter
+from sitl.faults.stage.link import LinkFaults
+from sitl.faults.stage.relay import Relay
+from sitl.faults.stage.stage import ORDERLY, Stage, faulty_policy, free_port, staged
+from sitl.faults.stage.transmitter import Transmitter
 
 pytestmark = pytest.mark.system
 

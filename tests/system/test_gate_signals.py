@@ -13,10 +13,10 @@ from mavbridge.flight.gate_process import GateProcess
 from mavbridge.gate.settings import GateSettings
 from mavbridge.mavlink.settings import LinkSettings
 from sitl.clock import Clock
-from sitl.faults.processes import Process
 from sitl.faults.record import aftermath
-from sitl.faults.relay import Override
-from sitl.faults.stage import ORDERLY, faulty_policy, staged
+from sitl.faults.stage.processes import Process
+from sitl.faults.stage.relay import Override
+from sitl.faults.stage.stage import ORDERLY, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from sitl.faults.relay import Sent
-from sitl.faults.stage import Stage, staged
+from sitl.faults.stage.relay import Sent
+from sitl.faults.stage.stage import Stage, staged
 
 pytestmark = pytest.mark.system
 

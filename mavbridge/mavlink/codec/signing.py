@@ -19,6 +19,8 @@ TICK_NS = 10_000
 """Unit of a timestamp, 10 us."""
 EPOCH_NS = 1_420_070_400 * 10**9
 """Unix time of 2015-01-01 UTC, from which timestamps count."""
+LATEST_TICKS = 2**48 - 2**40
+"""No later timestamp is followed: it has 48 bits, and those after it need room."""
 MOST_LAG_TICKS = 60 * 10**9 // TICK_NS
 """A stream that was never heard may begin a minute behind our own clock."""
 _RADIO_STATUS = 109
@@ -113,6 +115,9 @@ class Signing:
         elif not remembered and ticks < self._now_ticks() - MOST_LAG_TICKS:
             return "clock behind"
         self._heard[stream] = ticks
+        # Ours follow, as MAVLink says: a vehicle refuses a sender that is a minute behind it.
+        if ticks <= LATEST_TICKS:
+            self._sent_ticks = max(self._sent_ticks, ticks)
         return None
 
     def _now_ticks(self) -> int:

@@ -9,6 +9,7 @@ from mavbridge.core.clock import Clock
 from mavbridge.core.errors import UserError
 from mavbridge.mavlink.codec.frames import split_frames
 from mavbridge.mavlink.codec.messages import Endpoint
+from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
 from mavbridge.mavlink.transport.sockets import Address, resolved
 
@@ -38,7 +39,11 @@ class Forwarding:
         UserError: the address is malformed or in use, or its host does not exist.
     """
 
-    def __init__(self, spec: str, clock: Clock, *, sticks_win: bool = False) -> None:
+    def __init__(
+        self, spec: str, clock: Clock, *, sticks_win: bool = False, signing: Signing | None = None
+    ) -> None:
+        """With ``signing`` only packets signed with its key are passed on, and obeyed here."""
+        self._signing = signing
         parsed = parse_forward(spec)
         address = resolved(parsed.host, parsed.port)
         self._clock = clock
@@ -120,6 +125,9 @@ class Forwarding:
             packets += len(frames)
             self.rules.dropped += has_rest
             for frame in frames:
+                if self._signing is not None and not self._signing.accepts(frame.data):
+                    self.rules.dropped += 1
+                    continue
                 verdict = self.rules.judge(frame, now_ns, is_engaged=is_engaged)
                 if verdict is Verdict.PASS:
                     yield frame.data

@@ -7,6 +7,7 @@ import select
 import socket
 import struct
 import sys
+import termios
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -32,6 +33,11 @@ TCP_SILENCE_NS = 5 * NS_PER_S
 """Heartbeats come at 1 Hz: a connection this quiet is dead, even if the kernel has not noticed."""
 TCP_FIRST_S = 3.0
 """Longest wait for the answer to the first attempt to connect; nothing else waits for it then."""
+STALE_NS = 100 * NS_PER_MS
+"""Oldest byte that may wait in a serial port's queue: the usual limit of a state's age."""
+_TCP_STALE_MS = 500
+"""Longest time for which a TCP connection may leave sent bytes unanswered; then it is closed, and
+the sticks that wait in the kernel with it. As long as until sticks that nobody hears are known."""
 _CHUNK_BYTES = 65536
 _STREAM_BYTES = 2048
 """A piece of a TCP stream: some fifty packets, after which a reader may leave the rest."""
@@ -250,6 +256,9 @@ class TcpTransport(_StreamTransport[socket.socket]):
                 raise self._down(error.errno) from error
             if not data:
                 raise TransportDownError("tcp: the vehicle closed the connection")
+            if not self._is_connected and sys.platform == "linux":
+                option = socket.TCP_USER_TIMEOUT
+                self._handle.setsockopt(socket.IPPROTO_TCP, option, _TCP_STALE_MS)
             self._is_connected = True
             self._heard_ns = self._clock.now_ns()
             yield Received(data, self._heard_ns, None)
@@ -280,6 +289,8 @@ class SerialTransport(_StreamTransport[serial.Serial]):
         """Read, but not drained yet."""
         self._emptied_ns = 0
         """When the port was last seen empty: what comes later arrived later."""
+        self._written: deque[tuple[int, int]] = deque()
+        """Size and moment of what may still wait in the port's queue."""
 
     def open(self) -> None:
         """Open the port, non-blocking and exclusive."""
@@ -294,6 +305,7 @@ class SerialTransport(_StreamTransport[serial.Serial]):
         self._was_open = True
         self._unsent = b""
         self._backlog.clear()
+        self._written.clear()
         self._emptied_ns = self._clock.now_ns()
 
     def _obstacle(self, error: OSError | ValueError) -> str:
@@ -354,11 +366,32 @@ class SerialTransport(_StreamTransport[serial.Serial]):
         """See `Transport`. Bypasses pyserial, whose write loops forever on a full buffer."""
         if self._handle is None:
             return False
-        descriptor = self._handle.fileno()
         try:
-            return self._put(data, lambda part: os.write(descriptor, part))
-        except OSError as error:
+            self._drop_stale(self._handle)
+            return self._put(data, self._write)
+        except (OSError, termios.error) as error:
             raise self._down(error) from error
+
+    def _write(self, part: bytes) -> int:
+        assert self._handle is not None
+        size = os.write(self._handle.fileno(), part)
+        self._written.append((size, self._clock.now_ns()))
+        return size
+
+    def _drop_stale(self, port: serial.Serial) -> None:
+        """Empty the port's queue when its oldest byte waits for too long: nobody takes them now,
+        and sticks that old must not be taken later. A packet may be cut; its checksum shows it.
+
+        A driver that does not tell its queue, such as a pseudo-terminal, keeps it.
+        """
+        waiting = port.out_waiting
+        extra = sum(size for size, _ in self._written) - waiting
+        while self._written and self._written[0][0] <= extra:
+            extra -= self._written.popleft()[0]
+        if self._written and waiting and self._clock.now_ns() - self._written[0][1] > STALE_NS:
+            port.reset_output_buffer()
+            self._written.clear()
+            self._unsent = b""
 
 
 def _ports_here() -> str:

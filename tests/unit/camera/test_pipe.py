@@ -20,7 +20,7 @@ from mavbridge.camera.pipe import PipeCommand, PipeSource, parse_pipe
 from mavbridge.camera.pipe_frames import RAW_FORMATS, JpegCutter, RawCutter
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
-from sitl.faults.processes import child_of
+from sitl.faults.stage.processes import child_of
 
 WIDTH, HEIGHT = 32, 16
 WRITER = """

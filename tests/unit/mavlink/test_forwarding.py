@@ -1,5 +1,6 @@
 """A ground station beside us: what passes, what does not, and when its sticks win."""
 
+import select
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -14,6 +15,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.processes import free_port
 from mavbridge.mavlink.codec.frames import RawPacket, split_frames
 from mavbridge.mavlink.codec.messages import Endpoint
+from mavbridge.mavlink.codec.signing import EPOCH_NS, Signing
 from mavbridge.mavlink.transport.forwarding import MAX_DATAGRAMS, MAX_QUEUED_BYTES, Forwarding
 from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
 
@@ -381,3 +383,25 @@ def test_a_port_that_is_taken_is_refused(station: socket.socket) -> None:
     port = station.getsockname()[1]
     with pytest.raises(UserError, match="choose another port"):
         Forwarding(f"udpin:127.0.0.1:{port}", FakeClock())
+
+
+def test_with_a_key_only_signed_packets_are_passed_on_and_obeyed(station: socket.socket) -> None:
+    key, port = bytes(range(32)), station.getsockname()[1]
+    signing = Signing(key, unix_ns=lambda: EPOCH_NS)
+    forwarding = Forwarding(f"udp:127.0.0.1:{port}", FakeClock(), sticks_win=True, signing=signing)
+    try:
+        sticks, mav = manual(x=900), dialect.MAVLink(None, srcSystem=255, srcComponent=190)
+        unsigned = bytes(sticks.pack(mav))
+        mav.signing.secret_key, mav.signing.sign_outgoing = key, True
+        mav.signing.timestamp = 1
+        signed = bytes(sticks.pack(mav))
+        for packet in (unsigned, signed):
+            station.sendto(packet, ("127.0.0.1", ours(forwarding)[1]))
+            select.select([forwarding], [], [], 5)
+            passed = list(forwarding.receive(None, is_engaged=True))
+            assert passed == ([signed] if packet is signed else [])
+            assert forwarding.rules.has_won is (packet is signed)
+        assert forwarding.rules.dropped == 1
+        assert signing.refused == {"unsigned": 1}
+    finally:
+        forwarding.close()

@@ -174,3 +174,22 @@ def test_without_a_key_signed_packets_are_read_and_noticed():
     assert not codec.hears_signed
     assert names(codec, attitude(make_vehicle())) == ["ATTITUDE_QUATERNION"]
     assert codec.hears_signed
+
+
+def test_our_timestamps_follow_a_vehicle_whose_clock_is_ahead():
+    ahead = NOW_TICKS + 100 * MINUTE_TICKS
+    codec, vehicle = make_codec(), make_vehicle(ticks=ahead)
+    assert names(codec, heartbeat(vehicle)) == ["HEARTBEAT"]
+
+    reply = codec.encode_heartbeat()
+
+    assert timestamp(reply) == ahead + 1
+    assert vehicle.decode(bytearray(reply)).get_type() == "HEARTBEAT"
+
+
+def test_a_wrong_signature_and_a_time_without_a_next_one_move_nothing():
+    codec = make_codec()
+    assert not names(codec, heartbeat(make_vehicle(OTHER_KEY, ticks=NOW_TICKS + MINUTE_TICKS)))
+    assert names(codec, heartbeat(make_vehicle(ticks=2**48 - 1))) == ["HEARTBEAT"]
+
+    assert timestamp(codec.encode_heartbeat()) == NOW_TICKS

@@ -9,6 +9,7 @@ import tty
 from pathlib import Path
 
 import pytest
+import serial
 
 from helpers.fakes import FakeClock
 from mavbridge.core.clock import MonotonicClock
@@ -351,3 +352,75 @@ def test_a_silent_tcp_connection_is_taken_for_dead() -> None:
 def test_a_host_that_does_not_exist_is_the_users_error() -> None:
     with pytest.raises(UserError, match="cannot find host"):
         make_transport("tcp:no.such.host.invalid:5760", FakeClock())
+
+
+def test_sticks_that_a_serial_port_cannot_send_are_thrown_away_before_they_are_stale(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The far side stops reading for a second: no byte older than 100 ms is sent after it."""
+    clock, waiting = FakeClock(), bytearray()
+    ours_fd, theirs_fd = pty.openpty()
+    tty.setraw(theirs_fd)
+    ours = SerialTransport(os.ttyname(theirs_fd), 115200, clock)
+    ours.open()
+
+    def write(_descriptor: int, data: bytes) -> int:
+        waiting.extend(data)
+        return len(data)
+
+    monkeypatch.setattr("mavbridge.mavlink.transport.sockets.os.write", write)
+    monkeypatch.setattr(serial.Serial, "out_waiting", property(lambda _port: len(waiting)))
+    monkeypatch.setattr(serial.Serial, "reset_output_buffer", lambda _port: waiting.clear())
+    for tick in range(100):
+        assert ours.send(bytes([tick]) * 30)
+        assert min(waiting) >= tick - 10
+        clock.advance_ns(10_000_000)
+    assert waiting
+    ours.close()
+    os.close(theirs_fd)
+    os.close(ours_fd)
+
+
+def test_a_serial_port_that_sends_what_it_gets_loses_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Always something waits, but never for long."""
+    clock, waiting, sent = FakeClock(), bytearray(), bytearray()
+    ours_fd, theirs_fd = pty.openpty()
+    tty.setraw(theirs_fd)
+    ours = SerialTransport(os.ttyname(theirs_fd), 115200, clock)
+    ours.open()
+
+    def write(_descriptor: int, data: bytes) -> int:
+        waiting.extend(data)
+        sent.extend(data)
+        return len(data)
+
+    monkeypatch.setattr("mavbridge.mavlink.transport.sockets.os.write", write)
+    monkeypatch.setattr(serial.Serial, "out_waiting", property(lambda _port: len(waiting)))
+    monkeypatch.setattr(serial.Serial, "reset_output_buffer", lambda _port: sent.clear())
+    for tick in range(100):
+        assert ours.send(bytes([tick]) * 30)
+        clock.advance_ns(10_000_000)
+        del waiting[:-50]
+    assert len(sent) == 3000
+    ours.close()
+    os.close(theirs_fd)
+    os.close(ours_fd)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="TCP_USER_TIMEOUT is Linux's")
+def test_sent_bytes_that_nobody_confirms_end_a_tcp_connection_after_half_a_second() -> None:
+    clock = MonotonicClock()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ours = make_transport(f"tcp:127.0.0.1:{server.getsockname()[1]}", clock)
+        ours.open()
+        vehicle, _ = server.accept()
+        with vehicle:
+            vehicle.sendall(b"hello")
+            assert drain_until(ours, b"hello", clock) == b"hello"
+            fd = ours.fileno()
+            assert fd is not None
+            with socket.fromfd(fd, socket.AF_INET, socket.SOCK_STREAM) as handle:
+                assert handle.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 500
+    ours.close()

@@ -9,10 +9,10 @@ from typing import cast
 
 import pytest
 
-from sitl.faults import leftovers as module
-from sitl.faults.leftovers import leftovers, thread_names
-from sitl.faults.processes import processes_with
-from sitl.faults.stage import Stage
+from sitl.faults.stage import leftovers as module
+from sitl.faults.stage.leftovers import leftovers, thread_names
+from sitl.faults.stage.processes import processes_with
+from sitl.faults.stage.stage import Stage
 
 
 def stage_with(folder: Path, *memory: str, variable: str = "FAULTS_TEST=none") -> Stage:

@@ -28,7 +28,7 @@ class LinkFaults:
     hole_ms: float = 0.0
     """All packets are lost for this long, again and again, ..."""
     hole_every_ms: float = 0.0
-    """... about every so often: the time between two holes is exponentially distributed."""
+    """... about every so often: between half and one and a half of this is between two holes."""
     bytes_per_s: float = 0.0
     """Bandwidth; packets wait for those before them, up to ``QUEUE_NS``. 0: unlimited."""
 
@@ -89,7 +89,7 @@ class FaultyLink:
         return now_ns >= self._hole_ns
 
     def _until_hole_ns(self) -> int:
-        return round(float(self._random.exponential(self._faults.hole_every_ms)) * NS_PER_MS)
+        return round((0.5 + self._random.random()) * self._faults.hole_every_ms * NS_PER_MS)
 
     def _passed_ns(self, packet: bytes, now_ns: int) -> int | None:
         """When the packet has passed the link's bandwidth; None: it finds the queue full."""

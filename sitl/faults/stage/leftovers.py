@@ -3,8 +3,8 @@
 import threading
 from collections.abc import Set
 
-from sitl.faults.processes import MEMORY
-from sitl.faults.stage import Stage
+from sitl.faults.stage.processes import MEMORY
+from sitl.faults.stage.stage import Stage
 
 WAIT_S = 10.0
 """A recorder's writer ends after the processes that fed it."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from sitl import UsageError
-from sitl.faults.stage import ProcessName, Stage
+from sitl.faults.stage.stage import ProcessName, Stage
 
 BUSY = "while True: pass"
 

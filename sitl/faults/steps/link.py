@@ -9,10 +9,10 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sitl import UsageError
 from sitl.clock import NS_PER_MS
-from sitl.faults.carriers import LOOPBACK, SerialCarrier, UdpCarrier
-from sitl.faults.link import LinkFaults
-from sitl.faults.relay import VEHICLE
-from sitl.faults.stage import Stage
+from sitl.faults.stage.carriers import LOOPBACK, SerialCarrier, UdpCarrier
+from sitl.faults.stage.link import LinkFaults
+from sitl.faults.stage.relay import VEHICLE
+from sitl.faults.stage.stage import Stage
 
 
 @dataclass(frozen=True, kw_only=True)

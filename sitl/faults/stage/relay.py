@@ -12,9 +12,9 @@ from typing import Any, NamedTuple, TypeAlias
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sitl.clock import NS_PER_S, Clock
-from sitl.faults.carriers import LOOPBACK, Carrier
-from sitl.faults.link import FaultyLink, LinkFaults
 from sitl.faults.record import NEUTRAL_US, NUDGE_US
+from sitl.faults.stage.carriers import LOOPBACK, Carrier
+from sitl.faults.stage.link import FaultyLink, LinkFaults
 
 Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 FOREVER_NS = 1 << 62

@@ -8,12 +8,12 @@ from typing import Any, Literal, TypeAlias, TypeVar
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl import UsageError
-from sitl.faults import camera
-from sitl.faults.relay import Message, Override, set_fields
-from sitl.faults.stage import ProcessName, Stage
-from sitl.faults.steps_host import HOST_KINDS, HostStep
-from sitl.faults.steps_link import LINK_KINDS, LinkStep
-from sitl.faults.steps_vehicle import ClockStep, RadioLost, SetParam, Switch
+from sitl.faults.stage import camera
+from sitl.faults.stage.relay import Message, Override, set_fields
+from sitl.faults.stage.stage import ProcessName, Stage
+from sitl.faults.steps.host import HOST_KINDS, HostStep
+from sitl.faults.steps.link import LINK_KINDS, LinkStep
+from sitl.faults.steps.vehicle import ClockStep, RadioLost, SetParam, Switch
 
 REBOOT_IN_FLIGHT = 20190226
 """Sixth parameter of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with which ArduPilot reboots while armed."""

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast
 
 from sitl.clock import Clock
-from sitl.faults.camera import FrameFeed
-from sitl.faults.carriers import Carrier, UdpCarrier
-from sitl.faults.processes import Process, StageError, child_of, mapped_memory, processes_with
 from sitl.faults.record import VehicleReport
-from sitl.faults.relay import Relay
-from sitl.faults.transmitter import Transmitter
-from sitl.faults.viewer import Viewer
+from sitl.faults.stage.camera import FrameFeed
+from sitl.faults.stage.carriers import Carrier, UdpCarrier
+from sitl.faults.stage.processes import Process, StageError, child_of, mapped_memory, processes_with
+from sitl.faults.stage.relay import Relay
+from sitl.faults.stage.transmitter import Transmitter
+from sitl.faults.stage.viewer import Viewer
 
 TIMEOUT_S = 90.0
 STARTS = 3
@@ -33,7 +33,7 @@ MARK = "SITL_FAULT_MARK"
 """Environment variable: the file into which a policy of the catalogue writes the moment, in ns of
 CLOCK_MONOTONIC, when its fault begins."""
 PIPE_BLOCK = 4096
-CATALOGUE = Path(__file__).parent / "catalogue"
+CATALOGUE = Path(__file__).parents[1] / "catalogue"
 ProcessName: TypeAlias = Literal["flight", "gate", "recorder"]
 """``recorder`` is the process that writes the video of a recording."""
 

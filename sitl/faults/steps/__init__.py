@@ -1,0 +1,1 @@
+"""What a scenario can do to a flight, one step after the other."""
