@@ -77,12 +77,12 @@ class Driver:
             for mutant in mutants_of(Path(path).read_text()):
                 if not mutant.name.startswith(self._only):
                     continue
-                # A constant is read anywhere: every test that runs the module may depend on it.
-                lines = mutant.lines if mutant.scope in functions[path] else range(sys.maxsize)
+                # A constant is read anywhere, and a default by code that has no line: all tests.
+                is_constant = mutant.scope not in functions[path]
                 tests = [
                     k
                     for k, reached in enumerate(reach.lines)
-                    if any(n in lines for n in reached[path])
+                    if is_constant or any(n in mutant.lines for n in reached[path])
                 ]
                 tests.sort(key=lambda k: reach.cost_s[k])
                 while len(running) >= self._jobs:
@@ -131,6 +131,7 @@ class Driver:
     def _functions(self) -> dict[str, dict[str, list[FunctionType]]]:
         """The live functions of each file, by qualified name: those of slotted classes twice."""
         found: dict[str, dict[str, list[FunctionType]]] = {path: {} for path in self._files}
+        gc.unfreeze()  # what the group before has frozen is not listed
         for thing in gc.get_objects():
             if isinstance(thing, FunctionType) and thing.__code__.co_filename in found:
                 by_name = found[thing.__code__.co_filename]
