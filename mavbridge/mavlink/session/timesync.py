@@ -18,7 +18,8 @@ LONGEST_DELAY_NS = 30 * NS_PER_S
 LONGEST_SENDING_NS = 150 * NS_PER_MS
 """The way to the vehicle: sticks that act so late steer by what was seen too long ago."""
 _LATE_IN_A_ROW = 2
-"""Requests that must have come late: one may have waited for a vehicle that was busy."""
+"""Requests that must have come late: one may have waited for a vehicle that was busy; but not for
+twice as long, where a link that loses most packets lets few of them through."""
 _OUTSTANDING = 16
 _DRIFT_PER = 10_000
 """Clocks may drift apart by 1 in 10,000: crystals of autopilots and computers are within half."""
@@ -102,11 +103,13 @@ class TimesyncFilter:
         The time on the way is known less the error of the offset, so that a link that was as slow
         from the beginning, both ways, is not found.
         """
-        if not self.is_good or len(self._sending_ns) < _LATE_IN_A_ROW:
+        if not self.is_good or not self._sending_ns:
             return None
-        if (least_ns := min(self._sending_ns)) <= LONGEST_SENDING_NS:
+        newest_ns, least_ns = self._sending_ns[-1], min(self._sending_ns)
+        is_late = len(self._sending_ns) == _LATE_IN_A_ROW and least_ns > LONGEST_SENDING_NS
+        if not is_late and newest_ns <= 2 * LONGEST_SENDING_NS:
             return None
-        return f"our packets take {least_ns // NS_PER_MS} ms or more to the vehicle"
+        return f"our packets take {newest_ns // NS_PER_MS} ms or more to the vehicle"
 
     def _error_ns(self, exchange: _Exchange, now_ns: int) -> int:
         return exchange.error_ns + (now_ns - exchange.at_ns) // _DRIFT_PER

@@ -159,6 +159,8 @@ def test_packets_that_begin_to_come_late_are_told_after_two_of_them() -> None:
     assert "take 178 ms or more to the vehicle" in sync.late_sending
     exchange(sync, 12 * S, up_ns=NS_PER_MS, down_ns=NS_PER_MS)
     assert sync.late_sending is None
+    exchange(sync, 13 * S, up_ns=310 * NS_PER_MS, down_ns=NS_PER_MS)
+    assert sync.late_sending is not None
 
 
 @pytest.mark.parametrize(("up_ms", "down_ms"), [(140, 1), (1, 400)])
