@@ -15,7 +15,7 @@ from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
 
 MOST_CPU_S = 5.0
-"""For one datagram: it finds a loop without an end. The dearest take some 3 ms on an idle machine."""
+"""For one datagram, to find a loop without an end. The dearest take 3 ms on an idle machine."""
 MOST_SHOWN_BYTES = 4096
 """Of each datagram in a message: the gate reads no more of one."""
 _SAMPLE_EVERY = 50
