@@ -54,8 +54,9 @@ class Verdicts:
 class Driver:
     """Plugin that replaces pytest's loop over the tests."""
 
-    def __init__(self, modules: list[str], jobs: int) -> None:
+    def __init__(self, modules: list[str], jobs: int, only: tuple[str, ...]) -> None:
         self._jobs = jobs
+        self._only = only
         self._files = {str(ROOT / module): module for module in modules}
         self.verdicts = {module: Verdicts() for module in modules}
         self.is_sound = False
@@ -74,6 +75,8 @@ class Driver:
         running: dict[int, tuple[str, str]] = {}
         for path, module in self._files.items():
             for mutant in mutants_of(Path(path).read_text()):
+                if not mutant.name.startswith(self._only):
+                    continue
                 # A constant is read anywhere: every test that runs the module may depend on it.
                 lines = mutant.lines if mutant.scope in functions[path] else range(sys.maxsize)
                 tests = [
@@ -243,6 +246,7 @@ def main() -> int:
     """Run the groups that have one of the modules; without any, all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("modules", nargs="*", help="as in tests/mutation.toml")
+    parser.add_argument("--only", action="append", help="mutants whose name begins so")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     wanted = parser.parse_args()
     document = tomllib.loads(REASONS.read_text())
@@ -253,7 +257,7 @@ def main() -> int:
     for group in document["group"]:
         modules = [m for m in group["modules"] if not wanted.modules or m in wanted.modules]
         if modules:
-            driver = Driver(modules, wanted.jobs)
+            driver = Driver(modules, wanted.jobs, tuple(wanted.only or [""]))
             pytest.main([*_PYTEST, *group["tests"]], plugins=[driver])
             is_good = _report(driver.verdicts, document["reasons"]) and driver.is_sound and is_good
     return 0 if is_good else 1

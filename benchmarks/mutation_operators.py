@@ -68,6 +68,8 @@ def _walk(
                 continue
             if isinstance(child, ast.Assign) and isinstance(node, ast.ClassDef):
                 continue  # the values of an enumeration
+            if isinstance(child, ast.AnnAssign) and ast.unparse(child.annotation) == "TypeAlias":
+                continue
             inner, inside = scope, is_inside
             if isinstance(child, ast.FunctionDef | ast.ClassDef) and not is_inside:
                 inner = f"{scope}.{child.name}".lstrip(".")

@@ -115,7 +115,6 @@ class Engagement:
         if self._stop_reason is None:
             self._stop_reason = ending
             self._must_end = True
-            self._wants_arm = False
 
     def step(self, facts: Facts, act: Act | None) -> Move:
         """Advance to the facts of this moment."""
@@ -210,7 +209,6 @@ class Engagement:
         self.phase = Phase.PREPARING
         self._own_mode = facts.mode if facts.armed else None
         self._preparation.begin(facts)
-        self._was_ready = False
         self._prepare_timeout_ns, self._prepare_until_ns = timeout_ns, facts.now_ns + timeout_ns
         self._seen_interruption = facts.interruption
         return self._prepare(facts, None)
@@ -288,9 +286,11 @@ class Engagement:
 
     def _is_over(self, facts: Facts) -> bool:
         duration_ns = self._settings.duration_ns
-        if self.engaged_ns is None or duration_ns is None:
-            return False
-        return facts.now_ns - self.engaged_ns >= duration_ns
+        return (
+            self.engaged_ns is not None
+            and duration_ns is not None
+            and facts.now_ns - self.engaged_ns >= duration_ns
+        )
 
     def _takeover(self, facts: Facts) -> str | None:
         """Why the sticks are somebody else's now, or None."""
@@ -313,11 +313,12 @@ class Engagement:
     def _follows_us(self, facts: Facts) -> bool:
         """It goes on with our last setpoint, in a mode of ours, and does nothing else."""
         is_left_alone = facts.overruled is None and not facts.is_failsafe
-        if not (self._is_setpoint and facts.armed and is_left_alone):
-            return False
-        is_preparing = self.phase is Phase.PREPARING
-        is_own = self._preparation.is_own_mode(facts) or not is_preparing
-        return is_own and facts.mode == self._own_mode and facts.mode in facts.modes.setpoint
+        is_own = self._preparation.is_own_mode(facts) or self.phase is not Phase.PREPARING
+        return (
+            (self._is_setpoint and facts.armed and is_left_alone)
+            and (is_own and facts.mode == self._own_mode)
+            and facts.mode in facts.modes.setpoint
+        )
 
     def _yield(self, facts: Facts, reason: str) -> Move:
         """Somebody took over: sticks are given back, and a mode that follows setpoints is left.
@@ -382,7 +383,6 @@ class Engagement:
                     "with one that rests there: whether it took the release is not known"
                 )
             self.phase = Phase.RELEASED
-            self._own_mode = None
             self._departure.forget()
             return Move()
         return Move(hand=Hand.RELEASE)

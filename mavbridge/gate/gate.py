@@ -46,9 +46,9 @@ class FlightSettings:
     smoothing: Smoothing
     envelope: EnvelopeLimits
     engagement: EngagementSettings
-    watches_home_height: bool = False
+    watches_home_height: bool
     """The policy takes the height above home, which the vehicle is asked for then."""
-    watches_position: bool = False
+    watches_position: bool
     """It takes a position: the flight process is told whether there is one to be trusted."""
 
 

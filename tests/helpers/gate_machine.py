@@ -171,6 +171,8 @@ class GateWorld:
             ),
             smoothing=Smoothing(limits=free.of(self.kind), tau_s=0.0),
             envelope=EnvelopeLimits(),
+            watches_home_height=False,
+            watches_position=False,
             engagement=engagement_settings(
                 modes=(self.mode,),
                 is_setpoint=self.kind != "sticks",

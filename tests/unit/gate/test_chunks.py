@@ -10,7 +10,6 @@ from mavbridge.gate.chunks import (
     GRACE_PERIODS,
     LEAST_GRACE_NS,
     MAX_REFUSED,
-    SLOW_CHUNKS,
     Chunk,
     ChunkBuffer,
     FreshnessLimits,
@@ -73,21 +72,21 @@ def test_a_900_ms_solve_does_not_fly_the_attitude_that_it_began_with() -> None:
 
 def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve() -> None:
     slow = buffer()
-    for serial in range(1, SLOW_CHUNKS):
+    for serial in range(1, 5):
         slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 905) * MS), 0)
     assert slow.slowness is None
     slow.offer(chunk(9, 9000, attitude_ns=8095 * MS), 9000 * MS)
     assert "the newest 905 ms after its attitude" in (slow.slowness or "")
     slow.offer(chunk(10, 9100), 9100 * MS)
     assert slow.slowness is None
-    for serial in range(11, 10 + SLOW_CHUNKS):  # they count anew
+    for serial in range(11, 15):  # they count anew
         slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 101) * MS), 0)
     assert slow.slowness is None
 
 
 def test_solves_that_just_keep_the_limit_of_the_attitude_are_not_too_slow() -> None:
     held = buffer()
-    for serial in range(1, SLOW_CHUNKS + 2):
+    for serial in range(1, 8):
         held.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 100) * MS), 0)
     assert held.slowness is None
 
@@ -222,6 +221,13 @@ def test_unusable_chunks_count_within_a_second_or_ten_periods(
     assert (held.fault(MAX_REFUSED * gap_ms * MS) is not None) == is_fault
 
 
+def test_five_unusable_chunks_in_a_row_count_also_where_one_came_long_before() -> None:
+    held = buffer()
+    for serial, at_ms in enumerate((1000, 9000, 9010, 9020, 9030, 9040), start=1):
+        held.offer(chunk(serial, at_ms, actions=(NAN,)), at_ms * MS)
+    assert "unusable" in (held.fault(9040 * MS) or "")
+
+
 ages = st.integers(0, 400).map(lambda ms: ms * MS)
 
 
@@ -279,8 +285,12 @@ def test_stale_chunks_that_keep_coming_do_not_prolong_the_grace() -> None:
 def test_a_malformed_chunk_is_not_flown(changes: dict[str, object]) -> None:
     held = buffer()
     held.offer(chunk(1, 1000), 1000 * MS)
-    assert not held.offer(chunk(2, 1010, **changes), 1010 * MS)
+    assert held.offer(chunk(2, 1010, **changes), 1010 * MS) is False
     assert held.newest == chunk(1, 1000)
+
+
+def test_the_shortest_step_is_one_of_a_nanosecond() -> None:
+    assert buffer().offer(chunk(1, 1000, step_ns=1), 1000 * MS) is True
 
 
 def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -> None:
@@ -302,7 +312,7 @@ def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -
 def test_an_older_chunk_never_replaces_a_newer_one() -> None:
     held = buffer()
     held.offer(chunk(2, 1000), 1000 * MS)
-    assert not held.offer(chunk(1, 1001), 1001 * MS)
+    assert held.offer(chunk(1, 1001), 1001 * MS) is False
     assert not held.offer(chunk(2, 1001), 1001 * MS)  # nor the same one twice
 
 

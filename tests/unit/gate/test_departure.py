@@ -306,17 +306,26 @@ def test_a_takeover_that_leaves_the_mode_does_not_leave_the_last_setpoint(change
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "reason"),
     [
-        {"mode": "LOITER"},
-        {"armed": False},
-        {"is_failsafe": True},
-        {"overruled": "another station commands it as well"},
+        ({"mode": "LOITER"}, "mode changed from GUIDED to LOITER"),
+        ({"mode": "GUIDED_NOGPS"}, "mode changed from GUIDED to GUIDED_NOGPS"),
+        ({"armed": False}, "the vehicle has been disarmed"),
+        ({"is_failsafe": True}, "a failsafe of the vehicle is active (mode GUIDED)"),
+        ({"overruled": "another station commands it"}, "another station commands it"),
     ],
 )
-def test_setpoints_end_at_once_where_somebody_else_chose_what_it_does(change: Any) -> None:
+def test_setpoints_end_at_once_where_somebody_else_chose_what_it_does(
+    change: Any, reason: str
+) -> None:
     stepped = flying(GUIDED, is_setpoint=True, modes=("GUIDED",), departure=SETPOINTS)
     assert stepped.step(**change) == Move(hand=Hand.RELEASE)
+    assert stepped.reason == reason
+
+
+def test_sticks_leave_no_setpoint_behind_in_whichever_mode() -> None:
+    stepped = flying(GUIDED, modes=("GUIDED",))
+    assert stepped.step(interruption="rebooted") == Move(hand=Hand.RELEASE)
 
 
 @pytest.mark.parametrize(("is_landed", "hand"), [(True, Hand.IDLE), (False, Hand.NEUTRAL)])

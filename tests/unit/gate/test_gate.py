@@ -65,6 +65,8 @@ class Stepped:
             freshness=AGES,
             smoothing=smoothing or stick_smoothing(),
             envelope=EnvelopeLimits(),
+            watches_home_height=False,
+            watches_position=False,
             engagement=engagement,
         )
         self.gate = Gate(settings, START_NS)
@@ -501,6 +503,24 @@ def test_absence_is_the_reason_for_not_flying() -> None:
     assert output.reason == "no image feature yet"
 
 
+def test_why_a_chunk_was_not_taken_is_told_until_the_next_one() -> None:
+    gate = Stepped()
+    gate.step(0, gate.chunk(0)._replace(image_ns=START_NS - 400 * MS))
+    assert gate.step(5).reason == "the image is 400 ms old, beyond 300 ms"
+
+
+def test_the_first_arming_engages_where_that_was_asked_for() -> None:
+    gate = Stepped(engage_on_arm=True, status={"armed": False})
+    for at_ms in (0, 10, 20):
+        gate.step(at_ms, gate.chunk(at_ms))
+    assert gate.step(30, gate.chunk(30), armed=True).phase is Phase.FLYING
+
+
+def test_sticks_have_no_setpoint_to_rest_in() -> None:
+    assert Stepped().gate.last_setpoint is None
+    assert of_velocities("OFFBOARD").gate.last_setpoint == Velocity(0.0, 0.0, 0.0, 0.0)
+
+
 def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     gate = Stepped().gate
     link = LinkSnapshot(telemetry=Telemetry(), status=None, problem="waiting for a heartbeat")
@@ -560,9 +580,10 @@ def test_a_velocity_is_braked_within_the_limit_of_acceleration() -> None:
 
 def test_neutral_velocities_on_the_way_in_begin_with_what_the_vehicle_does() -> None:
     gate = of_velocities("ALTCTL")
-    gate.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (2.0, 0.0, 0.0)))
+    gate.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (3.0, 0.0, 0.0)))
     for at_ms in (0, 10, 20):
         gate.step(at_ms, gate.chunk(at_ms, Velocity(0.0, 0.0, 0.0, 0.0)))
+    gate.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (2.0, 0.0, 0.0)))
     entering = gate.step(30, act="engage")
     assert entering.phase is Phase.PREPARING
     assert entering.decision == Command(action=Velocity(2.0, 0.0, 0.0, 0.0))
@@ -619,3 +640,17 @@ def test_a_flight_by_velocities_begins_within_their_limits_whatever_the_vehicle_
     assert isinstance(first.action, Velocity)
     assert math.hypot(first.action.x_mps, first.action.y_mps) <= 8.0
     assert abs(first.action.z_mps) <= 3.0
+
+
+def test_a_flight_by_attitudes_begins_with_the_lean_that_there_is_also_beyond_the_limit() -> None:
+    limits = LimitSettings(lean_rad=0.5).of("attitude")
+    gate = Stepped(
+        meaning=ActionMeaning(kind="attitude", hover_thrust=0.4),
+        smoothing=Smoothing(limits=limits, tau_s=0.0),
+    )
+    half = (math.cos(0.4), math.sin(0.4), 0.0, 0.0)
+    gate.telemetry = Telemetry(ned_from_body_wxyz=Reading(START_NS, half))
+    gate.engaged(sticks=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    first = gate.decisions[0]
+    assert isinstance(first, Command)
+    assert first.action == pytest.approx((0.4, 0.8, 0.0, 0.0))

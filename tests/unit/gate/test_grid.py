@@ -54,3 +54,12 @@ def test_a_stall_after_an_early_send_counts_one_slot_less() -> None:
     slot = grid.take(35 * MS)
     assert slot is not None
     assert (slot.index, slot.missed) == (3, 1)
+
+
+def test_a_send_just_half_a_period_early_leaves_the_slot_to_be_served() -> None:
+    grid = StickGrid(PERIOD, 0)
+    grid.take(0)
+    grid.serve(5 * MS)
+    assert grid.take(10 * MS) is not None
+    grid.serve(15 * MS + 1)
+    assert grid.take(20 * MS) is None

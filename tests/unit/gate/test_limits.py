@@ -89,12 +89,57 @@ def test_neutral_is_level_or_at_rest_and_idle_stays_on_the_ground() -> None:
         )
         for kind in KINDS
     }
+    kinds = {kind: (type(neutral), type(idle)) for kind, (neutral, idle) in found.items()}
+    assert kinds == {
+        "sticks": (Sticks, Sticks),
+        "rates": (AttitudeThrust, AttitudeThrust),
+        "attitude": (AttitudeThrust, AttitudeThrust),
+        "velocity": (Velocity, Velocity),
+    }
     assert found == {
         "sticks": (NEUTRAL, IDLE),
         "rates": (hover, down),
         "attitude": (hover, down),
         "velocity": (rest, rest),
     }
+
+
+def test_the_shipped_limits() -> None:
+    assert LimitSettings() == LimitSettings(
+        stick_slew_per_s=8.0,
+        lean_rad=math.radians(35.0),
+        rate_radps=math.radians(220.0),
+        yaw_rate_radps=math.radians(120.0),
+        thrust=0.9,
+        speed_mps=8.0,
+        climb_mps=3.0,
+        accel_mps2=5.0,
+    )
+
+
+def test_a_slew_of_0_is_no_limit() -> None:
+    assert LimitSettings().of("sticks").change_per_s == (8.0,) * 4
+    assert LimitSettings(stick_slew_per_s=0.0).of("sticks").change_per_s == (math.inf,) * 4
+
+
+def test_where_the_vehicle_has_not_said_what_it_does_a_flight_begins_level_and_at_rest() -> None:
+    silent = Telemetry()
+    attitude = first_action(ActionMeaning(kind="attitude"), silent, None)
+    assert attitude == pytest.approx((0.39, 0.0, 0.0, 0.0))
+    assert first_action(ActionMeaning(kind="velocity"), silent, None) == (0.0, 0.0, 0.0, 0.0)
+    ahead = ActionMeaning(kind="velocity", is_heading_frame=True)
+    moving = Telemetry(velocity_ned_mps=Reading(0, (1.0, 2.0, -0.5)))
+    assert first_action(ahead, moving, None) == (1.0, 2.0, -0.5, 0.0)
+
+
+def test_a_velocity_ahead_is_that_of_the_world_turned_by_the_heading() -> None:
+    turned = Telemetry(
+        ned_from_body_wxyz=Reading(0, quaternion_from_euler(0.0, 0.0, math.radians(30.0))),
+        velocity_ned_mps=Reading(0, (3.0, 2.0, -0.5)),
+    )
+    ahead = first_action(ActionMeaning(kind="velocity", is_heading_frame=True), turned, None)
+    # 3 cos 30 + 2 sin 30 to the front, 2 cos 30 - 3 sin 30 to the right
+    assert ahead == pytest.approx((3.598076, 0.232051, -0.5, 0.0), abs=1e-6)
 
 
 HALF = math.radians(45.0)

@@ -52,6 +52,8 @@ FLIGHT = FlightSettings(
     ),
     smoothing=stick_smoothing(),
     envelope=EnvelopeLimits(),
+    watches_home_height=False,
+    watches_position=False,
     engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings()),
 )
 

@@ -51,6 +51,8 @@ FLIGHT = FlightSettings(
     freshness=FreshnessLimits(state_ns=1, velocity_ns=2, feature_ns=3, chunk_ns=4),
     smoothing=stick_smoothing(max_slew_per_s=8.0, tau_s=0.05),
     envelope=EnvelopeLimits(height_m=math.inf),
+    watches_home_height=False,
+    watches_position=False,
     engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings(then="rtl")),
 )
 CHUNK = Chunk(
