@@ -26,6 +26,8 @@ FAULT = {"chunk_fault": "no chunk"}
         (replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=0.21)), "auto", "BRAKE"),
         (IDLE_RECEIVER, "auto", "BRAKE"),
         (NO_RECEIVER, "auto", "BRAKE"),
+        (replace(MIDDLE, has_receiver=False), "auto", "BRAKE"),
+        (replace(MIDDLE, has_receiver=None), "auto", "BRAKE"),
         (replace(MIDDLE, is_position_valid=False), "auto", None),
         (replace(MIDDLE, is_position_valid=False), "rtl", "RTL"),
         (replace(NO_RECEIVER, is_position_valid=False), "auto", "LAND"),
@@ -202,6 +204,21 @@ def test_an_unconfirmed_mode_is_not_asked_for_while_neutral_holds() -> None:
     stepped.run(3.1)
     assert stepped.phase is Phase.HOLDING
     assert {(move.hand, move.mode) for move in stepped.run(5)} == {(Hand.NEUTRAL, None)}
+
+
+def test_a_refusal_that_comes_after_the_mode_is_there_asks_for_nothing() -> None:
+    stepped = flying(NO_RECEIVER)
+    stepped.step(**FAULT)
+    stepped.run(0.2, mode="BRAKE")
+    assert stepped.phase is Phase.HOLDING
+    moves = stepped.run(1, refused_mode="BRAKE")
+    assert {(move.hand, move.mode) for move in moves} == {(Hand.NEUTRAL, None)}
+
+
+def test_where_the_throttle_was_thrust_neutral_comes_with_the_mode() -> None:
+    stepped = flying(replace(NO_RECEIVER, mode="STABILIZE"), modes=("STABILIZE",))
+    assert stepped.step(**FAULT).hand is Hand.LEVEL
+    assert stepped.step(mode="BRAKE").hand is Hand.NEUTRAL
 
 
 def test_sticks_on_the_ground_end_in_neutral_as_in_the_air() -> None:
