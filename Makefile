@@ -14,7 +14,7 @@ AUTOPILOT ?= ardupilot
 SOAK_MINUTES ?= 60
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
-FLIGHTS := --numprocesses auto --maxprocesses 2 --dist loadfile
+FLIGHTS := --numprocesses auto --maxprocesses 2 --dist worksteal
 
 # Modules whose mutants are tried, as in MODULES=mavbridge/gate/gate.py; none = all of tests/mutation.toml.
 MODULES ?=

@@ -97,6 +97,7 @@ def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
         for stream in filter(None, (sys.stdout, sys.stderr)):
             stream.flush()
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would cut the last words short
     last_words = Worker("mavbridge-last-words", finish)
     last_words.start()
     if not last_words.ends_within(LAST_WORDS_S):

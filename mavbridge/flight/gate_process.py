@@ -25,7 +25,7 @@ LISTEN_S = 0.1
 OPEN_S = 20.0
 """Longest wait for a gate to start and to open the link: it imports little, and TCP is given three
 seconds, but the machine may be busy."""
-CLOSE_S = 1.0
+CLOSE_S = 5.0
 """Longest wait for a gate that holds no sticks to end and free its port."""
 
 

@@ -135,13 +135,16 @@ class Gate:
 
     def step(self, now_ns: int, given: GateInput) -> GateOutput:
         """Advance to this moment."""
+        # Judged before the news: a gate that stood still itself has let the grace run out.
+        is_flying = self._engagement.phase is Phase.FLYING
+        overdue = self._chunks.fault(now_ns) if is_flying else None
         has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
         if given.absence is not None:
             self._chunks.explain_absence(given.absence)
         if given.stop is not None:
             self._engagement.stop(given.stop)
         phase_before = self._engagement.phase
-        facts = self._facts(now_ns, given.link)
+        facts = self._facts(now_ns, given.link, overdue)
         move = self._engagement.step(facts, given.act)
         self._change_hand(move.hand, now_ns, given.link)
         phase = self._engagement.phase
@@ -168,7 +171,7 @@ class Gate:
             messages=self._take_messages(),
         )
 
-    def _facts(self, now_ns: int, link: LinkSnapshot) -> Facts:
+    def _facts(self, now_ns: int, link: LinkSnapshot, overdue: str | None) -> Facts:
         status, left = link.status, None
         if status is not None:
             left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
@@ -194,7 +197,7 @@ class Gate:
             shows_last=link.shows_last,
             refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns),
-            chunk_fault=self._chunks.fault(now_ns),
+            chunk_fault=overdue or self._chunks.fault(now_ns),
             slowness=self._chunks.slowness,
             envelope_problem=left.reason if left and left.kind == "fault" else None,
             landing=left.reason if left and left.kind == "landed" else None,

@@ -14,7 +14,16 @@ from sitl.clock import NS_PER_S
 from sitl.faults.stage.processes import StageError
 from sitl.faults.stage.stage import ORDERLY, Stage, faulty_policy, free_port, staged
 from sitl.faults.stage.transmitter import Transmitter
-from sitl.faults.steps.common import Images, Joystick, Messages, Pilot, Signal, Step, Wait
+from sitl.faults.steps.common import (
+    Images,
+    Joystick,
+    Messages,
+    Pilot,
+    Signal,
+    Step,
+    Wait,
+    WholeMessages,
+)
 from sitl.faults.steps.link import Link
 from sitl.faults.usage import Usage, growth, read_usage
 
@@ -60,7 +69,7 @@ FAULTS = (
     Fault("joystick on our id", (Joystick(hz=50, s=1.5),), True),
     Fault(
         "no attitude",
-        (Messages(names=["ATTITUDE", "ATTITUDE_QUATERNION"]), Wait(s=1.0), Messages(names=[])),
+        (Messages(names=["ATTITUDE", "ATTITUDE_QUATERNION"]), Wait(s=1.0), WholeMessages()),
         True,
     ),
     Fault("loss", (Link(loss=0.2, duplicate=0.2, reorder=0.2), Wait(s=3.0), Link()), False),
@@ -99,6 +108,7 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
     with staged(folder, "--receiver", "mid", *transmitter.flags, renders=False) as stage:
         stage.start(
             "--dual-rate", "--mode", "ALT_HOLD", "--policy", faulty_policy(POLICY),
+            "--max-height", "0", "--max-distance", "0",
             "--engage-channel", str(SWITCH), "--record", str(recording),
         )  # fmt: skip
         if not stage.wait_for("not engaged: press e, use the engage switch"):
@@ -169,7 +179,7 @@ def _engage(stage: Stage, transmitter: Transmitter) -> None:
         transmitter.move(SWITCH, HIGH_US)
         if stage.relay.wait_until(lambda: stage.relay.is_leaning(LEANING_ROWS), ENGAGE_S):
             return
-    raise StageError("the policy did not get the sticks by the switch")
+    raise StageError(f"the policy did not get the sticks by the switch:\n{stage.newest_output}")
 
 
 def _lost(recording: Path, result: SoakResult) -> list[str]:

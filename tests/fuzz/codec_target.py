@@ -14,8 +14,10 @@ from mavbridge.mavlink.codec.messages import Attitude, Endpoint, RcChannels, Rec
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
 
-MOST_CPU_S = 0.1
-"""For one datagram; the dearest take some 3 ms on an idle machine."""
+MOST_CPU_S = 5.0
+"""For one datagram, to find a loop without an end. The dearest take 3 ms on an idle machine."""
+MOST_SHOWN_BYTES = 4096
+"""Of each datagram in a message: the gate reads no more of one."""
 _SAMPLE_EVERY = 50
 """The vehicle's own packets, of which the mutations are made."""
 
@@ -26,7 +28,7 @@ class FuzzError(AssertionError):
 
 def failure(problem: object, datagrams: Iterable[bytes]) -> FuzzError:
     """The failure, with the datagrams of which one has brought it about."""
-    lines = "\n".join(f"  {data.hex()}" for data in datagrams)
+    lines = "\n".join(f"  {data[:MOST_SHOWN_BYTES].hex()}" for data in datagrams)
     return FuzzError(f"{problem}\nby one of these datagrams (hex):\n{lines}")
 
 

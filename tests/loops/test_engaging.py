@@ -110,7 +110,7 @@ def test_a_policy_that_returns_nan_every_other_time_loses_the_sticks_once() -> N
 def test_a_policy_that_always_returns_nan_never_moves_a_stick() -> None:
     flight = VirtualFlight(chunk=lambda solve: nan_chunk()).fly(0.5)
     assert flight.link.decisions == []
-    assert flight.reason == "the policy returned a value that is not finite"
+    assert flight.reason.endswith("the policy returned a value that is not finite")
 
 
 @pytest.mark.parametrize("shape", [(16, 4), (2, 16, 4), (1, 0, 4), (1, 16, 3), (1, 1025, 4)])

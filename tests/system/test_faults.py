@@ -11,6 +11,8 @@ pytestmark = pytest.mark.system
 
 SLACK_MS = 250.0
 """Added to the limits of the catalogue: other tests run on the same cores."""
+NEVER = ("outside their limits", "refused", "traceback", "flew again", "still runs")
+"""Words of failures that no busy computer excuses."""
 CATALOGUE = load_catalogue()
 
 
@@ -22,8 +24,10 @@ def test_a_fault_ends_as_the_catalogue_says(name: str) -> None:
     variants = scenario.variants
     variant = variants[zlib.crc32(name.encode()) % len(variants)]
     verdict = fly_scenario(scenario, variant, slack_ms=SLACK_MS)
-    if scenario.outcome == "keeps" and not verdict.passed and verdict.stall_ms > MOST_STALL_MS:
+    is_late = not any(word in failure for failure in verdict.failures for word in NEVER)
+    if not verdict.passed and is_late and verdict.stall_ms > MOST_STALL_MS:
         pytest.skip(
-            f"no policy flies on where the computer stands still: {verdict.stall_ms:.0f} ms"
+            f"this computer stood still for {verdict.stall_ms:.0f} ms in each of {verdict.runs} "
+            f"flights, which proves nothing: {verdict.failures}"
         )
     assert verdict.passed, f"{variant.text}: {verdict.failures}\n{verdict.output}"

@@ -15,6 +15,11 @@ LONGEST_ROUND_TRIP_NS = 2 * NS_PER_S
 """Slower exchanges say too little about the offset; a link this slow loses its heartbeats."""
 LONGEST_DELAY_NS = 30 * NS_PER_S
 """A stamp that seems older than this at its arrival is of another clock, for example Unix time."""
+LONGEST_SENDING_NS = 150 * NS_PER_MS
+"""The way to the vehicle: sticks that act so late steer by what was seen too long ago."""
+_LATE_IN_A_ROW = 2
+"""Requests that must have come late: one may have waited for a vehicle that was busy; but not for
+twice as long, where a link that loses most packets lets few of them through."""
 _OUTSTANDING = 16
 _DRIFT_PER = 10_000
 """Clocks may drift apart by 1 in 10,000: crystals of autopilots and computers are within half."""
@@ -50,12 +55,14 @@ class TimesyncFilter:
         self._outstanding: deque[int] = deque(maxlen=_OUTSTANDING)
         self._best: _Exchange | None = None
         self._agreeing = 0
+        self._sending_ns: deque[int] = deque(maxlen=_LATE_IN_A_ROW)
         self._next_ns = 0
         self.round_trips = Histogram()
 
     def restart(self) -> None:
         """Forget the offset: the vehicle has rebooted, or is another one."""
         self._outstanding.clear()
+        self._sending_ns.clear()
         self._best, self._agreeing = None, 0
 
     def request(self, now_ns: int) -> int | None:
@@ -76,17 +83,33 @@ class TimesyncFilter:
             return
         self.round_trips.add(round_trip_ns)
         offset_ns = reply.tc1 - (reply.ts1 + arrived_ns) // 2
-        new, best = _Exchange(arrived_ns, offset_ns, round_trip_ns // 2), self._best
-        if best is None:
-            self._best = new
-        else:
-            known_ns = self._error_ns(best, arrived_ns)
-            apart_ns = abs(offset_ns - best.offset_ns) - known_ns - new.error_ns
-            if (apart_ns - _UNEVEN_NS) * _UNSTEADY_PER > arrived_ns - best.at_ns:
-                self._agreeing = 0
-            if apart_ns > 0 or new.error_ns <= known_ns:
-                self._best = new
+        new = _Exchange(arrived_ns, offset_ns, round_trip_ns // 2)
+        best = self._best or new
+        known_ns = self._error_ns(best, arrived_ns)
+        apart_ns = abs(offset_ns - best.offset_ns) - known_ns - new.error_ns
+        if (apart_ns - _UNEVEN_NS) * _UNSTEADY_PER > arrived_ns - best.at_ns:
+            self._agreeing = 0
+        if apart_ns > 0 or new.error_ns <= known_ns:
+            best = new
+        self._best = best
         self._agreeing += 1
+        sending_ns = reply.tc1 - best.offset_ns - reply.ts1
+        self._sending_ns.append(sending_ns - self._error_ns(best, arrived_ns))
+
+    @property
+    def late_sending(self) -> str | None:
+        """Why the vehicle gets our packets too late, or None.
+
+        The time on the way is known less the error of the offset, so that a link that was as slow
+        from the beginning, both ways, is not found.
+        """
+        if not self.is_good or not self._sending_ns:
+            return None
+        newest_ns, least_ns = self._sending_ns[-1], min(self._sending_ns)
+        is_late = len(self._sending_ns) == _LATE_IN_A_ROW and least_ns > LONGEST_SENDING_NS
+        if not is_late and newest_ns <= 2 * LONGEST_SENDING_NS:
+            return None
+        return f"our packets take {newest_ns // NS_PER_MS} ms or more to the vehicle"
 
     def _error_ns(self, exchange: _Exchange, now_ns: int) -> int:
         return exchange.error_ns + (now_ns - exchange.at_ns) // _DRIFT_PER

@@ -3,30 +3,43 @@
 import hashlib
 import json
 import os
+import re
 import stat
 import threading
 from pathlib import Path
 
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
-from mavbridge.mavlink.codec.signing import KEY_BYTES, TICK_NS, Signing, SigningState, Stream
+from mavbridge.mavlink.codec.signing import (
+    KEY_BYTES,
+    LATEST_TICKS,
+    TICK_NS,
+    Signing,
+    SigningState,
+    Stream,
+)
 from mavbridge.mavlink.settings import SigningFiles
 
 SAVE_S = 10.0
 AHEAD_TICKS = 2 * round(SAVE_S) * NS_PER_S // TICK_NS
 """Saved beyond the newest timestamp: what is used until the next save, and once more."""
 JOIN_S = 2.0
+MOST_BYTES = 1024
 _MADE = "make one with: (umask 077; openssl rand -hex 32 > FILE)"
 
 
 def read_key(path: Path) -> bytes:
     """The 32 bytes of a key file, which holds them as they are, or as 64 hexadecimal digits.
 
+    No message tells any of them.
+
     Raises:
         UserError: it cannot be read, others may read it, or it is no key.
     """
     try:
-        mode, data = path.stat().st_mode, path.read_bytes()
+        # A pipe without a writer must not hold us up.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+            mode, data = os.fstat(file.fileno()).st_mode, file.read(MOST_BYTES)
     except OSError as error:
         raise UserError(f"--signing-key-file {path}: {error.strerror}; {_MADE}") from error
     if stat.S_IMODE(mode) & (stat.S_IRWXG | stat.S_IRWXO):
@@ -34,19 +47,27 @@ def read_key(path: Path) -> bytes:
             f"--signing-key-file {path} may be used by others (mode {stat.S_IMODE(mode):03o}), who "
             f"could then steer the vehicle: chmod 600 {path}, and think of a new key"
         )
-    if len(data) == KEY_BYTES:
-        return data
-    try:
-        key = bytes.fromhex(data.decode("ascii").strip())
-    except ValueError:
-        key = b""
-    if len(key) != KEY_BYTES:
+    key = _key(data)
+    if key is None:
         raise UserError(
-            f"--signing-key-file {path} holds {len(data)} bytes, but a key is 32 bytes or 64 "
-            f"hexadecimal digits; {_MADE}, or from the passphrase of a ground station: "
+            f"--signing-key-file {path} holds {len(data)} bytes, but a key is 32 random bytes or "
+            f"64 hexadecimal digits; {_MADE}, or from the passphrase of a ground station: "
             "printf %s 'the words' | sha256sum | cut -c1-64"
         )
+    if not any(key):
+        raise UserError(
+            f"--signing-key-file {path}: a key of zeros means to a vehicle that it shall not sign; "
+            f"{_MADE}"
+        )
     return key
+
+
+def _key(data: bytes) -> bytes | None:
+    text = data.strip()
+    if re.fullmatch(rb"[0-9A-Fa-f]{64}", text):
+        return bytes.fromhex(text.decode())
+    is_text = data.isascii() and data.decode().isprintable()  # a passphrase, or half of a key
+    return data if len(data) == KEY_BYTES and not is_text else None
 
 
 class SigningStore:
@@ -109,7 +130,10 @@ def _read_state(path: Path) -> SigningState:
     try:
         document = json.loads(path.read_text())
         streams = {_stream(name): int(ticks) for name, ticks in document["heard_ticks"].items()}
-        return SigningState(int(document["sent_ticks"]), streams)
+        sent_ticks = int(document["sent_ticks"])
+        if not all(0 <= ticks <= LATEST_TICKS for ticks in (sent_ticks, *streams.values())):
+            raise ValueError("a timestamp that no clock shows")
+        return SigningState(sent_ticks, streams)
     except FileNotFoundError:
         return SigningState()
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

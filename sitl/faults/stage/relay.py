@@ -221,6 +221,11 @@ class Relay:
         self._rewrites = (*self._rewrites, change)
         return self._clock.now_ns()
 
+    def rewrite_nothing(self) -> int:
+        """Let the vehicle's messages pass as they are again; returns the moment."""
+        self._rewrites = ()
+        return self._clock.now_ns()
+
     def inject(self, message: Message, station: Message = None) -> int:
         """Send a message to the vehicle as another ground station; returns the moment."""
         if self._vehicle is None:

@@ -33,6 +33,7 @@ MARK = "SITL_FAULT_MARK"
 """Environment variable: the file into which a policy of the catalogue writes the moment, in ns of
 CLOCK_MONOTONIC, when its fault begins."""
 PIPE_BLOCK = 4096
+NEWEST_LINES = 30
 CATALOGUE = Path(__file__).parents[1] / "catalogue"
 ProcessName: TypeAlias = Literal["flight", "gate", "recorder"]
 """``recorder`` is the process that writes the video of a recording."""
@@ -193,6 +194,11 @@ class Stage:
         self._lines.append("--- starting over: the machine was too busy to fly\n")
         self._vehicle = self._start_vehicle()
         self.start(*self._flags, is_read=self._is_read)
+
+    @property
+    def newest_output(self) -> str:
+        """The last lines that the bridge has printed."""
+        return "".join(self._lines[-NEWEST_LINES:])
 
     @property
     def _text(self) -> str:

@@ -88,6 +88,15 @@ class Messages:
 
 
 @dataclass(frozen=True, kw_only=True)
+class WholeMessages:
+    """Every message of the vehicle passes as it is again."""
+
+    def perform(self, stage: Stage) -> int:
+        """Returns the moment."""
+        return stage.relay.rewrite_nothing()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Pilot:
     """Another station changes the mode, arms, disarms or reboots the vehicle."""
 
@@ -150,6 +159,7 @@ Step: TypeAlias = (
     | PolicyFault
     | Signal
     | Messages
+    | WholeMessages
     | Pilot
     | Joystick
     | Images
@@ -166,6 +176,7 @@ KINDS: dict[str, Callable[..., Step]] = {
     "policy": PolicyFault,
     "signal": Signal,
     "messages": Messages,
+    "whole messages": WholeMessages,
     "pilot": Pilot,
     "joystick": Joystick,
     "images": Images,

@@ -199,6 +199,14 @@ def test_slots_that_a_stall_has_missed_are_counted_and_not_made_up_for() -> None
     assert (on_time.slot.index, on_time.slot.missed) == (10, 0)
 
 
+def test_a_gate_that_stood_still_beyond_the_grace_does_not_fly_on_with_a_fresh_chunk() -> None:
+    gate = Stepped().engaged()
+    late = gate.step(30 + 2000, gate.chunk(30 + 2000))
+    assert late.decision == Command(action=NEUTRAL)
+    assert "no chunk of the policy that may be flown" in late.reason
+    assert gate.step(2040, gate.chunk(2040)).decision in (Command(action=NEUTRAL), None)
+
+
 def test_the_next_step_is_due_at_the_next_slot() -> None:
     gate = Stepped().engaged()
     assert gate.gate.next_ns == START_NS + 40 * MS

@@ -150,6 +150,32 @@ def test_a_delay_that_begins_later_does_not_move_the_offset(up_ms: int, down_ms:
     assert sync.error_ns(204 * S) == pytest.approx(NS_PER_MS + drift_ns, rel=1e-3)
 
 
+def test_packets_that_begin_to_come_late_are_told_after_two_of_them() -> None:
+    sync = good_timesync()
+    exchange(sync, 10 * S, up_ns=200 * NS_PER_MS, down_ns=NS_PER_MS)
+    assert sync.late_sending is None  # one may have waited
+    exchange(sync, 11 * S, up_ns=180 * NS_PER_MS, down_ns=NS_PER_MS)
+    assert sync.late_sending is not None
+    assert "take 178 ms or more to the vehicle" in sync.late_sending
+    exchange(sync, 12 * S, up_ns=NS_PER_MS, down_ns=NS_PER_MS)
+    assert sync.late_sending is None
+    exchange(sync, 13 * S, up_ns=310 * NS_PER_MS, down_ns=NS_PER_MS)
+    assert sync.late_sending is not None
+
+
+@pytest.mark.parametrize(("up_ms", "down_ms"), [(140, 1), (1, 400)])
+def test_packets_that_come_soon_enough_are_not_told(up_ms: int, down_ms: int) -> None:
+    sync = good_timesync()
+    for k in range(10, 20):
+        exchange(sync, k * S, up_ns=up_ms * NS_PER_MS, down_ns=down_ms * NS_PER_MS)
+        assert sync.late_sending is None
+
+
+def test_a_link_that_was_as_slow_from_the_start_is_not_told() -> None:
+    sync = good_timesync(way_ns=300 * NS_PER_MS)
+    assert sync.late_sending is None
+
+
 def test_a_delay_from_the_start_is_seen_and_its_error_reported() -> None:
     sync = good_timesync(way_ns=200 * NS_PER_MS)
     assert sync.happened_ns(boot_us(9 * S), 9 * S + 200 * NS_PER_MS) == 9 * S

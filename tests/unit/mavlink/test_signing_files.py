@@ -1,6 +1,7 @@
 """Key files that are refused, and timestamps that outlive a process."""
 
 import json
+import os
 
 import pytest
 
@@ -31,9 +32,19 @@ def test_a_key_is_32_bytes_or_64_hexadecimal_digits(data, tmp_path):
     assert read_key(write_key(tmp_path, data)) == KEY
 
 
-@pytest.mark.parametrize("data", [b"", KEY[1:], KEY + b"\n", KEY.hex()[1:].encode(), b"g" * 64])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        KEY[1:],
+        KEY + b"\n",
+        KEY.hex()[1:].encode(),
+        b"g" * 64,
+        b"a passphrase of 32 characters ok!",
+    ],
+)
 def test_anything_else_is_no_key(data, tmp_path):
-    with pytest.raises(UserError, match=r"32 bytes or 64 hexadecimal digits; make one with"):
+    with pytest.raises(UserError, match=r"32 random bytes or 64 hexadecimal digits; make one with"):
         read_key(write_key(tmp_path, data))
 
 
@@ -50,6 +61,14 @@ def test_a_key_that_is_not_there_is_refused_with_the_way_to_make_one(tmp_path):
         read_key(tmp_path)
 
 
+def test_a_key_of_zeros_and_a_pipe_are_refused(tmp_path):
+    with pytest.raises(UserError, match="shall not sign"):
+        read_key(write_key(tmp_path, bytes(32)))
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    with pytest.raises(UserError, match="holds 0 bytes"):
+        read_key(tmp_path / "pipe")
+
+
 def test_timestamps_go_on_after_a_restart_and_after_a_kill(tmp_path):
     with (store := make_store(tmp_path)) as first:
         saved = json.loads(store.path.read_text())["sent_ticks"]
@@ -60,7 +79,7 @@ def test_timestamps_go_on_after_a_restart_and_after_a_kill(tmp_path):
 
 
 def test_each_key_has_a_state_of_its_own_that_does_not_tell_it(tmp_path):
-    with (store := make_store(tmp_path)), (other := make_store(tmp_path, bytes(32))):
+    with (store := make_store(tmp_path)), (other := make_store(tmp_path, bytes(range(1, 33)))):
         assert store.path != other.path
         assert KEY.hex() not in store.path.name + store.path.read_text()
 
@@ -76,7 +95,13 @@ def test_what_was_heard_is_kept(tmp_path):
 def test_a_damaged_state_is_told(tmp_path):
     with (store := make_store(tmp_path)):
         pass
-    for text in ("", "[]", '{"sent_ticks": 1}', '{"sent_ticks": 1, "heard_ticks": {"1": 2}}'):
+    for text in (
+        "",
+        "[]",
+        '{"sent_ticks": 1}',
+        '{"sent_ticks": 1, "heard_ticks": {"1": 2}}',
+        '{"sent_ticks": 281474976710656, "heard_ticks": {}}',
+    ):
         store.path.write_text(text)
         with pytest.raises(UserError, match=r"timestamps of signed packets .* remove it"):
             make_store(tmp_path)

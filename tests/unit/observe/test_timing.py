@@ -251,6 +251,7 @@ def test_json_has_the_keys_of_the_report_in_order() -> None:
     assert list(document["feature_age_ms"]) == ["p50", "p99", "p999", "max"]
     assert document["link"] == {
         "unusable_packets": 0,
+        "refused_signatures": 0,
         "saturated": {"yaw": 0.01},
         "vehicle_clock_offset_ns": None,
         "is_timesync_good": False,
