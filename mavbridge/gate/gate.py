@@ -136,8 +136,7 @@ class Gate:
     def step(self, now_ns: int, given: GateInput) -> GateOutput:
         """Advance to this moment."""
         # Judged before the news: a gate that stood still itself has let the grace run out.
-        is_flying = self._engagement.phase is Phase.FLYING
-        overdue = self._chunks.fault(now_ns) if is_flying else None
+        overdue = self._chunks.fault(now_ns)
         has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
         if given.absence is not None:
             self._chunks.explain_absence(given.absence)

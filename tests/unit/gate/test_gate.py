@@ -181,6 +181,23 @@ def test_what_has_not_changed_is_not_sent_between_slots() -> None:
     assert [gate.step(30 + k).decision for k in range(1, 10)] == [None] * 9
 
 
+def test_the_fifth_unusable_chunk_ends_the_flight_as_it_comes() -> None:
+    gate = Stepped().engaged()
+    nan = WANTED._replace(roll=float("nan"))
+    phases = [gate.step(31 + k, gate.chunk(31 + k, nan)).phase for k in range(5)]
+    assert phases == [Phase.FLYING] * 4 + [Phase.LEAVING]
+
+
+def test_without_a_stop_neutral_is_held_on_and_on() -> None:
+    gate = Stepped(status={"has_receiver": False, "pilot_sticks": None}).engaged()
+    gate.link = {"problem": "no heartbeat"}
+    assert gate.step(31).mode == "BRAKE"
+    gate.link = {}
+    held = [gate.step(at_ms, mode="BRAKE") for at_ms in range(40, 1000, 10)]
+    assert held[-1].phase is Phase.HOLDING
+    assert {(output.decision, output.mode) for output in held[10:]} == {(LEFT, None)}
+
+
 def test_a_chunk_that_is_not_taken_is_not_news() -> None:
     gate = Stepped().engaged()
     nan = gate.chunk(33, WANTED._replace(roll=float("nan")))
