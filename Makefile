@@ -61,7 +61,7 @@ test: .venv-peers/installed check  ## all of lint, then every test
 bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
 	$(BIN)/python -m benchmarks.compare --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
 
-mutants: $(VENV)/installed  ## small changes of the gate, each of which a test must notice; not part of test
+mutants: $(VENV)/installed  ## small changes of the safety core, each of which a test must notice; not part of test
 	$(BIN)/python -m benchmarks.mutants $(MODULES)
 
 faults: $(VENV)/installed  ## every fault of the catalogue with every vehicle; writes docs/faults.md

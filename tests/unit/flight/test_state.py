@@ -60,6 +60,9 @@ def values(source: Telemetry, frame: StateFrame) -> list[float]:
             [0, 0, 0, R, 0, 0, R, 0.1, -0.2, -0.3, 1, -2, -3],
         ),
         # q and -q are one attitude; lengths are corrected
+        (telemetry(q=(1, 1, 1, 1)), "ned_frd", [0, 0, 0, *(0.5,) * 4, 0, 0, 0, 0, 0, -9.81]),
+        # half a turn has no sign of w to be told by
+        (telemetry(q=(0, 1, 0, 0)), "ned_frd", [0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, -9.81]),
         (
             telemetry(q=(-2 * R, 0, 0, -2 * R)),
             "ned_frd",
@@ -133,6 +136,7 @@ def test_each_part_keeps_its_own_stamp_and_the_array_is_frozen() -> None:
     state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
     assert isinstance(state, VehicleState)
     assert (state.velocity_ns, state.attitude_ns) == (NOW_NS - 7, NOW_NS)
+    assert state.values.dtype == np.float32
     with pytest.raises(ValueError, match="read-only"):
         state.values[0] = pi
 
@@ -161,6 +165,32 @@ def test_an_attitude_that_stays_the_same_while_the_vehicle_turns_is_frozen() -> 
 def test_a_vehicle_that_turns_slowly_or_not_at_all_is_not_frozen() -> None:
     assert frozen_for(5.0, rate_radps=2e-4, moves=True) is None
     assert frozen_for(5.0, rate_radps=0.0) is None
+
+
+def test_an_attitude_is_frozen_whatever_the_rates_do() -> None:
+    check = FrozenStateCheck(max_frozen_ns=500 * NS_PER_MS)
+    for step in range(60):
+        source = telemetry(w=(0.01 + step / 1000, 0.0, 0.0))
+        state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
+        assert isinstance(state, VehicleState)
+        problem = check.problem(replace(state, attitude_ns=NOW_NS + step * 10 * NS_PER_MS))
+    assert "frozen" in (problem or "")
+
+
+@pytest.mark.parametrize(("rate_radps", "is_frozen"), [(0.9e-4, False), (1.1e-4, True)])
+def test_a_turn_counts_from_a_ten_thousandth_of_a_radian_per_second(
+    rate_radps: float, is_frozen: bool
+) -> None:
+    assert (frozen_for(1.0, rate_radps=rate_radps) is not None) == is_frozen
+
+
+def test_a_force_is_no_turn() -> None:
+    check = FrozenStateCheck(max_frozen_ns=500 * NS_PER_MS)
+    source = telemetry(a=(1.0, 2.0, -9.81))
+    state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
+    assert isinstance(state, VehicleState)
+    assert check.problem(state) is None
+    assert check.problem(replace(state, attitude_ns=NOW_NS + 10**10)) is None
 
 
 def test_the_check_of_a_frozen_attitude_can_be_switched_off() -> None:

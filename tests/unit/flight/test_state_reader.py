@@ -82,6 +82,17 @@ def test_what_is_missing_or_old_is_a_reason_and_never_a_zero(extra: StateExtra, 
     assert isinstance(read(old), VehicleState)  # nobody asks for it
 
 
+def test_a_state_that_is_missing_is_a_reason_also_where_extras_are_asked_for() -> None:
+    refused = read(replace(FLYING, ned_from_body_wxyz=None), "height")
+    assert refused == Release("no attitude from the vehicle yet")
+
+
+def test_a_contract_with_a_goal_is_not_flown_without_one() -> None:
+    reader = StateReader(Contract(state_extras=("goal",)), freshness=FRESH)
+    with pytest.raises(ValueError, match="takes a goal, and the flight has none"):
+        reader.read(FLYING, NOW_NS, has_position=True)
+
+
 def test_a_position_that_the_estimator_does_not_trust_is_none() -> None:
     for extra in ("goal", "altitude"):
         assert isinstance(read(FLYING, extra, has_position=False), Release)  # type: ignore[arg-type]

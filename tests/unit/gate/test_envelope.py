@@ -173,6 +173,95 @@ def test_a_gap_in_the_data_starts_the_count_again() -> None:
     assert flight.run(0.2, position_ned_m=(0.0, 0.0, -500.0)) is None
 
 
+@pytest.mark.parametrize("name", ["attitude", "velocity"])
+def test_a_gap_in_the_readings_starts_the_count_again(name: str) -> None:
+    flight = Flight(state_hz=400.0)
+    flight.run(0.1)
+    good, bad = getattr(flight, name), {"attitude": tilted(90), "velocity": (99.0, 0.0, 0.0)}[name]
+    for reading in (bad, None, bad, None, bad):
+        setattr(flight, name, reading)
+        assert flight.run(0.04) is None
+    setattr(flight, name, good)
+    assert flight.run(0.1) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "persist_ms"),
+    [
+        ({"position_ned_m": (0.0, 0.0, -121.0)}, 300),
+        ({"position_ned_m": (301.0, 0.0, -9.0)}, 300),
+        ({"is_position_valid": False}, 600),
+        ({"battery_problem": "low"}, 600),
+        ({"is_landed": True}, 600),
+    ],
+)
+def test_what_the_vehicle_says_must_be_out_for_just_so_long(
+    change: dict[str, Any], persist_ms: int
+) -> None:
+    envelope, status = Envelope(EnvelopeLimits()), replace(STATUS, **change)
+    envelope.check(EnvelopeInput(0, Telemetry(), STATUS))
+    for now_ns in (1 * S, 1 * S + persist_ms * MS - 1):
+        assert envelope.check(EnvelopeInput(now_ns, Telemetry(), status)) is None
+    assert envelope.check(EnvelopeInput(1 * S + persist_ms * MS, Telemetry(), status)) is not None
+
+
+def test_readings_must_be_out_for_50_ms_by_their_own_stamps() -> None:
+    envelope = Envelope(EnvelopeLimits())
+
+    def ends(stamp_ns: int) -> bool:
+        telemetry = Telemetry(ned_from_body_wxyz=Reading(stamp_ns, tilted(90)))
+        return envelope.check(EnvelopeInput(S, telemetry, STATUS)) is not None
+
+    first_ns = S - 100 * MS
+    assert [ends(first_ns + after_ns) for after_ns in (0, 50 * MS - 1, 50 * MS)] == [
+        *(False, False, True)
+    ]
+
+
+def test_a_reading_is_watched_until_it_is_500_ms_old() -> None:
+    envelope = Envelope(EnvelopeLimits())
+    telemetry = Telemetry(ned_from_body_wxyz=Reading(0, tilted(10)))
+    envelope.check(EnvelopeInput(500 * MS, telemetry, STATUS))
+    assert not any(text.startswith("tilt") for text in envelope.unwatched)
+
+
+def test_what_is_at_its_limit_is_inside_and_small_limits_count() -> None:
+    limits = EnvelopeLimits(height_m=0.5)
+    assert Flight(limits).run(1.0, position_ned_m=(0.0, 0.0, -0.5)) is None
+    told = Flight(limits).run(1.0, position_ned_m=(0.0, 0.0, -0.6))
+    assert told == "height 0.6 m is beyond 0.5 m (--max-height)"
+
+
+def test_of_two_reasons_the_first_is_told() -> None:
+    told = Flight().run(1.0, position_ned_m=(400.0, 0.0, -200.0))
+    assert (told or "").startswith("height")
+
+
+def test_a_new_flight_counts_anew() -> None:
+    flight = Flight()
+    assert flight.run(0.5, battery_problem="low") is None
+    flight.envelope.reset()
+    assert flight.run(0.5) is None
+    assert flight.run(0.2) == "low"
+
+
+def test_an_estimator_that_says_nothing_is_said_to_be_not_watched() -> None:
+    missing = "estimator is not watched: it reports no valid position"
+    silent = Flight()
+    silent.run(0.1)
+    silent.run(0.1, is_position_valid=None)
+    assert missing in silent.envelope.unwatched
+    never = Flight()
+    never.run(0.1, is_position_valid=False)
+    assert missing in never.envelope.unwatched
+
+
+def test_in_the_air_counts_while_armed() -> None:
+    flight = Flight()
+    assert flight.run(1.0, armed=False, is_landed=False) is None
+    assert flight.run(2.0, armed=True, is_landed=True) is None
+
+
 def test_without_a_position_from_the_start_none_is_lost() -> None:
     flight = Flight()
     assert flight.run(5.0, is_position_valid=False, position_ned_m=None) is None
