@@ -2,7 +2,6 @@
 
 import difflib
 import sys
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +33,7 @@ from mavbridge.core.log import run_log
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
 from policy.foreign.websocket.kind import require_packages
+from policy.text_files import read_toml
 from policy.training.settings import TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
@@ -316,10 +316,10 @@ def with_config(
     cli.config = []
     if config is not None:
         try:
-            tomllib.loads(config.read_text())
+            read_toml(config)
         except OSError as error:
             raise UserError(f"--config {config}: {error.strerror}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except ValueError as error:
             raise UserError(f"--config {config} is not TOML: {error}") from error
         cli.config = [Toml(config, use_commands_as_keys=False)]
     with run_log(log_file, verbose=verbose):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.errors import ContractError
+from policy.text_files import parse_json
 
 CONTRACT_VERSION = 4
 READABLE_VERSIONS = (1, 2, 3, 4)
@@ -350,8 +351,8 @@ class Contract:
             ContractError: not JSON, another version, unknown keys, or values out of range.
         """
         try:
-            data: Any = json.loads(text)
-        except json.JSONDecodeError as error:
+            data: Any = parse_json(text)
+        except ValueError as error:
             raise ContractError(f"the contract in the checkpoint is not JSON: {error}") from error
         if not isinstance(data, dict):
             raise ContractError("the contract in the checkpoint is not a JSON object")

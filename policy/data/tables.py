@@ -1,7 +1,6 @@
 """Read JSON and columns of Arrow tables; what is wrong is raised as a ``DatasetError``."""
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -10,12 +9,13 @@ import pyarrow as pa
 
 from policy.contract import FloatArray, StateFrame
 from policy.data.flight_data import DatasetError, Nanoseconds
+from policy.text_files import parse_json
 
 
 def read_json(path: Path, kind: str) -> Any:
     """The contents of a JSON file; ``kind`` names what its folder should be."""
     try:
-        return json.loads(path.read_text())
+        return parse_json(path.read_text())
     except OSError as error:
         raise DatasetError(f"{path}: {error.strerror}: is it a {kind}?") from error
     except ValueError as error:

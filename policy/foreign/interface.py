@@ -26,7 +26,6 @@ and of ``foreign.state``. A draft has the text "?" where only the user knows the
 flown before each has one: ``foreign.drafts`` writes them.
 """
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -37,6 +36,7 @@ import numpy as np
 from policy.contract import ACTION_DIM, ACTION_NAMES, Contract
 from policy.errors import ContractError
 from policy.foreign.state import DERIVED_NAMES, state_values
+from policy.text_files import read_toml
 
 ArrayOrTensor = TypeVar("ArrayOrTensor")
 CONTRACT_FILE = "mavbridge.toml"
@@ -171,10 +171,10 @@ def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> I
         ContractError: it cannot be read, is not TOML, or says something unknown or malformed.
     """
     try:
-        data: dict[str, Any] = tomllib.loads(path.read_text())
+        data: dict[str, Any] = read_toml(path)
     except OSError as error:
         raise ContractError(f"--contract {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ContractError(f"--contract {path} is not TOML: {error}") from error
     try:
         return _interface(data, derived or {})

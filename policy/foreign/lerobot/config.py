@@ -5,7 +5,6 @@ not have it yet. Those have the one value that this version computed with; all o
 because the defaults of LeRobot's own code changed with 0.6.0.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, Literal
 
 from policy.contract import ACTION_DIM
 from policy.errors import CheckpointError
+from policy.text_files import parse_json
 
 CONFIG_FILE = "config.json"
 STATE_KEY, ACTION_KEY = "observation.state", "action"
@@ -161,7 +161,7 @@ def read_config(folder: Path) -> tuple[Config, list[str]]:
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object; raises CheckpointError."""
     try:
-        data = json.loads(path.read_text())
+        data = parse_json(path.read_text())
     except OSError as error:
         raise CheckpointError(f"{path}: {error.strerror}") from error
     except ValueError as error:

@@ -4,7 +4,6 @@ msgpack and websockets are an extra, and imported only where such a policy is lo
 """
 
 import os
-import tomllib
 from dataclasses import fields, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +13,7 @@ from urllib.parse import urlsplit
 from policy.contract import ENVELOPE_TERMS, Contract
 from policy.errors import ContractError, PolicyError
 from policy.foreign.interface import Interface, read_interface
+from policy.text_files import read_toml
 
 if TYPE_CHECKING:
     from policy.foreign.websocket.messages import Message
@@ -110,7 +110,7 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
         raise ContractError(f"the server's contract cannot be used: {error}") from error
     if contract_file is None:
         return Interface(contract=contract)
-    said = tomllib.loads(contract_file.read_text()).get("contract", {})
+    said = read_toml(contract_file).get("contract", {})
     kept = {
         field.name: getattr(contract, field.name)
         for field in fields(Contract)

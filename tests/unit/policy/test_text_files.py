@@ -1,0 +1,47 @@
+from pathlib import Path
+
+import pytest
+
+from mavbridge.__main__ import main
+from policy.errors import ContractError
+from policy.foreign.interface import read_interface
+from policy.text_files import MAX_TOML_BYTES, parse_json, read_toml
+
+
+@pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 100_000, "[" * 2_000 + "1,"])
+def test_json_that_is_nested_too_deeply_is_a_value_error(text: str) -> None:
+    with pytest.raises(ValueError, match="nested too deeply|Expecting value"):
+        parse_json(text)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"a = " + b"[\n" * 20_000, "nested too deeply"),
+        (b"a." * 30_000 + b"a = 1", "a line of it has 60005 characters"),
+        ('"\u2028".'.encode() * 5_000 + b"a = 1", "a line of it has 20005 characters"),
+        (b"#" * (MAX_TOML_BYTES + 1), "larger than 64 KiB"),
+        (b"\xff\xfe", "decode"),
+        (b"a = \0", "Invalid"),
+    ],
+)
+def test_toml_that_would_fill_the_memory_is_refused(
+    content: bytes, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=told):
+        read_toml(path)
+    with pytest.raises(ContractError, match=f"is not TOML: .*{told}"):
+        read_interface(path)
+    with pytest.raises(SystemExit) as ended:
+        main(["--config", str(path), "--connect", "udp:127.0.0.1:1"])
+    assert ended.value.code == 2
+    assert told in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_lines_of_the_longest_length_take_little_memory(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    lines = [f"k{number}." + "a." * 990 + "a = 1" for number in range(32)]
+    path.write_text("\n".join(lines))
+    assert len(read_toml(path)) == 32
