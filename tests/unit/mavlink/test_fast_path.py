@@ -129,3 +129,34 @@ def test_a_damaged_one_is_no_message(data: bytes, name: str, body: Body) -> None
     for k in range(10, len(data)):
         damaged = bytes((*data[:k], data[k] ^ 0x10, *data[k + 1 :]))
         assert all(message.body is None for message in by_pymavlink(damaged)), (name, body)
+
+
+# --- sound checksums, and yet no packet for the fast path
+
+
+def sealed(data: bytes, *, crc_extra: int) -> bytes:
+    """The bytes with the checksum that they should have."""
+    checksum: int = dialect.x25crc(data[1:] + bytes((crc_extra,))).crc
+    return data + checksum.to_bytes(2, "little")
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [(0, 0xFE), (2, 2), (9, 1), (1, 5)],
+    ids=["marker of MAVLink 1", "unknown flag", "number beyond 16 bits", "shorter than it is"],
+)
+def test_a_header_that_says_something_else_is_left_to_pymavlink(at: int, value: int) -> None:
+    position = dialect.MAVLink_local_position_ned_message
+    mav = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    packet = bytearray(mav.local_position_ned_encode(7, 1, 2, 3, 4, 5, 6).pack(mav)[:-2])
+    assert decode_state_packet(sealed(bytes(packet), crc_extra=position.crc_extra)) is not None
+    packet[at] = value
+    assert decode_state_packet(sealed(bytes(packet), crc_extra=position.crc_extra)) is None
+
+
+def test_a_payload_beyond_the_layout_is_left_to_pymavlink() -> None:
+    position = dialect.MAVLink_local_position_ned_message
+    for length, is_taken in ((28, True), (29, False)):
+        header = bytes((0xFD, length, 0, 0, 0, 1, 1, position.id, 0, 0))
+        packet = sealed(header + bytes(length), crc_extra=position.crc_extra)
+        assert (decode_state_packet(packet) is not None) is is_taken

@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.wire import ARDUPILOT
 from mavbridge.mavlink.codec.messages import Endpoint, ParamWrite
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.codec.signing import EPOCH_NS, TICK_NS, Signing, SigningState
+from mavbridge.mavlink.codec.signing import EPOCH_NS, LATEST_TICKS, TICK_NS, Signing, SigningState
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 NOW_NS = EPOCH_NS + 350_000_000 * 10**9
@@ -193,3 +193,35 @@ def test_a_wrong_signature_and_a_time_without_a_next_one_move_nothing():
     assert names(codec, heartbeat(make_vehicle(ticks=2**48 - 1))) == ["HEARTBEAT"]
 
     assert timestamp(codec.encode_heartbeat()) == NOW_TICKS
+
+
+def test_a_packet_of_mavlink_1_has_no_signature_whatever_its_sequence_number():
+    vehicle, judging, without_key = make_vehicle(None), make_codec(), make_codec(None)
+    packets = []
+    for _ in range(2):
+        packets.append(bytes(vehicle.heartbeat_encode(2, 3, 0, 0, 4).pack(vehicle, True)))
+        vehicle.seq += 1
+    assert names(judging, *packets) == []
+    assert judging.signing.refused == {"unsigned": 2}
+    assert names(without_key, *packets) == ["HEARTBEAT"] * 2
+    assert without_key.hears_signed is False
+    radio = bytes(vehicle.radio_status_encode(1, 2, 3, 4, 5, 6, 7).pack(vehicle, True))
+    assert names(judging, radio) == ["RADIO_STATUS"]
+
+
+def test_a_judgement_is_a_bool_and_the_first_timestamp_is_one_before_2015():
+    early = Signing(KEY, unix_ns=TimeOfDay(0))
+    packet = make_codec(None).encode_heartbeat()
+    assert early.accepts(packet) is False
+    assert timestamp(early.sign(packet, dialect.MAVLink_heartbeat_message.crc_extra)) == 1
+
+
+@pytest.mark.parametrize(
+    ("ticks", "is_followed"),
+    [(LATEST_TICKS, True), (LATEST_TICKS + 1, False), (2**48 - 2**39, False)],
+)
+def test_a_timestamp_near_the_end_of_its_bits_is_not_followed(ticks, is_followed):
+    sender = make_codec(state=SigningState(sent_ticks=ticks - 1))
+    codec = make_codec()
+    assert names(codec, sender.encode_heartbeat()) == ["HEARTBEAT"]
+    assert (codec.signing.state.sent_ticks == ticks) is is_followed
