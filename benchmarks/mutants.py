@@ -210,7 +210,7 @@ def _install(mutant: Mutant, path: str, functions: dict[str, list[FunctionType]]
 def _change_default(owner: type, changed: type, name: str) -> None:
     """Give a dataclass or named tuple the default of its mutant."""
     for function in ("__init__", "__new__"):
-        old, new = vars(owner).get(function), vars(changed).get(function)
+        old, new = getattr(owner, function, None), getattr(changed, function, None)
         if isinstance(old, FunctionType) and isinstance(new, FunctionType):
             old.__defaults__, old.__kwdefaults__ = new.__defaults__, new.__kwdefaults__
 

@@ -184,6 +184,31 @@ def test_bytes_that_begin_nothing_count_once() -> None:
     assert ours.bad_data_count == 2
 
 
+def test_what_was_cut_off_does_not_swallow_the_next_datagram() -> None:
+    vehicle, ours = WireEnd(), codec()
+    one = vehicle.pack(m.heartbeat_encode(2, 3, 0, 0, 4))
+    for cut_off in (one[:9], one + one[:9]):
+        list(ours.decode_datagram(cut_off))
+        assert len(list(ours.decode_datagram(one + one))) == 2
+
+
+def test_without_a_beginning_a_datagram_is_no_next_piece() -> None:
+    ours = codec()
+    assert (
+        list(ours.decode_datagram(b"x" + WireEnd().pack(m.heartbeat_encode(2, 3, 0, 0, 4)))) == []
+    )
+    assert ours.bad_data_count == 1
+
+
+def test_a_timesync_request_has_no_answer_in_it() -> None:
+    message = sent(codec().encode_timesync(-5))
+    assert (message.tc1, message.ts1) == (0, -5)
+
+
+def test_without_a_key_no_signature_is_refused() -> None:
+    assert codec().refused_signatures == 0
+
+
 def test_a_lean_up_to_the_hard_limit_leaves() -> None:
     def leaning(degrees: float) -> tuple[float, float, float, float]:
         half_rad = math.radians(degrees) / 2

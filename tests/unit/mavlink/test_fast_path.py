@@ -154,6 +154,13 @@ def test_a_header_that_says_something_else_is_left_to_pymavlink(at: int, value: 
     assert decode_state_packet(sealed(bytes(packet), crc_extra=position.crc_extra)) is None
 
 
+def test_a_flag_that_is_not_the_one_of_a_signature_is_left_to_pymavlink() -> None:
+    unknown = bytearray(signed(IN_RTL, crc_extra=193))
+    unknown[2] = 2
+    body = sealed(bytes(unknown[:-15]), crc_extra=193) + bytes(13)
+    assert decode_state_packet(body) is None
+
+
 def test_a_payload_beyond_the_layout_is_left_to_pymavlink() -> None:
     position = dialect.MAVLink_local_position_ned_message
     for length, is_taken in ((28, True), (29, False)):

@@ -225,3 +225,9 @@ def test_a_timestamp_near_the_end_of_its_bits_is_not_followed(ticks, is_followed
     codec = make_codec()
     assert names(codec, sender.encode_heartbeat()) == ["HEARTBEAT"]
     assert (codec.signing.state.sent_ticks == ticks) is is_followed
+
+
+def test_a_signature_that_was_heard_once_is_remembered():
+    codec = make_codec(None)
+    names(codec, heartbeat(make_vehicle()), heartbeat(make_vehicle(None)))
+    assert codec.hears_signed
