@@ -149,8 +149,10 @@ class MavlinkLink:
             return "the connection to the vehicle is lost: reconnecting"
         if (vehicle := self._vehicle) is None:
             return "waiting for the vehicle's heartbeat"
-        problem = vehicle.problem(now_ns) or vehicle.output_problem(now_ns)
-        return problem or self._timesync.late_sending
+        if (problem := vehicle.problem(now_ns)) is not None:
+            hint = self._connection.hint
+            return problem if hint is None else f"{problem}; {hint}"
+        return vehicle.output_problem(now_ns) or self._timesync.late_sending
 
     def _share_with(self, station: Forwarding, now_ns: int) -> str | None:
         """Pass the ground station's packets on; why its sticks rule out ours, or None."""

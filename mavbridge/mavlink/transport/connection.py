@@ -127,12 +127,17 @@ class Connection:
         """Tell the user, once each, of packets whose signatures do not fit."""
         signing = self._codec.signing
         if signing is None:
-            reasons = [SIGNED_VEHICLE] if self._codec.hears_signed else []
+            reasons = [self.hint] if self.hint else []
         else:
             reasons = [REFUSALS[refusal] for refusal in signing.refused]
         for text in reasons[len(self._told) :]:
             self._told.append(text)
             self.texts.append(text)
+
+    @property
+    def hint(self) -> str | None:
+        """What may be the reason if the vehicle does not answer, or None."""
+        return SIGNED_VEHICLE if self._codec.hears_signed else None
 
     def send(self, data: bytes) -> bool:
         """Send one packet; False: it was not sent."""

@@ -187,7 +187,7 @@ def test_bytes_that_begin_nothing_count_once() -> None:
 def test_what_was_cut_off_does_not_swallow_the_next_datagram() -> None:
     vehicle, ours = WireEnd(), codec()
     one = vehicle.pack(m.heartbeat_encode(2, 3, 0, 0, 4))
-    for cut_off in (one[:9], one + one[:9]):
+    for cut_off in (one[:9], one[:15], one + one[:9]):
         list(ours.decode_datagram(cut_off))
         assert len(list(ours.decode_datagram(one + one))) == 2
 

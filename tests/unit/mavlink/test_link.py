@@ -227,6 +227,20 @@ def test_from_first_heartbeat_to_ready() -> None:
     assert any("RC_OVERRIDE_TIME is 3" in text for text in rig.texts)
 
 
+@pytest.mark.parametrize("signs", [False, True])
+def test_what_is_missing_is_said_with_why_a_vehicle_that_signs_does_not_answer(
+    signs: bool,
+) -> None:
+    """ArduPilot 4.7 with a key sent its state, and no parameter; "does it have RC input?"."""
+    rig = Rig()
+    rig.vehicle.end.mav.signing.secret_key = bytes(range(32))
+    rig.vehicle.end.mav.signing.sign_outgoing = signs
+    rig.vehicle.is_deaf = True
+    problem = rig.run(12.0).problem
+    assert problem is not None
+    assert ("give its key by --signing-key-file" in problem) is signs
+
+
 def test_the_packet_log_has_both_directions_and_only_what_left() -> None:
     rig = Rig()
     rig.run(9.5)
