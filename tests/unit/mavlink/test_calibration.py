@@ -1,10 +1,17 @@
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.wire import ARDUPILOT
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks
-from mavbridge.mavlink.codec.calibration import RcCalibration, RcChannel
+from mavbridge.mavlink.codec.calibration import (
+    DEAD_ZONE_US,
+    FS_THR_MARGIN_US,
+    RcCalibration,
+    RcChannel,
+)
 
 
 @pytest.mark.parametrize(
@@ -87,3 +94,61 @@ def test_two_sticks_on_one_channel_are_refused() -> None:
             pitch=ARDUPILOT.pitch,
             roll=ARDUPILOT.roll,
         )
+
+
+def channel(number: int = 1, **values: int) -> RcChannel:
+    return replace(RcChannel(number=number, min_us=1100, trim_us=1500, max_us=1900), **values)
+
+
+def test_each_stick_has_its_sign_in_a_new_calibration() -> None:
+    new = RcCalibration(throttle=channel(3), yaw=channel(4), pitch=channel(2), roll=channel(1))
+    assert new.to_pwm_us(Sticks(0.5, 0.5, 0.5, 0.5)) == (1700, 1700, 1300, 1700)
+    assert new.to_sticks((1700, 1700, 1300, 1700)) == Sticks(0.5, 0.5, 0.5, 0.5)
+    assert new.throttle_floor_us == 0
+
+
+def test_what_ardupilot_has_where_nothing_is_set() -> None:
+    assert (DEAD_ZONE_US, FS_THR_MARGIN_US) == (20, 10)
+
+
+def test_a_calibration_may_go_to_the_ends_of_a_radio() -> None:
+    widest = channel(8, min_us=800, trim_us=800, max_us=2200)
+    assert (widest.to_us(-1.0, centre_us=800), widest.to_us(1.0, centre_us=800)) == (800, 2200)
+    for values, message in (({"max_us": 2201}, "RC1_MAX 2201"), ({"min_us": 799}, "RC1_MIN 799")):
+        with pytest.raises(ValueError, match=message):
+            channel(**values)
+    with pytest.raises(ValueError, match="not below"):
+        channel(min_us=1900)
+
+
+def test_pwm_beyond_the_calibration_is_a_full_stick() -> None:
+    assert channel().to_stick(500, centre_us=1500) == -1.0
+    assert channel().to_stick(2500, centre_us=1500) == 1.0
+
+
+def test_a_centre_at_the_end_of_its_range_is_the_centre() -> None:
+    for end_us in (1100, 1900):
+        assert channel().to_stick(end_us, centre_us=end_us) == 0.0
+
+
+@pytest.mark.parametrize("stick", ["yaw", "pitch", "roll"])
+@pytest.mark.parametrize("trim_us", [1100, 1900, 1099, 1901])
+def test_a_trim_is_inside_its_channel(stick: str, trim_us: int) -> None:
+    moved = replace(getattr(ARDUPILOT, stick), trim_us=trim_us)
+    if 1100 <= trim_us <= 1900:
+        assert replace(ARDUPILOT, **{stick: moved}).to_pwm_us(NEUTRAL)
+    else:
+        name = f"RC{moved.number}_TRIM"
+        with pytest.raises(ValueError, match=f"{name} {trim_us} is not .* --set {name}=1500"):
+            replace(ARDUPILOT, **{stick: moved})
+
+
+def test_the_trim_of_the_throttle_means_nothing() -> None:
+    moved = replace(ARDUPILOT, throttle=replace(ARDUPILOT.throttle, trim_us=0))
+    assert moved.to_pwm_us(NEUTRAL)[0] == 1500
+
+
+def test_a_failsafe_in_the_middle_of_the_throttle_is_refused() -> None:
+    assert replace(ARDUPILOT, throttle_floor_us=1499).to_pwm_us(NEUTRAL)[0] == 1500
+    with pytest.raises(ValueError, match="FS_THR_VALUE 1490 makes a failsafe"):
+        replace(ARDUPILOT, throttle_floor_us=1500)
