@@ -1,6 +1,7 @@
 """``python -m fuzz``: many hostile datagrams, on all cores; `make fuzz` runs it.
 
-Nine of ten go to the codec alone, the rest through whole flights. A failure prints the datagrams.
+Eight of ten go to the codec alone, one to a link with a key, one through whole flights. A failure
+prints the datagrams.
 """
 
 import argparse
@@ -11,10 +12,11 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 
 from fuzz.codec_target import FuzzError, fuzz_codec
 from fuzz.link_target import COMBINATIONS, HostileFlight
+from fuzz.signed_target import fuzz_signing
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 
 CODEC_CHUNK, FLIGHT_CHUNK = 50_000, 50_000
-FLIGHT_SHARE = 0.1
+FLIGHT_SHARE = SIGNED_SHARE = 0.1
 
 
 def fuzz_flight(seed: int, count: int) -> None:
@@ -26,12 +28,13 @@ def fuzz_flight(seed: int, count: int) -> None:
 def _run(datagrams: int, seed: int, workers: int) -> int:
     clock, fed, failures = MonotonicClock(), 0, 0
     start_ns = clock.now_ns()
-    in_flights = round(datagrams * FLIGHT_SHARE)
+    in_flights, signed = round(datagrams * FLIGHT_SHARE), round(datagrams * SIGNED_SHARE)
     with ProcessPoolExecutor(workers) as pool:
         work: dict[Future[None], tuple[str, int, int]] = {}
         for target, total, chunk in (
             (fuzz_flight, in_flights, FLIGHT_CHUNK),
-            (fuzz_codec, datagrams - in_flights, CODEC_CHUNK),
+            (fuzz_signing, signed, CODEC_CHUNK),
+            (fuzz_codec, datagrams - in_flights - signed, CODEC_CHUNK),
         ):
             for number, at in enumerate(range(0, total, chunk)):
                 count = min(chunk, total - at)

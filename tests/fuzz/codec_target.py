@@ -46,7 +46,7 @@ def fuzz_codec(seed: int, count: int) -> None:
     rules = GroundStationRules(sticks_win=draw.random() < 0.5)
     for number in range(count):
         if number % _SAMPLE_EVERY == 0:
-            source.heard.append(_sample(vehicle, draw))
+            source.heard.append(sample(vehicle, draw))
         data = source.own() if draw.random() < 0.7 else source.foreign()
         start_s = time.thread_time()
         try:
@@ -64,7 +64,7 @@ def fuzz_codec(seed: int, count: int) -> None:
         assert len(codec._mav.buf) < 2 * 65536, "the parser's buffer grows"
 
 
-def _sample(end: WireEnd, draw: Random) -> bytes:
+def sample(end: WireEnd, draw: Random) -> bytes:
     mav, boot_ms = end.mav, draw.randrange(1_000_000)
     none = (0.0,) * 3
     return end.pack(
