@@ -102,7 +102,7 @@ def main(
     *,
     json: Path,
     plot: Path | None = None,
-    checkpoint: Path = SHIPPED,
+    checkpoint: Path = SHIPPED["toge"],
     without_age: Path | None = None,
     episodes: int = 25,
     workers: int = 1,

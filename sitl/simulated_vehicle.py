@@ -92,7 +92,7 @@ class SimulatedVehicle:
         return self.server.links[link_id].take_outgoing()
 
     def launch(self, start: AirborneStart) -> None:
-        """Put the vehicle in the air in this state, armed, in ALT_HOLD or ALTCTL."""
+        """Put the vehicle in the air in this state, armed, where the sticks lean and climb."""
         self.ap.launch(start.position_ned_m, start.velocity_ned_mps, start.ned_from_body_wxyz)
         self.log.start_over(start.next_gate)
         self.pose = Pose(stamp_ns=self.ap.now_ns, body=self.ap.truth)

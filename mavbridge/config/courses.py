@@ -1,4 +1,13 @@
-"""Seeds of gate courses: training, its checks and evaluation never share one."""
+"""Simulated vehicles and seeds of gate courses: training, its checks and evaluation share none."""
+
+from typing import Literal
+
+AutopilotKind = Literal["ardupilot", "px4"]
+CourseKind = Literal["easy", "race"]
+"""Family of courses; each has seeds of its own, and in them the same ranges."""
+
+RACE_COURSE_SEED = 1_000_000_000
+"""Seeds of race courses begin here (`sitl.course.layout.RACE_SEEDS`)."""
 
 CHECK_COURSE_SEED = 900_000
 """Courses from here on are flown during training, and neither learned from nor evaluated."""
@@ -8,3 +17,8 @@ HELD_OUT_COURSE_SEED = 1_000_000
 
 MAX_EPISODES = 10_000
 """Most episodes of one evaluation, so that another seed has other courses."""
+
+
+def first_seed(courses: CourseKind) -> int:
+    """Seed 0 of a family."""
+    return RACE_COURSE_SEED if courses == "race" else 0

@@ -49,8 +49,9 @@ class Limits:
     max_frozen_state: Annotated[float, Parameter(group=RARE)] = 0.5
     """Longest time in seconds for which the attitude may stay exactly the same while the vehicle
     turns; 0 = no limit."""
-    tau: float = 0.05
-    """Time constant of the stick low-pass, in seconds; 0 = off."""
+    tau: float | None = None
+    """Time constant of the low-pass of actions, in seconds; 0 = off. By default 0.05, of body rates
+    0.01."""
     max_slew: float = 8.0
     """Fastest stick movement, in full deflections a second; 0 = no limit."""
 
@@ -65,7 +66,8 @@ class Limits:
             if age is not None:
                 check_range(name, age, 0.01, 60, "s")
         check_range("max-frozen-state", self.max_frozen_state, 0, 60, "s")
-        check_range("tau", self.tau, 0, 2, "s")
+        if self.tau is not None:
+            check_range("tau", self.tau, 0, 2, "s")
         check_range("max-slew", self.max_slew, 0, 1000, "1/s")
 
 

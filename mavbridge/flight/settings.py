@@ -19,11 +19,15 @@ from mavbridge.gate.preparation import PreparationSettings
 from mavbridge.gate.settings import GateSettings
 from mavbridge.gate.smoothing import Smoothing
 from mavbridge.mavlink.settings import LinkSettings, SigningFiles
-from policy.contract import Contract
+from policy.contract import ActionKind, Contract
 from policy.protocol import Executable
 
 LEAST = 1e-9
 """A limit that widens nothing."""
+
+TAU_S: dict[ActionKind, float] = {"sticks": 0.05, "rates": 0.01, "attitude": 0.05, "velocity": 0.05}
+"""Usual time constants of the low-pass. Body rates close the loop of the attitude, which has no
+room for 50 ms more."""
 
 
 def gate_settings(
@@ -59,7 +63,10 @@ def flight_settings(config: FlyConfig, executable: Executable) -> FlightSettings
         ),
         meaning=action_meaning(contract, config.link),
         output=None if config.link.output == "auto" else config.link.output,
-        smoothing=Smoothing(limits=limit_settings(config).of(contract.action), tau_s=limits.tau),
+        smoothing=Smoothing(
+            limits=limit_settings(config).of(contract.action),
+            tau_s=TAU_S[contract.action] if limits.tau is None else limits.tau,
+        ),
         envelope=envelope_limits(config.envelope, _policy_envelope(contract)),
         engagement=engagement_settings(config, contract),
         watches_home_height="height" in contract.state_extras,

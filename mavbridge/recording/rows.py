@@ -52,8 +52,8 @@ class FrameRow:
 class TickLabels:
     """Labels of a tick in a demonstration."""
 
-    expert: Sticks | None
-    """Sticks that the expert would hold here, without the disturbance that was flown."""
+    expert: Action | None
+    """The expert's action here, without the disturbance that was flown."""
 
 
 class TickRow(NamedTuple):
@@ -163,8 +163,10 @@ def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickR
     has_labels = "expert" in table.column_names
     for row in _rows(table):
         serial += 1 + row["dropped_before"]
-        labels = TickLabels(expert=_sticks(row["expert"])) if has_labels else None
-        yield TickRow(_tick(row, serial, ACTION_CLASSES[action]), row["dropped_before"], labels)
+        make, labels = ACTION_CLASSES[action], None
+        if has_labels:
+            labels = TickLabels(expert=row["expert"] and make(*row["expert"]))
+        yield TickRow(_tick(row, serial, make), row["dropped_before"], labels)
 
 
 def read_frames(table: pa.Table) -> Iterator[FrameRow]:

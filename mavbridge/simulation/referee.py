@@ -4,6 +4,7 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S, Clock
@@ -11,6 +12,7 @@ from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import Action
 from policy.contract import ACTION_DIM
+from sitl.course.layout import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
 
 READY_NS = 30 * NS_PER_S
@@ -51,6 +53,16 @@ class EpisodeResult:
     def mean_speed_mps(self) -> float:
         """Over the whole flight, take-off included."""
         return self.distance_m / self.flown_s if self.flown_s > 0 else 0.0
+
+    @property
+    def course_speed_mps(self) -> float | None:
+        """Along the straight legs from the first gate to the last one passed; None for fewer than
+        two."""
+        if self.gates_passed < 2:
+            return None
+        gates = make_course(self.course_seed).gates[: self.gates_passed]
+        legs_m = [math.dist(a.center_ned_m, b.center_ned_m) for a, b in pairwise(gates)]
+        return sum(legs_m) / (self.gate_times_s[-1] - self.gate_times_s[0])
 
     @property
     def course_s(self) -> float | None:

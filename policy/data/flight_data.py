@@ -5,11 +5,20 @@ Everything keeps its true stamp, so the rates of camera, telemetry and sticks ne
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, QUATERNION, STATE_DIM, STATE_NAMES, FloatArray, StateFrame
+from policy.contract import (
+    ACTION_DIM,
+    QUATERNION,
+    STATE_DIM,
+    STATE_NAMES,
+    ActionKind,
+    FloatArray,
+    StateFrame,
+)
 from policy.errors import PolicyError
 from policy.preprocess import STATE_SCALE
 
@@ -26,6 +35,23 @@ MAX_STATE_SCALES = 30.0
 
 class DatasetError(PolicyError):
     """Flights that cannot be learned from; the message says which and why."""
+
+
+class ActionTerms(NamedTuple):
+    """What the actions of a flight are, by the fields of a contract."""
+
+    action: ActionKind = "sticks"
+    hover_thrust: float = 0.39
+    max_tilt_deg: float | None = None
+
+    @property
+    def neutral(self) -> tuple[float, float, float, float]:
+        """The action while nobody acts."""
+        has_thrust = self.action in ("rates", "attitude")
+        return (self.hover_thrust if has_thrust else 0.0, 0.0, 0.0, 0.0)
+
+
+STICK_TERMS = ActionTerms()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +75,10 @@ class FlightData:
     """[T] arrival of its velocity."""
     target_ns: Nanoseconds
     target: FloatArray
-    """[M, 4] sticks to imitate, at ``target_ns`` [M]."""
+    """[M, 4] actions to imitate, at ``target_ns`` [M]."""
     sent_ns: Nanoseconds
     sent: FloatArray
-    """[S, 4] sticks that flew, each until the next one; zeros where they were released."""
+    """[S, 4] actions that flew, each until the next one; neutral where there was none."""
     age_ns: Nanoseconds
     """[A] measured ages of the image at a tick; may be empty."""
     captured_ns: Nanoseconds
@@ -63,6 +89,7 @@ class FlightData:
     """Changes with the images."""
     decode: Callable[[], Iterator[ImageArray]]
     """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``; may stop early."""
+    terms: ActionTerms = STICK_TERMS
 
     def __post_init__(self) -> None:
         """Refuse what would train a net on nonsense."""
@@ -85,7 +112,9 @@ class FlightData:
             raise DatasetError(f"{self.name}: each tick needs the stamps of attitude and velocity")
         for of in ("target", "sent"):
             values = getattr(self, of)
-            if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > 1.0:
+            if not np.isfinite(values).all():
+                raise DatasetError(f"{self.name}: {of} must be finite numbers")
+            if self.terms.action == "sticks" and np.abs(values).max(initial=0.0) > 1.0:
                 raise DatasetError(f"{self.name}: {of} must be sticks in [-1, 1]")
         self._check_state()
 
@@ -128,6 +157,24 @@ def common_frame(flights: Sequence[FlightData]) -> StateFrame:
                 f"{flight.state_frame}: train on one kind at a time"
             )
     return first.state_frame
+
+
+def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
+    """The kind of actions that all flights share, and the largest of their tilts.
+
+    Raises:
+        DatasetError: two kinds, or two thrusts that hover.
+    """
+    first = flights[0]
+    for flight in flights:
+        if (flight.terms.action, flight.terms.neutral) != (first.terms.action, first.terms.neutral):
+            raise DatasetError(
+                f"{first.name} was flown by {first.terms.action} around {first.terms.neutral}, "
+                f"{flight.name} by {flight.terms.action} around {flight.terms.neutral}: train on "
+                "one kind at a time"
+            )
+    tilts_deg = [each.terms.max_tilt_deg for each in flights if each.terms.max_tilt_deg is not None]
+    return first.terms._replace(max_tilt_deg=max(tilts_deg, default=None))
 
 
 def hold_out(

@@ -10,8 +10,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, STATE_DIM, FloatArray, StateFrame
-from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
+from policy.contract import ACTION_DIM, ACTION_MODES, STATE_DIM, FloatArray, StateFrame
+from policy.data.flight_data import (
+    GATE_DIM,
+    ActionTerms,
+    DatasetError,
+    FlightData,
+    ImageArray,
+    Nanoseconds,
+)
 from policy.data.tables import file_digest, parse_state_frame, read_json, stamps, vectors
 
 FORMAT, VERSION = "mavbridge-flight", 1
@@ -89,7 +96,7 @@ def read_flight(folder: Path) -> FlightData:
     Raises:
         DatasetError: not a flight of ours, or damaged, or nobody flew in it.
     """
-    state_frame = _state_frame(folder)
+    state_frame, terms = _state_frame(folder), _terms(folder)
     name = str(folder)
     ticks = _read_table(folder, "ticks", _TICK_COLUMNS)
     frames = _read_table(folder, "frames", _FRAME_COLUMNS)
@@ -98,7 +105,7 @@ def read_flight(folder: Path) -> FlightData:
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
     tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
     sent = vectors(name, ticks, "sent", ACTION_DIM)
-    if not _known(sent).any():
+    if not _known(sent).any() and terms.action == "sticks":
         sent = vectors(name, ticks, "rc_sticks", ACTION_DIM)
     target_ns, target = sent_ns, sent
     if "expert" in ticks.column_names:
@@ -121,7 +128,8 @@ def read_flight(folder: Path) -> FlightData:
         target_ns=target_ns[is_target],
         target=target[is_target],
         sent_ns=sent_ns,
-        sent=np.nan_to_num(sent, nan=0.0),
+        sent=np.where(np.isnan(sent), np.array(terms.neutral, np.float32), sent),
+        terms=terms,
         age_ns=_ages(ticks),
         captured_ns=stamps(name, frames, "captured_ns"),
         gate=_gates(name, frames),
@@ -180,13 +188,22 @@ def _read_meta(folder: Path) -> dict[str, object]:
 
 def _state_frame(folder: Path) -> StateFrame:
     contract = _read_meta(folder).get("contract")
-    action = contract.get("action", "sticks") if isinstance(contract, dict) else "sticks"
-    if action != "sticks":
-        raise DatasetError(
-            f"{folder} was flown by {action}: this build learns from sticks, and exports them"
-        )
     frame = contract.get("state_frame") if isinstance(contract, dict) else None
     return parse_state_frame(str(folder), frame)
+
+
+def _terms(folder: Path) -> ActionTerms:
+    """From the contract of a flight; the first ones had none, and were flown by sticks."""
+    contract = _read_meta(folder).get("contract")
+    said = contract if isinstance(contract, dict) else {}
+    action = said.get("action", "sticks")
+    if action not in ACTION_MODES:
+        raise DatasetError(f"{folder}: its actions are {action!r}, which this build does not know")
+    hover, tilt = said.get("hover_thrust", 0.39), said.get("max_tilt_deg")
+    for number in (hover, tilt):
+        if not isinstance(number, int | float | None) or isinstance(number, bool):
+            raise DatasetError(f"{folder}: {number!r} in its contract is no number")
+    return ActionTerms(action, float(hover), None if tilt is None else float(tilt))
 
 
 def _read_table(folder: Path, stem: str, columns: tuple[str, ...]) -> pa.Table:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from policy.action_units import action_units
 from policy.contract import (
     ACTION_DIM,
     AGE,
@@ -49,15 +50,19 @@ _BETWEEN_NS = 10 * NS_PER_S
 # In a mirror, the plane of the first and third axis of world and body, vectors change the sign of y
 # and rotations those of x and z. It holds in both state frames.
 _VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
-STICK_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
-"""Factors of throttle, yaw, pitch and roll in a mirror."""
+ACTION_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
+"""Factors of an action in a mirror: of throttle, yaw, pitch and roll; of thrust, roll, pitch and
+yaw. Velocities along the world's axes would need others."""
 GATE_SIGNS = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
 """Factors of ``FlightData.gate`` in a mirror."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """``B`` pairs of an image and a later tick: state [B, state_dim], history [B, K, 4], labels."""
+    """``B`` pairs of an image and a later tick: state [B, state_dim], history [B, K, 4], labels.
+
+    Actions are in ``policy.action_units``.
+    """
 
     state: FloatArray
     history: FloatArray
@@ -72,8 +77,8 @@ class Samples:
         """Exchange left and right where ``is_mirrored`` [B]."""
         return Samples(
             state=mirrored(self.state, state_signs(self.state.shape[1]), is_mirrored),
-            history=mirrored(self.history, STICK_SIGNS, is_mirrored),
-            chunk=mirrored(self.chunk, STICK_SIGNS, is_mirrored),
+            history=mirrored(self.history, ACTION_SIGNS, is_mirrored),
+            chunk=mirrored(self.chunk, ACTION_SIGNS, is_mirrored),
             known=self.known,
             gate=mirrored(self.gate, GATE_SIGNS, is_mirrored),
         )
@@ -108,15 +113,17 @@ class Timeline:
         self._velocity_ns = stamps("velocity_ns")[known]
         self._velocity = Interpolator(self._velocity_ns, self._state[:, VELOCITY])
         self._target_ns = stamps("target_ns")
-        self._target = np.concatenate([flight.target for flight in flights])
-        # Before its first stick, a flight's sticks were neutral.
+        units = action_units(contract)
+        self._target = units.to_network(np.concatenate([flight.target for flight in flights]))
+        # Before its first action, a flight's actions were neutral.
         sent_ns = [
             np.concatenate([[start - NS_PER_S], flight.sent_ns + offset])
             for flight, offset, start in zip(flights, offsets, starts, strict=True)
         ]
         neutral = np.zeros((1, ACTION_DIM), np.float32)
         self._sent_ns = np.concatenate(sent_ns).astype(np.int64)
-        self._sent = np.concatenate([part for e in flights for part in (neutral, e.sent)])
+        sent = [units.to_network(flight.sent) for flight in flights]
+        self._sent = np.concatenate([part for each in sent for part in (neutral, each)])
         self.captured_ns = stamps("captured_ns")
         self.gate = np.concatenate([flight.gate for flight in flights]).reshape(-1, GATE_DIM)
         self._usable_ticks = np.flatnonzero(self.chunks(np.arange(len(self.tick_ns)))[1][:, 0])

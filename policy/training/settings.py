@@ -143,6 +143,8 @@ class TrainSettings(RunSettings):
     check_flights: int = 0
     """Courses to fly with the weights now and then; those that fly best are kept, not those with
     the least loss. Takes the extra "sitl"."""
+    check_courses: Literal["easy", "race"] = "easy"
+    """Family of those courses."""
     check_every: int = 5
     """Validations between two such checks."""
 

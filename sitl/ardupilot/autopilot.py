@@ -244,15 +244,17 @@ class Autopilot:
     def launch(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> None:
-        """Put the vehicle in the air in this state, armed and in ALT_HOLD.
+        """Put the vehicle in the air in this state, armed; in ALT_HOLD, unless setpoints fly it.
 
-        The sticks count from the next step: an idle receiver commands a descent.
+        The sticks count from the next step: an idle receiver commands a descent. Setpoints count
+        from the next one on.
         """
         self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
         self.sensed = self.gps = self._physics.body
         self.armed = True
         self.landed = False
-        self.mode = Mode.ALT_HOLD
+        if not self.mode.is_guided:
+            self.mode = Mode.ALT_HOLD
         self._idle_since_ns = self.now_ns
         self._still_since_ns = self._tipped_since_ns = None
         self.control.enter(self.mode, self.sensed)

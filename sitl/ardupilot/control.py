@@ -187,13 +187,14 @@ class _Response:
 
 
 def boosted(thrust: float, body: BodyState, params: Params) -> float:
-    """Collective in [0, 1] that keeps the vertical thrust of a leaning vehicle, to 60 degrees.
+    """Collective in [0, 1] that keeps the vertical thrust of a leaning vehicle, to 84 degrees.
 
-    ATC_ANGLE_BOOST turns it off.
+    ATC_ANGLE_BOOST turns it off. Formula: ArduPilot's ``get_throttle_boosted``.
     """
     if not params["ATC_ANGLE_BOOST"]:
         return thrust
-    return min(1.0, thrust / max(cos_tilt(body.ned_from_body_wxyz), 0.5))
+    lean = cos_tilt(body.ned_from_body_wxyz)
+    return min(1.0, thrust * max(0.0, min(1.0, 10.0 * lean)) / max(lean, 0.1))
 
 
 def lean_for(accel_ne_mps2: tuple[float, float], body: BodyState) -> tuple[float, float]:

@@ -13,19 +13,50 @@ import numpy as np
 from sitl import UsageError
 from sitl.rotation import Quat, Vec3, conjugate, rotate, to_euler, wrap_pi
 
-GATE_COUNT = 8
 OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
 BAR_M = 0.32  # width of the bars around an opening
 DEPTH_M = 0.24  # depth of the frame along the passage; the gate's centre is halfway in
+RACE_SEEDS = 1_000_000_000
+"""Seeds from here on are race courses, those below are easy ones."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """What the courses of one kind have in common; pairs are least and most."""
+
+    gate_count: int
+    first_leg_m: float
+    leg_m: tuple[float, float]
+    turn_rad: float
+    """Largest turn from one leg to the next, to either side."""
+    climb_m: float
+    """Largest change of height from gate to gate, up or down."""
+    first_altitude_m: tuple[float, float]
+    altitude_m: tuple[float, float]
+
 
 # At 8 m/s the sharpest turn over the shortest leg, 35 degrees in 7 m, asks for v^2 * angle / leg =
 # 5.6 m/s^2 = g * tan(30 deg), ArduCopter's default lean limit. The climb limit asks for 1.1 m/s.
-FIRST_LEG_M = 8.0
-LEG_M = (7.0, 12.0)
-TURN_RAD = math.radians(35.0)
-CLIMB_M = 1.0
-FIRST_ALTITUDE_M = (2.0, 3.0)
-ALTITUDE_M = (2.0, 4.0)
+EASY = Family(
+    gate_count=8,
+    first_leg_m=8.0,
+    leg_m=(7.0, 12.0),
+    turn_rad=math.radians(35.0),
+    climb_m=1.0,
+    first_altitude_m=(2.0, 3.0),
+    altitude_m=(2.0, 4.0),
+)
+# At 10 m/s the sharpest turn, 50 degrees in 10 m, asks for 8.7 m/s^2: a lean of 42 degrees, and
+# with the steepest climb or dive, 3 m in 10 m, for changes of 3 m/s in a second.
+RACE = Family(
+    gate_count=12,
+    first_leg_m=12.0,
+    leg_m=(10.0, 16.0),
+    turn_rad=math.radians(50.0),
+    climb_m=3.0,
+    first_altitude_m=(2.5, 3.5),
+    altitude_m=(2.0, 8.0),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,28 +102,29 @@ class AirborneStart:
 def make_course(seed: int) -> Course:
     """Generate the course of this seed: the same on every machine.
 
-    Legs turn by up to 35 degrees and rise or fall by up to 1 m; a gate faces the mean of the legs
-    before and after it.
+    Below ``RACE_SEEDS`` legs turn by up to 35 degrees and rise or fall by up to 1 m, from there on
+    by up to 50 degrees and 3 m. A gate faces the mean of the legs before and after it.
 
     Raises:
         UsageError: the seed is negative.
     """
     if seed < 0:
         raise UsageError(f"a course seed is 0 or more, got {seed}")
+    family = EASY if seed < RACE_SEEDS else RACE
     random = np.random.Generator(np.random.PCG64(seed))
-    turns_rad = random.uniform(-TURN_RAD, TURN_RAD, GATE_COUNT)
-    legs_m = random.uniform(*LEG_M, GATE_COUNT)
-    climbs_m = random.uniform(-CLIMB_M, CLIMB_M, GATE_COUNT)
+    turns_rad = random.uniform(-family.turn_rad, family.turn_rad, family.gate_count)
+    legs_m = random.uniform(*family.leg_m, family.gate_count)
+    climbs_m = random.uniform(-family.climb_m, family.climb_m, family.gate_count)
 
     north_m = east_m = heading_rad = 0.0
-    altitude_m = float(random.uniform(*FIRST_ALTITUDE_M))
+    altitude_m = float(random.uniform(*family.first_altitude_m))
     gates = []
-    for index in range(GATE_COUNT):
-        leg_m = FIRST_LEG_M if index == 0 else float(legs_m[index])
+    for index in range(family.gate_count):
+        leg_m = family.first_leg_m if index == 0 else float(legs_m[index])
         north_m += leg_m * math.cos(heading_rad)
         east_m += leg_m * math.sin(heading_rad)
         if index > 0:
-            altitude_m = float(np.clip(altitude_m + climbs_m[index], *ALTITUDE_M))
+            altitude_m = float(np.clip(altitude_m + climbs_m[index], *family.altitude_m))
         turn_rad = float(turns_rad[index])
         gates.append(
             Gate(

@@ -1,46 +1,88 @@
-"""Perturbs demonstrations, so that they hold mistakes to learn from: sticks and starts in the air.
+"""Perturbs demonstrations, so that they hold mistakes to learn from: actions and starts in the air.
 
-The disturbed sticks are flown while the expert's stay the label, so that the way back from a
+The disturbed actions are flown while the expert's stay the label, so that the way back from a
 mistake is in the data (Laskey et al., "DART: Noise Injection for Robust Imitation Learning", 2017).
 Everything follows from a seed.
 """
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from sitl.course.layout import AirborneStart, Course
-from sitl.expert.stick_response import CENTRED, StickPositions
+from sitl.course.layout import RACE_SEEDS, AirborneStart, Course
+from sitl.expert.rate_response import RateCommand
+from sitl.expert.stick_response import StickPositions
 from sitl.rotation import from_euler
 from sitl.vehicle.control import clamp
+
+Numbers: TypeAlias = tuple[float, ...]
+Commanded = TypeVar("Commanded", StickPositions, RateCommand)
 
 QUIET_S = (1.0, 5.0)
 NOISY_S = (0.5, 2.0)
 PULSE_S = (0.15, 0.5)
 NOISE_TIME_S = 0.25  # correlation time of the noise: about as fast as a thumb
-NOISE_RMS = StickPositions(throttle=0.25, yaw=0.12, pitch=0.25, roll=0.25)
-PULSE_MAX = StickPositions(throttle=0.6, yaw=0.4, pitch=0.6, roll=0.6)
 START_AWAY_M = (3.0, 5.5)
-"""Distance before a gate: past the previous one, whose leg is at least 7 m long."""
+"""Distance before a gate of an easy course: past the previous one, whose leg is at least 7 m."""
+RACE_START_AWAY_M = (4.0, 8.5)
+"""Likewise with legs of at least 10 m."""
 LATE_CHANCE = 0.3
 LATE_S = (0.2, 2.0)
+
+
+class Strengths(NamedTuple):
+    """Disturbances of one kind of actions, number by number."""
+
+    noise_rms: Numbers
+    pulse_max: Numbers
+    low: Numbers
+    high: Numbers
+    idle: Numbers
+    """Does nothing on the ground."""
+
+
+STICK_STRENGTHS = Strengths(
+    noise_rms=(0.25, 0.12, 0.25, 0.25),
+    pulse_max=(0.6, 0.4, 0.6, 0.6),
+    low=(-1.0,) * 4,
+    high=(1.0,) * 4,
+    idle=(0.0,) * 4,
+)
+RATE_STRENGTHS = Strengths(
+    noise_rms=(0.06, 1.0, 1.0, 0.4),
+    pulse_max=(0.15, 2.5, 2.5, 1.0),
+    low=(0.0, -4.0, -4.0, -2.1),
+    high=(0.9, 4.0, 4.0, 2.1),
+    idle=(0.0,) * 4,
+)
 
 
 class _Stretch(NamedTuple):
     kind: Literal["quiet", "noise", "pulse", "late"]
     end_s: float
-    offset: StickPositions
+    offset: Numbers
 
 
-class StickDisturbance:
-    """Stretches of correlated noise and held pulses on the sticks, with quiet ones in between.
+NONE: Numbers = (0.0,) * 4
+
+
+class Disturbance:
+    """Stretches of correlated noise and held pulses on the actions, with quiet ones in between.
 
     ``strength`` scales amplitudes; 0 never disturbs. Use one per flight and call `flown` at every
     tick, in order of time. Some flights from the ground start late.
     """
 
-    def __init__(self, seed: int, *, strength: float = 1.0, from_ground: bool = True) -> None:
+    def __init__(
+        self,
+        seed: int,
+        *,
+        strength: float = 1.0,
+        from_ground: bool = True,
+        strengths: Strengths = STICK_STRENGTHS,
+    ) -> None:
+        self._strengths = strengths
         self._random = np.random.Generator(np.random.PCG64(seed))
         self._strength = strength
         self._start_s: float | None = None
@@ -48,15 +90,15 @@ class StickDisturbance:
         self._noise = np.zeros(4)
         late = from_ground and self._random.random() < LATE_CHANCE * strength
         end_s = float(self._random.uniform(*(LATE_S if late else QUIET_S)))
-        self._stretch = _Stretch("late" if late else "quiet", end_s, CENTRED)
+        self._stretch = _Stretch("late" if late else "quiet", end_s, NONE)
 
     @property
     def active(self) -> bool:
-        """True if the last call of `flown` disturbed the sticks."""
+        """True if the last call of `flown` disturbed the action."""
         return self._strength > 0.0 and self._stretch.kind != "quiet"
 
-    def flown(self, wanted: StickPositions, t_s: float) -> StickPositions:
-        """Sticks to fly at ``t_s`` where the expert wants ``wanted``; within [-1, 1]."""
+    def flown(self, wanted: Commanded, t_s: float) -> Commanded:
+        """Action to fly at ``t_s`` where the expert wants ``wanted``; within the bounds."""
         if self._start_s is None:
             self._start_s = t_s
         t_s -= self._start_s
@@ -66,29 +108,30 @@ class StickDisturbance:
         # An Ornstein-Uhlenbeck process, exact for any step.
         kept = math.exp(-max(dt_s, 0.0) / NOISE_TIME_S)
         fresh = math.sqrt(1.0 - kept * kept) * self._random.standard_normal(4)
-        self._noise = kept * self._noise + fresh * np.array(NOISE_RMS)
+        self._noise = kept * self._noise + fresh * np.array(self._strengths.noise_rms)
         if not self.active:
             return wanted
         if self._stretch.kind == "late":
-            return CENTRED
+            return type(wanted)(*self._strengths.idle)
         offset = self._noise if self._stretch.kind == "noise" else self._stretch.offset
+        bounds = zip(wanted, offset, self._strengths.low, self._strengths.high, strict=True)
         disturbed = [
-            clamp(stick + self._strength * float(off), 1.0)
-            for stick, off in zip(wanted, offset, strict=True)
+            max(low, min(high, number + self._strength * float(off)))
+            for number, off, low, high in bounds
         ]
-        return StickPositions(*disturbed)
+        return type(wanted)(*disturbed)
 
     def _next(self, ended: _Stretch) -> _Stretch:
         if ended.kind != "quiet":
-            return _Stretch("quiet", ended.end_s + float(self._random.uniform(*QUIET_S)), CENTRED)
+            return _Stretch("quiet", ended.end_s + float(self._random.uniform(*QUIET_S)), NONE)
         if self._random.random() < 0.5:
             self._noise[:] = 0.0
-            return _Stretch("noise", ended.end_s + float(self._random.uniform(*NOISY_S)), CENTRED)
-        # A pulse is on one or two sticks, as a slip of the thumb is.
-        held = self._random.uniform(-1.0, 1.0, 4) * np.array(PULSE_MAX)
+            return _Stretch("noise", ended.end_s + float(self._random.uniform(*NOISY_S)), NONE)
+        # A pulse is on one or two numbers, as a slip of the thumb is.
+        held = self._random.uniform(-1.0, 1.0, 4) * np.array(self._strengths.pulse_max)
         held *= self._random.permutation([1.0, 1.0, 0.0, 0.0])
         length_s = float(self._random.uniform(*PULSE_S))
-        return _Stretch("pulse", ended.end_s + length_s, StickPositions(*held.tolist()))
+        return _Stretch("pulse", ended.end_s + length_s, tuple(held.tolist()))
 
 
 def random_start(
@@ -97,7 +140,8 @@ def random_start(
     """Draw a start before a random gate, off its axis, moving and facing roughly along it."""
     random = np.random.Generator(np.random.PCG64(seed))
     gate = course.gates[int(random.integers(len(course.gates)))]
-    away_m = float(random.uniform(*START_AWAY_M))
+    is_race = course.seed >= RACE_SEEDS
+    away_m = float(random.uniform(*(RACE_START_AWAY_M if is_race else START_AWAY_M)))
     side_m = clamp(float(random.normal(0.0, 1.2 * strength)), 0.4 * away_m)
     up_m = float(random.normal(0.0, 0.5 * strength))
     heading_rad = gate.yaw_rad + float(random.normal(0.0, 0.2 * strength))

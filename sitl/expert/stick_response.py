@@ -5,6 +5,7 @@ import math
 from typing import NamedTuple
 
 from sitl.ardupilot.params import Params
+from sitl.expert.course_guide import Demand
 from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 
@@ -23,14 +24,6 @@ class StickPositions(NamedTuple):
 
 
 CENTRED = StickPositions(0.0, 0.0, 0.0, 0.0)
-
-
-class Demand(NamedTuple):
-    """Motion that the sticks are to bring about."""
-
-    accel_mps2: complex  # horizontal, north + 1j * east
-    climb_mps: float
-    yaw_rate_radps: float
 
 
 class StickResponse:

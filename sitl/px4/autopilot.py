@@ -191,16 +191,17 @@ class Autopilot:
     def launch(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> None:
-        """Put the vehicle in the air in this state, armed and in ALTCTL.
+        """Put the vehicle in the air in this state, armed; in ALTCTL, unless setpoints fly it.
 
-        Until the first sticks come they count as valid and centred.
+        Until the first sticks come they count as valid and centred. Setpoints go on.
         """
         self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
         self.sensed = self.gps = self._physics.body
-        self.stick_input.pretend_centred(self.now_ns)
         commander = self.commander
-        commander.mode = commander.intended = self._flown_mode = Mode.ALTCTL
-        commander.start(ignores_sticks=False)
+        if commander.mode is not Mode.OFFBOARD:
+            self.stick_input.pretend_centred(self.now_ns)
+            commander.mode = commander.intended = self._flown_mode = Mode.ALTCTL
+            commander.start(ignores_sticks=False)
         self._set_landed(landed=False)
         commander.texts.clear()
         commander.events.clear()

@@ -10,7 +10,7 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_S
 from sitl.course.layout import AirborneStart, Course
 from sitl.expert.demonstrator import Expert
-from sitl.expert.disturbance import StickDisturbance
+from sitl.expert.disturbance import Disturbance
 from sitl.expert.stick_response import StickPositions
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, Conditions
@@ -74,7 +74,7 @@ def fly_course(
     *,
     conditions: Conditions = NOMINAL,
     start: AirborneStart | None = None,
-    disturbance: StickDisturbance | None = None,
+    disturbance: Disturbance | None = None,
     limit_s: float = 60.0,
 ) -> CourseFlight:
     config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0, conditions=conditions)

@@ -15,6 +15,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FloatArray
 from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.flight.settings import TAU_S
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import MID_RECEIVER_US, Battery
@@ -207,7 +208,7 @@ def test_a_slow_policy_flies_its_plan_at_the_stick_rate(hz: float) -> None:
     assert not any(t.is_coasting for t in ticks)
     assert oldest_s(flight) < 1 / hz + 0.2
     for tick in ticks:
-        wanted = weaving(tick.sent_ns / NS_PER_S + Limits().tau)
+        wanted = weaving(tick.sent_ns / NS_PER_S + TAU_S["sticks"])
         assert tick.trace.raw == pytest.approx(wanted, abs=0.05)
 
 

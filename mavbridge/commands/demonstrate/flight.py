@@ -1,4 +1,4 @@
-"""One demonstration: a simulated flight, labelled with the expert's sticks and recorded."""
+"""One demonstration: a simulated flight, labelled with the expert's actions and recorded."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -12,6 +12,7 @@ from mavbridge.commands.demonstrate.config import DemonstrateConfig
 from mavbridge.commands.demonstrate.pilot import Pilot, Variation, draw_variation
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.errors import UserError
 from mavbridge.core.records import Event, Tick
 from mavbridge.flight.policies import load_for_episodes
 from mavbridge.recording.flight_writer import FlightWriter
@@ -26,6 +27,8 @@ from sitl.course.layout import gate_truth
 
 TRUTHS_KEPT = 64
 """Exposures whose frames may still be on their way."""
+RATE_TILT_DEG = 80.0
+"""Largest tilt of a policy that learns from an expert by body rates, which leans by up to 62."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,13 +62,24 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     variation, wanted = draw_variation(spec.seed), spec.config.policy
     student: Executable | None = None
     size_px = wanted.image_size or SIM_CAMERA_PX
-    contract = Contract(feature_dim=1, arrays="numpy", image_height=size_px, image_width=size_px)
+    contract = Contract(
+        feature_dim=1,
+        arrays="numpy",
+        image_height=size_px,
+        image_width=size_px,
+        action=spec.config.action,
+        max_tilt_deg=RATE_TILT_DEG if spec.config.action == "rates" else None,
+    )
     if wanted.checkpoint is not None:
         loaded = load_for_episodes(
             replace(wanted, dual_rate=True, head_steps=wanted.head_steps or 0), MonotonicClock()
         )
         student = stack.enter_context(loaded).executable
         contract = student.contract
+        if contract.action != spec.config.action:
+            raise UserError(
+                f"{wanted.checkpoint} flies by {contract.action}: use --action {contract.action}"
+            )
     flight = SimulatedFlight(
         course_seed=spec.seed,
         seed=spec.seed,
@@ -73,7 +87,11 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         settings=SimulationSettings(
             delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
         ),
-        vehicle=replace(NOMINAL_VEHICLE, conditions=variation.conditions),
+        vehicle=replace(
+            NOMINAL_VEHICLE,
+            conditions=variation.conditions,
+            autopilot=spec.config.autopilot,
+        ),
     )
     pilot = Pilot(
         flight, variation, speed_mps=spec.config.speed, contract=contract, student=student
@@ -160,6 +178,6 @@ class _LabelledRecorder:
         if tick.woke_ns < from_ns or serial is None or serial == self._chunk_serial:
             return
         self._chunk_serial = serial
-        labels = TickLabels(expert=self._pilot.expert_sticks(serial))
+        labels = TickLabels(expert=self._pilot.expert_action(serial))
         self._writer.tick(replace(tick, serial=self._ticks), labels)
         self._ticks += 1

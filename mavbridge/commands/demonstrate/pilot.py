@@ -3,20 +3,21 @@
 An expert flies, or a student whose every action the expert labels.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.vehicle import Action, BodyRates, Sticks
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight
-from policy.contract import Contract, FloatArray
+from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.protocol import Executable
-from sitl.expert.demonstrator import Expert
-from sitl.expert.disturbance import StickDisturbance, random_start
-from sitl.expert.stick_response import StickPositions
+from sitl.expert.demonstrator import Expert, RateExpert
+from sitl.expert.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
+from sitl.vehicle.dynamics import BodyState
 
 SETTLE_NS = 300 * NS_PER_MS
 """After a start in the air: until the last frame and state from the ground are gone."""
@@ -25,13 +26,13 @@ STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
 student that crashes at the first gate would otherwise learn nothing about the later ones (DAgger,
 Ross et al. 2011, mixes the two at random)."""
 SOLVES_KEPT = 64
-"""Solves whose expert sticks are kept until their ticks are recorded."""
+"""Solves whose expert actions are kept until their ticks are recorded."""
 NOMINAL_SHARE = 0.25
 """Flights without random conditions: what most users fly first."""
 AIRBORNE_SHARE = 0.35
 """Flights that start in the air and off the course."""
 UNDISTURBED_SHARE = 0.3
-"""Flights without disturbed sticks: examples of a good flight."""
+"""Flights without disturbed actions: examples of a good flight."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +78,7 @@ def _random_delays(random: np.random.Generator) -> Delays:
 
 
 class Pilot:
-    """The expert's sticks at every action, and an executable that flies."""
+    """The expert's action at every solve, and an executable that flies."""
 
     def __init__(
         self,
@@ -92,15 +93,17 @@ class Pilot:
         self._variation = variation
         self._speed_mps = speed_mps
         self._student = student
-        self._disturbance = StickDisturbance(
+        self._by_rates = contract.action == "rates"
+        self._disturbance = Disturbance(
             variation.seed,
             strength=variation.disturbance,
             from_ground=not variation.starts_airborne,
+            strengths=RATE_STRENGTHS if self._by_rates else STICK_STRENGTHS,
         )
         self._turns = TurnSchedule(variation.seed)
-        self._expert: Expert | None = None
+        self._expert: Expert | RateExpert | None = None
         self._solves = 0
-        self._expert_sticks: dict[int, Sticks] = {}
+        self._expert_actions: dict[int, Action] = {}
         """By the serial of the chunk that was computed with them."""
         self.begin_ns: int | None = None
         """When the demonstration begins; None before the policy has the vehicle's sticks."""
@@ -114,9 +117,9 @@ class Pilot:
         )
         self.executable = replace(student or expert, act=self._act, reset=self._start)
 
-    def expert_sticks(self, chunk_serial: int) -> Sticks | None:
-        """The expert's sticks at the state of a recent chunk; None before its demonstration."""
-        return self._expert_sticks.get(chunk_serial)
+    def expert_action(self, chunk_serial: int) -> Action | None:
+        """The expert's action at the state of a recent chunk; None before its demonstration."""
+        return self._expert_actions.get(chunk_serial)
 
     def _start(self) -> None:
         """The policy has the sticks now: a vehicle that is put in the air is under control."""
@@ -130,12 +133,10 @@ class Pilot:
         self._solves += 1
         horizon = self.executable.contract.horizon
         if self._expert is None:  # not engaged yet: the gate wants to see chunks first
-            return np.zeros((1, horizon, len(Sticks._fields)), np.float32)
+            return np.zeros((1, horizon, ACTION_DIM), np.float32)
         now_s, body = self._flight.clock.now_ns() / NS_PER_S, self._flight.vehicle.ap.truth
-        sticks = self._expert.sticks(body, now_s)
-        self._expert_sticks[self._solves] = Sticks(*sticks)
-        self._expert_sticks.pop(self._solves - SOLVES_KEPT, None)
-        disturbed = self._disturbance.flown(StickPositions(*sticks), now_s)
+        self._expert_actions[self._solves], disturbed = self._demonstrate(self._expert, body, now_s)
+        self._expert_actions.pop(self._solves - SOLVES_KEPT, None)
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
         if self._student is None:
             return chunk
@@ -143,7 +144,17 @@ class Pilot:
         students = self._student.act(encoded, state, history, elapsed_s)
         return students if self._turns.is_students(now_s) else chunk
 
-    def _begin(self, now_ns: int) -> Expert:
+    def _demonstrate(
+        self, expert: Expert | RateExpert, body: BodyState, now_s: float
+    ) -> tuple[Action, Sequence[float]]:
+        """The expert's action, and what is flown of it."""
+        if isinstance(expert, RateExpert):
+            command = expert.command(body, now_s)
+            return BodyRates(*command), self._disturbance.flown(command, now_s)
+        sticks = expert.sticks(body, now_s)
+        return Sticks(*sticks), self._disturbance.flown(sticks, now_s)
+
+    def _begin(self, now_ns: int) -> Expert | RateExpert:
         """Put the vehicle where the demonstration starts, and make the expert that flies it.
 
         The expert does not know the vehicle's parameters, which no learner could see: it flies as
@@ -151,12 +162,16 @@ class Pilot:
         """
         if not self._variation.starts_airborne:
             self.begin_ns = now_ns
-            return Expert(self._flight.course, self._speed_mps)
+            return self._make_expert(0)
         seed = self._variation.seed
         start = random_start(self._flight.course, seed, speed_mps=self._speed_mps)
         self._flight.vehicle.launch(start)
         self.begin_ns = now_ns + SETTLE_NS
-        return Expert(self._flight.course, self._speed_mps, next_gate=start.next_gate)
+        return self._make_expert(start.next_gate)
+
+    def _make_expert(self, next_gate: int) -> Expert | RateExpert:
+        make = RateExpert if self._by_rates else Expert
+        return make(self._flight.course, self._speed_mps, next_gate=next_gate)
 
 
 class TurnSchedule:

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from mavbridge.commands.episode_workers import WorkerProcess, raise_failure
 from mavbridge.commands.evaluate.config import EvaluateConfig
-from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES
+from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES, first_seed
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.rates import SIM_CAMERA_PX
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
@@ -26,7 +26,7 @@ from mavbridge.core.processes import END_TIMEOUT_S, end, free_port, running, wai
 from mavbridge.flight.app import fly_executable
 from mavbridge.flight.policies import is_scripted, load_configured_policy, load_for_episodes
 from mavbridge.flight.settings import contract_with_ages
-from mavbridge.simulation.delays import Delays
+from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult, Outcome, StickMeter
 from mavbridge.simulation.world import make_vehicle
@@ -52,7 +52,7 @@ class EpisodeSpec:
     @property
     def course_seed(self) -> int:
         """A held-out course."""
-        return HELD_OUT_COURSE_SEED + self.seed
+        return first_seed(self.config.courses) + HELD_OUT_COURSE_SEED + self.seed
 
     @property
     def conditions_seed(self) -> int | None:
@@ -80,7 +80,10 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         MavbridgeError: it cannot be flown.
     """
     config, delays = spec.config, Delays()
-    vision = replace(delays.vision, offset_ns=round(config.vision_delay * NS_PER_MS))
+    vision = delays.vision
+    if config.vision_time is not None:
+        vision = Delay(p50_ns=round(config.vision_time * NS_PER_MS))
+    vision = replace(vision, offset_ns=round(config.vision_delay * NS_PER_MS))
     settings = SimulationSettings(
         rates=config.rates,
         limits=config.limits,

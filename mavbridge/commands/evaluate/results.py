@@ -24,8 +24,10 @@ class Summary:
     gates_passed: Estimate | None
     mean_speed_mps: Estimate | None
     """Path over time, take-off included."""
+    course_speed_mps: Estimate | None
+    """Straight legs over time, from the first gate to the last one passed."""
     stick_rate_per_s: Estimate | None
-    """Mean |change| of a stick per second: lower is smoother."""
+    """Mean |change| of a number of the action per second: lower is smoother."""
     flown_s: Estimate | None
     course_s: Estimate | None
     """First action to last gate, of the successful flights."""
@@ -38,11 +40,13 @@ def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
     Raises:
         ValueError: there are none.
     """
+    speeds = [one.course_speed_mps for one in episodes]
     sticks = [one.stick_rate_per_s for one in episodes if one.stick_rate_per_s is not None]
     return Summary(
         success_rate=rate(sum(one.has_finished for one in episodes), len(episodes)),
         gates_passed=mean([one.gates_passed for one in episodes]),
         mean_speed_mps=mean([one.mean_speed_mps for one in episodes]),
+        course_speed_mps=mean([speed for speed in speeds if speed is not None]),
         stick_rate_per_s=mean(sticks),
         flown_s=mean([one.flown_s for one in episodes]),
         course_s=mean([one.course_s for one in episodes if one.course_s is not None]),
@@ -108,7 +112,8 @@ def print_evaluation(evaluation: Evaluation, console: Console) -> None:
     figures = (
         (f"gates passed, of {evaluation.episodes[0].gates_total}", summary.gates_passed),
         ("mean speed, m/s", summary.mean_speed_mps),
-        ("stick movement, 1/s", summary.stick_rate_per_s),
+        ("speed from gate to gate, m/s", summary.course_speed_mps),
+        ("change of actions, 1/s", summary.stick_rate_per_s),
         ("flown, s", summary.flown_s),
         ("course time, s (successful flights)", summary.course_s),
     )

@@ -21,7 +21,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import stop_on_signals
 from policy.contract import STATE_NAMES
-from policy.data.flight_data import FlightData, common_frame
+from policy.data.flight_data import FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.tables import read_json
 from policy.foreign.drafts.entries import Entry, draft_text
@@ -88,6 +88,8 @@ def write_dataset(
     Raises:
         UserError, VideoError, DatasetError: flights that cannot be in one dataset, or damaged.
     """
+    if (action := common_terms(list(episodes)).action) != "sticks":
+        raise UserError(f"these flights were flown by {action}: this command exports sticks")
     parts = [stretches(episode) for episode in episodes]
     every = list(chain.from_iterable(parts))
     if not every:

@@ -21,12 +21,14 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
     console = Console(stderr=True, highlight=False, emoji=False)
     kind = config.policy.partition(":")[0]
     if kind not in BUILTIN_KINDS:
-        raise UserError(
-            f"--policy {config.policy}: policies of {' and '.join(BUILTIN_KINDS)} are exported"
-        )
+        raise UserError(f"--policy {config.policy}: policies of toge and resnet-unet are exported")
     ours = PolicyRequest(spec=config.policy, checkpoint=checkpoint, engine="torch")
     _require_room(config)
     policy, notes = load_builtin(ours)
+    if policy.contract.action != "sticks":
+        raise UserError(
+            f"{config.policy} flies by {policy.contract.action}: policies by sticks are exported"
+        )
     if config.format == "onnx":
         config.out.mkdir(parents=True, exist_ok=True)
         export_onnx(policy, config.out)
@@ -59,4 +61,4 @@ def _difference(ours: PolicyRequest, written: PolicyRequest) -> str | None:
     for request in (ours, written):
         executable = load_policy(replace(request, dual_rate=False), now_s=lambda: 0.0).executable
         chunks.append(chunks_of_samples(executable, make_parity_samples(executable.contract)))
-    return parity_failure(*chunks)
+    return parity_failure(chunks[0], chunks[1])

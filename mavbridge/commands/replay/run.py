@@ -45,7 +45,7 @@ VIDEO_TOLERANCE = 0.15
 """Largest difference of a smoothed stick from the lossy video, in full deflections: twice what was
 measured, see docs/commands.md."""
 ENGINE_TOLERANCE = 0.05
-"""The same on another engine. A single chunk may differ by ``parity.MAX_STICK_ERROR``; a warm start
+"""The same on another engine. A chunk alone may differ by ``parity.MAX_ACTION_ERROR``; a warm start
 builds on its last chunk, and was seen to add that up to 0.022."""
 CLOCK_TOLERANCE = 0.01
 """The same of a scripted policy, which reads the clock while it computes: some 0.1 ms apart."""

@@ -15,7 +15,7 @@ from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from policy.contract import Contract
-from policy.data.flight_data import FlightData, common_frame
+from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.engines.devices import require_devices
@@ -50,7 +50,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
             ) from error
 
         def check(checkpoint: Path) -> float:
-            return share_of_gates(checkpoint, settings.policy, settings.check_flights)
+            return share_of_gates(checkpoint, settings)
 
     flights = _read_flights(paths, settings)
     network = fit_to_flights(network, flights, settings)
@@ -62,6 +62,8 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
     require_devices(settings.device)
     config = WorldModelConfig(image_size=settings.image_size)
     flights = _read_flights(paths, settings)
+    if (action := common_terms(flights).action) != "sticks":
+        raise DatasetError(f"a world model learns from flights by sticks, these were by {action}")
     config = replace(config, contract=Contract(state_frame=common_frame(flights)))
     return _finish(lambda hooks: train_world_model(flights, config, settings, hooks))
 
@@ -69,11 +71,16 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
 def fit_to_flights(
     network: Network, flights: Sequence[FlightData], settings: TrainSettings
 ) -> Network:
-    """The network with the state frame of the flights, and the inputs of the settings."""
+    """The network with state frame and actions of the flights, and the inputs of the settings."""
+    terms = common_terms(flights)
     contract = replace(
         network.contract,
         state_frame=common_frame(flights),
         since_exposure=settings.since_exposure,
+        action=terms.action,
+        modes=(),  # the usual ones of these actions
+        hover_thrust=terms.hover_thrust,
+        max_tilt_deg=terms.max_tilt_deg,
     )
     return replace(network, contract=contract)
 

@@ -34,6 +34,8 @@ attitude setpoint on. The nudge is 0.06 degrees/s of yaw rate."""
 MOST_LEAD_RAD = math.radians(45.0)
 """Largest angle between the heading that is asked for and the vehicle's own. It follows with a lag
 of 0.3 to 0.4 s, so that yaw rates up to 110 degrees/s are followed in full."""
+LEAST_COS_TILT = 0.1
+"""ArduPilot boosts the thrust of a lean by the inverse of this at most (get_throttle_boosted)."""
 _PAUSE_NS = 500 * NS_PER_MS
 """After this long without a setpoint, heading and thrust start afresh."""
 _LEVEL_RAD = math.radians(15.0)
@@ -68,7 +70,9 @@ class HeadingTarget:
 class AttitudeOutput(SetpointOutput):
     """SET_ATTITUDE_TARGET; either kind of action is sent as what it is.
 
-    Thrust is scaled so that the thrust that hovered in training hovers here.
+    Thrust is scaled so that the thrust that hovered in training hovers here. That of body rates is
+    along the body's axis on every firmware: where the autopilot raises it in a lean, it is lowered
+    by as much. That of an attitude is what the autopilot makes of it.
     """
 
     _echo_message = "ATTITUDE_TARGET"
@@ -88,6 +92,7 @@ class AttitudeOutput(SetpointOutput):
         self._heading = HeadingTarget()
         self._measured_rad: float | None = None
         self._is_level = False
+        self._cos_tilt = 1.0
 
     def restart(self) -> None:
         """A new session: another battery, perhaps another vehicle."""
@@ -119,16 +124,18 @@ class AttitudeOutput(SetpointOutput):
             raise CommandRefusedError(f"{action} is not finite, or its thrust not in [0, 1]")
         if self._scale is None or self._sent_ns is None or now_ns - self._sent_ns > _PAUSE_NS:
             self._scale = self._thrust_scale(vehicle)
-        shown: Shown = (round(min(self._scale * action.thrust, 1.0) * THRUST_UNITS),)
+        scale = self._scale
+        if isinstance(action, BodyRates) and vehicle.profile.boosts_thrust(vehicle.known_params):
+            scale *= self._cos_tilt
+        shown: Shown = (round(min(scale * action.thrust, 1.0) * THRUST_UNITS),)
         is_checked = shown[0] > 0  # idle motors are left idle
         if is_checked and not self._shows_rates:
             shown = self.echo.with_nudge(shown, now_ns)
         thrust = shown[0] / THRUST_UNITS
-        policy_thrust = thrust / self._scale
+        policy_thrust = thrust / scale
         if isinstance(action, BodyRates):
-            return self._encode_rates(
-                action, vehicle, thrust, shown if is_checked else None, now_ns
-            )
+            flown = action._replace(thrust=policy_thrust)
+            return self._encode_rates(flown, vehicle, thrust, shown if is_checked else None, now_ns)
         if self._measured_rad is None:
             return None
         if not self._follows(vehicle, now_ns):
@@ -149,7 +156,6 @@ class AttitudeOutput(SetpointOutput):
         shown: Shown | None,
         now_ns: int,
     ) -> Encoded:
-        assert self._scale is not None
         self._heading.restart()
         rates = tuple(round(rate * RATE_UNITS) for rate in action[1:])
         if self._shows_rates:
@@ -158,7 +164,7 @@ class AttitudeOutput(SetpointOutput):
         packet = self._codec.encode_rates(
             vehicle.identity.source, (roll, pitch, yaw), thrust, now_ns=now_ns
         )
-        return Encoded(packet, BodyRates(thrust / self._scale, roll, pitch, yaw), shown)
+        return Encoded(packet, BodyRates(action.thrust, roll, pitch, yaw), shown)
 
     def _thrust_scale(self, vehicle: VehicleSession) -> float:
         hover = self._hover.value or vehicle.profile.hover_thrust(vehicle.known_params)
@@ -172,7 +178,9 @@ class AttitudeOutput(SetpointOutput):
         match body:
             case Attitude():
                 self._measured_rad = heading_rad(body.ned_from_body_wxyz)
-                self._is_level = tilt_rad(body.ned_from_body_wxyz) < _LEVEL_RAD
+                tilt = tilt_rad(body.ned_from_body_wxyz)
+                self._is_level = tilt < _LEVEL_RAD
+                self._cos_tilt = max(math.cos(tilt), LEAST_COS_TILT)
             case SpecificForce():
                 self._hover.receive_force(-body.specific_force_body_mps2[2], arrived_ns)
             case AttitudeTarget():

@@ -151,6 +151,10 @@ class ArduPilot(Profile):
         """MOT_THST_HOVER, which it learns in flight."""
         return values.get("MOT_THST_HOVER")
 
+    def boosts_thrust(self, values: Mapping[str, float]) -> bool:
+        """Unless ATC_ANGLE_BOOST is 0."""
+        return values.get("ATC_ANGLE_BOOST", 1.0) != 0
+
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest:
         """NAV_TAKEOFF in GUIDED, whose height counts from home, where it was armed."""
         return CommandRequest(dialect.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, height_m))

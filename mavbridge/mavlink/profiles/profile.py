@@ -196,6 +196,10 @@ class Profile(ABC):
     def hover_thrust(self, values: Mapping[str, float]) -> float | None:
         """Collective thrust in 0..1 that hovers, by the vehicle's own estimate; None: not known."""
 
+    def boosts_thrust(self, values: Mapping[str, float]) -> bool:
+        """The vehicle divides the thrust of a setpoint by the cosine of its tilt."""
+        return False
+
     def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
         """Climb and descent in m/s to which it cuts velocity setpoints, as its echo shows them."""
         return math.inf, math.inf

@@ -1,6 +1,7 @@
 """Demonstrations are flights: recorded, labelled, resumable, and the same for the same seed."""
 
 import shutil
+from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
 
@@ -11,10 +12,18 @@ from mavbridge.commands.demonstrate.config import DemonstrateConfig
 from mavbridge.commands.demonstrate.flight import DemonstrationSpec, fly_demonstration
 from mavbridge.commands.demonstrate.pilot import TurnSchedule, draw_variation
 from mavbridge.commands.demonstrate.run import demonstrate
+from mavbridge.commands.train.run import fit_to_flights
+from mavbridge.config.courses import RACE_COURSE_SEED, AutopilotKind
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
+from mavbridge.core.vehicle import BodyRates
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.simulation.referee import EpisodeInterruptedError
+from policy.data.flight_data import ActionTerms
+from policy.data.flight_folders import read_flight
+from policy.loading.builtin import SHIPPED
+from policy.nets.toge import TogeConfig
+from policy.training.settings import TrainSettings
 
 SIZE = 48
 
@@ -147,3 +156,37 @@ def test_student_and_expert_fly_in_turns_and_the_seed_decides_whose_it_is() -> N
         assert lengths.min() >= 0.39
         assert lengths.max() <= 6.01
         assert 0.55 < np.mean(one) < 0.95
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_by_body_rates_races_are_demonstrated_and_read_back(
+    tmp_path: Path, autopilot: AutopilotKind
+) -> None:
+    by_rates = replace(
+        config(tmp_path, max_time=3.0), action="rates", courses="race", autopilot=autopilot
+    )
+    assert demonstrate(by_rates) == 0
+    flight = open_flight(tmp_path / "000000")
+    assert flight.meta.course_seed == RACE_COURSE_SEED + 30_000
+    assert set(column(flight, "mode")) == {
+        "GUIDED_NOGPS" if autopilot == "ardupilot" else "OFFBOARD"
+    }
+    first, *words = [row.labels.expert for row in flight.tick_rows() if row.labels]
+    assert first is None or isinstance(first, BodyRates)  # the chunk may be from before
+    assert {type(word) for word in words} == {BodyRates}
+    data = read_flight(flight.folder)
+    assert data.terms == ActionTerms("rates", 0.39, 80.0)
+    assert 0.0 <= data.target[:, 0].min() < data.target[:, 0].max() < 0.9
+    assert np.abs(data.target[:, 1:]).max() > 0.1
+    network = fit_to_flights(TogeConfig(), [data], TrainSettings(out=tmp_path / "a.safetensors"))
+    assert (network.contract.action, network.contract.max_tilt_deg) == ("rates", 80.0)
+    assert network.contract.modes == ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")
+
+
+def test_a_student_is_flown_by_what_it_was_trained_for(tmp_path: Path) -> None:
+    by_rates = replace(config(tmp_path), action="rates")
+    student = replace(
+        by_rates, policy=replace(by_rates.policy, image_size=None, checkpoint=SHIPPED["toge"])
+    )
+    with pytest.raises(UserError, match="flies by sticks: use --action sticks"):
+        demonstrate(student)

@@ -1,11 +1,12 @@
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from helpers.evaluated_flights import crashed, finished
+from helpers.evaluated_flights import FINISHED, crashed, finished
 from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
 from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.results import (
@@ -17,6 +18,7 @@ from mavbridge.commands.evaluate.results import (
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.simulation.referee import EpisodeResult, StickMeter
+from sitl.course.layout import make_course
 
 
 def evaluation(*episodes: EpisodeResult) -> Evaluation:
@@ -103,3 +105,10 @@ def test_stick_movement_counts_only_what_the_policy_sent_in_a_row() -> None:
     meter.emit(make_tick(5, sent=half, trace=make_trace(half)))  # 0 in 10 ms
     assert meter.engaged_ns == make_tick(1).woke_ns
     assert meter.rate_per_s == pytest.approx(1 / 4 / (20 * NS_PER_MS / 1e9))
+
+
+def test_the_speed_from_gate_to_gate_is_that_of_the_straight_legs_that_were_flown() -> None:
+    first, second = make_course(FINISHED.course_seed).gates[:2]
+    leg_m = math.dist(first.center_ned_m, second.center_ned_m)
+    assert FINISHED.course_speed_mps == pytest.approx(leg_m / 5.0)
+    assert finished(gate_times_s=(4.0,)).course_speed_mps is None

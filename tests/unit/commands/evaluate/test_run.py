@@ -152,7 +152,8 @@ def test_the_old_names_of_the_clocks_work_with_a_notice(
         (["--max-time", "0"], "--max-time must be between"),
         (["--clock", "wall", "--workers", "2"], "--clock wall flies one episode at a time"),
         (["--realtime", "--ray"], "--clock wall flies one episode at a time"),
-        (["--clock", "wall", "--vision-delay", "50"], "--vision-delay needs --clock simulated"),
+        (["--clock", "wall", "--vision-delay", "50"], "--vision-delay and --vision-time need"),
+        (["--clock", "wall", "--vision-time", "50"], "--vision-delay and --vision-time need"),
         (["--vision-delay", "-1"], "--vision-delay must be between 0 and 5000 ms"),
         (["--conditions", "stormy"], "--conditions"),
         (["--action-rate", "0"], "between 0.5 and 500 Hz"),
@@ -176,6 +177,7 @@ def test_help_lists_the_flags(capsys: pytest.CaptureFixture[str]) -> None:
     status, text = output(capsys, "--help")
     assert status == 0
     flags = """--clock --episodes --workers --ray --json --plot --seed --policy --conditions
-        --vision-delay --checkpoint --engine --head-steps --dual-rate --max-time"""
+        --vision-delay --vision-time --courses --checkpoint --engine --head-steps --dual-rate
+        --max-time"""
     assert [flag for flag in flags.split() if flag not in text] == []
     assert "--realtime" not in text

@@ -11,7 +11,12 @@ import pytest
 import torch
 
 from mavbridge.commands.train import check_flights as train_check
-from mavbridge.config.courses import CHECK_COURSE_SEED, HELD_OUT_COURSE_SEED, MAX_EPISODES
+from mavbridge.config.courses import (
+    CHECK_COURSE_SEED,
+    HELD_OUT_COURSE_SEED,
+    MAX_EPISODES,
+    RACE_COURSE_SEED,
+)
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import Clock
 from mavbridge.flight.policies import load_configured_policy
@@ -21,6 +26,7 @@ from policy.contract import Contract, FloatArray
 from policy.loading.request import LoadedPolicy
 from policy.nets.toge import Toge, TogeConfig
 from policy.protocol import Executable
+from policy.training.settings import TrainSettings
 
 
 def save(path: Path, seed: int) -> Path:
@@ -43,6 +49,10 @@ def result(course_seed: int, seed: int, gates: int) -> EpisodeResult:
     )
 
 
+def load_for_torch(config: PolicyConfig, clock: Clock) -> LoadedPolicy:
+    return load_configured_policy(replace(config, engine="torch"), clock)
+
+
 def flights_by(fly: Callable[..., EpisodeResult]) -> Callable[..., SimpleNamespace]:
     return lambda **seeds: SimpleNamespace(fly=partial(fly, **seeds))
 
@@ -61,13 +71,33 @@ def test_counts_the_gates_of_courses_that_nothing_else_flies_with_the_weights_in
 
     monkeypatch.setattr(train_check, "SimulatedFlight", flights_by(fly))
 
-    def load_for_torch(config: PolicyConfig, clock: Clock) -> LoadedPolicy:
-        return load_configured_policy(replace(config, engine="torch"), clock)
-
     monkeypatch.setattr(train_check, "load_configured_policy", load_for_torch)  # compiles nothing
     path = tmp_path / "toge.safetensors"
-    assert train_check.share_of_gates(save(path, 0), "toge", 3) == pytest.approx((0 + 2 + 4) / 24)
+    assert train_check.share_of_gates(save(path, 0), checks(path, 3)) == pytest.approx(
+        (0 + 2 + 4) / 24
+    )
     assert flown == [CHECK_COURSE_SEED, CHECK_COURSE_SEED + 1, CHECK_COURSE_SEED + 2]
     assert CHECK_COURSE_SEED + MAX_EPISODES <= HELD_OUT_COURSE_SEED
-    train_check.share_of_gates(save(path, 1), "toge", 1)
+    train_check.share_of_gates(save(path, 1), checks(path, 1))
     assert not np.allclose(features[0], features[-1])
+
+
+def checks(path: Path, flights: int) -> TrainSettings:
+    return TrainSettings(out=path, check_flights=flights)
+
+
+def test_races_have_courses_of_their_own_to_check_by(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown: list[int] = []
+
+    def fly(_executable: Executable, *, course_seed: int, seed: int) -> EpisodeResult:
+        flown.append(course_seed)
+        return result(course_seed, seed, gates=1)
+
+    monkeypatch.setattr(train_check, "SimulatedFlight", flights_by(fly))
+    monkeypatch.setattr(train_check, "load_configured_policy", load_for_torch)
+    path = save(tmp_path / "toge.safetensors", 0)
+    settings = TrainSettings(out=path, check_flights=2, check_courses="race")
+    train_check.share_of_gates(path, settings)
+    assert flown == [RACE_COURSE_SEED + CHECK_COURSE_SEED + index for index in range(2)]

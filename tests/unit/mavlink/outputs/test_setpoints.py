@@ -55,6 +55,23 @@ def target(thrust: float, rates: tuple[float, float, float] = (0.0, 0.0, 0.0)) -
 # --- attitude and rates
 
 
+@pytest.mark.parametrize(
+    ("profile", "boost", "factor"), [(ARDUPILOT, 1.0, 0.5), (ARDUPILOT, 0.0, 1.0), (PX4, 1.0, 1.0)]
+)
+def test_the_thrust_of_body_rates_is_along_the_body_whatever_the_autopilot_adds(
+    profile: Profile, boost: float, factor: float
+) -> None:
+    flight = attitude_flight(profile, is_rates=True)
+    flight.vehicle.known_params["ATC_ANGLE_BOOST"] = boost
+    leaning = quaternion_from_euler(math.radians(60.0), 0.0, 0.0)
+    flight.receive(Attitude(True, 0, leaning, (0.0, 0.0, 0.0)))
+    encoded = flight.send(BodyRates(0.6, 0.1, 0.2, 0.3))
+    message: Any = flight.message(encoded)
+    assert message.thrust == pytest.approx(factor * 0.6, abs=1e-4)
+    assert encoded is not None
+    assert encoded.action.thrust == pytest.approx(0.6, abs=1e-4)  # what the policy's history holds
+
+
 def test_an_attitude_keeps_the_vehicles_own_heading_until_it_turns() -> None:
     flight = attitude_flight(PX4, yaw_rad=1.0)
     message: Any = flight.message(flight.send(AttitudeThrust(0.5, 0.2, -0.1, 0.0)))

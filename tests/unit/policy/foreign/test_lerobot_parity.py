@@ -109,7 +109,7 @@ def test_actions_are_those_of_lerobot(golden):
     actions = policy.predict(image, state, torch.zeros(len(image), 4, 4), steps).numpy()
     wanted = in_contract_units(expected["actions"])
     assert actions.shape == (len(image), policy.contract.horizon, 4)
-    np.testing.assert_allclose(actions, wanted, rtol=0, atol=ATOL)
+    np.testing.assert_allclose(actions, wanted, rtol=1e-4, atol=ATOL)
 
 
 @torch.inference_mode()

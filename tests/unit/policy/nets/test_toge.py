@@ -229,3 +229,57 @@ def test_a_u_net_without_an_opinion_leaves_the_sticks_to_what_is_read_off_the_co
     read = head.read(condition).clamp(-1, 1)
     is_read = [torch.allclose(head.sample(condition, steps), read) for steps in (1, 3)]
     assert is_read == [prediction == "sample"] * 2
+
+
+def rates_toge(**contract: object) -> Toge:
+    torch.manual_seed(0)
+    terms = Contract(image_height=32, image_width=32, action="rates", **contract)  # type: ignore[arg-type]
+    return Toge(TogeConfig(backbone="resnet8", contract=terms)).eval()
+
+
+@torch.inference_mode()
+def test_body_rates_leave_in_their_own_units() -> None:
+    toge = rates_toge(hover_thrust=0.5)
+    image, state, history = sample()
+    chunk = toge.predict(image, state, history, 4)
+    low = torch.tensor([0.5 - 0.625, -4.0, -4.0, -2.1])
+    assert (chunk >= low - 1e-5).all()
+    assert (chunk <= torch.tensor([1.125, 4.0, 4.0, 2.1]) + 1e-5).all()
+    inside = toge.head.to_network(chunk)
+    assert inside.abs().max() <= 1.0 + 1e-5
+    assert chunk[..., 0].mean() != pytest.approx(float(inside[..., 0].mean()), abs=0.1)
+
+
+@torch.inference_mode()
+def test_no_history_is_hovering_at_no_rate() -> None:
+    toge = rates_toge()
+    image, state, _ = sample()
+    hover = torch.zeros(1, 4, 4)
+    hover[..., 0] = toge.contract.hover_thrust
+    without, hovering = (toge.predict(image, state, past, 4) for past in (None, hover))
+    torch.testing.assert_close(without, hovering)
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("counts", [[1] * 10, [2, 4, 4], [10]])
+def test_a_solve_of_body_rates_in_parts_is_the_whole_one(counts: list[int]) -> None:
+    toge = rates_toge()
+    _, state, history = sample()
+    feature = torch.randn(1, 256, generator=torch.Generator().manual_seed(3))
+    noisy, first = toge.initial_noise, 0
+    for count in counts:
+        noisy = toge.denoise_fast(feature, state, history, noisy, 10, first, count)
+        first += count
+    torch.testing.assert_close(noisy, toge.predict_fast(feature, state, history, 10))
+
+
+@torch.inference_mode()
+def test_a_guess_of_body_rates_enters_a_solve_in_their_units() -> None:
+    """What a warm start mixes, in the contract's units, is what the network has in its own."""
+    toge = rates_toge()
+    guess = torch.tensor([0.6, 1.0, -2.0, 0.5]).expand(1, 16, 4)
+    signal, share = toge.noise_shares(10, 8)
+    mixed = signal * guess + share * toge.initial_noise
+    inside = (mixed - signal * toge.head._neutral) / toge.head._scale
+    noise = toge.initial_noise / toge.head._scale
+    torch.testing.assert_close(inside, signal * toge.head.to_network(guess) + share * noise)

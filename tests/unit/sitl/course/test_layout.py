@@ -8,35 +8,42 @@ from hypothesis import strategies as st
 
 from sitl import UsageError
 from sitl.course.layout import (
-    ALTITUDE_M,
-    CLIMB_M,
-    FIRST_LEG_M,
-    GATE_COUNT,
-    LEG_M,
-    TURN_RAD,
+    EASY,
+    RACE,
+    RACE_SEEDS,
+    Family,
     Gate,
     course_to_json,
     make_course,
 )
 
 
-@given(st.integers(0, 2**32))
-def test_every_course_is_flyable(seed):
+@given(st.integers(0, RACE_SEEDS - 1))
+def test_every_easy_course_keeps_the_limits_of_its_family(seed):
+    check_course(seed, EASY)
+
+
+@given(st.integers(RACE_SEEDS, 2**32))
+def test_every_race_keeps_the_limits_of_its_family(seed):
+    check_course(seed, RACE)
+
+
+def check_course(seed: int, family: Family) -> None:
     gates = make_course(seed).gates
-    assert [gate.index for gate in gates] == list(range(GATE_COUNT))
+    assert [gate.index for gate in gates] == list(range(family.gate_count))
     north, east, down = gates[0].center_ned_m
-    assert (north, east) == (FIRST_LEG_M, 0.0)
-    assert 2.0 <= -down <= 3.0
+    assert (north, east) == (family.first_leg_m, 0.0)
+    assert family.first_altitude_m[0] <= -down <= family.first_altitude_m[1]
     for here, there in pairwise(gates):
         delta = [b - a for a, b in zip(here.center_ned_m, there.center_ned_m, strict=True)]
-        assert LEG_M[0] - 1e-9 <= math.hypot(delta[0], delta[1]) <= LEG_M[1] + 1e-9
-        assert abs(delta[2]) <= CLIMB_M
+        assert family.leg_m[0] - 1e-9 <= math.hypot(delta[0], delta[1]) <= family.leg_m[1] + 1e-9
+        assert abs(delta[2]) <= family.climb_m
         heading_rad = math.atan2(delta[1], delta[0])
         for gate in (here, there):
             off_rad = math.remainder(gate.yaw_rad - heading_rad, math.tau)
-            assert abs(off_rad) <= TURN_RAD / 2 + 1e-9
+            assert abs(off_rad) <= family.turn_rad / 2 + 1e-9
     for gate in gates:
-        assert ALTITUDE_M[0] <= -gate.center_ned_m[2] <= ALTITUDE_M[1]
+        assert family.altitude_m[0] <= -gate.center_ned_m[2] <= family.altitude_m[1]
 
 
 def test_the_seed_decides():

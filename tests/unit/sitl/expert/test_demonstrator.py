@@ -13,7 +13,7 @@ from sitl import UsageError
 from sitl.camera.fpv import body_from_camera
 from sitl.course.layout import AirborneStart, gate_truth, make_course
 from sitl.expert.demonstrator import Expert
-from sitl.expert.disturbance import StickDisturbance, random_start
+from sitl.expert.disturbance import Disturbance, random_start
 from sitl.expert.guidance import Waypoint, least_acceleration
 from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import random_conditions
@@ -65,7 +65,7 @@ def test_what_it_holds_depends_on_the_present_alone(nominal_flight):
 
 
 def test_it_flies_another_vehicle_in_wind_with_a_bad_thumb():
-    disturbance = StickDisturbance(5)
+    disturbance = Disturbance(5)
     flight = fly_course(
         make_course(5), 5.0, conditions=random_conditions(5), disturbance=disturbance
     )
@@ -141,7 +141,7 @@ def test_truth_by_hand():
 
 def test_disturbances_come_in_stretches_and_by_seed():
     def flown(seed):
-        disturbance = StickDisturbance(seed)
+        disturbance = Disturbance(seed)
         wanted = Expert(make_course(0), 5.0).sticks(Quadrotor().at_rest().body, 0.0)
         return [disturbance.flown(wanted, k / 100) != wanted for k in range(3000)]
 
@@ -150,4 +150,4 @@ def test_disturbances_come_in_stretches_and_by_seed():
     changes = sum(a != b for a, b in pairwise(flown(3)))
     assert 4 < changes < 60
     assert 0.1 < np.mean(flown(3)) < 0.7
-    assert StickDisturbance(3, strength=0.0).flown((0.9, 0, 0, 0), 9.0) == (0.9, 0, 0, 0)
+    assert Disturbance(3, strength=0.0).flown((0.9, 0, 0, 0), 9.0) == (0.9, 0, 0, 0)

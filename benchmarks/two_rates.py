@@ -1,0 +1,214 @@
+"""Where two rates pay: one loop that waits for the encoder, beside a fast loop that does not.
+
+python -m benchmarks.two_rates --episodes 50 --json docs/two_rates.json
+--plot docs/images/two_rates.png
+
+For each time that an image takes to encode, the same courses are flown by a single loop, which runs
+as often as the encoder and the action head let it, and at two rates: as many images a second as the
+encoder makes, and 100 or 250 actions a second from the newest state. Each cell is a ``mavbridge
+evaluate`` of its own. Cells that the JSON holds for the same weights and as many episodes are not
+flown again: an interrupted map resumes.
+"""
+
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from json import dumps, loads
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, NamedTuple
+
+from cyclopts import App
+
+from benchmarks.study import sha256
+from mavbridge.commands.output import (
+    BLUE,
+    FIGURE_DPI,
+    FIGURE_STYLE,
+    MUTED,
+    RED,
+    make_table,
+    require_outputs,
+    table_console,
+)
+from policy.loading.builtin import SHIPPED
+
+Loop = Literal["one rate", "100 actions a second", "250 actions a second"]
+LOOPS: tuple[Loop, ...] = ("one rate", "100 actions a second", "250 actions a second")
+ENCODER_MS = (5, 20, 50, 100, 200)
+HEAD_MS = 4
+"""What the action head takes beside the encoder in a single loop: 3 ms, and some for late ones."""
+MOST_HZ = 100.0
+"""Most that a single loop is asked for: the rate of the vehicle's state."""
+CAMERA_HZ = 30.0
+LOOSE = "--max-attitude-age 2 --max-velocity-age 2 --max-feature-age 2 --max-chunk-age 2"
+"""Nothing is refused for its age: what age costs is what is measured."""
+app = App(help=__doc__)
+
+
+class Control(NamedTuple):
+    """What is controlled, by which weights, over which courses."""
+
+    name: str
+    flags: str
+
+
+CONTROLS = (
+    Control("body rates, race courses", "--policy toge-rates --courses race"),
+    Control("sticks in ALT_HOLD, easy courses", "--policy toge --courses easy"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One evaluated cell; intervals are 95 %."""
+
+    control: str
+    loop: Loop
+    encoder_ms: int
+    command: str
+    checkpoint_sha256: str
+    episodes: int
+    success: float
+    success_low: float
+    success_high: float
+    gates: float
+    speed_mps: float
+
+    @property
+    def key(self) -> tuple[str, str, int, str]:
+        """What makes it another cell."""
+        return self.control, self.loop, self.encoder_ms, self.checkpoint_sha256
+
+
+@app.default
+def main(
+    *,
+    json: Path,
+    plot: Path | None = None,
+    episodes: int = 50,
+    workers: int = 2,
+    loops: tuple[Loop, ...] = LOOPS,
+    checkpoint: Path | None = None,
+) -> None:
+    """Evaluate what has not been evaluated yet, then print and draw.
+
+    Args:
+        json: where the cells are kept.
+        plot: where to draw them as PNG.
+        episodes: courses for each cell.
+        workers: episodes at a time.
+        loops: which loops to fly.
+        checkpoint: weights by body rates in place of the shipped ones; only they fly then.
+    """
+    require_outputs(json, plot)
+    known = [Cell(**one) for one in loads(json.read_text())] if json.exists() else []
+    cells = {cell.key: cell for cell in known if cell.episodes == episodes}
+    shown = []
+    for control in CONTROLS[:1] if checkpoint else CONTROLS:
+        weights = checkpoint or SHIPPED[control.flags.split()[1]]
+        for encoder_ms in ENCODER_MS:
+            for loop in loops:
+                key = (control.name, loop, encoder_ms, sha256(weights))
+                if key not in cells:
+                    cells[key] = evaluate(control, loop, encoder_ms, weights, episodes, workers)
+                    json.write_text(dumps([asdict(one) for one in cells.values()], indent=2) + "\n")
+                    print_cells([cells[key]])
+                shown.append(cells[key])
+    print_cells(shown)
+    if plot is not None:
+        draw(shown, plot)
+
+
+def flags_of(loop: Loop, encoder_ms: int) -> str:
+    """Flags of ``mavbridge evaluate`` for a loop beside such an encoder."""
+    images_hz = min(CAMERA_HZ, 1000 / encoder_ms)
+    if loop == "one rate":
+        rate_hz = min(MOST_HZ, 1000 / (encoder_ms + HEAD_MS))
+        return f"--single-rate --rate {rate_hz:.4g} --visual-rate {max(CAMERA_HZ, rate_hz):.4g}"
+    action_hz = loop.partition(" ")[0]
+    return f"--dual-rate --head-steps 2 --visual-rate {images_hz:.4g} --action-rate {action_hz}"
+
+
+def evaluate(
+    control: Control, loop: Loop, encoder_ms: int, weights: Path, episodes: int, workers: int
+) -> Cell:
+    """Fly one cell.
+
+    Raises:
+        subprocess.CalledProcessError: the evaluation failed, and printed why.
+    """
+    flags = f"{control.flags} {flags_of(loop, encoder_ms)} --vision-time {encoder_ms} {LOOSE}"
+    flags += f" --episodes {episodes} --max-time 45"
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "evaluation.json"
+        files = ("--checkpoint", str(weights), "--workers", str(workers), "--json", str(out))
+        policy = flags.replace("--policy toge-rates", "--policy toge").split()
+        command = [sys.executable, "-m", "mavbridge", "evaluate", *policy, *files]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        summary: dict[str, Any] = loads(out.read_text())["summary"]
+    speed = summary["course_speed_mps"]
+    return Cell(
+        control=control.name,
+        loop=loop,
+        encoder_ms=encoder_ms,
+        command=f"mavbridge evaluate {flags}",
+        checkpoint_sha256=sha256(weights),
+        episodes=episodes,
+        success=summary["success_rate"]["value"],
+        success_low=summary["success_rate"]["low"],
+        success_high=summary["success_rate"]["high"],
+        gates=summary["gates_passed"]["value"],
+        speed_mps=speed["value"] if speed else 0.0,
+    )
+
+
+def print_cells(cells: list[Cell]) -> None:
+    """Print the table of docs/study.md."""
+    rows = [
+        (
+            *(one.control, f"{one.encoder_ms} ms", one.loop, f"{one.success:.0%}"),
+            f"{one.success_low:.0%} to {one.success_high:.0%}",
+            *(f"{one.gates:.1f}", f"{one.speed_mps:.1f}"),
+        )
+        for one in cells
+    ]
+    header = ("controlled", "encoder", "loop", "courses flown", "95 %", "gates", "m/s")
+    table_console().print(make_table("Held-out courses", header, rows))
+
+
+def draw(cells: list[Cell], path: Path) -> None:
+    """Write a PNG: success by the encoder's time; loops are lines, controls are panels."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys(cell.control for cell in cells))
+    with rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(6.0 * len(names), 4.6), dpi=FIGURE_DPI, facecolor="white")
+        panels = figure.subplots(1, len(names), squeeze=False)[0]
+        for axes, name in zip(panels, names, strict=True):
+            for loop, colour in zip(LOOPS, (MUTED, BLUE, RED), strict=True):
+                draw_loop(axes, [c for c in cells if (c.control, c.loop) == (name, loop)], colour)
+            axes.set_xscale("log")
+            axes.set_xticks(ENCODER_MS, [str(ms) for ms in ENCODER_MS])
+            axes.minorticks_off()
+            axes.set_ylim(-3, 103)
+            axes.set_xlabel("ms to encode an image")
+            axes.set_title(f"{name}: courses flown, %, 95 %")
+            axes.legend(loc="lower left")
+        figure.tight_layout(w_pad=3)
+        figure.savefig(path)
+
+
+def draw_loop(axes: Any, cells: list[Cell], colour: str) -> None:
+    """Success in percent by the encoder's time, with its interval."""
+    if not cells:
+        return
+    at = [cell.encoder_ms for cell in cells]
+    low, high = ([100 * getattr(c, f"success_{end}") for c in cells] for end in ("low", "high"))
+    axes.fill_between(at, low, high, color=colour, alpha=0.12, linewidth=0)
+    axes.plot(at, [100 * cell.success for cell in cells], "o-", color=colour, label=cells[0].loop)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,299 @@
+"""Guides a flight over a gate course: from a predicted state to the motion that is wanted.
+
+The demand follows from position, velocity, the next gate and the two after it, which a policy could
+see or have as input; its one memory is which gate comes next. It plans the path of least
+acceleration through the gates ahead (`guidance`), and slows down where the path would need more
+than the vehicle is to be asked for. After a miss it backs off, nose towards the gate, and flies at
+it again. After the last gate it brakes and hovers.
+
+Horizontal vectors are complex numbers, north + 1j * east: a product with the conjugate of a unit
+vector has the component along it as its real part and the one to its right as its imaginary part.
+"""
+
+import cmath
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from sitl import UsageError
+from sitl.course.layout import Course, Gate
+from sitl.course.referee import GateCounter, crossing
+from sitl.expert.guidance import Plan, Waypoint, least_acceleration
+from sitl.rotation import Vec3, wrap_pi
+from sitl.vehicle.control import clamp
+
+GATES_AHEAD = 3
+SPEED_GAIN_PER_S = 1.5
+MIN_SPEED_MPS = 1.5
+LOOK_M = 5.0  # the nose points at the next gate, and nearer than this along the leg after it
+YAW_GAIN_PER_S = 2.5
+MAX_YAW_RATE_RADPS = math.radians(110.0)
+TAKEOFF_HEIGHT_M = (0.4, 1.4)
+"""Below the first it only climbs, above the second it flies at full speed."""
+BACKING_SPEED_MPS = 2.5
+CLEAR_OF_FRAME_M = 2.4  # sideways from the axis of a gate, with the vehicle's own size
+MISS_M = (0.7, 1.2)
+"""Predicted distance from the axis in the plane of a gate, with full lean: from the first on it
+begins to back off, at the second it does nothing else."""
+BRAKING_GAIN_PER_S = 1.2
+BEYOND_LEG_M = 8.0
+
+
+class Demand(NamedTuple):
+    """Motion that the actions are to bring about."""
+
+    accel_mps2: complex  # horizontal, north + 1j * east
+    climb_mps: float
+    yaw_rate_radps: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agility:
+    """The most that is asked of the vehicle; accelerations are horizontal but where they say."""
+
+    max_speed_mps: float
+    max_accel_mps2: float
+    corner_accel_mps2: float
+    """Most that the planned path may need before it slows down; the rest is for gusts and
+    mistakes."""
+    along_accel_mps2: tuple[float, float]
+    """Braking, negative, and speeding up."""
+    planned_braking_mps2: float
+    planned_accel_mps2: float
+    climb_accel_mps2: float
+    """Vertical; what it counts on to get into the opening of a gate."""
+    climb_lead_s: float
+    """The climb rate that is demanded is the planned one so much later."""
+    takeoff_climb_mps: float
+    braking_distance_m: float
+    """Beyond the last gate, until it brakes in full."""
+
+
+class CourseGuide:
+    """Guidance of one flight over a course; call `demand` at 50 Hz or more.
+
+    ``speed_mps`` is the speed where the course allows it.
+
+    Raises:
+        UsageError: a speed that cannot be flown.
+    """
+
+    def __init__(self, course: Course, agility: Agility, speed_mps: float, next_gate: int) -> None:
+        if not MIN_SPEED_MPS <= speed_mps <= agility.max_speed_mps:
+            raise UsageError(
+                f"the expert flies at {MIN_SPEED_MPS} to {agility.max_speed_mps} m/s, "
+                f"got {speed_mps}"
+            )
+        self._last = course.gates[-1]
+        # Points straight on from the last gate, so that it is flown like any other.
+        north_m, east_m, down_m = self._last.center_ned_m
+        step_m = cmath.rect(BEYOND_LEG_M, self._last.yaw_rad)
+        beyond_ned_m = [
+            (north_m + k * step_m.real, east_m + k * step_m.imag, down_m)
+            for k in range(1, GATES_AHEAD + 1)
+        ]
+        self._beyond = tuple(replace(self._last, center_ned_m=point) for point in beyond_ned_m)
+        self._gates = course.gates + self._beyond
+        self._agility = agility
+        self._speed_mps = speed_mps
+        self._referee = GateCounter(course, first=next_gate)
+
+    @property
+    def next_gate(self) -> int | None:
+        """Index of the gate to be passed next; None after the last."""
+        return self._referee.next_gate
+
+    def demand(self, position_ned_m: Vec3, t_s: float, state: "Predicted") -> Demand:
+        """Motion for a vehicle that is here now, and in ``state`` when its action takes effect.
+
+        The positions of successive calls are the flown trajectory.
+        """
+        agility = self._agility
+        self._referee.update(position_ned_m, t_s)
+        ahead = self._gates_ahead(position_ned_m, state)
+        demand = _approach(state, ahead[:GATES_AHEAD], agility, self._speed_mps)
+        if len(ahead) <= GATES_AHEAD:
+            beyond_m, _, _ = self._last.offset_m(state.position_ned_m)
+            share = _smoothstep(beyond_m, 0.0, agility.braking_distance_m)
+            demand = _blend(demand, _brake(state, agility), share)
+        elif (share := _back_off_share(state, ahead[0], agility)) > 0.0:
+            demand = _blend(demand, _back_off(state, ahead[0], agility), share)
+        climb_away = Demand(
+            _brake(state, agility).accel_mps2, agility.takeoff_climb_mps, demand.yaw_rate_radps
+        )
+        flying = _smoothstep(-state.position_ned_m[2], *TAKEOFF_HEIGHT_M)
+        return _blend(climb_away, demand, flying)
+
+    def _gates_ahead(self, position_ned_m: Vec3, state: "Predicted") -> tuple[Gate, ...]:
+        """Gates still to fly, without one that will be behind by the time that the sticks act."""
+        next_gate = self.next_gate
+        if next_gate is None:
+            return self._beyond
+        ahead = self._gates[next_gate:]
+        is_passing = crossing(ahead[0], position_ned_m, state.position_ned_m) is not None
+        return ahead[1:] if is_passing else ahead
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Predicted:
+    """The vehicle when an action that is sent now takes effect, if nothing changes until then."""
+
+    position_ned_m: Vec3
+    velocity_ned_mps: Vec3
+    yaw_rad: float
+
+    @property
+    def velocity_mps(self) -> complex:
+        """Horizontal velocity, north + 1j * east."""
+        north, east, _ = self.velocity_ned_mps
+        return complex(north, east)
+
+
+def _approach(
+    state: Predicted, ahead: tuple[Gate, ...], agility: Agility, speed_mps: float
+) -> Demand:
+    """Fly along the path through the gates ahead, at the speed that it allows."""
+    velocity = state.velocity_mps
+    to_aim_m = _aim_point(state, ahead) - complex(*state.position_ned_m[:2])
+    distance_m = max(_length(to_aim_m), 1e-3)
+    sight = to_aim_m / distance_m
+    closing_mps = max(MIN_SPEED_MPS, (velocity * sight.conjugate()).real)
+    waypoints = _waypoints(state, ahead, closing_mps, agility, speed_mps)
+    plan = least_acceleration(state.position_ned_m, state.velocity_ned_mps, waypoints)
+    accel_n, accel_e, accel_d = plan.accel_mps2[0].tolist()
+    # Along the path speed is controlled; the plan's own speed is only what it was timed by.
+    along = velocity + MIN_SPEED_MPS * sight
+    along /= max(_length(along), 1e-3)
+    right_mps2 = clamp((complex(accel_n, accel_e) * along.conjugate()).imag, agility.max_accel_mps2)
+    allowed_mps = min(
+        speed_mps,
+        closing_mps * _corner_ratio(right_mps2, agility),
+        _corner_speed(plan, waypoints, agility),
+    )
+    error_mps = max(MIN_SPEED_MPS, allowed_mps) - (velocity * along.conjugate()).real
+    low, high = agility.along_accel_mps2
+    room = math.sqrt(agility.max_accel_mps2**2 - right_mps2**2)
+    along_mps2 = clamp(max(low, min(high, SPEED_GAIN_PER_S * error_mps)), room)
+    turning_radps = (velocity.conjugate() * sight).imag / max(distance_m, LOOK_M / 2)
+    return Demand(
+        accel_mps2=complex(along_mps2, right_mps2) * along,
+        climb_mps=-(state.velocity_ned_mps[2] + agility.climb_lead_s * accel_d),
+        yaw_rate_radps=_yaw_rate(cmath.phase(sight) - state.yaw_rad, turning_radps),
+    )
+
+
+def _aim_point(state: Predicted, ahead: tuple[Gate, ...]) -> complex:
+    """The next gate; from nearer than ``LOOK_M`` a point that slides along the leg after it."""
+    gate = ahead[0]
+    forward_m, _, _ = gate.offset_m(state.position_ned_m)
+    center, leg, leg_m = complex(*gate.center_ned_m[:2]), cmath.rect(1.0, gate.yaw_rad), 1.0
+    if len(ahead) > 1:
+        leg = complex(*ahead[1].center_ned_m[:2]) - center
+        leg_m = math.dist(ahead[1].center_ned_m, gate.center_ned_m)
+    return center + max(0.0, LOOK_M + forward_m) / leg_m * leg
+
+
+def _waypoints(
+    state: Predicted,
+    ahead: tuple[Gate, ...],
+    closing_mps: float,
+    agility: Agility,
+    speed_mps: float,
+) -> list[Waypoint]:
+    """The gates, each leg timed by the speed that can be reached half-way along it."""
+    waypoints = []
+    before, covered_m = state.position_ned_m, 0.0
+    for gate in ahead:
+        # Off the axis the distance does not shrink to nothing in the plane of the gate; time must.
+        forward_m, right_m, _ = gate.offset_m(before)
+        leg_m = math.hypot(min(0.0, forward_m), max(0.0, abs(right_m) - gate.size_m / 2))
+        gained = 2 * agility.planned_accel_mps2 * (covered_m + leg_m / 2)
+        pace_mps = min(max(closing_mps, speed_mps), math.sqrt(closing_mps**2 + gained))
+        through = cmath.rect(pace_mps, gate.yaw_rad)
+        waypoints.append(
+            Waypoint(
+                point_m=gate.center_ned_m,
+                velocity_mps=(through.real, through.imag, 0.0),
+                leg_s=leg_m / pace_mps,
+            )
+        )
+        before, covered_m = gate.center_ned_m, covered_m + leg_m
+    return waypoints
+
+
+def _corner_speed(plan: Plan, waypoints: list[Waypoint], agility: Agility) -> float:
+    """The speed from which it can still slow down for the corners at the gates ahead."""
+    allowed_mps, distance_m = math.inf, 0.0
+    for waypoint, accel in zip(waypoints, plan.accel_mps2[1:].tolist(), strict=True):
+        timed_mps = math.hypot(*waypoint.velocity_mps)
+        distance_m += waypoint.leg_s * timed_mps
+        corner_mps = timed_mps * _corner_ratio(math.hypot(*accel[:2]), agility)
+        braking = 2 * agility.planned_braking_mps2 * distance_m
+        allowed_mps = min(allowed_mps, math.sqrt(corner_mps**2 + braking))
+    return allowed_mps
+
+
+def _corner_ratio(accel_mps2: float, agility: Agility) -> float:
+    """Factor by which a corner can be flown faster than at this lateral acceleration."""
+    return math.sqrt(agility.corner_accel_mps2 / max(abs(accel_mps2), 1e-3))
+
+
+def _back_off_share(state: Predicted, gate: Gate, agility: Agility) -> float:
+    """0 where the gate can be flown at from here; 1 where it cannot, since the vehicle is beside or
+    behind it, or too fast and too far off to get into the opening."""
+    forward_m, right_m, down_m = gate.offset_m(state.position_ned_m)
+    if forward_m >= 0.0:
+        return 1.0
+    reach_m = gate.size_m / 2 + 0.2 - 0.8 * forward_m
+    beside = _smoothstep(abs(right_m) - reach_m, 0.0, 1.5)
+    forward_mps, rightward_mps, downward_mps = gate.to_axes(state.velocity_ned_mps)
+    left_s = -forward_m / max(forward_mps, MIN_SPEED_MPS)
+    right_miss_m = abs(right_m + rightward_mps * left_s) - agility.max_accel_mps2 * left_s**2 / 2
+    down_miss_m = abs(down_m + downward_mps * left_s) - agility.climb_accel_mps2 * left_s**2 / 2
+    return max(beside, _smoothstep(max(right_miss_m, down_miss_m), *MISS_M))
+
+
+def _back_off(state: Predicted, gate: Gate, agility: Agility) -> Demand:
+    """Fly backwards beside the gate, nose along its passage, until it is in front again."""
+    forward_m, right_m, down_m = gate.offset_m(state.position_ned_m)
+    is_beside = forward_m > -1.0 and abs(right_m) < CLEAR_OF_FRAME_M
+    side_m = math.copysign(CLEAR_OF_FRAME_M, right_m) if is_beside else right_m
+    across_mps = clamp(side_m - right_m, 2.0)
+    wanted_mps = complex(-BACKING_SPEED_MPS, across_mps) * cmath.rect(1.0, gate.yaw_rad)
+    accel = SPEED_GAIN_PER_S * (wanted_mps - state.velocity_mps)
+    return Demand(
+        accel_mps2=min(1.0, -agility.along_accel_mps2[0] / max(1e-6, _length(accel))) * accel,
+        climb_mps=0.0 if is_beside else clamp(down_m, 1.0),
+        yaw_rate_radps=_yaw_rate(gate.yaw_rad - state.yaw_rad, 0.0),
+    )
+
+
+def _brake(state: Predicted, agility: Agility) -> Demand:
+    """Brake to a hover."""
+    most_mps = -agility.along_accel_mps2[0] / BRAKING_GAIN_PER_S
+    gain = BRAKING_GAIN_PER_S * min(1.0, most_mps / max(1e-6, _length(state.velocity_mps)))
+    return Demand(-gain * state.velocity_mps, 0.0, 0.0)
+
+
+def _yaw_rate(error_rad: float, lead_radps: float) -> float:
+    rate_radps = YAW_GAIN_PER_S * wrap_pi(error_rad) + lead_radps
+    return MAX_YAW_RATE_RADPS * math.tanh(rate_radps / MAX_YAW_RATE_RADPS)
+
+
+def _blend(a: Demand, b: Demand, share: float) -> Demand:
+    """``a`` at a share of 0, ``b`` at 1."""
+    return Demand(
+        accel_mps2=a.accel_mps2 + share * (b.accel_mps2 - a.accel_mps2),
+        climb_mps=a.climb_mps + share * (b.climb_mps - a.climb_mps),
+        yaw_rate_radps=a.yaw_rate_radps + share * (b.yaw_rate_radps - a.yaw_rate_radps),
+    )
+
+
+def _length(vector: complex) -> float:
+    """More exact than ``abs``, which may differ from one platform's C library to another."""
+    return math.hypot(vector.real, vector.imag)
+
+
+def _smoothstep(value: float, low: float, high: float) -> float:
+    fraction = max(0.0, min(1.0, (value - low) / (high - low)))
+    return fraction * fraction * (3.0 - 2.0 * fraction)
