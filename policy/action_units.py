@@ -40,14 +40,16 @@ class ActionUnits:
         if self.is_identity:
             return actions
         neutral, scale = np.array(self.neutral, np.float32), np.array(self.scale, np.float32)
-        return (actions - np.float32(signal) * neutral) / scale
+        x = (actions - np.float32(signal) * neutral) / scale
+        return x.astype(np.float32, copy=False)
 
     def from_network(self, x: FloatArray, signal: float = 1.0) -> FloatArray:
         """The inverse."""
         if self.is_identity:
             return x
         neutral, scale = np.array(self.neutral, np.float32), np.array(self.scale, np.float32)
-        return scale * x + np.float32(signal) * neutral
+        actions: FloatArray = scale * x + np.float32(signal) * neutral
+        return actions
 
 
 SAME_UNITS = ActionUnits((0.0,) * 4, (1.0,) * 4)

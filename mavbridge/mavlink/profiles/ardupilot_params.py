@@ -187,7 +187,7 @@ def setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Itera
             "no receiver was seen: the vehicle will not arm without one while its throttle "
             "failsafe is on; setpoints do not need it: --set FS_THR_ENABLE=0"
         )
-    if context.output in ("attitude", "rates") and values.get("ATC_ANGLE_BOOST") == 0:
+    if context.output == "attitude" and values.get("ATC_ANGLE_BOOST") == 0:
         yield "ATC_ANGLE_BOOST is 0: thrust is not raised when it leans, the policy has to do it"
 
 
@@ -226,4 +226,5 @@ def wanted_params(values: Mapping[str, float], context: ParamContext) -> Iterato
     yield WantedParam("FS_THR_ENABLE", "not 0" if context.has_receiver else "0")
     if context.output in ("attitude", "rates"):
         yield WantedParam("GUID_OPTIONS", "bit 3 (8) set")
-        yield WantedParam("ATC_ANGLE_BOOST", "1, or as in training")
+        boost = "1, or as in training" if context.output == "attitude" else "any"
+        yield WantedParam("ATC_ANGLE_BOOST", boost)

@@ -45,7 +45,8 @@ def test_thrust_must_be_thrust(options: float | None, expected: str | None) -> N
         ({"FS_THR_ENABLE": 1.0}, "velocity", False, ["--set FS_THR_ENABLE=0"]),
         ({"FS_THR_ENABLE": 1.0}, "velocity", None, []),  # not known yet
         ({"FS_THR_ENABLE": 0.0}, "velocity", False, []),
-        ({"ATC_ANGLE_BOOST": 0.0}, "rates", True, ["ATC_ANGLE_BOOST is 0"]),
+        ({"ATC_ANGLE_BOOST": 0.0}, "attitude", True, ["ATC_ANGLE_BOOST is 0"]),
+        ({"ATC_ANGLE_BOOST": 0.0}, "rates", True, []),
         ({"ATC_ANGLE_BOOST": 0.0}, "velocity", True, []),
         ({"ATC_ANGLE_BOOST": 1.0}, "attitude", True, []),
         ({"GUID_TIMEOUT": 3.0, "ATC_ANGLE_BOOST": 0.0}, None, False, []),
