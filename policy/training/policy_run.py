@@ -258,6 +258,11 @@ def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
 
 def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
     policy = load_checkpoint(path, fallback=network)
+    if policy.contract.action != network.contract.action:
+        raise PolicyError(
+            f"--start-from {path} flies by {policy.contract.action}, these flights were flown by "
+            f"{network.contract.action}: start from one of their kind, or anew"
+        )
     # What flags of this command do not name is taken over from the checkpoint.
     kept = {name: getattr(policy.contract, name) for name in ("feature_dim", *FLIGHT_TERMS)}
     wanted = replace(network.contract, **kept)

@@ -99,6 +99,10 @@ class PolicyDecider:
                 f"{executable.name} takes several cameras, past observations or a place in the "
                 "world; flights are imagined for policies that take the newest image and state"
             )
+        if seen.action != "sticks":
+            raise UserError(
+                f"{executable.name} flies by {seen.action}; flights are imagined from sticks"
+            )
         ours, theirs = sampler.config.contract.state_frame, executable.contract.state_frame
         if ours != theirs:
             raise UserError(

@@ -98,6 +98,7 @@ class AttitudeOutput(SetpointOutput):
         """A new session: another battery, perhaps another vehicle."""
         super().restart()
         self._hover, self._scale, self._measured_rad = HoverThrust(), None, None
+        self._cos_tilt = 1.0
         self._heading.restart()
 
     def take_notes(self) -> tuple[str, ...]:

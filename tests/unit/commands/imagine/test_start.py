@@ -88,6 +88,12 @@ def test_a_policy_of_another_frame_is_refused() -> None:
         PolicyDecider(noise_executable(other), make_sampler())
 
 
+def test_a_policy_by_body_rates_is_refused() -> None:
+    other = Contract(feature_dim=1, arrays="numpy", action="rates")
+    with pytest.raises(UserError, match="flies by rates; flights are imagined from sticks"):
+        PolicyDecider(noise_executable(other), make_sampler())
+
+
 def observe(contract: Contract) -> ObservationQueue:
     sampler, start = make_sampler(), make_start()
     latents = sampler.encode(start.images)

@@ -153,6 +153,9 @@ def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(
     other = TogeConfig(backbone="resnet50", contract=CONTRACT)
     with pytest.raises(PolicyError, match=r"another policy: backbone 'resnet8'"):
         run(flights[:2], further, network=other)
+    by_rates = replace(NETWORK, contract=replace(CONTRACT, action="rates", modes=()))
+    with pytest.raises(PolicyError, match="flies by sticks, these flights were flown by rates"):
+        run(flights[:2], further, network=by_rates)
 
 
 def with_contract(checkpoint: Path, contract: Contract, path: Path) -> Path:
