@@ -54,7 +54,7 @@ def eager_toge(policy: PolicyConfig) -> Toge:
     if policy.allow_untrained:
         net = build_policy(TogeConfig(size="small"))
     else:
-        net = load_checkpoint(SHIPPED["toge"], fallback=TogeConfig())
+        net = load_checkpoint(SHIPPED, fallback=TogeConfig())
     if not isinstance(net, Toge):
         raise TypeError(f"not a Toge: {type(net).__name__}")
     net.eval()

@@ -102,7 +102,7 @@ def main(
     *,
     json: Path,
     plot: Path | None = None,
-    checkpoint: Path = SHIPPED["toge"],
+    checkpoint: Path = SHIPPED,
     without_age: Path | None = None,
     episodes: int = 25,
     workers: int = 1,

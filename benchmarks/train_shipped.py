@@ -1,6 +1,5 @@
 """Train a policy that ships, from nothing: flights, training, the student's own flights, training.
 
-python -m benchmarks.train_shipped toge-rates --out training
 python -m benchmarks.train_shipped toge --out training
 
 Run the same command again to go on after an interruption: flights that are recorded are kept,
@@ -21,7 +20,6 @@ from mavbridge.commands.output import table_console
 app = App(help=__doc__)
 
 NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
-RACE = "--action rates --courses race"
 OWN = "--num-diffusion-steps 1"
 """A student that flies to be corrected is sampled in one step: it leaves the time to the expert."""
 
@@ -56,7 +54,7 @@ STEPS: dict[str, tuple[Step, ...]] = {
 
 
 @app.default
-def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) -> None:
+def main(policy: Literal["toge"], *, out: Path, workers: int = 2) -> None:
     """Run every step that has not been done yet.
 
     Args:

@@ -20,8 +20,7 @@ class PolicyConfig:
     """The policy, its weights, and what runs it."""
 
     policy: str = "toge"
-    """toge (by sticks) or toge-rates (by body rates) with the shipped weights;
-    toge[:small|medium|large[:BACKBONE]], resnet-unet; your own class, ./file.py:Class or
+    """toge[:small|medium|large[:BACKBONE]], resnet-unet; your own class, ./file.py:Class or
     package.module:Class; lerobot:DIR, onnx:DIR, torchscript:FILE; ws://HOST:PORT, a server
     (mavbridge serve, openpi's); or
     scripted[:hover|square|circle|yaw|doublet][:sticks|attitude|rates|velocity][:air], air: the
@@ -69,9 +68,8 @@ class PolicyConfig:
 
     @property
     def kind(self) -> str:
-        """The first word of ``policy``: scripted, onnx...; toge whatever its weights."""
-        word = self.policy.partition(":")[0]
-        return "toge" if word == "toge-rates" else word
+        """The first word of ``policy``: toge, scripted, onnx..."""
+        return self.policy.partition(":")[0]
 
     @property
     def may_be_dual(self) -> bool:

@@ -70,7 +70,7 @@ def policy_files(wanted: PolicyConfig) -> list[Path]:
     """The files that make the policy what it is: weights, contract, graphs, a user's code."""
     files = [path for path in (wanted.checkpoint, wanted.contract) if path is not None]
     if wanted.kind == "toge" and not files and not wanted.allow_untrained:
-        files += [SHIPPED[wanted.policy]] if wanted.policy in SHIPPED else []
+        files.append(SHIPPED)
     named = wanted.policy.partition(":")[2] if wanted.kind in FILE_KINDS else wanted.kind
     path = Path(named).expanduser()
     if path.is_dir() and wanted.kind in FILE_KINDS:

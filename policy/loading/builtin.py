@@ -11,10 +11,9 @@ from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 if TYPE_CHECKING:
     from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
 
-_WEIGHTS = Path(__file__).parents[1] / "weights"
-SHIPPED = {"toge": _WEIGHTS / "toge.safetensors", "toge-rates": _WEIGHTS / "toge-rates.safetensors"}
-"""Flown by these specs where no other weights are named; their card is beside them."""
-BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
+SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
+"""Flown by ``toge`` where no other weights are named; its card is beside it."""
+BUILTIN_KINDS = ("toge", "resnet-unet")
 
 
 def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
@@ -24,7 +23,7 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
         PolicyError: it names none.
     """
     kind, *options = spec.split(":")
-    if kind not in ("toge", "resnet-unet"):
+    if kind not in BUILTIN_KINDS:
         raise PolicyError(
             f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
             "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
@@ -45,9 +44,8 @@ def builtin_checkpoint(request: PolicyRequest) -> Path | None:
     """The weights of a network of ours; None where random ones will do."""
     if request.checkpoint is not None or request.allow_untrained:
         return request.checkpoint
-    shipped = SHIPPED.get(request.spec)
-    if shipped is not None and shipped.is_file():
-        return shipped
+    if request.spec == "toge" and SHIPPED.is_file():
+        return SHIPPED
     raise PolicyError(
         f"{request.spec} needs trained weights: give --checkpoint FILE, or --allow-untrained for "
         "seeded random ones (timing and bring-up), or fly --policy scripted"
@@ -74,7 +72,7 @@ def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinCo
 
     size, backbone = parse_builtin(kind, options)
     contract = default_contract(image_size)
-    if kind in SHIPPED:
+    if kind == "toge":
         return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
     return ResnetUnetConfig(size=size, contract=contract)
 

@@ -6,7 +6,16 @@ from pathlib import Path
 import pytest
 
 from benchmarks import two_rates
-from benchmarks.two_rates import CONTROLS, ENCODER_MS, LOOPS, Cell, Control, Loop, flags_of
+from benchmarks.two_rates import (
+    ENCODER_MS,
+    LOOPS,
+    RATES,
+    STICKS,
+    Cell,
+    Control,
+    Loop,
+    flags_of,
+)
 
 
 def made(control: Control, loop: Loop, encoder_ms: int, weights: Path, episodes: int) -> Cell:
@@ -26,10 +35,12 @@ def made(control: Control, loop: Loop, encoder_ms: int, weights: Path, episodes:
 
 
 def test_a_single_loop_waits_for_its_encoder_and_two_rates_do_not() -> None:
-    assert "--single-rate --rate 18.52" in flags_of("one rate", 50)
-    assert "--single-rate --rate 100 " in flags_of("one rate", 5)
-    assert "--visual-rate 20 --action-rate 100" in flags_of("100 actions a second", 50)
-    assert "--visual-rate 30 --action-rate 250" in flags_of("250 actions a second", 5)
+    assert "--single-rate --rate 18.52" in flags_of(STICKS, "one rate", 50)
+    assert "--single-rate --rate 100 " in flags_of(STICKS, "one rate", 5)
+    assert "--visual-rate 20 --action-rate 100" in flags_of(RATES, "100 actions a second", 50)
+    assert "--visual-rate 30 --action-rate 250" in flags_of(RATES, "250 actions a second", 5)
+    assert "--head-steps 2" in flags_of(STICKS, "100 actions a second", 5)
+    assert "--head-steps 0" in flags_of(RATES, "100 actions a second", 5)
 
 
 def test_an_interrupted_map_resumes_and_other_weights_begin_anew(
@@ -49,13 +60,13 @@ def test_an_interrupted_map_resumes_and_other_weights_begin_anew(
     monkeypatch.setattr(two_rates, "evaluate", evaluate)
     most = 4
     with pytest.raises(KeyboardInterrupt):
-        two_rates.main(json=out, checkpoint=weights)
+        two_rates.main(json=out, sticks=weights)
     most = 1000
-    two_rates.main(json=out, checkpoint=weights)
+    two_rates.main(json=out, sticks=weights)
     assert flown == [(loop, ms) for ms in ENCODER_MS for loop in LOOPS]
     assert len(json.loads(out.read_text())) == len(flown)
     weights.write_text("other weights")
-    two_rates.main(json=out, checkpoint=weights)
+    two_rates.main(json=out, sticks=weights)
     assert len(flown) == 2 * len(ENCODER_MS) * len(LOOPS)
 
 
@@ -65,7 +76,7 @@ def test_the_figure_shows_every_cell(tmp_path: Path) -> None:
     weights.write_text("")
     cells = [
         made(control, loop, ms, weights, 50)
-        for control in CONTROLS
+        for control in (STICKS, RATES)
         for ms in ENCODER_MS
         for loop in LOOPS
     ]

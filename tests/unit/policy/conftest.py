@@ -32,7 +32,7 @@ def small_toge() -> Toge:
 @pytest.fixture(scope="session")
 def trained_toge() -> BuiltinPolicy:
     """The shipped policy: what a warm start does cannot be judged by untrained weights."""
-    return load_checkpoint(SHIPPED["toge"], fallback=TogeConfig())
+    return load_checkpoint(SHIPPED, fallback=TogeConfig())
 
 
 Fly = Callable[[Executable, float | None], FloatArray]

@@ -63,7 +63,7 @@ def test_version_1_flies_sticks_in_the_modes_that_hold_altitude() -> None:
 
 
 def test_the_shipped_weights_are_read_as_they_are() -> None:
-    contract = read_contract(SHIPPED["toge"])
+    contract = read_contract(SHIPPED)
     assert contract is not None
     same = {"image_height": 96, "image_width": 96, "feature_dim": 256, "since_exposure": True}
     assert contract == Contract(**same)

@@ -189,7 +189,7 @@ def test_by_body_rates_races_are_demonstrated_and_read_back(
 def test_a_student_is_flown_by_what_it_was_trained_for(tmp_path: Path) -> None:
     by_rates = replace(config(tmp_path), action="rates")
     student = replace(
-        by_rates, policy=replace(by_rates.policy, image_size=None, checkpoint=SHIPPED["toge"])
+        by_rates, policy=replace(by_rates.policy, image_size=None, checkpoint=SHIPPED)
     )
     with pytest.raises(UserError, match="flies by sticks: use --action sticks"):
         demonstrate(student)

@@ -1,0 +1,45 @@
+"""Training of what ships: its commands are ours, and what is done is not done again."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import train_shipped
+from benchmarks.train_shipped import STEPS
+from mavbridge.cli import cli
+
+
+@pytest.fixture
+def commands(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    run: list[str] = []
+
+    def remember(folder: Path, command: str) -> None:
+        run.append(command)
+        if command.startswith("train"):
+            (folder / command.partition("--out ")[2].split()[0]).touch()
+
+    monkeypatch.setattr(train_shipped, "run", remember)
+    return run
+
+
+@pytest.mark.parametrize("policy", list(STEPS))
+def test_every_command_is_one_of_ours(
+    policy: str, commands: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train_shipped.main(policy, out=tmp_path)  # type: ignore[arg-type]
+    assert len(commands) == len(STEPS[policy])
+    monkeypatch.chdir(tmp_path / policy)
+    for command in commands:
+        cli.parse_args(command.split(), print_error=False, exit_on_error=False)
+
+
+def test_weights_that_are_there_are_not_trained_again_and_an_unfinished_run_goes_on(
+    commands: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "toge").mkdir()
+    (tmp_path / "toge" / "first.safetensors").touch()
+    (tmp_path / "toge" / "toge.training").mkdir()
+    train_shipped.main("toge", out=tmp_path)
+    trained = [command for command in commands if command.startswith("train")]
+    assert len(trained) == 1
+    assert trained[0].endswith("--out toge.safetensors --resume")
