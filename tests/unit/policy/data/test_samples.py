@@ -14,11 +14,12 @@ from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy import rotation
 from policy.contract import QUATERNION, RATE, VELOCITY, Contract
-from policy.data.flight_data import DatasetError, FlightData
+from policy.data.flight_data import ActionTerms, DatasetError, FlightData
 from policy.data.samples import (
     BLIND_SHARE,
     FRESH_START_SHARE,
     HISTORY_NOISE,
+    RATE_NOISE_RADPS,
     Samples,
     Timeline,
 )
@@ -247,3 +248,24 @@ def test_a_mirrored_flight_is_a_flight() -> None:
     np.testing.assert_array_equal(mirrored[:, 14:17], state[::2, 14:17] * -flip.astype("f4"))
     np.testing.assert_array_equal(left.chunk[::2], samples.chunk[::2] * [1, -1, 1, -1])
     np.testing.assert_array_equal(left.gate[::2], samples.gate[::2] * [1, -1, 1, -1, 1, -1, 1])
+
+
+def test_what_tells_the_next_body_rate_without_looking_is_hidden_in_training() -> None:
+    """The history and the vehicle's own rates; nothing else of the state, and only for rates."""
+    by_rates = Contract(since_exposure=True, horizon=4, action="rates")
+    terms = ActionTerms("rates")
+    ticks, frames = np.full(400, 60), np.full(400, 15)
+    for contract, flight, is_hidden in (
+        (by_rates, flown(terms=terms), True),
+        (CONTRACT, flown(), False),
+    ):
+        timeline = Timeline([flight], contract, np.array([40 * MS]))
+        plain = timeline.samples(frames, ticks)
+        trained = timeline.samples(frames, ticks, np.random.default_rng(1))
+        change = trained.state - plain.state
+        expected = RATE_NOISE_RADPS if is_hidden else 0.0
+        assert change[:, RATE].std() == pytest.approx(expected, rel=0.1)
+        change[:, RATE] = 0.0
+        assert not change.any()
+        spread = (trained.history[:, -1] - plain.history[:, -1]).std()
+        assert (spread > 0.5) == is_hidden
