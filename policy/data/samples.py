@@ -120,7 +120,7 @@ class Timeline:
         self._velocity_ns = stamps("velocity_ns")[known]
         self._velocity = Interpolator(self._velocity_ns, self._state[:, VELOCITY])
         self._target_ns = stamps("target_ns")
-        units, self._by_rates = action_units(contract), contract.action == "rates"
+        units, self.by_rates = action_units(contract), contract.action == "rates"
         self._target = units.to_network(np.concatenate([flight.target for flight in flights]))
         # Before its first action, a flight's actions were neutral.
         sent_ns = [
@@ -177,7 +177,7 @@ class Timeline:
         """Inputs and labels at ``ticks`` with the images ``frames``; augmented by ``random``."""
         chunk, known = self.chunks(ticks)
         state = self.states(frames, ticks)
-        if random is not None and self._by_rates:
+        if random is not None and self.by_rates:
             noise = random.normal(0.0, RATE_NOISE_RADPS, state[:, RATE].shape)
             state[:, RATE] += noise.astype(np.float32)
         return Samples(
@@ -219,7 +219,7 @@ class Timeline:
         if random is None:
             return history
         samples = len(ticks)
-        spread = RATES_HISTORY_NOISE if self._by_rates else HISTORY_NOISE
+        spread = RATES_HISTORY_NOISE if self.by_rates else HISTORY_NOISE
         offset = random.normal(0.0, spread, (samples, 1, ACTION_DIM))
         history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
         chance = random.random(samples)

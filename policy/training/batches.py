@@ -158,14 +158,17 @@ class Batches:
         return self._batch(random, samples, len(frames), features=rows)
 
     def validation(self, samples: int, size: int) -> Iterator[Batch]:
-        """The same samples at each call, without augmentation."""
+        """The same samples at each call, without augmentation; only what training hides is hidden.
+
+        By body rates weights that copy would else be the best ones.
+        """
         frames, count = self.frames, self._settings.batch_size
         chosen = frames[np.linspace(0, len(frames) - 1, min(samples, len(frames))).astype(int)]
         for start in range(0, len(chosen), count):
             random = np.random.default_rng([self._seed, VALIDATION_KEY, start])
             part = chosen[start : start + count]
             ticks = self._timeline.draw_ticks(part, random)
-            plain = self._timeline.samples(part, ticks)
+            plain = self._timeline.samples(part, ticks, random if self._timeline.by_rates else None)
             images = self._store.read(part, size)
             yield self._batch(random, plain, len(part), images=images)
 
