@@ -54,11 +54,10 @@ class DiffusionHead(nn.Module):
     The initial noise is fixed for a flight: the same inputs then give the same sticks, and chunks
     do not jitter from sample to sample. It is not part of a checkpoint.
 
-    Inside, actions are in ``policy.action_units``; ``solve`` and ``initial_noise`` have the units
-    of the contract. There a noisy chunk is ``signal * action + noise * initial_noise``, and so it
-    is where another solve is entered, as a warm start does.
-
-    Steps that the schedule does not have raise a ``PolicyError``.
+    Inside, actions are in ``policy.action_units``; ``sample``, ``denoise_steps`` and
+    ``initial_noise`` have the units of the contract. There a noisy chunk is
+    ``signal * action + noise * initial_noise``, and so it is where another solve is entered, as a
+    warm start does.
     """
 
     def __init__(self, size: Size, contract: Contract, schedule: NoiseSchedule) -> None:

@@ -149,7 +149,8 @@ class Pilot:
         # Called at every tick, also in the expert's turns: the student may hold state of its own.
         students = self._student.act(encoded, state, history, elapsed_s)
         if self._by_rates:
-            apart = self._units.to_network(students[0, 0]) - self._units.to_network(chunk[0, 0])
+            wanted = np.array(self._expert_actions[self._solves], np.float32)
+            apart = self._units.to_network(students[0, 0]) - self._units.to_network(wanted)
             if np.abs(apart).max() > MOST_APART:
                 self._turns.take_over(now_s)
         return students if self._turns.is_students(now_s) else chunk
