@@ -8,6 +8,7 @@ and as many episodes are not flown again: an interrupted study resumes.
 """
 
 import hashlib
+import math
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -149,25 +150,59 @@ def evaluate(setting: Setting, checkpoint: Path, episodes: int, workers: int) ->
     Raises:
         subprocess.CalledProcessError: the evaluation failed, and printed why.
     """
-    flags = (*setting.flags.split(), "--episodes", str(episodes))
-    with TemporaryDirectory() as folder:
-        out = Path(folder) / "evaluation.json"
-        files = ("--checkpoint", str(checkpoint), "--workers", str(workers), "--json", str(out))
-        command = [sys.executable, "-m", "mavbridge", "evaluate", *flags, *files]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        summary = loads(out.read_text())["summary"]
+    flags = f"{setting.flags} --episodes {episodes}"
+    flown = fly(flags, checkpoint, workers)
     return SettingScore(
         group=setting.group,
         name=setting.name,
-        command=f"mavbridge evaluate {' '.join(flags)}",
+        command=f"mavbridge evaluate {flags}",
         checkpoint_sha256=sha256(checkpoint),
         episodes=episodes,
-        success=summary["success_rate"]["value"],
+        success=flown.success,
+        success_low=flown.success_low,
+        success_high=flown.success_high,
+        gates=flown.gates,
+        speed_mps=flown.speed_mps,
+        stick_rate_per_s=flown.stick_rate_per_s,
+    )
+
+
+class Flown(NamedTuple):
+    """Figures of one ``mavbridge evaluate``; intervals are 95 %. NaN: no flight has the figure."""
+
+    success: float
+    success_low: float
+    success_high: float
+    gates: float
+    speed_mps: float
+    course_speed_mps: float
+    stick_rate_per_s: float
+
+
+def fly(flags: str, checkpoint: Path, workers: int) -> Flown:
+    """Run ``mavbridge evaluate`` with these flags.
+
+    Raises:
+        subprocess.CalledProcessError: the evaluation failed, and printed why.
+    """
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "evaluation.json"
+        files = ("--checkpoint", str(checkpoint), "--workers", str(workers), "--json", str(out))
+        command = [sys.executable, "-m", "mavbridge", "evaluate", *flags.split(), *files]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        summary = loads(out.read_text())["summary"]
+
+    def value(name: str) -> float:
+        return float(summary[name]["value"]) if summary[name] else math.nan
+
+    return Flown(
+        success=value("success_rate"),
         success_low=summary["success_rate"]["low"],
         success_high=summary["success_rate"]["high"],
-        gates=summary["gates_passed"]["value"],
-        speed_mps=summary["mean_speed_mps"]["value"],
-        stick_rate_per_s=summary["stick_rate_per_s"]["value"],
+        gates=value("gates_passed"),
+        speed_mps=value("mean_speed_mps"),
+        course_speed_mps=value("course_speed_mps"),
+        stick_rate_per_s=value("stick_rate_per_s"),
     )
 
 

@@ -9,17 +9,15 @@ evaluate`` of its own. Cells that the JSON holds for the same weights and as man
 flown again: an interrupted map resumes.
 """
 
-import subprocess
-import sys
+import math
 from dataclasses import asdict, dataclass
 from json import dumps, loads
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
 from cyclopts import App
 
-from benchmarks.study import sha256
+from benchmarks.study import fly, sha256
 from mavbridge.commands.output import (
     BLUE,
     FIGURE_DPI,
@@ -146,13 +144,7 @@ def evaluate(
     loop_flags = flags_of(control, loop, encoder_ms)
     flags = f"{control.flags} {loop_flags} --vision-time {encoder_ms} {LOOSE}"
     flags += f" --episodes {episodes} --max-time 45"
-    with TemporaryDirectory() as folder:
-        out = Path(folder) / "evaluation.json"
-        files = ("--checkpoint", str(weights), "--workers", str(workers), "--json", str(out))
-        command = [sys.executable, "-m", "mavbridge", "evaluate", *flags.split(), *files]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        summary: dict[str, Any] = loads(out.read_text())["summary"]
-    speed = summary["course_speed_mps"]
+    flown = fly(flags, weights, workers)
     return Cell(
         control=control.name,
         loop=loop,
@@ -160,16 +152,16 @@ def evaluate(
         command=f"mavbridge evaluate {flags}",
         checkpoint_sha256=sha256(weights),
         episodes=episodes,
-        success=summary["success_rate"]["value"],
-        success_low=summary["success_rate"]["low"],
-        success_high=summary["success_rate"]["high"],
-        gates=summary["gates_passed"]["value"],
-        speed_mps=speed["value"] if speed else 0.0,
+        success=flown.success,
+        success_low=flown.success_low,
+        success_high=flown.success_high,
+        gates=flown.gates,
+        speed_mps=0.0 if math.isnan(flown.course_speed_mps) else flown.course_speed_mps,
     )
 
 
 def print_cells(cells: list[Cell]) -> None:
-    """Print the table of docs/study.md."""
+    """Print the map as a table."""
     rows = [
         (
             *(one.control, f"{one.encoder_ms} ms", one.loop, f"{one.success:.0%}"),

@@ -33,6 +33,7 @@ from mavbridge.simulation.world import (
     SimulatedCamera,
     VehicleStepper,
     VisionStepper,
+    needed_params,
 )
 from policy.contract import Contract, FloatArray
 from policy.protocol import Executable
@@ -44,8 +45,6 @@ from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 MAX_TIME_S = 60.0
 """Default limit: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
-THRUST_OPTION = 8
-"""GUID_OPTIONS with which ArduCopter takes a thrust for a thrust, as --set does in real time."""
 END_NS = 3 * NS_PER_S
 """Longest that the gate may take to give the sticks back."""
 
@@ -188,8 +187,8 @@ class SimulatedFlight:
         )
         gate = GateLoop(world, link, MemoryPort(outgoing=to_flight, incoming=to_gate))
         contract, policy_clock = executable.contract, AheadClock(world)
-        if contract.action in ("rates", "attitude") and self._vehicle_config.autopilot != "px4":
-            self.vehicle.params.set("GUID_OPTIONS", THRUST_OPTION)
+        for name, value in needed_params(contract, self._vehicle_config.autopilot).items():
+            self.vehicle.params.set(name, value)
         vision_clocks = [AheadClock(world) for _ in contract.cameras]
         cameras = self._make_cameras(contract, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
         send = sender(world, policy_clock, flight_port)

@@ -15,6 +15,8 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.network import DelayedChannel
+from policy.contract import Contract
+from sitl.ardupilot.guided import OPTION_THRUST
 from sitl.camera.fpv import FpvRenderer
 from sitl.rotation import IDENTITY, Quat, Vec3, from_euler, multiply
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
@@ -64,6 +66,12 @@ def make_vehicle(
         pilot_speed_down_cmps=gains * before.pilot_speed_down_cmps,
     )
     return replace(vehicle, autopilot=autopilot, conditions=conditions)
+
+
+def needed_params(contract: Contract, autopilot: AutopilotName) -> dict[str, float]:
+    """Parameters without which a simulated vehicle takes the actions for something else."""
+    has_thrust = contract.action in ("rates", "attitude")
+    return {"GUID_OPTIONS": OPTION_THRUST} if has_thrust and autopilot == "ardupilot" else {}
 
 
 class BlankRenderer:

@@ -10,12 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from policy.action_units import action_units
 from policy.contract import (
     ACTION_DIM,
     QUATERNION,
     STATE_DIM,
     STATE_NAMES,
     ActionKind,
+    Contract,
     FloatArray,
     StateFrame,
 )
@@ -47,8 +49,8 @@ class ActionTerms(NamedTuple):
     @property
     def neutral(self) -> tuple[float, float, float, float]:
         """The action while nobody acts."""
-        has_thrust = self.action in ("rates", "attitude")
-        return (self.hover_thrust if has_thrust else 0.0, 0.0, 0.0, 0.0)
+        contract = Contract(action=self.action, hover_thrust=self.hover_thrust)
+        return action_units(contract).neutral
 
 
 STICK_TERMS = ActionTerms()

@@ -1,8 +1,9 @@
 """Reads the project's flight folders (docs/formats/flight_folder.md)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -10,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, ACTION_MODES, STATE_DIM, FloatArray, StateFrame
+from policy.contract import ACTION_DIM, ACTION_MODES, STATE_DIM, FloatArray
 from policy.data.flight_data import (
     GATE_DIM,
     ActionTerms,
@@ -96,8 +97,11 @@ def read_flight(folder: Path) -> FlightData:
     Raises:
         DatasetError: not a flight of ours, or damaged, or nobody flew in it.
     """
-    state_frame, terms = _state_frame(folder), _terms(folder)
-    name = str(folder)
+    name, contract = str(folder), _contract(folder)
+    state_frame, terms = (
+        parse_state_frame(name, contract.get("state_frame")),
+        _terms(name, contract),
+    )
     ticks = _read_table(folder, "ticks", _TICK_COLUMNS)
     frames = _read_table(folder, "frames", _FRAME_COLUMNS)
     video = folder / VIDEO
@@ -144,7 +148,7 @@ def read_ages(folder: Path) -> Nanoseconds:
     Raises:
         DatasetError: not a flight, or no policy looked in it.
     """
-    _state_frame(folder)
+    parse_state_frame(str(folder), _contract(folder).get("state_frame"))
     ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns")))
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
@@ -186,23 +190,21 @@ def _read_meta(folder: Path) -> dict[str, object]:
     return data
 
 
-def _state_frame(folder: Path) -> StateFrame:
+def _contract(folder: Path) -> dict[str, Any]:
+    """Fields of a flight's contract; the first flights had none."""
     contract = _read_meta(folder).get("contract")
-    frame = contract.get("state_frame") if isinstance(contract, dict) else None
-    return parse_state_frame(str(folder), frame)
+    return contract if isinstance(contract, dict) else {}
 
 
-def _terms(folder: Path) -> ActionTerms:
-    """From the contract of a flight; the first ones had none, and were flown by sticks."""
-    contract = _read_meta(folder).get("contract")
-    said = contract if isinstance(contract, dict) else {}
-    action = said.get("action", "sticks")
+def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
+    """From the contract of a flight; the first ones were flown by sticks."""
+    action = contract.get("action", "sticks")
     if action not in ACTION_MODES:
-        raise DatasetError(f"{folder}: its actions are {action!r}, which this build does not know")
-    hover, tilt = said.get("hover_thrust", 0.39), said.get("max_tilt_deg")
+        raise DatasetError(f"{name}: its actions are {action!r}, which this build does not know")
+    hover, tilt = contract.get("hover_thrust", 0.39), contract.get("max_tilt_deg")
     for number in (hover, tilt):
         if not isinstance(number, int | float | None) or isinstance(number, bool):
-            raise DatasetError(f"{folder}: {number!r} in its contract is no number")
+            raise DatasetError(f"{name}: {number!r} in its contract is no number")
     return ActionTerms(action, float(hover), None if tilt is None else float(tilt))
 
 

@@ -93,11 +93,10 @@ class Toge(nn.Module):
         """
         require_shape("feature", feature, self.contract.feature_dim)
         require_shape("state", state, self.contract.state_dim)
-        if action_history is None:
-            past = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
-        else:
+        past = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
+        if action_history is not None:
+            require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
             past = self.head.to_network(action_history)
-        require_shape("action_history", past, self.contract.history_len, ACTION_DIM)
         return self.condition(feature, self.state_encoder(state), past)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from sitl.ardupilot.params import Params
 from sitl.course.layout import Course
 from sitl.expert.course_guide import Agility, CourseGuide, Predicted
-from sitl.expert.rate_response import RateCommand, RateResponse
+from sitl.expert.rate_response import RateCommand, rate_command
 from sitl.expert.stick_response import DRAG_PER_S, StickPositions, StickResponse
 from sitl.rotation import integrate, rotate, to_euler, wrap_pi
 from sitl.vehicle.conditions import NOMINAL
@@ -76,7 +76,6 @@ class RateExpert:
 
     def __init__(self, course: Course, speed_mps: float, *, next_gate: int = 0) -> None:
         self._guide = CourseGuide(course, RATE_AGILITY, speed_mps, next_gate)
-        self._response = RateResponse()
 
     @property
     def next_gate(self) -> int | None:
@@ -92,7 +91,7 @@ class RateExpert:
         # drag, whatever the airframe and the wind.
         drag_x, drag_y, _ = body.specific_force_body_mps2
         drag_ned_mps2 = rotate(body.ned_from_body_wxyz, (drag_x, drag_y, 0.0))
-        return self._response.command(demand, state, ned_from_body, drag_ned_mps2)
+        return rate_command(demand, state, ned_from_body, drag_ned_mps2)
 
 
 def _predict_level(body: BodyState, lag_s: float) -> Predicted:

@@ -31,6 +31,10 @@ LATE_CHANCE = 0.3
 LATE_S = (0.2, 2.0)
 
 
+ZEROS: Numbers = (0.0,) * 4
+"""No offset; as an action it does nothing on the ground, in either kind."""
+
+
 class Strengths(NamedTuple):
     """Disturbances of one kind of actions, number by number."""
 
@@ -38,8 +42,6 @@ class Strengths(NamedTuple):
     pulse_max: Numbers
     low: Numbers
     high: Numbers
-    idle: Numbers
-    """Does nothing on the ground."""
 
 
 STICK_STRENGTHS = Strengths(
@@ -47,14 +49,12 @@ STICK_STRENGTHS = Strengths(
     pulse_max=(0.6, 0.4, 0.6, 0.6),
     low=(-1.0,) * 4,
     high=(1.0,) * 4,
-    idle=(0.0,) * 4,
 )
 RATE_STRENGTHS = Strengths(
     noise_rms=(0.06, 1.0, 1.0, 0.4),
     pulse_max=(0.15, 2.5, 2.5, 1.0),
     low=(0.0, -4.0, -4.0, -2.1),
     high=(0.9, 4.0, 4.0, 2.1),
-    idle=(0.0,) * 4,
 )
 
 
@@ -62,9 +62,6 @@ class _Stretch(NamedTuple):
     kind: Literal["quiet", "noise", "pulse", "late"]
     end_s: float
     offset: Numbers
-
-
-NONE: Numbers = (0.0,) * 4
 
 
 class Disturbance:
@@ -90,7 +87,7 @@ class Disturbance:
         self._noise = np.zeros(4)
         late = from_ground and self._random.random() < LATE_CHANCE * strength
         end_s = float(self._random.uniform(*(LATE_S if late else QUIET_S)))
-        self._stretch = _Stretch("late" if late else "quiet", end_s, NONE)
+        self._stretch = _Stretch("late" if late else "quiet", end_s, ZEROS)
 
     @property
     def active(self) -> bool:
@@ -112,7 +109,7 @@ class Disturbance:
         if not self.active:
             return wanted
         if self._stretch.kind == "late":
-            return type(wanted)(*self._strengths.idle)
+            return type(wanted)(*ZEROS)
         offset = self._noise if self._stretch.kind == "noise" else self._stretch.offset
         bounds = zip(wanted, offset, self._strengths.low, self._strengths.high, strict=True)
         disturbed = [
@@ -123,10 +120,10 @@ class Disturbance:
 
     def _next(self, ended: _Stretch) -> _Stretch:
         if ended.kind != "quiet":
-            return _Stretch("quiet", ended.end_s + float(self._random.uniform(*QUIET_S)), NONE)
+            return _Stretch("quiet", ended.end_s + float(self._random.uniform(*QUIET_S)), ZEROS)
         if self._random.random() < 0.5:
             self._noise[:] = 0.0
-            return _Stretch("noise", ended.end_s + float(self._random.uniform(*NOISY_S)), NONE)
+            return _Stretch("noise", ended.end_s + float(self._random.uniform(*NOISY_S)), ZEROS)
         # A pulse is on one or two numbers, as a slip of the thumb is.
         held = self._random.uniform(-1.0, 1.0, 4) * np.array(self._strengths.pulse_max)
         held *= self._random.permutation([1.0, 1.0, 0.0, 0.0])

@@ -28,36 +28,31 @@ class RateCommand(NamedTuple):
     yaw_radps: float
 
 
-LEVEL_HOVER = RateCommand(HOVER_THRUST, 0.0, 0.0, 0.0)
+def rate_command(
+    demand: Demand, state: Predicted, ned_from_body: Quat, drag_ned_mps2: Vec3
+) -> RateCommand:
+    """Thrust and rates for a demand, in a predicted state and attitude, against this drag.
 
-
-class RateResponse:
-    """Points the thrust where the demand needs it, the shorter way round, and turns as demanded.
-
-    The tilt has a loop of its own, and the heading follows by its rate alone: the thrust's
-    direction matters more than where the nose points (Brescianini and D'Andrea, "Tilt-Prioritized
-    Quadrocopter Attitude Control", 2018).
+    The thrust points where the demand needs it, turned there the shorter way round. The tilt has a
+    loop of its own, and the heading follows by its rate alone: the thrust's direction matters more
+    than where the nose points (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude
+    Control", 2018).
     """
-
-    def command(
-        self, demand: Demand, state: Predicted, ned_from_body: Quat, drag_ned_mps2: Vec3
-    ) -> RateCommand:
-        """Thrust and rates for a demand, in a predicted state and attitude, against this drag."""
-        force_ned = _specific_force(demand, state, drag_ned_mps2)
-        size = math.hypot(*force_ned)
-        body_from_ned = conjugate(ned_from_body)
-        x, y, z = (part / size for part in rotate(body_from_ned, force_ned))
-        # The rotation vector that takes the thrust, along -z of the body, to the force.
-        sine = math.hypot(x, y)
-        angle_rad = math.atan2(sine, -z)
-        per_sine = TILT_GAIN_PER_S * angle_rad / sine if sine > 1e-6 else TILT_GAIN_PER_S
-        turn = tuple(demand.yaw_rate_radps * down for down in rotate(body_from_ned, (0, 0, 1.0)))
-        return RateCommand(
-            thrust=HOVER_THRUST * size * max(0.2, -z) / GRAVITY_MPS2,
-            roll_radps=clamp(per_sine * y + turn[0], MAX_RATE_RADPS),
-            pitch_radps=clamp(-per_sine * x + turn[1], MAX_RATE_RADPS),
-            yaw_radps=clamp(turn[2], MAX_YAW_RATE_RADPS),
-        )
+    force_ned = _specific_force(demand, state, drag_ned_mps2)
+    size = math.hypot(*force_ned)
+    body_from_ned = conjugate(ned_from_body)
+    x, y, z = (part / size for part in rotate(body_from_ned, force_ned))
+    # The rotation vector that takes the thrust, along -z of the body, to the force.
+    sine = math.hypot(x, y)
+    angle_rad = math.atan2(sine, -z)
+    per_sine = TILT_GAIN_PER_S * angle_rad / sine if sine > 1e-6 else TILT_GAIN_PER_S
+    turn = tuple(demand.yaw_rate_radps * down for down in rotate(body_from_ned, (0, 0, 1.0)))
+    return RateCommand(
+        thrust=HOVER_THRUST * size * max(0.2, -z) / GRAVITY_MPS2,
+        roll_radps=clamp(per_sine * y + turn[0], MAX_RATE_RADPS),
+        pitch_radps=clamp(-per_sine * x + turn[1], MAX_RATE_RADPS),
+        yaw_radps=clamp(turn[2], MAX_YAW_RATE_RADPS),
+    )
 
 
 def _specific_force(demand: Demand, state: Predicted, drag_ned_mps2: Vec3) -> Vec3:

@@ -24,17 +24,12 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.processes import END_TIMEOUT_S, end, free_port, running, wait
 from mavbridge.flight.app import fly_executable
-from mavbridge.flight.policies import (
-    configured_contract,
-    is_scripted,
-    load_configured_policy,
-    load_for_episodes,
-)
+from mavbridge.flight.policies import is_scripted, load_configured_policy, load_for_episodes
 from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delay, Delays
-from mavbridge.simulation.flight import THRUST_OPTION, SimulatedFlight, SimulationSettings
+from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult, Outcome, StickMeter
-from mavbridge.simulation.world import make_vehicle
+from mavbridge.simulation.world import make_vehicle, needed_params
 from policy.protocol import Executable
 
 STARTUP_S = 90.0
@@ -179,34 +174,28 @@ def _run_bridge(
 def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> tuple[str, StickMeter]:
     """Fly once, as ``mavbridge fly`` does; ended by signals, like that."""
     settings, clock, meter = job.spec.config, MonotonicClock(), StickMeter()
-    config = FlyConfig(
-        link=LinkConfig(
-            connect=f"udp:127.0.0.1:{job.port}",
-            raw_sticks=settings.raw_sticks,
-            set=_needed_params(settings),
-        ),
-        policy=settings.policy,
-        camera=CameraConfig(camera=(job.camera,)),
-        rates=settings.rates,
-        limits=settings.limits,
-        arm=True,
-        duration=settings.max_time,
-    )
     with (
-        load_configured_policy(config.policy, clock) as loaded,
+        load_configured_policy(settings.policy, clock) as loaded,
         Path("/dev/null").open("w") as nowhere,
     ):
         executable = _measured(loaded.executable, settings)
+        params = needed_params(executable.contract, settings.autopilot)
+        config = FlyConfig(
+            link=LinkConfig(
+                connect=f"udp:127.0.0.1:{job.port}",
+                raw_sticks=settings.raw_sticks,
+                set=tuple(f"{name}={value:g}" for name, value in params.items()),
+            ),
+            policy=settings.policy,
+            camera=CameraConfig(camera=(job.camera,)),
+            rates=settings.rates,
+            limits=settings.limits,
+            arm=True,
+            duration=settings.max_time,
+        )
         console = Console(file=nowhere)
         fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))
     return executable.engine, meter
-
-
-def _needed_params(config: EvaluateConfig) -> tuple[str, ...]:
-    """Those without which the vehicle takes the policy's actions for something else."""
-    has_thrust = configured_contract(config.policy).action in ("rates", "attitude")
-    is_ardupilot = config.autopilot == "ardupilot"
-    return (f"GUID_OPTIONS={THRUST_OPTION}",) if has_thrust and is_ardupilot else ()
 
 
 def _read_result(spec: EpisodeSpec, meter: StickMeter, path: Path) -> EpisodeResult:
