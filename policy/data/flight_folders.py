@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, ACTION_MODES, STATE_DIM, FloatArray
+from policy.contract import ACTION_DIM, STATE_DIM, FloatArray
 from policy.data.flight_data import (
     GATE_DIM,
     ActionTerms,
@@ -108,6 +108,11 @@ def read_flight(folder: Path) -> FlightData:
     if not video.is_file() or frames.num_rows == 0:
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
     tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
+    if terms.action == "rates" and "expert" not in ticks.column_names:
+        raise DatasetError(
+            f"{name} was flown by rates without an expert: what was sent in it may also be an "
+            "attitude, and the recording does not tell them apart; use mavbridge demonstrate"
+        )
     sent = vectors(name, ticks, "sent", ACTION_DIM)
     if not _known(sent).any() and terms.action == "sticks":
         sent = vectors(name, ticks, "rc_sticks", ACTION_DIM)
@@ -197,14 +202,26 @@ def _contract(folder: Path) -> dict[str, Any]:
 
 
 def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
-    """From the contract of a flight; the first ones were flown by sticks."""
+    """From the contract of a flight; the first ones were flown by sticks.
+
+    Raises:
+        DatasetError: actions that nothing here learns from.
+    """
     action = contract.get("action", "sticks")
-    if action not in ACTION_MODES:
-        raise DatasetError(f"{name}: its actions are {action!r}, which this build does not know")
+    if action not in ("sticks", "rates"):
+        raise DatasetError(
+            f"{name} was flown by {action}: this build learns from sticks and body rates"
+        )
+    if action == "rates" and contract.get("state_frame") != "ned_frd":
+        # Recorded actions have NED and FRD axes, whatever those of the state; sticks have none.
+        raise DatasetError(
+            f"{name} was flown by rates with its state in {contract.get('state_frame')}: this "
+            "build learns body rates in ned_frd alone"
+        )
     hover, tilt = contract.get("hover_thrust", 0.39), contract.get("max_tilt_deg")
-    for number in (hover, tilt):
-        if not isinstance(number, int | float | None) or isinstance(number, bool):
-            raise DatasetError(f"{name}: {number!r} in its contract is no number")
+    for number in (hover, 1.0 if tilt is None else tilt):
+        if not isinstance(number, int | float) or isinstance(number, bool) or not number > 0:
+            raise DatasetError(f"{name}: {number!r} in its contract is no number above 0")
     return ActionTerms(action, float(hover), None if tilt is None else float(tilt))
 
 

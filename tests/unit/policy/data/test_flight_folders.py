@@ -223,3 +223,27 @@ def test_a_failed_flight_is_nothing_to_imitate(
 ) -> None:
     write_meta(tmp_path / "flight", **meta)
     assert is_exemplary(tmp_path / "flight") is exemplary
+
+
+@pytest.mark.parametrize(
+    ("contract", "says"),
+    [
+        ({"action": "velocity"}, "was flown by velocity: this build learns from sticks and body"),
+        ({"action": "attitude"}, "was flown by attitude"),
+        ({"action": "thrust"}, "was flown by thrust"),
+        ({"action": "rates", "state_frame": "enu_flu"}, "learns body rates in ned_frd alone"),
+        ({"action": "rates", "hover_thrust": None}, "None in its contract is no number above 0"),
+        ({"action": "rates", "hover_thrust": 0.0}, "0.0 in its contract is no number above 0"),
+        ({"action": "rates"}, "without an expert"),
+    ],
+)
+def test_actions_that_nothing_here_learns_from_are_refused(
+    tmp_path: Path, contract: dict[str, object], says: str
+) -> None:
+    folder = flight(
+        tmp_path / "a",
+        ticks_table(woke_ns=WOKE, expert=None, sent=[STICK] * 3),
+        contract={"state_frame": "ned_frd", **contract},
+    )
+    with pytest.raises(DatasetError, match=says):
+        read_flight(folder)

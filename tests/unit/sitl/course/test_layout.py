@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mavbridge.config.courses import RACE_COURSE_SEED
 from sitl import UsageError
 from sitl.course.layout import (
     EASY,
@@ -65,3 +66,7 @@ def test_json_holds_all_that_the_course_does():
         Gate(**{**gate, "center_ned_m": tuple(gate["center_ned_m"])}) for gate in read["gates"]
     ]
     assert tuple(gates) == course.gates
+
+
+def test_the_bridge_and_the_simulator_agree_where_races_begin() -> None:
+    assert RACE_COURSE_SEED == RACE_SEEDS
