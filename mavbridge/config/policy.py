@@ -44,6 +44,9 @@ class PolicyConfig:
     noise."""
     allow_untrained: Annotated[bool, Parameter(group=RARE)] = False
     """Fly TOGE with random weights: for timing and bring-up only."""
+    by_rates: bool = False
+    """Fly the sticks of toge or resnet-unet by thrust and body rates, attitude and climb closed by
+    the policy from the newest state; in GUIDED_NOGPS, GUIDED or OFFBOARD."""
     image_size: Annotated[int | None, Parameter(group=RARE)] = None
     """Pixels a side into the encoder; by default what the policy's contract says (224)."""
     engine: Annotated[Engine, Parameter(group=RARE)] = "auto"

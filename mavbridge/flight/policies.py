@@ -61,6 +61,7 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
         dual_rate=wanted.dual_rate is not False,
         num_diffusion_steps=wanted.num_diffusion_steps,
         head_steps=wanted.warm_steps,
+        by_rates=wanted.by_rates,
         image_size=wanted.image_size,
         seed=wanted.seed,
     )

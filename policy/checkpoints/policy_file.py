@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from policy.action_units import action_units
 from policy.checkpoints.header import (
     ARCHITECTURE_KEY,
     CONTRACT_KEY,
@@ -173,7 +172,7 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
         made = _chunks(policy, ParitySamples(rgb=rgb, state=state, history=history))
     except (PolicyError, RuntimeError, ValueError) as error:
         raise CheckpointError(f"{damaged}: {error}; copy the file again") from error
-    if (reason := parity_failure(chunks, made, action_units(policy.contract))) is not None:
+    if (reason := parity_failure(chunks, made)) is not None:
         raise CheckpointError(
             f"{path}: these weights do not make the sticks that they made where they were saved: "
             f"{reason}. The file is damaged, or of another version: copy or export it again"

@@ -10,14 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.action_units import action_units
 from policy.contract import (
     ACTION_DIM,
     QUATERNION,
     STATE_DIM,
     STATE_NAMES,
     ActionKind,
-    Contract,
     FloatArray,
     StateFrame,
 )
@@ -46,12 +44,6 @@ class ActionTerms(NamedTuple):
     hover_thrust: float = 0.39
     max_tilt_deg: float | None = None
 
-    @property
-    def neutral(self) -> tuple[float, float, float, float]:
-        """The action while nobody acts."""
-        contract = Contract(action=self.action, hover_thrust=self.hover_thrust)
-        return action_units(contract).neutral
-
 
 STICK_TERMS = ActionTerms()
 
@@ -77,10 +69,12 @@ class FlightData:
     """[T] arrival of its velocity."""
     target_ns: Nanoseconds
     target: FloatArray
-    """[M, 4] actions to imitate, at ``target_ns`` [M]."""
+    """[M, 4] sticks to imitate, at ``target_ns`` [M]; of a flight by rates those that
+    ``policy.stick_loop`` would have flown so."""
     sent_ns: Nanoseconds
     sent: FloatArray
-    """[S, 4] actions that flew, each until the next one; neutral where there was none."""
+    """[S, 4] sticks that flew, each until the next one; centred where there were none, and in
+    flights by rates."""
     age_ns: Nanoseconds
     """[A] measured ages of the image at a tick; may be empty."""
     captured_ns: Nanoseconds
@@ -116,7 +110,7 @@ class FlightData:
             values = getattr(self, of)
             if not np.isfinite(values).all():
                 raise DatasetError(f"{self.name}: {of} must be finite numbers")
-            if self.terms.action == "sticks" and np.abs(values).max(initial=0.0) > 1.0:
+            if np.abs(values).max(initial=0.0) > 1.0:
                 raise DatasetError(f"{self.name}: {of} must be sticks in [-1, 1]")
         self._check_state()
 
@@ -169,11 +163,11 @@ def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
     """
     first = flights[0]
     for flight in flights:
-        if (flight.terms.action, flight.terms.neutral) != (first.terms.action, first.terms.neutral):
+        if flight.terms[:2] != first.terms[:2]:
             raise DatasetError(
-                f"{first.name} was flown by {first.terms.action} around {first.terms.neutral}, "
-                f"{flight.name} by {flight.terms.action} around {flight.terms.neutral}: train on "
-                "one kind at a time"
+                f"{first.name} was flown by {first.terms.action} and hovers at a thrust of "
+                f"{first.terms.hover_thrust:g}, {flight.name} by {flight.terms.action} at "
+                f"{flight.terms.hover_thrust:g}: train on one kind at a time"
             )
     tilts_deg = [each.terms.max_tilt_deg for each in flights if each.terms.max_tilt_deg is not None]
     return first.terms._replace(max_tilt_deg=max(tilts_deg, default=None))

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, STATE_DIM, FloatArray
+from policy.contract import ACTION_DIM, STATE_DIM, Contract, FloatArray
 from policy.data.flight_data import (
     GATE_DIM,
     ActionTerms,
@@ -21,6 +21,7 @@ from policy.data.flight_data import (
     Nanoseconds,
 )
 from policy.data.tables import file_digest, parse_state_frame, read_json, stamps, vectors
+from policy.stick_loop import StickLoop, rates_contract
 
 FORMAT, VERSION = "mavbridge-flight", 1
 VIDEO = "camera.mp4"
@@ -126,6 +127,11 @@ def read_flight(folder: Path) -> FlightData:
             f"{folder}: nobody to learn from: no expert, and no stick was sent while armed"
         )
     state = vectors(name, ticks, "state", STATE_DIM)
+    if terms.action == "rates":
+        is_target &= _known(state)
+        loop = StickLoop(rates_contract(Contract(hover_thrust=terms.hover_thrust)))
+        target[is_target] = loop.to_sticks(target[is_target], state[is_target])
+        sent = np.zeros_like(sent)
     state[~is_target] = np.nan
     return FlightData(
         name=name,
@@ -137,7 +143,7 @@ def read_flight(folder: Path) -> FlightData:
         target_ns=target_ns[is_target],
         target=target[is_target],
         sent_ns=sent_ns,
-        sent=np.where(np.isnan(sent), np.array(terms.neutral, np.float32), sent),
+        sent=np.nan_to_num(sent, nan=0.0),
         terms=terms,
         age_ns=_ages(ticks),
         captured_ns=stamps(name, frames, "captured_ns"),

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.action_units import action_units
 from policy.contract import (
     ACTION_DIM,
     AGE,
@@ -42,13 +41,10 @@ copy them and not to look (de Haan et al., "Causal Confusion in Imitation Learni
 drifts off in flight, however small its error on the data."""
 HISTORY_NOISE = 0.1
 """Standard deviation of an offset on the sticks of a history, against the same."""
-RATES_HISTORY_NOISE = 1.0
 RATE_NOISE_RADPS = 1.5
-"""Where actions are body rates, the last ones, and the vehicle's own rates, which are these a
-moment later, tell an expert's next one far better than anything that is seen. Nets that could read
-them agreed with the expert where the expert flew (correlation 0.98), and hardly rolled where they
-flew themselves. These standard deviations, on the history and on the rates of the state, hide them.
-"""
+FORCE_NOISE_MPS2 = 5.0
+"""Standard deviations that hide body rates and specific force from a network that flies by rates:
+they are the last action a moment later, and copied like a history."""
 
 _BETWEEN_NS = 10 * NS_PER_S
 """Time between two flights on the common axis: far longer than every gap that is bridged."""
@@ -57,19 +53,15 @@ _BETWEEN_NS = 10 * NS_PER_S
 # In a mirror, the plane of the first and third axis of world and body, vectors change the sign of y
 # and rotations those of x and z. It holds in both state frames.
 _VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
-ACTION_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
-"""Factors of an action in a mirror: of throttle, yaw, pitch and roll; of thrust, roll, pitch and
-yaw. Velocities along the world's axes would need others."""
+STICK_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
+"""Factors of throttle, yaw, pitch and roll in a mirror."""
 GATE_SIGNS = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
 """Factors of ``FlightData.gate`` in a mirror."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """``B`` pairs of an image and a later tick: state [B, state_dim], history [B, K, 4], labels.
-
-    Actions are in ``policy.action_units``.
-    """
+    """``B`` pairs of an image and a later tick: state [B, state_dim], history [B, K, 4], labels."""
 
     state: FloatArray
     history: FloatArray
@@ -84,8 +76,8 @@ class Samples:
         """Exchange left and right where ``is_mirrored`` [B]."""
         return Samples(
             state=mirrored(self.state, state_signs(self.state.shape[1]), is_mirrored),
-            history=mirrored(self.history, ACTION_SIGNS, is_mirrored),
-            chunk=mirrored(self.chunk, ACTION_SIGNS, is_mirrored),
+            history=mirrored(self.history, STICK_SIGNS, is_mirrored),
+            chunk=mirrored(self.chunk, STICK_SIGNS, is_mirrored),
             known=self.known,
             gate=mirrored(self.gate, GATE_SIGNS, is_mirrored),
         )
@@ -105,6 +97,7 @@ class Timeline:
             DatasetError: not one image has a tick at any such age.
         """
         self.contract = contract
+        self.by_rates = contract.action == "rates"
         self._ages_ns = ages_ns
         starts, offsets = _starts_and_offsets(flights)
 
@@ -120,17 +113,15 @@ class Timeline:
         self._velocity_ns = stamps("velocity_ns")[known]
         self._velocity = Interpolator(self._velocity_ns, self._state[:, VELOCITY])
         self._target_ns = stamps("target_ns")
-        units, self.by_rates = action_units(contract), contract.action == "rates"
-        self._target = units.to_network(np.concatenate([flight.target for flight in flights]))
-        # Before its first action, a flight's actions were neutral.
+        self._target = np.concatenate([flight.target for flight in flights])
+        # Before its first stick, a flight's sticks were neutral.
         sent_ns = [
             np.concatenate([[start - NS_PER_S], flight.sent_ns + offset])
             for flight, offset, start in zip(flights, offsets, starts, strict=True)
         ]
         neutral = np.zeros((1, ACTION_DIM), np.float32)
         self._sent_ns = np.concatenate(sent_ns).astype(np.int64)
-        sent = [units.to_network(flight.sent) for flight in flights]
-        self._sent = np.concatenate([part for each in sent for part in (neutral, each)])
+        self._sent = np.concatenate([part for e in flights for part in (neutral, e.sent)])
         self.captured_ns = stamps("captured_ns")
         self.gate = np.concatenate([flight.gate for flight in flights]).reshape(-1, GATE_DIM)
         self._usable_ticks = np.flatnonzero(self.chunks(np.arange(len(self.tick_ns)))[1][:, 0])
@@ -178,8 +169,9 @@ class Timeline:
         chunk, known = self.chunks(ticks)
         state = self.states(frames, ticks)
         if random is not None and self.by_rates:
-            noise = random.normal(0.0, RATE_NOISE_RADPS, state[:, RATE].shape)
-            state[:, RATE] += noise.astype(np.float32)
+            for part, spread in ((RATE, RATE_NOISE_RADPS), (SPECIFIC_FORCE, FORCE_NOISE_MPS2)):
+                noise = random.normal(0.0, spread, state[:, part].shape)
+                state[:, part] += noise.astype(np.float32)
         return Samples(
             state=state,
             history=self.histories(ticks, random),
@@ -219,8 +211,7 @@ class Timeline:
         if random is None:
             return history
         samples = len(ticks)
-        spread = RATES_HISTORY_NOISE if self.by_rates else HISTORY_NOISE
-        offset = random.normal(0.0, spread, (samples, 1, ACTION_DIM))
+        offset = random.normal(0.0, HISTORY_NOISE, (samples, 1, ACTION_DIM))
         history = np.clip(history + offset, -1.0, 1.0).astype(np.float32)
         chance = random.random(samples)
         neutral = np.where(chance < FRESH_START_SHARE, random.integers(1, count + 1, samples), 0)

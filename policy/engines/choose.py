@@ -12,7 +12,6 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 
-from policy.action_units import action_units
 from policy.contract import FloatArray
 from policy.engines.executable import EngineName, ExecutionSettings, encode_all
 from policy.engines.kept import changes, modules_of, snapshot
@@ -82,9 +81,7 @@ def first_that_agrees(
     for label, make in candidates:
         try:
             executable = make()
-            reason = parity_failure(
-                expected, chunks_of_samples(executable, samples), action_units(policy.contract)
-            )
+            reason = parity_failure(expected, chunks_of_samples(executable, samples))
         except (PolicyError, RuntimeError, TypeError) as error:
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
         if reason is None:

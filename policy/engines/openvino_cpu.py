@@ -5,8 +5,6 @@ from collections.abc import Callable
 
 from torch import nn
 
-from policy.action_units import action_units
-from policy.contract import FloatArray
 from policy.engines.executable import (
     Act,
     ExecutionSettings,
@@ -79,33 +77,19 @@ def _segments(
     steps: int,
     unrolled: int,
 ) -> Callable[[int, int], Segment]:
-    """(first, count <= ``unrolled``) -> that part of a solve of ``steps``, in the contract's units.
+    """(first, count <= ``unrolled``) -> that part of a solve of ``steps``.
 
     One graph, and so one copy of the weights, runs them all: what tells the steps apart are inputs.
     """
-    units = action_units(policy.contract)
     denoise = compiler.compile(
         f"denoise {unrolled}", precision, lambda: denoise_graph(policy, unrolled)
     )
 
     def segment(first: int, count: int) -> Segment:
         films, updates = step_inputs(policy.head, steps, first, count, unrolled)
-        spans = policy.head.schedule.ddim_steps(steps)[first : first + count]
-
-        def run(
-            encoded: FloatArray, state: FloatArray, history: FloatArray, noisy: FloatArray
-        ) -> FloatArray:
-            made = denoise(
-                encoded,
-                egocentric(state, policy.contract),
-                units.to_network(history),
-                units.to_network(noisy, spans[0].signal),
-                films,
-                updates,
-            )
-            return units.from_network(made, spans[-1].next_signal)
-
-        return run
+        return lambda encoded, state, history, noisy: denoise(
+            encoded, egocentric(state, policy.contract), history, noisy, films, updates
+        )
 
     return segment
 

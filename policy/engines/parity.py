@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.action_units import SAME_UNITS, ActionUnits, action_units
 from policy.contract import (
     ACTION_DIM,
     QUATERNION,
@@ -18,9 +17,8 @@ from policy.preprocess import SINCE_EXPOSURE_SCALE
 
 MIN_COSINE = 0.999
 """Least cosine between the two chunks of a sample, taken as vectors."""
-MAX_ACTION_ERROR = 0.01
-"""Largest difference in ``policy.action_units``: of sticks 5 us of PWM on the usual 1000..2000 us,
-of a roll rate 0.04 rad/s."""
+MAX_STICK_ERROR = 0.01
+"""Largest difference in full deflections: 5 us of PWM on the usual 1000..2000 us."""
 SAMPLES = 4
 
 
@@ -49,9 +47,7 @@ def make_parity_samples(contract: Contract) -> ParitySamples:
     states = (SAMPLES, *contract.state_shape[:-1])
     parts = [random.normal(0.0, 2.0, (*states, STATE_DIM))]
     parts[0][..., QUATERNION] /= np.linalg.norm(parts[0][..., QUATERNION], axis=-1, keepdims=True)
-    units = action_units(contract)
     history = random.uniform(-1.0, 1.0, (SAMPLES, contract.history_len, ACTION_DIM))
-    history = np.array(units.neutral) + np.array(units.scale) * history
     if contract.since_exposure:
         since = random.uniform(-1.0, 1.0, (*states, SINCE_EXPOSURE_DIM)) * SINCE_EXPOSURE_SCALE
         since[..., 0] = np.abs(since[..., 0])
@@ -65,21 +61,18 @@ def make_parity_samples(contract: Contract) -> ParitySamples:
     )
 
 
-def parity_failure(
-    expected: FloatArray, chunks: FloatArray, units: ActionUnits = SAME_UNITS
-) -> str | None:
+def parity_failure(expected: FloatArray, chunks: FloatArray) -> str | None:
     """Why two arrays of chunks [samples, horizon, 4] are not the same policy, or None."""
-    expected, chunks = units.to_network(expected), units.to_network(chunks)
     if expected.shape != chunks.shape:
         return f"chunks of shape {list(chunks.shape)} instead of {list(expected.shape)}"
     if not np.isfinite(chunks).all():
         return "NaN or infinity in a chunk"
     furthest = float(np.abs(expected - chunks).max())
     cosine = min(_cosine(a, b) for a, b in zip(expected, chunks, strict=True))
-    if furthest <= MAX_ACTION_ERROR and cosine >= MIN_COSINE:
+    if furthest <= MAX_STICK_ERROR and cosine >= MIN_COSINE:
         return None
     return (
-        f"an action is off by {furthest:.4f} (at most {MAX_ACTION_ERROR}), the cosine is "
+        f"a stick is off by {furthest:.4f} (at most {MAX_STICK_ERROR}), the cosine is "
         f"{cosine:.5f} (at least {MIN_COSINE})"
     )
 

@@ -48,6 +48,7 @@ from policy.protocol import (
     WarmStartPolicy,
 )
 from policy.scripted.spec import IN_AIR, make_scripted
+from policy.stick_loop import by_rates, flown_by_rates
 
 
 def check_request(request: PolicyRequest) -> None:
@@ -61,6 +62,11 @@ def check_request(request: PolicyRequest) -> None:
     """
     kind, *options = request.spec.split(":")
     _require_flags_of_kind(kind, request)
+    if request.by_rates and kind not in BUILTIN_KINDS:
+        raise PolicyError(
+            f"--by-rates is for {' and '.join(BUILTIN_KINDS)}, whose sticks are known to the "
+            f"degree: {request.spec} flies by what its contract says"
+        )
     if kind == "scripted":
         _scripted(options, request, lambda: 0.0)
     elif kind in BUILTIN_KINDS:
@@ -103,7 +109,8 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
         return policy.contract
     checkpoint = builtin_checkpoint(request)
     contract = None if checkpoint is None else read_contract(checkpoint)
-    return contract or default_contract(request.image_size)
+    contract = contract or default_contract(request.image_size)
+    return by_rates(contract) if request.by_rates else contract
 
 
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
@@ -154,7 +161,11 @@ def _on_engine(
         head_steps=request.head_steps,
         dual_rate=dual_rate,
     )
-    return _executable(policy, request, settings)
+    executable, engine_notes = _executable(policy, request, settings)
+    is_ours = request.spec.partition(":")[0] in BUILTIN_KINDS
+    if is_ours and (request.by_rates or policy.contract.action == "rates"):
+        executable = flown_by_rates(executable)
+    return executable, engine_notes
 
 
 def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:

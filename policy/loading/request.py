@@ -40,6 +40,8 @@ class PolicyRequest:
     """Height and width that the policy takes; None leaves it to the contract."""
     seed: int = 0
     """Seed of untrained weights and of the flight's initial noise."""
+    by_rates: bool = False
+    """A network of ours that computes sticks flies by thrust and body rates."""
     starts_in_air: bool = False
     """The vehicle flies already when the policy takes over: a scripted program does not climb."""
 

@@ -1,11 +1,10 @@
-"""The diffusion action head: a condition vector in, a chunk of actions out."""
+"""The diffusion action head: a condition vector in, a chunk of stick positions out."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from policy.action_units import action_units
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule, ddim_solve
@@ -54,22 +53,13 @@ class DiffusionHead(nn.Module):
     The initial noise is fixed for a flight: the same inputs then give the same sticks, and chunks
     do not jitter from sample to sample. It is not part of a checkpoint.
 
-    Inside, actions are in ``policy.action_units``; ``sample``, ``denoise_steps`` and
-    ``initial_noise`` have the units of the contract. There a noisy chunk is
-    ``signal * action + noise * initial_noise``, and so it is where another solve is entered, as a
-    warm start does.
+    Steps that the schedule does not have raise a ``PolicyError``.
     """
 
     def __init__(self, size: Size, contract: Contract, schedule: NoiseSchedule) -> None:
         super().__init__()
         dims = size_dims(size)
         self.schedule = schedule
-        units = action_units(contract)
-        self._has_units = not units.is_identity
-        self._neutral: Tensor
-        self._scale: Tensor
-        self.register_buffer("_neutral", torch.tensor(units.neutral), persistent=False)
-        self.register_buffer("_scale", torch.tensor(units.scale), persistent=False)
         self.unet = UNet1d(
             horizon=contract.horizon, condition_dim=dims.base_dim, widths=dims.widths
         )
@@ -85,12 +75,7 @@ class DiffusionHead(nn.Module):
     def seed_noise(self, seed: int) -> None:
         """Draw the initial noise of a flight, the same for the same seed on every device."""
         generator = torch.Generator().manual_seed(seed)
-        noise = torch.randn(self.initial_noise.shape, generator=generator)
-        self.initial_noise.copy_(noise.to(self._scale.device) * self._scale)
-
-    def to_network(self, actions: Tensor) -> Tensor:
-        """Actions [..., 4] in the contract's units -> those of the network."""
-        return (actions - self._neutral) / self._scale if self._has_units else actions
+        self.initial_noise.copy_(torch.randn(self.initial_noise.shape, generator=generator))
 
     def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
         """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
@@ -114,7 +99,7 @@ class DiffusionHead(nn.Module):
         return chunk.reshape(condition.shape[0], -1, ACTION_DIM)
 
     def sample(self, condition: Tensor, num_diffusion_steps: int) -> Tensor:
-        """Condition [B, C] -> chunk [B, horizon, 4] in the contract's units."""
+        """Condition [B, C] -> chunk [B, horizon, 4] in [-1, 1]."""
         noise = self.initial_noise.expand(condition.shape[0], -1, -1)
         return self.denoise_steps(condition, noise, num_diffusion_steps, 0, num_diffusion_steps)
 
@@ -124,7 +109,7 @@ class DiffusionHead(nn.Module):
         """``count`` steps of a solve from step ``first`` on, bit for bit as within the whole one.
 
         ``noisy`` [B, horizon, 4] is what step ``first``, counted from 0, starts with; the condition
-        is [B, C]. Both it and the result are in the contract's units.
+        is [B, C].
         """
         steps = self.schedule.ddim_steps(num_diffusion_steps)
         if not 0 <= first < first + count <= num_diffusion_steps:
@@ -143,9 +128,4 @@ class DiffusionHead(nn.Module):
             prediction: Tensor = self.unet(noisy, film_of_step[index] + film_of_condition)
             return prediction + read
 
-        steps = steps[first : first + count]
-        if not self._has_units:
-            return ddim_solve(self.schedule, steps, denoise, noisy)
-        inside = (noisy - steps[0].signal * self._neutral) / self._scale
-        made = ddim_solve(self.schedule, steps, denoise, inside)
-        return self._scale * made + steps[-1].next_signal * self._neutral
+        return ddim_solve(self.schedule, steps[first : first + count], denoise, noisy)

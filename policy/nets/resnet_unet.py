@@ -61,10 +61,7 @@ class ResnetUnet(nn.Module):
         self.head.seed_noise(seed)
 
     def condition(self, visual: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Projected image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C].
-
-        The history is in the network's units.
-        """
+        """Projected image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C]."""
         parts = [visual, state_token, action_history.flatten(1)]
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition
@@ -72,7 +69,7 @@ class ResnetUnet(nn.Module):
     def predict(
         self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int = 10
     ) -> Tensor:
-        """Image, state and history -> chunk [B, horizon, 4].
+        """Image, state and history -> chunk [B, horizon, 4] in [-1, 1].
 
         Raises:
             PolicyError: a shape is not the contract's, or the steps are not 1..100.
@@ -82,6 +79,5 @@ class ResnetUnet(nn.Module):
         require_shape("state", state, contract.state_dim)
         require_shape("action_history", action_history, contract.history_len, ACTION_DIM)
         visual = self.visual_projection(self.backbone(image))
-        past = self.head.to_network(action_history)
-        condition = self.condition(visual, self.state_encoder(state), past)
+        condition = self.condition(visual, self.state_encoder(state), action_history)
         return self.head.sample(condition, num_diffusion_steps)

@@ -89,21 +89,17 @@ class Toge(nn.Module):
     ) -> Tensor:
         """Feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
 
-        No history is the same as neutral actions all the time: training shows both so.
+        No history is the same as sticks that were centred all the time: training shows both so.
         """
         require_shape("feature", feature, self.contract.feature_dim)
         require_shape("state", state, self.contract.state_dim)
-        past = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
-        if action_history is not None:
-            require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
-            past = self.head.to_network(action_history)
-        return self.condition(feature, self.state_encoder(state), past)
+        if action_history is None:
+            action_history = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
+        require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
+        return self.condition(feature, self.state_encoder(state), action_history)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C].
-
-        The history is in the network's units.
-        """
+        """Feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
         condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
         return condition
 
@@ -114,7 +110,7 @@ class Toge(nn.Module):
         action_history: Tensor | None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
-        """Cached feature, newest state and history -> chunk [B, horizon, 4]."""
+        """Cached feature, newest state and history -> chunk [B, horizon, 4] in [-1, 1]."""
         condition = self.encode_and_fuse(feature, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)
 

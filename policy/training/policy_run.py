@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.action_units import action_units
 from policy.checkpoints.policy_file import (
     BuiltinPolicy,
     build_policy,
@@ -108,7 +107,6 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         if not held:
             self.note("no flight is held out: the last weights will be kept, not the best")
         targets = np.concatenate([flight.target for flight in self._flights])
-        targets = action_units(network.contract).to_network(targets)
         for each in (self.trainee, self.average):
             each.set_sticks(targets)
         self._features: FeatureStore | None = None
@@ -328,8 +326,8 @@ def _training_card(
         },
         "state_mean": _by_name(np.nanmean(state, axis=0)),
         "state_std": _by_name(np.nanstd(state, axis=0)),
-        "action_mean": target.mean(axis=0).round(4).tolist(),
-        "action_std": target.std(axis=0).round(4).tolist(),
+        "stick_mean": target.mean(axis=0).round(4).tolist(),
+        "stick_std": target.std(axis=0).round(4).tolist(),
         "validation": position.kept,
     }
     return json.dumps(card, sort_keys=True)

@@ -157,7 +157,6 @@ def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
         visual = trainee.policy.visual_projection(trainee.encode(batch))
         steps = min(VALIDATION_STEPS, trainee.policy.config.schedule.num_train_timesteps)
         chunk = trainee.policy.head.sample(trainee.condition(visual, batch), steps).float()
-        chunk = trainee.policy.head.to_network(chunk)
         held = batch.history[:, -1:].expand_as(batch.chunk)
         guesses = (chunk, trainee.stick_mean.expand_as(batch.chunk), held)
         errors = [(guess - batch.chunk).abs()[batch.known].mean() for guess in guesses]

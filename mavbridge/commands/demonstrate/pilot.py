@@ -12,7 +12,6 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Action, BodyRates, Sticks
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight
-from policy.action_units import action_units
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.protocol import Executable
 from sitl.expert.demonstrator import Expert, RateExpert
@@ -26,10 +25,6 @@ STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
 """Least and most length of a turn. Where a student flies, the expert takes over now and then: a
 student that crashes at the first gate would otherwise learn nothing about the later ones (DAgger,
 Ross et al. 2011, mixes the two at random)."""
-MOST_APART = 0.3
-"""Largest difference from the expert, in ``policy.action_units``, with which a student flies on by
-body rates: within a second it would be upside down, where there is nothing to learn for a flight
-(SafeDAgger, Zhang and Cho 2017)."""
 SOLVES_KEPT = 64
 """Solves whose expert actions are kept until their ticks are recorded."""
 NOMINAL_SHARE = 0.25
@@ -106,7 +101,6 @@ class Pilot:
             strengths=RATE_STRENGTHS if self._by_rates else STICK_STRENGTHS,
         )
         self._turns = TurnSchedule(variation.seed)
-        self._units = action_units(contract)
         self._expert: Expert | RateExpert | None = None
         self._solves = 0
         self._expert_actions: dict[int, Action] = {}
@@ -148,11 +142,6 @@ class Pilot:
             return chunk
         # Called at every tick, also in the expert's turns: the student may hold state of its own.
         students = self._student.act(encoded, state, history, elapsed_s)
-        if self._by_rates:
-            wanted = np.array(self._expert_actions[self._solves], np.float32)
-            apart = self._units.to_network(students[0, 0]) - self._units.to_network(wanted)
-            if np.abs(apart).max() > MOST_APART:
-                self._turns.take_over(now_s)
         return students if self._turns.is_students(now_s) else chunk
 
     def _demonstrate(
@@ -201,12 +190,6 @@ class TurnSchedule:
             self._is_students = not self._is_students
             self._end_s += self._length_s()
         return self._is_students
-
-    def take_over(self, t_s: float) -> None:
-        """Begin a turn of the expert's now, if it is the student's."""
-        if self._is_students:
-            self._is_students = False
-            self._end_s = t_s + self._length_s()
 
     def _length_s(self) -> float:
         turn_s = STUDENT_TURN_S if self._is_students else EXPERT_TURN_S

@@ -20,6 +20,7 @@ from policy.data.flight_folders import find_flights, leave_out_failed, read_flig
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.engines.devices import require_devices
 from policy.loading.builtin import builtin_config
+from policy.stick_loop import rates_contract
 from policy.training.policy_run import Check, Network, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import TrainingStoppedError
@@ -77,11 +78,11 @@ def fit_to_flights(
         network.contract,
         state_frame=common_frame(flights),
         since_exposure=settings.since_exposure,
-        action=terms.action,
-        modes=(),  # the usual ones of these actions
         hover_thrust=terms.hover_thrust,
         max_tilt_deg=terms.max_tilt_deg,
     )
+    if terms.action == "rates":
+        contract = rates_contract(contract)
     return replace(network, contract=contract)
 
 

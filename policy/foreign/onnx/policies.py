@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from policy.action_units import action_units
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.engines.choose import chunks_of_samples
 from policy.engines.executable import (
@@ -203,7 +202,7 @@ def choose_precision(
             break
         try:
             candidate = executable_of(policy.graphs.at(vision, action), vision, action)
-            reason = parity_failure(expected, chunks(candidate), action_units(policy.contract))
+            reason = parity_failure(expected, chunks(candidate))
         except (PolicyError, RuntimeError) as error:
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
         if reason is None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from policy.contract import FloatArray
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
-from policy.data.samples import ACTION_SIGNS, mirrored, state_signs
+from policy.data.samples import STICK_SIGNS, mirrored, state_signs
 from policy.data.windows import Windows
 from policy.training.batches import VALIDATION_KEY, FeatureStore, next_of
 from policy.training.parallel import TensorBatch
@@ -145,7 +145,7 @@ class WindowBatches:
         arrays = {
             "latents": flat.reshape(count, length, *shape),
             "states": mirrored(samples.states, state_signs(samples.states.shape[-1]), is_mirrored),
-            "actions": mirrored(samples.actions, ACTION_SIGNS, is_mirrored),
+            "actions": mirrored(samples.actions, STICK_SIGNS, is_mirrored),
             "context_noise": sigma * drawn(config.context_frames, *shape),
             "latent_noise": drawn(config.frames, *shape),
             "motion_noise": drawn(config.frames, MOTION_DIM),

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from policy.contract import STATE_DIM, VELOCITY
-from policy.data.samples import ACTION_SIGNS, state_signs
+from policy.data.samples import STICK_SIGNS, state_signs
 from policy.data.windows import Windows
 from policy.training.batches import FeatureStore
 from policy.training.parallel import StepLoss
@@ -159,7 +159,7 @@ def set_scales(
     states, actions = torch.from_numpy(samples.states), torch.from_numpy(samples.actions)
     if mirrors:
         states = torch.cat([states, states * torch.from_numpy(state_signs(STATE_DIM))])
-        actions = torch.cat([actions, actions * torch.from_numpy(ACTION_SIGNS)])
+        actions = torch.cat([actions, actions * torch.from_numpy(STICK_SIGNS)])
     now = states[:, config.context_frames - 1 : config.context_frames]
     motion = motion_since(now, states[:, config.context_frames :])
     least = MIN_MOTION_STD * torch.tensor(MOTION_SCALE)

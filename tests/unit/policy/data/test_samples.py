@@ -13,10 +13,11 @@ from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy import rotation
-from policy.contract import QUATERNION, RATE, VELOCITY, Contract
+from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
 from policy.data.flight_data import ActionTerms, DatasetError, FlightData
 from policy.data.samples import (
     BLIND_SHARE,
+    FORCE_NOISE_MPS2,
     FRESH_START_SHARE,
     HISTORY_NOISE,
     RATE_NOISE_RADPS,
@@ -251,7 +252,7 @@ def test_a_mirrored_flight_is_a_flight() -> None:
 
 
 def test_what_tells_the_next_body_rate_without_looking_is_hidden_in_training() -> None:
-    """The history and the vehicle's own rates; nothing else of the state, and only for rates."""
+    """Rates and forces, nothing else of the state, and only for rates."""
     by_rates = Contract(since_exposure=True, horizon=4, action="rates")
     terms = ActionTerms("rates")
     ticks, frames = np.full(400, 60), np.full(400, 15)
@@ -263,9 +264,7 @@ def test_what_tells_the_next_body_rate_without_looking_is_hidden_in_training() -
         plain = timeline.samples(frames, ticks)
         trained = timeline.samples(frames, ticks, np.random.default_rng(1))
         change = trained.state - plain.state
-        expected = RATE_NOISE_RADPS if is_hidden else 0.0
-        assert change[:, RATE].std() == pytest.approx(expected, rel=0.1)
-        change[:, RATE] = 0.0
+        for part, spread in ((RATE, RATE_NOISE_RADPS), (SPECIFIC_FORCE, FORCE_NOISE_MPS2)):
+            assert change[:, part].std() == pytest.approx(spread if is_hidden else 0.0, rel=0.1)
+            change[:, part] = 0.0
         assert not change.any()
-        spread = (trained.history[:, -1] - plain.history[:, -1]).std()
-        assert (spread > 0.5) == is_hidden

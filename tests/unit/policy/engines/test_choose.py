@@ -14,7 +14,7 @@ from policy.engines.choose import Candidate, choose_executable, chunks_of_sample
 from policy.engines.executable import EngineName, ExecutionSettings
 from policy.engines.openvino_compile import precisions
 from policy.engines.openvino_cpu import make_openvino_executable
-from policy.engines.parity import MAX_ACTION_ERROR, make_parity_samples, parity_failure
+from policy.engines.parity import MAX_STICK_ERROR, make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
@@ -46,7 +46,7 @@ def failing(error: Exception) -> Candidate:
 
 def one_bad_stick(chunk: FloatArray) -> FloatArray:
     chunk = chunk.copy()
-    chunk[0, 7, 2] += 2 * MAX_ACTION_ERROR
+    chunk[0, 7, 2] += 2 * MAX_STICK_ERROR
     return chunk
 
 
@@ -57,8 +57,8 @@ def shifted(chunk: FloatArray) -> FloatArray:
 @pytest.mark.parametrize(
     ("alter", "reason"),
     [
-        (one_bad_stick, r"an action is off by 0\.02"),
-        (shifted, "an action is off by"),
+        (one_bad_stick, r"a stick is off by 0\.02"),
+        (shifted, "a stick is off by"),
         (np.zeros_like, r"the cosine is 0\.0"),
         (lambda chunk: np.full_like(chunk, np.nan), "NaN or infinity"),
         (lambda chunk: chunk[:, :8], r"chunks of shape \[8, 8, 4\]"),

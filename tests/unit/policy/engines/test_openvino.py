@@ -106,16 +106,6 @@ def test_segments_compute_what_a_whole_solve_on_torch_does(
     np.testing.assert_allclose(chunks, expected, atol=2e-3)
 
 
-@pytest.mark.parametrize("head_steps", [None, 2])
-def test_body_rates_leave_in_the_units_that_torch_gives_them(head_steps: int | None) -> None:
-    rates = replace(SMALL, action="rates", modes=(), hover_thrust=0.5)
-    policy = seeded(TogeConfig(backbone="resnet8", contract=rates))
-    settings = ExecutionSettings(name="toge", num_diffusion_steps=4, head_steps=head_steps)
-    expected, chunks = both(policy, settings)
-    assert np.abs(expected[..., 1:]).max() > 1.0  # rad/s: beyond what a stick can be
-    np.testing.assert_allclose(chunks, expected, atol=8e-3)
-
-
 def test_every_precision_of_this_cpu_is_near(
     trained_toge: Toge, warm_started: dict[tuple[Precision, Precision], Executable]
 ) -> None:

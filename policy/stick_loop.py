@@ -1,0 +1,230 @@
+"""Flies sticks by thrust and body rates: closes attitude and climb, at the action rate.
+
+This project's networks compute sticks, also where their contract says rates: the lean, yaw rate and
+climb that an autopilot's height-holding mode would be asked for, full stick by the contract. There
+the autopilot closes the loops that fly them; by rates, this does, from the newest state. So the
+image decides where to go, and the attitude never waits for it.
+
+A network that was trained on thrust and rates themselves copied the vehicle's own rates and flew
+into the first gates; see ``docs/LOG.md``.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from policy.contract import (
+    ACTION_DIM,
+    QUATERNION,
+    RATE,
+    VELOCITY,
+    Contract,
+    FloatArray,
+)
+from policy.errors import ContractError
+from policy.protocol import Executable
+from policy.rotation import Array, Quaternion, Vector, conjugate, matrix_columns, multiply, rotate
+
+GRAVITY_MPS2 = 9.80665
+TILT_GAIN_PER_S = 8.0
+"""Body rate for an error of the tilt; a fifth of what a rate loop of 20 ms can follow."""
+CLIMB_GAIN_PER_S = 4.0
+LAG_S = 0.06
+"""From a rate command to the rate: motors, and the loop before them."""
+MAX_TILT_RATE_RADPS = math.radians(200.0)
+UP_FORCE_MPS2 = (3.0, 21.0)
+"""Least and most vertical specific force."""
+MIN_COS_TILT = 0.35
+"""In a steeper lean the thrust no longer holds the height."""
+RATES_FULL_LEAN_DEG = 65.0
+RATES_FULL_YAW_RATE_DEGPS = 115.0
+RATES_FULL_CLIMB_MPS = 6.0
+"""What full stick means to a network that learns from flights by rates."""
+
+
+def by_rates(contract: Contract) -> Contract:
+    """Contract of a network that computes sticks, flown by thrust and body rates."""
+    return contract if contract.action == "rates" else replace(contract, action="rates", modes=())
+
+
+def rates_contract(contract: Contract) -> Contract:
+    """Contract of a network that learns from flights by rates."""
+    return replace(
+        by_rates(contract),
+        full_lean_deg=RATES_FULL_LEAN_DEG,
+        full_yaw_rate_degps=RATES_FULL_YAW_RATE_DEGPS,
+        full_climb_mps=RATES_FULL_CLIMB_MPS,
+        full_descent_mps=RATES_FULL_CLIMB_MPS,
+        lean_dead_zone=0.0,
+        yaw_dead_zone=0.0,
+        throttle_dead_zone=0.0,
+    )
+
+
+def flown_by_rates(executable: Executable) -> Executable:
+    """An executable whose chunks are sticks, flown by thrust and body rates.
+
+    Its network gets a history of centred sticks: what was sent are rates.
+
+    Raises:
+        ContractError: the state is not in ned_frd.
+    """
+    loop = StickLoop(by_rates(executable.contract))
+    centred = np.zeros((1, executable.contract.history_len, ACTION_DIM), np.float32)
+
+    def act(
+        encoded: FloatArray, state: FloatArray, _history: FloatArray, elapsed_s: float | None
+    ) -> FloatArray:
+        return loop.to_rates(executable.act(encoded, state, centred, elapsed_s), state)
+
+    return replace(executable, contract=loop.contract, act=act)
+
+
+@dataclass(frozen=True, slots=True)
+class StickLoop:
+    """From sticks to the thrust and body rates that fly them, and back.
+
+    Sticks are throttle, yaw, pitch, roll in [-1, 1], full stick by ``contract``; rates are thrust
+    in [0, 1] and roll, pitch, yaw rate in rad/s about FRD axes.
+
+    Raises:
+        ContractError: the state is not in ned_frd.
+    """
+
+    contract: Contract
+
+    def __post_init__(self) -> None:
+        """Refuse other axes."""
+        if self.contract.state_frame != "ned_frd":
+            raise ContractError(
+                "a network flies by rates with its state in ned_frd, not in "
+                f"{self.contract.state_frame}: train it on flights of mavbridge demonstrate"
+            )
+
+    def to_rates(self, sticks: FloatArray, state: FloatArray) -> FloatArray:
+        """Chunk of sticks [1, horizon, 4], state [1, state_dim] -> chunk of rates [1, horizon, 4].
+
+        Each action is for the attitude and climb that those before it bring about.
+        """
+        rates = np.empty_like(sticks)
+        numbers: list[float] = state[0].tolist()
+        w, x, y, z = numbers[QUATERNION]
+        p, q, r = numbers[RATE]
+        attitude = _turned((w, x, y, z), (p, q, r), LAG_S)
+        climb_mps = -numbers[VELOCITY][2]
+        dt_s, hover = self.contract.chunk_dt_s, self.contract.hover_thrust
+        for step, (throttle, yaw, pitch, roll) in enumerate(sticks[0].tolist()):
+            down_body: Vector = rotate(conjugate(attitude), (0.0, 0.0, 1.0))
+            up_mps2 = GRAVITY_MPS2 + CLIMB_GAIN_PER_S * (self._climb_mps(throttle) - climb_mps)
+            up_mps2 = min(max(up_mps2, UP_FORCE_MPS2[0]), UP_FORCE_MPS2[1])
+            thrust = hover * up_mps2 / (GRAVITY_MPS2 * max(down_body[2], MIN_COS_TILT))
+            wanted_body = rotate(conjugate(attitude), self._thrust_axis_ned(pitch, roll, attitude))
+            tilt_p, tilt_q = _tilt_rates(wanted_body)
+            yaw_rate = self._yaw_rate_radps(yaw)
+            rate = (
+                tilt_p + yaw_rate * down_body[0],
+                tilt_q + yaw_rate * down_body[1],
+                yaw_rate * down_body[2],
+            )
+            rates[0, step] = (min(thrust, 1.0), *rate)
+            attitude = _turned(attitude, rate, dt_s)
+            climb_mps += (up_mps2 - GRAVITY_MPS2) * dt_s
+        return rates
+
+    def to_sticks(self, rates: FloatArray, state: FloatArray) -> FloatArray:
+        """Single actions: rates [N, 4], states [N, state_dim] -> the sticks [N, 4] behind them.
+
+        What full stick cannot ask for is cut off.
+        """
+        contract = self.contract
+        attitude = np.stack(
+            _turned(tuple(state[:, QUATERNION].T), tuple(state[:, RATE].T), LAG_S), axis=-1
+        ).astype(np.float64)
+        down_body = rotate(conjugate(attitude), np.tile([0.0, 0.0, 1.0], (len(rates), 1)))
+        cos_tilt = np.maximum(down_body[:, 2], MIN_COS_TILT)
+        up_mps2 = rates[:, 0] / contract.hover_thrust * GRAVITY_MPS2 * cos_tilt
+        climb_mps = -state[:, VELOCITY.stop - 1] + (up_mps2 - GRAVITY_MPS2) / CLIMB_GAIN_PER_S
+        yaw_rate = rates[:, 3] / cos_tilt
+        tilt_p = rates[:, 1] - yaw_rate * down_body[:, 0]
+        tilt_q = rates[:, 2] - yaw_rate * down_body[:, 1]
+        # The inverse of _tilt_rates: the turn of the thrust's axis that takes such rates.
+        angle = np.hypot(tilt_p, tilt_q) / TILT_GAIN_PER_S
+        share = np.sinc(angle / np.pi) / TILT_GAIN_PER_S
+        wanted_body = np.stack([-share * tilt_q, share * tilt_p, -np.cos(angle)], axis=-1)
+        north, east, down = rotate(attitude, wanted_body).T
+        forward, _, _ = matrix_columns(*attitude.T)
+        heading = np.arctan2(forward[1], forward[0])
+        cosine, sine = np.cos(heading), np.sin(heading)
+        ahead, right = cosine * north + sine * east, cosine * east - sine * north
+        lean = np.arctan2(np.hypot(ahead, right), -down) / math.radians(contract.full_lean_deg)
+        per_length = lean / np.maximum(np.hypot(ahead, right), 1e-9)
+        full_climb = np.where(climb_mps > 0, contract.full_climb_mps, contract.full_descent_mps)
+        deflections = (
+            _deflection(climb_mps / full_climb, contract.throttle_dead_zone),
+            _deflection(
+                yaw_rate / math.radians(contract.full_yaw_rate_degps), contract.yaw_dead_zone
+            ),
+            _deflection(per_length * ahead, contract.lean_dead_zone),
+            _deflection(per_length * right, contract.lean_dead_zone),
+        )
+        return np.clip(np.stack(deflections, axis=-1), -1.0, 1.0).astype(np.float32)
+
+    def _climb_mps(self, throttle: float) -> float:
+        contract = self.contract
+        full = contract.full_climb_mps if throttle > 0 else contract.full_descent_mps
+        return full * _beyond(throttle, contract.throttle_dead_zone)
+
+    def _yaw_rate_radps(self, yaw: float) -> float:
+        contract = self.contract
+        return math.radians(contract.full_yaw_rate_degps) * _beyond(yaw, contract.yaw_dead_zone)
+
+    def _thrust_axis_ned(self, pitch: float, roll: float, attitude: Quaternion) -> Vector:
+        """Unit vector along the thrust of this lean, for the heading of the attitude."""
+        ahead = _beyond(pitch, self.contract.lean_dead_zone)
+        right = _beyond(roll, self.contract.lean_dead_zone)
+        length = math.hypot(ahead, right)
+        lean_rad = math.radians(self.contract.full_lean_deg) * min(length, 1.0)
+        share = math.sin(lean_rad) / max(length, 1e-9)
+        (north, east, _), _, _ = matrix_columns(*attitude)
+        level = max(math.hypot(north, east), 1e-9)
+        cosine, sine = north / level, east / level
+        return (
+            share * (cosine * ahead - sine * right),
+            share * (sine * ahead + cosine * right),
+            -math.cos(lean_rad),
+        )
+
+
+def _tilt_rates(wanted_body: Vector) -> tuple[float, float]:
+    """Roll and pitch rate that turn the thrust, along -z, to a unit vector, the shorter way round.
+
+    The tilt has a loop of its own, without the heading: where the thrust points matters more
+    (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude Control", 2018).
+    """
+    x, y, z = wanted_body
+    sine = math.hypot(x, y)
+    rate = min(TILT_GAIN_PER_S * math.atan2(sine, -z), MAX_TILT_RATE_RADPS)
+    share = rate / sine if sine > 1e-6 else TILT_GAIN_PER_S
+    return share * y, -share * x
+
+
+def _turned(attitude: Quaternion, rate: Vector, dt_s: float) -> Quaternion:
+    """The attitude after a turn at even body rates; floats, or arrays of them."""
+    half = dt_s / 2
+    turn = (1.0, half * rate[0], half * rate[1], half * rate[2])
+    w, x, y, z = multiply(attitude, turn)
+    length = (w * w + x * x + y * y + z * z) ** 0.5
+    return (w / length, x / length, y / length, z / length)
+
+
+def _beyond(stick: float, dead_zone: float) -> float:
+    """Share of full motion that a stick asks for."""
+    beyond = max(abs(stick) - dead_zone, 0.0) / (1.0 - dead_zone)
+    return math.copysign(min(beyond, 1.0), stick)
+
+
+def _deflection(share: Array, dead_zone: float) -> Array:
+    """The inverse; nothing is the centre."""
+    deflection: Array = np.sign(share) * (dead_zone + (1.0 - dead_zone) * np.abs(share))
+    return deflection

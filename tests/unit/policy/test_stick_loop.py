@@ -1,0 +1,191 @@
+"""Sticks flown by thrust and body rates: what they mean, and that they can be read back."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from policy.contract import Contract, FloatArray
+from policy.errors import ContractError
+from policy.protocol import Executable
+from policy.rotation import matrix_columns, multiply
+from policy.stick_loop import (
+    GRAVITY_MPS2,
+    MAX_TILT_RATE_RADPS,
+    StickLoop,
+    by_rates,
+    flown_by_rates,
+    rates_contract,
+)
+
+CONTRACT = rates_contract(Contract(hover_thrust=0.5))
+STICKS = by_rates(Contract(hover_thrust=0.5))
+"""Of a policy by sticks: with ArduPilot's dead zones."""
+
+
+def state(
+    lean_deg: float = 0.0, *, towards_deg: float = 0.0, heading_deg: float = 0.0, climb: float = 0.0
+) -> FloatArray:
+    """[1, 13]: leaning to a side of the nose, without rates."""
+    half, side = math.radians(lean_deg) / 2, math.radians(towards_deg)
+    turn = math.radians(heading_deg) / 2
+    # Towards the nose is nose down: a turn about minus the y axis.
+    lean = (
+        math.cos(half),
+        math.sin(half) * math.sin(side),
+        -math.sin(half) * math.cos(side),
+        0.0,
+    )
+    attitude = multiply((math.cos(turn), 0.0, 0.0, math.sin(turn)), lean)
+    return np.array([[0.0, 0.0, -climb, *attitude, *[0.0] * 6]], np.float32)
+
+
+def first_rates(loop: StickLoop, sticks: tuple[float, ...], at: FloatArray) -> list[float]:
+    chunk = np.tile(np.array(sticks, np.float32), (1, 16, 1))
+    return loop.to_rates(chunk, at)[0, 0].tolist()
+
+
+@pytest.mark.parametrize("contract", [CONTRACT, STICKS])
+def test_centred_sticks_hover(contract: Contract) -> None:
+    rates = first_rates(StickLoop(contract), (0.0, 0.0, 0.0, 0.0), state())
+    assert rates == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sticks", "axis", "sign"),
+    [
+        ((0.5, 0.0, 0.0, 0.0), 0, 1),  # throttle up: more thrust
+        ((-0.5, 0.0, 0.0, 0.0), 0, -1),
+        ((0.0, 0.5, 0.0, 0.0), 3, 1),  # nose right
+        ((0.0, 0.0, 0.5, 0.0), 2, -1),  # stick forward: nose down
+        ((0.0, 0.0, 0.0, 0.5), 1, 1),  # right: roll right
+    ],
+)
+@pytest.mark.parametrize("heading_deg", [0.0, 130.0])
+def test_each_stick_moves_its_own_axis(
+    sticks: tuple[float, ...], axis: int, sign: int, heading_deg: float
+) -> None:
+    still = np.array([0.5, 0.0, 0.0, 0.0])
+    rates = np.array(first_rates(StickLoop(CONTRACT), sticks, state(heading_deg=heading_deg)))
+    change = rates - still
+    assert sign * change[axis] > 0.1
+    assert np.abs(np.delete(change, axis)).max() < 1e-5
+
+
+def test_yaw_and_lean_are_those_of_full_stick() -> None:
+    loop = StickLoop(STICKS)
+    full_turn = first_rates(loop, (0.0, 1.0, 0.0, 0.0), state())
+    assert math.degrees(full_turn[3]) == pytest.approx(202.5)
+    leaning = state(STICKS.full_lean_deg, towards_deg=90.0)
+    assert first_rates(loop, (0.0, 0.0, 0.0, 1.0), leaning)[1] == pytest.approx(0.0, abs=1e-3)
+    inside = first_rates(loop, (0.0, 0.04, 0.04, 0.04), state())
+    assert inside == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=1e-6)
+
+
+def test_a_lean_keeps_the_height_and_a_climb_ends_at_its_speed() -> None:
+    loop = StickLoop(CONTRACT)
+    stick = 40.0 / CONTRACT.full_lean_deg
+    leaning = first_rates(loop, (0.0, 0.0, stick, 0.0), state(40.0))
+    assert leaning[0] == pytest.approx(0.5 / math.cos(math.radians(40.0)), rel=1e-3)
+    assert leaning[1:] == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
+    climbing = first_rates(loop, (0.5, 0.0, 0.0, 0.0), state(climb=3.0))
+    assert climbing[0] == pytest.approx(0.5, rel=1e-4)
+
+
+def test_a_turn_in_a_lean_is_about_the_worlds_vertical() -> None:
+    loop, leaning = StickLoop(CONTRACT), state(50.0)
+    rates = first_rates(loop, (0.0, 0.5, 50.0 / CONTRACT.full_lean_deg, 0.0), leaning)
+    w, x, y, z = (float(part) for part in leaning[0, 3:7])
+    columns = np.array(matrix_columns(w, x, y, z)).T
+    world = columns @ rates[1:]
+    assert np.degrees(world) == pytest.approx([0.0, 0.0, 0.5 * 115.0], abs=0.5)
+
+
+def test_a_chunk_ends_where_its_sticks_point() -> None:
+    """Each action counts on those before it: held sticks turn the attitude, and then rest."""
+    loop, stick = StickLoop(CONTRACT), 0.5
+    chunk = np.tile(np.array([0.0, 0.0, 0.0, stick], np.float32), (1, 16, 1))
+    rates = loop.to_rates(chunk, state())[0]
+    rolled_deg = math.degrees(rates[:, 1].sum() * CONTRACT.chunk_dt_s)
+    assert rolled_deg == pytest.approx(stick * CONTRACT.full_lean_deg, rel=0.01)
+    assert abs(rates[-1, 1]) < 0.05
+
+
+def test_no_stick_asks_for_more_than_a_vehicle_has() -> None:
+    loop, random = StickLoop(CONTRACT), np.random.default_rng(0)
+    for _ in range(50):
+        at = state(*random.uniform(0, 170, 1), towards_deg=random.uniform(0, 360), climb=-20.0)
+        rates = loop.to_rates(random.uniform(-1, 1, (1, 16, 4)).astype(np.float32), at)
+        assert np.isfinite(rates).all()
+        assert 0.0 < rates[..., 0].min() <= rates[..., 0].max() <= 1.0
+        tilting = np.hypot(rates[0, 0, 1], rates[0, 0, 2])
+        assert tilting <= MAX_TILT_RATE_RADPS + math.radians(115.0) + 1e-6
+
+
+@pytest.mark.parametrize("contract", [CONTRACT, STICKS])
+def test_sticks_are_read_back_from_the_rates_that_flew_them(contract: Contract) -> None:
+    loop, random = StickLoop(contract), np.random.default_rng(1)
+    for _ in range(200):
+        lean_deg, towards = random.uniform(0, 30), random.uniform(-math.pi, math.pi)
+        at = state(lean_deg, towards_deg=math.degrees(towards), heading_deg=random.uniform(0, 360))
+        at[0, 7:10] = random.uniform(-1, 1, 3)
+        share = (lean_deg + random.uniform(-8, 8)) / contract.full_lean_deg
+        lean = max(share, 0.1)
+        sticks = np.array(
+            [
+                *random.choice([-0.24, 0.24], 1),
+                random.uniform(0.1, 0.9),
+                *(np.clip(lean, 0.1, 0.9) * np.array([math.cos(towards), math.sin(towards)])),
+            ],
+            np.float32,
+        )
+        beyond = np.abs(sticks) > contract.lean_dead_zone  # inside, nothing tells them apart
+        rates = loop.to_rates(sticks[None, None], at)[0]
+        back = loop.to_sticks(rates, at)[0]
+        np.testing.assert_allclose(back[beyond], sticks[beyond], atol=1e-3)
+        assert np.abs(back[~beyond]).max(initial=0.0) <= contract.lean_dead_zone + 1e-3
+
+
+def test_rates_beyond_full_stick_are_cut_off() -> None:
+    loop = StickLoop(CONTRACT)
+    rates = np.array([[1.0, 30.0, 0.0, 9.0], [0.0, 0.0, 0.0, 0.0]], np.float32)
+    sticks = loop.to_sticks(rates, np.repeat(state(climb=9.0), 2, axis=0))
+    assert sticks[0].tolist()[:2] == [1.0, 1.0]
+    assert np.abs(sticks).max() <= 1.0
+
+
+def test_the_policy_flies_its_own_network_by_rates() -> None:
+    given: list[FloatArray] = []
+
+    def act(
+        _encoded: FloatArray, _state: FloatArray, history: FloatArray, _e: object
+    ) -> FloatArray:
+        given.append(history)
+        return np.full((1, 16, 4), 0.5, np.float32)
+
+    sticks = Executable(
+        contract=Contract(),
+        name="sticks",
+        engine="numpy",
+        dual_rate=True,
+        encode=lambda _rgb, _camera=0: np.zeros((1, 1), np.float32),
+        act=act,
+    )
+    flown = flown_by_rates(sticks)
+    assert flown.contract.action == "rates"
+    assert flown.contract.modes == ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")
+    chunk = flown.act(np.zeros((1, 1), np.float32), state(), np.ones((1, 4, 4), np.float32), None)
+    expected = StickLoop(flown.contract).to_rates(np.full((1, 16, 4), 0.5, np.float32), state())
+    np.testing.assert_array_equal(chunk, expected)
+    assert not given[0].any()  # what was sent are rates: the network sees centred sticks
+
+
+def test_other_axes_are_refused() -> None:
+    with pytest.raises(ContractError, match="not in enu_flu"):
+        StickLoop(replace(CONTRACT, state_frame="enu_flu"))
+
+
+def test_hover_is_what_the_contract_says() -> None:
+    falling = first_rates(StickLoop(CONTRACT), (0.0, 0.0, 0.0, 0.0), state(climb=-1.0))
+    assert falling[0] == pytest.approx(0.5 * (GRAVITY_MPS2 + 4.0) / GRAVITY_MPS2, rel=1e-5)
