@@ -1,12 +1,15 @@
 """Where two rates pay: one loop that waits for the encoder, beside a fast loop that does not.
 
-python -m benchmarks.two_rates --episodes 50 --json map.json --plot map.png --rates WEIGHTS
+python -m benchmarks.two_rates --episodes 50 --json map.json --plot map.png
 
 For each time that an image takes to encode, the same courses are flown by a single loop, which runs
 as often as the encoder and the action head let it, and at two rates: as many images a second as the
 encoder makes, and 100 or 250 actions a second from the newest state. Each cell is a ``mavbridge
 evaluate`` of its own. Cells that the JSON holds for the same weights and as many episodes are not
 flown again: an interrupted map resumes.
+
+The weights by sticks fly their courses twice: where the autopilot closes attitude and climb, and by
+body rates, where the policy does. So what differs is who closes them, and nothing else.
 """
 
 import math
@@ -28,7 +31,7 @@ from mavbridge.commands.output import (
     require_outputs,
     table_console,
 )
-from policy.loading.builtin import SHIPPED
+from policy.loading.builtin import SHIPPED, SHIPPED_RATES
 
 Loop = Literal["one rate", "100 actions a second", "250 actions a second"]
 LOOPS: tuple[Loop, ...] = ("one rate", "100 actions a second", "250 actions a second")
@@ -44,18 +47,15 @@ app = App(help=__doc__)
 
 
 class Control(NamedTuple):
-    """What is controlled, over which courses, and how chunks are sampled at two rates."""
+    """What is controlled, and over which courses."""
 
     name: str
     flags: str
-    sampling: str
 
 
-STICKS = Control("sticks in ALT_HOLD, easy courses", "--courses easy", "--head-steps 2")
-RATES = Control(
-    "body rates, race courses", "--courses race", "--head-steps 0 --num-diffusion-steps 1"
-)
-"""Without a warm start, which holds on to its last chunk: in ALT_HOLD that costs nothing."""
+STICKS = Control("sticks in ALT_HOLD, easy courses", "--courses easy")
+BY_RATES = Control("the same weights by body rates", "--courses easy --by-rates")
+RACES = Control("body rates, race courses", "--courses race")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ def main(
     workers: int = 2,
     loops: tuple[Loop, ...] = LOOPS,
     sticks: Path = SHIPPED,
-    rates: Path | None = None,
+    rates: Path = SHIPPED_RATES,
 ) -> None:
     """Evaluate what has not been evaluated yet, then print and draw.
 
@@ -100,15 +100,13 @@ def main(
         workers: episodes at a time.
         loops: which loops to fly.
         sticks: weights by sticks.
-        rates: weights by body rates; without them only sticks are flown.
+        rates: weights that learned from races by body rates.
     """
     require_outputs(json, plot)
     known = [Cell(**one) for one in loads(json.read_text())] if json.exists() else []
     cells = {cell.key: cell for cell in known if cell.episodes == episodes}
     shown = []
-    for control, weights in ((STICKS, sticks), (RATES, rates)):
-        if weights is None:
-            continue
+    for control, weights in ((STICKS, sticks), (BY_RATES, sticks), (RACES, rates)):
         for encoder_ms in ENCODER_MS:
             for loop in loops:
                 key = (control.name, loop, encoder_ms, sha256(weights))
@@ -122,15 +120,14 @@ def main(
         draw(shown, plot)
 
 
-def flags_of(control: Control, loop: Loop, encoder_ms: int) -> str:
+def flags_of(loop: Loop, encoder_ms: int) -> str:
     """Flags of ``mavbridge evaluate`` for a loop beside such an encoder."""
     images_hz = min(CAMERA_HZ, 1000 / encoder_ms)
     if loop == "one rate":
         rate_hz = min(MOST_HZ, 1000 / (encoder_ms + HEAD_MS))
         return f"--single-rate --rate {rate_hz:.4g} --visual-rate {max(CAMERA_HZ, rate_hz):.4g}"
     action_hz = loop.partition(" ")[0]
-    rates = f"--visual-rate {images_hz:.4g} --action-rate {action_hz}"
-    return f"--dual-rate {control.sampling} {rates}"
+    return f"--dual-rate --visual-rate {images_hz:.4g} --action-rate {action_hz}"
 
 
 def evaluate(
@@ -141,7 +138,7 @@ def evaluate(
     Raises:
         subprocess.CalledProcessError: the evaluation failed, and printed why.
     """
-    loop_flags = flags_of(control, loop, encoder_ms)
+    loop_flags = flags_of(loop, encoder_ms)
     flags = f"{control.flags} {loop_flags} --vision-time {encoder_ms} {LOOSE}"
     flags += f" --episodes {episodes} --max-time 45"
     flown = fly(flags, weights, workers)

@@ -20,14 +20,14 @@ class PolicyConfig:
     """The policy, its weights, and what runs it."""
 
     policy: str = "toge"
-    """toge[:small|medium|large[:BACKBONE]], resnet-unet; your own class, ./file.py:Class or
-    package.module:Class; lerobot:DIR, onnx:DIR, torchscript:FILE; ws://HOST:PORT, a server
-    (mavbridge serve, openpi's); or
+    """toge[:small|medium|large[:BACKBONE]], toge-rates, resnet-unet; your own class,
+    ./file.py:Class or package.module:Class; lerobot:DIR, onnx:DIR, torchscript:FILE;
+    ws://HOST:PORT, a server (mavbridge serve, openpi's); or
     scripted[:hover|square|circle|yaw|doublet][:sticks|attitude|rates|velocity][:air], air: the
     vehicle flies already, so do not climb first. docs/policies.md has the details."""
     checkpoint: Path | None = None
-    """Weights: .safetensors with the contract in its header, .pt or .ckpt; toge has shipped ones. A
-    class of yours is made as Class(checkpoint=path)."""
+    """Weights: .safetensors with the contract in its header, .pt or .ckpt; toge and
+    toge-rates have shipped ones. A class of yours is made as Class(checkpoint=path)."""
     contract: Path | None = None
     """TOML file that says what the files of a policy trained elsewhere do not: rate, names, units,
     camera; mavbridge contract writes a first draft."""
@@ -84,5 +84,5 @@ class PolicyConfig:
         """DDIM steps of a warm start; None: every solve starts from noise."""
         if self.head_steps is not None:
             return self.head_steps or None
-        is_warm = self.may_be_dual and self.kind == "toge"
+        is_warm = self.may_be_dual and self.kind in ("toge", "toge-rates")
         return WARM_STEPS if is_warm and self.num_diffusion_steps > WARM_STEPS else None

@@ -11,17 +11,15 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 from policy.contract import Contract
-from policy.loading.builtin import SHIPPED
+from policy.loading.builtin import BUILTIN_KINDS, shipped_weights
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
 
 NO_IMAGE_ADVICE = "looks at no image: --camera none does without"
-STATELESS = ("toge", "resnet-unet", "onnx")
+STATELESS = (*BUILTIN_KINDS, "onnx")
 FILE_KINDS = ("lerobot", "onnx", "torchscript")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
 """Of the files of a policy's folder."""
-SEEING = ("toge", "resnet-unet")
-"""Nets of ours: all of them fly by their images."""
 
 
 def load_configured_policy(
@@ -70,8 +68,9 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
 def policy_files(wanted: PolicyConfig) -> list[Path]:
     """The files that make the policy what it is: weights, contract, graphs, a user's code."""
     files = [path for path in (wanted.checkpoint, wanted.contract) if path is not None]
-    if wanted.kind == "toge" and not files and not wanted.allow_untrained:
-        files.append(SHIPPED)
+    shipped = shipped_weights(wanted.policy)
+    if shipped is not None and wanted.checkpoint is None and not wanted.allow_untrained:
+        files.append(shipped)
     named = wanted.policy.partition(":")[2] if wanted.kind in FILE_KINDS else wanted.kind
     path = Path(named).expanduser()
     if path.is_dir() and wanted.kind in FILE_KINDS:
@@ -91,13 +90,13 @@ def looks_at_images(config: FlyConfig) -> bool:
 
     Without a camera a policy of the user's is taken at its user's word; our own nets need images.
     """
-    is_blind = _has_no_camera(config) and config.policy.kind not in SEEING
+    is_blind = _has_no_camera(config) and config.policy.kind not in BUILTIN_KINDS
     return not is_blind and not is_scripted(config.policy)
 
 
 def require_images(config: FlyConfig) -> None:
     """Refuse to fly a net of ours without a camera; raises UserError."""
-    if config.policy.kind in SEEING and _has_no_camera(config):
+    if config.policy.kind in BUILTIN_KINDS and _has_no_camera(config):
         raise UserError(
             f"--camera none: {config.policy.policy} flies by its images, so name its camera; "
             "scripted programs, and policies of yours that look at no image, fly without one"

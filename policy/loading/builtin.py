@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
 """Flown by ``toge`` where no other weights are named; its card is beside it."""
-BUILTIN_KINDS = ("toge", "resnet-unet")
+SHIPPED_RATES = SHIPPED.with_name("toge-rates.safetensors")
+"""The same of ``toge-rates``, by thrust and body rates."""
+BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 
 def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
@@ -44,19 +46,25 @@ def builtin_checkpoint(request: PolicyRequest) -> Path | None:
     """The weights of a network of ours; None where random ones will do."""
     if request.checkpoint is not None or request.allow_untrained:
         return request.checkpoint
-    if request.spec == "toge" and SHIPPED.is_file():
-        return SHIPPED
+    shipped = shipped_weights(request.spec)
+    if shipped is not None and shipped.is_file():
+        return shipped
     raise PolicyError(
         f"{request.spec} needs trained weights: give --checkpoint FILE, or --allow-untrained for "
         "seeded random ones (timing and bring-up), or fly --policy scripted"
     )
 
 
+def shipped_weights(spec: str) -> Path | None:
+    """The weights that ship for a spec; None where none do."""
+    return {"toge": SHIPPED, "toge-rates": SHIPPED_RATES}.get(spec)
+
+
 def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | None]:
     """Size and backbone that a spec asks for; a checkpoint that says more overrules them."""
     rest: list[Any] = list(options)
     size: Size = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
-    if len(rest) > (1 if kind == "toge" else 0):
+    if len(rest) > (0 if kind == "resnet-unet" else 1):
         raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {FORMS}")
     if rest and rest[0] not in BACKBONE_NAMES:
         raise PolicyError(
@@ -72,7 +80,7 @@ def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinCo
 
     size, backbone = parse_builtin(kind, options)
     contract = default_contract(image_size)
-    if kind == "toge":
+    if kind != "resnet-unet":
         return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
     return ResnetUnetConfig(size=size, contract=contract)
 

@@ -12,6 +12,7 @@ from helpers.pilots import steady
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
+from policy.stick_loop import flown_by_rates
 from sitl.rotation import cos_tilt
 from sitl.vehicle.dynamics import BodyState
 
@@ -31,7 +32,7 @@ class Moved:
     """The sticks, as the policy hears of them."""
 
 
-def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0) -> Moved:
+def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0, is_by_rates: bool = False) -> Moved:
     """What a vehicle does after six seconds of climbing and three of ``STICKS``."""
     flight = SimulatedFlight(
         course_seed=3,
@@ -56,7 +57,8 @@ def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0) -> Moved:
             seen.append(flight.vehicle.ap.truth)
 
     flight.watch_steps(watch)
-    assert flight.fly(steady(sticks), max_time_s=FLOWN_S, sinks=(sink,)).outcome == "timed out"
+    policy = flown_by_rates(steady(sticks)) if is_by_rates else steady(sticks)
+    assert flight.fly(policy, max_time_s=FLOWN_S, sinks=(sink,)).outcome == "timed out"
     sent = [tick.sent for tick in sink.ticks if tick.trace is not None and tick.sent is not None]
     return Moved(
         climb_mps=-float(np.mean([body.velocity_ned_mps[2] for body in seen])),
@@ -83,3 +85,14 @@ def test_sticks_mean_the_same_to_every_vehicle(vehicle: dict[str, Any], trained:
     # The copter of the training sinks 0.05 m/s faster than its contract says, for RC3_DZ.
     assert mapped.climb_mps == pytest.approx(trained.climb_mps, abs=0.07)
     assert mapped.sent == pytest.approx(STICKS, abs=0.01)
+
+
+@pytest.mark.parametrize(("autopilot", "climb_mps"), [("ardupilot", 0.1), ("px4", 0.3)])
+def test_by_rates_the_policy_flies_them_as_the_autopilot_does(
+    autopilot: str, climb_mps: float, trained: Moved
+) -> None:
+    """Its climb has no integral: PX4's airframe, whose drag pushes up in a lean, sinks less."""
+    by_policy = moved(autopilot=autopilot, is_by_rates=True)
+    assert by_policy.lean_deg == pytest.approx(trained.lean_deg, abs=0.7)
+    assert by_policy.yaw_rate_degps == pytest.approx(trained.yaw_rate_degps, rel=0.05)
+    assert by_policy.climb_mps == pytest.approx(trained.climb_mps, abs=climb_mps)

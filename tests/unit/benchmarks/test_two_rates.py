@@ -7,9 +7,10 @@ import pytest
 
 from benchmarks import two_rates
 from benchmarks.two_rates import (
+    BY_RATES,
     ENCODER_MS,
     LOOPS,
-    RATES,
+    RACES,
     STICKS,
     Cell,
     Control,
@@ -35,39 +36,40 @@ def made(control: Control, loop: Loop, encoder_ms: int, weights: Path, episodes:
 
 
 def test_a_single_loop_waits_for_its_encoder_and_two_rates_do_not() -> None:
-    assert "--single-rate --rate 18.52" in flags_of(STICKS, "one rate", 50)
-    assert "--single-rate --rate 100 " in flags_of(STICKS, "one rate", 5)
-    assert "--visual-rate 20 --action-rate 100" in flags_of(RATES, "100 actions a second", 50)
-    assert "--visual-rate 30 --action-rate 250" in flags_of(RATES, "250 actions a second", 5)
-    assert "--head-steps 2" in flags_of(STICKS, "100 actions a second", 5)
-    assert "--head-steps 0" in flags_of(RATES, "100 actions a second", 5)
+    assert "--single-rate --rate 18.52" in flags_of("one rate", 50)
+    assert "--single-rate --rate 100 " in flags_of("one rate", 5)
+    assert "--visual-rate 20 --action-rate 100" in flags_of("100 actions a second", 50)
+    assert "--visual-rate 30 --action-rate 250" in flags_of("250 actions a second", 5)
 
 
 def test_an_interrupted_map_resumes_and_other_weights_begin_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, weights, flown = tmp_path / "map.json", tmp_path / "rates.safetensors", []
+    out, flown = tmp_path / "map.json", []
+    weights, races = tmp_path / "sticks.safetensors", tmp_path / "rates.safetensors"
     weights.write_text("weights")
+    races.write_text("weights of races")
 
     def evaluate(
         control: Control, loop: Loop, encoder_ms: int, weights: Path, episodes: int, _workers: int
     ) -> Cell:
         if len(flown) == most:
             raise KeyboardInterrupt
-        flown.append((loop, encoder_ms))
+        flown.append((control, loop, encoder_ms))
         return made(control, loop, encoder_ms, weights, episodes)
 
     monkeypatch.setattr(two_rates, "evaluate", evaluate)
     most = 4
     with pytest.raises(KeyboardInterrupt):
-        two_rates.main(json=out, sticks=weights)
+        two_rates.main(json=out, sticks=weights, rates=races)
     most = 1000
-    two_rates.main(json=out, sticks=weights)
-    assert flown == [(loop, ms) for ms in ENCODER_MS for loop in LOOPS]
+    two_rates.main(json=out, sticks=weights, rates=races)
+    controls = (STICKS, BY_RATES, RACES)
+    assert flown == [(each, loop, ms) for each in controls for ms in ENCODER_MS for loop in LOOPS]
     assert len(json.loads(out.read_text())) == len(flown)
-    weights.write_text("other weights")
-    two_rates.main(json=out, sticks=weights)
-    assert len(flown) == 2 * len(ENCODER_MS) * len(LOOPS)
+    races.write_text("other weights")
+    two_rates.main(json=out, sticks=weights, rates=races)
+    assert len(flown) == 4 * len(ENCODER_MS) * len(LOOPS)
 
 
 def test_the_figure_shows_every_cell(tmp_path: Path) -> None:
@@ -76,7 +78,7 @@ def test_the_figure_shows_every_cell(tmp_path: Path) -> None:
     weights.write_text("")
     cells = [
         made(control, loop, ms, weights, 50)
-        for control in (STICKS, RATES)
+        for control in (STICKS, BY_RATES, RACES)
         for ms in ENCODER_MS
         for loop in LOOPS
     ]

@@ -1,5 +1,7 @@
+import copy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,11 @@ import torch
 from policy.checkpoints.policy_file import build_policy, save_checkpoint
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.loading.load import check_request, load_policy
+from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge
+from policy.stick_loop import StickLoop, by_rates, rates_contract
 
 RGB = np.full((48, 64, 3), 90, np.uint8)
 STATE = np.eye(1, 13, 3, dtype=np.float32)
@@ -211,11 +214,36 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("json.decoder:Nothing", {}, "no class Nothing"),
         ("policy:Mine", {}, "a file of that name flies by its path: --policy ./policy.py:Mine"),
         ("json.decoder:FLAGS", {}, "no class FLAGS"),
+        ("scripted:yaw", {"by_rates": True}, "--by-rates is for toge"),
     ],
 )
 def test_refusals_say_what_to_do(spec: str, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(PolicyError, match=message):
         load(spec, **changes)
+
+
+def test_sticks_are_flown_by_rates_where_that_is_asked_for(checkpoint: Path) -> None:
+    sticks = load("toge", checkpoint=checkpoint)
+    rates = load("toge", checkpoint=checkpoint, by_rates=True)
+    contract = rates.executable.contract
+    assert contract == by_rates(sticks.executable.contract)
+    request = PolicyRequest(spec="toge", checkpoint=checkpoint, by_rates=True)
+    assert read_policy_contract(request) == contract
+    flown = StickLoop(contract).to_rates(act(sticks), STATE)
+    np.testing.assert_allclose(act(rates), flown, atol=1e-6)
+
+
+def test_weights_that_learned_from_rates_are_flown_by_them(
+    small_toge: Toge, tmp_path: Path
+) -> None:
+    network = copy.deepcopy(small_toge)
+    network.contract = rates_contract(network.contract)
+    network.config = replace(network.config, contract=network.contract)
+    path = tmp_path / "rates.safetensors"
+    save_checkpoint(path, network)
+    loaded = load("toge", checkpoint=path)
+    assert loaded.executable.contract.action == "rates"
+    assert act(loaded)[0, 0, 0] == pytest.approx(0.39, abs=0.25)  # a thrust about hover
 
 
 @pytest.mark.parametrize(
