@@ -87,7 +87,7 @@ def test_sticks_mean_the_same_to_every_vehicle(vehicle: dict[str, Any], trained:
     assert mapped.sent == pytest.approx(STICKS, abs=0.01)
 
 
-@pytest.mark.parametrize(("autopilot", "climb_mps"), [("ardupilot", 0.1), ("px4", 0.3)])
+@pytest.mark.parametrize(("autopilot", "climb_mps"), [("ardupilot", 0.15), ("px4", 0.3)])
 def test_by_rates_the_policy_flies_them_as_the_autopilot_does(
     autopilot: str, climb_mps: float, trained: Moved
 ) -> None:
