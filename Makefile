@@ -4,13 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 PORT ?= 14550
-COURSE ?= 1000007
-DURATION ?= 60
 POLICY ?= toge
+# toge-rates flies races.
+COURSE ?= $(if $(filter toge-rates,$(POLICY)),1001000007,1000007)
+DURATION ?= 60
 # Flags of mavbridge for this flight, as in FLAGS="--takeoff 5".
 FLAGS ?=
 # Firmware of the simulated vehicle: ardupilot or px4.
 AUTOPILOT ?= ardupilot
+# ArduPilot takes the thrust of body rates for a climb rate without this.
+BY_RATES := $(if $(filter toge-rates/ardupilot,$(POLICY)/$(AUTOPILOT)),--set GUID_OPTIONS=8)
 SOAK_MINUTES ?= 60
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
@@ -40,7 +43,7 @@ fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy 
 		--camera shm:fpv-$(PORT) --course $(COURSE) --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --policy $(POLICY) \
-		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(FLAGS) \
+		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(BY_RATES) $(FLAGS) \
 		--rerun out/flight.rrd --gates out/gates.json --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
 	echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \

@@ -125,10 +125,12 @@ class AttitudeOutput(SetpointOutput):
             raise CommandRefusedError(f"{action} is not finite, or its thrust not in [0, 1]")
         if self._scale is None or self._sent_ns is None or now_ns - self._sent_ns > _PAUSE_NS:
             self._scale = self._thrust_scale(vehicle)
-        scale = self._scale
-        if isinstance(action, BodyRates) and vehicle.profile.boosts_thrust(vehicle.known_params):
-            scale *= self._cos_tilt
-        shown: Shown = (round(min(scale * action.thrust, 1.0) * THRUST_UNITS),)
+        is_boosted = isinstance(action, BodyRates) and vehicle.profile.boosts_thrust(
+            vehicle.known_params
+        )
+        boost = self._cos_tilt if is_boosted else 1.0
+        scale = self._scale * boost
+        shown: Shown = (round(min(self._scale * action.thrust, 1.0) * boost * THRUST_UNITS),)
         is_checked = shown[0] > 0  # idle motors are left idle
         if is_checked and not self._shows_rates:
             shown = self.echo.with_nudge(shown, now_ns)

@@ -100,7 +100,8 @@ class ArduPilot(Profile):
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
         """Calibration, and what decides how safe a flight is."""
         names = ardupilot_params.calibration_names(values)
-        return (*names, *ardupilot_params.RISK_NAMES, "GUID_OPTIONS", "MOT_THST_HOVER")
+        thrust_names = ("GUID_OPTIONS", "ATC_ANGLE_BOOST", "MOT_THST_HOVER")
+        return (*names, *ardupilot_params.RISK_NAMES, *thrust_names)
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration:
         """RCMAP_* and RCn_*."""
