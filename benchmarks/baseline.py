@@ -121,7 +121,7 @@ class Baseline:
 
     @torch.no_grad()
     def _sample(self, feature: torch.Tensor, state: np.ndarray) -> list[float]:
-        history, steps = torch.from_numpy(self._history), self._job.policy.num_diffusion_steps
+        history, steps = torch.from_numpy(self._history), self._job.policy.steps
         chunk = self._net.predict_fast(feature, torch.from_numpy(state), history, steps)
         action: list[float] = chunk[0, 0].tolist()
         return action

@@ -59,7 +59,7 @@ def time_rooflines(policies: Sequence[PolicyConfig]) -> tuple[EngineTiming, ...]
 
 def works_of(policy: PolicyConfig) -> Iterator[tuple[str, Work]]:
     """Encoding an image; and a full solve: the condition once, the U-Net once a step."""
-    net, steps = eager_toge(policy), policy.num_diffusion_steps
+    net, steps = eager_toge(policy), policy.steps
     contract = net.contract
     image = torch.zeros(1, 3, contract.image_height, contract.image_width)
     yield (

@@ -55,7 +55,7 @@ class Control(NamedTuple):
 
 STICKS = Control("sticks in ALT_HOLD, easy courses", "--courses easy")
 BY_RATES = Control("the same weights by body rates", "--courses easy --by-rates")
-RACES = Control("body rates, race courses", "--courses race")
+RACES = Control("body rates, race courses", "--courses race --policy toge-rates")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +139,8 @@ def evaluate(
         subprocess.CalledProcessError: the evaluation failed, and printed why.
     """
     loop_flags = flags_of(loop, encoder_ms)
-    flags = f"{control.flags} {loop_flags} --vision-time {encoder_ms} {LOOSE}"
+    flags = f"{control.flags} {loop_flags} --num-diffusion-steps 1"
+    flags += f" --vision-time {encoder_ms} {LOOSE}"
     flags += f" --episodes {episodes} --max-time 45"
     flown = fly(flags, weights, workers)
     return Cell(

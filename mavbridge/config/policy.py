@@ -11,6 +11,8 @@ from mavbridge.config.groups import POLICY, RARE
 
 WARM_STEPS = 2
 """Of toge, as it ships: ten steps from noise for each chunk are too slow for two cores."""
+STEPS, RATES_STEPS = 10, 1
+"""DDIM steps from noise: of most policies, and of toge-rates, which flies as well in one."""
 Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 
 
@@ -36,8 +38,8 @@ class PolicyConfig:
     ] = None
     """Encode images in their own thread and sample actions faster from the cached feature; by
     default wherever the policy can (encode_visual and predict_fast)."""
-    num_diffusion_steps: int = 10
-    """DDIM steps of the action head."""
+    num_diffusion_steps: Annotated[int | None, Parameter(show_default=False)] = None
+    """DDIM steps of the action head: by default 10, and 1 for toge-rates."""
     head_steps: int | None = None
     """Warm start at two rates: DDIM steps from the last chunk, shifted to now, in place of all
     steps from noise; by default 2 for toge, and none for other policies; 0 = every solve from
@@ -62,9 +64,9 @@ class PolicyConfig:
 
     def __post_init__(self) -> None:
         """Refuse what the scheduler and encoders cannot serve."""
-        check_range("num-diffusion-steps", self.num_diffusion_steps, 1, 100, "steps")
+        check_range("num-diffusion-steps", self.steps, 1, 100, "steps")
         if self.head_steps is not None:
-            check_range("head-steps", self.head_steps, 0, self.num_diffusion_steps, "steps")
+            check_range("head-steps", self.head_steps, 0, self.steps, "steps")
         if self.image_size is not None:
             check_range("image-size", self.image_size, 32, 1024, "pixels")
         check_range("seed", self.seed, 0, 2**63 - 1, "")
@@ -80,9 +82,16 @@ class PolicyConfig:
         return self.dual_rate is not False and self.kind != "resnet-unet"
 
     @property
+    def steps(self) -> int:
+        """DDIM steps from noise."""
+        if self.num_diffusion_steps is not None:
+            return self.num_diffusion_steps
+        return RATES_STEPS if self.kind == "toge-rates" else STEPS
+
+    @property
     def warm_steps(self) -> int | None:
         """DDIM steps of a warm start; None: every solve starts from noise."""
         if self.head_steps is not None:
             return self.head_steps or None
-        is_warm = self.may_be_dual and self.kind in ("toge", "toge-rates")
-        return WARM_STEPS if is_warm and self.num_diffusion_steps > WARM_STEPS else None
+        is_warm = self.may_be_dual and self.kind == "toge"
+        return WARM_STEPS if is_warm and self.steps > WARM_STEPS else None

@@ -57,7 +57,7 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
         vision_device=wanted.vision_device,
         action_device=wanted.action_device,
         dual_rate=wanted.dual_rate is not False,
-        num_diffusion_steps=wanted.num_diffusion_steps,
+        num_diffusion_steps=wanted.steps,
         head_steps=wanted.warm_steps,
         by_rates=wanted.by_rates,
         image_size=wanted.image_size,

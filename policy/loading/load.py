@@ -153,16 +153,23 @@ def _on_engine(
             f"warning: --head-steps {request.head_steps} is not used: it takes two rates and a "
             "policy with denoise_fast, such as toge; every solve is a full one"
         )
+    is_ours = request.spec.partition(":")[0] in BUILTIN_KINDS
+    head_steps = request.head_steps
+    if is_ours and policy.contract.action == "rates" and head_steps is not None:
+        head_steps = None
+        notes.append(
+            "every solve is a full one: weights that learned from body rates hold on to the last "
+            "chunk in a warm start"
+        )
     settings = ExecutionSettings(
         name=request.spec,
         vision_device=request.vision_device or request.device,
         action_device=request.action_device or request.device,
         num_diffusion_steps=request.num_diffusion_steps,
-        head_steps=request.head_steps,
+        head_steps=head_steps,
         dual_rate=dual_rate,
     )
     executable, engine_notes = _executable(policy, request, settings)
-    is_ours = request.spec.partition(":")[0] in BUILTIN_KINDS
     if is_ours and (request.by_rates or policy.contract.action == "rates"):
         executable = flown_by_rates(executable)
     return executable, engine_notes

@@ -20,6 +20,7 @@ from mavbridge.core.errors import UserError
         ({"head_steps": 3}, True, 3),
         ({"num_diffusion_steps": 2}, True, None),  # a warm start of all steps saves nothing
         ({"policy": "resnet-unet"}, False, None),
+        ({"policy": "toge-rates"}, True, None),
         ({"policy": "./mine.py:Mine"}, True, None),
         ({"policy": "./mine.py:Mine", "head_steps": 2}, True, 2),
     ],
@@ -27,6 +28,12 @@ from mavbridge.core.errors import UserError
 def test_defaults(changes: dict[str, Any], is_dual: bool, warm_steps: int | None) -> None:
     config = PolicyConfig(**changes)
     assert (config.may_be_dual, config.warm_steps) == (is_dual, warm_steps)
+
+
+def test_steps_from_noise_are_those_that_the_weights_fly_best_with() -> None:
+    assert PolicyConfig().steps == 10
+    assert PolicyConfig(policy="toge-rates").steps == 1
+    assert PolicyConfig(policy="toge-rates", num_diffusion_steps=4).steps == 4
 
 
 def test_a_warm_start_has_no_more_steps_than_a_solve() -> None:
