@@ -23,12 +23,21 @@ NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 OWN = "--num-diffusion-steps 1"
 """A student that flies to be corrected is sampled in one step: it leaves the time to the expert."""
 
+RACES, PX4 = "--action rates --courses race", "--autopilot px4"
+AGES = "--ages 10:120"
+
 
 class Step(NamedTuple):
     """One command, and the file or folder that it makes in ``--out``."""
 
     makes: str
     command: str
+
+
+def race_of(makes: str, student: str, flags: str) -> Step:
+    """A student's own races, labelled by the expert."""
+    own = f"{OWN} --checkpoint {student}.safetensors"
+    return Step(makes, f"demonstrate {flags} --speed 9 {RACES} {own}")
 
 
 STEPS: dict[str, tuple[Step, ...]] = {
@@ -50,11 +59,30 @@ STEPS: dict[str, tuple[Step, ...]] = {
             "--pack",
         ),
     ),
+    "toge-rates": (
+        Step("races", f"demonstrate --episodes 100 --seed 3 --speed 9.5 {RACES}"),
+        Step("races_px4", f"demonstrate --episodes 30 --seed 4 --speed 9 {RACES} {PX4}"),
+        Step("first.safetensors", f"train races races_px4 {NET} --minutes 45 {AGES}"),
+        race_of("own1", "first", "--episodes 54 --seed 11"),
+        race_of("own1_px4", "first", f"--episodes 14 --seed 12 {PX4}"),
+        Step(
+            "second.safetensors",
+            f"train races races_px4 own1 own1_px4 {NET} --minutes 22 {AGES} "
+            "--start-from first.safetensors",
+        ),
+        race_of("own2", "second", "--episodes 44 --seed 13"),
+        race_of("own2_px4", "second", f"--episodes 20 --seed 14 {PX4}"),
+        Step(
+            "toge-rates.safetensors",
+            f"train races races_px4 own1 own1_px4 own2 own2_px4 {NET} --minutes 22 {AGES} "
+            "--start-from second.safetensors --pack",
+        ),
+    ),
 }
 
 
 @app.default
-def main(policy: Literal["toge"], *, out: Path, workers: int = 2) -> None:
+def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) -> None:
     """Run every step that has not been done yet.
 
     Args:
