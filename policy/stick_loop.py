@@ -28,7 +28,7 @@ from policy.rotation import Array, Quaternion, Vector, conjugate, matrix_columns
 
 GRAVITY_MPS2 = 9.80665
 TILT_GAIN_PER_S = 8.0
-"""Body rate for an error of the tilt; a fifth of what a rate loop of 20 ms can follow."""
+"""Body rate for an error of the tilt; the gain of the expert that demonstrates."""
 CLIMB_GAIN_PER_S = 4.0
 LAG_S = 0.06
 """From a rate command to the rate: motors, and the loop before them."""
