@@ -18,6 +18,9 @@ HELD_OUT_COURSE_SEED = 1_000_000
 MAX_EPISODES = 10_000
 """Most episodes of one evaluation, so that another seed has other courses."""
 
+MAX_EVALUATION_SEED = (RACE_COURSE_SEED - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
+"""From the next on, easy courses of an evaluation would be races, some of them trained on."""
+
 
 def first_seed(courses: CourseKind) -> int:
     """Seed 0 of a family."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from mavbridge.config.checks import check_range
-from mavbridge.config.courses import MAX_EPISODES, AutopilotKind, CourseKind
+from mavbridge.config.courses import MAX_EPISODES, MAX_EVALUATION_SEED, AutopilotKind, CourseKind
 from mavbridge.config.flight import Limits
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
@@ -71,6 +71,7 @@ class EvaluateConfig:
         if self.vision_time is not None:
             check_range("vision-time", self.vision_time, 0, 5000, "ms")
         check_range("gains", self.gains, 0.2, 2.5, "")
+        check_range("seed", self.policy.seed, 0, MAX_EVALUATION_SEED, "")
         if self.gains != 1 and (self.is_wall_clock or self.autopilot != "ardupilot"):
             raise UserError("--gains needs --clock simulated and --autopilot ardupilot")
         if self.is_wall_clock and (self.vision_delay or self.vision_time is not None):
