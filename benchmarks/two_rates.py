@@ -187,6 +187,7 @@ def draw(cells: list[Cell], path: Path) -> None:
             axes.set_xscale("log")
             axes.set_xticks(ENCODER_MS, [str(ms) for ms in ENCODER_MS])
             axes.minorticks_off()
+            axes.set_xlim(0.85 * ENCODER_MS[0], 1.18 * ENCODER_MS[-1])
             axes.set_ylim(-3, 103)
             axes.set_xlabel("ms to encode an image")
             axes.set_title(f"{name}: courses flown, %, 95 %")
