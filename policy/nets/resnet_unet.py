@@ -38,7 +38,10 @@ class ResnetUnetConfig:
 
 
 class ResnetUnet(nn.Module):
-    """The policy protocol of ``protocol.SingleRatePolicy``, on torch tensors."""
+    """The policy protocol of ``protocol.SingleRatePolicy``, on torch tensors.
+
+    Chunks are sticks, also where the contract says rates: ``policy.stick_loop`` flies them so.
+    """
 
     def __init__(self, config: ResnetUnetConfig) -> None:
         super().__init__()
