@@ -56,8 +56,8 @@ class Toge(nn.Module):
     """The policy protocol of ``protocol.DualRatePolicy``, on torch tensors.
 
     Images are normalised by ``preprocess.image_to_input``, states are in SI units. A shape that is
-    not the contract's, or steps that the schedule does not have, raise a ``PolicyError``. Chunks are
-    sticks, also where the contract says rates: ``policy.stick_loop`` flies them so.
+    not the contract's, or steps that the schedule does not have, raise a ``PolicyError``.
+    Chunks are sticks, also where the contract says rates: ``policy.stick_loop`` flies them so.
     """
 
     def __init__(self, config: TogeConfig) -> None:
