@@ -26,6 +26,7 @@ SAFE: dict[str, float] = {
     "FS_THR_ENABLE": 1.0,
     "FS_OPTIONS": 16.0,
     "GUID_OPTIONS": 0.0,
+    "ATC_ANGLE_BOOST": 1.0,
     "MOT_THST_HOVER": 0.39,
     "GUID_TIMEOUT": 3.0,
     "RC7_OPTION": 0.0,

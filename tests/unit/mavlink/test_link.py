@@ -41,6 +41,7 @@ PARAMS = CALIBRATION | {
     "RC_OPTIONS": 0.0,
     "FS_THR_ENABLE": 1.0,
     "GUID_OPTIONS": 0.0,
+    "ATC_ANGLE_BOOST": 1.0,
     "MOT_THST_HOVER": 0.39,
 }
 
