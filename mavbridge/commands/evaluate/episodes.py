@@ -7,9 +7,10 @@ import json
 import multiprocessing
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from subprocess import Popen
+from subprocess import Popen, TimeoutExpired
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES, first_s
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.rates import SIM_CAMERA_PX
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from mavbridge.core.errors import MavbridgeError, PeerError
+from mavbridge.core.errors import CameraError, MavbridgeError, PeerError
 from mavbridge.core.processes import END_TIMEOUT_S, end, free_port, running, wait
 from mavbridge.flight.app import fly_executable
 from mavbridge.flight.policies import is_scripted, load_configured_policy, load_for_episodes
@@ -116,6 +117,13 @@ class _BridgeJob(NamedTuple):
     camera: str
 
 
+class _BridgeFlight(NamedTuple):
+    engine: str
+    meter: StickMeter
+    camera_failure: str
+    """Empty where there was none; the vehicle takes its camera with it when the course is done."""
+
+
 def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEpisode:
     """Fly one episode in real time.
 
@@ -137,19 +145,29 @@ def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> Flo
         )
         with running(*command, log=log) as vehicle:
             try:
-                engine, meter = _run_bridge(_BridgeJob(spec, port, camera), vehicle, should_stop)
+                flown = _run_bridge(_BridgeJob(spec, port, camera), vehicle, should_stop)
+                if flown.camera_failure:
+                    _require_ended(vehicle, flown.camera_failure)
             except MavbridgeError:
                 if vehicle.poll():  # then the vehicle's failure is the reason
                     wait(vehicle, "python -m sitl", log, END_TIMEOUT_S)
                 raise
             end(vehicle)
             wait(vehicle, "python -m sitl", log, END_TIMEOUT_S)
-        return FlownEpisode(engine=engine, result=_read_result(spec, meter, report))
+        return FlownEpisode(engine=flown.engine, result=_read_result(spec, flown.meter, report))
+
+
+def _require_ended(vehicle: "Popen[bytes]", camera_failure: str) -> None:
+    """Raise CameraError if the vehicle goes on without its camera."""
+    with suppress(TimeoutExpired):
+        vehicle.wait(END_TIMEOUT_S)
+    if vehicle.poll() is None:
+        raise CameraError(camera_failure)
 
 
 def _run_bridge(
     job: _BridgeJob, vehicle: "Popen[bytes]", should_stop: Callable[[], bool]
-) -> tuple[str, StickMeter]:
+) -> _BridgeFlight:
     """Run the bridge in a process of its own until it or the vehicle has ended."""
     clock, spec = MonotonicClock(), job.spec
     deadline_ns = clock.now_ns() + round((spec.config.max_time + STARTUP_S) * NS_PER_S)
@@ -171,7 +189,7 @@ def _run_bridge(
     return raise_failure(outcome)
 
 
-def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> tuple[str, StickMeter]:
+def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> _BridgeFlight:
     """Fly once, as ``mavbridge fly`` does; ended by signals, like that."""
     settings, clock, meter = job.spec.config, MonotonicClock(), StickMeter()
     with (
@@ -194,8 +212,11 @@ def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> tuple[str, StickMeter
             duration=settings.max_time,
         )
         console = Console(file=nowhere)
-        fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))
-    return executable.engine, meter
+        try:
+            fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))
+        except CameraError as error:
+            return _BridgeFlight(executable.engine, meter, str(error))
+    return _BridgeFlight(executable.engine, meter, "")
 
 
 def _read_result(spec: EpisodeSpec, meter: StickMeter, path: Path) -> EpisodeResult:
