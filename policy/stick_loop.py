@@ -11,6 +11,7 @@ into the first gates; see ``docs/LOG.md``.
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,6 +42,29 @@ RATES_FULL_LEAN_DEG = 65.0
 RATES_FULL_YAW_RATE_DEGPS = 115.0
 RATES_FULL_CLIMB_MPS = 6.0
 """What full stick means to a network that learns from flights by rates."""
+
+
+class StickMotion(NamedTuple):
+    """Motion that sticks ask for; leans are forwards and to the right."""
+
+    climb_mps: float
+    yaw_rate_radps: float
+    forward_rad: float
+    right_rad: float
+
+
+def motion_of_sticks(
+    contract: Contract, throttle: float, yaw: float, pitch: float, roll: float
+) -> StickMotion:
+    """Motion that sticks in [-1, 1] ask for, by full stick and dead zones of the contract."""
+    climb = _beyond(throttle, contract.throttle_dead_zone)
+    lean_rad = math.radians(contract.full_lean_deg)
+    return StickMotion(
+        climb * (contract.full_climb_mps if climb > 0 else contract.full_descent_mps),
+        math.radians(contract.full_yaw_rate_degps) * _beyond(yaw, contract.yaw_dead_zone),
+        lean_rad * _beyond(pitch, contract.lean_dead_zone),
+        lean_rad * _beyond(roll, contract.lean_dead_zone),
+    )
 
 
 def by_rates(contract: Contract) -> Contract:
@@ -114,14 +138,16 @@ class StickLoop:
         attitude = _turned((w, x, y, z), (p, q, r), LAG_S)
         climb_mps = -numbers[VELOCITY][2]
         dt_s, hover = self.contract.chunk_dt_s, self.contract.hover_thrust
-        for step, (throttle, yaw, pitch, roll) in enumerate(sticks[0].tolist()):
-            down_body: Vector = rotate(conjugate(attitude), (0.0, 0.0, 1.0))
-            up_mps2 = GRAVITY_MPS2 + CLIMB_GAIN_PER_S * (self._climb_mps(throttle) - climb_mps)
+        for step, positions in enumerate(sticks[0].tolist()):
+            wanted = motion_of_sticks(self.contract, *positions)
+            body_from_ned: Quaternion = conjugate(attitude)
+            down_body: Vector = rotate(body_from_ned, (0.0, 0.0, 1.0))
+            up_mps2 = GRAVITY_MPS2 + CLIMB_GAIN_PER_S * (wanted.climb_mps - climb_mps)
             up_mps2 = min(max(up_mps2, UP_FORCE_MPS2[0]), UP_FORCE_MPS2[1])
             thrust = hover * up_mps2 / (GRAVITY_MPS2 * max(down_body[2], MIN_COS_TILT))
-            wanted_body = rotate(conjugate(attitude), self._thrust_axis_ned(pitch, roll, attitude))
-            tilt_p, tilt_q = _tilt_rates(wanted_body)
-            yaw_rate = self._yaw_rate_radps(yaw)
+            axis_body = rotate(body_from_ned, self._thrust_axis_ned(wanted, attitude))
+            tilt_p, tilt_q = _tilt_rates(axis_body)
+            yaw_rate = wanted.yaw_rate_radps
             rate = (
                 tilt_p + yaw_rate * down_body[0],
                 tilt_q + yaw_rate * down_body[1],
@@ -170,22 +196,12 @@ class StickLoop:
         )
         return np.clip(np.stack(deflections, axis=-1), -1.0, 1.0).astype(np.float32)
 
-    def _climb_mps(self, throttle: float) -> float:
-        contract = self.contract
-        full = contract.full_climb_mps if throttle > 0 else contract.full_descent_mps
-        return full * _beyond(throttle, contract.throttle_dead_zone)
-
-    def _yaw_rate_radps(self, yaw: float) -> float:
-        contract = self.contract
-        return math.radians(contract.full_yaw_rate_degps) * _beyond(yaw, contract.yaw_dead_zone)
-
-    def _thrust_axis_ned(self, pitch: float, roll: float, attitude: Quaternion) -> Vector:
+    def _thrust_axis_ned(self, wanted: StickMotion, attitude: Quaternion) -> Vector:
         """Unit vector along the thrust of this lean, for the heading of the attitude."""
-        ahead = _beyond(pitch, self.contract.lean_dead_zone)
-        right = _beyond(roll, self.contract.lean_dead_zone)
-        length = math.hypot(ahead, right)
-        lean_rad = math.radians(self.contract.full_lean_deg) * min(length, 1.0)
-        share = math.sin(lean_rad) / max(length, 1e-9)
+        length_rad = math.hypot(wanted.forward_rad, wanted.right_rad)
+        lean_rad = min(length_rad, math.radians(self.contract.full_lean_deg))
+        share = math.sin(lean_rad) / max(length_rad, 1e-9)
+        ahead, right = wanted.forward_rad, wanted.right_rad
         (north, east, _), _, _ = matrix_columns(*attitude)
         level = max(math.hypot(north, east), 1e-9)
         cosine, sine = north / level, east / level
@@ -219,7 +235,7 @@ def _turned(attitude: Quaternion, rate: Vector, dt_s: float) -> Quaternion:
 
 
 def _beyond(stick: float, dead_zone: float) -> float:
-    """Share of full motion that a stick asks for."""
+    """Share of full motion that a stick asks for, with its sign."""
     beyond = max(abs(stick) - dead_zone, 0.0) / (1.0 - dead_zone)
     return math.copysign(min(beyond, 1.0), stick)
 

@@ -15,6 +15,7 @@ from mavbridge.observe.viewer.columns import Columns
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.observe.viewer.motion import Motion
 from policy.contract import Contract
+from policy.stick_loop import motion_of_sticks
 
 GRAVITY_MPS2 = 9.81
 _STEEPEST_RAD = math.radians(80)
@@ -72,31 +73,15 @@ def planned_path(
                 velocity[:2] = _turned(velocity[0], velocity[1], yaw_rad)
             yaw_rad += action.yaw_rate_radps * step_s
         elif isinstance(action, Sticks):
-            roll_rad, pitch_rad, climb_mps, yaw_rate_radps = _meaning(action, contract)
-            yaw_rad += yaw_rate_radps * step_s
-            velocity[:2] += (_lean_mps2(roll_rad, pitch_rad, yaw_rad) + beyond_mps2) * step_s
-            velocity[2] = -climb_mps
+            wanted = motion_of_sticks(contract, *action)
+            yaw_rad += wanted.yaw_rate_radps * step_s
+            lean_mps2 = _lean_mps2(wanted.right_rad, -wanted.forward_rad, yaw_rad)
+            velocity[:2] += (lean_mps2 + beyond_mps2) * step_s
+            velocity[2] = -wanted.climb_mps
         else:
             return None
         path.append(path[-1] + velocity * step_s)
     return np.array(path)
-
-
-def _meaning(sticks: Sticks, contract: Contract) -> tuple[float, float, float, float]:
-    """Roll, pitch (+ nose up), climb in m/s and yaw rate that these sticks ask for."""
-    lean_rad = math.radians(contract.full_lean_deg)
-    climb = _beyond(sticks.throttle, contract.throttle_dead_zone)
-    return (
-        _beyond(sticks.roll, contract.lean_dead_zone) * lean_rad,
-        -_beyond(sticks.pitch, contract.lean_dead_zone) * lean_rad,
-        climb * (contract.full_climb_mps if climb > 0 else contract.full_descent_mps),
-        math.radians(_beyond(sticks.yaw, contract.yaw_dead_zone) * contract.full_yaw_rate_degps),
-    )
-
-
-def _beyond(stick: float, dead_zone: float) -> float:
-    """Share of the travel beyond the dead zone, with the stick's sign."""
-    return math.copysign(max(0.0, min(abs(stick), 1.0) - dead_zone) / (1 - dead_zone), stick)
 
 
 def _lean_mps2(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float64]:
