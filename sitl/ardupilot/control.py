@@ -2,7 +2,7 @@
 
 import math
 
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import DEFAULT_RATE_P, Params
 from sitl.rotation import (
     IDENTITY,
     Quat,
@@ -19,7 +19,8 @@ from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
 
 RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
-"""With a 28 ms motor lag 18/s keeps the rate loop at a damping ratio of about 0.7."""
+"""At the default gains. With a 28 ms motor lag 18/s keeps the rate loop at a damping ratio of about
+0.7."""
 MIN_INPUT_TIME_S = 0.01
 MAX_TARGET_LEAD_RAD = math.radians(30.0)
 """In rate mode the target may run ahead of the vehicle by this much before it is pulled back."""
@@ -27,6 +28,7 @@ MOTOR_LAG_S = 0.028
 CATCH_UP_PER_S = 1.0
 YAW_GAIN_PER_S = 6.0
 YAW_LAG_S = 0.1
+_RATE_GAINS = ("ATC_RAT_RLL_P", "ATC_RAT_PIT_P")
 _ANGLE_GAINS = ("ATC_ANG_RLL_P", "ATC_ANG_PIT_P", "ATC_ANG_YAW_P")
 
 
@@ -118,8 +120,11 @@ class AttitudeController:
         self._target_rate_radps = feedforward_radps
         error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), attitude))
         gains = [self._params[name] for name in _ANGLE_GAINS]
+        roll_share, pitch_share = (self._params[name] / DEFAULT_RATE_P for name in _RATE_GAINS)
+        shares = (roll_share, pitch_share, 1.0)
         ax, ay, az = (
-            RATE_GAIN_PER_S[k]
+            shares[k]
+            * RATE_GAIN_PER_S[k]
             * (feedforward_radps[k] + gains[k] * error[k] - body.rate_body_radps[k])
             for k in range(3)
         )

@@ -16,6 +16,15 @@ from sitl.vehicle.config import ArduPilotRelease
 
 RC_CHANNELS_WITH_PARAMS = 8
 
+
+def _float32(value: float) -> float:
+    """Round as the wire does; raises OverflowError beyond its range."""
+    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
+    return float(rounded)
+
+
+DEFAULT_RATE_P = _float32(0.135)
+"""Gain of the loop from body rates to torque, roll and pitch."""
 _FIXED = {
     "ACRO_BAL_PITCH": 1.0,
     "ACRO_BAL_ROLL": 1.0,
@@ -97,6 +106,8 @@ def _varied(conditions: Conditions) -> dict[str, float]:
         "ATC_ANG_RLL_P": roll_gain,
         "ATC_ANG_YAW_P": yaw_gain,
         "ATC_INPUT_TC": conditions.input_time_s,  # s
+        "ATC_RAT_PIT_P": DEFAULT_RATE_P * conditions.rate_gain_factor,
+        "ATC_RAT_RLL_P": DEFAULT_RATE_P * conditions.rate_gain_factor,
         "ATC_RATE_P_MAX": conditions.lean_rate_max_degps,  # deg/s; 0: no limit
         "ATC_RATE_R_MAX": conditions.lean_rate_max_degps,
         "PILOT_ACCEL_Z": conditions.pilot_accel_z_cmps2,
@@ -159,9 +170,3 @@ class Params:
         except OverflowError:
             return False
         return True
-
-
-def _float32(value: float) -> float:
-    """Round as the wire does; raises OverflowError beyond its range."""
-    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
-    return float(rounded)

@@ -4,8 +4,8 @@ from sitl.ardupilot.params import Params
 from sitl.course.layout import Course
 from sitl.expert.course_guide import Agility, CourseGuide, Predicted
 from sitl.expert.rate_response import RateCommand, rate_command
-from sitl.expert.stick_response import DRAG_PER_S, StickPositions, StickResponse
-from sitl.rotation import integrate, rotate, to_euler, wrap_pi
+from sitl.expert.stick_response import StickPositions, StickResponse
+from sitl.rotation import Vec3, integrate, rotate, to_euler, wrap_pi
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
 
@@ -62,9 +62,10 @@ class Expert:
 
     def sticks(self, body: BodyState, t_s: float) -> StickPositions:
         """Sticks for this state; the positions of successive calls are the flown trajectory."""
-        state = _predict_level(body, self._lag_s)
+        north_mps2, east_mps2, _ = drag_ned_mps2 = _drag_ned_mps2(body)
+        state = _predict_level(body, drag_ned_mps2, self._lag_s)
         demand = self._guide.demand(body.position_ned_m, t_s, state)
-        return self._response.sticks(demand, state.velocity_mps, state.yaw_rad)
+        return self._response.sticks(demand, complex(north_mps2, east_mps2), state.yaw_rad)
 
 
 class RateExpert:
@@ -87,20 +88,27 @@ class RateExpert:
         ned_from_body = integrate(body.ned_from_body_wxyz, body.rate_body_radps, RATE_LAG_S)
         state = _predict_free(body, RATE_LAG_S)
         demand = self._guide.demand(body.position_ned_m, t_s, state)
-        # The thrust is along the body's third axis: what an accelerometer feels along the others is
-        # drag, whatever the airframe and the wind.
-        drag_x, drag_y, _ = body.specific_force_body_mps2
-        drag_ned_mps2 = rotate(body.ned_from_body_wxyz, (drag_x, drag_y, 0.0))
-        return rate_command(demand, state, ned_from_body, drag_ned_mps2)
+        return rate_command(demand, state, ned_from_body, _drag_ned_mps2(body))
 
 
-def _predict_level(body: BodyState, lag_s: float) -> Predicted:
+def _drag_ned_mps2(body: BodyState) -> Vec3:
+    """Drag over mass, whatever the airframe and the wind; 0 on the ground.
+
+    The thrust is along the body's third axis: what an accelerometer feels along the others is drag.
+    """
+    if body.touching:
+        return (0.0, 0.0, 0.0)
+    drag_x, drag_y, _ = body.specific_force_body_mps2
+    return rotate(body.ned_from_body_wxyz, (drag_x, drag_y, 0.0))
+
+
+def _predict_level(body: BodyState, drag_ned_mps2: Vec3, lag_s: float) -> Predicted:
     """Extrapolate by the lag, with the acceleration of the present lean in level flight."""
     thrust_n, thrust_e, thrust_d = rotate(body.ned_from_body_wxyz, (0.0, 0.0, -1.0))
     per_g = GRAVITY_MPS2 / max(0.5, -thrust_d)
     velocity_n, velocity_e, velocity_d = body.velocity_ned_mps
-    accel_n = thrust_n * per_g - DRAG_PER_S * velocity_n
-    accel_e = thrust_e * per_g - DRAG_PER_S * velocity_e
+    accel_n = thrust_n * per_g + drag_ned_mps2[0]
+    accel_e = thrust_e * per_g + drag_ned_mps2[1]
     half = lag_s * lag_s / 2
     north_m, east_m, down_m = body.position_ned_m
     _, _, yaw = to_euler(body.ned_from_body_wxyz)

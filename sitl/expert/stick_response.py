@@ -9,7 +9,6 @@ from sitl.expert.course_guide import Demand
 from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 
-DRAG_PER_S = 0.125  # linear drag over mass, compensated by lean
 DEAD_ZONE_SLOPE = 0.08
 """A dead zone is crossed within about this share of full scale: by a slope, not by a jump."""
 
@@ -41,9 +40,9 @@ class StickResponse:
         half = (1000.0 - params["RC3_DZ"]) / 2.0
         self._throttle_dead = 2.0 * params["THR_DZ"] * (half / 500.0) / 1000.0
 
-    def sticks(self, demand: Demand, velocity_mps: complex, yaw_rad: float) -> StickPositions:
-        """Leans by the ratio to gravity in heading axes, rates by their full scale."""
-        accel_mps2 = demand.accel_mps2 + DRAG_PER_S * velocity_mps
+    def sticks(self, demand: Demand, drag_mps2: complex, yaw_rad: float) -> StickPositions:
+        """Leans by the ratio to gravity in heading axes, against this drag, rates by full scale."""
+        accel_mps2 = demand.accel_mps2 - drag_mps2
         forward_right = accel_mps2 * cmath.rect(1.0, -yaw_rad) / GRAVITY_MPS2
         nose_down_rad = math.atan(forward_right.real)
         right_rad = math.atan(forward_right.imag * math.cos(nose_down_rad))

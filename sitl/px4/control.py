@@ -1,13 +1,14 @@
 """Inner loops: attitude or body rates to angular acceleration; velocity to a lean and thrust.
 
 The gains of the attitude and velocity loops are PX4's parameters. Those of the rate loop are this
-vehicle's own, chosen so that a step of rate or attitude takes as long as measured on PX4's SIH.
+vehicle's own, chosen so that a step of rate or attitude takes as long as measured on PX4's SIH;
+PX4's parameters of it only scale them.
 """
 
 import math
 from collections import deque
 
-from sitl.px4.params import Params
+from sitl.px4.params import DEFAULT_RATE_P, Params
 from sitl.rotation import (
     Quat,
     Vec3,
@@ -31,7 +32,7 @@ SIH_QUAD = Airframe(
 )
 HOVER_THRUST = 0.484
 
-RATE_GAIN_PER_S = 14.0  # roll and pitch
+RATE_GAIN_PER_S = 14.0  # roll and pitch, at the default MC_ROLLRATE_P and MC_PITCHRATE_P
 YAW_GAIN_PER_S = 2.6
 TARGET_DELAY_STEPS = 9
 """Control steps until an attitude that is asked for is flown: 36 ms."""
@@ -78,12 +79,15 @@ class RateController:
             for rate, limit in zip(wanted_radps, limits, strict=True)
         )
         self.rates_radps = (roll, pitch, yaw)
+        roll_share, pitch_share = (
+            self._params[name] / DEFAULT_RATE_P for name in ("MC_ROLLRATE_P", "MC_PITCHRATE_P")
+        )
         actual = body.rate_body_radps
         yaw_accel = YAW_GAIN_PER_S * (yaw - actual[2])
         self._yaw_accel_radps2 += (yaw_accel - self._yaw_accel_radps2) * dt_s / YAW_TORQUE_LAG_S
         return (
-            RATE_GAIN_PER_S * (roll - actual[0]),
-            RATE_GAIN_PER_S * (pitch - actual[1]),
+            roll_share * RATE_GAIN_PER_S * (roll - actual[0]),
+            pitch_share * RATE_GAIN_PER_S * (pitch - actual[1]),
             self._yaw_accel_radps2,
         )
 

@@ -11,7 +11,7 @@ class Px4:
     """A `sitl.firmware.Firmware`."""
 
     def __init__(self, config: VehicleConfig, links: int, boot_ns: int, log: FlightLog) -> None:
-        self.params = Params(receiver=config.receiver)
+        self.params = Params(config.conditions, receiver=config.receiver)
         self.ap = Autopilot(self.params, config, boot_ns)
         self.server = MavlinkServer(self.ap, links, log)
 

@@ -11,6 +11,8 @@ from types import MappingProxyType
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from sitl.vehicle.conditions import NOMINAL, Conditions
+
 _INTEGERS: Mapping[str, int] = MappingProxyType(
     {
         "COM_FLTMODE_BOOT": 4,
@@ -55,8 +57,10 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "MC_ACRO_Y_MAX": 100.0,
         "MC_MAN_TILT_TAU": 0.0,  # s
         "MC_PITCHRATE_MAX": 220.0,  # deg/s
+        "MC_PITCHRATE_P": 0.15,
         "MC_PITCH_P": 4.0,  # 1/s
         "MC_ROLLRATE_MAX": 220.0,
+        "MC_ROLLRATE_P": 0.15,
         "MC_ROLL_P": 4.0,
         "MC_YAWRATE_MAX": 200.0,
         "MC_YAW_P": 2.8,
@@ -106,12 +110,52 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
 _INT32_LIMIT = 1 << 31
 
 
+def _float32(value: float) -> float:
+    """Round as the wire does; raises OverflowError beyond its range."""
+    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
+    return float(rounded)
+
+
+DEFAULT_RATE_P = _float32(_FLOATS["MC_ROLLRATE_P"])
+
+
+def _varied(conditions: Conditions) -> dict[str, float]:
+    """What other vehicles set otherwise: the defaults, scaled by as much as ArduPilot's are."""
+    lean = conditions.angle_max_cdeg / NOMINAL.angle_max_cdeg
+    yaw_rate = conditions.pilot_yaw_rate_degps / NOMINAL.pilot_yaw_rate_degps
+    climb = conditions.pilot_speed_up_cmps / NOMINAL.pilot_speed_up_cmps
+    down_cmps = conditions.pilot_speed_down_cmps or conditions.pilot_speed_up_cmps
+    descent = down_cmps / NOMINAL.pilot_speed_up_cmps
+    climb_accel = conditions.pilot_accel_z_cmps2 / NOMINAL.pilot_accel_z_cmps2
+    roll_gain, pitch_gain, yaw_gain = (
+        gain / nominal
+        for gain, nominal in zip(
+            conditions.angle_gains_per_s, NOMINAL.angle_gains_per_s, strict=True
+        )
+    )
+    factors = {
+        "MC_PITCHRATE_P": conditions.rate_gain_factor,
+        "MC_PITCH_P": pitch_gain,
+        "MC_ROLLRATE_P": conditions.rate_gain_factor,
+        "MC_ROLL_P": roll_gain,
+        "MC_YAW_P": yaw_gain,
+        "MPC_ACC_DOWN_MAX": climb_accel,
+        "MPC_ACC_UP_MAX": climb_accel,
+        "MPC_MAN_TILT_MAX": lean,
+        "MPC_MAN_Y_MAX": yaw_rate,
+        "MPC_MAN_Y_TAU": conditions.input_time_s / NOMINAL.input_time_s,
+        "MPC_Z_VEL_MAX_DN": descent,
+        "MPC_Z_VEL_MAX_UP": climb,
+    }
+    return {name: factor * _FLOATS[name] for name, factor in factors.items()}
+
+
 class Params:
     """Named numbers in a fixed, sorted order (the order is PARAM_VALUE's index)."""
 
-    def __init__(self, *, receiver: bool = False) -> None:
+    def __init__(self, conditions: Conditions = NOMINAL, *, receiver: bool = False) -> None:
         """With ``receiver`` its first four channels are mapped, in the order that is usual."""
-        values: dict[str, float] = {**_INTEGERS, **_FLOATS}
+        values: dict[str, float] = {**_INTEGERS, **_FLOATS, **_varied(conditions)}
         if receiver:
             values |= {"RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4}
             values["RC_CHAN_CNT"] = 8
@@ -162,9 +206,3 @@ class Params:
             return self.set(name, packed)
         (value,) = struct.unpack("<i", struct.pack("<f", packed))
         return self.set(name, value)
-
-
-def _float32(value: float) -> float:
-    """Round as the wire does; raises OverflowError beyond its range."""
-    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
-    return float(rounded)

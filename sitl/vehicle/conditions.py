@@ -21,8 +21,9 @@ Rgb: TypeAlias = tuple[int, int, int]
 class Conditions:
     """Conditions of one flight; factors of 1 and offsets of 0 change nothing.
 
-    The fields from ``angle_max_cdeg`` to ``lean_accel_max_cdegps2`` become firmware parameters
-    (`sitl.ardupilot.params`).
+    The fields from ``angle_max_cdeg`` to ``rate_gain_factor`` become firmware parameters, by name
+    and unit those of ArduPilot (`sitl.ardupilot.params`). PX4 scales its own by as much
+    (`sitl.px4.params`), and has no dead zones and expo that vary.
     """
 
     seed: int = 0  # of gusts, sensor noise and image noise
@@ -30,6 +31,8 @@ class Conditions:
     mass_factor: float = 1.0  # scales mass and inertia
     thrust_factor: float = 1.0  # scales full thrust: battery, propellers, air
     drag_factor: float = 1.0  # scales rotor and body drag
+    min_rotor_drag_nspm: float = 0.0  # linear; an airframe that has more keeps its own
+    motor_lag_factor: float = 1.0
     wind_ned_mps: Vec3 = (0.0, 0.0, 0.0)  # mean velocity of the air
     gust_rms_mps: float = 0.0  # per horizontal axis; the vertical gust is half as strong
     gust_time_s: float = 1.5
@@ -46,6 +49,7 @@ class Conditions:
     angle_gains_per_s: Vec3 = (6.0, 6.0, 3.0)  # roll, pitch, yaw
     lean_rate_max_degps: float = 220.0  # 0: no limit
     lean_accel_max_cdegps2: float = 110_000.0  # 0: no limit
+    rate_gain_factor: float = 1.0  # of the loop from body rates to torque, roll and pitch
 
     stream_slowdown_ms: int = 0  # added to every interval, as for a full radio buffer
     stream_jitter_ms: float = 0.0  # largest random delay of a message
@@ -101,7 +105,10 @@ def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
     if strength > 0.0:
         draw = _Draw(np.random.Generator(np.random.PCG64(seed)), strength)
         # The order is part of the seed's meaning.
-        for vary in (_vary_physics, _vary_lens, _vary_scene, _vary_firmware, _vary_streams):
+        for vary in (
+            *(_vary_physics, _vary_lens, _vary_scene, _vary_firmware, _vary_streams),
+            _vary_airframe,
+        ):
             conditions = vary(conditions, draw)
     return conditions
 
@@ -173,11 +180,11 @@ def _vary_physics(nominal: Conditions, draw: _Draw) -> Conditions:
 def _vary_lens(nominal: Conditions, draw: _Draw) -> Conditions:
     return replace(
         nominal,
-        camera_tilt_rad=nominal.camera_tilt_rad + draw.offset(math.radians(4.0)),
+        camera_tilt_rad=nominal.camera_tilt_rad + draw.offset(math.radians(6.0)),
         camera_roll_rad=draw.offset(math.radians(2.0)),
         camera_yaw_rad=draw.offset(math.radians(2.0)),
         camera_offset_body_m=(draw.offset(0.08), draw.offset(0.02), draw.offset(0.04)),
-        horizontal_fov_rad=nominal.horizontal_fov_rad + draw.offset(math.radians(5.0)),
+        horizontal_fov_rad=nominal.horizontal_fov_rad + draw.offset(math.radians(8.0)),
     )
 
 
@@ -239,4 +246,19 @@ def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
         stream_slowdown_ms=slowdown_ms if is_slow else 0,
         stream_jitter_ms=draw.amount(5.0),
         stream_phase_spread=min(1.0, draw.amount(1.0)),
+    )
+
+
+def _vary_airframe(nominal: Conditions, draw: _Draw) -> Conditions:
+    """From a racing frame to the drag of PX4's SIH, 1 N per m/s; half of the vehicles have little.
+
+    The loop of the body rates settles in 30 to 90 ms.
+    """
+    is_heavy = draw.random.random() < 0.5
+    heavy_nspm = 0.15 * math.exp(draw.amount(math.log(1.0 / 0.15)))
+    return replace(
+        nominal,
+        min_rotor_drag_nspm=heavy_nspm if is_heavy else 0.0,
+        motor_lag_factor=draw.factor(1.5),
+        rate_gain_factor=round(draw.factor(1.35), 3),
     )

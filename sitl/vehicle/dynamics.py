@@ -54,13 +54,14 @@ def _model_xml(airframe: Airframe, conditions: Conditions) -> str:
     """
     density = airframe.air_density_kgpm3 * conditions.drag_factor
     thrust_n = airframe.max_motor_thrust_n * conditions.thrust_factor
+    motor_lag_s = airframe.motor_lag_s * conditions.motor_lag_factor
     inertia_kgm2 = [conditions.mass_factor * moment for moment in INERTIA_KGM2]
     return f"""
 <mujoco>
   <option timestep="{airframe.step_ns / 1e9}" gravity="0 0 -{GRAVITY_MPS2}" density="{density}"
           integrator="implicitfast"/>
   <default>
-    <general dyntype="filterexact" dynprm="{airframe.motor_lag_s}" gainprm="{thrust_n}"
+    <general dyntype="filterexact" dynprm="{motor_lag_s}" gainprm="{thrust_n}"
              ctrlrange="0 1" ctrllimited="true"/>
   </default>
   <worldbody>
@@ -124,7 +125,8 @@ class Quadrotor:
         self._model = mujoco.MjModel.from_xml_string(_model_xml(airframe, conditions))
         self._mass_kg = airframe.mass_kg * conditions.mass_factor
         self._max_motor_thrust_n = airframe.max_motor_thrust_n * conditions.thrust_factor
-        self._rotor_drag_nspm = airframe.rotor_drag_nspm * conditions.drag_factor
+        rotor_drag_nspm = max(airframe.rotor_drag_nspm, conditions.min_rotor_drag_nspm)
+        self._rotor_drag_nspm = rotor_drag_nspm * conditions.drag_factor
         self._model.dof_damping[:3] = self._rotor_drag_nspm
         self._data = mujoco.MjData(self._model)
         self._state_size = mujoco.mj_stateSize(self._model, _FULL_STATE)
