@@ -109,29 +109,21 @@ def read_flight(folder: Path) -> FlightData:
     if not video.is_file() or frames.num_rows == 0:
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
     tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
-    if terms.action == "rates" and "expert" not in ticks.column_names:
-        raise DatasetError(
-            f"{name} was flown by rates without an expert: what was sent in it may also be an "
-            "attitude, and the recording does not tell them apart; use mavbridge demonstrate"
-        )
-    sent = vectors(name, ticks, "sent", ACTION_DIM)
-    if not _known(sent).any() and terms.action == "sticks":
-        sent = vectors(name, ticks, "rc_sticks", ACTION_DIM)
-    target_ns, target = sent_ns, sent
-    if "expert" in ticks.column_names:
-        # The expert looked when the policy would have; its stick is for that moment.
-        target_ns, target = tick_ns, vectors(name, ticks, "expert", ACTION_DIM)
+    state = vectors(name, ticks, "state", STATE_DIM)
+    sent = _sent(name, ticks, terms)
+    is_expert = "expert" in ticks.column_names
+    # The expert looked when the policy would have; its stick is for that moment.
+    target_ns = tick_ns if is_expert else sent_ns
+    target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
     is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
     if not is_target.any():
         raise DatasetError(
             f"{folder}: nobody to learn from: no expert, and no stick was sent while armed"
         )
-    state = vectors(name, ticks, "state", STATE_DIM)
     if terms.action == "rates":
         is_target &= _known(state)
         loop = StickLoop(rates_contract(Contract(hover_thrust=terms.hover_thrust)))
         target[is_target] = loop.to_sticks(target[is_target], state[is_target])
-        sent = np.zeros_like(sent)
     state[~is_target] = np.nan
     return FlightData(
         name=name,
@@ -151,6 +143,19 @@ def read_flight(folder: Path) -> FlightData:
         fingerprint=file_digest(video),
         decode=partial(decode_video, video),
     )
+
+
+def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
+    """Sticks that were sent, or where none were the pilot's; centred in a flight by rates."""
+    if terms.action == "sticks":
+        sent = vectors(name, ticks, "sent", ACTION_DIM)
+        return sent if _known(sent).any() else vectors(name, ticks, "rc_sticks", ACTION_DIM)
+    if "expert" not in ticks.column_names:
+        raise DatasetError(
+            f"{name} was flown by rates without an expert: what was sent in it may also be an "
+            "attitude, and the recording does not tell them apart; use mavbridge demonstrate"
+        )
+    return np.zeros((ticks.num_rows, ACTION_DIM), np.float32)
 
 
 def read_ages(folder: Path) -> Nanoseconds:

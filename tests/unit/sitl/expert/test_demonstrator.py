@@ -1,6 +1,7 @@
 """The demonstrator over whole courses in stepped time: a few of them."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +17,7 @@ from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import Disturbance, random_start
 from sitl.expert.guidance import Waypoint, least_acceleration
 from sitl.rotation import IDENTITY, from_euler
-from sitl.vehicle.conditions import random_conditions
+from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.dynamics import Quadrotor
 
 
@@ -71,6 +72,13 @@ def test_it_flies_another_vehicle_in_wind_with_a_bad_thumb():
     )
     assert flight.succeeded
     assert any(tick.flown != tick.label for tick in flight.ticks)
+
+
+def test_it_leans_against_the_drag_of_any_airframe():
+    heavy = replace(NOMINAL, min_rotor_drag_nspm=0.8)
+    flight = fly_course(make_course(3), 5.0, conditions=heavy)
+    assert flight.succeeded
+    assert flight.mean_speed_mps() > 4.0
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.px4.params import Params
+from sitl.vehicle.conditions import random_conditions
 
 
 def as_float(value):
@@ -48,3 +49,12 @@ def test_names_are_sorted_and_fit_the_wire():
 def test_a_receiver_is_mapped():
     assert Params()["RC_MAP_THROTTLE"] == 0
     assert Params(receiver=True)["RC_MAP_THROTTLE"] == 3
+
+
+def test_other_vehicles_have_other_settings():
+    nominal, drawn = Params(), Params(random_conditions(8))
+    varied = {name for name in nominal.names if drawn[name] != nominal[name]}
+
+    assert varied >= {"MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_Z_VEL_MAX_DN", "MC_ROLLRATE_P"}
+    assert 35.0 <= drawn["MPC_MAN_TILT_MAX"] <= 52.5
+    assert 1.07 <= drawn["MPC_Z_VEL_MAX_DN"] <= 2.1

@@ -33,7 +33,7 @@ NOMINAL_VIEW = [
 def fly(conditions, seconds=8.0):
     """Take off, then weave; the state at the end."""
     config = VehicleConfig(estimator_ready_s=0.0, conditions=conditions)
-    ap = Autopilot(Params(), config, boot_ns=0)
+    ap = Autopilot(Params(conditions), config, boot_ns=0)
     for tick in range(round(seconds * 100)):
         t_s = tick / 100
         sticks = [1500, 1500, 1000 if t_s < 0.5 else 1800 if t_s < 3.0 else 1500, 1500]
@@ -109,6 +109,38 @@ def test_the_wind_carries_a_level_vehicle_along():
     windy = fly(replace(NOMINAL, wind_ned_mps=(0.0, 3.0, 0.0)))
     still = fly(NOMINAL)
     assert windy.truth.position_ned_m[1] > still.truth.position_ned_m[1] + 1.0
+
+
+@pytest.mark.parametrize(("nspm", "is_heavier"), [(0.1, False), (0.8, True)])
+def test_an_airframe_keeps_the_drag_it_has(nspm, is_heavier):
+    """Of 10 m/s are left after a second: exp(-nspm / 1.2 kg) at most."""
+    start = ((0.0, 0.0, -50.0), (10.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    nominal_mps, mps = (
+        quad.step(quad.airborne(*start), (0.39,) * 4, 800).body.velocity_ned_mps[0]
+        for quad in (Quadrotor(), Quadrotor(replace(NOMINAL, min_rotor_drag_nspm=nspm)))
+    )
+    assert (mps < nominal_mps) == is_heavier
+    assert mps == nominal_mps or mps < 10.0 * math.exp(-nspm / 1.2)
+
+
+def test_slow_motors_reach_less_thrust_in_the_same_time():
+    nominal, slow = (
+        quad.step(quad.at_rest(), (1.0,) * 4, 16).body.motors[0]
+        for quad in (Quadrotor(), Quadrotor(replace(NOMINAL, motor_lag_factor=1.5)))
+    )
+    assert nominal == pytest.approx(1 - math.exp(-0.02 / 0.028), abs=0.01)
+    assert slow == pytest.approx(1 - math.exp(-0.02 / 0.042), abs=0.01)
+
+
+def test_a_smaller_gain_of_the_rate_loop_takes_longer_to_roll():
+    rates = []
+    for factor in (1.0, 0.7):
+        ap = fly(replace(NOMINAL, rate_gain_factor=factor), 3.0)
+        ap.rc.override([1700, *[65535] * 7], ap.now_ns)
+        for _ in range(40):
+            ap.step()
+        rates.append(ap.truth.rate_body_radps[0])
+    assert rates[0] > 1.05 * rates[1] > 0
 
 
 def test_gusts_and_noise_come_from_the_seed():
