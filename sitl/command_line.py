@@ -16,7 +16,7 @@ from sitl.course.layout import course_to_json, make_course
 from sitl.faults.command import add_faults_command, add_soak_command
 from sitl.pilot.axes import DEFAULT_AXES
 from sitl.pilot.choose import NAMES as PILOTS
-from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.conditions import NOMINAL, held_out_conditions, random_conditions
 from sitl.vehicle.config import (
     IDLE_RECEIVER_US,
     MID_RECEIVER_US,
@@ -77,7 +77,22 @@ def _parser() -> argparse.ArgumentParser:
     key_help = "sign with this key (MAVLink 2): a file of 32 bytes or 64 hexadecimal digits"
     add("--signing-key-file", type=Path, metavar="FILE", help=key_help)
     conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
-    add("--conditions", type=_SEED, metavar="SEED", help=conditions_help)
+    conditions = parser.add_mutually_exclusive_group()
+    conditions.add_argument(
+        "--conditions",
+        type=lambda text: random_conditions(int(_SEED(text))),
+        default=NOMINAL,
+        metavar="SEED",
+        help=conditions_help,
+    )
+    conditions.add_argument(
+        "--held-out-conditions",
+        dest="conditions",
+        type=lambda text: held_out_conditions(int(_SEED(text))),
+        default=argparse.SUPPRESS,
+        metavar="SEED",
+        help="the same, and gates partly hidden, in shadow, at night or against the sun",
+    )
     _add_camera_flags(parser)
     commands = parser.add_subparsers(title="other commands", metavar="COMMAND")
     camera_help = "film the course from another vehicle's reported pose"
@@ -108,7 +123,6 @@ def _fly(args: argparse.Namespace) -> None:
     links, onboard = args.connect or [], args.connect_onboard or []
     if not links + onboard:
         raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
-    conditions = NOMINAL if args.conditions is None else random_conditions(args.conditions)
     if args.pilot and (args.rc_in or args.receiver):
         raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
     has_receiver = args.autopilot != "px4" or args.pilot
@@ -122,7 +136,7 @@ def _fly(args: argparse.Namespace) -> None:
             receiver_us=MID_RECEIVER_US if receiver == "mid" else IDLE_RECEIVER_US,
             vehicle_type=args.vehicle_type,
             signing=args.signing_key_file and _signing_key(args.signing_key_file),
-            conditions=conditions,
+            conditions=args.conditions,
         ),
         make_course(args.course),
         camera=None if args.camera is None else _camera(args),

@@ -5,6 +5,9 @@ from typing import Literal
 AutopilotKind = Literal["ardupilot", "px4"]
 CourseKind = Literal["easy", "race"]
 """Family of courses; each has seeds of its own, and in them the same ranges."""
+ConditionsKind = Literal["nominal", "random", "held-out"]
+"""Vehicles, wind and light: the same for every course, drawn as demonstrations do, or with looks
+that no demonstration has."""
 
 RACE_COURSE_SEED = 1_000_000_000
 """Seeds of race courses begin here (`sitl.course.layout.RACE_SEEDS`)."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mavbridge.config.courses import ConditionsKind
 from mavbridge.core.ports import TickSink
 from mavbridge.core.records import Event, FeatureFrame, Frame, ImageArray, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
@@ -20,7 +21,12 @@ from sitl.ardupilot.guided import OPTION_THRUST
 from sitl.camera.fpv import FpvRenderer
 from sitl.rotation import IDENTITY, Quat, Vec3, from_euler, multiply
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
-from sitl.vehicle.conditions import random_conditions
+from sitl.vehicle.conditions import (
+    NOMINAL,
+    Conditions,
+    held_out_conditions,
+    random_conditions,
+)
 from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 from sitl.vehicle.dynamics import BodyState
 
@@ -37,35 +43,47 @@ NOMINAL_VEHICLE = VehicleConfig(estimator_ready_s=0.5, position_ready_s=0.5)
 """Nothing is random; ready at once, since the handshake alone takes longer than half a second."""
 
 
-def random_vehicle(conditions_seed: int) -> VehicleConfig:
-    """The vehicle and the view of ``python -m sitl --conditions SEED``.
+def draw_conditions(kind: ConditionsKind, seed: int) -> Conditions:
+    """Conditions of an evaluated flight; the seed of its course, so that no demonstration had them.
 
     Raises:
         UsageError: the seed is negative.
     """
-    return replace(NOMINAL_VEHICLE, conditions=random_conditions(conditions_seed))
+    match kind:
+        case "nominal":
+            return NOMINAL
+        case "random":
+            return random_conditions(seed)
+        case "held-out":
+            return held_out_conditions(seed)
+
+
+CONDITIONS_FLAGS: dict[ConditionsKind, str | None] = {
+    "nominal": None,
+    "random": "--conditions",
+    "held-out": "--held-out-conditions",
+}
+"""Flags of ``python -m sitl`` that ask for them; each takes the seed."""
 
 
 def make_vehicle(
-    *, autopilot: AutopilotName, gains: float = 1.0, conditions_seed: int | None = None
+    *, autopilot: AutopilotName, gains: float = 1.0, conditions: Conditions = NOMINAL
 ) -> VehicleConfig:
     """A vehicle to evaluate a policy with.
 
     Args:
         autopilot: its firmware.
         gains: factor on ArduCopter's lean, yaw rate and climb rate at full stick.
-        conditions_seed: random conditions, as in ``random_vehicle``; None = nominal ones.
+        conditions: airframe, settings, wind, light and lens.
     """
-    vehicle = NOMINAL_VEHICLE if conditions_seed is None else random_vehicle(conditions_seed)
-    before = vehicle.conditions
-    conditions = replace(
-        before,
-        angle_max_cdeg=gains * before.angle_max_cdeg,
-        pilot_yaw_rate_degps=gains * before.pilot_yaw_rate_degps,
-        pilot_speed_up_cmps=gains * before.pilot_speed_up_cmps,
-        pilot_speed_down_cmps=gains * before.pilot_speed_down_cmps,
+    scaled = replace(
+        conditions,
+        angle_max_cdeg=gains * conditions.angle_max_cdeg,
+        pilot_yaw_rate_degps=gains * conditions.pilot_yaw_rate_degps,
+        pilot_speed_up_cmps=gains * conditions.pilot_speed_up_cmps,
+        pilot_speed_down_cmps=gains * conditions.pilot_speed_down_cmps,
     )
-    return replace(vehicle, autopilot=autopilot, conditions=conditions)
+    return replace(NOMINAL_VEHICLE, autopilot=autopilot, conditions=scaled)
 
 
 def needed_params(contract: Contract, autopilot: AutopilotName) -> dict[str, float]:

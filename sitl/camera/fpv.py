@@ -25,6 +25,8 @@ LOWEST_EYE_M = 0.12
 GATE_HAZE_M = 90.0  # distance at which a gate has lost 63 % of its contrast
 GROUND_FADE_M = 14.0
 """Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
+GLOW_SHARE = 0.18
+"""Of the image's width: where the sun's glow has lost 63 %."""
 SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
 REFERENCE_WIDTH_PX = 224  # image width for which the conditions give the blur
 NOISE_MARGIN_PX = 61
@@ -65,9 +67,9 @@ class FpvRenderer:
         self._ridge_rgb = scenery.tinted(scenery.RIDGE_RGB, conditions.sky_tint)
         self._ground = scenery.ground_tile(conditions)
         self._ridge = scenery.ridge_directions(course.seed)
-        self._faces = scenery.gate_faces(course, conditions)
+        self._faces = scenery.course_faces(course, conditions)
         self._sensor = _ImageSensor(conditions, width, height)
-        self._centers_ned_m = np.array([gate.center_ned_m for gate in course.gates])
+        self._glare, self._sun_ned = conditions.glare, np.array(conditions.sun_ned)
 
     def render(self, position_ned_m: Vec3, ned_from_body_wxyz: Quat) -> Image:
         """Draw the view as [H, W, 3] uint8 RGB, a new array."""
@@ -79,7 +81,9 @@ class FpvRenderer:
         image = self._draw_backdrop(eye_ned_m, ned_from_camera)
         ridge = self._ridge @ ned_from_camera
         self._fill(image, ridge, np.tile(self._ridge_rgb, (len(ridge), 1)), cv2.LINE_8)
-        self._draw_gates(image, eye_ned_m, ned_from_camera)
+        self._draw_faces(image, eye_ned_m, ned_from_camera)
+        if self._glare:
+            image = self._add_glare(image, self._sun_ned @ ned_from_camera)
         return self._sensor.expose(image)
 
     def _draw_backdrop(self, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> Image:
@@ -124,17 +128,29 @@ class FpvRenderer:
         )
         image[:] = cv2.blendLinear(ground, image, weight, 1 - weight)
 
-    def _draw_gates(self, image: Image, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> None:
-        """Paint far gates first, and the faces of a gate in their order."""
+    def _draw_faces(self, image: Image, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> None:
+        """Paint far gates and panels first, and the faces of a gate in their order."""
         faces = self._faces
         from_eye_m = faces.corners_ned_m - eye_ned_m
         facing = np.einsum("nk,nk->n", faces.normals_ned, from_eye_m[:, 0]) <= 0
-        distance_m = np.linalg.norm(self._centers_ned_m - eye_ned_m, axis=1)[faces.gate]
+        distance_m = np.linalg.norm(faces.centers_ned_m - eye_ned_m, axis=1)[faces.owner]
         order = np.argsort(-distance_m, kind="stable")
         order = order[facing[order]]
         haze = 1 - np.exp(-distance_m[order, None] / GATE_HAZE_M)
         rgb = faces.rgb[order] * (1 - haze) + self._haze_rgb * haze
         self._fill(image, from_eye_m[order] @ ned_from_camera, rgb, cv2.LINE_AA)
+
+    def _add_glare(self, image: Image, sun: FloatArray) -> Image:
+        """A glow around the sun, which is in this direction, and a veil the nearer it is to the
+        optical axis; gates do not hide it."""
+        x, y, z = sun.tolist()
+        if z <= 0.0:
+            return image
+        white = 255.0 * self._glare
+        u_px, v_px = self._center_px + self._focal_px * np.array([x, y]) / max(z, 0.05)
+        away_px = np.hypot(self._u_px - np.float32(u_px), self._v_px - np.float32(v_px))
+        light = white * (0.35 * z + np.exp(-away_px / (GLOW_SHARE * len(self._u_px))))
+        return np.asarray(cv2.add(image, cv2.merge([light] * 3), dtype=cv2.CV_8U), dtype=np.uint8)
 
     def _fill(self, image: Image, corners_m: FloatArray, rgb: FloatArray, line_type: int) -> None:
         """Paint quadrilaterals [N, 4, 3] in camera axes, in this order, with colours [N, 3]."""

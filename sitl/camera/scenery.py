@@ -19,6 +19,12 @@ LEG_M = 0.09  # width of the two posts that reach down to the ground
 PIP_M = 0.16
 PIP_PITCH_M = 0.32  # white squares on the front of the top bar: the gate's number, counted from one
 INSIDE_BRIGHTNESS = 0.7
+SHADE_BRIGHTNESS = 0.4
+PANEL_AHEAD_M = (2.0, 4.5)
+"""Distance before the gate of a panel that hides a part of it."""
+PANEL_ASIDE_M = (1.3, 1.9)
+"""From the way to its middle, to either side. Nothing flies through one, and nothing can hit it."""
+PANEL_WIDTH_M = 1.2
 BOTH_SIDES: Vec3 = (0.0, 0.0, 0.0)
 
 RIDGE_SEGMENTS = 120
@@ -34,6 +40,7 @@ SOIL_RGB = (112, 116, 74)
 GRASS_RGB = (62, 96, 62)
 GRID_RGB = (196, 200, 160)
 LEG_RGB = (58, 60, 68)
+PANEL_RGB = (74, 72, 66)
 PIP_RGB = (255, 248, 232)
 BACK_RGB = (96, 98, 112)  # a gate is grey from behind: it must not be passed from there
 BACKDROP_RGB = (
@@ -66,30 +73,48 @@ class Faces:
     """[N, 3] unit, towards the side from which a face is seen; zero = it is seen from both."""
     rgb: FloatArray
     """[N, 3], lit by the sun."""
-    gate: NDArray[np.intp]
-    """[N] index of the gate that a face belongs to. Of the faces of one gate that are seen from a
-    point, a later one is never hidden by an earlier one."""
+    owner: NDArray[np.intp]
+    """[N] index of the gate or panel that a face belongs to. Of the faces of one that are seen from
+    a point, a later one is never hidden by an earlier one."""
+    centers_ned_m: FloatArray
+    """[M, 3] of the gates, then of the panels."""
 
 
-def gate_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
-    """Build all surfaces of all gates."""
+def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
+    """Build all surfaces of all gates, and of the panels that hide some."""
     sun_ned, ambient = np.array(conditions.sun_ned), conditions.ambient
+    random = np.random.Generator(np.random.PCG64((conditions.seed, 6)))
+    is_shaded = random.random(len(course.gates)) < conditions.shaded_gates
+    is_hidden = random.random(len(course.gates)) < conditions.hidden_gates
     corners, normals, rgb, owners = [], [], [], []
+    centers = [gate.center_ned_m for gate in course.gates]
     for gate in course.gates:
         cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
         ned_from_gate = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
         for face in _faces_of(gate, conditions.gate_rgb):
             normal_ned = ned_from_gate @ np.array(face.normal)
             light = ambient + (1 - ambient) * max(0.0, float(normal_ned @ sun_ned))
+            light *= SHADE_BRIGHTNESS if is_shaded[gate.index] else 1.0
             corners.append(np.array(face.corners_m) @ ned_from_gate.T + gate.center_ned_m)
             normals.append(normal_ned)
             rgb.append(np.array(face.rgb) * light)
             owners.append(gate.index)
+        if is_hidden[gate.index]:
+            ahead_m, aside_m = -random.uniform(*PANEL_AHEAD_M), random.uniform(*PANEL_ASIDE_M)
+            aside_m *= random.choice((-1.0, 1.0))
+            down_m = (-gate.size_m, -gate.center_ned_m[2])
+            panel_m = np.array(_upright(ahead_m, aside_m, PANEL_WIDTH_M, down_m))
+            corners.append(panel_m @ ned_from_gate.T + gate.center_ned_m)
+            normals.append(np.array(BOTH_SIDES))
+            rgb.append(tinted(PANEL_RGB, conditions.ground_tint))
+            owners.append(len(centers))
+            centers.append(tuple(corners[-1].mean(axis=0).tolist()))
     return Faces(
         corners_ned_m=np.array(corners),
         normals_ned=np.array(normals),
         rgb=np.array(rgb),
-        gate=np.array(owners, dtype=np.intp),
+        owner=np.array(owners, dtype=np.intp),
+        centers_ned_m=np.array(centers),
     )
 
 
@@ -214,9 +239,10 @@ def ground_tile(conditions: Conditions = NOMINAL) -> Image:
     random = np.random.Generator(np.random.PCG64(conditions.ground_seed))
     patches = _periodic_noise(random, smooth_m=1.2)[..., None]
     speckle = _periodic_noise(random, smooth_m=0.06)[..., None]
-    mix = np.clip(0.5 + 0.35 * patches, 0, 1)
+    contrast = conditions.ground_contrast
+    mix = np.clip(0.5 + 0.35 * contrast * patches, 0, 1)
     ground = mix * np.array(SOIL_RGB) + (1 - mix) * np.array(GRASS_RGB)
-    lit = ground * (1 + 0.13 * speckle) * conditions.ground_tint
+    lit = ground * (1 + 0.13 * contrast * speckle) * conditions.ground_tint
     tile = np.asarray(np.clip(lit, 0, 255), dtype=np.uint8)
     grid_rgb = tinted(GRID_RGB, conditions.ground_tint).tolist()
     pitch_px = round(GRID_M * GROUND_TILE_PX / GROUND_TILE_M)

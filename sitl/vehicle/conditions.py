@@ -72,6 +72,11 @@ class Conditions:
     sun_ned: Vec3 = (-0.45, 0.35, -0.82)  # direction to the sun, unit length
     ambient: float = 0.78  # brightness of a surface turned away from the sun
 
+    hidden_gates: float = 0.0  # share of the gates with a panel before them, beside the way
+    shaded_gates: float = 0.0  # share of the gates that stand in shadow
+    ground_contrast: float = 1.0  # factor on the pattern of the ground
+    glare: float = 0.0  # of the sun in the lens, as a share of white
+
     exposure: float = 1.0  # factor on all colours, before they saturate
     white_balance: Vec3 = (1.0, 1.0, 1.0)
     blur_px: float = 0.0  # standard deviation, in pixels of a 224 pixel wide image
@@ -111,6 +116,21 @@ def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
         ):
             conditions = vary(conditions, draw)
     return conditions
+
+
+def held_out_conditions(seed: int) -> Conditions:
+    """Vehicle, wind and lens of ``random_conditions``, and a look that no demonstration has.
+
+    One seed in four each: gates partly hidden by panels; gates in shadow over ground of high
+    contrast; night, with gates that shine; a low sun in the lens.
+
+    Raises:
+        UsageError: a negative seed.
+    """
+    conditions = random_conditions(seed)
+    draw = _Draw(np.random.Generator(np.random.PCG64((seed, 7))), 1.0)
+    looks = (_hide_gates, _shade_gates, _make_night, _make_glare)
+    return looks[seed % len(looks)](conditions, draw)
 
 
 class _Draw:
@@ -261,4 +281,37 @@ def _vary_airframe(nominal: Conditions, draw: _Draw) -> Conditions:
         min_rotor_drag_nspm=heavy_nspm if is_heavy else 0.0,
         motor_lag_factor=draw.factor(1.5),
         rate_gain_factor=round(draw.factor(1.35), 3),
+    )
+
+
+def _hide_gates(usual: Conditions, draw: _Draw) -> Conditions:
+    return replace(usual, hidden_gates=0.7)
+
+
+def _shade_gates(usual: Conditions, draw: _Draw) -> Conditions:
+    return replace(usual, shaded_gates=0.6, ground_contrast=2.0 * draw.factor(1.3))
+
+
+def _make_night(usual: Conditions, draw: _Draw) -> Conditions:
+    sky, ground = 0.12 * draw.factor(1.5), 0.2 * draw.factor(1.5)
+    return replace(
+        usual,
+        sky_tint=(sky, sky, 1.3 * sky),
+        ground_tint=(ground, ground, ground),
+        ambient=1.0,
+        image_noise=10.0 + draw.amount(6.0),
+    )
+
+
+def _make_glare(usual: Conditions, draw: _Draw) -> Conditions:
+    """The sun stands ahead on the first leg, to 60 degrees to either side."""
+    azimuth_rad, elevation_rad = draw.offset(math.pi / 3), math.radians(4.0 + draw.amount(14.0))
+    return replace(
+        usual,
+        glare=0.5 + draw.amount(0.5),
+        sun_ned=(
+            math.cos(elevation_rad) * math.cos(azimuth_rad),
+            math.cos(elevation_rad) * math.sin(azimuth_rad),
+            -math.sin(elevation_rad),
+        ),
     )

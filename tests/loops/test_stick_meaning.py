@@ -38,7 +38,7 @@ def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0, is_by_rates: bool
         course_seed=3,
         seed=0,
         settings=SimulationSettings(draw_images=False),
-        vehicle=make_vehicle(autopilot=autopilot, gains=gains, conditions_seed=None),
+        vehicle=make_vehicle(autopilot=autopilot, gains=gains),
     )
     sink = ListSink()
     begun_ns: list[int] = []

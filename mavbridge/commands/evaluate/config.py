@@ -7,14 +7,19 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from mavbridge.config.checks import check_range
-from mavbridge.config.courses import MAX_EPISODES, MAX_EVALUATION_SEED, AutopilotKind, CourseKind
+from mavbridge.config.courses import (
+    MAX_EPISODES,
+    MAX_EVALUATION_SEED,
+    AutopilotKind,
+    ConditionsKind,
+    CourseKind,
+)
 from mavbridge.config.flight import Limits
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.config.workers import WorkersConfig
 from mavbridge.core.errors import UserError
 
-ConditionsKind = Literal["nominal", "random"]
 ClockKind = Literal["simulated", "wall"]
 
 
@@ -39,7 +44,9 @@ class EvaluateConfig:
     courses: CourseKind = "easy"
     """easy, or race: longer, with sharper turns, climbs and dives."""
     conditions: ConditionsKind = "nominal"
-    """random: each flight has another vehicle, firmware settings, wind, light, colours and lens."""
+    """random: each flight has another vehicle, firmware settings, wind, light, colours and lens.
+    held-out: the same, and a look that no demonstration has: gates partly hidden, in shadow, at
+    night, or against the sun."""
     autopilot: AutopilotKind = "ardupilot"
     """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
     gains: float = 1.0

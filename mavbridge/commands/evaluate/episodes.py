@@ -30,7 +30,12 @@ from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult, Outcome, StickMeter
-from mavbridge.simulation.world import make_vehicle, needed_params
+from mavbridge.simulation.world import (
+    CONDITIONS_FLAGS,
+    draw_conditions,
+    make_vehicle,
+    needed_params,
+)
 from policy.protocol import Executable
 
 STARTUP_S = 90.0
@@ -56,9 +61,10 @@ class EpisodeSpec:
         return first_seed(self.config.courses) + HELD_OUT_COURSE_SEED + self.seed
 
     @property
-    def conditions_seed(self) -> int | None:
-        """The course's, so that no demonstration had these conditions; None = nominal."""
-        return self.course_seed if self.config.conditions == "random" else None
+    def conditions_flags(self) -> tuple[str, ...]:
+        """Flags of ``python -m sitl``."""
+        flag = CONDITIONS_FLAGS[self.config.conditions]
+        return () if flag is None else (flag, str(self.course_seed))
 
     def __str__(self) -> str:
         return f"course {self.course_seed}"
@@ -92,13 +98,12 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         raw_sticks=config.raw_sticks,
         draw_images=not is_scripted(config.policy),
     )
+    conditions = draw_conditions(config.conditions, spec.course_seed)
     flight = SimulatedFlight(
         course_seed=spec.course_seed,
         seed=spec.seed,
         settings=settings,
-        vehicle=make_vehicle(
-            autopilot=config.autopilot, gains=config.gains, conditions_seed=spec.conditions_seed
-        ),
+        vehicle=make_vehicle(autopilot=config.autopilot, gains=config.gains, conditions=conditions),
     )
     with load_for_episodes(config.policy, flight.clock) as loaded:
         executable = _measured(loaded.executable, config)
@@ -133,7 +138,7 @@ def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> Flo
     """
     port = free_port()
     camera = f"shm:mavbridge-evaluate-{port}"
-    conditions_seed, image_size = spec.conditions_seed, spec.config.policy.image_size
+    image_size = spec.config.policy.image_size
     with TemporaryDirectory(prefix="mavbridge-evaluate-") as folder:
         report, log = Path(folder, "vehicle.json"), Path(folder, "vehicle.log")
         command = (
@@ -141,7 +146,7 @@ def fly_on_wall_clock(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> Flo
             *("--connect", f"udpout:127.0.0.1:{port}", "--report", str(report)),
             *("--course", str(spec.course_seed), "--autopilot", spec.config.autopilot),
             *("--image-size", str(max(SIM_CAMERA_PX, image_size or 0))),
-            *(() if conditions_seed is None else ("--conditions", str(conditions_seed))),
+            *spec.conditions_flags,
         )
         with running(*command, log=log) as vehicle:
             try:

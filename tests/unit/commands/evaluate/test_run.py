@@ -11,10 +11,10 @@ import pytest
 from helpers.evaluated_flights import finished
 from mavbridge.__main__ import main
 from mavbridge.commands.evaluate import run
-from mavbridge.commands.evaluate.config import ConditionsKind, EvaluateConfig
+from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode, fly_simulated
 from mavbridge.commands.evaluate.run import INTERRUPTED, evaluate
-from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES
+from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES, ConditionsKind
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError
 from mavbridge.flight.policies import is_stateless
@@ -51,10 +51,19 @@ def test_only_built_in_nets_are_kept_from_one_episode_to_the_next() -> None:
     assert not is_stateless(PolicyConfig(policy="my.package:Policy"))
 
 
-def test_random_conditions_are_held_out_like_the_courses() -> None:
-    for conditions, held_out in (("random", [1_000_000, 1_000_001]), ("nominal", [None, None])):
-        config = EvaluateConfig(policy=CIRCLE, conditions=conditions)
-        assert [spec.conditions_seed for spec in specs(config, 2)] == held_out
+@pytest.mark.parametrize(
+    ("kind", "flags"),
+    [
+        ("nominal", ()),
+        ("random", ("--conditions", "1000001")),
+        ("held-out", ("--held-out-conditions", "1000001")),
+    ],
+)
+def test_conditions_are_held_out_like_the_courses(
+    kind: ConditionsKind, flags: tuple[str, ...]
+) -> None:
+    spec = EpisodeSpec(config=EvaluateConfig(policy=CIRCLE, conditions=kind), index=1)
+    assert spec.conditions_flags == flags
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from sitl.camera import scenery
 from sitl.camera.fpv import NEAR_M, FpvRenderer, clip_near
 from sitl.course.layout import Course, Gate, make_course
 from sitl.rotation import IDENTITY, from_euler
-from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.conditions import NOMINAL, held_out_conditions
 
 TILT_UP_RAD = NOMINAL.camera_tilt_rad
 SIZE_PX = 201
@@ -186,7 +186,7 @@ def test_clipping_cuts_edges_where_they_meet_the_plane():
 
 
 def test_every_face_is_flat_and_its_normal_stands_on_it():
-    faces = scenery.gate_faces(make_course(3))
+    faces = scenery.course_faces(make_course(3), held_out_conditions(4))
     for corners, normal in zip(faces.corners_ned_m, faces.normals_ned, strict=True):
         np.testing.assert_allclose((corners - corners[0]) @ normal, 0, atol=1e-9)
 

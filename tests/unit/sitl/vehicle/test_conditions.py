@@ -13,12 +13,19 @@ from sitl.ardupilot.params import Params
 from sitl.camera.fpv import FpvRenderer
 from sitl.course.layout import make_course
 from sitl.rotation import from_euler, multiply
-from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
+from sitl.vehicle.conditions import (
+    NOMINAL,
+    Conditions,
+    held_out_conditions,
+    random_conditions,
+)
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import GRAVITY_MPS2, Quadrotor
 
 POSE = ((1.0, 0.3, -2.2), from_euler(0.1, -0.15, 0.05))
 
+HELD_OUT = {"hidden_gates", "shaded_gates", "ground_contrast", "glare"}
+"""Never drawn for a demonstration."""
 NOMINAL_POSITION = (-0.661369108, -8.008113679, -3.14245931)
 NOMINAL_ATTITUDE = (0.995199671, 0.097863692, -0.00053679, -0.000157648)
 NOMINAL_VIEW = [
@@ -73,7 +80,35 @@ def test_every_field_is_drawn_and_the_seed_decides():
     drawn = random_conditions(8)
     assert drawn == random_conditions(8)
     same = {f.name for f in fields(drawn) if getattr(drawn, f.name) == getattr(NOMINAL, f.name)}
-    assert same == set()
+    assert same == HELD_OUT
+
+
+def test_a_held_out_look_is_one_that_no_demonstration_has():
+    """Night is in the tints: darker than the darkest that is drawn else."""
+    changed = dict.fromkeys(HELD_OUT, 0)
+    darkest = min(min(random_conditions(seed).sky_tint) for seed in range(200))
+    nights = 0
+    for seed in range(40):
+        usual, held_out = random_conditions(seed), held_out_conditions(seed)
+        assert held_out.wind_ned_mps == usual.wind_ned_mps
+        for name in HELD_OUT:
+            changed[name] += getattr(held_out, name) != getattr(NOMINAL, name)
+        nights += max(held_out.sky_tint) < darkest / 2
+    assert nights == 10
+    assert set(changed.values()) == {10}
+
+
+@pytest.mark.parametrize("name", ["hidden_gates", "shaded_gates", "glare"])
+def test_what_hides_gates_changes_the_picture(name):
+    """A sun straight ahead, for the glare."""
+    usual = replace(NOMINAL, sun_ned=(1.0, 0.0, -0.2), seed=2)
+    changed = render(replace(usual, **{name: 1.0})).astype(int)
+    assert np.abs(changed - render(usual)).mean() > 0.5
+
+
+def test_the_sun_behind_does_not_blind():
+    behind = replace(NOMINAL, sun_ned=(-0.9, 0.0, -0.4))
+    np.testing.assert_array_equal(render(replace(behind, glare=1.0)), render(behind))
 
 
 def test_numbers_are_flat():
