@@ -59,10 +59,13 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
 def is_exemplary(folder: Path) -> bool:
     """False for a flight that failed: flying into a gate's frame is not to be imitated.
 
-    It missed gates as a demonstration, its pilot has marked it as bad, or it crashed. A policy's
-    flight that an expert has labelled ("dagger") is learnt from whatever became of it.
+    It missed gates as a demonstration, its pilot has marked it as bad, it crashed, or it ended
+    before its policy sent anything. A policy's flight that an expert has labelled ("dagger") is
+    learnt from whatever became of it.
     """
     meta = _read_meta(folder)
+    if meta.get("ticks") == 0:
+        return False
     return meta.get("source") == "dagger" or meta.get("success") is not False
 
 

@@ -193,13 +193,15 @@ class Autopilot:
     ) -> None:
         """Put the vehicle in the air in this state, armed; in ALTCTL, unless setpoints fly it.
 
-        Until the first sticks come they count as valid and centred. Setpoints go on.
+        Sticks that are valid go on, as do setpoints; else they count as valid and centred until the
+        first ones come.
         """
         self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
         self.sensed = self.gps = self._physics.body
         commander = self.commander
         if commander.mode is not Mode.OFFBOARD:
-            self.stick_input.pretend_centred(self.now_ns)
+            if not self.stick_input.valid:
+                self.stick_input.pretend_centred(self.now_ns)
             commander.mode = commander.intended = self._flown_mode = Mode.ALTCTL
             commander.start(ignores_sticks=False)
         self._set_landed(landed=False)

@@ -211,6 +211,7 @@ def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
         ({"source": "demonstration", "success": False}, False),
         ({"source": "demonstration", "success": True}, True),
         ({"source": "dagger", "success": False}, True),
+        ({"source": "dagger", "success": False, "ticks": 0}, False),
         ({"source": "flight", "success": None}, True),
         ({"source": "flight", "success": False, "crash": "it lay on its back"}, False),
         ({"source": "pilot", "success": None}, True),

@@ -49,6 +49,16 @@ def test_a_launched_vehicle_misses_the_sticks_that_came_and_stopped(airborne):
     assert airborne.ap.in_failsafe
 
 
+def test_a_launch_under_sticks_leaves_them(ends):
+    """Else the vehicle would show sticks that nobody has sent."""
+    ends.run(0.2, {0: (0, 300, 500, 0)})
+    ends.vehicle.launch(START)
+
+    assert ends.ap.stick_input.sticks.right == pytest.approx(0.3)
+    ends.run(0.6)
+    assert not ends.ap.stick_input.valid
+
+
 def test_it_hovers_at_the_thrust_of_sih(airborne):
     airborne.run(3.0, {0: MID})
     motors = airborne.ap.truth.motors
