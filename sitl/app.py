@@ -28,9 +28,9 @@ class PilotOptions(NamedTuple):
 
     name: PilotName
     axes: str
-    """Of a gamepad, as ``sitl.pilot.axes`` reads them."""
+    """Axes of a gamepad, as ``sitl.pilot.axes`` reads them."""
     speed_mps: float
-    """Of the expert."""
+    """Speed of the expert."""
 
 
 def run_vehicle(

@@ -11,7 +11,7 @@ from mavbridge.core.records import ImageArray
 
 MAX_JPEG_BYTES = 16 << 20
 MAX_BETWEEN_BYTES = 4096
-"""Of what is no JPEG before the next one: multipart headers."""
+"""Most bytes between two JPEGs: multipart headers."""
 MAX_BAD_FRAMES = 10
 """Frames in a row that cannot be decoded."""
 _SOI, _EOI, _SOS, _FILL = b"\xff\xd8", 0xD9, 0xDA, 0xFF
@@ -25,7 +25,7 @@ class RawFormat(NamedTuple):
     bits: int
     """For each pixel."""
     conversion: int | None
-    """Of OpenCV, to RGB; None: it is RGB."""
+    """OpenCV's code of the conversion to RGB; None: it is RGB."""
 
 
 RAW_FORMATS = {

@@ -20,7 +20,8 @@ class ActionFrame:
     """Kind of a policy's actions, and how its axes lie to NED and FRD."""
 
     neutral: Action = NEUTRAL
-    """Of the policy's kind: zeros, with the thrust that hovers. The same in both axes."""
+    """Action of the policy's kind that does nothing: zeros, with the thrust that hovers. The same
+    in both axes."""
     order: tuple[int, ...] = (0, 1, 2, 3)
     signs: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
     """Number ``i`` in the one axes is ``signs[i]`` times number ``order[i]`` in the other."""

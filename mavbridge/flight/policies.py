@@ -19,7 +19,7 @@ NO_IMAGE_ADVICE = "looks at no image: --camera none does without"
 STATELESS = (*BUILTIN_KINDS, "onnx")
 FILE_KINDS = ("lerobot", "onnx", "torchscript")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
-"""Of the files of a policy's folder."""
+"""Files of a policy's folder that belong to it."""
 
 
 def load_configured_policy(

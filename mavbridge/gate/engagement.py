@@ -16,7 +16,7 @@ from mavbridge.gate.preparation import Preparation, PreparationSettings
 PREPARE_TIMEOUT_NS = 90 * NS_PER_S
 """For mode change and arming; a cold autopilot needs some 40 s for its estimator."""
 SLOWEST_CLIMB_MPS = 1.0
-"""Of a takeoff by the autopilot, for which the above is prolonged; 1.5 m/s and more are usual."""
+"""Slowest takeoff by the autopilot, for which the time above is prolonged; 1.5 m/s are usual."""
 ACT_TIMEOUT_NS = 3 * NS_PER_S
 """For the change of mode that an act asks for while armed: no act comes true much later."""
 RELEASE_TIMEOUT_NS = NS_PER_S

@@ -84,7 +84,7 @@ class LimitSettings:
     climb_mps: float = 3.0
     """Up or down."""
     accel_mps2: float = 5.0
-    """Of a velocity, in any horizontal direction; also up and down."""
+    """Most change of a velocity, in any horizontal direction, and up and down."""
 
     def of(self, kind: ActionKind) -> ActionLimits:
         """Limits of one kind of action."""

@@ -65,7 +65,7 @@ class FlightMeta:
     command: tuple[str, ...] = ()
     """Command line, word by word, without passwords."""
     versions: dict[str, str] = field(default_factory=dict)
-    """Of mavbridge, Python, the system and the packages that matter, by name."""
+    """Versions of mavbridge, Python, the system and packages that matter, by name."""
     git_revision: str | None = None
     """Commit of the checkout that ran, with ``-dirty`` where files of it differed."""
     policy_files: dict[str, str] = field(default_factory=dict)

@@ -13,7 +13,7 @@ MAX_ENTRIES = 24
 """Files kept, about eight policies of two graphs each, some at two precisions; the least recently
 used is dropped first."""
 MAX_BYTES = 2_000_000_000
-"""Of all files together: the graphs of a large policy are as large as its weights."""
+"""Size of all files together: the graphs of a large policy are as large as its weights."""
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 

@@ -21,7 +21,7 @@ from policy.nets.toge import Toge
 
 OurPolicy: TypeAlias = Toge | ResnetUnet
 OPSET = 18
-"""Of ONNX: of 2022, so that every runtime in use reads it."""
+"""ONNX operator set: of 2022, so that every runtime in use reads it."""
 DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
 
 

@@ -133,7 +133,7 @@ class Program:
     """What is flown, and where."""
 
     motion: Callable[[float], Motion]
-    """Of the seconds since the program began."""
+    """Motion by the seconds since the program began."""
     altitude_m: float = TAKEOFF_ALTITUDE_M
     """Above the start, where that is the ground."""
 

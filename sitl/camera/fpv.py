@@ -26,7 +26,7 @@ GATE_HAZE_M = 90.0  # distance at which a gate has lost 63 % of its contrast
 GROUND_FADE_M = 14.0
 """Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
 GLOW_SHARE = 0.18
-"""Of the image's width: where the sun's glow has lost 63 %."""
+"""Share of the image's width at which the sun's glow has lost 63 %."""
 SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
 REFERENCE_WIDTH_PX = 224  # image width for which the conditions give the blur
 NOISE_MARGIN_PX = 61

@@ -57,7 +57,7 @@ class Scenario:
     carrier: CarrierName = "udp"
     """The bridge's link."""
     baud: int = 115_200
-    """Of a serial port."""
+    """Bits a second of a serial port."""
     policy: str = "Leaning"
     """Class in ``catalogue/policies.py``."""
     flags: list[str] = field(default_factory=list)

@@ -87,7 +87,7 @@ class SoakResult:
     sent: int = 0
     """Overrides and releases that left the bridge."""
     growth: dict[str, Usage] = field(default_factory=dict)
-    """Of the flight process and of the gate, after they had settled."""
+    """Growth of the flight process and of the gate, after they had settled."""
     stalls: int = 0
     """Faults that the policy should have survived, but a busy machine took the sticks from it."""
     failures: list[str] = field(default_factory=list)

@@ -39,7 +39,7 @@ class Home(NamedTuple):
     alt_m: float
     """Above mean sea level."""
     field_ned_gauss: Vec3
-    """Of the earth's magnet."""
+    """Magnetic field of the earth."""
 
     def lat_lon_e7(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 degrees."""

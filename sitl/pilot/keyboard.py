@@ -13,7 +13,7 @@ HELP = (
     "switch of channel 7 up and down, X to its middle"
 )
 DEFLECTION = 0.7
-"""Of full travel; with Shift all of it."""
+"""Share of full travel; with Shift all of it."""
 TRAVEL_PER_S = 4.0
 """Sticks move towards where the keys want them at this speed: a thumb's, and not a jump."""
 _SIZE_PX = (460, 120)

@@ -36,7 +36,7 @@ class SigningKey(NamedTuple):
     key: bytes
     """32 bytes."""
     timestamp: int
-    """Of the first packet, in units of 10 us since 2015."""
+    """Timestamp of the first packet, in units of 10 us since 2015."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -37,7 +37,7 @@ class Airframe:
     air_density_kgpm3: float = 1.225
     """0 leaves the rotors' drag alone."""
     step_ns: int = 1_250_000
-    """Of the physics; a firmware's control period is a whole number of them."""
+    """Step of the physics; a firmware's control period is a whole number of them."""
 
 
 QUAD = Airframe()

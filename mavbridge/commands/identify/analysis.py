@@ -14,7 +14,7 @@ from policy.contract import ActionKind, Contract
 from policy.scripted.programs import Axis, DoubletStep, doublet_steps
 
 BEFORE_S = 0.1
-"""Of the motion before a push that is looked at."""
+"""Length of the motion before a push that is looked at."""
 EARLY_S = 0.12
 """A push ends by so much before its time: chunks are linear between their actions, and sampled
 ahead by the lag of the smoothing."""
@@ -24,7 +24,7 @@ LEAST_R_SQUARED = 0.7
 SETTLED = 0.1
 """Most change between the last two eighths of a push, of the whole, at which it has settled."""
 STILL_S = 1.0
-"""Of the end of each pause: by then the vehicle hovers."""
+"""Length of the end of each pause that is looked at: by then the vehicle hovers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,7 +183,7 @@ class FullStick:
     reached: float
     trained: float
     dead_zone: float
-    """Of the stick's travel, where the line meets zero."""
+    """Share of the stick's travel at which the line meets zero."""
 
 
 def full_stick(

@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 STEP_S = 0.005
 LEAD_S = 0.5
-"""Of the input before the first output: what the output still remembers."""
+"""Time of the input before the first output: what the output still remembers."""
 DEAD_TIMES_S = np.arange(0.0, 0.601, 0.02)
 LAGS_S = np.geomspace(0.01, 1.5, 36)
 FINE_DEAD_S = np.arange(-0.02, 0.0201, 0.002)

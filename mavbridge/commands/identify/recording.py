@@ -11,7 +11,7 @@ from mavbridge.core.records import Event, Tick, VehicleState
 from mavbridge.core.vehicle import Action
 
 MAX_ROWS = 100_000
-"""Of actions, and of states: four minutes at 400 Hz. Beyond it the oldest are forgotten."""
+"""Most actions, and most states: four minutes at 400 Hz. Beyond it the oldest are forgotten."""
 
 
 class ResponseRecording:

@@ -180,7 +180,7 @@ def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
 
 
 def _old_images(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
-    """Of each stretch of sticks by images twice as old as usual, the ones by the oldest."""
+    """In each stretch of sticks by images twice as old as usual, those by the oldest one."""
     aged = [
         (tick.sent_ns - tick.feature_captured_ns, tick)
         for tick in ticks

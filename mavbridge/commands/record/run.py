@@ -56,7 +56,7 @@ JOIN_S = 2.0
 RERUN_CAPACITY = 1000
 GATE_END_S = 5.0
 MAX_FROZEN_S = MAX_BLACK_S = 0.5
-"""Of the image, before it is shown as a problem."""
+"""Time for which an image may stand still, or be black, before it is shown as a problem."""
 NOTHING = np.zeros((1, 1), np.float32)
 CONTRACT = Contract(feature_dim=1, arrays="numpy")
 """What the recorded sticks mean: those of a policy with the usual contract, into whose terms the

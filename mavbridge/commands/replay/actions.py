@@ -17,7 +17,7 @@ class ActionResult:
     """One policy beside one recording."""
 
     name: str
-    """Of the recording."""
+    """Name of the recording."""
     recorded_by: str
     """Whose actions they are compared with."""
     policy: str
@@ -28,7 +28,7 @@ class ActionResult:
 
     @property
     def figures(self) -> dict[str, list[float]]:
-        """Of each stick, in full deflections; empty where nobody had sticks."""
+        """Figures of each stick, in full deflections; empty where nobody had sticks."""
         difference = self.actions.difference
         if not len(difference):
             return {}

@@ -38,8 +38,8 @@ MG_TO_MPS2 = 9.80665e-3
 _TEXT_BYTES = 50
 """Text of one STATUSTEXT."""
 MOST_VALUE = 1e9
-"""Of an angle, a rate, a speed, a position or a force in SI units: far beyond any vehicle, and its
-square is still a number in the float32 with which policies compute."""
+"""Largest angle, rate, speed, position or force in SI units: far beyond any vehicle, and its square
+is still a number in the float32 with which policies compute."""
 UNPRINTABLE = "\N{REPLACEMENT CHARACTER}"
 """Stands for control characters, with which a text could write into the user's terminal."""
 _HIGHRES_ACCEL_FIELDS = 0b111

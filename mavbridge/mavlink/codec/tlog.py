@@ -10,7 +10,7 @@ STAMP_BYTES = 8
 """Big-endian, unsigned."""
 _BLOCK_BYTES = 1 << 20
 _MOST_BYTES = STAMP_BYTES + 300
-"""Of one record: a MAVLink packet has at most 280 bytes."""
+"""Size of one record: a MAVLink packet has at most 280 bytes."""
 
 
 def read_tlog(path: Path) -> Iterator[tuple[int, RawPacket]]:

@@ -20,7 +20,7 @@ MAX_QUEUED_BYTES = 64 * 1024
 MAX_PACKED = 1200
 """Bytes in one datagram, below any usual MTU; what arrived larger leaves larger."""
 _MAX_DATAGRAM = 2048
-"""Of the ground station: what is longer than any usual MTU is cut off, and is not MAVLink."""
+"""Longest datagram of a ground station; beyond any usual MTU it is no MAVLink, and is cut off."""
 
 
 def _own_side(station: Address) -> Address:

@@ -12,7 +12,7 @@ from mavbridge.observe.viewer.columns import Columns, Spread
 from mavbridge.observe.viewer.layout import ViewedFlight
 
 ALLOWED_SHARE = 0.001
-"""Of slots and of images: what a minute at full rate may lose, by our own measure."""
+"""Share of slots and of images that a minute at full rate may lose, by our own measure."""
 _GAP = Sticks(math.nan, math.nan, math.nan, math.nan)
 
 

@@ -42,7 +42,7 @@ class PolicyComparison:
     equal_chunks: int
     """Solves with the same chunk, bit for bit."""
     deviation: Deviation
-    """Of all actions of all chunks."""
+    """Deviation of all actions of all chunks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class GateComparison:
     first: str | None
     """The first difference, in words."""
     deviation: Deviation
-    """Of the smoothed sticks."""
+    """Deviation of the smoothed sticks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +79,7 @@ class StickTraces:
 
 
 def deviation_of(difference: Array) -> Deviation:
-    """Of absolute differences [N, 4]."""
+    """Largest and root mean square of absolute differences [N, 4]."""
     if not len(difference):
         return Deviation(largest=(0.0,) * 4, rms=(0.0,) * 4)
     return Deviation(

@@ -55,7 +55,7 @@ class ReplaySource:
     ticks: tuple[Tick, ...]
     solves: tuple[Solve, ...]
     features: tuple[tuple[FeatureFrame, ...], ...]
-    """Of each camera of the contract; empty for a single-rate policy."""
+    """Features of each camera of the contract; empty for a single-rate policy."""
     packets: tuple[RecordedPacket, ...]
     """In order of arrival."""
     gaps: tuple[str, ...]

@@ -163,7 +163,7 @@ class Act(nn.Module):
 
     @staticmethod
     def own_name(name: str) -> str | None:
-        """Of a parameter in LeRobot's file, without the prefix; None: inference needs it not."""
+        """Our name of a parameter in LeRobot's file, without the prefix; None: not needed."""
         return None if name.startswith("vae_encoder") else name
 
     def encode(self, image: Tensor, _camera: int) -> Tensor:

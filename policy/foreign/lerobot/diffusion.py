@@ -80,7 +80,7 @@ class Diffusion(nn.Module):
 
     @staticmethod
     def own_name(name: str) -> str | None:
-        """Of a parameter in LeRobot's file, without the prefix; None: inference needs it not."""
+        """Our name of a parameter in LeRobot's file, without the prefix; None: not needed."""
         name = name.replace("unet._orig_mod.", "unet.")  # of a policy that was compiled
         before, dot, after = name.partition("backbone.")
         return before + dot + torchvision_name(after) if dot else name

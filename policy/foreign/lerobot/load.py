@@ -14,7 +14,7 @@ from policy.foreign.lerobot.policy import LeRobotDiffusion, LeRobotPolicy, build
 from policy.foreign.lerobot.statistics import WEIGHTS_FILE
 
 _STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
-"""Of checkpoints before 0.4; they are read apart."""
+"""Prefixes of the statistics in checkpoints before 0.4, which are read apart."""
 _COUNTS = "num_batches_tracked"
 
 

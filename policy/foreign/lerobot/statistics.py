@@ -40,7 +40,7 @@ class Affine:
 
 @dataclass(frozen=True, kw_only=True)
 class Normalisation:
-    """Of each input by its name in config.json, and of the action; None: as it is."""
+    """Statistics of each input, by its name in config.json, and of the action; None: as it is."""
 
     images: Mapping[str, Affine | None]
     state: Affine | None

@@ -57,7 +57,7 @@ class ServerLink:
         self._url = url
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
         self._metadata: Future[Message] = Future()
-        """Of the first connection."""
+        """Metadata of the first connection."""
         self._problem: str | None = None
         """Why there is no connection now."""
         self._next: _Request | None = None

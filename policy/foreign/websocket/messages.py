@@ -19,7 +19,7 @@ from policy.errors import PolicyError
 
 Message: TypeAlias = dict[str, object]
 CONTRACT_KEY = "mavbridge_contract"
-"""Of the metadata of our own server: its contract as JSON."""
+"""Key in the metadata of our own server: its contract as JSON."""
 ARRAY, NUMBER = "__ndarray__", "__npgeneric__"
 MAX_DIMENSIONS = 8
 _NUMERIC_DTYPE = re.compile(r"[<>|=]?[biuf][1248]|bool|u?int(8|16|32|64)|float(16|32|64)")

@@ -16,7 +16,7 @@ from policy.foreign.websocket.messages import Message, MessageError, number_arra
 from policy.preprocess import image_to_input
 
 HISTORY_KEY = "action_history"
-"""Of requests to our own server: float32 [K, 4]."""
+"""Key in requests to our own server: float32 [K, 4]."""
 RESET_KEY = "reset"
 """Likewise: true where a flight has begun since the last request."""
 

@@ -20,7 +20,7 @@ from policy.foreign.websocket.messages import (
 from policy.foreign.websocket.observation import RESET_KEY, to_message
 
 ACTIONS_KEY = "actions"
-"""Of an answer, unless the contract file's own key is there."""
+"""Key of the actions in an answer, unless the contract file's own key is there."""
 TRIAL_S = 120.0
 """Longest first answers, before any flight: servers compile on their first request."""
 MOST_WAIT_S = 1.5

@@ -13,7 +13,7 @@ CarrierName: TypeAlias = Literal["udp", "tcp", "serial"]
 LOOPBACK = "127.0.0.1"
 MOST_BYTES = 65536
 BITS_PER_BYTE = 10
-"""Of a serial port: 8, and a start and a stop bit."""
+"""Bits on a serial line for a byte: 8, and a start and a stop bit."""
 LINE_BUFFER = 4096
 """A serial driver's ring of bytes that wait to be sent."""
 PACE_S = 0.002

@@ -17,7 +17,7 @@ class Transmitter:
     def __init__(self, port: int, receiver: Receiver) -> None:
         """``receiver`` says where its throttle rests."""
         self.flags = ("--rc-in", str(port))
-        """Of the simulated vehicle."""
+        """Flags of the simulated vehicle."""
         self._address = (HOST, port)
         sticks_us = RECEIVER_US.get(receiver, NEUTRAL_US)
         self._channels_us = [*sticks_us, 1500, *[SWITCH_ON_US] * (CHANNELS - 5)]

@@ -47,7 +47,7 @@ ONBOARD_HZ: Mapping[int, float] = MappingProxyType(
         mav.MAVLINK_MSG_ID_SYS_STATUS: 5.0,
     }
 )
-"""Of a link to a companion computer (mode Onboard)."""
+"""Message rates on a link to a companion computer (mode Onboard)."""
 GCS_HZ: Mapping[int, float] = MappingProxyType(
     _BOTH
     | {
@@ -65,7 +65,7 @@ GCS_HZ: Mapping[int, float] = MappingProxyType(
         mav.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
     }
 )
-"""Of a link to a ground station (mode Normal, with what PX4's SITL script adds)."""
+"""Rates on a link to a ground station (mode Normal, with what PX4's SITL script adds)."""
 
 _UNSCALED = (mav.MAVLINK_MSG_ID_HEARTBEAT,)
 
