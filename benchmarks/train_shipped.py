@@ -20,11 +20,8 @@ from mavbridge.commands.output import table_console
 app = App(help=__doc__)
 
 NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
-OWN = "--num-diffusion-steps 1"
-"""A student that flies to be corrected is sampled in one step: it leaves the time to the expert."""
-
 RACES, PX4 = "--action rates --courses race", "--autopilot px4"
-AGES = "--ages 10:120"
+STICK_AGES, RATE_AGES = "--ages 10:160", "--ages 10:140"
 
 
 class Step(NamedTuple):
@@ -34,48 +31,59 @@ class Step(NamedTuple):
     command: str
 
 
-def race_of(makes: str, student: str, flags: str) -> Step:
-    """A student's own races, labelled by the expert."""
-    own = f"{OWN} --checkpoint {student}.safetensors"
-    return Step(makes, f"demonstrate {flags} --speed 9 {RACES} {own}")
+def flights(makes: str, flags: str, student: str | None = None) -> Step:
+    """Flights of the expert, or of a student that it corrects."""
+    own = "" if student is None else f" --checkpoint {student}.safetensors"
+    return Step(makes, f"demonstrate {flags}{own}")
+
+
+def training(makes: str, data: str, flags: str, start: str | None = None) -> Step:
+    """A training of so many minutes on these folders, from the weights of an earlier one."""
+    start_from = "" if start is None else f" --start-from {start}.safetensors"
+    return Step(f"{makes}.safetensors", f"train {data} {NET} {flags}{start_from}")
 
 
 STEPS: dict[str, tuple[Step, ...]] = {
     "toge": (
-        Step("demos", "demonstrate --episodes 109 --speed 5"),
-        Step("demos2", "demonstrate --episodes 32 --seed 2 --speed 5"),
-        Step("first.safetensors", f"train demos demos2 {NET} --minutes 20"),
-        Step(
-            "own1",
-            f"demonstrate --episodes 60 --seed 4 --speed 5 {OWN} --checkpoint first.safetensors",
-        ),
-        Step(
-            "own2",
-            f"demonstrate --episodes 12 --seed 5 --speed 5 {OWN} --checkpoint first.safetensors",
-        ),
-        Step(
-            "toge.safetensors",
-            f"train demos demos2 own1 own2 {NET} --minutes 28 --start-from first.safetensors "
-            "--pack",
+        flights("demos", "--episodes 100 --seed 30 --speed 8"),
+        flights("demos_px4", f"--episodes 40 --seed 31 --speed 6 {PX4}"),
+        training("first", "demos demos_px4", f"--minutes 40 {STICK_AGES}"),
+        flights("own", "--episodes 40 --seed 32 --speed 8", "first"),
+        flights("own_px4", f"--episodes 20 --seed 33 --speed 6 {PX4}", "first"),
+        training(
+            "toge",
+            "demos demos_px4 own own_px4",
+            f"--minutes 30 {STICK_AGES} --pack",
+            start="first",
         ),
     ),
     "toge-rates": (
-        Step("races", f"demonstrate --episodes 100 --seed 3 --speed 9.5 {RACES}"),
-        Step("races_px4", f"demonstrate --episodes 30 --seed 4 --speed 9 {RACES} {PX4}"),
-        Step("first.safetensors", f"train races races_px4 {NET} --minutes 45 {AGES}"),
-        race_of("own1", "first", "--episodes 54 --seed 11"),
-        race_of("own1_px4", "first", f"--episodes 14 --seed 12 {PX4}"),
-        Step(
-            "second.safetensors",
-            f"train races races_px4 own1 own1_px4 {NET} --minutes 22 {AGES} "
-            "--start-from first.safetensors",
+        flights("races", f"--episodes 100 --seed 3 --speed 9.5 {RACES}"),
+        flights("races_px4", f"--episodes 30 --seed 4 --speed 9 {RACES} {PX4}"),
+        training("first", "races races_px4", f"--minutes 45 {RATE_AGES}"),
+        flights("own1", f"--episodes 54 --seed 11 --speed 9 {RACES}", "first"),
+        flights("own1_px4", f"--episodes 14 --seed 12 --speed 9 {RACES} {PX4}", "first"),
+        training(
+            "second",
+            "races races_px4 own1 own1_px4",
+            f"--minutes 22 {RATE_AGES}",
+            start="first",
         ),
-        race_of("own2", "second", "--episodes 44 --seed 13"),
-        race_of("own2_px4", "second", f"--episodes 20 --seed 14 {PX4}"),
-        Step(
-            "toge-rates.safetensors",
-            f"train races races_px4 own1 own1_px4 own2 own2_px4 {NET} --minutes 22 {AGES} "
-            "--start-from second.safetensors --pack",
+        flights("own2", f"--episodes 44 --seed 13 --speed 9 {RACES}", "second"),
+        flights("own2_px4", f"--episodes 20 --seed 14 --speed 9 {RACES} {PX4}", "second"),
+        training(
+            "third",
+            "races races_px4 own1 own1_px4 own2 own2_px4",
+            f"--minutes 22 {RATE_AGES}",
+            start="second",
+        ),
+        flights("own3", f"--episodes 50 --seed 34 --speed 9 {RACES}", "third"),
+        flights("own3_px4", f"--episodes 24 --seed 35 --speed 9 {RACES} {PX4}", "third"),
+        training(
+            "toge-rates",
+            "races races_px4 own1 own1_px4 own2 own2_px4 own3 own3_px4",
+            f"--minutes 30 {RATE_AGES} --pack",
+            start="third",
         ),
     ),
 }

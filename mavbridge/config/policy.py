@@ -9,10 +9,9 @@ from cyclopts import Parameter
 from mavbridge.config.checks import check_range
 from mavbridge.config.groups import POLICY, RARE
 
-WARM_STEPS = 2
-"""Of toge, as it ships: ten steps from noise for each chunk are too slow for two cores."""
-STEPS, RATES_STEPS = 10, 1
-"""DDIM steps from noise: of most policies, and of toge-rates, which flies as well in one."""
+STEPS, TOGE_STEPS = 10, 1
+"""DDIM steps from noise of most policies, and of toge and toge-rates, which fly as well in one
+(docs/study.md)."""
 Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 
 
@@ -39,11 +38,10 @@ class PolicyConfig:
     """Encode images in their own thread and sample actions faster from the cached feature; by
     default wherever the policy can (encode_visual and predict_fast)."""
     num_diffusion_steps: Annotated[int | None, Parameter(show_default=False)] = None
-    """DDIM steps of the action head: by default 10, and 1 for toge-rates."""
+    """DDIM steps of the action head: by default 10, and 1 for toge and toge-rates."""
     head_steps: int | None = None
-    """Warm start at two rates: DDIM steps from the last chunk, shifted to now, in place of all
-    steps from noise; by default 2 for toge, and none for other policies; 0 = every solve from
-    noise."""
+    """Warm start at two rates: so many of 10 DDIM steps, from the last chunk shifted to now, in
+    place of all steps from noise; by default, and with 0, every chunk is sampled from noise."""
     allow_untrained: Annotated[bool, Parameter(group=RARE)] = False
     """Fly TOGE with random weights: for timing and bring-up only."""
     by_rates: bool = False
@@ -86,12 +84,10 @@ class PolicyConfig:
         """DDIM steps from noise."""
         if self.num_diffusion_steps is not None:
             return self.num_diffusion_steps
-        return RATES_STEPS if self.kind == "toge-rates" else STEPS
+        is_toge = self.kind in ("toge", "toge-rates")
+        return TOGE_STEPS if is_toge and not self.head_steps else STEPS
 
     @property
     def warm_steps(self) -> int | None:
         """DDIM steps of a warm start; None: every solve starts from noise."""
-        if self.head_steps is not None:
-            return self.head_steps or None
-        is_warm = self.may_be_dual and self.kind == "toge"
-        return WARM_STEPS if is_warm and self.steps > WARM_STEPS else None
+        return self.head_steps or None

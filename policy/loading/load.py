@@ -154,19 +154,12 @@ def _on_engine(
             "policy with denoise_fast, such as toge; every solve is a full one"
         )
     is_ours = request.spec.partition(":")[0] in BUILTIN_KINDS
-    head_steps = request.head_steps
-    if is_ours and policy.contract.action == "rates" and head_steps is not None:
-        head_steps = None
-        notes.append(
-            "every solve is a full one: weights that learned from body rates hold on to the last "
-            "chunk in a warm start"
-        )
     settings = ExecutionSettings(
         name=request.spec,
         vision_device=request.vision_device or request.device,
         action_device=request.action_device or request.device,
         num_diffusion_steps=request.num_diffusion_steps,
-        head_steps=head_steps,
+        head_steps=request.head_steps,
         dual_rate=dual_rate,
     )
     executable, engine_notes = _executable(policy, request, settings)

@@ -76,7 +76,7 @@ def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[st
 
 
 def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
-    full = _load(replace(policy, head_steps=0), lives)
+    full = _load(replace(policy, num_diffusion_steps=policy.steps, head_steps=0), lives)
     contract = full.contract
     shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
     images = np.random.default_rng(0).integers(0, 256, shape, np.uint8)

@@ -1,4 +1,4 @@
-"""How a policy flies where no flag says it: at two rates, and toge with a warm start."""
+"""How a policy flies where no flag says it: at two rates, and toge in one step from noise."""
 
 from typing import Any
 
@@ -10,30 +10,26 @@ from mavbridge.core.errors import UserError
 
 
 @pytest.mark.parametrize(
-    ("changes", "is_dual", "warm_steps"),
+    ("changes", "is_dual", "steps", "warm_steps"),
     [
-        ({}, True, 2),
-        ({"policy": "toge:medium"}, True, 2),
-        ({"dual_rate": True}, True, 2),
-        ({"dual_rate": False}, False, None),
-        ({"head_steps": 0}, True, None),
-        ({"head_steps": 3}, True, 3),
-        ({"num_diffusion_steps": 2}, True, None),  # a warm start of all steps saves nothing
-        ({"policy": "resnet-unet"}, False, None),
-        ({"policy": "toge-rates"}, True, None),
-        ({"policy": "./mine.py:Mine"}, True, None),
-        ({"policy": "./mine.py:Mine", "head_steps": 2}, True, 2),
+        ({}, True, 1, None),
+        ({"policy": "toge:medium"}, True, 1, None),
+        ({"dual_rate": False}, False, 1, None),
+        ({"head_steps": 0}, True, 1, None),
+        ({"head_steps": 3}, True, 10, 3),
+        ({"num_diffusion_steps": 4, "head_steps": 2}, True, 4, 2),
+        ({"policy": "resnet-unet"}, False, 10, None),
+        ({"policy": "toge-rates"}, True, 1, None),
+        ({"policy": "toge-rates", "num_diffusion_steps": 4}, True, 4, None),
+        ({"policy": "./mine.py:Mine"}, True, 10, None),
+        ({"policy": "./mine.py:Mine", "head_steps": 2}, True, 10, 2),
     ],
 )
-def test_defaults(changes: dict[str, Any], is_dual: bool, warm_steps: int | None) -> None:
+def test_defaults(
+    changes: dict[str, Any], is_dual: bool, steps: int, warm_steps: int | None
+) -> None:
     config = PolicyConfig(**changes)
-    assert (config.may_be_dual, config.warm_steps) == (is_dual, warm_steps)
-
-
-def test_steps_from_noise_are_those_that_the_weights_fly_best_with() -> None:
-    assert PolicyConfig().steps == 10
-    assert PolicyConfig(policy="toge-rates").steps == 1
-    assert PolicyConfig(policy="toge-rates", num_diffusion_steps=4).steps == 4
+    assert (config.may_be_dual, config.steps, config.warm_steps) == (is_dual, steps, warm_steps)
 
 
 def test_a_warm_start_has_no_more_steps_than_a_solve() -> None:

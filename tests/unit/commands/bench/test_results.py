@@ -40,8 +40,8 @@ def test_missed_fraction_is_of_the_asked_slots() -> None:
     [
         ({"dual_rate": False}, "single rate"),
         ({"head_steps": 0}, "full solves"),
-        ({"num_diffusion_steps": 1}, "full solves"),
-        ({}, "warm start of 2"),
+        ({}, "full solves"),
+        ({"head_steps": 2}, "warm start of 2"),
         ({"dual_rate": True, "head_steps": 3}, "warm start of 3"),
     ],
 )
