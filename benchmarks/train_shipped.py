@@ -45,15 +45,15 @@ def training(makes: str, data: str, flags: str, start: str | None = None) -> Ste
 
 STEPS: dict[str, tuple[Step, ...]] = {
     "toge": (
-        flights("demos", "--episodes 100 --seed 30 --speed 8"),
-        flights("demos_px4", f"--episodes 40 --seed 31 --speed 6 {PX4}"),
+        flights("demos", "--episodes 100 --seed 40 --speed 7"),
+        flights("demos_px4", f"--episodes 40 --seed 41 --speed 5.5 {PX4}"),
         training("first", "demos demos_px4", f"--minutes 40 {STICK_AGES}"),
-        flights("own", "--episodes 40 --seed 32 --speed 8", "first"),
-        flights("own_px4", f"--episodes 20 --seed 33 --speed 6 {PX4}", "first"),
+        flights("own", "--episodes 60 --seed 42 --speed 7", "first"),
+        flights("own_px4", f"--episodes 20 --seed 43 --speed 5.5 {PX4}", "first"),
         training(
             "toge",
             "demos demos_px4 own own_px4",
-            f"--minutes 30 {STICK_AGES} --pack",
+            f"--minutes 40 {STICK_AGES} --pack",
             start="first",
         ),
     ),
