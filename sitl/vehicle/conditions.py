@@ -109,11 +109,7 @@ def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
     conditions = replace(NOMINAL, seed=seed)
     if strength > 0.0:
         draw = _Draw(np.random.Generator(np.random.PCG64(seed)), strength)
-        # The order is part of the seed's meaning.
-        for vary in (
-            *(_vary_physics, _vary_lens, _vary_scene, _vary_firmware, _vary_streams),
-            _vary_airframe,
-        ):
+        for vary in _VARIATIONS:
             conditions = vary(conditions, draw)
     return conditions
 
@@ -177,6 +173,15 @@ class _Draw:
         return (round(255 * red), round(255 * green), round(255 * blue))
 
 
+def _direction_ned(azimuth_rad: float, elevation_rad: float) -> Vec3:
+    """Unit vector to a point of the sky."""
+    return (
+        math.cos(elevation_rad) * math.cos(azimuth_rad),
+        math.cos(elevation_rad) * math.sin(azimuth_rad),
+        -math.sin(elevation_rad),
+    )
+
+
 def _vary_physics(nominal: Conditions, draw: _Draw) -> Conditions:
     body = replace(
         nominal,
@@ -218,11 +223,7 @@ def _vary_scene(nominal: Conditions, draw: _Draw) -> Conditions:
         ground_tint=draw.light(1.25, 1.3),
         sky_tint=draw.light(1.1, 1.15),
         ground_seed=int(draw.random.integers(1 << 16)),
-        sun_ned=(
-            math.cos(elevation_rad) * math.cos(azimuth_rad),
-            math.cos(elevation_rad) * math.sin(azimuth_rad),
-            -math.sin(elevation_rad),
-        ),
+        sun_ned=_direction_ned(azimuth_rad, elevation_rad),
         ambient=min(0.95, max(0.4, nominal.ambient + draw.offset(0.15))),
         exposure=draw.factor(1.3),
         white_balance=draw.tint(1.08),
@@ -270,10 +271,7 @@ def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
 
 
 def _vary_airframe(nominal: Conditions, draw: _Draw) -> Conditions:
-    """From a racing frame to the drag of PX4's SIH, 1 N per m/s; half of the vehicles have little.
-
-    The loop of the body rates settles in 30 to 90 ms.
-    """
+    """From a racing frame to the drag of PX4's SIH, 1 N per m/s; half of them have little."""
     is_heavy = draw.random.random() < 0.5
     heavy_nspm = 0.15 * math.exp(draw.amount(math.log(1.0 / 0.15)))
     return replace(
@@ -282,6 +280,17 @@ def _vary_airframe(nominal: Conditions, draw: _Draw) -> Conditions:
         motor_lag_factor=draw.factor(1.5),
         rate_gain_factor=round(draw.factor(1.35), 3),
     )
+
+
+_VARIATIONS = (
+    _vary_physics,
+    _vary_lens,
+    _vary_scene,
+    _vary_firmware,
+    _vary_streams,
+    _vary_airframe,
+)
+"""In the order in which they draw, which is part of the seed's meaning."""
 
 
 def _hide_gates(usual: Conditions, draw: _Draw) -> Conditions:
@@ -309,9 +318,5 @@ def _make_glare(usual: Conditions, draw: _Draw) -> Conditions:
     return replace(
         usual,
         glare=0.5 + draw.amount(0.5),
-        sun_ned=(
-            math.cos(elevation_rad) * math.cos(azimuth_rad),
-            math.cos(elevation_rad) * math.sin(azimuth_rad),
-            -math.sin(elevation_rad),
-        ),
+        sun_ned=_direction_ned(azimuth_rad, elevation_rad),
     )

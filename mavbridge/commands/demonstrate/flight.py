@@ -71,9 +71,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         max_tilt_deg=RATE_TILT_DEG if spec.config.action == "rates" else None,
     )
     if wanted.checkpoint is not None:
-        loaded = load_for_episodes(
-            replace(wanted, dual_rate=True, head_steps=wanted.head_steps or 0), MonotonicClock()
-        )
+        loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
         student = stack.enter_context(loaded).executable
         contract = student.contract
         if contract.action != spec.config.action:

@@ -16,9 +16,7 @@ def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
     Raises:
         MavbridgeError, PolicyError: it cannot be flown.
     """
-    wanted = PolicyConfig(
-        policy=settings.policy, checkpoint=checkpoint, dual_rate=True, head_steps=0
-    )
+    wanted = PolicyConfig(policy=settings.policy, checkpoint=checkpoint, dual_rate=True)
     first, passed, total = first_seed(settings.check_courses) + CHECK_COURSE_SEED, 0, 0
     with load_configured_policy(wanted, MonotonicClock()) as loaded:
         for index in range(settings.check_flights):
