@@ -279,6 +279,8 @@ class Stage:
         bridge = self._running()
         try:
             bridge.wait(TIMEOUT_S)
+        except subprocess.TimeoutExpired as error:
+            raise StageError(f"the bridge has not ended:\n{self._text}") from error
         finally:
             self.close()
         return bridge.returncode, self._text
