@@ -14,6 +14,7 @@ body rates, where the policy does. So what differs is who closes them, and nothi
 
 import math
 from dataclasses import asdict, dataclass
+from itertools import product
 from json import dumps, loads
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -35,27 +36,45 @@ from policy.loading.builtin import SHIPPED, SHIPPED_RATES
 
 Loop = Literal["one rate", "100 actions a second", "250 actions a second"]
 LOOPS: tuple[Loop, ...] = ("one rate", "100 actions a second", "250 actions a second")
+ControlName = Literal[
+    "sticks", "by-rates", "races", "sticks-gusts", "by-rates-gusts", "by-rates-px4"
+]
 ENCODER_MS = (5, 20, 50, 100, 200)
 HEAD_MS = 4
 """What the action head takes beside the encoder in a single loop: 3 ms, and some for late ones."""
 MOST_HZ = 100.0
 """Most that a single loop is asked for: the rate of the vehicle's state."""
 CAMERA_HZ = 30.0
+PANELS_A_ROW = 3
 LOOSE = "--max-attitude-age 2 --max-velocity-age 2 --max-feature-age 2 --max-chunk-age 2"
 """Nothing is refused for its age: what age costs is what is measured."""
 app = App(help=__doc__)
 
 
 class Control(NamedTuple):
-    """What is controlled, and over which courses."""
+    """What is controlled, of which vehicle, and over which courses."""
 
     name: str
     flags: str
+    is_race: bool = False
+    """Flown by the weights that learned from races."""
 
 
-STICKS = Control("sticks in ALT_HOLD, easy courses", "--courses easy")
-BY_RATES = Control("the same weights by body rates", "--courses easy --by-rates")
-RACES = Control("body rates, race courses", "--courses race --policy toge-rates")
+GUSTS = "--gusts 2"
+"""m/s, along each horizontal axis: more than any demonstration has."""
+CONTROLS: dict[ControlName, Control] = {
+    "sticks": Control("sticks in ALT_HOLD, easy courses", "--courses easy"),
+    "by-rates": Control("the same weights by body rates", "--courses easy --by-rates"),
+    "races": Control("body rates, race courses", "--courses race --policy toge-rates", True),
+    "sticks-gusts": Control("sticks, gusts of 2 m/s", f"--courses easy {GUSTS}"),
+    "by-rates-gusts": Control(
+        "by body rates, gusts of 2 m/s", f"--courses easy --by-rates {GUSTS}"
+    ),
+    "by-rates-px4": Control(
+        "by body rates, PX4's rate loop of 100 ms", "--courses easy --by-rates --autopilot px4"
+    ),
+}
+"""ArduPilot's rate loop takes 53 ms to 63 % of a step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +106,8 @@ def main(
     plot: Path | None = None,
     episodes: int = 50,
     workers: int = 2,
+    controls: tuple[ControlName, ...] = tuple(CONTROLS),
+    encoders_ms: tuple[int, ...] = ENCODER_MS,
     loops: tuple[Loop, ...] = LOOPS,
     sticks: Path = SHIPPED,
     rates: Path = SHIPPED_RATES,
@@ -98,6 +119,8 @@ def main(
         plot: where to draw them as PNG.
         episodes: courses for each cell.
         workers: episodes at a time.
+        controls: which controls to fly.
+        encoders_ms: times of an encoder, in ms.
         loops: which loops to fly.
         sticks: weights by sticks.
         rates: weights that learned from races by body rates.
@@ -105,19 +128,28 @@ def main(
     require_outputs(json, plot)
     known = [Cell(**one) for one in loads(json.read_text())] if json.exists() else []
     cells = {cell.key: cell for cell in known if cell.episodes == episodes}
-    shown = []
-    for control, weights in ((STICKS, sticks), (BY_RATES, sticks), (RACES, rates)):
-        for encoder_ms in ENCODER_MS:
-            for loop in loops:
-                key = (control.name, loop, encoder_ms, sha256(weights))
-                if key not in cells:
-                    cells[key] = evaluate(control, loop, encoder_ms, weights, episodes, workers)
-                    json.write_text(dumps([asdict(one) for one in cells.values()], indent=2) + "\n")
-                    print_cells([cells[key]])
-                shown.append(cells[key])
+    for name, encoder_ms, loop in product(controls, encoders_ms, loops):
+        control = CONTROLS[name]
+        weights = rates if control.is_race else sticks
+        key = (control.name, loop, encoder_ms, sha256(weights))
+        if key not in cells:
+            cells[key] = evaluate(control, loop, encoder_ms, weights, episodes, workers)
+            json.write_text(dumps([asdict(one) for one in cells.values()], indent=2) + "\n")
+            print_cells([cells[key]])
+    shown = shown_cells(list(cells.values()), sticks, rates)
     print_cells(shown)
     if plot is not None:
         draw(shown, plot)
+
+
+def shown_cells(cells: list[Cell], sticks: Path, rates: Path) -> list[Cell]:
+    """All cells of these weights, in the order of the controls, encoders and loops."""
+    weights = {sha256(sticks), sha256(rates)}
+    names = [control.name for control in CONTROLS.values()]
+    return sorted(
+        (cell for cell in cells if cell.checkpoint_sha256 in weights and cell.control in names),
+        key=lambda one: (names.index(one.control), one.encoder_ms, LOOPS.index(one.loop)),
+    )
 
 
 def flags_of(loop: Loop, encoder_ms: int) -> str:
@@ -179,9 +211,14 @@ def draw(cells: list[Cell], path: Path) -> None:
 
     names = list(dict.fromkeys(cell.control for cell in cells))
     with rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(6.0 * len(names), 4.6), dpi=FIGURE_DPI, facecolor="white")
-        panels = figure.subplots(1, len(names), squeeze=False)[0]
-        for axes, name in zip(panels, names, strict=True):
+        rows = math.ceil(len(names) / PANELS_A_ROW)
+        columns = min(len(names), PANELS_A_ROW)
+        size = (6.0 * columns, 4.6 * rows)
+        figure = Figure(figsize=size, dpi=FIGURE_DPI, facecolor="white")
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes in panels[len(names) :]:
+            axes.set_visible(False)
+        for axes, name in zip(panels, names, strict=False):
             for loop, colour in zip(LOOPS, (MUTED, BLUE, RED), strict=True):
                 draw_loop(axes, [c for c in cells if (c.control, c.loop) == (name, loop)], colour)
             axes.set_xscale("log")

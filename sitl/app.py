@@ -180,8 +180,10 @@ def filming(
     def film() -> None:
         due_ns = clock.now_ns()
         while not stop.wait(max(0, due_ns - clock.now_ns()) / NS_PER_S):
-            pose = vehicle.pose
-            image = renderer.render(pose.body.position_ned_m, pose.body.ned_from_body_wxyz)
+            pose, body = vehicle.pose, vehicle.pose.body
+            image = renderer.render(
+                body.position_ned_m, body.ned_from_body_wxyz, body.rate_body_radps
+            )
             publisher.publish(image, pose.stamp_ns)
             due_ns += period_ns * max(1, -(-(clock.now_ns() - due_ns) // period_ns))
 

@@ -19,7 +19,7 @@ from mavbridge.simulation.network import DelayedChannel
 from policy.contract import Contract
 from sitl.ardupilot.guided import OPTION_THRUST
 from sitl.camera.fpv import FpvRenderer
-from sitl.rotation import IDENTITY, Quat, Vec3, from_euler, multiply
+from sitl.rotation import IDENTITY, Quat, Vec3, conjugate, from_euler, multiply, rotate
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import (
     NOMINAL,
@@ -98,7 +98,9 @@ class BlankRenderer:
     def __init__(self, width: int, height: int) -> None:
         self._black = np.zeros((height, width, 3), np.uint8)
 
-    def render(self, position_ned_m: Vec3, ned_from_body_wxyz: Quat) -> ImageArray:
+    def render(
+        self, position_ned_m: Vec3, ned_from_body_wxyz: Quat, rate_body_radps: Vec3
+    ) -> ImageArray:
         """Black [H, W, 3] uint8; always the same array."""
         return self._black
 
@@ -202,10 +204,11 @@ class SimulatedCamera:
         if exposure is None:
             return None
         body = exposure.body
-        attitude = body.ned_from_body_wxyz
+        attitude, rate_radps = body.ned_from_body_wxyz, body.rate_body_radps
         if self._mount != IDENTITY:
             attitude = multiply(attitude, self._mount)
-        rgb = self._renderer.render(body.position_ned_m, attitude)
+            rate_radps = rotate(conjugate(self._mount), rate_radps)
+        rgb = self._renderer.render(body.position_ned_m, attitude, rate_radps)
         rgb.setflags(write=False)
         return Frame(frame_id=exposure.frame_id, captured_ns=exposure.captured_ns, rgb=rgb)
 

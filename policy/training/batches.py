@@ -22,6 +22,7 @@ from policy.data.flight_data import ImageArray
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import Samples, Timeline
+from policy.training.disturb import disturb
 from policy.training.parallel import TensorBatch, row_parts
 from policy.training.settings import TrainSettings
 
@@ -141,6 +142,7 @@ class Batches:
         shifts = random.integers(-most, most + 1, size=(count, 2))
         images = self._store.read(frames, size, shifts)
         images[is_mirrored] = images[is_mirrored, :, ::-1]
+        disturb(images, random)
         low = np.array([-CONTRAST, -BRIGHTNESS, -COLOUR, -COLOUR, 0.0])
         high = np.array([CONTRAST, BRIGHTNESS, COLOUR, COLOUR, NOISE])
         look = random.uniform(low, high, (count, 5)).astype(np.float32)

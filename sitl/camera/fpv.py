@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sitl import UsageError
 from sitl.camera import scenery
 from sitl.camera.scenery import FloatArray, Image
+from sitl.camera.shutter import STILL, Shutter
 from sitl.course.layout import Course
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
@@ -68,11 +69,17 @@ class FpvRenderer:
         self._ground = scenery.ground_tile(conditions)
         self._ridge = scenery.ridge_directions(course.seed)
         self._faces = scenery.course_faces(course, conditions)
+        self._shutter = Shutter(conditions, width, height, focal_px=self._focal_px)
         self._sensor = _ImageSensor(conditions, width, height)
         self._glare, self._sun_ned = conditions.glare, np.array(conditions.sun_ned)
 
-    def render(self, position_ned_m: Vec3, ned_from_body_wxyz: Quat) -> Image:
-        """Draw the view as [H, W, 3] uint8 RGB, a new array."""
+    def render(
+        self, position_ned_m: Vec3, ned_from_body_wxyz: Quat, rate_body_radps: Vec3 = STILL
+    ) -> Image:
+        """Draw the view as [H, W, 3] uint8 RGB, a new array.
+
+        The body rates matter where the conditions have an exposure or a read-out that takes time.
+        """
         eye_ned_m = np.array(position_ned_m, dtype=np.float64)
         if any(self._offset_body_m):
             eye_ned_m += rotate(ned_from_body_wxyz, self._offset_body_m)
@@ -84,6 +91,7 @@ class FpvRenderer:
         self._draw_faces(image, eye_ned_m, ned_from_camera)
         if self._glare:
             image = self._add_glare(image, self._sun_ned @ ned_from_camera)
+        image = self._shutter.expose(image, np.array(rate_body_radps) @ self._body_from_camera)
         return self._sensor.expose(image)
 
     def _draw_backdrop(self, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> Image:

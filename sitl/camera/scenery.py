@@ -1,7 +1,8 @@
 """Surfaces and colours of the FPV view: gates, ridge, ground and sky; constant for a course."""
 
+import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.course.layout import BAR_M, DEPTH_M, Course, Gate
-from sitl.rotation import Vec3
+from sitl.rotation import Vec3, wrap_pi
 from sitl.vehicle.conditions import NOMINAL, Conditions, Rgb
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -25,6 +26,14 @@ PANEL_AHEAD_M = (2.0, 4.5)
 PANEL_ASIDE_M = (1.3, 1.9)
 """From the way to its middle, to either side. Nothing flies through one, and nothing can hit it."""
 PANEL_WIDTH_M = 1.2
+STRAY_AHEAD_M = (-3.0, 3.0)
+"""Distance of a gate that is out of order beyond the one that it stands beside."""
+STRAY_ASIDE_M = (5.0, 8.0)
+"""From the middle of that gate, to either side. It cannot be hit."""
+STRAY_TURN_RAD = math.radians(120.0)
+"""Largest turn of its passage against the other's, to either side."""
+STRAY_CLEARANCE_M = 4.5
+"""From the middle of every gate of the course; where there is less, none stands."""
 BOTH_SIDES: Vec3 = (0.0, 0.0, 0.0)
 
 RIDGE_SEGMENTS = 120
@@ -86,9 +95,10 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
     random = np.random.Generator(np.random.PCG64((conditions.seed, 6)))
     is_shaded = random.random(len(course.gates)) < conditions.shaded_gates
     is_hidden = random.random(len(course.gates)) < conditions.hidden_gates
+    gates = [*course.gates, *_stray_gates(course, conditions)]
     corners, normals, rgb, owners = [], [], [], []
-    centers = [gate.center_ned_m for gate in course.gates]
-    for gate in course.gates:
+    centers = [gate.center_ned_m for gate in gates]
+    for owner, gate in enumerate(gates):
         cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
         ned_from_gate = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
         for face in _faces_of(gate, conditions.gate_rgb):
@@ -98,8 +108,8 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
             corners.append(np.array(face.corners_m) @ ned_from_gate.T + gate.center_ned_m)
             normals.append(normal_ned)
             rgb.append(np.array(face.rgb) * light)
-            owners.append(gate.index)
-        if is_hidden[gate.index]:
+            owners.append(owner)
+        if is_hidden[gate.index] and owner < len(course.gates):
             ahead_m, aside_m = -random.uniform(*PANEL_AHEAD_M), random.uniform(*PANEL_ASIDE_M)
             aside_m *= random.choice((-1.0, 1.0))
             down_m = (-gate.size_m, -gate.center_ned_m[2])
@@ -116,6 +126,29 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
         owner=np.array(owners, dtype=np.intp),
         centers_ned_m=np.array(centers),
     )
+
+
+def _stray_gates(course: Course, conditions: Conditions) -> list[Gate]:
+    """Gates that do not belong to the course, with numbers and colours of some that do."""
+    random = np.random.Generator(np.random.PCG64((conditions.seed, 8)))
+    strays = []
+    for gate in course.gates:
+        is_there = random.random() < conditions.stray_gates
+        ahead_m, aside_m = random.uniform(*STRAY_AHEAD_M), random.uniform(*STRAY_ASIDE_M)
+        offset_m = complex(ahead_m, aside_m * random.choice((-1.0, 1.0)))
+        turn_rad = random.uniform(-STRAY_TURN_RAD, STRAY_TURN_RAD)
+        north_m, east_m, down_m = gate.center_ned_m
+        at_m = complex(north_m, east_m) + offset_m * cmath.rect(1.0, gate.yaw_rad)
+        room_m = min(abs(at_m - complex(*other.center_ned_m[:2])) for other in course.gates)
+        if is_there and room_m >= STRAY_CLEARANCE_M:
+            stray = replace(
+                gate,
+                center_ned_m=(at_m.real, at_m.imag, down_m),
+                yaw_rad=wrap_pi(gate.yaw_rad + turn_rad),
+                index=int(random.integers(len(course.gates))),
+            )
+            strays.append(stray)
+    return strays
 
 
 def _faces_of(gate: Gate, front_rgb: tuple[Rgb, Rgb]) -> list[_Face]:

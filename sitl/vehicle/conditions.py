@@ -74,9 +74,12 @@ class Conditions:
 
     hidden_gates: float = 0.0  # share of the gates with a panel before them, beside the way
     shaded_gates: float = 0.0  # share of the gates that stand in shadow
+    stray_gates: float = 0.0  # share of the gates beside which another one stands, out of order
     ground_contrast: float = 1.0  # factor on the pattern of the ground
     glare: float = 0.0  # of the sun in the lens, as a share of white
 
+    exposure_time_s: float = 0.0  # of a row; a camera that turns meanwhile smears it
+    readout_time_s: float = 0.0  # from the first row to the last; 0: a global shutter
     exposure: float = 1.0  # factor on all colours, before they saturate
     white_balance: Vec3 = (1.0, 1.0, 1.0)
     blur_px: float = 0.0  # standard deviation, in pixels of a 224 pixel wide image
@@ -117,15 +120,15 @@ def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
 def held_out_conditions(seed: int) -> Conditions:
     """Vehicle, wind and lens of ``random_conditions``, and a look that no demonstration has.
 
-    One seed in four each: gates partly hidden by panels; gates in shadow over ground of high
-    contrast; night, with gates that shine; a low sun in the lens.
+    One seed in five each: gates partly hidden by panels; gates in shadow over ground of high
+    contrast; night, with gates that shine; a low sun in the lens; other gates beside the way.
 
     Raises:
         UsageError: a negative seed.
     """
     conditions = random_conditions(seed)
     draw = _Draw(np.random.Generator(np.random.PCG64((seed, 7))), 1.0)
-    looks = (_hide_gates, _shade_gates, _make_night, _make_glare)
+    looks = (_hide_gates, _shade_gates, _make_night, _make_glare, _scatter_gates)
     return looks[seed % len(looks)](conditions, draw)
 
 
@@ -282,6 +285,16 @@ def _vary_airframe(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
+def _vary_shutter(nominal: Conditions, draw: _Draw) -> Conditions:
+    """Up to the exposure and the read-out of a rolling shutter of a usual 30 Hz camera."""
+    return replace(
+        nominal,
+        exposure_time_s=draw.amount(0.012),
+        readout_time_s=draw.amount(0.025),
+        ground_contrast=draw.factor(1.5),
+    )
+
+
 _VARIATIONS = (
     _vary_physics,
     _vary_lens,
@@ -289,6 +302,7 @@ _VARIATIONS = (
     _vary_firmware,
     _vary_streams,
     _vary_airframe,
+    _vary_shutter,
 )
 """In the order in which they draw, which is part of the seed's meaning."""
 
@@ -320,3 +334,7 @@ def _make_glare(usual: Conditions, draw: _Draw) -> Conditions:
         glare=0.5 + draw.amount(0.5),
         sun_ned=_direction_ned(azimuth_rad, elevation_rad),
     )
+
+
+def _scatter_gates(usual: Conditions, draw: _Draw) -> Conditions:
+    return replace(usual, stray_gates=0.8)

@@ -46,11 +46,14 @@ class EvaluateConfig:
     conditions: ConditionsKind = "nominal"
     """random: each flight has another vehicle, firmware settings, wind, light, colours and lens.
     held-out: the same, and a look that no demonstration has: gates partly hidden, in shadow, at
-    night, or against the sun."""
+    night, against the sun, or beside others that are out of order."""
     autopilot: AutopilotKind = "ardupilot"
     """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
     gains: float = 1.0
     """Factor on the lean, yaw rate and climb of ArduPilot at full stick (simulated clock)."""
+    gusts: float | None = None
+    """Gusts of this many m/s (standard deviation) along each horizontal axis, in place of those of
+    --conditions (simulated clock)."""
     raw_sticks: bool = False
     """Send the policy's sticks as they are, whatever the vehicle's curves make of them."""
     clock: ClockKind = "simulated"
@@ -81,6 +84,10 @@ class EvaluateConfig:
         check_range("seed", self.policy.seed, 0, MAX_EVALUATION_SEED, "")
         if self.gains != 1 and (self.is_wall_clock or self.autopilot != "ardupilot"):
             raise UserError("--gains needs --clock simulated and --autopilot ardupilot")
+        if self.gusts is not None:
+            check_range("gusts", self.gusts, 0, 10, "m/s")
+            if self.is_wall_clock:
+                raise UserError("--gusts needs --clock simulated")
         if self.is_wall_clock and (self.vision_delay or self.vision_time is not None):
             raise UserError(
                 "--vision-delay and --vision-time need --clock simulated: real encoders take their "

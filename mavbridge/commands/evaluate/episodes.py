@@ -99,6 +99,8 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         draw_images=not is_scripted(config.policy),
     )
     conditions = draw_conditions(config.conditions, spec.course_seed)
+    if config.gusts is not None:
+        conditions = replace(conditions, seed=spec.course_seed, gust_rms_mps=config.gusts)
     flight = SimulatedFlight(
         course_seed=spec.course_seed,
         seed=spec.seed,

@@ -19,6 +19,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             (folder / command.partition("--out ")[2].split()[0]).touch()
 
     monkeypatch.setattr(train_shipped, "run", remember)
+    monkeypatch.setattr(train_shipped, "copy_weights_before", lambda _policy, path: path.touch())
     return run
 
 
@@ -33,13 +34,23 @@ def test_every_command_is_one_of_ours(
         cli.parse_args(command.split(), print_error=False, exit_on_error=False)
 
 
-def test_weights_that_are_there_are_not_trained_again_and_an_unfinished_run_goes_on(
-    commands: list[str], tmp_path: Path
-) -> None:
+def test_weights_that_are_there_are_not_trained_again(commands: list[str], tmp_path: Path) -> None:
     (tmp_path / "toge").mkdir()
-    (tmp_path / "toge" / "first.safetensors").touch()
-    (tmp_path / "toge" / "toge.training").mkdir()
+    (tmp_path / "toge" / "toge.safetensors").touch()
     train_shipped.main("toge", out=tmp_path)
-    trained = [command for command in commands if command.startswith("train")]
-    assert len(trained) == 1
-    assert trained[0].endswith("--out toge.safetensors --resume")
+    assert not [command for command in commands if command.startswith("train")]
+
+
+def test_an_unfinished_training_goes_on(commands: list[str], tmp_path: Path) -> None:
+    (tmp_path / "toge" / "toge.training").mkdir(parents=True)
+    train_shipped.main("toge", out=tmp_path)
+    assert commands[-1].endswith("--out toge.safetensors --resume")
+
+
+def test_a_clone_without_history_is_told_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_shipped, "HERE", tmp_path)
+    with pytest.raises(SystemExit, match="unshallow"):
+        train_shipped.copy_weights_before("toge", tmp_path / "before.safetensors")
+    assert not (tmp_path / "before.safetensors").exists()

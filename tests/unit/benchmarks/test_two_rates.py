@@ -7,11 +7,9 @@ import pytest
 
 from benchmarks import two_rates
 from benchmarks.two_rates import (
-    BY_RATES,
+    CONTROLS,
     ENCODER_MS,
     LOOPS,
-    RACES,
-    STICKS,
     Cell,
     Control,
     Loop,
@@ -64,12 +62,35 @@ def test_an_interrupted_map_resumes_and_other_weights_begin_anew(
         two_rates.main(json=out, sticks=weights, rates=races)
     most = 1000
     two_rates.main(json=out, sticks=weights, rates=races)
-    controls = (STICKS, BY_RATES, RACES)
+    controls = CONTROLS.values()
     assert flown == [(each, loop, ms) for each in controls for ms in ENCODER_MS for loop in LOOPS]
     assert len(json.loads(out.read_text())) == len(flown)
     races.write_text("other weights")
     two_rates.main(json=out, sticks=weights, rates=races)
-    assert len(flown) == 4 * len(ENCODER_MS) * len(LOOPS)
+    assert len(flown) == (len(CONTROLS) + 1) * len(ENCODER_MS) * len(LOOPS)
+
+
+def test_a_part_of_the_map_is_shown_with_what_is_there_already(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, shown = tmp_path / "map.json", []
+    weights = tmp_path / "weights"
+    weights.write_text("")
+    monkeypatch.setattr(two_rates, "evaluate", lambda *cell: made(*cell[:5]))
+    monkeypatch.setattr(two_rates, "draw", lambda cells, _path: shown.append(cells))
+    for name in ("races", "sticks"):
+        two_rates.main(
+            json=out,
+            plot=tmp_path / "map.png",
+            controls=(name,),  # type: ignore[arg-type]
+            encoders_ms=(100, 50),
+            loops=("one rate",),
+            sticks=weights,
+            rates=weights,
+        )
+    kinds = [(cell.control, cell.encoder_ms) for cell in shown[-1]]
+    sticks, races = CONTROLS["sticks"].name, CONTROLS["races"].name
+    assert kinds == [(sticks, 50), (sticks, 100), (races, 50), (races, 100)]
 
 
 def test_the_figure_shows_every_cell(tmp_path: Path) -> None:
@@ -78,7 +99,7 @@ def test_the_figure_shows_every_cell(tmp_path: Path) -> None:
     weights.write_text("")
     cells = [
         made(control, loop, ms, weights, 50)
-        for control in (STICKS, BY_RATES, RACES)
+        for control in CONTROLS.values()
         for ms in ENCODER_MS
         for loop in LOOPS
     ]

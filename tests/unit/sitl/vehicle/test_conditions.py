@@ -11,6 +11,7 @@ from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import Params
 from sitl.camera.fpv import FpvRenderer
+from sitl.camera.scenery import STRAY_CLEARANCE_M, course_faces
 from sitl.course.layout import make_course
 from sitl.rotation import from_euler, multiply
 from sitl.vehicle.conditions import (
@@ -24,7 +25,7 @@ from sitl.vehicle.dynamics import GRAVITY_MPS2, Quadrotor
 
 POSE = ((1.0, 0.3, -2.2), from_euler(0.1, -0.15, 0.05))
 
-HELD_OUT = {"hidden_gates", "shaded_gates", "ground_contrast", "glare"}
+HELD_OUT = {"hidden_gates", "shaded_gates", "stray_gates", "glare"}
 """Never drawn for a demonstration."""
 NOMINAL_POSITION = (-0.661369108, -8.008113679, -3.14245931)
 NOMINAL_ATTITUDE = (0.995199671, 0.097863692, -0.00053679, -0.000157648)
@@ -84,7 +85,7 @@ def test_every_field_is_drawn_and_the_seed_decides():
 
 
 def test_a_held_out_look_is_one_that_no_demonstration_has():
-    """Night is in the tints: darker than the darkest that is drawn else."""
+    """Night is in the tints: darker than the darkest that is drawn else. One seed in five each."""
     changed = dict.fromkeys(HELD_OUT, 0)
     darkest = min(min(random_conditions(seed).sky_tint) for seed in range(200))
     nights = 0
@@ -94,11 +95,11 @@ def test_a_held_out_look_is_one_that_no_demonstration_has():
         for name in HELD_OUT:
             changed[name] += getattr(held_out, name) != getattr(NOMINAL, name)
         nights += max(held_out.sky_tint) < darkest / 2
-    assert nights == 10
-    assert set(changed.values()) == {10}
+    assert nights == 8
+    assert set(changed.values()) == {8}
 
 
-@pytest.mark.parametrize("name", ["hidden_gates", "shaded_gates", "glare"])
+@pytest.mark.parametrize("name", ["hidden_gates", "shaded_gates", "stray_gates", "glare"])
 def test_what_hides_gates_changes_the_picture(name):
     """A sun straight ahead, for the glare."""
     usual = replace(NOMINAL, sun_ned=(1.0, 0.0, -0.2), seed=2)
@@ -219,3 +220,14 @@ def test_a_rolled_and_turned_camera_sees_what_a_rolled_and_turned_vehicle_does()
     same = multiply(attitude, from_euler(0.1, 0.0, -0.2))
     wanted = FpvRenderer(course, 64, 64, level).render(position, same)
     assert np.abs(seen.astype(int) - wanted).mean() < 0.1
+
+
+def test_gates_out_of_order_stand_clear_of_the_way():
+    course = make_course(7)
+    own = course_faces(course)
+    faces = course_faces(course, replace(NOMINAL, stray_gates=1.0, seed=3))
+    strays_m = faces.centers_ned_m[len(course.gates) :]
+    assert 4 <= len(strays_m) <= len(course.gates)
+    np.testing.assert_array_equal(faces.corners_ned_m[: len(own.corners_ned_m)], own.corners_ned_m)
+    between = strays_m[:, None, :2] - own.centers_ned_m[None, :, :2]
+    assert np.linalg.norm(between, axis=2).min() >= STRAY_CLEARANCE_M
