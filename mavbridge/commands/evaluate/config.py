@@ -70,6 +70,9 @@ class EvaluateConfig:
     workers: WorkersConfig = field(default_factory=WorkersConfig)
     json: Path | None = None
     """Write all results here as JSON."""
+    resume: bool = False
+    """Go on with the flights that --json holds, if they were flown by the same flags and weights;
+    the file is written anew after each flight."""
     plot: Path | None = None
     """Draw the results here as PNG; needs matplotlib (the extra "bench")."""
 
@@ -78,6 +81,8 @@ class EvaluateConfig:
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("max-time", self.max_time, 1, 3600, "s")
         check_range("vision-delay", self.vision_delay, 0, 5000, "ms")
+        if self.resume and self.json is None:
+            raise UserError("--resume needs the --json FILE to go on with")
         if self.vision_time is not None:
             check_range("vision-time", self.vision_time, 0, 5000, "ms")
         check_range("gains", self.gains, 0.2, 2.5, "")

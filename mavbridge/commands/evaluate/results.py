@@ -86,8 +86,11 @@ class Evaluation:
         return ", ".join(parts)
 
 
-def to_json(evaluation: Evaluation) -> str:
-    """Everything as JSON, the summary before the episodes; without episodes it is null."""
+def to_json(evaluation: Evaluation, flown_by: str) -> str:
+    """Everything as JSON, the summary before the episodes; without episodes it is null.
+
+    ``flown_by`` says by what the flights were flown (``resuming.identity``).
+    """
     config, summary = evaluation.config, None
     if evaluation.episodes:
         summary = asdict(evaluation.summary)
@@ -100,6 +103,7 @@ def to_json(evaluation: Evaluation) -> str:
         "vision_delay_ms": config.vision_delay,
         "seed": config.policy.seed,
         "asked_episodes": config.episodes,
+        "flown_by": flown_by,
         "summary": summary,
         "episodes": [asdict(one) for one in evaluation.episodes],
     }

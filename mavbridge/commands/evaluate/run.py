@@ -14,6 +14,7 @@ from mavbridge.commands.evaluate.episodes import (
     fly_simulated,
 )
 from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
+from mavbridge.commands.evaluate.resuming import flown_before, identity, write_whole
 from mavbridge.commands.output import progress_bar, require_outputs
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
@@ -30,7 +31,10 @@ def evaluate(config: EvaluateConfig) -> int:
     if config.realtime is not None:
         names = ("--realtime", "wall") if config.realtime else ("--lockstep", "simulated")
         console.print(Text("{} is now --clock {}".format(*names), style="yellow"))
-    flown: dict[int, FlownEpisode] = {}
+    flown = {
+        index: FlownEpisode(engine=engine, result=result)
+        for index, (engine, result) in (flown_before(config) if config.resume else {}).items()
+    }
     failure: MavbridgeError | None = None
     with stop_on_signals() as stop:
         try:
@@ -38,26 +42,30 @@ def evaluate(config: EvaluateConfig) -> int:
         except MavbridgeError as error:
             failure = error  # the episodes flown before still count
         was_stopped = stop.is_set()
-    episodes = [flown[index] for index in sorted(flown)]
-    evaluation = Evaluation(
-        config=config,
-        engine=episodes[0].engine if episodes else "",
-        episodes=tuple(one.result for one in episodes),
-    )
-    if episodes:
+    evaluation = _evaluation(config, flown)
+    if flown:
         print_evaluation(evaluation, Console())
         if config.plot is not None:
             from mavbridge.commands.evaluate.figure import make_figure
 
             make_figure(evaluation).savefig(config.plot)
-    if config.json is not None and (episodes or failure is None):
-        config.json.write_text(to_json(evaluation))
+    if config.json is not None and (flown or failure is None):
+        write_whole(config.json, to_json(evaluation, identity(config)))
     if failure is not None or was_stopped:
         ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
         console.print(Text(f"{ended}{config.episodes} episodes", style="yellow"))
     if failure is not None:
         raise failure
     return INTERRUPTED if was_stopped else 0
+
+
+def _evaluation(config: EvaluateConfig, flown: dict[int, FlownEpisode]) -> Evaluation:
+    episodes = [flown[index] for index in sorted(flown)]
+    return Evaluation(
+        config=config,
+        engine=episodes[0].engine if episodes else "",
+        episodes=tuple(one.result for one in episodes),
+    )
 
 
 def _fly(
@@ -67,13 +75,20 @@ def _fly(
     should_stop: Callable[[], bool],
 ) -> None:
     """Add episodes to ``flown`` as they end, until all are flown or ``should_stop``."""
-    specs = [EpisodeSpec(config=config, index=index) for index in range(config.episodes)]
+    specs = [
+        EpisodeSpec(config=config, index=index)
+        for index in range(config.episodes)
+        if index not in flown
+    ]
+    flown_by, begun = identity(config), len(flown)
     fly = fly_on_wall_clock if config.is_wall_clock else fly_simulated
     with progress_bar(console) as progress:
-        bar = progress.add_task("flying", total=config.episodes)
-        for index, episode in fly_jobs(fly, specs, config.workers, should_stop):
-            for note in () if flown else episode.notes:
+        bar = progress.add_task("flying", total=config.episodes, completed=begun)
+        for at, episode in fly_jobs(fly, specs, config.workers, should_stop):
+            for note in () if len(flown) > begun else episode.notes:
                 console.print(Text(note, style="yellow"))
-            flown[index] = episode
+            flown[specs[at].index] = episode
+            if config.resume and config.json is not None:
+                write_whole(config.json, to_json(_evaluation(config, flown), flown_by))
             finished = sum(one.result.has_finished for one in flown.values())
             progress.update(bar, advance=1, status=f"{finished} of {len(flown)} finished")

@@ -51,7 +51,7 @@ def test_a_flight_without_time_has_no_speed() -> None:
 
 
 def test_json_holds_the_summary_and_every_episode() -> None:
-    document = json.loads(to_json(evaluation(finished(), crashed())))
+    document = json.loads(to_json(evaluation(finished(), crashed()), "digest"))
     assert document["summary"]["success_rate"]["value"] == 0.5
     assert document["summary"]["outcomes"] == {"finished": 1, "crashed": 1}
     assert document["asked_episodes"] == 5
@@ -61,7 +61,7 @@ def test_json_holds_the_summary_and_every_episode() -> None:
 
 
 def test_json_of_no_flight_at_all() -> None:
-    document = json.loads(to_json(evaluation()))
+    document = json.loads(to_json(evaluation(), "digest"))
     assert document["summary"] is None
     assert document["episodes"] == []
 

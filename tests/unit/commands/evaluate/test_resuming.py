@@ -1,0 +1,123 @@
+"""An interrupted evaluation goes on: with the same flags and weights, and with no others."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from helpers.evaluated_flights import finished
+from mavbridge.commands.evaluate import run
+from mavbridge.commands.evaluate.config import EvaluateConfig
+from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode
+from mavbridge.commands.evaluate.run import evaluate
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.workers import WorkersConfig
+from mavbridge.core.errors import PeerError, UserError
+
+
+class Flights:
+    """Stands in for the simulator: remembers what was flown, and fails once at an index."""
+
+    def __init__(self) -> None:
+        self.flown: list[int] = []
+        self.fails_at: int | None = None
+
+    def fly(self, spec: EpisodeSpec, _: Any) -> FlownEpisode:
+        if spec.index == self.fails_at:
+            raise PeerError("the vehicle is gone")
+        self.flown.append(spec.index)
+        result = finished(
+            course_seed=spec.course_seed, seed=spec.seed, distance_m=30.0 + spec.index
+        )
+        return FlownEpisode(engine="numpy", result=result)
+
+
+@pytest.fixture
+def flights(monkeypatch: pytest.MonkeyPatch) -> Flights:
+    made = Flights()
+    monkeypatch.setattr(run, "fly_simulated", made.fly)
+    return made
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> EvaluateConfig:
+    policy = PolicyConfig(policy="scripted:circle", seed=3)
+    return EvaluateConfig(policy=policy, episodes=5, json=tmp_path / "out.json", resume=True)
+
+
+def test_what_was_flown_is_not_flown_again(
+    flights: Flights, config: EvaluateConfig, tmp_path: Path
+) -> None:
+    flights.fails_at = 3
+    with pytest.raises(PeerError):
+        evaluate(config)
+    flights.fails_at = None
+    assert evaluate(config) == 0
+    assert flights.flown == [0, 1, 2, 3, 4]
+    assert config.json is not None
+    at_once = replace(config, json=tmp_path / "at_once.json")
+    evaluate(at_once)
+    assert at_once.json is not None
+    assert config.json.read_text() == at_once.json.read_text()
+
+
+def test_each_flight_is_on_disk_when_the_next_one_begins(
+    flights: Flights, config: EvaluateConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert config.json is not None
+    path, seen = config.json, list[int]()
+
+    def fly(spec: EpisodeSpec, stop: Any) -> FlownEpisode:
+        if spec.index:
+            seen.append(len(json.loads(path.read_text())["episodes"]))
+        return flights.fly(spec, stop)
+
+    monkeypatch.setattr(run, "fly_simulated", fly)
+    evaluate(config)
+    assert seen == [1, 2, 3, 4]
+
+
+def test_more_episodes_and_workers_go_on_and_fewer_leave_some_out(
+    flights: Flights, config: EvaluateConfig
+) -> None:
+    evaluate(config)
+    evaluate(replace(config, episodes=7))
+    evaluate(replace(config, episodes=2, workers=WorkersConfig(workers=2)))
+    assert flights.flown == [0, 1, 2, 3, 4, 5, 6]
+    assert config.json is not None
+    assert len(json.loads(config.json.read_text())["episodes"]) == 2
+
+
+def test_without_the_flag_all_are_flown(flights: Flights, config: EvaluateConfig) -> None:
+    evaluate(config)
+    evaluate(replace(config, resume=False))
+    assert flights.flown == [0, 1, 2, 3, 4] * 2
+
+
+def test_flights_by_other_flags_or_weights_are_not_mixed(
+    flights: Flights, config: EvaluateConfig, tmp_path: Path
+) -> None:
+    weights = tmp_path / "weights.safetensors"
+    weights.write_text("one")
+    config = replace(config, policy=replace(config.policy, checkpoint=weights))
+    evaluate(config)
+    with pytest.raises(UserError, match="other flags or other weights"):
+        evaluate(replace(config, gusts=1.0))
+    weights.write_text("another")
+    with pytest.raises(UserError, match="other flags or other weights"):
+        evaluate(config)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[", "[]", "{}", '{"flown_by": 1, "engine": "", "episodes": [{}]}', "[" * 5000]
+)
+def test_a_file_that_is_no_evaluation_is_refused_and_kept(
+    config: EvaluateConfig, text: str
+) -> None:
+    assert config.json is not None
+    config.json.write_text(text)
+    with pytest.raises(UserError, match="no evaluation that can go on"):
+        evaluate(config)
+    assert config.json.read_text() == text
