@@ -50,14 +50,14 @@ def training(makes: str, data: str, flags: str) -> Step:
 
 STEPS: dict[str, tuple[Step, ...]] = {
     "toge": (
-        flights("own", "--episodes 84 --seed 50 --speed 6.7"),
-        flights("own_px4", f"--episodes 46 --seed 51 --speed 6.5 {PX4}"),
-        training("toge", "own own_px4", f"--minutes 25 {AGES}"),
+        flights("own", "--episodes 54 --seed 50 --speed 6.7"),
+        flights("own_px4", f"--episodes 36 --seed 51 --speed 6.5 {PX4}"),
+        training("toge", "own own_px4", f"--minutes 24 {AGES}"),
     ),
     "toge-rates": (
         flights("own", f"--episodes 54 --seed 52 --speed 9 {RACES}"),
-        flights("own_px4", f"--episodes 30 --seed 53 --speed 9 {RACES} {PX4}"),
-        training("toge-rates", "own own_px4", f"--minutes 25 {AGES}"),
+        flights("own_px4", f"--episodes 20 --seed 53 --speed 9 {RACES} {PX4}"),
+        training("toge-rates", "own own_px4", f"--minutes 24 {AGES}"),
     ),
 }
 

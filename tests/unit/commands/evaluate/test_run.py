@@ -3,6 +3,7 @@
 import json
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,18 @@ def test_two_runs_write_the_same_and_other_vehicles_fly_otherwise(
     assert (nominal["conditions"], random["conditions"]) == ("nominal", "random")
     for a, b in zip(nominal["episodes"], random["episodes"], strict=True):
         assert a["distance_m"] != b["distance_m"]
+
+
+def test_gusts_are_the_only_thing_that_changes() -> None:
+    """Each flight has gusts of its own; without any it is the nominal one."""
+    config = EvaluateConfig(policy=CIRCLE, max_time=1.0)
+    distances_m = [
+        [fly_simulated(spec, lambda: False).result.distance_m for spec in specs(one, 2)]
+        for one in (config, replace(config, gusts=0.0), replace(config, gusts=5.0))
+    ]
+    calm, same, windy = distances_m
+    assert calm == same
+    assert len({*calm, *windy}) == 4
 
 
 def test_images_later_than_the_age_limit_are_not_flown_by() -> None:
