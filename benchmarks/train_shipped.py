@@ -25,8 +25,7 @@ NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, PX4 = "--action rates --courses race", "--autopilot px4"
 AGES = "--ages 10:220"
 
-
-BEFORE = "6ec5125"
+BEFORE = "6ec5125d549ce680a1948114cb9b9f5180260677"
 """Commit of 2026-11-24 that holds the weights to start from."""
 
 
@@ -88,11 +87,14 @@ def copy_weights_before(policy: str, path: Path) -> None:
     if path.exists():
         return
     name = f"{BEFORE}:policy/weights/{policy}.safetensors"
-    shown = subprocess.run(["git", "show", name], cwd=HERE, capture_output=True)
-    if shown.returncode:
-        text = shown.stderr.decode(errors="replace").strip()
-        raise SystemExit(f"no {name} ({text}): a shallow clone needs git fetch --unshallow")
-    path.write_bytes(shown.stdout)
+    partial = path.with_suffix(".part")
+    try:
+        with partial.open("wb") as file:
+            subprocess.run(["git", "show", name], cwd=HERE, stdout=file, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        partial.unlink(missing_ok=True)
+        raise SystemExit(f"{error}: a shallow clone needs git fetch --unshallow") from error
+    partial.replace(path)
 
 
 def run(folder: Path, command: str) -> None:

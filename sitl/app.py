@@ -176,14 +176,17 @@ def filming(
     renderer = FpvRenderer(course, *size, vehicle.ap.config.conditions)
     publisher = FramePublisher(camera.shm_name, *size)
     period_ns = round(NS_PER_S / camera.fps)
+    to_end_ns = round(vehicle.ap.config.conditions.frame_time_s / 2 * NS_PER_S)
 
     def film() -> None:
         due_ns = clock.now_ns()
         while not stop.wait(max(0, due_ns - clock.now_ns()) / NS_PER_S):
-            pose, body = vehicle.pose, vehicle.pose.body
+            pose = vehicle.pose
+            body = pose.body
             image = renderer.render(
                 body.position_ned_m, body.ned_from_body_wxyz, body.rate_body_radps
             )
+            clock.sleep_until_ns(pose.stamp_ns + to_end_ns)
             publisher.publish(image, pose.stamp_ns)
             due_ns += period_ns * max(1, -(-(clock.now_ns() - due_ns) // period_ns))
 

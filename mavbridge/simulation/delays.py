@@ -48,7 +48,7 @@ class Delays:
     """The delays of one flight; by default those of TOGE small on two shared cores."""
 
     camera: Delay = Delay(p50_ns=3 * NS_PER_MS)
-    """Exposure to arrival of the frame."""
+    """End of the exposure to arrival of the frame."""
     vision: Delay = Delay(p50_ns=11 * NS_PER_MS, p99_ns=25 * NS_PER_MS)
     """Image to feature."""
     action: Delay = Delay(p50_ns=3 * NS_PER_MS, p99_ns=6 * NS_PER_MS)

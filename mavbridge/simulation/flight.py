@@ -250,6 +250,7 @@ class SimulatedFlight:
             period_ns=camera_period_ns,
             phase_ns=int(self._random(10 * number + 2).integers(camera_period_ns)),
             delays_ns=self._settings.delays.camera.samples_ns(self._random(10 * number + 3)),
+            to_end_ns=round(conditions.frame_time_s / 2 * NS_PER_S),
             mount=mount,
         )
 

@@ -149,7 +149,8 @@ class VehicleStepper:
 class SimulatedCamera:
     """A ``ports.Camera`` on the vehicle; a frame is drawn when read, from the pose at exposure.
 
-    As in ``sitl``, a frame shows the vehicle's last step and carries that step's stamp.
+    As in ``sitl``, a frame shows the vehicle's last step and carries that step's stamp, which is
+    the middle of the frame: it ends ``to_end_ns`` later, and arrives after that.
     """
 
     def __init__(
@@ -161,9 +162,11 @@ class SimulatedCamera:
         period_ns: int,
         phase_ns: int,
         delays_ns: Iterator[int],
+        to_end_ns: int = 0,
         mount: Quat = IDENTITY,
     ) -> None:
         self._clock = clock
+        self._to_end_ns = to_end_ns
         self._mount = mount
         self._pose = pose
         self._renderer = renderer
@@ -188,7 +191,8 @@ class SimulatedCamera:
         for watch in self.exposure_watchers:
             watch(exposure)
         now_ns = self._clock.now_ns()
-        self._clock.schedule(now_ns + next(self._delays_ns), lambda: self._arrive(exposure))
+        arrival_ns = now_ns + self._to_end_ns + next(self._delays_ns)
+        self._clock.schedule(arrival_ns, lambda: self._arrive(exposure))
         self._clock.schedule(now_ns + self._period_ns, self._expose)
 
     def _arrive(self, exposure: Exposure) -> None:
@@ -204,11 +208,11 @@ class SimulatedCamera:
         if exposure is None:
             return None
         body = exposure.body
-        attitude, rate_radps = body.ned_from_body_wxyz, body.rate_body_radps
+        attitude, rate_mount_radps = body.ned_from_body_wxyz, body.rate_body_radps
         if self._mount != IDENTITY:
             attitude = multiply(attitude, self._mount)
-            rate_radps = rotate(conjugate(self._mount), rate_radps)
-        rgb = self._renderer.render(body.position_ned_m, attitude, rate_radps)
+            rate_mount_radps = rotate(conjugate(self._mount), rate_mount_radps)
+        rgb = self._renderer.render(body.position_ned_m, attitude, rate_mount_radps)
         rgb.setflags(write=False)
         return Frame(frame_id=exposure.frame_id, captured_ns=exposure.captured_ns, rgb=rgb)
 

@@ -69,7 +69,9 @@ class FpvRenderer:
         self._ground = scenery.ground_tile(conditions)
         self._ridge = scenery.ridge_directions(course.seed)
         self._faces = scenery.course_faces(course, conditions)
-        self._shutter = Shutter(conditions, width, height, focal_px=self._focal_px)
+        self._shutter = Shutter(
+            conditions, u_px=self._u_px, v_px=self._v_px, focal_px=self._focal_px
+        )
         self._sensor = _ImageSensor(conditions, width, height)
         self._glare, self._sun_ned = conditions.glare, np.array(conditions.sun_ned)
 

@@ -83,14 +83,17 @@ class Faces:
     rgb: FloatArray
     """[N, 3], lit by the sun."""
     owner: NDArray[np.intp]
-    """[N] index of the gate or panel that a face belongs to. Of the faces of one that are seen from
-    a point, a later one is never hidden by an earlier one."""
+    """[N] row in ``centers_ned_m`` of what a face belongs to. Of the faces of one that are seen
+    from a point, a later one is never hidden by an earlier one."""
     centers_ned_m: FloatArray
-    """[M, 3] of the gates, then of the panels."""
+    """[M, 3] of the course's gates, of those out of order, then of the panels."""
 
 
 def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
-    """Build all surfaces of all gates, and of the panels that hide some."""
+    """Build all surfaces of all gates, in order or not, and of the panels that hide some.
+
+    A gate out of order is shaded as the one whose number it has.
+    """
     sun_ned, ambient = np.array(conditions.sun_ned), conditions.ambient
     random = np.random.Generator(np.random.PCG64((conditions.seed, 6)))
     is_shaded = random.random(len(course.gates)) < conditions.shaded_gates

@@ -85,6 +85,11 @@ class Conditions:
     blur_px: float = 0.0  # standard deviation, in pixels of a 224 pixel wide image
     image_noise: float = 0.0  # standard deviation per channel, in levels of 0..255
 
+    @property
+    def frame_time_s(self) -> float:
+        """From the first light of a frame to its last; its stamp is the middle."""
+        return self.exposure_time_s + self.readout_time_s
+
     def numbers(self) -> dict[str, float]:
         """Every number by name, for ``meta.json``; ``name_k`` is entry k of a vector."""
         flat: dict[str, float] = {}
@@ -287,12 +292,12 @@ def _vary_airframe(nominal: Conditions, draw: _Draw) -> Conditions:
 
 def _vary_shutter(nominal: Conditions, draw: _Draw) -> Conditions:
     """Up to the exposure and the read-out of a rolling shutter of a usual 30 Hz camera."""
-    return replace(
-        nominal,
-        exposure_time_s=draw.amount(0.012),
-        readout_time_s=draw.amount(0.025),
-        ground_contrast=draw.factor(1.5),
-    )
+    exposure_time_s, readout_time_s = draw.amount(0.012), draw.amount(0.025)
+    return replace(nominal, exposure_time_s=exposure_time_s, readout_time_s=readout_time_s)
+
+
+def _vary_ground(nominal: Conditions, draw: _Draw) -> Conditions:
+    return replace(nominal, ground_contrast=draw.factor(1.5))
 
 
 _VARIATIONS = (
@@ -303,6 +308,7 @@ _VARIATIONS = (
     _vary_streams,
     _vary_airframe,
     _vary_shutter,
+    _vary_ground,
 )
 """In the order in which they draw, which is part of the seed's meaning."""
 

@@ -187,6 +187,8 @@ def _run_bridge(
                 raise EpisodeInterruptedError(f"{spec}: interrupted")
             if clock.now_ns() > deadline_ns:
                 raise PeerError(f"{spec}: the bridge has not ended in time")
+        if should_stop():  # the vehicle ended by the same Ctrl-C
+            raise EpisodeInterruptedError(f"{spec}: interrupted")
     finally:
         worker.terminate()  # gives the sticks back
         outcome = worker.receive()

@@ -81,6 +81,8 @@ class Evaluation:
         parts = [f"{config.policy.policy} ({self.engine})", self.mode]
         if config.conditions != "nominal":
             parts.append(f"{config.conditions} conditions")
+        if config.gusts is not None:
+            parts.append(f"gusts of {config.gusts:g} m/s")
         if config.vision_delay:
             parts.append(f"images {config.vision_delay:g} ms later")
         return ", ".join(parts)
@@ -100,6 +102,7 @@ def to_json(evaluation: Evaluation, flown_by: str) -> str:
         "engine": evaluation.engine,
         "mode": evaluation.mode,
         "conditions": config.conditions,
+        "gusts_mps": config.gusts,
         "vision_delay_ms": config.vision_delay,
         "seed": config.policy.seed,
         "asked_episodes": config.episodes,

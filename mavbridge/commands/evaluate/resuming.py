@@ -1,51 +1,65 @@
 """Goes on with an evaluation: the flights that its JSON file holds are not flown again."""
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.config.courses import MAX_EPISODES
 from mavbridge.config.workers import WorkersConfig
 from mavbridge.core.errors import UserError
+from mavbridge.core.provenance import digests, git_revision, versions
+from mavbridge.flight.policies import policy_files
 from mavbridge.simulation.referee import EpisodeResult
-from policy.loading.builtin import shipped_weights
 from policy.text_files import parse_json
 
 
-def identity(config: EvaluateConfig) -> str:
-    """Digest of all that decides how a flight of the evaluation goes: the flags, and the weights.
+class FlownBefore(NamedTuple):
+    """What a JSON file holds: the engine, and the results by the index of their episode."""
 
-    How many are flown, where, and what is written does not matter.
+    engine: str
+    results: Mapping[int, EpisodeResult]
+
+
+def identity(config: EvaluateConfig) -> str:
+    """Digest of what decides how a flight goes: flags, contents of the policy's files, versions.
+
+    How many are flown, where, and what is written does not matter. What a server flies by, and what
+    a user's code reads besides, is not known.
     """
-    flown = replace(
+    flags = replace(
         config,
-        policy=replace(config.policy, checkpoint=None),
+        policy=replace(config.policy, checkpoint=None, contract=None),
+        clock="wall" if config.is_wall_clock else "simulated",
+        realtime=None,
         episodes=1,
         workers=WorkersConfig(),
         resume=False,
         json=None,
         plot=None,
     )
-    digest = hashlib.sha256(repr(flown).encode())
-    weights = config.policy.checkpoint or shipped_weights(config.policy.policy)
-    if weights is not None and weights.is_file():
-        digest.update(weights.read_bytes())
-    return digest.hexdigest()
+    files = policy_files(config.policy)
+    known = digests(files)
+    contents = [known.get(str(path.resolve()), str(path)) for path in files]
+    parts = (flags, contents, git_revision(), sorted(versions().items()))
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def flown_before(config: EvaluateConfig) -> dict[int, tuple[str, EpisodeResult]]:
-    """Engine and result of the flights that ``config.json`` holds, by index; none if it is missing.
+def flown_before(config: EvaluateConfig, flown_by: str) -> FlownBefore:
+    """The flights that ``config.json`` holds; none if it is missing.
 
     Raises:
-        UserError: it holds something else, or flights by other flags or weights.
+        UserError: it holds something else, more than is asked for, or other flights than those
+            of the identity ``flown_by``.
     """
     path = config.json
     if path is None or not path.exists():
-        return {}
+        return FlownBefore("", {})
     try:
         document = parse_json(path.read_text())
-        flown_by, engine = document["flown_by"], str(document["engine"])
+        held_by, engine = document["flown_by"], str(document["engine"])
         results = [
             EpisodeResult(**one | {"gate_times_s": tuple(one["gate_times_s"])})
             for one in document["episodes"]
@@ -54,18 +68,39 @@ def flown_before(config: EvaluateConfig) -> dict[int, tuple[str, EpisodeResult]]
         raise UserError(
             f"--resume: {path} is no evaluation that can go on ({error!r}): name another --json"
         ) from error
-    if flown_by != identity(config):
+    if held_by != flown_by:
         raise UserError(
-            f"--resume: {path} holds flights by other flags or other weights: give those, or name "
-            "another --json"
+            f"--resume: {path} holds flights by other flags, weights or versions: give those, or "
+            "name another --json"
         )
     first = config.policy.seed * MAX_EPISODES
-    by_index = {result.seed - first: (engine, result) for result in results}
-    return {index: one for index, one in by_index.items() if 0 <= index < config.episodes}
+    by_index = {result.seed - first: result for result in results}
+    if by_index and max(by_index) >= config.episodes:
+        raise UserError(
+            f"--resume: {path} holds {len(by_index)} flights: ask for as many --episodes or more"
+        )
+    return FlownBefore(engine, by_index)
+
+
+def require_same_engine(before: FlownBefore, engine: str) -> None:
+    """Refuse flights of another engine than those before.
+
+    Raises:
+        UserError: it is another one, as on another computer.
+    """
+    if before.results and engine != before.engine:
+        raise UserError(
+            f"--resume: the flights before were flown by the engine {before.engine}, here it is "
+            f"{engine}: go on where they were flown, or name another --json"
+        )
 
 
 def write_whole(path: Path, text: str) -> None:
     """Replace a file as a whole, so that one that is interrupted leaves the old one."""
     draft = path.with_name(f".{path.name}.part")
-    draft.write_text(text)
-    draft.replace(path)
+    try:
+        draft.write_text(text)
+        draft.replace(path)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        raise UserError(f"cannot write --json {path}: {error.strerror or error}") from error

@@ -1,6 +1,6 @@
 """``mavbridge evaluate`` from its config to its exit status: fly, print, write, draw."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from rich.console import Console
 from rich.text import Text
@@ -14,7 +14,13 @@ from mavbridge.commands.evaluate.episodes import (
     fly_simulated,
 )
 from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
-from mavbridge.commands.evaluate.resuming import flown_before, identity, write_whole
+from mavbridge.commands.evaluate.resuming import (
+    FlownBefore,
+    flown_before,
+    identity,
+    require_same_engine,
+    write_whole,
+)
 from mavbridge.commands.output import progress_bar, require_outputs
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
@@ -31,14 +37,20 @@ def evaluate(config: EvaluateConfig) -> int:
     if config.realtime is not None:
         names = ("--realtime", "wall") if config.realtime else ("--lockstep", "simulated")
         console.print(Text("{} is now --clock {}".format(*names), style="yellow"))
+    flown_by = "" if config.json is None else identity(config)
+    before = flown_before(config, flown_by) if config.resume else FlownBefore("", {})
     flown = {
-        index: FlownEpisode(engine=engine, result=result)
-        for index, (engine, result) in (flown_before(config) if config.resume else {}).items()
+        index: FlownEpisode(engine=before.engine, result=result)
+        for index, result in before.results.items()
     }
     failure: MavbridgeError | None = None
     with stop_on_signals() as stop:
         try:
-            _fly(config, console, flown, stop.is_set)
+            for index, episode in _fly(config, console, before, stop.is_set):
+                require_same_engine(before, episode.engine)
+                flown[index] = episode
+                if config.resume and config.json is not None:
+                    write_whole(config.json, to_json(_evaluation(config, flown), flown_by))
         except MavbridgeError as error:
             failure = error  # the episodes flown before still count
         was_stopped = stop.is_set()
@@ -50,7 +62,7 @@ def evaluate(config: EvaluateConfig) -> int:
 
             make_figure(evaluation).savefig(config.plot)
     if config.json is not None and (flown or failure is None):
-        write_whole(config.json, to_json(evaluation, identity(config)))
+        config.json.write_text(to_json(evaluation, flown_by))
     if failure is not None or was_stopped:
         ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
         console.print(Text(f"{ended}{config.episodes} episodes", style="yellow"))
@@ -71,24 +83,21 @@ def _evaluation(config: EvaluateConfig, flown: dict[int, FlownEpisode]) -> Evalu
 def _fly(
     config: EvaluateConfig,
     console: Console,
-    flown: dict[int, FlownEpisode],
+    before: FlownBefore,
     should_stop: Callable[[], bool],
-) -> None:
-    """Add episodes to ``flown`` as they end, until all are flown or ``should_stop``."""
-    specs = [
-        EpisodeSpec(config=config, index=index)
-        for index in range(config.episodes)
-        if index not in flown
-    ]
-    flown_by, begun = identity(config), len(flown)
+) -> Iterator[tuple[int, FlownEpisode]]:
+    """Fly what was not flown before, until all are flown or ``should_stop``: index and episode."""
+    indices = [index for index in range(config.episodes) if index not in before.results]
+    specs = [EpisodeSpec(config=config, index=index) for index in indices]
+    done = len(before.results)
+    finished = sum(result.has_finished for result in before.results.values())
     fly = fly_on_wall_clock if config.is_wall_clock else fly_simulated
     with progress_bar(console) as progress:
-        bar = progress.add_task("flying", total=config.episodes, completed=begun)
+        bar = progress.add_task("flying", total=config.episodes, completed=done)
         for at, episode in fly_jobs(fly, specs, config.workers, should_stop):
-            for note in () if len(flown) > begun else episode.notes:
+            for note in () if done > len(before.results) else episode.notes:
                 console.print(Text(note, style="yellow"))
-            flown[specs[at].index] = episode
-            if config.resume and config.json is not None:
-                write_whole(config.json, to_json(_evaluation(config, flown), flown_by))
-            finished = sum(one.result.has_finished for one in flown.values())
-            progress.update(bar, advance=1, status=f"{finished} of {len(flown)} finished")
+            yield indices[at], episode
+            done += 1
+            finished += episode.result.has_finished
+            progress.update(bar, advance=1, status=f"{finished} of {done} finished")

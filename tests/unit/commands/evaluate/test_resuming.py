@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 
 from helpers.evaluated_flights import finished
-from mavbridge.commands.evaluate import run
+from mavbridge.commands.evaluate import resuming, run
 from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode
+from mavbridge.commands.evaluate.resuming import identity
 from mavbridge.commands.evaluate.run import evaluate
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.workers import WorkersConfig
@@ -79,15 +80,17 @@ def test_each_flight_is_on_disk_when_the_next_one_begins(
     assert seen == [1, 2, 3, 4]
 
 
-def test_more_episodes_and_workers_go_on_and_fewer_leave_some_out(
+def test_more_episodes_and_workers_go_on_and_fewer_lose_none(
     flights: Flights, config: EvaluateConfig
 ) -> None:
     evaluate(config)
-    evaluate(replace(config, episodes=7))
-    evaluate(replace(config, episodes=2, workers=WorkersConfig(workers=2)))
-    assert flights.flown == [0, 1, 2, 3, 4, 5, 6]
+    evaluate(replace(config, episodes=7, workers=WorkersConfig(workers=1)))
     assert config.json is not None
-    assert len(json.loads(config.json.read_text())["episodes"]) == 2
+    text = config.json.read_text()
+    with pytest.raises(UserError, match="holds 7 flights"):
+        evaluate(replace(config, episodes=2))
+    assert flights.flown == [0, 1, 2, 3, 4, 5, 6]
+    assert config.json.read_text() == text
 
 
 def test_without_the_flag_all_are_flown(flights: Flights, config: EvaluateConfig) -> None:
@@ -103,11 +106,45 @@ def test_flights_by_other_flags_or_weights_are_not_mixed(
     weights.write_text("one")
     config = replace(config, policy=replace(config.policy, checkpoint=weights))
     evaluate(config)
-    with pytest.raises(UserError, match="other flags or other weights"):
+    with pytest.raises(UserError, match="other flags, weights or versions"):
         evaluate(replace(config, gusts=1.0))
     weights.write_text("another")
-    with pytest.raises(UserError, match="other flags or other weights"):
+    with pytest.raises(UserError, match="other flags, weights or versions"):
         evaluate(config)
+
+
+def test_a_contract_and_a_program_are_known_by_what_they_say(
+    config: EvaluateConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = tmp_path / "one.toml", tmp_path / "other.toml"
+    one.write_text("a = 1")
+    other.write_text("a = 1")
+    by_one, by_other = (
+        replace(config, policy=replace(config.policy, contract=path)) for path in (one, other)
+    )
+    assert identity(by_one) == identity(by_other) != identity(config)
+    other.write_text("a = 2")
+    assert identity(by_one) != identity(by_other)
+    before = identity(config)
+    monkeypatch.setattr(resuming, "git_revision", lambda: "another")
+    assert identity(config) != before
+
+
+def test_flights_of_another_engine_are_not_mixed(
+    flights: Flights, config: EvaluateConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluate(config)
+    assert config.json is not None
+    before = json.loads(config.json.read_text())
+
+    def fly(spec: EpisodeSpec, stop: Any) -> FlownEpisode:
+        return replace(flights.fly(spec, stop), engine="torch")
+
+    monkeypatch.setattr(run, "fly_simulated", fly)
+    with pytest.raises(UserError, match="flown by the engine numpy, here it is torch"):
+        evaluate(replace(config, episodes=6))
+    after = json.loads(config.json.read_text())
+    assert (after["engine"], after["episodes"]) == ("numpy", before["episodes"])
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from policy.data.samples import Timeline
 from policy.errors import PolicyError
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
+from policy.training import batches as batches_module
 from policy.training.batches import Batches
 from policy.training.policy_run import Network, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
@@ -202,6 +203,22 @@ def test_in_training_the_denoiser_sees_a_part_of_many_samples(
         trainee.train(is_training)
         trainee(batches.with_images(0, 32))
     assert seen == rows
+
+
+def test_images_are_disturbed_in_training_and_never_in_validation(
+    flights: list[FlightData], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches_module, "disturb", lambda images, _random: images.fill(255))
+    asked = settings(tmp_path)
+    store = store_frames(flights, tmp_path / "frames", 32)
+    timeline = Timeline(flights, CONTRACT, np.array([40_000_000]))
+    batches = Batches(timeline, store, timesteps=100, settings=asked)
+    trained, validated = batches.with_images(0, 32).images, next(batches.validation(4, 32)).images
+    assert trained is not None
+    assert validated is not None
+    assert (trained == 255).all()
+    assert not (validated == 255).all()
+    assert not (batches.images(batches.frames[:4], is_mirrored=False) == 255).all()
 
 
 def test_a_packed_checkpoint_is_smaller_and_flies_alike(

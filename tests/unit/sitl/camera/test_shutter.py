@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sitl.camera.fpv import FpvRenderer
-from sitl.camera.shutter import MOST_SMEARED, Shutter
+from sitl.camera.fpv import FpvRenderer, rotation_matrix
+from sitl.camera.shutter import Shutter
 from sitl.course.layout import make_course
-from sitl.rotation import from_euler
+from sitl.rotation import IDENTITY, from_euler, integrate
 from sitl.vehicle.conditions import NOMINAL
 
 SIZE_PX = 97
@@ -18,8 +18,9 @@ POSITION = (1.0, 0.3, -2.2)
 
 
 def shutter(exposure_s=0.0, readout_s=0.0):
+    pixels = np.arange(SIZE_PX, dtype=np.float32)
     conditions = replace(NOMINAL, exposure_time_s=exposure_s, readout_time_s=readout_s)
-    return Shutter(conditions, SIZE_PX, SIZE_PX, focal_px=FOCAL_PX)
+    return Shutter(conditions, u_px=pixels, v_px=pixels[:, None], focal_px=FOCAL_PX)
 
 
 def post():
@@ -52,14 +53,30 @@ def test_turning_right_leans_a_post_to_the_left_further_down():
     assert seen[-1] == pytest.approx(middle - shift_px, abs=0.1)
 
 
-def test_an_exposure_smears_by_the_angle_that_it_turns():
-    rate_radps, exposure_s = 3.0, 0.03
+def test_an_exposure_smears_evenly_over_the_angle_that_it_turns():
+    """The variance of an even spread is a twelfth of its squared width."""
+    rate_radps, exposure_s = 3.0, 0.06
     seen = shutter(exposure_s).expose(post(), np.array([0.0, rate_radps, 0.0]))
-    row = seen[SIZE_PX // 2, :, 0].astype(float)
-    lit = np.flatnonzero(row > 5)
-    wanted_px = FOCAL_PX * rate_radps * exposure_s
-    assert np.ptp(lit) == pytest.approx(wanted_px * (1 - 1 / MOST_SMEARED), abs=1.6)
-    assert row.sum() == pytest.approx(255, rel=0.1)  # no light is lost
+    light = seen[SIZE_PX // 2, :, 0].astype(float)
+    at_px = np.arange(SIZE_PX) - SIZE_PX // 2
+    width_px = FOCAL_PX * rate_radps * exposure_s
+    assert light.sum() == pytest.approx(255, rel=0.05)  # no light is lost
+    assert light @ at_px / light.sum() == pytest.approx(0.0, abs=0.05)
+    assert light @ at_px**2 / light.sum() == pytest.approx(width_px**2 / 12, rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0.4, -0.7, 0.5)])
+def test_the_flow_is_that_of_rays_of_a_turning_camera(rate):
+    """Against the projection of turned rays, over a hundredth of a second."""
+    flow_right, flow_down = shutter().flow_pxps(np.array(rate))
+    dt_s, middle_px = 0.01, SIZE_PX // 2
+    turned = rotation_matrix(integrate(IDENTITY, rate, dt_s))
+    for v_px, u_px in ((0, 0), (20, 90), (middle_px, middle_px), (96, 40)):
+        ray = np.array([u_px - middle_px, v_px - middle_px, FOCAL_PX])
+        x, y, z = turned @ ray
+        moved_px = FOCAL_PX * np.array([x, y]) / z - ray[:2]
+        flow_pxps = np.array([flow_right[v_px, u_px], flow_down[v_px, u_px]])
+        np.testing.assert_allclose(flow_pxps * dt_s, moved_px, atol=0.02)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -222,7 +222,7 @@ def test_a_rolled_and_turned_camera_sees_what_a_rolled_and_turned_vehicle_does()
     assert np.abs(seen.astype(int) - wanted).mean() < 0.1
 
 
-def test_gates_out_of_order_stand_clear_of_the_way():
+def test_gates_out_of_order_stand_clear_of_those_of_the_course():
     course = make_course(7)
     own = course_faces(course)
     faces = course_faces(course, replace(NOMINAL, stray_gates=1.0, seed=3))
