@@ -8,26 +8,20 @@ and an unfinished training is resumed. Seeds decide the flights; budgets of trai
 that another machine makes similar weights, not the same.
 """
 
-import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import torch
 from cyclopts import App
 
-from benchmarks.study import sha256
 from mavbridge.commands.output import table_console
-from policy.checkpoints.policy_file import load_checkpoint, save_checkpoint
-from policy.loading.builtin import builtin_config
 
 app = App(help=__doc__)
 
 HERE = Path(__file__).parent
 
-IMAGE_SIZE = 96
-NET = f"--policy toge:small:resnet8 --image-size {IMAGE_SIZE} --batch-size 64"
+NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, PX4 = "--action rates --courses race", "--autopilot px4"
 AGES = "--ages 10:220"
 
@@ -40,8 +34,6 @@ class Step(NamedTuple):
 
     makes: str
     command: str
-    """Of mavbridge; where there is none, the file is the mean of two weights."""
-    mean_of: tuple[str, str] | None = None
 
 
 def flights(makes: str, flags: str) -> Step:
@@ -55,12 +47,6 @@ def training(makes: str, data: str, flags: str) -> Step:
     return Step(f"{makes}.safetensors", command)
 
 
-def mean(makes: str, *weights: str) -> Step:
-    """Mean of two weights; see ``write_mean``."""
-    first, second = (f"{each}.safetensors" for each in weights)
-    return Step(f"{makes}.safetensors", "", (first, second))
-
-
 STEPS: dict[str, tuple[Step, ...]] = {
     "toge": (
         flights("own", "--episodes 54 --seed 50 --speed 6.7"),
@@ -70,8 +56,7 @@ STEPS: dict[str, tuple[Step, ...]] = {
     "toge-rates": (
         flights("own", f"--episodes 54 --seed 52 --speed 9 {RACES}"),
         flights("own_px4", f"--episodes 20 --seed 53 --speed 9 {RACES} {PX4}"),
-        training("after", "own own_px4", f"--minutes 24 {AGES}"),
-        mean("toge-rates", "before", "after"),
+        training("toge-rates", "own own_px4", f"--minutes 24 {AGES}"),
     ),
 }
 
@@ -90,16 +75,8 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
     copy_weights_before(policy, folder / "before.safetensors")
     for step in STEPS[policy]:
         if step.command.startswith("demonstrate"):
-            run(
-                folder,
-                f"{step.command} --image-size {IMAGE_SIZE} --workers {workers} --out {step.makes}",
-            )
-        elif (folder / step.makes).exists():
-            continue
-        elif step.mean_of is not None:
-            before, after = step.mean_of
-            write_mean(folder / before, folder / after, folder / step.makes)
-        else:
+            run(folder, f"{step.command} --image-size 96 --workers {workers} --out {step.makes}")
+        elif not (folder / step.makes).exists():
             unfinished = folder / Path(step.makes).with_suffix(".training")
             resume = " --resume" if unfinished.exists() else ""
             run(folder, f"{step.command} --out {step.makes}{resume}")
@@ -118,25 +95,6 @@ def copy_weights_before(policy: str, path: Path) -> None:
         partial.unlink(missing_ok=True)
         raise SystemExit(f"{error}: a shallow clone needs git fetch --unshallow") from error
     partial.replace(path)
-
-
-def write_mean(before: Path, after: Path, path: Path) -> None:
-    """Write the mean of two weights, of which one began where the other is.
-
-    What few new flights teach is kept, and less of what many old ones taught is lost (Wortsman et
-    al., "Robust Fine-Tuning of Zero-Shot Models", 2022).
-    """
-    network = builtin_config("toge:small:resnet8", image_size=IMAGE_SIZE)
-    policy, other = (load_checkpoint(each, fallback=network) for each in (before, after))
-    weights, others = policy.state_dict(), other.state_dict()
-    policy.load_state_dict(
-        {
-            name: torch.lerp(value, others[name], 0.5) if value.is_floating_point() else value
-            for name, value in weights.items()
-        }
-    )
-    made_of = json.dumps({"mean_of": [sha256(before), sha256(after)]})
-    save_checkpoint(path, policy, training=made_of, packed=True)
 
 
 def run(folder: Path, command: str) -> None:

@@ -3,13 +3,10 @@
 from pathlib import Path
 
 import pytest
-import torch
 
 from benchmarks import train_shipped
 from benchmarks.train_shipped import STEPS
 from mavbridge.cli import cli
-from policy.checkpoints.policy_file import build_policy, load_checkpoint, save_checkpoint
-from policy.loading.builtin import builtin_config
 
 
 @pytest.fixture
@@ -22,7 +19,6 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             (folder / command.partition("--out ")[2].split()[0]).touch()
 
     monkeypatch.setattr(train_shipped, "run", remember)
-    monkeypatch.setattr(train_shipped, "write_mean", lambda _before, _after, path: path.touch())
     monkeypatch.setattr(train_shipped, "copy_weights_before", lambda _policy, path: path.touch())
     return run
 
@@ -32,8 +28,7 @@ def test_every_command_is_one_of_ours(
     policy: str, commands: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train_shipped.main(policy, out=tmp_path)  # type: ignore[arg-type]
-    assert len(commands) == len([step for step in STEPS[policy] if step.mean_of is None])
-    assert (tmp_path / policy / f"{policy}.safetensors").exists()
+    assert len(commands) == len(STEPS[policy])
     monkeypatch.chdir(tmp_path / policy)
     for command in commands:
         cli.parse_args(command.split(), print_error=False, exit_on_error=False)
@@ -59,16 +54,3 @@ def test_a_clone_without_history_is_told_what_to_do(
     with pytest.raises(SystemExit, match="unshallow"):
         train_shipped.copy_weights_before("toge", tmp_path / "before.safetensors")
     assert not (tmp_path / "before.safetensors").exists()
-
-
-def test_a_mean_lies_half_way_between_two_weights(tmp_path: Path) -> None:
-    paths = [tmp_path / f"{name}.safetensors" for name in ("before", "after", "mean")]
-    network = builtin_config("toge:small:resnet8", image_size=96)
-    for seed, path in enumerate(paths[:2]):
-        torch.manual_seed(seed)
-        save_checkpoint(path, build_policy(network), packed=True)
-    train_shipped.write_mean(*paths)
-    before, after, mean = (
-        load_checkpoint(path, fallback=network).state_dict()["head.direct.weight"] for path in paths
-    )
-    torch.testing.assert_close(mean, (before + after) / 2, atol=1e-3, rtol=1e-2)
