@@ -1,11 +1,16 @@
-"""Train a policy that ships: flights of the weights that shipped before, corrected by the expert.
+"""Train a policy that ships.
 
 python -m benchmarks.train_shipped toge --out training
 
-The weights before come from this repository's history. Run the same command again to go on after an
-interruption: flights that are recorded are kept, weights that are written are not trained again,
-and an unfinished training is resumed. Seeds decide the flights; budgets of training are minutes, so
-that another machine makes similar weights, not the same.
+toge begins with the weights that shipped before, which come from this repository's history: they
+fly, the expert corrects them, and they learn from that. toge-rates begins with nothing: flights of
+the expert, training, the student's own flights, training, three times over; what ships began
+otherwise (policy/weights/README.md), and this has not been run whole.
+
+Run the same command again to go on after an interruption: flights that are recorded are kept,
+weights that are written are not trained again, and an unfinished training is resumed. Seeds decide
+the flights; budgets of training are minutes, so that another machine makes similar weights, not the
+same.
 """
 
 import subprocess
@@ -23,7 +28,7 @@ HERE = Path(__file__).parent
 
 NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, PX4 = "--action rates --courses race", "--autopilot px4"
-AGES = "--ages 10:220"
+STICK_AGES, RATE_AGES = "--ages 10:220", "--ages 10:140"
 
 BEFORE = "6ec5125d549ce680a1948114cb9b9f5180260677"
 """Commit of 2026-11-24 that holds the weights to start from."""
@@ -36,27 +41,52 @@ class Step(NamedTuple):
     command: str
 
 
-def flights(makes: str, flags: str) -> Step:
-    """Flights of the weights before, which the expert corrects."""
-    return Step(makes, f"demonstrate {flags} --checkpoint before.safetensors")
+def flights(makes: str, flags: str, student: str | None = None) -> Step:
+    """Flights of the expert, or of a student that it corrects."""
+    own = "" if student is None else f" --checkpoint {student}.safetensors"
+    return Step(makes, f"demonstrate {flags}{own}")
 
 
-def training(makes: str, data: str, flags: str) -> Step:
-    """A training of so many minutes on these folders, from the weights before."""
-    command = f"train {data} {NET} {flags} --start-from before.safetensors --pack"
-    return Step(f"{makes}.safetensors", command)
+def training(makes: str, data: str, flags: str, start: str | None = None) -> Step:
+    """A training of so many minutes on these folders, from the weights of an earlier one."""
+    start_from = "" if start is None else f" --start-from {start}.safetensors"
+    return Step(f"{makes}.safetensors", f"train {data} {NET} {flags}{start_from}")
 
 
 STEPS: dict[str, tuple[Step, ...]] = {
     "toge": (
-        flights("own", "--episodes 54 --seed 50 --speed 6.7"),
-        flights("own_px4", f"--episodes 36 --seed 51 --speed 6.5 {PX4}"),
-        training("toge", "own own_px4", f"--minutes 24 {AGES}"),
+        flights("own", "--episodes 54 --seed 50 --speed 6.7", "before"),
+        flights("own_px4", f"--episodes 36 --seed 51 --speed 6.5 {PX4}", "before"),
+        training("toge", "own own_px4", f"--minutes 24 {STICK_AGES} --pack", start="before"),
     ),
     "toge-rates": (
-        flights("own", f"--episodes 54 --seed 52 --speed 9 {RACES}"),
-        flights("own_px4", f"--episodes 20 --seed 53 --speed 9 {RACES} {PX4}"),
-        training("toge-rates", "own own_px4", f"--minutes 24 {AGES}"),
+        flights("races", f"--episodes 100 --seed 3 --speed 9.5 {RACES}"),
+        flights("races_px4", f"--episodes 30 --seed 4 --speed 9 {RACES} {PX4}"),
+        training("first", "races races_px4", f"--minutes 45 {RATE_AGES}"),
+        flights("own1", f"--episodes 54 --seed 11 --speed 9 {RACES}", "first"),
+        flights("own1_px4", f"--episodes 14 --seed 12 --speed 9 {RACES} {PX4}", "first"),
+        training(
+            "second",
+            "races races_px4 own1 own1_px4",
+            f"--minutes 22 {RATE_AGES}",
+            start="first",
+        ),
+        flights("own2", f"--episodes 44 --seed 13 --speed 9 {RACES}", "second"),
+        flights("own2_px4", f"--episodes 20 --seed 14 --speed 9 {RACES} {PX4}", "second"),
+        training(
+            "third",
+            "races races_px4 own1 own1_px4 own2 own2_px4",
+            f"--minutes 22 {RATE_AGES}",
+            start="second",
+        ),
+        flights("own3", f"--episodes 50 --seed 34 --speed 9 {RACES}", "third"),
+        flights("own3_px4", f"--episodes 24 --seed 35 --speed 9 {RACES} {PX4}", "third"),
+        training(
+            "toge-rates",
+            "races races_px4 own1 own1_px4 own2 own2_px4 own3 own3_px4",
+            f"--minutes 30 {RATE_AGES} --pack",
+            start="third",
+        ),
     ),
 }
 
@@ -72,7 +102,8 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
     """
     folder = out / policy
     folder.mkdir(parents=True, exist_ok=True)
-    copy_weights_before(policy, folder / "before.safetensors")
+    if policy == "toge":
+        copy_weights_before(folder / "before.safetensors")
     for step in STEPS[policy]:
         if step.command.startswith("demonstrate"):
             run(folder, f"{step.command} --image-size 96 --workers {workers} --out {step.makes}")
@@ -82,11 +113,11 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
             run(folder, f"{step.command} --out {step.makes}{resume}")
 
 
-def copy_weights_before(policy: str, path: Path) -> None:
-    """Write the weights that shipped before; end with a message where git has them no more."""
+def copy_weights_before(path: Path) -> None:
+    """Write the toge that shipped before; end with a message where git does not have it."""
     if path.exists():
         return
-    name = f"{BEFORE}:policy/weights/{policy}.safetensors"
+    name = f"{BEFORE}:policy/weights/toge.safetensors"
     partial = path.with_suffix(".part")
     try:
         with partial.open("wb") as file:
