@@ -4,9 +4,9 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from mavbridge.commands.evaluate.config import EvaluateConfig
+from mavbridge.commands.evaluate.episodes import FlownEpisode
 from mavbridge.config.courses import MAX_EPISODES
 from mavbridge.config.workers import WorkersConfig
 from mavbridge.core.errors import UserError
@@ -14,13 +14,6 @@ from mavbridge.core.provenance import digests, git_revision, versions
 from mavbridge.flight.policies import policy_files
 from mavbridge.simulation.referee import EpisodeResult
 from policy.text_files import parse_json
-
-
-class FlownBefore(NamedTuple):
-    """What a JSON file holds: the engine, and the results by the index of their episode."""
-
-    engine: str
-    results: Mapping[int, EpisodeResult]
 
 
 def identity(config: EvaluateConfig) -> str:
@@ -47,8 +40,8 @@ def identity(config: EvaluateConfig) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def flown_before(config: EvaluateConfig, flown_by: str) -> FlownBefore:
-    """The flights that ``config.json`` holds; none if it is missing.
+def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisode]:
+    """The flights that ``config.json`` holds, by index; none if it is missing.
 
     Raises:
         UserError: it holds something else, more than is asked for, or other flights than those
@@ -56,12 +49,15 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> FlownBefore:
     """
     path = config.json
     if path is None or not path.exists():
-        return FlownBefore("", {})
+        return {}
     try:
         document = parse_json(path.read_text())
         held_by, engine = document["flown_by"], str(document["engine"])
-        results = [
-            EpisodeResult(**one | {"gate_times_s": tuple(one["gate_times_s"])})
+        episodes = [
+            FlownEpisode(
+                engine=engine,
+                result=EpisodeResult(**one | {"gate_times_s": tuple(one["gate_times_s"])}),
+            )
             for one in document["episodes"]
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -74,24 +70,24 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> FlownBefore:
             "name another --json"
         )
     first = config.policy.seed * MAX_EPISODES
-    by_index = {result.seed - first: result for result in results}
+    by_index = {episode.result.seed - first: episode for episode in episodes}
     if by_index and max(by_index) >= config.episodes:
         raise UserError(
             f"--resume: {path} holds {len(by_index)} flights: ask for as many --episodes or more"
         )
-    return FlownBefore(engine, by_index)
+    return by_index
 
 
-def require_same_engine(before: FlownBefore, engine: str) -> None:
-    """Refuse flights of another engine than those before.
+def require_same_engine(flown: Mapping[int, FlownEpisode], engine: str) -> None:
+    """Refuse a flight by another engine than those before.
 
     Raises:
         UserError: it is another one, as on another computer.
     """
-    if before.results and engine != before.engine:
+    if others := {episode.engine for episode in flown.values()} - {engine}:
         raise UserError(
-            f"--resume: the flights before were flown by the engine {before.engine}, here it is "
-            f"{engine}: go on where they were flown, or name another --json"
+            f"--resume: the flights before were flown by the engine {', '.join(others)}, here it "
+            f"is {engine}: go on where they were flown, or name another --json"
         )
 
 

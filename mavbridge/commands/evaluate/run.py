@@ -1,6 +1,7 @@
 """``mavbridge evaluate`` from its config to its exit status: fly, print, write, draw."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Mapping
+from contextlib import closing
 
 from rich.console import Console
 from rich.text import Text
@@ -15,7 +16,6 @@ from mavbridge.commands.evaluate.episodes import (
 )
 from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
 from mavbridge.commands.evaluate.resuming import (
-    FlownBefore,
     flown_before,
     identity,
     require_same_engine,
@@ -38,19 +38,16 @@ def evaluate(config: EvaluateConfig) -> int:
         names = ("--realtime", "wall") if config.realtime else ("--lockstep", "simulated")
         console.print(Text("{} is now --clock {}".format(*names), style="yellow"))
     flown_by = "" if config.json is None else identity(config)
-    before = flown_before(config, flown_by) if config.resume else FlownBefore("", {})
-    flown = {
-        index: FlownEpisode(engine=before.engine, result=result)
-        for index, result in before.results.items()
-    }
+    flown = flown_before(config, flown_by) if config.resume else {}
     failure: MavbridgeError | None = None
     with stop_on_signals() as stop:
         try:
-            for index, episode in _fly(config, console, before, stop.is_set):
-                require_same_engine(before, episode.engine)
-                flown[index] = episode
-                if config.resume and config.json is not None:
-                    write_whole(config.json, to_json(_evaluation(config, flown), flown_by))
+            with closing(_fly(config, console, dict(flown), stop.is_set)) as episodes:
+                for index, episode in episodes:
+                    if config.resume:
+                        require_same_engine(flown, episode.engine)
+                    flown[index] = episode
+                    _keep(config, flown, flown_by)
         except MavbridgeError as error:
             failure = error  # the episodes flown before still count
         was_stopped = stop.is_set()
@@ -71,6 +68,12 @@ def evaluate(config: EvaluateConfig) -> int:
     return INTERRUPTED if was_stopped else 0
 
 
+def _keep(config: EvaluateConfig, flown: dict[int, FlownEpisode], flown_by: str) -> None:
+    """Write what was flown so far, where that is to be gone on with."""
+    if config.resume and config.json is not None:
+        write_whole(config.json, to_json(_evaluation(config, flown), flown_by))
+
+
 def _evaluation(config: EvaluateConfig, flown: dict[int, FlownEpisode]) -> Evaluation:
     episodes = [flown[index] for index in sorted(flown)]
     return Evaluation(
@@ -83,19 +86,18 @@ def _evaluation(config: EvaluateConfig, flown: dict[int, FlownEpisode]) -> Evalu
 def _fly(
     config: EvaluateConfig,
     console: Console,
-    before: FlownBefore,
+    before: Mapping[int, FlownEpisode],
     should_stop: Callable[[], bool],
-) -> Iterator[tuple[int, FlownEpisode]]:
+) -> Generator[tuple[int, FlownEpisode]]:
     """Fly what was not flown before, until all are flown or ``should_stop``: index and episode."""
-    indices = [index for index in range(config.episodes) if index not in before.results]
+    indices = [index for index in range(config.episodes) if index not in before]
     specs = [EpisodeSpec(config=config, index=index) for index in indices]
-    done = len(before.results)
-    finished = sum(result.has_finished for result in before.results.values())
+    done, finished = len(before), sum(one.result.has_finished for one in before.values())
     fly = fly_on_wall_clock if config.is_wall_clock else fly_simulated
     with progress_bar(console) as progress:
         bar = progress.add_task("flying", total=config.episodes, completed=done)
         for at, episode in fly_jobs(fly, specs, config.workers, should_stop):
-            for note in () if done > len(before.results) else episode.notes:
+            for note in () if done > len(before) else episode.notes:
                 console.print(Text(note, style="yellow"))
             yield indices[at], episode
             done += 1
