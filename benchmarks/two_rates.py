@@ -214,6 +214,7 @@ def draw(cells: list[Cell], path: Path) -> None:
     from matplotlib.figure import Figure
 
     names = list(dict.fromkeys(cell.control for cell in cells))
+    encoders_ms = sorted({cell.encoder_ms for cell in cells})
     with rc_context(FIGURE_STYLE):
         rows = math.ceil(len(names) / PANELS_A_ROW)
         columns = min(len(names), PANELS_A_ROW)
@@ -226,9 +227,9 @@ def draw(cells: list[Cell], path: Path) -> None:
             for loop, colour in zip(LOOPS, (MUTED, BLUE, RED), strict=True):
                 draw_loop(axes, [c for c in cells if (c.control, c.loop) == (name, loop)], colour)
             axes.set_xscale("log")
-            axes.set_xticks(ENCODER_MS, [str(ms) for ms in ENCODER_MS])
+            axes.set_xticks(encoders_ms, [str(ms) for ms in encoders_ms])
             axes.minorticks_off()
-            axes.set_xlim(0.85 * ENCODER_MS[0], 1.18 * ENCODER_MS[-1])
+            axes.set_xlim(0.85 * encoders_ms[0], 1.18 * encoders_ms[-1])
             axes.set_ylim(-3, 103)
             axes.set_xlabel("ms to encode an image")
             axes.set_title(f"{name}: courses flown, %, 95 %")
