@@ -142,7 +142,8 @@ class Batches:
         shifts = random.integers(-most, most + 1, size=(count, 2))
         images = self._store.read(frames, size, shifts)
         images[is_mirrored] = images[is_mirrored, :, ::-1]
-        disturb(images, random)
+        if self._settings.disturb:
+            disturb(images, random)
         low = np.array([-CONTRAST, -BRIGHTNESS, -COLOUR, -COLOUR, 0.0])
         high = np.array([CONTRAST, BRIGHTNESS, COLOUR, COLOUR, NOISE])
         look = random.uniform(low, high, (count, 5)).astype(np.float32)
