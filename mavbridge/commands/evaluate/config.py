@@ -71,8 +71,8 @@ class EvaluateConfig:
     json: Path | None = None
     """Write all results here as JSON."""
     resume: bool = False
-    """Go on with the flights that --json holds, if they were flown by the same flags and weights;
-    the file is written anew after each flight."""
+    """Go on with the flights that --json holds, if they were flown by the same flags, weights and
+    versions; the file is written anew after each flight."""
     plot: Path | None = None
     """Draw the results here as PNG; needs matplotlib (the extra "bench")."""
 
