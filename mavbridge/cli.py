@@ -1,14 +1,15 @@
 """The command line: every flag is a field of a config dataclass."""
 
 import difflib
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
-from cyclopts.config import Toml
+from cyclopts.config import Dict
 from rich.text import Text
 
 import mavbridge
@@ -32,8 +33,8 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.log import run_log
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
+from policy.files import read_toml, user_path
 from policy.foreign.websocket.kind import require_packages
-from policy.text_files import read_toml
 from policy.training.settings import TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
@@ -48,6 +49,10 @@ EXIT_CODES = """Exit status: 0 done, and a flight flown and ended in order; 1 a 
 off the ground, or disarmed under the policy; 4 flown, and ended by a fault; 128 + its number: a
 signal before the flight.
 """
+
+
+_HOME = re.compile(r"((?:--[\w.-]+=)?(?:[a-z]+:)?)(~[^/]*(?:/.*)?)")
+"""A path below a home directory, behind a flag's name or a prefix such as ``lerobot:``."""
 
 
 def _shown_default(value: object) -> str | None:
@@ -316,15 +321,29 @@ def with_config(
     cli.config = []
     if config is not None:
         try:
-            read_toml(config)
+            settings = _with_home(read_toml(user_path(config)))
         except OSError as error:
             raise UserError(f"--config {config}: {error.strerror}") from error
         except ValueError as error:
             raise UserError(f"--config {config} is not TOML: {error}") from error
-        cli.config = [Toml(config, use_commands_as_keys=False)]
+        cli.config = [Dict(settings, use_commands_as_keys=False, source=str(config))]
     with run_log(log_file, verbose=verbose):
-        status: int | None = cli(_current_spelling(tokens))
+        status: int | None = cli(_with_home(list(_current_spelling(tokens))))
     return status or 0
+
+
+def _with_home(value: Any) -> Any:
+    """Return words or settings with ``~`` expanded in each text that names a path.
+
+    Shells leave it alone behind a colon or an equals sign: ``lerobot:~/act``, ``--out=~/flights``.
+    """
+    if isinstance(value, str) and (found := _HOME.match(value)) is not None:
+        return f"{found[1]}{user_path(found[2])}"
+    if isinstance(value, list):
+        return [_with_home(each) for each in value]
+    if isinstance(value, dict):
+        return {name: _with_home(each) for name, each in value.items()}
+    return value
 
 
 def _check_command(tokens: tuple[str, ...]) -> None:

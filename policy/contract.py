@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.errors import ContractError
-from policy.text_files import parse_json
+from policy.files import parse_json
 
 CONTRACT_VERSION = 4
 READABLE_VERSIONS = (1, 2, 3, 4)

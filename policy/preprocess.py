@@ -92,6 +92,16 @@ def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:
     return planes
 
 
+def input_to_bytes(planes: FloatArray, contract: Contract) -> FloatArray:
+    """Undo the normalisation of ``image_to_input``: [..., 3, H, W] -> whole numbers 0 to 255."""
+    scale, offset = _scale_offset(contract)
+    colours = [0, 1, 2] if contract.image_channels == "rgb" else [2, 1, 0]
+    per_plane = (3, 1, 1)
+    values = (planes - offset[colours].reshape(per_plane)) / scale[colours].reshape(per_plane)
+    whole: FloatArray = np.rint(values).clip(0.0, 255.0).astype(np.float32)
+    return whole
+
+
 def fit_image(rgb: NDArray[np.uint8], contract: Contract) -> NDArray[np.uint8]:
     """RGB image [H, W, 3] of any size -> the contract's part of it [image_height, image_width, 3].
 

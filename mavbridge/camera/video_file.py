@@ -11,6 +11,7 @@ from mavbridge.camera.grabber import Image
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.records import Frame
+from policy.files import library_name
 
 DEFAULT_FPS = 30.0
 """For files with neither stamps nor a rate."""
@@ -28,7 +29,7 @@ class VideoFileCamera:
         """Open the file; raises CameraError if OpenCV cannot decode its first frame."""
         self._path = path
         self._clock = clock
-        self._capture = cv2.VideoCapture(str(path))
+        self._capture = cv2.VideoCapture(library_name(path))
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         has_rate = math.isfinite(fps) and fps > 0
         self._interval_ns = round(NS_PER_S / (fps if has_rate else DEFAULT_FPS))

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Position
-from policy.text_files import parse_json
+from policy.files import read_json
 
 
 class CourseGate(NamedTuple):
@@ -29,7 +29,7 @@ def read_gates(path: Path) -> tuple[CourseGate, ...]:
         UserError: the file cannot be read, or is another one.
     """
     try:
-        document: Any = parse_json(path.read_text())
+        document: Any = read_json(path)
     except OSError as error:
         raise UserError(f"--gates {path}: {error.strerror}; name a JSON file of gates") from error
     except ValueError as error:

@@ -11,6 +11,7 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 from policy.contract import Contract
+from policy.files import user_path
 from policy.loading.builtin import BUILTIN_KINDS, shipped_weights
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
@@ -72,7 +73,7 @@ def policy_files(wanted: PolicyConfig) -> list[Path]:
     if shipped is not None and wanted.checkpoint is None and not wanted.allow_untrained:
         files.append(shipped)
     named = wanted.policy.partition(":")[2] if wanted.kind in FILE_KINDS else wanted.kind
-    path = Path(named).expanduser()
+    path = user_path(named)
     if path.is_dir() and wanted.kind in FILE_KINDS:
         files += sorted(each for each in path.iterdir() if each.suffix in POLICY_SUFFIXES)
     elif path.is_file():

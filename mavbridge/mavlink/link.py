@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.address import parse_address
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.histogram import Histogram
@@ -33,7 +34,12 @@ from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.outputs.sender import ActionSender
 from mavbridge.mavlink.session.commands import ModeAndArm
-from mavbridge.mavlink.session.discovery import Namesakes, VehicleDiscovery, VehicleIdentity
+from mavbridge.mavlink.session.discovery import (
+    Hearing,
+    Namesakes,
+    VehicleDiscovery,
+    VehicleIdentity,
+)
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import TimesyncFilter
@@ -298,7 +304,13 @@ class MavlinkLink:
         timeout_s, waited_ns = self._config.connect_timeout_s, now_ns - self._started_ns
         if not self._discovery.is_settling and waited_ns > timeout_s * NS_PER_S:
             waited = f"no vehicle on {self._config.connect} after {timeout_s:g} s"
-            raise PeerError(f"{waited}: {self._discovery.describe()}")
+            hearing = Hearing(
+                address=parse_address(self._config.connect),
+                waited_s=waited_ns / NS_PER_S,
+                received_bytes=self._connection.received_bytes,
+                received_packets=self._connection.received_packets,
+            )
+            raise PeerError(f"{waited}: {self._discovery.describe(hearing)}")
 
     def _follow_vehicle(self, identity: VehicleIdentity, now_ns: int) -> None:
         if (moved := self._discovery.moved(identity, now_ns)) is not None:

@@ -10,7 +10,7 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.folder import META
 from policy.contract import Contract
 from policy.errors import ContractError
-from policy.text_files import parse_json
+from policy.files import read_json
 
 FORMAT = "mavbridge-flight"
 VERSION = 1
@@ -92,7 +92,7 @@ def write_meta(folder: Path, meta: FlightMeta) -> None:
 def read_meta(folder: Path) -> FlightMeta:
     """Read ``meta.json``; raises FlightError if there is none, or it is not one of ours."""
     try:
-        document: Any = parse_json((folder / META).read_text())
+        document: Any = read_json(folder / META)
     except OSError as error:
         raise FlightError(_unreadable(folder)) from error
     except ValueError as error:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.folder import SETTINGS
-from policy.text_files import parse_json
+from policy.files import read_json
 
 _T = TypeVar("_T")
 
@@ -36,7 +36,7 @@ def write_settings(folder: Path, settings: ReplaySettings) -> None:
 def read_settings(folder: Path) -> ReplaySettings:
     """Read the file; raises SettingsError if there is none, or it is not one of this version."""
     try:
-        return _made(ReplaySettings, parse_json((folder / SETTINGS).read_text()))
+        return _made(ReplaySettings, read_json(folder / SETTINGS))
     except FileNotFoundError as error:
         raise SettingsError(
             f"{folder} has no {SETTINGS}: it was recorded by an older mavbridge, or is no flight "

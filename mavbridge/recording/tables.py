@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mavbridge.core.errors import MavbridgeError
+from policy.files import library_name
 
 READ_ERRORS = (pa.ArrowException, OSError)
 MAX_ROWS = 10_000_000
@@ -60,7 +61,7 @@ def to_parquet(stream: Path, parquet: Path) -> None:
     try:
         with stream.open("rb") as file:
             schema, batches = _whole_batches(file)
-            with pq.ParquetWriter(part, schema, compression="zstd") as writer:
+            with pq.ParquetWriter(library_name(part), schema, compression="zstd") as writer:
                 for table in _groups(schema, batches):
                     writer.write_table(table)
         part.replace(parquet)
@@ -96,10 +97,10 @@ def read_table(stem: Path, schema: pa.Schema, *, later: Collection[str] = ()) ->
     path = parquet if parquet.exists() else stream
     try:
         if path is parquet:
-            rows = pq.read_metadata(parquet).num_rows
+            rows = pq.read_metadata(library_name(parquet)).num_rows
             if rows > MAX_ROWS:
                 raise TableError(f"{path} has {rows} rows, more rows than a flight has")
-            table = pq.read_table(parquet)
+            table = pq.read_table(library_name(parquet))
         elif stream.stat().st_size == 0:  # killed before the first batch
             table = schema.empty_table()
         else:

@@ -3,34 +3,19 @@
 What is wrong with a file is raised as a ``CheckpointError``.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-from safetensors import SafetensorError, safe_open
 
 from policy.checkpoints.what_file import recognise
 from policy.contract import Contract
 from policy.errors import CheckpointError
+from policy.files import open_safetensors
 
 CONTRACT_KEY = "contract"
 ARCHITECTURE_KEY = "architecture"
 TRAINING_KEY = "training"
 HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
 SUFFIXES = (".safetensors", ".pt", ".pth", ".ckpt")
-
-
-@contextmanager
-def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
-    """An open file of safetensors; also errors while it is read are refused."""
-    try:
-        with safe_open(path, framework=framework) as file:
-            yield file
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(
-            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
-        ) from error
 
 
 def require_file(path: Path, suffixes: Sequence[str]) -> None:

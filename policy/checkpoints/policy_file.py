@@ -41,6 +41,7 @@ from policy.checkpoints.which_of_ours import which_of_ours
 from policy.contract import Contract, FloatArray
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.errors import CheckpointError, PolicyError
+from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
@@ -245,10 +246,7 @@ def _read_torch(path: Path) -> _Contents:
             "loading that could run any program. Save only model.state_dict() where it was trained"
         ) from error
     except _DAMAGED as error:
-        reason = str(error).partition("\n")[0] or "empty file"
-        raise CheckpointError(
-            f"{path}: not a readable torch file ({reason}); it may be cut short: copy it again"
-        ) from error
+        raise CheckpointError(why_unreadable(path, error)) from error
     if not isinstance(loaded, dict):
         raise CheckpointError(
             f"{path}: holds a {type(loaded).__name__}, not a dict of weights; "

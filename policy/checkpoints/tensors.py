@@ -8,9 +8,9 @@ from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from policy.checkpoints.header import open_safetensors
 from policy.checkpoints.state_dicts import Shapes, misfits
 from policy.errors import CheckpointError
+from policy.files import open_safetensors
 
 SCALE = ".int8_scale"
 """After a weight's name: its scales, one an output channel."""

@@ -14,6 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from policy.files import read_json, stand_in
+
 HEAD_BYTES = 4096
 MAX_HEADER_BYTES = 100_000_000
 """Longest header of safetensors, as its own reader has it."""
@@ -67,8 +69,10 @@ def recognise(path: Path) -> str | None:
 def _file(path: Path) -> tuple[str, str] | None:
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
-    if (text := _text(head)) is not None:
-        return text
+    if (found := stand_in(path)) is not None:
+        return found
+    if head.lstrip().startswith(b"<?xml") and b"<net " in head.lower():
+        return "an OpenVINO model", f"fly the ONNX file that it was made of, or {OWN_CLASS}"
     for offset, magic, what, advice in _MAGIC:
         if head[offset : offset + len(magic)] == magic:
             return what, advice
@@ -81,23 +85,6 @@ def _file(path: Path) -> tuple[str, str] | None:
             return _pickle(path, file.read(MAX_PICKLE_BYTES))
     if path.suffix == ".onnx":
         return "an ONNX model", f"fly it with --policy onnx:{path}"
-    return None
-
-
-def _text(head: bytes) -> tuple[str, str] | None:
-    """What a file of text is, that may stand where weights should."""
-    start = head.lstrip().lower()
-    if not start:
-        return "empty, or cut short", "copy it again"
-    if start.startswith(b"version https://git-lfs.github.com/"):
-        return "a pointer of Git LFS, not the file itself", "fetch it with `git lfs pull`"
-    if start.startswith((b"<!doctype html", b"<html")):
-        return (
-            "a web page, not weights",
-            "download it again, by the link to the file itself, logged in where that is needed",
-        )
-    if start.startswith(b"<?xml") and b"<net " in start:
-        return "an OpenVINO model", f"fly the ONNX file that it was made of, or {OWN_CLASS}"
     return None
 
 
@@ -258,8 +245,8 @@ def _config_kind(folder: Path) -> tuple[str, str] | None:
     if (folder / "model_index.json").is_file():
         return "a pipeline of diffusers", OWN_CLASS
     try:
-        config: Any = json.loads((folder / "config.json").read_text())
-    except (OSError, ValueError, RecursionError):
+        config: Any = read_json(folder / "config.json")
+    except (OSError, ValueError):
         return None
     if not isinstance(config, dict):
         return None

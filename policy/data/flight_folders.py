@@ -21,6 +21,7 @@ from policy.data.flight_data import (
     Nanoseconds,
 )
 from policy.data.tables import file_digest, parse_state_frame, read_json, stamps, vectors
+from policy.files import library_name, why_unreadable
 from policy.stick_loop import StickLoop, rates_contract
 
 FORMAT, VERSION = "mavbridge-flight", 1
@@ -181,9 +182,9 @@ def decode_video(path: Path) -> Iterator[ImageArray]:
         DatasetError: no video at all.
     """
     try:
-        container = av.open(str(path))
+        container = av.open(library_name(path))
     except (av.FFmpegError, OSError) as error:
-        raise DatasetError(f"{path}: not a readable video ({error})") from error
+        raise DatasetError(why_unreadable(path, error)) from error
     with container:
         if not container.streams.video:
             raise DatasetError(f"{path}: there is no video in it")
@@ -243,7 +244,7 @@ def _read_table(folder: Path, stem: str, columns: tuple[str, ...]) -> pa.Table:
     parquet, stream = folder / f"{stem}.parquet", folder / f"{stem}.arrows"
     try:
         if parquet.is_file():
-            table = pq.read_table(parquet)
+            table = pq.read_table(library_name(parquet))
         elif stream.is_file():
             table = _read_stream(stream)
         else:

@@ -24,6 +24,7 @@ from policy.contract import (
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
 from policy.data.tables import file_digest, numbers, parse_state_frame, read_json, stamps, vectors
+from policy.files import library_name, why_unreadable
 
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
@@ -196,14 +197,14 @@ def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
 
 def _read_table(path: Path, columns: Sequence[str]) -> pa.Table:
     try:
-        has = pq.read_schema(path).names
+        has = pq.read_schema(library_name(path)).names
         if missing := [name for name in columns if name not in has]:
             raise DatasetError(f"{path} lacks {missing}, which meta/info.json promises")
-        return pq.read_table(path, columns=list(columns), partitioning=None)
+        return pq.read_table(library_name(path), columns=list(columns), partitioning=None)
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is not there: copy the dataset again, whole") from error
     except (pa.ArrowException, OSError) as error:
-        raise DatasetError(f"{path} cannot be read: {error}") from error
+        raise DatasetError(why_unreadable(path, error)) from error
 
 
 def _rows_of(table: pa.Table, row: _Row) -> pa.Table:
@@ -268,7 +269,7 @@ def _decode(info: _Info, row: _Row) -> Iterator[ImageArray]:
 def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
     """Yield the frames nearest to ``from_timestamp + k / fps``, as LeRobot's reader does."""
     try:
-        with av.open(str(row.video)) as container:
+        with av.open(library_name(row.video)) as container:
             stream = container.streams.video[0]
             tick_s = float(stream.time_base or 0)
             container.seek(max(0, round(row.from_s / tick_s) - 1), backward=True, stream=stream)
@@ -286,14 +287,33 @@ def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
                 if wanted == row.length:
                     return
     except (av.FFmpegError, OSError, IndexError, ZeroDivisionError) as error:
-        raise DatasetError(f"{row.video}: not a readable video ({error})") from error
+        raise DatasetError(why_unreadable(row.video, error)) from error
 
 
 def _decode_table(info: _Info, row: _Row) -> Iterator[ImageArray]:
     table = _read_table(row.data, ["episode_index", info.camera])
-    for value in _rows_of(table, row)[info.camera]:
-        encoded = value.as_py().get("bytes") if value.is_valid else None
-        bgr = cv2.imdecode(np.frombuffer(encoded or b"", np.uint8), cv2.IMREAD_COLOR)
+    for number, value in enumerate(_rows_of(table, row)[info.camera].to_pylist()):
+        encoded, name = _encoded_image(info.folder, value)
+        image = f"{row.name}: the image of row {number}{name and f' ({name})'}"
+        if not encoded:
+            raise DatasetError(f"{image} is empty, and no file lies at its path: copy it again")
+        bgr = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
         if bgr is None:
-            raise DatasetError(f"{row.name}: {row.data} holds an image that cannot be decoded")
+            raise DatasetError(f"{image} is not a PNG or JPEG that can be decoded")
         yield cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def _encoded_image(folder: Path, value: object) -> tuple[bytes, str]:
+    """Return an image cell's bytes and path; the bytes of its file where the cell has none.
+
+    LeRobot's cells are ``{"bytes", "path"}``; before they are embedded, only the path is set. A
+    path that leads out of the dataset's folder is not followed.
+    """
+    cell = value if isinstance(value, dict) else {"bytes": value}
+    encoded, name = cell.get("bytes"), str(cell.get("path") or "")
+    if encoded or not name:
+        return encoded if isinstance(encoded, bytes) else b"", name
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()) or not path.is_file():
+        return b"", name
+    return path.read_bytes(), name

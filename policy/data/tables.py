@@ -7,15 +7,15 @@ from typing import Any, cast, get_args
 import numpy as np
 import pyarrow as pa
 
+from policy import files
 from policy.contract import FloatArray, StateFrame
 from policy.data.flight_data import DatasetError, Nanoseconds
-from policy.text_files import parse_json
 
 
 def read_json(path: Path, kind: str) -> Any:
     """The contents of a JSON file; ``kind`` names what its folder should be."""
     try:
-        return parse_json(path.read_text())
+        return files.read_json(path)
     except OSError as error:
         raise DatasetError(f"{path}: {error.strerror}: is it a {kind}?") from error
     except ValueError as error:

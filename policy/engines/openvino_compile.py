@@ -84,11 +84,12 @@ class Graph:
         self._inputs = [np.zeros(port.shape, np.float32) for port in compiled.inputs]
         for index, array in enumerate(self._inputs):
             self._request.set_input_tensor(index, ov.Tensor(array, shared_memory=True))
-        self._output = np.zeros(compiled.output(0).shape, np.float32)
-        self._request.set_output_tensor(ov.Tensor(self._output, shared_memory=True))
+        self._outputs = [np.zeros(port.shape, np.float32) for port in compiled.outputs]
+        for index, array in enumerate(self._outputs):
+            self._request.set_output_tensor(index, ov.Tensor(array, shared_memory=True))
 
     def __call__(self, *arrays: FloatArray) -> FloatArray:
-        """Run the graph; the result is the caller's. An array of another shape is refused."""
+        """Return the first output of a run, the caller's; refuses an array of another shape."""
         for index, (own, array) in enumerate(zip(self._inputs, arrays, strict=True)):
             if own.shape != array.shape:
                 raise PolicyError(
@@ -96,4 +97,8 @@ class Graph:
                 )
             np.copyto(own, array)
         self._request.infer()
-        return self._output.copy()
+        return self._outputs[0].copy()
+
+    def rest(self) -> list[FloatArray]:
+        """Return copies of the further outputs of the last run."""
+        return [array.copy() for array in self._outputs[1:]]

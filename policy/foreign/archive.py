@@ -5,6 +5,7 @@ import zlib
 from pathlib import Path
 
 from policy.errors import CheckpointError
+from policy.files import why_unreadable
 from policy.foreign.description import DESCRIPTION, Description, describe
 
 
@@ -21,7 +22,7 @@ def read_description(spec: str, path: Path, contract_file: Path | None) -> Descr
             extra = [name for name in names if name.endswith(f"/extra/{DESCRIPTION}")]
             text = archive.read(extra[0]).decode() if extra else None
     except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError) as error:
-        raise CheckpointError(f"--policy {spec}: {path} cannot be read: {error}") from error
+        raise CheckpointError(f"--policy {spec}: {why_unreadable(path, error)}") from error
     if not any("/code/" in name for name in names):
         raise CheckpointError(
             f"--policy {spec}: {path} is not a TorchScript archive: write it with "

@@ -3,12 +3,17 @@
     {
       "contract": {"action": "sticks", "chunk_dt_s": 0.05},
       "schedule": {"num_train_timesteps": 100, "betas": "squared_cosine", "prediction": "sample"},
-      "inputs": {"state": "obs_vector"}
+      "inputs": {"state": "obs_vector"},
+      "outputs": {"chunk": "actions"},
+      "hidden": {"h_in": "h_out"}
     }
 
 ``contract`` are fields of ``policy.contract.Contract``, ``schedule`` those of
 ``nets.diffusion.NoiseSchedule``, ``inputs`` the names of an ONNX file's inputs by their meaning. A
-contract file (``interface``) takes the place of ``contract``.
+contract file (``interface``) takes the place of ``contract``. ``outputs`` says which of several
+outputs is meant: its name, or its place from 0 in a TorchScript tuple. ``hidden`` are the inputs of
+a recurrent ONNX graph that take an output of the call before; names such as h_in and h_out need no
+entry.
 """
 
 import json
@@ -18,12 +23,24 @@ from typing import Any
 
 from policy.contract import Contract
 from policy.errors import CheckpointError, PolicyError
+from policy.files import parse_json
 from policy.foreign.interface import CONTRACT_FILE, Interface, read_interface
 
 DESCRIPTION = "policy.json"
 ROLES = ("image", "feature", "state", "action_history", "noisy", "timestep")
 """What an input of a graph may be."""
-TABLES = ("contract", "schedule", "inputs")
+USUAL_NAMES: dict[str, tuple[str, ...]] = {
+    "image": ("image", "images", "rgb", "pixels"),
+    "feature": ("feature", "features", "global_cond"),
+    "state": ("state", "proprio", "obs", "observation", "observations"),
+    "action_history": ("action_history", "history"),
+    "noisy": ("noisy", "noisy_action", "noisy_actions", "sample"),
+    "timestep": ("timestep", "timesteps", "t"),
+}
+"""Names by which an input is known where nothing else is said."""
+RESULTS = ("chunk", "feature", "prediction")
+"""What an output of a graph may be: of a policy or head, an encoder, a denoiser."""
+TABLES = ("contract", "schedule", "inputs", "outputs", "hidden")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +52,10 @@ class Description:
     """Fields of ``nets.diffusion.NoiseSchedule``; empty where nothing is said."""
     inputs: dict[str, str] = field(default_factory=dict)
     """Name of an input by its role."""
+    outputs: dict[str, str | int] = field(default_factory=dict)
+    """Name of an output, or its place in a tuple, by its result."""
+    hidden: dict[str, str] = field(default_factory=dict)
+    """Output that each hidden input takes at the next call, by name."""
 
 
 def describe(
@@ -50,9 +71,10 @@ def describe(
         PolicyError: something is malformed, or nothing says what the contract is.
     """
     data = {} if text is None else _parsed(where, text)
-    rest = {"schedule": data.get("schedule", {}), "inputs": data.get("inputs", {})}
-    if unknown := sorted(set(rest["inputs"]) - set(ROLES)):
-        raise CheckpointError(f"{where}: inputs {unknown} are unknown; known are {list(ROLES)}")
+    rest = {name: data.get(name, {}) for name in TABLES if name != "contract"}
+    for name, known in (("inputs", ROLES), ("outputs", RESULTS)):
+        if unknown := sorted(set(rest[name]) - set(known)):
+            raise CheckpointError(f"{where}: {name} {unknown} are unknown; known are {list(known)}")
     if contract_file is not None:
         return Description(interface=read_interface(contract_file), **rest)
     if "contract" in data:
@@ -71,8 +93,8 @@ def describe(
 
 def _parsed(where: Path, text: str) -> dict[str, dict[str, Any]]:
     try:
-        data: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        data: Any = parse_json(text)
+    except ValueError as error:
         raise CheckpointError(f"{where} is not JSON: {error}") from error
     if not isinstance(data, dict) or not set(data) <= set(TABLES):
         there = sorted(data) if isinstance(data, dict) else type(data).__name__

@@ -35,8 +35,8 @@ import numpy as np
 
 from policy.contract import ACTION_DIM, ACTION_NAMES, Contract
 from policy.errors import ContractError
+from policy.files import read_toml
 from policy.foreign.state import DERIVED_NAMES, state_values
-from policy.text_files import read_toml
 
 ArrayOrTensor = TypeVar("ArrayOrTensor")
 CONTRACT_FILE = "mavbridge.toml"

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from policy.errors import CheckpointError
+from policy.files import why_unreadable
 from policy.foreign.description import Description
 from policy.foreign.modules import PARTS, adopt_modules, make_schedule
 from policy.protocol import SingleRatePolicy
@@ -29,8 +30,7 @@ def load_torchscript(
         with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
             module = torch.jit.load(path, map_location="cpu").eval()  # type: ignore[no-untyped-call]
     except (RuntimeError, OSError) as error:
-        reason = str(error).strip().partition("\n")[0]
-        raise CheckpointError(f"{path}: damaged TorchScript archive ({reason})") from error
+        raise CheckpointError(why_unreadable(path, error)) from error
     contract = replace(description.interface.contract, arrays="torch")
     schedule = make_schedule(path, description.schedule) if description.schedule else None
     policy = adopt_modules(
@@ -39,6 +39,8 @@ def load_torchscript(
         replace(description.interface, contract=contract),
         schedule=schedule,
         seed=seed,
+        inputs=description.inputs,
+        outputs=description.outputs,
     )
     if policy is None:
         raise CheckpointError(f"--policy {spec}: the archive has none of {PARTS}")

@@ -16,6 +16,7 @@ from types import ModuleType
 
 from policy.contract import Contract
 from policy.errors import PolicyError, user_code
+from policy.files import user_path
 from policy.foreign.interface import Interface
 from policy.protocol import DualRatePolicy, SingleRatePolicy
 
@@ -88,7 +89,7 @@ def _split(spec: str) -> tuple[Path | str, str]:
     if not colon:
         where, class_name = spec, ""
     is_file = where.endswith(".py") or os.sep in where
-    named = Path(where).expanduser() if is_file else where
+    named = user_path(where) if is_file else where
     if is_file and not class_name:
         raise PolicyError(f"--policy {spec} names no class: write {where}:Class")
     is_module = all(name.isidentifier() for name in where.split("."))

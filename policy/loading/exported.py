@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from policy.errors import PolicyError
+from policy.files import user_path
 from policy.foreign.archive import read_description
 from policy.foreign.description import Description
 from policy.foreign.onnx.files import OnnxFiles, find_onnx_files
@@ -70,4 +71,4 @@ def _path(request: PolicyRequest, form: str) -> Path:
     path = request.spec.partition(":")[2]
     if not path or request.checkpoint is not None:
         raise PolicyError(f"--policy {request.spec}: write {form}, and leave out --checkpoint")
-    return Path(path).expanduser()
+    return user_path(path)

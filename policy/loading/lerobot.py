@@ -1,9 +1,9 @@
 """``lerobot:DIR``: an ACT or DiffusionPolicy that LeRobot trained."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from policy.errors import PolicyError
+from policy.files import user_path
 from policy.foreign.lerobot.plan import Plan, read_plan
 from policy.loading.request import PolicyRequest
 
@@ -25,7 +25,7 @@ def check_lerobot(request: PolicyRequest) -> Plan:
             f"--policy {request.spec}: name the folder of config.json and its weights, as "
             "lerobot:DIR, and leave out --checkpoint"
         )
-    return read_plan(Path(folder), request.contract_file)
+    return read_plan(user_path(folder), request.contract_file)
 
 
 def load_lerobot(request: PolicyRequest) -> tuple["LeRobotPolicy", list[str]]:

@@ -26,6 +26,7 @@ from policy.contract import Contract
 from policy.engines.devices import require_devices
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError
+from policy.files import user_path
 from policy.foreign.user_class import check_user_class, load_user_class
 from policy.foreign.websocket.kind import SCHEMES, check_server, load_server_policy
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
@@ -46,6 +47,7 @@ from policy.protocol import (
     Executable,
     SingleRatePolicy,
     WarmStartPolicy,
+    keep_nothing,
 )
 from policy.scripted.spec import IN_AIR, make_scripted
 from policy.stick_loop import by_rates, flown_by_rates
@@ -126,13 +128,15 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     reset, close = (life_method(policy, name, request.spec) for name in ("reset", "close"))
     try:
         executable, engine_notes = _on_engine(policy, request, notes)
+        if executable.reset is keep_nothing:  # an engine that keeps the state has its own
+            executable = replace(executable, reset=reset)
         times = measure_times(executable, now_s)
-        reset()  # of what the trial on dummy samples left behind
+        executable.reset()  # forget the dummy samples
     except BaseException:
         with suppress(PolicyError):
             close()
         raise
-    executable = replace(executable, reset=reset, close=close)
+    executable = replace(executable, close=close)
     return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes), times=times)
 
 
@@ -224,7 +228,7 @@ def _scripted(
 def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
     """Refuse a contract file where it has no use, and a file of another kind than was named."""
     if kind in (LEROBOT, ONNX, TORCHSCRIPT):
-        path = Path(request.spec.partition(":")[2]).expanduser()
+        path = user_path(request.spec.partition(":")[2])
         sentence = recognise(path) if path.is_file() else None
         own = tuple(f"--policy {kind}:{each}" for each in (path, path.parent))
         if sentence is not None and not sentence.endswith(own):

@@ -13,7 +13,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.provenance import digests, git_revision, versions
 from mavbridge.flight.policies import policy_files
 from mavbridge.simulation.referee import EpisodeResult
-from policy.text_files import parse_json
+from policy.files import read_json
 
 
 def identity(config: EvaluateConfig) -> str:
@@ -51,7 +51,7 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
     if path is None or not path.exists():
         return {}
     try:
-        document = parse_json(path.read_text())
+        document = read_json(path)
         held_by, engine = document["flown_by"], str(document["engine"])
         episodes = [
             FlownEpisode(

@@ -25,6 +25,7 @@ from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
 from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.data import lerobot_format as names
+from policy.files import library_name
 from policy.foreign.state import state_values
 from policy.preprocess import resize
 
@@ -148,8 +149,8 @@ class DatasetWriter:
             raise VideoError("nothing to export: not one image of these flights can be decoded")
         episodes = self._folder / names.EPISODES.format(chunk_index=0, file_index=0)
         episodes.parent.mkdir(parents=True)
-        pq.write_table(_tasks(self._spec.task), self._folder / names.TASKS)
-        pq.write_table(pa.Table.from_pylist(self._episodes), episodes)
+        pq.write_table(_tasks(self._spec.task), library_name(self._folder / names.TASKS))
+        pq.write_table(pa.Table.from_pylist(self._episodes), library_name(episodes))
         # One feature after the other, so that memory holds one.
         columns = (name for name in _features(self._spec) if name != names.CAMERA_KEY)
         stats = {name: vector_stats(self._data.column(name)) for name in columns}

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mavbridge.core.records import ImageArray
 from policy.contract import STATE_NAMES, StateFrame
 from policy.data import lerobot_format as names
+from policy.files import library_name
 
 MB = 1024**2
 DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
@@ -91,7 +92,7 @@ class VideoFiles:
             self._file += 1
             self._frames = self._bytes = 0
             path = _path(self._folder, names.VIDEO, self._file)
-            self._container = av.open(str(path), "w", options={"movflags": "faststart"})
+            self._container = av.open(library_name(path), "w", options={"movflags": "faststart"})
             stream = self._container.add_stream("libx264", self._spec.fps)
             stream.height, stream.width = self._spec.height, self._spec.width
             stream.pix_fmt, stream.options = "yuv420p", dict(_OPTIONS)
@@ -148,7 +149,9 @@ class TableFiles:
         if self._writer is None or self._bytes + table.nbytes >= self._limit_bytes:
             self.close()
             self._paths.append(_path(self._folder, names.DATA, len(self._paths)))
-            self._writer = pq.ParquetWriter(self._paths[-1], table.schema, compression="snappy")
+            self._writer = pq.ParquetWriter(
+                library_name(self._paths[-1]), table.schema, compression="snappy"
+            )
             self._bytes = 0
         self._writer.write_table(table)
         self._bytes += table.nbytes
@@ -162,7 +165,8 @@ class TableFiles:
 
     def column(self, name: str) -> NDArray[np.generic]:
         """[rows, D] of all files."""
-        parts = [pq.read_table(path, columns=[name], partitioning=None) for path in self._paths]
+        files = map(library_name, self._paths)
+        parts = [pq.read_table(file, columns=[name], partitioning=None) for file in files]
         column = pa.concat_tables(parts)[name].combine_chunks()
         values = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
         return np.asarray(values.to_numpy()).reshape(len(column), -1)

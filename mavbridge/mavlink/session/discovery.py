@@ -1,9 +1,11 @@
 """Finds the vehicle to fly among all senders on the link."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.address import LinkAddress, SerialAddress, TcpAddress, UdpAddress
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.mavlink.codec.messages import Endpoint, Heartbeat
@@ -49,22 +51,27 @@ class VehicleDiscovery:
         self._target_system = target_system
         self._heard_ns: dict[VehicleIdentity, int] = {}
         self._others: set[str] = set()
+        self._odd_components: set[int] = set()
+        """Components other than 1 that say that they are the autopilot of a vehicle."""
         self._first_ns: int | None = None
 
     def receive(
         self, source: Endpoint, heartbeat: Heartbeat, address: Address | None, now_ns: int
     ) -> None:
         """Note a heartbeat from any sender."""
-        if (
-            source.component != AUTOPILOT_COMPONENT
-            or source.system == 0
-            or heartbeat.vehicle_type in _NOT_VEHICLES
-            or heartbeat.autopilot == dialect.MAV_AUTOPILOT_INVALID
-        ):
+        is_vehicle = (
+            source.system != 0
+            and heartbeat.vehicle_type not in _NOT_VEHICLES
+            and heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
+        )
+        if is_vehicle and source.component != AUTOPILOT_COMPONENT:
+            self._odd_components.add(source.component)
+        elif not is_vehicle:
             kind = dialect.enums["MAV_TYPE"].get(heartbeat.vehicle_type)
             name = kind.name.removeprefix("MAV_TYPE_") if kind else str(heartbeat.vehicle_type)
             if len(self._others) < _CAPACITY:
                 self._others.add(f"{name} (system {source.system}, component {source.component})")
+        if not is_vehicle or source.component != AUTOPILOT_COMPONENT:
             return
         vehicle = VehicleIdentity(
             source=source,
@@ -117,21 +124,74 @@ class VehicleDiscovery:
                 return other
         return None
 
-    def describe(self) -> str:
-        """Everything that was heard instead of the vehicle, with advice."""
+    def describe(self, hearing: "Hearing") -> str:
+        """Say what was heard instead of the vehicle, with advice for this kind of link."""
         if self._heard_ns:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
             silent = f"system {self._target_system} is silent"
             return f"{silent}, but system {heard} was heard: correct --target-system"
+        if self._odd_components:
+            found = ", ".join(map(str, sorted(self._odd_components)))
+            return (
+                f"an autopilot was heard as component {found}, and component "
+                f"{AUTOPILOT_COMPONENT} is flown: set MAV_COMP_ID (PX4) to {AUTOPILOT_COMPONENT}, "
+                "or mend the router that changes it"
+            )
         if self._others:
             return (
                 f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "
                 "the vehicle's own port, or have the ground station forward it"
             )
-        return (
-            "heard nothing: is the vehicle running, and does it send to this address? "
-            "(udp: listens, udpout: calls)"
-        )
+        return hearing.without_heartbeat()
+
+
+class Hearing(NamedTuple):
+    """What has come over a link on which no vehicle was found."""
+
+    address: LinkAddress
+    waited_s: float
+    received_bytes: int
+    received_packets: int
+    """MAVLink packets among them."""
+
+    def without_heartbeat(self) -> str:
+        """Say why no heartbeat was heard, as far as can be told, and what to do."""
+        amount = f"{self.received_bytes / 1000 / max(self.waited_s, 0.1):.1f} kB/s came"
+        if self.received_packets:
+            return (
+                f"{amount}, MAVLink without a heartbeat of any sender: the link loses most of it, "
+                "or a router filters HEARTBEAT"
+            )
+        match self.address:
+            case SerialAddress(baud=baud) if self.received_bytes:
+                return (
+                    f"{amount}, and no MAVLink in it: another baud rate than {baud}, or another "
+                    "protocol on the vehicle's port (SERIALn_PROTOCOL 2 on ArduPilot, MAV_n_CONFIG "
+                    "on PX4)"
+                )
+            case SerialAddress(baud=baud):
+                return (
+                    f"the port is silent at {baud} baud: is the vehicle powered, are TX and RX "
+                    "crossed, and is MAVLink on that port (SERIALn_PROTOCOL 2 on ArduPilot, "
+                    "MAV_n_CONFIG on PX4)?"
+                )
+            case _ if self.received_bytes:
+                return f"{amount}, and no MAVLink in it: another program sends to this port"
+            case TcpAddress(port=port):
+                return (
+                    f"connected, and not a byte came: a simulator serves one client on TCP {port}: "
+                    "end the other one (a ground station, MAVProxy), or use another of its ports"
+                )
+            case UdpAddress(listens=True, port=port):
+                return (
+                    f"heard nothing: is the vehicle running, and does it send to port {port} of "
+                    "this computer? (udp: listens, udpout: calls)"
+                )
+            case _:
+                return (
+                    "nobody answered: is the vehicle running, and does it listen at this address? "
+                    "(udpout: calls, udp: listens)"
+                )
 
 
 class Namesakes:

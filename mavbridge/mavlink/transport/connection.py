@@ -64,6 +64,7 @@ class Connection:
         """Gets everything that comes from the peer, as it came; must neither wait nor raise."""
         self.texts: list[str] = []
         """Messages for the user, until `take_texts`."""
+        self.received_bytes = self.received_packets = 0
         self._told: list[str] = []
         self._was_open = False
         self._open(clock.now_ns())
@@ -111,9 +112,11 @@ class Connection:
             for data, arrived_ns, sender in self._transport.drain():
                 if self.tap is not None and self.peer in (None, sender):
                     self.tap(data)
+                self.received_bytes += len(data)
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data):
+                    self.received_packets += 1
                     if self._log is not None:
                         self._log.put(Packet(arrived_ns, message.packet))
                     yield message, arrived_ns, sender

@@ -28,6 +28,7 @@ from mavbridge.gate.wire import Absence, GateStatus, GateTick
 from mavbridge.simulation.clock import START_NS, SteppedClock
 from mavbridge.simulation.replay.actions import ActionPair
 from mavbridge.simulation.replay.telemetry_log import PilotSticks, TelemetryLog
+from policy.files import library_name, why_unreadable
 from policy.protocol import Executable
 
 STICKS_FRESH_NS = 500 * NS_PER_MS
@@ -49,11 +50,11 @@ class LogVideo:
         self._start_ns = START_NS + round(start_s * NS_PER_S)
         self._frames = 0
         try:
-            self._container = av.open(str(path))
+            self._container = av.open(library_name(path))
             self._images = self._decode()
             self._next = next(self._images, None)
         except (av.FFmpegError, OSError, IndexError) as error:
-            raise UserError(f"--video {path} cannot be read: {error}") from error
+            raise UserError(f"--video {why_unreadable(path, error)}") from error
         if self._next is None:
             raise UserError(f"--video {path} holds no image with a time")
 

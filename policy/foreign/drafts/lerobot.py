@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from policy import files
 from policy.contract import ACTION_DIM
 from policy.data.lerobot_format import ACTION_KEY, INFO, STATE_FRAME, STATE_KEY, STATS
 from policy.errors import CheckpointError
@@ -17,7 +18,6 @@ from policy.foreign.drafts.entries import (
     state_entries,
 )
 from policy.foreign.lerobot.config import CONFIG_FILE, read_json
-from policy.text_files import parse_json
 
 TRAIN_CONFIG_FILE = "train_config.json"
 
@@ -72,7 +72,7 @@ def checkpoint_entries(folder: Path, dataset: Path | None) -> list[Entry]:
 def dataset_of(checkpoint: Path) -> Path | None:
     """The dataset that LeRobot's training noted beside a policy, if it is on this machine."""
     try:
-        noted = parse_json((checkpoint / TRAIN_CONFIG_FILE).read_text())["dataset"]
+        noted = files.read_json(checkpoint / TRAIN_CONFIG_FILE)["dataset"]
         home = Path.home() / ".cache" / "huggingface" / "lerobot"  # LeRobot's own default
         folder = Path(noted["root"]) if noted.get("root") else home / str(noted["repo_id"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -110,7 +110,7 @@ def _frame(dataset: Path, features: Mapping[str, Any], names: Sequence[str] | No
     if isinstance(about, dict) and STATE_FRAME in about:
         return frame_entry(str(about[STATE_FRAME]), "read", f"the dataset's {INFO}")
     try:
-        stats = parse_json((dataset / STATS).read_text())
+        stats = files.read_json(dataset / STATS)
         mean = float(stats[STATE_KEY]["mean"][list(names or ()).index("az_mps2")])
     except (OSError, ValueError, KeyError, IndexError, TypeError):
         return frame_entry(None, "to answer", "")

@@ -10,12 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from policy.contract import ACTION_DIM
+from policy import files
+from policy.contract import ACTION_DIM, EXTRA_NAMES
 from policy.errors import CheckpointError
-from policy.text_files import parse_json
 
 CONFIG_FILE = "config.json"
 STATE_KEY, ACTION_KEY = "observation.state", "action"
+ENVIRONMENT_KEY = "observation.environment_state"
+"""LeRobot's input for what is known of the world; here the goal of the flight."""
+NO_IMAGE_PX = 16
+"""Side of the blank image of a policy without a camera: the smallest of a contract."""
 BACKBONES = ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152")
 MODES = ("IDENTITY", "MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10")
 _WITHOUT_EFFECT = {
@@ -36,11 +40,13 @@ class Features:
     """What a policy takes and gives, by LeRobot's names."""
 
     image_keys: tuple[str, ...]
-    """Its cameras, in the order of their features."""
+    """Its cameras, in the order of their features; empty for a policy that looks at no image."""
     image_height: int
     image_width: int
     state_dim: int | None
     """Width of observation.state; None where it takes none."""
+    takes_goal: bool
+    """observation.environment_state is the vector to the goal, ``policy.contract.EXTRA_NAMES``."""
     modes: Mapping[str, str]
     """Normalisation of STATE, VISUAL and ACTION: one of ``MODES``."""
 
@@ -115,8 +121,8 @@ class DiffusionConfig:
 
     @property
     def feature_dim(self) -> int:
-        """Two coordinates of each keypoint, through one layer."""
-        return 2 * self.spatial_softmax_num_keypoints
+        """Two coordinates of each keypoint, through one layer; one zero without a camera."""
+        return 2 * self.spatial_softmax_num_keypoints if self.features.image_keys else 1
 
     @property
     def encoded_size(self) -> tuple[int, int]:
@@ -161,7 +167,7 @@ def read_config(folder: Path) -> tuple[Config, list[str]]:
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object; raises CheckpointError."""
     try:
-        data = parse_json(path.read_text())
+        data = files.read_json(path)
     except OSError as error:
         raise CheckpointError(f"{path}: {error.strerror}") from error
     except ValueError as error:
@@ -183,6 +189,11 @@ def _where_to_look(folder: Path) -> str:
 
 def _act(entries: "_Entries", features: Features) -> ActConfig:
     entries.only("n_obs_steps", 1)
+    if features.takes_goal or not features.image_keys:
+        raise CheckpointError(
+            f"{entries.path}: of LeRobot's ACT those with cameras and without {ENVIRONMENT_KEY} "
+            "fly from their files; run this one behind --policy ws://HOST:PORT"
+        )
     entries.only("replace_final_stride_with_dilation", False)
     return ActConfig(
         features=features,
@@ -250,6 +261,8 @@ def _resize_and_crop(
     if resize is not None:  # then LeRobot takes the crop from the ratio, whatever crop_shape says
         crop = None if ratio == 1.0 else (int(resize[0] * ratio), int(resize[1] * ratio))
     before = resize or (features.image_height, features.image_width)
+    if not features.image_keys:
+        return None, None
     if crop is not None and (crop[0] > before[0] or crop[1] > before[1]):
         raise CheckpointError(f"{entries.path}: cannot crop images of {before} to {crop}")
     return resize, crop
@@ -258,17 +271,23 @@ def _resize_and_crop(
 def _features(entries: "_Entries") -> Features:
     """Cameras, state and action.
 
-    LeRobot's ACT and DiffusionPolicy look at no other feature of type STATE than observation.state.
+    LeRobot's ACT and DiffusionPolicy look at no other feature of type STATE than observation.state,
+    and at no other of type ENV than observation.environment_state.
     """
     inputs, outputs = entries.table("input_features"), entries.table("output_features")
     kinds = {key: _feature(entries.path, key, value) for key, value in inputs.items()}
-    if others := [key for key, (kind, _) in kinds.items() if kind not in ("STATE", "VISUAL")]:
+    goal = (len(EXTRA_NAMES["goal"]),)
+    takes_goal = kinds.pop(ENVIRONMENT_KEY, None) == ("ENV", goal)
+    others = [key for key in inputs if key not in kinds and not takes_goal]
+    if others := others + [k for k, (kind, _) in kinds.items() if kind not in ("STATE", "VISUAL")]:
         raise CheckpointError(
-            f"{entries.path}: takes {others}, which no vehicle measures; supported are images and "
-            f"{STATE_KEY}"
+            f"{entries.path}: takes {others}, which no vehicle measures; supported are images, "
+            f"{STATE_KEY}, and {ENVIRONMENT_KEY} of {goal[0]} numbers: {EXTRA_NAMES['goal']}"
         )
     images = {key: shape for key, (kind, shape) in kinds.items() if kind == "VISUAL"}
     shapes = sorted(set(images.values()))
+    if not images and takes_goal:
+        shapes = [(3, NO_IMAGE_PX, NO_IMAGE_PX)]
     if len(shapes) != 1 or len(shapes[0]) != 3 or shapes[0][0] != 3:
         raise CheckpointError(
             f"{entries.path}: images must be of one shape [3, height, width], got {images}"
@@ -286,6 +305,7 @@ def _features(entries: "_Entries") -> Features:
         image_height=shapes[0][1],
         image_width=shapes[0][2],
         state_dim=state[0] if state else None,
+        takes_goal=takes_goal,
         modes=modes,
     )
 

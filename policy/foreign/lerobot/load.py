@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from policy.errors import CheckpointError
+from policy.files import open_safetensors
 from policy.foreign.lerobot.config import ActConfig
 from policy.foreign.lerobot.plan import Plan
 from policy.foreign.lerobot.policy import LeRobotDiffusion, LeRobotPolicy, build_policy_of
@@ -38,12 +37,8 @@ def load_policy_of(
 
 def _read(path: Path, policy: LeRobotPolicy) -> dict[str, Tensor]:
     net, wanted = policy.net, policy.net.state_dict()
-    try:
-        tensors = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(
-            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
-        ) from error
+    with open_safetensors(path, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     state = {name: value for name, value in wanted.items() if name.endswith(_COUNTS)}
     problems, seen = [], set(state)
     for name, value in tensors.items():

@@ -7,7 +7,7 @@ from a contract file: ``foreign.interface``.
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from policy.contract import Contract
+from policy.contract import EXTRA_NAMES, Contract
 from policy.errors import CheckpointError, ContractError
 from policy.foreign.interface import CONTRACT_FILE, Interface, read_interface
 from policy.foreign.lerobot.config import STATE_KEY, Config, Features, read_config
@@ -75,6 +75,11 @@ def _interface(path: Path, config: Config) -> Interface:
     }
     interface = read_interface(path, derived)
     contract: Contract = interface.contract
+    if config.features.takes_goal and "goal" not in contract.state_extras:
+        contract = replace(contract, state_extras=(*contract.state_extras, "goal"))
+    if config.features.takes_goal and not interface.state_names:
+        own = tuple(name for name in contract.state_names if name not in EXTRA_NAMES["goal"])
+        interface = replace(interface, contract=contract, state_names=own)
     return replace(interface, contract=replace(contract, observation_dt_s=contract.chunk_dt_s))
 
 
@@ -95,6 +100,8 @@ def _policy_cameras(
     path: Path, interface: Interface, features: Features, normalisation: Normalisation
 ) -> tuple[int, ...]:
     known = features.image_keys
+    if not known:
+        return ()
     keys = [normalisation.renamed.get(key, key) for key in interface.camera_keys]
     if not interface.image_keys and len(known) == len(keys) == 1:
         return (0,)  # one camera there and one here, whatever they are called

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from policy.contract import Contract
+from policy.contract import EXTRA_NAMES, Contract
 from policy.foreign.lerobot.act import Act
 from policy.foreign.lerobot.config import ActConfig, DiffusionConfig
 from policy.foreign.lerobot.diffusion import Diffusion
@@ -60,7 +60,10 @@ class LeRobotPolicy(nn.Module):
         self._interface = interface
 
     def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
-        """Image [B, 3, H, W] of that camera of the contract -> feature [B, feature_dim]."""
+        """Image [B, 3, H, W] of that camera of the contract -> feature [B, feature_dim]; zeros for
+        a policy without a camera."""
+        if not self._policy_cameras:
+            return image.new_zeros(image.shape[0], self.contract.feature_dim)
         own = self._policy_cameras[camera]
         return self.net.encode(self._images[own](image), own)
 
@@ -116,6 +119,28 @@ class LeRobotDiffusion(LeRobotPolicy):
     def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
         super().__init__(plan)
         self.net = Diffusion(config)
+        names = self.contract.state_names
+        self._goal_columns = (
+            [names.index(name) for name in EXTRA_NAMES["goal"]]
+            if config.features.takes_goal
+            else []
+        )
+        self._goal = Normaliser(plan.normalisation.goal)
+
+    def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Features of all cameras and the goal [B, T, 1, X], normalised states [B, T, S].
+
+        LeRobot's order: images, then the environment (``_prepare_global_conditioning``).
+        """
+        if not self._goal_columns:
+            return super()._network_inputs(feature, state)
+        states = state.reshape(state.shape[0], self.contract.observation_steps, -1)
+        parts = [self._goal(states[..., self._goal_columns])]
+        own = self._state(self._interface.to_state(states))
+        if self._policy_cameras:
+            by_camera, own = super()._network_inputs(feature, state)
+            parts.insert(0, by_camera.flatten(2))
+        return torch.cat(parts, dim=-1).unsqueeze(2), own
 
     @property
     def schedule(self) -> DdimSchedule:

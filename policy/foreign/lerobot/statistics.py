@@ -9,11 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
 
 from policy.contract import FloatArray
 from policy.errors import CheckpointError
-from policy.foreign.lerobot.config import ACTION_KEY, MODES, STATE_KEY, Features, read_json
+from policy.files import open_safetensors
+from policy.foreign.lerobot.config import (
+    ACTION_KEY,
+    ENVIRONMENT_KEY,
+    MODES,
+    STATE_KEY,
+    Features,
+    read_json,
+)
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -44,6 +51,8 @@ class Normalisation:
 
     images: Mapping[str, Affine | None]
     state: Affine | None
+    goal: Affine | None
+    """Of observation.environment_state."""
     action: Affine | None
     renamed: Mapping[str, str]
     """What the data called an input -> its name in config.json."""
@@ -99,6 +108,7 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
     normalisation = Normalisation(
         images={key: inputs.affine(key, "VISUAL") for key in features.image_keys},
         state=inputs.affine(STATE_KEY, "STATE") if features.state_dim else None,
+        goal=inputs.affine(ENVIRONMENT_KEY, "ENV") if features.takes_goal else None,
         action=outputs.affine(ACTION_KEY, "ACTION"),
         renamed=renamed,
     )
@@ -109,6 +119,7 @@ def _notes(folder: Path, features: Features, normalisation: Normalisation) -> li
     """What LeRobot would compute without a word, and what is seldom meant."""
     found = [(key, "VISUAL", affine) for key, affine in normalisation.images.items()]
     found += [(ACTION_KEY, "ACTION", normalisation.action)]
+    found += [(ENVIRONMENT_KEY, "ENV", normalisation.goal)] if features.takes_goal else []
     state = normalisation.state
     found += [(STATE_KEY, "STATE", state)] if features.state_dim else []
     notes = [
@@ -165,7 +176,8 @@ def _legacy(folder: Path, features: Features) -> _Statistics:
             f"{folder}: there is no {PREPROCESSOR}, and {WEIGHTS_FILE} holds no statistics "
             "(normalize_inputs.buffer_*): copy the whole folder that LeRobot wrote"
         )
-    keys = {key: sides[0] + key.replace(".", "_") for key in (*features.image_keys, STATE_KEY)}
+    names = (*features.image_keys, STATE_KEY, ENVIRONMENT_KEY)
+    keys = {key: sides[0] + key.replace(".", "_") for key in names}
     keys[ACTION_KEY] = sides[1] + ACTION_KEY
     arrays = {key: found[name] for key, name in keys.items() if name in found}
     return _Statistics(path=path, modes=features.modes, epsilon=_EPSILON, arrays=arrays)
@@ -183,11 +195,6 @@ def _by_feature(arrays: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatAr
 def _read_arrays(path: Path, starts: tuple[str, ...] = ("",)) -> dict[str, FloatArray]:
     if not path.is_file():
         raise CheckpointError(f"{path} is missing: copy the whole folder that LeRobot wrote")
-    try:
-        with safe_open(path, framework="numpy") as file:
-            names = [name for name in file.keys() if name.startswith(starts)]  # noqa: SIM118
-            return {name: file.get_tensor(name) for name in names}
-    except (OSError, SafetensorError, TypeError) as error:
-        raise CheckpointError(
-            f"{path}: not a readable safetensors file ({error}); it may be cut short: copy it again"
-        ) from error
+    with open_safetensors(path, "numpy") as file:
+        names = [name for name in file.keys() if name.startswith(starts)]  # noqa: SIM118
+        return {name: file.get_tensor(name) for name in names}

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from policy.errors import CheckpointError
+from policy.files import read_text
 from policy.foreign.description import DESCRIPTION, Description, describe
 
 ENCODER, DENOISER, HEAD, WHOLE = "encoder.onnx", "denoiser.onnx", "head.onnx", "policy.onnx"
@@ -48,8 +49,8 @@ def find_onnx_files(spec: str, path: Path, contract_file: Path | None) -> OnnxFi
     encoder, rest = _graphs(spec, path)
     where = folder / DESCRIPTION
     try:
-        text = where.read_text() if where.is_file() else None
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_text(where) if where.is_file() else None
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{where} cannot be read: {error}") from error
     description = describe(spec, text, where=where, beside=folder, contract_file=contract_file)
     files = OnnxFiles(description=description, encoder=encoder, rest=rest)

@@ -20,10 +20,12 @@ from policy.engines.openvino_compile import engine_name, precisions
 from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.stepwise import solver_segment
 from policy.errors import PolicyError
+from policy.foreign.description import USUAL_NAMES
 from policy.foreign.modules import make_schedule
 from policy.foreign.onnx.files import DENOISER, OnnxFiles
-from policy.foreign.onnx.graphs import USUAL_NAMES, GraphFile, Wanted, require_roles
+from policy.foreign.onnx.graphs import GraphFile, Ports, Wanted, require_roles
 from policy.nets.diffusion import NoiseSchedule
+from policy.preprocess import input_to_bytes
 from policy.protocol import Executable
 
 
@@ -43,14 +45,20 @@ class OnnxGraphs:
         contract = replace(files.description.interface.contract, arrays="numpy")
         if files.encoder is not None:
             image = replace(wanted["image"], shape=(1, *contract.image_shape[-3:]))
-            self.encoder = GraphFile(files.encoder, {"image": image})
+            ports = _ports(files, {"image": image}, "feature")
+            self.encoder = GraphFile(files.encoder, ports)
             contract = _with_feature(contract, self.encoder, files.encoder)
             wanted["feature"] = replace(wanted["feature"], shape=(1, *contract.feature_shape))
         self.interface = replace(files.description.interface, contract=contract)
         needed = ("noisy", "timestep") if files.is_denoiser else ()
         seen = "image" if self.encoder is None else "feature"
         taken = (*needed, seen, "state", "action_history")
-        self.rest = GraphFile(files.rest, {role: wanted[role] for role in taken})
+        result = "prediction" if files.is_denoiser else "chunk"
+        self.rest = GraphFile(
+            files.rest, _ports(files, {role: wanted[role] for role in taken}, result)
+        )
+        if self.rest.hidden and files.is_denoiser:
+            raise PolicyError(f"{files.rest}: a denoiser cannot have a hidden state")
         require_roles(self.rest, files.rest, needed)
 
     def at(self, vision: Precision, action: Precision) -> "OnnxPolicy":
@@ -68,6 +76,10 @@ class OnnxPolicy:
         self._interface = graphs.interface
         self._graph = graphs.rest.compile(action)
 
+    def reset(self) -> None:
+        """Forget earlier flights: a recurrent graph's hidden state becomes zeros."""
+        self._graph.reset()
+
     def predict(
         self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
     ) -> FloatArray:
@@ -78,7 +90,13 @@ class OnnxPolicy:
         """The graph on a state and a history as the policy orders and scales them."""
         own_state = self._interface.to_state(state)
         theirs = self._interface.from_actions(history)
-        return self._graph(state=own_state, action_history=theirs, **arrays)
+        result = self._graph(state=own_state, action_history=theirs, **arrays)
+        # Policies of reinforcement learning give one action, without an axis of time.
+        return result[:, None] if result.ndim == 2 and self.contract.horizon == 1 else result
+
+    def _image(self, graph: GraphFile, image: FloatArray) -> FloatArray:
+        """The image in the graph's own type: normalised by the contract, or bytes."""
+        return input_to_bytes(image, self.contract) if graph.takes_bytes else image
 
 
 class WholePolicy(OnnxPolicy):
@@ -88,7 +106,9 @@ class WholePolicy(OnnxPolicy):
         self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
     ) -> FloatArray:
         """One call of the graph."""
-        return self._interface.to_actions(self._call(state, action_history, image=image))
+        return self._interface.to_actions(
+            self._call(state, action_history, image=self._image(self.graphs.rest, image))
+        )
 
 
 class HeadPolicy(OnnxPolicy):
@@ -98,11 +118,12 @@ class HeadPolicy(OnnxPolicy):
         super().__init__(graphs, vision, action)
         if graphs.encoder is None:
             raise PolicyError("a policy at two rates needs an encoder")
+        self._encoder_file = graphs.encoder
         self._encoder = graphs.encoder.compile(vision)
 
     def encode_visual(self, image: FloatArray, camera: int = 0) -> FloatArray:
         """Image [1, 3, H, W] -> feature [1, F], by one encoder for every camera."""
-        return self._encoder(image=image).reshape(1, -1)
+        return self._encoder(image=self._image(self._encoder_file, image)).reshape(1, -1)
 
     def predict_fast(
         self, feature: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
@@ -188,11 +209,12 @@ def choose_precision(
     samples = make_parity_samples(policy.contract)
 
     def chunks(executable: Executable) -> FloatArray:
+        executable.reset()
         return chunks_of_samples(executable, samples)
 
     def executable_of(policy: OnnxPolicy, vision: Precision, action: Precision) -> Executable:
         executable = make_numpy_executable(policy, settings)
-        return replace(executable, engine=engine_name(vision, action))
+        return replace(executable, engine=engine_name(vision, action), reset=policy.reset)
 
     reference = executable_of(policy, "f32", "f32")
     notes: list[str] = []
@@ -229,6 +251,16 @@ def _schedule(files: OnnxFiles) -> NoiseSchedule | None:
             f"{files.rest}: [action] offset must be zeros for a {DENOISER}, whose noise is about 0"
         )
     return make_schedule(files.rest.parent, files.description.schedule)
+
+
+def _ports(files: OnnxFiles, inputs: dict[str, Wanted], result: str) -> Ports:
+    description = files.description
+    return Ports(
+        inputs=inputs,
+        result=result,
+        output=description.outputs.get(result),
+        hidden={} if result == "feature" else description.hidden,
+    )
 
 
 def _wanted(files: OnnxFiles) -> dict[str, Wanted]:

@@ -12,8 +12,8 @@ from urllib.parse import urlsplit
 
 from policy.contract import ENVELOPE_TERMS, Contract
 from policy.errors import ContractError, PolicyError
+from policy.files import read_toml
 from policy.foreign.interface import Interface, read_interface
-from policy.text_files import read_toml
 
 if TYPE_CHECKING:
     from policy.foreign.websocket.messages import Message

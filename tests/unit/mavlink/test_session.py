@@ -3,6 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.address import parse_address
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.mavlink.codec.messages import (
@@ -13,7 +14,7 @@ from mavbridge.mavlink.codec.messages import (
     SpecificForce,
     Timesync,
 )
-from mavbridge.mavlink.session.discovery import VehicleDiscovery
+from mavbridge.mavlink.session.discovery import Hearing, VehicleDiscovery
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import GOOD_EXCHANGES, TimesyncFilter
@@ -83,6 +84,7 @@ def test_a_vehicle_that_speaks_from_a_new_address_has_moved() -> None:
         ([], "heard nothing"),
         ([(Endpoint(255, 190), heartbeat(6, 8))], "heard only GCS (system 255, component 190)"),
         ([(Endpoint(1, 1), heartbeat(2, 8))], "no autopilot"),  # quadrotor type, but no autopilot
+        ([(Endpoint(1, 42), heartbeat(2, 3))], "as component 42"),
     ],
 )
 def test_other_senders_are_described(
@@ -92,7 +94,29 @@ def test_other_senders_are_described(
     for source, heartbeat in heard:
         discovery.receive(source, heartbeat, None, 0)
     assert discovery.choose(10 * S) is None
-    assert expected in discovery.describe()
+    assert expected in discovery.describe(hearing("udp:127.0.0.1:14550"))
+
+
+def hearing(spec: str, received_bytes: int = 0, received_packets: int = 0) -> Hearing:
+    return Hearing(parse_address(spec), 5.0, received_bytes, received_packets)
+
+
+@pytest.mark.parametrize(
+    ("link", "expected"),
+    [
+        (hearing("/dev/ttyACM0,921600"), ("silent at 921600 baud", "TX and RX")),
+        (hearing("/dev/ttyACM0,921600", 30_000), ("6.0 kB/s came", "baud rate than 921600")),
+        (hearing("/dev/ttyACM0,921600", 30_000, 9), ("without a heartbeat",)),
+        (hearing("tcp:127.0.0.1:5760"), ("not a byte", "one client on TCP 5760")),
+        (hearing("tcp:127.0.0.1:5760", 500), ("0.1 kB/s came", "another program")),
+        (hearing("udp:127.0.0.1:14550"), ("send to port 14550",)),
+        (hearing("udpout:127.0.0.1:14550"), ("nobody answered",)),
+        (hearing("udp:127.0.0.1:14550", 500), ("another program",)),
+    ],
+)
+def test_silence_is_explained_by_the_kind_of_link(link: Hearing, expected: tuple[str, ...]) -> None:
+    told = VehicleDiscovery(target_system=0).describe(link)
+    assert all(part in told for part in expected), told
 
 
 # --- timesync

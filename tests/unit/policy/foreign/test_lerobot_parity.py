@@ -109,7 +109,9 @@ def test_actions_are_those_of_lerobot(golden):
     actions = policy.predict(image, state, torch.zeros(len(image), 4, 4), steps).numpy()
     wanted = in_contract_units(expected["actions"])
     assert actions.shape == (len(image), policy.contract.horizon, 4)
-    np.testing.assert_allclose(actions, wanted, rtol=1e-4, atol=ATOL)
+    # Solves of several steps magnify rounding: 6e-4 where a CPU has no AVX-512.
+    atol = 1e-3 if case.startswith("diffusion") else ATOL
+    np.testing.assert_allclose(actions, wanted, rtol=1e-4, atol=atol)
 
 
 @torch.inference_mode()

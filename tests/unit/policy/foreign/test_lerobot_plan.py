@@ -89,10 +89,17 @@ def test_a_config_that_is_not_supported_is_refused(folder, change, said):
         read_plan(folder, None)
 
 
-def test_inputs_that_no_vehicle_measures_are_refused(folder):
-    feature = {"observation.environment_state": {"type": "ENV", "shape": [3]}}
+@pytest.mark.parametrize(
+    "feature",
+    [
+        {"observation.environment_state": {"type": "ENV", "shape": [4]}},
+        {"observation.wind": {"type": "ENV", "shape": [3]}},
+        {"observation.goal": {"type": "GOAL", "shape": [3]}},
+    ],
+)
+def test_inputs_that_no_vehicle_measures_are_refused(folder, feature):
     edit(folder / "config.json", lambda data: data["input_features"].update(feature))
-    with pytest.raises(CheckpointError, match="environment_state"):
+    with pytest.raises(CheckpointError, match=next(iter(feature))):
         read_plan(folder, None)
 
 

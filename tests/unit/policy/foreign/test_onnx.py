@@ -19,7 +19,7 @@ from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.foreign.export import OurPolicy, export_onnx, export_torchscript
 from policy.foreign.onnx import policies
-from policy.foreign.onnx.graphs import GraphFile, Wanted
+from policy.foreign.onnx.graphs import GraphFile, Ports, Wanted
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
@@ -232,8 +232,8 @@ def one_file(tmp_path: Path, shapes: dict[str, tuple[int, ...]]) -> PolicyReques
 
 
 def test_inputs_that_are_not_known_are_named(tmp_path: Path) -> None:
-    request = one_file(tmp_path, {"image": IMAGE, "obs": STATE})
-    with pytest.raises(PolicyError, match=r"input \['obs'\] is unknown.*'state': \[.*'proprio'"):
+    request = one_file(tmp_path, {"image": IMAGE, "thing": STATE})
+    with pytest.raises(PolicyError, match=r"input \['thing'\] is unknown.*'state': \[.*'proprio'"):
         loaded(request)
 
 
@@ -275,7 +275,8 @@ def test_new_weights_in_a_file_of_their_own_are_flown(tmp_path: Path, weights_fi
         onnx.save_model(
             model, path, save_as_external_data=True, location=weights_file, size_threshold=0
         )
-        file = GraphFile(path, {"state": Wanted(names=("state",), shape=(1, 13))})
+        state = Wanted(names=("state",), shape=(1, 13))
+        file = GraphFile(path, Ports(inputs={"state": state}, result="chunk"))
         return float(file.compile("f32")(state=np.ones((1, 13), np.float32))[0, 0])
 
     assert [compiled(1.0), compiled(2.0)] == [1.0, 2.0]

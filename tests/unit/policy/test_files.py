@@ -4,8 +4,8 @@ import pytest
 
 from mavbridge.__main__ import main
 from policy.errors import ContractError
+from policy.files import MAX_TOML_BYTES, parse_json, read_toml
 from policy.foreign.interface import read_interface
-from policy.text_files import MAX_TOML_BYTES, parse_json, read_toml
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 100_000, "[" * 2_000 + "1,"])
@@ -21,7 +21,8 @@ def test_json_that_is_nested_too_deeply_is_a_value_error(text: str) -> None:
         (b"a." * 30_000 + b"a = 1", "a line of it has 60005 characters"),
         ('"\u2028".'.encode() * 5_000 + b"a = 1", "a line of it has 20005 characters"),
         (b"#" * (MAX_TOML_BYTES + 1), "larger than 64 KiB"),
-        (b"\xff\xfe", "decode"),
+        (b"\xff\xfe", "UTF-16"),
+        (b"a = '\xe4'", "not UTF-8"),
         (b"a = \0", "Invalid"),
     ],
 )

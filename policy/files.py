@@ -1,0 +1,142 @@
+"""The one door to files that people name: paths, text encodings, damage, JSON and TOML."""
+
+import codecs
+import json
+import os
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+
+from policy.errors import CheckpointError
+
+MAX_TEXT_BYTES = 100_000_000
+MAX_TOML_BYTES = 64 * 1024
+MAX_TOML_LINE = 2_000
+"""Characters. Memory and time of ``tomllib`` grow with the square of the dots in a key, which has
+to end with its line: 200 kB of ``a.a.a`` took more than 10 GB."""
+_HEAD_BYTES = 4096
+_WIDE_MARKS = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+def user_path(name: str | Path) -> Path:
+    """Return the path that a user's flag or setting names, with ``~`` expanded."""
+    try:
+        return Path(name).expanduser()
+    except RuntimeError:  # ~ of an account that does not exist: a file may have that name
+        return Path(name)
+
+
+def library_name(path: Path) -> str:
+    """Return an absolute name: FFmpeg and Arrow take ``10:30.mp4`` for an address."""
+    return os.path.abspath(path)  # noqa: PTH100 - Path.absolute keeps ".."
+
+
+def stand_in(path: Path) -> tuple[str, str] | None:
+    """Return what lies in place of a file's content and the remedy, or None.
+
+    Recognises empty files, Git LFS pointers, and web pages saved under a file's name.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(_HEAD_BYTES).lstrip().lower()
+    except OSError:
+        return None
+    if not start:
+        return "empty, or cut short", "copy it again"
+    if start.startswith(b"version https://git-lfs.github.com/"):
+        return "a pointer of Git LFS, not the file itself", "fetch it with `git lfs pull`"
+    if start.startswith((b"<!doctype html", b"<html")):
+        return (
+            "a web page, not the file itself",
+            "download it again, by the link to the file itself, logged in where that is needed",
+        )
+    return None
+
+
+def why_unreadable(path: Path, error: Exception, remedy: str = "copy it again") -> str:
+    """Return why a library could not read a file: its real content if known, else one line of the
+    library's own words with the remedy."""
+    if isinstance(error, OSError) and error.strerror and not path.is_file():
+        return f"{path}: {error.strerror.lower()}"
+    if (found := stand_in(path)) is not None:
+        what, advice = found
+        return f"{path} is {what}: {advice}"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    words = lines[-1] if lines else type(error).__name__
+    return f"{path} cannot be read ({words}); it may be damaged or cut short: {remedy}"
+
+
+@contextmanager
+def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
+    """Open a safetensors file; raises CheckpointError if it is damaged, also while it is read."""
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except (OSError, SafetensorError, TypeError) as error:
+        raise CheckpointError(why_unreadable(path, error)) from error
+
+
+def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Read a text file in UTF-8, with or without a byte order mark.
+
+    Raises:
+        OSError: it cannot be opened.
+        ValueError: it is not UTF-8, or larger than ``max_bytes``; the message says what it is.
+    """
+    with path.open("rb") as file:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise ValueError(f"it is larger than {max_bytes // 1024} KiB")
+    if data.startswith(_WIDE_MARKS):
+        raise ValueError("it is UTF-16 or UTF-32: save it as UTF-8")
+    if data.strip() and (found := stand_in(path)) is not None:
+        raise ValueError(f"it is {found[0]}: {found[1]}")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise ValueError(f"it is not UTF-8 text (line {line}): save it as UTF-8") from error
+
+
+def parse_json(text: str) -> Any:
+    """Parse JSON; raises ValueError also where it is nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file; raises OSError, or ValueError as ``read_text`` and ``parse_json``."""
+    return parse_json(read_text(path))
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Parse TOML that a person wrote.
+
+    Raises:
+        ValueError: not TOML, nested too deeply, or a line longer than MAX_TOML_LINE.
+    """
+    if (longest := max(map(len, text.split("\n")))) > MAX_TOML_LINE:
+        raise ValueError(
+            f"a line of it has {longest} characters, and may have {MAX_TOML_LINE}: write a long "
+            "list over several lines"
+        )
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a settings file.
+
+    Raises:
+        OSError: it cannot be opened.
+        ValueError: not UTF-8, larger than MAX_TOML_BYTES, or as ``parse_toml``.
+    """
+    return parse_toml(read_text(path, MAX_TOML_BYTES))
