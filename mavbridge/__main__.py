@@ -19,6 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     from mavbridge.cli import cli
     from mavbridge.core.errors import MavbridgeError
+    from mavbridge.core.provenance import without_secrets
     from mavbridge.core.stopping import end_process
 
     try:
@@ -26,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         end_process(128 + signal.SIGINT)
     except MavbridgeError as error:
-        message = f"[bold red]error:[/] {escape(str(error))}"
+        message = f"[bold red]error:[/] {escape(without_secrets(str(error)))}"
         console = Console(stderr=True, highlight=False, emoji=False)
         end_process(error.exit_code, partial(console.print, message, soft_wrap=True))
     end_process(status or 0)

@@ -12,7 +12,9 @@ import numpy as np
 from mavbridge.camera.grabber import Image
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
+from mavbridge.core.provenance import without_secrets
 from mavbridge.core.records import ImageArray
+from policy.files import library_name
 
 OPEN_TIMEOUT_MS = 5000
 READ_TIMEOUT_MS = 2000
@@ -20,6 +22,8 @@ FFMPEG_OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 LOW_LATENCY_OPTIONS = "rtsp_flags;prefer_tcp|fflags;nobuffer|flags;low_delay"
 """No buffering in the demuxer, no reordering delay in the decoder. Setting options drops OpenCV's
 default, which is the first of these."""
+SDP_OPTIONS = "|protocol_whitelist;file,udp,rtp"
+"""FFmpeg opens what an .sdp file names only where that is allowed."""
 DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
 """Offered by practically every camera; the smallest that covers the policy's image is used."""
 MAX_DRIVER_AGE_NS = NS_PER_S
@@ -64,14 +68,15 @@ def open_device(device: int | Path, *, image_size: int, clock: Clock) -> Capture
 
 def present_devices() -> str:
     """The local cameras of this computer, for a message."""
-    names = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*")))
+    found = [*Path("/dev").glob("video*"), *Path("/dev").glob("v4l/by-id/*")]
+    names = ", ".join(sorted(map(str, found)))
     if not names:
         return "there is no /dev/video* on this machine"
     return f"present: {names} (in use, or no permission to open it: group video?)"
 
 
 def open_stream(url: str, *, clock: Clock) -> CaptureSource:
-    """Open a network stream that FFmpeg can read; frames are stamped on arrival.
+    """Open a network stream or an .sdp file; frames are stamped on arrival.
 
     Raises CameraError if no video arrives within OPEN_TIMEOUT_MS.
     """
@@ -79,15 +84,18 @@ def open_stream(url: str, *, clock: Clock) -> CaptureSource:
         *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, OPEN_TIMEOUT_MS),
         *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, READ_TIMEOUT_MS),
     ]
-    with _ffmpeg_options(LOW_LATENCY_OPTIONS):
-        capture = cv2.VideoCapture(url, cv2.CAP_FFMPEG, timeouts)
+    name, source, options = without_secrets(url), url, LOW_LATENCY_OPTIONS
+    if "://" not in url:
+        source, options = library_name(Path(url)), options + SDP_OPTIONS
+    with _ffmpeg_options(options):
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, timeouts)
     if not capture.isOpened():
         raise CameraError(
-            f"stream {url} cannot be opened within {OPEN_TIMEOUT_MS / 1000:g} s: check the "
+            f"stream {name} cannot be opened within {OPEN_TIMEOUT_MS / 1000:g} s: check the "
             "address, that the sender is running, and that it sends video"
         )
     failure = f"ended, or was silent for {READ_TIMEOUT_MS / 1000:g} s"
-    return CaptureSource(capture, f"stream {url}", failure, clock)
+    return CaptureSource(capture, f"stream {name}", failure, clock)
 
 
 @contextmanager

@@ -18,12 +18,13 @@ from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.extras import require_packages
 from mavbridge.core.ports import Camera
 
-STREAM_SCHEMES = ("rtsp://", "udp://", "tcp://", "http://", "https://")
+STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
 SCREEN_PACKAGES = {"mss": "mss", "Xlib": "python-xlib"}
 """The extra "screen"."""
 NO_CAMERA = "none"
 FORMS = (
-    "a device (0, /dev/video0), a stream (rtsp://, udp://, tcp://, http://, https://), "
+    "a device (0, /dev/video0, /dev/v4l/by-id/NAME), a stream (rtsp://, rtp://, udp://, tcp://, "
+    "http://, https://, an .sdp file), "
     "a video file, shm:NAME, screen:WINDOW TITLE (screen: alone = the whole screen), pipe:COMMAND "
     "(MJPEG from a program), or none for a policy that looks at no image"
 )
@@ -48,8 +49,7 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
     if kind == "screen":
         require_packages("--camera screen:", SCREEN_PACKAGES)
         return
-    is_device = spec.startswith("/dev/video") or spec.isdecimal()
-    is_known = kind == "shm" or spec == NO_CAMERA or spec.startswith(STREAM_SCHEMES) or is_device
+    is_known = kind == "shm" or spec == NO_CAMERA or _is_stream(spec) or _is_device(spec)
     if not is_known and not Path(spec).is_file():
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
 
@@ -61,8 +61,20 @@ def require_present(spec: str) -> None:
         CameraError: there is no such device.
     """
     device = Path(f"/dev/video{spec}" if spec.isdecimal() else spec)
-    if sys.platform == "linux" and device.match("/dev/video*") and not device.exists():
+    if sys.platform == "linux" and _is_device(spec) and not device.exists():
         raise CameraError(f"camera {spec} is not there: {present_devices()}")
+
+
+def _is_device(spec: str) -> bool:
+    """Return True for a number, and for anything under /dev but regular files: names by udev are
+    links to devices, and a link that leads nowhere is a camera that is not plugged in."""
+    return spec.isdecimal() or (spec.startswith("/dev/") and not Path(spec).is_file())
+
+
+def _is_stream(spec: str) -> bool:
+    return spec.startswith(STREAM_SCHEMES) or (
+        spec.lower().endswith(".sdp") and Path(spec).is_file()
+    )
 
 
 def open_camera(
@@ -118,9 +130,9 @@ def _open(spec: str, *, image_size: int, clock: Clock) -> Camera:
         return ScreenCamera(rest, clock=clock)
     if kind == "pipe":
         return PipeCamera(parse_pipe(rest), clock=clock)
-    if spec.startswith(STREAM_SCHEMES):
+    if _is_stream(spec):
         return Grabber(partial(open_stream, spec, clock=clock), clock=clock)
-    if spec.isdecimal() or spec.startswith("/dev/video"):
+    if _is_device(spec):
         device = int(spec) if spec.isdecimal() else Path(spec)
         opener = partial(open_device, device, image_size=image_size, clock=clock)
         return Grabber(opener, clock=clock)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.files import require_writable
-from mavbridge.core.provenance import command_line, git_revision, versions
+from mavbridge.core.provenance import command_line, git_revision, versions, without_secrets
 from mavbridge.core.workers import HungError, Worker
 
 SAID = "mavbridge.said"
@@ -38,6 +38,12 @@ class _Queue(logging.handlers.QueueHandler):
         self.records: queue.Queue[logging.LogRecord] = queue.Queue(CAPACITY)
         super().__init__(self.records)
         self.dropped = 0
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        """Format it, without the secrets of addresses in it."""
+        prepared: logging.LogRecord = super().prepare(record)
+        prepared.msg = prepared.message = without_secrets(str(prepared.msg))
+        return prepared
 
     def enqueue(self, record: logging.LogRecord) -> None:
         """Queue it, or drop and count it."""

@@ -18,17 +18,28 @@ PACKAGES = (
 )
 """Those that have a part in how a flight goes or in what is recorded."""
 GIT_TIMEOUT_S = 2.0
-_PASSWORD = re.compile(r"(?<=://)([^/@\s:]*):[^/@\s]*@")
+_USER_PASSWORD = re.compile(r"(?<=://)([^/@\s:]*):\S*@")
+"""To the last @ of the word: a password may hold any character, a slash or another @ too."""
+_NAMED_SECRET = re.compile(
+    r"""((?:pass|passwd|password|pwd|pw|token|secret|key|auth|sig|signature)=)"""
+    r"""(?:(?!_[a-z]+=)[^&;/?\#\s"'])+""",
+    re.IGNORECASE,
+)
+"""In a query, or in a path as some cameras have it: /user=me_password=it_channel=1."""
 
 
 def command_line() -> tuple[str, ...]:
     """The words of this process's command line, without the passwords in addresses."""
-    return tuple(without_password(word) for word in ("mavbridge", *sys.argv[1:]))
+    return tuple(without_secrets(word) for word in ("mavbridge", *sys.argv[1:]))
 
 
-def without_password(text: str) -> str:
-    """The text with ``***`` for the password of each address in it, as in ``rtsp://me:it@host``."""
-    return _PASSWORD.sub(r"\1:***@", text)
+def without_secrets(text: str) -> str:
+    """Return a text with ``***`` for the passwords and keys of the addresses in it.
+
+    The one door for terminal, log, errors and records: ``rtsp://me:it@host`` becomes
+    ``rtsp://me:***@host``, ``?token=abc`` becomes ``?token=***``.
+    """
+    return _NAMED_SECRET.sub(r"\1***", _USER_PASSWORD.sub(r"\1:***@", text))
 
 
 def versions() -> dict[str, str]:

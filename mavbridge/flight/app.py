@@ -20,7 +20,7 @@ from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError
 from mavbridge.core.files import empty_folders_removed
 from mavbridge.core.log import SAID
 from mavbridge.core.ports import Camera, TickSink
-from mavbridge.core.provenance import without_password
+from mavbridge.core.provenance import without_secrets
 from mavbridge.core.realtime import (
     prepare_to_die_first,
     settle_process,
@@ -230,7 +230,7 @@ class _Flight:
             report=lambda line: console.print(Text(line)),
         )
         self._stack.callback(camera.close)
-        _log.debug("camera %s is open", without_password(source))
+        _log.debug("camera %s is open", without_secrets(source))
         return camera
 
     def run(self, stop: StopRequest) -> None:

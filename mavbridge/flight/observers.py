@@ -22,7 +22,7 @@ from mavbridge.core.provenance import (
     digests,
     git_revision,
     versions,
-    without_password,
+    without_secrets,
 )
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
@@ -194,7 +194,7 @@ class FlightObservers:
 
     def _camera_sources(self) -> dict[str, str]:
         names = self._executable.contract.cameras
-        sources = map(without_password, self._config.camera.sources_of(names))
+        sources = map(without_secrets, self._config.camera.sources_of(names))
         return dict(zip(names, sources, strict=True))
 
     def finish(self, summary: GateSummary | None, autopilot: str | None) -> None:

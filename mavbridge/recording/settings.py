@@ -8,6 +8,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.provenance import without_secrets
 from mavbridge.recording.folder import SETTINGS
 from policy.files import read_json
 
@@ -30,7 +31,7 @@ class ReplaySettings:
 def write_settings(folder: Path, settings: ReplaySettings) -> None:
     """Write the file; raises OSError."""
     text = json.dumps(asdict(settings), indent=2, default=str) + "\n"
-    (folder / SETTINGS).write_text(text)
+    (folder / SETTINGS).write_text(without_secrets(text))
 
 
 def read_settings(folder: Path) -> ReplaySettings:

@@ -26,7 +26,7 @@ from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wal
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import FanOut, ObserverThread
 from mavbridge.core.ports import Camera, TickSink
-from mavbridge.core.provenance import command_line, git_revision, versions, without_password
+from mavbridge.core.provenance import command_line, git_revision, versions, without_secrets
 from mavbridge.core.records import FloatArray
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import Worker
@@ -225,7 +225,7 @@ class _Session:
             command=command_line(),
             versions=versions(),
             git_revision=git_revision(),
-            cameras={"front": without_password(self._config.film.camera)},
+            cameras={"front": without_secrets(self._config.film.camera)},
         )
 
     def run(self, stop: StopRequest) -> None:

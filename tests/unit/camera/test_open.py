@@ -43,6 +43,12 @@ def openers(monkeypatch):
         ("0", ("device", 0, {"image_size": 224})),
         ("12", ("device", 12, {"image_size": 224})),
         ("/dev/video3", ("device", Path("/dev/video3"), {"image_size": 224})),
+        ("/dev/null", ("device", Path("/dev/null"), {"image_size": 224})),
+        (
+            "/dev/v4l/by-id/usb-X-video-index0",
+            ("device", Path("/dev/v4l/by-id/usb-X-video-index0"), {"image_size": 224}),
+        ),
+        ("rtp://0.0.0.0:5004", ("stream", "rtp://0.0.0.0:5004", {})),
         ("rtsp://host:8554/cam", ("stream", "rtsp://host:8554/cam", {})),
         ("udp://0.0.0.0:5600", ("stream", "udp://0.0.0.0:5600", {})),
         ("tcp://host:1", ("stream", "tcp://host:1", {})),
@@ -58,9 +64,19 @@ def test_live_sources(spec, asked):
     assert caught.value.__cause__.args == asked
 
 
-@pytest.fixture
-def video(tmp_path):
-    path = tmp_path / "a.avi"
+@pytest.mark.usefixtures("openers")
+def test_a_session_description_is_a_stream(tmp_path):
+    path = tmp_path / "camera.sdp"
+    path.write_text("v=0\n")
+    with pytest.raises(CameraError) as caught:
+        open_camera(str(path), image_size=224, clock=MonotonicClock())
+    assert caught.value.__cause__.args == ("stream", str(path), {})
+
+
+@pytest.fixture(params=["a.avi", "10:30.avi"])  # FFmpeg would take the second for a protocol
+def video(tmp_path, monkeypatch, request):
+    monkeypatch.chdir(tmp_path)
+    path = Path(request.param)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20, (32, 32))
     writer.write(np.zeros((32, 32, 3), np.uint8))
     writer.release()

@@ -7,14 +7,36 @@ from pathlib import Path
 import pytest
 
 import mavbridge
-from mavbridge.core.provenance import command_line, digests, git_revision, versions
+from mavbridge.core.provenance import command_line, digests, git_revision, versions, without_secrets
 
 
-def test_the_command_line_is_kept_without_passwords(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_line_is_kept_without_secretss(monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["--camera", "front=rtsp://me:se:cret@host:8554/x", "--connect", "udp:1.2.3.4:14550"]
     monkeypatch.setattr(sys, "argv", ["/somewhere/__main__.py", *words])
     kept = ("mavbridge", "--camera", "front=rtsp://me:***@host:8554/x", *words[2:])
     assert command_line() == kept
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("rtsp://me:it@host/x", "rtsp://me:***@host/x"),
+        ("rtsp://me:p@ss/w:rd@host/x", "rtsp://me:***@host/x"),
+        ("ws://:it@host:8000", "ws://:***@host:8000"),
+        ("front=rtsp://me:it@host/x down=rtsp://me:it@host/y", "front=rtsp://me:***@host/x "
+         "down=rtsp://me:***@host/y"),
+        ("http://host/video?user=me&password=it&channel=1", "http://host/video?user=me&password=***"
+         "&channel=1"),
+        ("rtsp://host/user=me_password=it_channel=1_stream=0.sdp",
+         "rtsp://host/user=me_password=***_channel=1_stream=0.sdp"),
+        ("https://host/x?access_token=it#here", "https://host/x?access_token=***#here"),
+        ("udp:127.0.0.1:14550 --set RC_OVERRIDE_TIME=0.5", "udp:127.0.0.1:14550 --set "
+         "RC_OVERRIDE_TIME=0.5"),
+        ("--signing-key-file key.txt", "--signing-key-file key.txt"),
+    ],
+)  # fmt: skip
+def test_secrets_in_addresses_are_masked(text: str, shown: str) -> None:
+    assert without_secrets(text) == shown
 
 
 def test_versions_are_of_what_is_installed() -> None:

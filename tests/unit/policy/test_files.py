@@ -4,7 +4,7 @@ import pytest
 
 from mavbridge.__main__ import main
 from policy.errors import ContractError
-from policy.files import MAX_TOML_BYTES, parse_json, read_toml
+from policy.files import MAX_TOML_BYTES, parse_json, read_json, read_text, read_toml, user_path
 from policy.foreign.interface import read_interface
 
 
@@ -46,3 +46,52 @@ def test_lines_of_the_longest_length_take_little_memory(tmp_path: Path) -> None:
     lines = [f"k{number}." + "a." * 990 + "a = 1" for number in range(32)]
     path.write_text("\n".join(lines))
     assert len(read_toml(path)) == 32
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_text_of_windows_editors_is_read(tmp_path: Path, newline: str) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + f'a = 1{newline}b = "x"{newline}'.encode())
+    assert read_toml(path) == {"a": 1, "b": "x"}
+    path.write_bytes(b"\xef\xbb\xbf" + b'{"a": 1}')
+    assert read_json(path) == {"a": 1}
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("a".encode("utf-16"), "UTF-16"),
+        ("a".encode("utf-32"), "UTF-16 or UTF-32"),
+        (b"a = 1\nb = '\xe4'", r"line 2"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+        (b"<!DOCTYPE html><html>", "web page"),
+    ],
+)
+def test_what_is_no_text_is_named(tmp_path: Path, content: bytes, told: str) -> None:
+    path = tmp_path / "config.json"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=told):
+        read_text(path)
+
+
+def test_a_home_directory_is_expanded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    assert user_path("~/act") == Path("/home/me/act")
+    assert user_path("~nobody-of-this-name/act") == Path("~nobody-of-this-name/act")
+
+
+@pytest.mark.parametrize(
+    "words", [["--policy", "lerobot:~/act"], ["--policy=lerobot:~/act"], ["--config", "~/fly.toml"]]
+)
+def test_the_command_line_expands_what_shells_leave(
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "fly.toml").write_text('policy = "lerobot:~/act"')
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--connect", "udp:127.0.0.1:1", "--camera", "none"])
+    assert ended.value.code == 2
+    assert f"{tmp_path}/act" in capsys.readouterr().err.replace("\n", "")
