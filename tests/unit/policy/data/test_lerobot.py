@@ -33,7 +33,7 @@ def feature(dtype: str, shape: list[int], named: object) -> dict[str, Any]:
 def write(root: Path, *, kind: str = "video", state: object = LEVEL) -> Path:
     """A dataset without any column of ours."""
     features = {
-        CAMERA: feature(kind, [SIZE, SIZE, 3], ["height", "width", "channels"]),
+        CAMERA: feature(kind.split()[0], [SIZE, SIZE, 3], ["height", "width", "channels"]),
         "observation.state": feature("float32", [13], list(STATE_NAMES)),
         "action": feature("float32", [4], {"motors": list(ACTION_NAMES)}),
         "timestamp": feature("float32", [1], None),
@@ -54,6 +54,14 @@ def write(root: Path, *, kind: str = "video", state: object = LEVEL) -> Path:
     if kind == "image":
         encoded = [cv2.imencode(".png", image[..., ::-1])[1].tobytes() for image in images]
         rows[CAMERA] = pa.array([{"bytes": value, "path": None} for value in encoded])
+    elif kind == "image files":
+        cells = []
+        for number, image in enumerate(images):
+            name = f"images/{number}.png"
+            (root / "images").mkdir(exist_ok=True)
+            cv2.imwrite(str(root / name), image[..., ::-1])
+            cells.append({"bytes": None, "path": name})
+        rows[CAMERA] = pa.array(cells, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
     else:
         encode(root / f"videos/{CAMERA}/chunk-000/file-000.mp4", images)
     pq.write_table(pa.table(rows), root / "data/chunk-000/file-000.parquet")
@@ -80,7 +88,7 @@ def encode(path: Path, images: list[np.ndarray]) -> None:
         container.mux(stream.encode(None))
 
 
-@pytest.mark.parametrize("kind", ["video", "image"])
+@pytest.mark.parametrize("kind", ["video", "image", "image files"])
 def test_a_foreign_dataset_has_its_timestamps_for_everything(kind: str, tmp_path: Path) -> None:
     assert not is_lerobot(tmp_path)
     assert is_lerobot(write(tmp_path / "a", kind=kind))
@@ -212,7 +220,7 @@ def test_a_damaged_dataset_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("shown", "says"), [(14, "ends after 2 of 8"), (12, "ends after 0 of 8|not a readable video")]
+    ("shown", "says"), [(14, "ends after 2 of 8"), (12, "ends after 0 of 8|cannot be read")]
 )
 def test_a_video_that_ends_early_is_refused(shown: int, says: str, tmp_path: Path) -> None:
     root = write(tmp_path / "a")
@@ -227,5 +235,23 @@ def test_a_video_that_ends_early_is_refused(shown: int, says: str, tmp_path: Pat
 def test_a_file_that_is_no_video_is_refused(tmp_path: Path) -> None:
     root = write(tmp_path / "a")
     (root / f"videos/{CAMERA}/chunk-000/file-000.mp4").write_bytes(b"no video")
-    with pytest.raises(DatasetError, match="not a readable video"):
+    with pytest.raises(DatasetError, match=r"file-000\.mp4 cannot be read"):
+        list(read_dataset(root)[0].decode())
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("images/9.png", "not a PNG"), ("images/none.png", "is empty"), ("../out.png", "is empty")],
+)
+def test_an_image_file_that_cannot_be_used_is_named(name: str, says: str, tmp_path: Path) -> None:
+    root = write(tmp_path / "a", kind="image files")
+    cv2.imwrite(str(tmp_path / "out.png"), np.zeros((SIZE, SIZE, 3), np.uint8))
+    (root / "images/9.png").write_bytes(b"no image")
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    cells = pa.array([{"bytes": None, "path": name}] * table.num_rows, kind)
+    at = table.column_names.index(CAMERA)
+    pq.write_table(table.set_column(at, CAMERA, cells), path)
+    with pytest.raises(DatasetError, match=f"row 0 .*{name}.*{says}"):
         list(read_dataset(root)[0].decode())
