@@ -29,7 +29,7 @@ DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
 MAX_DRIVER_AGE_NS = NS_PER_S
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class CaptureSource:
     """Implements `ImageSource` over an open OpenCV capture; ``failure`` says why it may end."""
 
@@ -38,6 +38,8 @@ class CaptureSource:
     failure: str
     clock: Clock
     has_driver_stamps: bool = False
+    is_our_clock: bool = False
+    """A stamp of the driver has been plausible: later ones tell the age, however great it is."""
 
     def next_image(self) -> Image:
         """See `ImageSource`."""
@@ -45,7 +47,9 @@ class CaptureSource:
             raise CameraError(f"{self.name} {self.failure}")
         captured_ns = self.clock.now_ns()
         if self.has_driver_stamps:
-            captured_ns = exposure_ns(self.capture.get(cv2.CAP_PROP_POS_MSEC), captured_ns)
+            driver_ms, arrived_ns = self.capture.get(cv2.CAP_PROP_POS_MSEC), captured_ns
+            captured_ns = exposure_ns(driver_ms, arrived_ns, is_our_clock=self.is_our_clock)
+            self.is_our_clock = self.is_our_clock or captured_ns != arrived_ns
         return Image(captured_ns=captured_ns, rgb=retrieve_rgb(self.capture, self.name))
 
     def close(self) -> None:
@@ -123,15 +127,15 @@ def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> ImageArray:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def exposure_ns(driver_ms: float, arrived_ns: int) -> int:
-    """The driver's stamp if it is plausible, else the arrival.
+def exposure_ns(driver_ms: float, arrived_ns: int, *, is_our_clock: bool = False) -> int:
+    """Return the driver's stamp if it is plausible or known to be of our clock, else the arrival.
 
     Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as CAP_PROP_POS_MSEC
     (modules/videoio/src/cap_v4l.cpp); other systems return something else, or nothing.
     """
     stamp_ns = round(driver_ms * NS_PER_MS)
     is_plausible = 0 <= arrived_ns - stamp_ns <= MAX_DRIVER_AGE_NS
-    return stamp_ns if is_plausible else arrived_ns
+    return stamp_ns if is_plausible or (is_our_clock and stamp_ns > 0) else arrived_ns
 
 
 def device_mode(image_size: int) -> tuple[int, int]:

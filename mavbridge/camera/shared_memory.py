@@ -111,7 +111,10 @@ class SharedMemoryCamera:
         skipped = newest_id - self._seen_id - 1
         self._seen_id = newest_id
         self._stamp_age_ns = self._clock.now_ns() - captured_ns
-        if abs(self._stamp_age_ns) > STALL_NS:
+        # A stamp from the future is no sign of a dead writer: in flight it is for the vision loop,
+        # which names it.
+        is_ahead = self._stamp_age_ns < -STALL_NS and self._dead_ns is None
+        if is_ahead or self._stamp_age_ns > STALL_NS:
             return None
         self.dropped_frames += skipped
         return Frame(frame_id=self._first_id + newest_id, captured_ns=captured_ns, rgb=rgb)
@@ -136,9 +139,10 @@ class SharedMemoryCamera:
         if segment.is_closed():
             return f"{name}: the writer has closed it and no other has replaced it: start it again"
         if abs(self._stamp_age_ns) > STALL_NS:
+            when = "ago" if self._stamp_age_ns > 0 else "in the future"
             return (
-                f"{name}: the newest frame is stamped {self._stamp_age_ns / NS_PER_S:.1f} s ago: "
-                "its writer has died, or does not stamp on CLOCK_MONOTONIC"
+                f"{name}: the newest frame is stamped {abs(self._stamp_age_ns) / NS_PER_S:.1f} s "
+                f"{when}: its writer has died, or does not stamp on CLOCK_MONOTONIC"
             )
         if self._dead_ns is None:
             return f"{name}: no frame in it yet"

@@ -1,5 +1,6 @@
-"""Files that a command will write at its end, checked at its start."""
+"""Files that are checked before they are needed, or must survive a loss of power."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -41,3 +42,28 @@ def empty_folders_removed(*folders: Path | None) -> Iterator[None]:
         for folder in sorted(missing, key=lambda each: len(each.parts), reverse=True):
             with suppress(OSError):
                 folder.rmdir()
+
+
+def write_durably(path: Path, text: str) -> None:
+    """Replace a file at once and on the disk itself, so that a loss of power leaves old or new.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(f".{os.getpid()}")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make what was created, renamed or removed in a folder survive a loss of power."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

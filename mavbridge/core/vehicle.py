@@ -132,12 +132,17 @@ class Reading(NamedTuple):
     arrived_ns: int
     values: tuple[float, ...]
     delay_ns: int = 0
-    """From the measured moment to the arrival, by the vehicle's own stamp; 0 = not known."""
+    """From the measured moment to the arrival, by the vehicle's own stamp; 0 = not known, negative
+    = stamped in the future, so that the age is not known either."""
 
     @property
     def happened_ns(self) -> int:
         """The measured moment, from which its age counts."""
         return self.arrived_ns - self.delay_ns
+
+    def is_fresh(self, now_ns: int, limit_ns: int) -> bool:
+        """True if it is known to be at most ``limit_ns`` old."""
+        return self.delay_ns >= 0 and now_ns - self.happened_ns <= limit_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -37,14 +37,14 @@ def build_state(
     """
     attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
     velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
-    if attitude is None or now_ns - attitude.happened_ns > freshness.attitude_ns:
-        return _stale(attitude, "attitude", freshness.attitude_ns)
-    if rate is None or now_ns - rate.happened_ns > freshness.attitude_ns:
-        return _stale(rate, "body rates", freshness.attitude_ns)
-    if velocity is None or now_ns - velocity.happened_ns > freshness.velocity_ns:
-        return _stale(velocity, "velocity", freshness.velocity_ns)
-    if force is None or now_ns - force.happened_ns > freshness.velocity_ns:
-        return _stale(force, "acceleration", freshness.velocity_ns)
+    if attitude is None or not attitude.is_fresh(now_ns, freshness.attitude_ns):
+        return stale(attitude, "attitude", freshness.attitude_ns)
+    if rate is None or not rate.is_fresh(now_ns, freshness.attitude_ns):
+        return stale(rate, "body rates", freshness.attitude_ns)
+    if velocity is None or not velocity.is_fresh(now_ns, freshness.velocity_ns):
+        return stale(velocity, "velocity", freshness.velocity_ns)
+    if force is None or not force.is_fresh(now_ns, freshness.velocity_ns):
+        return stale(force, "acceleration", freshness.velocity_ns)
     v, q, w, a = velocity.values, attitude.values, rate.values, force.values
     if frame == "enu_flu":
         v, q, w, a = _to_enu_flu(v, q, w, a)
@@ -84,9 +84,13 @@ class FrozenStateCheck:
         return f"the vehicle's attitude has been frozen for more than {limit_ms} ms"
 
 
-def _stale(reading: Reading | None, what: str, limit_ns: int) -> Release:
+def stale(reading: Reading | None, what: str, limit_ns: int) -> Release:
+    """Say why a reading is none to fly by."""
     if reading is None:
         return Release(f"no {what} from the vehicle yet")
+    if reading.delay_ns < 0:
+        ahead_ms = -reading.delay_ns // NS_PER_MS
+        return Release(f"{what} is stamped {ahead_ms} ms ahead of the vehicle's clock")
     # The limit, not the age: reasons are compared from tick to tick.
     return Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
 

@@ -5,10 +5,9 @@ Freshness of the extra inputs is that of the velocity: a missing or an old one i
 
 from dataclasses import replace
 
-from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Release, Telemetry
-from mavbridge.flight.state import Freshness, build_state
+from mavbridge.flight.state import Freshness, build_state, stale
 from policy.contract import Contract
 
 Ned = tuple[float, float, float]
@@ -39,7 +38,7 @@ class StateReader:
         stamps_ns: list[int] = []
         for extra in self._extras:
             reading = telemetry.height_above_home_m if extra == "height" else position
-            if reading is None or self._is_old(reading, now_ns):
+            if reading is None or not reading.is_fresh(now_ns, self._freshness.velocity_ns):
                 return self._missing(extra, reading)
             stamps_ns.append(reading.happened_ns)
             if extra == "goal":
@@ -48,15 +47,11 @@ class StateReader:
                 numbers.append(reading.values[0] if extra == "height" else -reading.values[2])
         return replace(state, extras=tuple(numbers), extras_ns=min(stamps_ns))
 
-    def _is_old(self, reading: Reading, now_ns: int) -> bool:
-        return now_ns - reading.happened_ns > self._freshness.velocity_ns
-
     def _missing(self, extra: str, reading: Reading | None) -> Release:
         what = _READINGS[extra]
         if reading is None:
             return Release(f"no {what} from the vehicle yet, or none that it trusts")
-        # The limit, not the age: reasons are compared from tick to tick.
-        return Release(f"{what} is older than {self._freshness.velocity_ns // NS_PER_MS} ms")
+        return stale(reading, what, self._freshness.velocity_ns)
 
     def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:
         """From the vehicle to the goal, in the world's axes of the contract."""

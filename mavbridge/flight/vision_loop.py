@@ -11,6 +11,8 @@ from mavbridge.flight.feature_cache import FeatureCache
 
 READ_TIMEOUT_NS = 100 * NS_PER_MS
 """Longest wait for a frame before the stop flag is checked."""
+MAX_AHEAD_NS = 20 * NS_PER_MS
+"""Most by which a stamp may lie in the future: it would hide so much of the image's age."""
 
 
 class VisionLoop:
@@ -83,7 +85,6 @@ class VisionLoop:
         started_ns = self._clock.now_ns()
         if frame is None:
             return
-        # A stamp from the future would make the feature look fresh for too long.
         captured_ns = min(frame.captured_ns, started_ns)
         if not self._is_due(captured_ns):
             return
@@ -91,6 +92,12 @@ class VisionLoop:
         if self._image_watch is not None:
             is_airborne = self._is_airborne()
             fault = self._image_watch.check(frame.rgb, captured_ns, is_airborne=is_airborne)
+        ahead_ns = frame.captured_ns - started_ns
+        if ahead_ns > MAX_AHEAD_NS:
+            fault = (
+                f"the camera stamps its images {ahead_ns / NS_PER_MS:.0f} ms in the future (limit "
+                f"{MAX_AHEAD_NS // NS_PER_MS} ms): have it stamp them on CLOCK_MONOTONIC"
+            )
         with self._encoder_lock:
             self.encoding_since_ns = self._clock.now_ns()
             value = self._encode(frame.rgb)

@@ -76,8 +76,8 @@ class Home(NamedTuple):
 
 
 def boot_ms(ap: Sensing) -> int:
-    """Time since boot in whole milliseconds."""
-    return ap.uptime_ns // 1_000_000
+    """Time since boot in whole milliseconds, a uint32 that wraps after 49.7 days."""
+    return ap.uptime_ns // 1_000_000 % 2**32
 
 
 def boot_us(ap: Sensing) -> int:

@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.gate_flights import MS, GateFlight, climbing_first, hovering
 from helpers.wire import WireEnd
 from mavbridge.config.flight import FlyConfig
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
@@ -62,6 +63,20 @@ def test_a_reboot_in_flight_is_latched_and_still_leaves_a_release() -> None:
     flight.ap.arm(force=True)
     flight.run(2)
     assert flight.phase is Phase.RELEASED, "armed and ready again, and nobody has asked"
+
+
+def test_a_clock_that_wraps_in_flight_is_no_reboot_and_hides_no_age() -> None:
+    flight = GateFlight()
+    flight.ap.boot_ns = flight.ap.now_ns - 2**32 * MS + 30 * NS_PER_S
+    flight.fly()
+    flight.run((2**32 * MS - flight.ap.uptime_ns) / NS_PER_S + 2)
+    assert flight.ap.uptime_ns > 2**32 * MS
+    assert flight.phase is Phase.FLYING, flight.describe()
+    assert set(flight.phases(flight.clock.now_ns() - 10 * NS_PER_S)) == {Phase.FLYING}
+
+    flight.vehicle.reboot()
+    flight.until(lambda: any("has rebooted" in text for text in flight.messages), within_s=8)
+    assert flight.phase is not Phase.FLYING
 
 
 def test_a_reboot_while_the_sticks_are_given_back_ends_there() -> None:

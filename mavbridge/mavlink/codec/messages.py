@@ -76,6 +76,21 @@ class RcChannels(NamedTuple):
     """Vehicle's clock since it started."""
 
 
+RESTART_STEP_US, RESTART_STAMPS = 1_000_000, 2
+"""A stamp this far back may be a late datagram; so many in a row are a clock that has restarted."""
+WRAP_US = 2**32 * 1000
+"""Period of ``time_boot_ms``: 49.7 days."""
+
+
+def later_by_us(stamp_us: int, other_us: int) -> int:
+    """Return how much later a stamp of the vehicle's clock is than another one; negative: earlier.
+
+    A wrap is known by a difference of less than ``RESTART_STEP_US``: no vehicle reboots so soon.
+    """
+    across_us = (stamp_us - other_us + RESTART_STEP_US) % WRAP_US - RESTART_STEP_US
+    return across_us if across_us <= RESTART_STEP_US else stamp_us - other_us
+
+
 STICK_END = 1000
 """MANUAL_CONTROL: x forward, y right and r, nose right, in -1000..1000, z up in 0..1000."""
 

@@ -78,7 +78,7 @@ class Signing:
         body = bytearray(packet[1:-_CHECKSUM_BYTES])
         body[_FLAGS_AT - 1] |= SIGNED
         crc: int = dialect.x25crc(bytes(body) + bytes((crc_extra,))).crc
-        self._sent_ticks = max(self._sent_ticks + 1, self._now_ticks())
+        self._sent_ticks = max(self._sent_ticks + 1, self.now_ticks)
         unsealed = (
             packet[:1]
             + bytes(body)
@@ -112,7 +112,7 @@ class Signing:
                 return "replayed"
         elif ticks <= (remembered := self._remembered.get(stream, 0)):
             return "replayed"
-        elif not remembered and ticks < self._now_ticks() - MOST_LAG_TICKS:
+        elif not remembered and ticks < self.now_ticks - MOST_LAG_TICKS:
             return "clock behind"
         self._heard[stream] = ticks
         # Ours follow, as MAVLink says: a vehicle refuses a sender that is a minute behind it.
@@ -120,7 +120,9 @@ class Signing:
             self._sent_ticks = max(self._sent_ticks, ticks)
         return None
 
-    def _now_ticks(self) -> int:
+    @property
+    def now_ticks(self) -> int:
+        """The time of day as a timestamp."""
         return max((self._unix_ns() - EPOCH_NS) // TICK_NS, 0)
 
     def _hash(self, signed: bytes) -> bytes:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.mavlink.codec.messages import RESTART_STAMPS, RESTART_STEP_US
 
 Shown: TypeAlias = tuple[int, ...]
 """Numbers of a message, in its own units: PWM of the four sticks in RC_CHANNELS, for one."""
@@ -37,8 +38,6 @@ _NUDGE_LEVELS = 3
 hits the same level each time, and one lost packet never makes two levels look like one."""
 _PAUSE_NS = 100 * NS_PER_MS
 """After this long without a command of ours, an echo may rightly have been constant."""
-RESTART_STEP_US, RESTART_STAMPS = 1_000_000, 2
-"""A stamp this far back may be a late datagram; so many in a row are another clock."""
 _RETRY_NS = 3 * NS_PER_S
 """A fault stays known for this long after it was last seen."""
 

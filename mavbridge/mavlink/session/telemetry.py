@@ -2,13 +2,18 @@
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Reading, Telemetry
-from mavbridge.mavlink.codec.messages import Altitude, Attitude, LocalVelocity, Measurement
+from mavbridge.mavlink.codec.messages import (
+    RESTART_STAMPS,
+    RESTART_STEP_US,
+    Altitude,
+    Attitude,
+    LocalVelocity,
+    Measurement,
+    later_by_us,
+)
 
 _YIELD_NS = 300 * NS_PER_MS
 """Silence after which a better message gives way to a worse one."""
-_RESTART_STEP_US = 1_000_000
-_RESTART_STAMPS = 2
-"""One stamp from long ago may be a late datagram; two in a row are a clock that has restarted."""
 
 _FORCE_RANK = {"HIGHRES_IMU": 0, "RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2}
 """Float m/s^2 first, then the first IMU in milli-g, then the second."""
@@ -29,14 +34,17 @@ class _Filter:
         self._old_stamps = 0
 
     def delay_ns(self, rank: int, boot_us: int, arrived_ns: int, happened_ns: int) -> int | None:
-        """Delay of a message that is taken, or None; a lower rank is better."""
+        """Delay of a message that is taken, or None; a lower rank is better.
+
+        It is negative where the message is stamped in the future.
+        """
         if self._arrived_ns is not None:
             if rank > self._rank and arrived_ns - self._arrived_ns <= _YIELD_NS:
                 return None
-            if 0 < boot_us <= self._boot_us:
-                is_far_back = boot_us + _RESTART_STEP_US < self._boot_us
-                self._old_stamps = self._old_stamps + 1 if is_far_back else 0
-                if self._old_stamps < _RESTART_STAMPS:
+            later_us = later_by_us(boot_us, self._boot_us)
+            if boot_us > 0 >= later_us:
+                self._old_stamps = self._old_stamps + 1 if later_us < -RESTART_STEP_US else 0
+                if self._old_stamps < RESTART_STAMPS:
                     return None
             if happened_ns < self._happened_ns:
                 # By a better offset of the clocks; but what is newer happened later.
@@ -44,7 +52,7 @@ class _Filter:
         self._rank, self._boot_us, self._old_stamps = rank, boot_us, 0
         self._arrived_ns = arrived_ns
         self._happened_ns = happened_ns if happened_ns < arrived_ns else arrived_ns
-        return arrived_ns - self._happened_ns
+        return arrived_ns - happened_ns
 
 
 class TelemetryCollector:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, period_ns
 from mavbridge.core.histogram import Histogram
-from mavbridge.mavlink.codec.messages import Timesync
+from mavbridge.mavlink.codec.messages import WRAP_US, Timesync
 
 TIMESYNC_HZ = 5.0
 """TIMESYNC requests: the offset is good a second after the first, and a step is seen in 0.2 s."""
@@ -13,8 +13,12 @@ GOOD_EXCHANGES = 5
 """Exchanges that must agree before the vehicle's stamps are trusted."""
 LONGEST_ROUND_TRIP_NS = 2 * NS_PER_S
 """Slower exchanges say too little about the offset; a link this slow loses its heartbeats."""
-LONGEST_DELAY_NS = 30 * NS_PER_S
-"""A stamp that seems older than this at its arrival is of another clock, for example Unix time."""
+UNIX_US = 10**15
+"""Stamps from here on are Unix time, by MAVLink's rule for ``time_usec``; no vehicle runs for so
+many years."""
+MAX_AHEAD_NS = 20 * NS_PER_MS
+"""Most by which a stamp may lie in the future, beyond the error of the offset: clocks of simulators
+are uneven."""
 LONGEST_SENDING_NS = 150 * NS_PER_MS
 """The way to the vehicle: sticks that act so late steer by what was seen too long ago."""
 _LATE_IN_A_ROW = 2
@@ -131,11 +135,15 @@ class TimesyncFilter:
     def happened_ns(self, boot_us: int, arrived_ns: int) -> int:
         """Our time of something that the vehicle stamped ``boot_us`` after its start.
 
-        The arrival where the vehicle's stamp says nothing: it is missing (0), the offset is not
-        good yet, or it is a stamp of another clock. Never later than the arrival.
+        The arrival where the vehicle's stamp says nothing: it is missing (0), Unix time, or the
+        offset is not good yet. Later than the arrival only by more than ``MAX_AHEAD_NS``: a reading
+        of which the age is not known.
         """
-        if self._best is None or not boot_us or self._agreeing < GOOD_EXCHANGES:
+        is_stamped = 0 < boot_us < UNIX_US and self._agreeing >= GOOD_EXCHANGES
+        if self._best is None or not is_stamped:
             return arrived_ns
-        happened_ns = 1000 * boot_us - self._best.offset_ns
-        is_plausible = 0 <= arrived_ns - happened_ns <= LONGEST_DELAY_NS
-        return happened_ns if is_plausible else arrived_ns
+        wrap_ns = 1000 * WRAP_US
+        delay_ns = arrived_ns + self._best.offset_ns - 1000 * boot_us
+        delay_ns = (delay_ns + wrap_ns // 2) % wrap_ns - wrap_ns // 2
+        is_ahead = -delay_ns > MAX_AHEAD_NS + self._error_ns(self._best, arrived_ns)
+        return arrived_ns - delay_ns if delay_ns > 0 or is_ahead else arrived_ns

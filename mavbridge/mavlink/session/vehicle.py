@@ -13,6 +13,8 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
+    RESTART_STAMPS,
+    RESTART_STEP_US,
     Attitude,
     AutopilotVersion,
     CommandAck,
@@ -24,6 +26,7 @@ from mavbridge.mavlink.codec.messages import (
     ReceivedMessage,
     Request,
     StatusText,
+    later_by_us,
 )
 from mavbridge.mavlink.profiles.choice import require_profile
 from mavbridge.mavlink.profiles.profile import HOME_HEIGHT
@@ -42,9 +45,6 @@ HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
 _VERSION_ATTEMPTS = 8
 """Its unique id names the file of remembered parameters: worth more than one lost packet."""
-_REBOOT_STEP_MS = 1000
-_REBOOT_STAMPS = 2
-"""One old stamp may be a delayed datagram; two in a row are a clock that has restarted."""
 _SWITCH_ON_US, _SWITCH_OFF_US = 1800, 1200
 """ArduPilot's thresholds of a high and a low auxiliary switch; between them nothing changes."""
 
@@ -105,7 +105,7 @@ class VehicleSession:
     @property
     def has_rebooted(self) -> bool:
         """Its clock has started again."""
-        return self._old_stamps >= _REBOOT_STAMPS
+        return self._old_stamps >= RESTART_STAMPS
 
     def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
         """Take one message from this vehicle."""
@@ -156,7 +156,7 @@ class VehicleSession:
             )
 
     def _watch_boot(self, boot_ms: int) -> None:
-        if boot_ms + _REBOOT_STEP_MS < self._boot_ms:
+        if later_by_us(1000 * boot_ms, 1000 * self._boot_ms) < -RESTART_STEP_US:
             self._old_stamps += 1
         else:
             self._old_stamps, self._boot_ms = 0, boot_ms

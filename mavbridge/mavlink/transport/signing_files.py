@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import write_durably
 from mavbridge.mavlink.codec.signing import (
     KEY_BYTES,
     LATEST_TICKS,
@@ -22,7 +23,10 @@ from mavbridge.mavlink.settings import SigningFiles
 
 SAVE_S = 10.0
 AHEAD_TICKS = 2 * round(SAVE_S) * NS_PER_S // TICK_NS
-"""Saved beyond the newest timestamp: what is used until the next save, and once more."""
+"""Saved beyond the time of day while packets are sent: used until the next save, and once more."""
+MOST_PACKETS = 2 * round(SAVE_S) * 2000
+"""Saved beyond the newest timestamp where that is ahead of the time of day and rises by one tick a
+packet, of which 2,000 a second are more than any link carries."""
 JOIN_S = 2.0
 MOST_BYTES = 1024
 _MADE = "make one with: (umask 077; openssl rand -hex 32 > FILE)"
@@ -95,30 +99,30 @@ class SigningStore:
         self._thread = threading.Thread(target=self._run, name="mavbridge-signing", daemon=True)
 
     def __enter__(self) -> Signing:
-        """Save for the first time, then every ten seconds."""
-        self._save()
+        """Reserve the first timestamps, then more every ten seconds."""
+        self._save(is_over=False)
         self._thread.start()
         return self.signing
 
     def __exit__(self, *_: object) -> None:
-        """Save for the last time."""
+        """Save the newest timestamp itself: what was reserved beyond it was not used."""
         self._stop.set()
         self._thread.join(JOIN_S)
-        self._save()
 
     def _run(self) -> None:
         while not self._stop.wait(SAVE_S):
-            self._save()
+            self._save(is_over=False)
+        self._save(is_over=True)
 
-    def _save(self) -> None:
+    def _save(self, *, is_over: bool) -> None:
         sent_ticks, heard = self.signing.state
+        if not is_over:  # not from what an earlier start has reserved: each would gain 20 s
+            now_ticks = self.signing.now_ticks
+            sent_ticks = max(sent_ticks + MOST_PACKETS, now_ticks + AHEAD_TICKS)
         streams = {"/".join(map(str, stream)): ticks for stream, ticks in heard.items()}
-        text = json.dumps({"sent_ticks": sent_ticks + AHEAD_TICKS, "heard_ticks": streams})
-        temporary = self.path.with_suffix(f".{os.getpid()}")
+        text = json.dumps({"sent_ticks": sent_ticks, "heard_ticks": streams})
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_text(text)
-            temporary.replace(self.path)
+            write_durably(self.path, text)
         except OSError as error:
             self.problem = (
                 f"timestamps of signed packets cannot be kept in {self.path} ({error.strerror}): "

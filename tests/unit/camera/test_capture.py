@@ -35,6 +35,19 @@ def test_the_drivers_stamp_is_taken_if_it_can_be_one(driver_ms, captured_ns):
 
 
 @pytest.mark.parametrize(
+    ("driver_ms", "captured_ns"),
+    [
+        pytest.param(999_990.0, NOW_NS - 10 * NS_PER_MS, id="10 ms ago"),
+        pytest.param(997_000.0, NOW_NS - 3 * NS_PER_S, id="from a queue that nobody read"),
+        pytest.param(1_000_400.0, NOW_NS + 400 * NS_PER_MS, id="from the future"),
+        pytest.param(0.0, NOW_NS, id="no stamp"),
+    ],
+)
+def test_a_driver_on_our_clock_is_believed_however_old_its_frame(driver_ms, captured_ns):
+    assert exposure_ns(driver_ms, NOW_NS, is_our_clock=True) == captured_ns
+
+
+@pytest.mark.parametrize(
     ("image_size", "mode"),
     [(224, (640, 480)), (480, (640, 480)), (481, (1280, 720)), (4000, (1920, 1080))],
 )

@@ -120,6 +120,12 @@ def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
     refused = build_state(old, NOW_NS, frame="ned_frd", freshness=LIMITS)
     assert refused == Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
 
+    future = replace(good, **{field: Reading(NOW_NS, reading.values, delay_ns=-400 * NS_PER_MS)})
+    for now_ns in (NOW_NS, NOW_NS + 40 * NS_PER_MS):
+        assert build_state(future, now_ns, frame="ned_frd", freshness=LIMITS) == Release(
+            f"{what} is stamped 400 ms ahead of the vehicle's clock"
+        )
+
 
 def test_a_reading_that_arrived_just_now_but_happened_long_ago_is_old() -> None:
     late = Reading(NOW_NS, (1.0, 0.0, 0.0, 0.0), delay_ns=LIMITS.attitude_ns)

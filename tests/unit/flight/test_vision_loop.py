@@ -1,12 +1,14 @@
 """The vision loop tells with each feature what is wrong with its image."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from helpers.fakes import START_NS, FakeClock, ListSink
 from mavbridge.camera.image_watch import TAKEOFF_NS, ImageWatch
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.vision_loop import VisionLoop
@@ -135,3 +137,54 @@ def test_of_two_loops_with_one_lock_only_the_one_that_computes_is_encoding():
     assert b is not None
     assert nothing is None
     assert nothing_either is None
+
+
+@pytest.mark.parametrize("ahead_ms", [-600, 0, 20, 21, 400, 3_000, 55 * 365 * 86_400_000])
+@pytest.mark.parametrize("is_watched", [False, True])
+def test_a_stamp_more_than_20_ms_ahead_is_a_fault_of_the_camera(ahead_ms, is_watched):
+    clock, cache = FakeClock(), FeatureCache()
+    camera = StillCamera(clock, np.zeros((8, 8, 3), np.uint8))
+    read = camera.read
+    camera.read = lambda timeout_ns: replace(
+        read(timeout_ns), captured_ns=clock.now_ns() + ahead_ms * NS_PER_MS
+    )
+    loop = VisionLoop(
+        camera=camera,
+        encode=lambda rgb: np.zeros((1, 8), np.float32),
+        cache=cache,
+        sink=ListSink(),
+        clock=clock,
+        period_ns=lambda: FRAME_NS,
+        encoder_lock=threading.Lock(),
+        image_watch=watch() if is_watched else None,
+    )
+    loop.step()
+    feature = cache.latest()
+    assert feature is not None
+    assert feature.captured_ns == clock.now_ns() + min(ahead_ms, 0) * NS_PER_MS
+    assert (feature.fault is not None) == (ahead_ms > 20)
+    if feature.fault is not None:
+        assert f"{ahead_ms} ms in the future (limit 20 ms)" in feature.fault
+
+
+def test_of_a_camera_that_goes_back_to_right_stamps_the_next_feature_is_flown_by():
+    clock, cache = FakeClock(), FeatureCache()
+    camera = StillCamera(clock, np.zeros((8, 8, 3), np.uint8))
+    read, ahead_ms = camera.read, [0, 500, 0]
+    camera.read = lambda timeout_ns: replace(
+        read(timeout_ns), captured_ns=clock.now_ns() + ahead_ms.pop(0) * NS_PER_MS
+    )
+    loop = VisionLoop(
+        camera=camera,
+        encode=lambda rgb: np.zeros((1, 8), np.float32),
+        cache=cache,
+        sink=ListSink(),
+        clock=clock,
+        period_ns=lambda: FRAME_NS,
+        encoder_lock=threading.Lock(),
+    )
+    seen = []
+    while ahead_ms:
+        loop.step()
+        seen.append(cache.latest().fault is not None)
+    assert seen == [False, True, False]

@@ -1,6 +1,8 @@
 """The parts of a session, each a state machine without I/O."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.address import parse_address
@@ -156,10 +158,48 @@ def test_things_happened_when_the_vehicle_says_once_the_offset_is_good() -> None
     assert sync.happened_ns(boot_us(9 * S + NS_PER_MS), 9 * S) == 9 * S  # never later
     assert sync.happened_ns(0, 9 * S) == 9 * S  # not stamped
     assert sync.happened_ns(1_700_000_000_000_000, 9 * S) == 9 * S  # Unix time
-    assert sync.happened_ns(5, 9 * S) == 9 * S  # seconds after a reboot that is not known yet
+    assert (
+        sync.happened_ns(5, 9 * S) < -69 * S
+    )  # after a reboot that is not known yet: no new state
     sync.restart()
     assert sync.happened_ns(boot_us(9 * S), 10 * S) == 10 * S
     assert (sync.offset_ns, sync.error_ns(10 * S), sync.is_good) == (None, None, False)
+
+
+@given(
+    clock_ms=st.one_of(
+        st.integers(1, 2**32), st.integers(-60_000, 60_000).map(lambda ms: ms % 2**32)
+    ),
+    delay_ms=st.integers(0, 20 * 86_400_000),
+)
+def test_a_stamp_is_as_old_as_it_says_wherever_the_clock_stands(
+    clock_ms: int, delay_ms: int
+) -> None:
+    """Also across the wrap of uint32 milliseconds, and beyond 30 s."""
+    sync, offset_ns = TimesyncFilter(), clock_ms * NS_PER_MS + 2**32 * NS_PER_MS
+    for k in range(GOOD_EXCHANGES):
+        exchange(sync, k * S, up_ns=NS_PER_MS, down_ns=NS_PER_MS, offset_ns=offset_ns)
+    now_ns = 9 * S
+    stamp_ms = ((now_ns + offset_ns) // NS_PER_MS - delay_ms) % 2**32 or 1
+    age_ms = (now_ns - sync.happened_ns(1000 * stamp_ms, now_ns)) / NS_PER_MS
+    assert age_ms == pytest.approx(delay_ms, abs=1)
+
+
+@pytest.mark.parametrize("ahead_ms", [0, 10, 20])
+def test_a_stamp_that_is_hardly_ahead_is_of_the_arrival(ahead_ms: int) -> None:
+    assert good_timesync().happened_ns(boot_us(9 * S + ahead_ms * NS_PER_MS), 9 * S) == 9 * S
+
+
+@pytest.mark.parametrize("ahead_ms", [25, 400, 40_000, 86_400_000])
+def test_a_stamp_from_the_future_tells_no_age(ahead_ms: int) -> None:
+    stamp_us = boot_us(9 * S + ahead_ms * NS_PER_MS)
+    assert good_timesync().happened_ns(stamp_us, 9 * S) == 9 * S + ahead_ms * NS_PER_MS
+
+
+def test_the_error_of_the_offset_is_no_future() -> None:
+    sync = good_timesync(way_ns=200 * NS_PER_MS)
+    assert sync.happened_ns(boot_us(9 * S + 215 * NS_PER_MS), 9 * S) == 9 * S
+    assert sync.happened_ns(boot_us(9 * S + 225 * NS_PER_MS), 9 * S) > 9 * S
 
 
 @pytest.mark.parametrize(("up_ms", "down_ms"), [(200, 200), (0, 400), (400, 0)])
@@ -320,6 +360,12 @@ def test_a_late_or_doubled_datagram_never_replaces_a_newer_one() -> None:
     # A second and more, once and again, but never twice in a row.
     late = velocities((5000, 1.0, 0), (3000, 2.0, 0), (5010, 3.0, 0), (3010, 4.0, 0))
     assert late == [(1.0, 0), (1.0, 10), (3.0, 0), (3.0, 10)]
+
+
+def test_across_a_wrap_of_the_clock_newer_readings_are_taken_and_late_ones_left_out() -> None:
+    end = 2**32
+    around = velocities((end - 10, 1.0, 0), (4, 2.0, 0), (end - 5, 3.0, 0), (14, 4.0, 0))
+    assert [value for value, _ in around] == [1.0, 2.0, 2.0, 4.0]
 
 
 def test_two_old_stamps_in_a_row_are_a_clock_that_has_restarted() -> None:

@@ -7,8 +7,14 @@ import pytest
 
 from helpers.fakes import FakeClock
 from mavbridge.core.errors import UserError
+from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.settings import SigningFiles
-from mavbridge.mavlink.transport.signing_files import AHEAD_TICKS, SigningStore, read_key
+from mavbridge.mavlink.transport.signing_files import (
+    AHEAD_TICKS,
+    MOST_PACKETS,
+    SigningStore,
+    read_key,
+)
 
 KEY = bytes(range(32))
 
@@ -69,13 +75,58 @@ def test_a_key_of_zeros_and_a_pipe_are_refused(tmp_path):
         read_key(tmp_path / "pipe")
 
 
-def test_timestamps_go_on_after_a_restart_and_after_a_kill(tmp_path):
-    with (store := make_store(tmp_path)) as first:
-        saved = json.loads(store.path.read_text())["sent_ticks"]
-        assert saved == AHEAD_TICKS  # before anything is sent
-    with make_store(tmp_path) as second:
-        assert second.state.sent_ticks >= saved
-    assert first.state.sent_ticks < second.state.sent_ticks
+def sign_one(signing):
+    """The timestamp of one more packet."""
+    packet = Codec(source_system=255, source_component=191, signing=signing).encode_heartbeat()
+    return int.from_bytes(packet[-12:-6], "little")
+
+
+def saved_ticks(store):
+    return json.loads(store.path.read_text())["sent_ticks"]
+
+
+def kill(store):
+    """End the saving as a kill does: the file stays as it is."""
+    text = store.path.read_text()
+    store.__exit__()
+    store.path.write_text(text)
+
+
+def test_timestamps_are_reserved_before_anything_is_sent(tmp_path):
+    store = make_store(tmp_path)
+    with store as signing:
+        assert saved_ticks(store) >= signing.now_ticks + AHEAD_TICKS - 100_000
+
+
+def test_no_clean_start_moves_the_timestamps_ahead_of_the_time_of_day(tmp_path):
+    newest = 0
+    for _ in range(12):
+        with make_store(tmp_path) as signing:
+            ticks = sign_one(signing)
+            assert newest < ticks <= signing.now_ticks + 100
+        newest = ticks
+
+
+def test_the_end_saves_what_was_really_sent(tmp_path):
+    store = make_store(tmp_path)
+    with store as signing:
+        ticks = sign_one(signing)
+    assert saved_ticks(store) == ticks
+
+
+def test_kills_never_repeat_a_timestamp_and_gain_no_more_than_packets_could_take(tmp_path):
+    newest = 0
+    for number in range(12):
+        signing = (store := make_store(tmp_path)).__enter__()
+        ticks = sign_one(signing)
+        assert ticks > newest
+        assert ticks - signing.now_ticks <= AHEAD_TICKS + number * (MOST_PACKETS + 1)
+        newest = max(sign_one(signing) for _ in range(50))
+        kill(store)
+    with make_store(tmp_path) as signing:  # and an end in order takes nothing of it further
+        first = sign_one(signing)
+    with make_store(tmp_path) as signing:
+        assert sign_one(signing) == first + 1
 
 
 def test_each_key_has_a_state_of_its_own_that_does_not_tell_it(tmp_path):

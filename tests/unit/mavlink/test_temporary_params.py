@@ -326,7 +326,7 @@ def test_a_full_disk_forbids_the_flight(tmp_path: Path, monkeypatch: pytest.Monk
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("mavbridge.mavlink.session.params.memory.os.fsync", full)
+    monkeypatch.setattr("mavbridge.core.files.os.fsync", full)
     vehicle.run(6.0)
     assert "No space left on device" in (vehicle.problem() or "")
     assert vehicle.writes == []

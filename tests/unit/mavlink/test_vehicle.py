@@ -3,6 +3,8 @@
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.wire import ARDUPILOT, CALIBRATION
@@ -531,3 +533,27 @@ def test_a_reboot_is_noticed_by_two_old_stamps() -> None:
     for boot_ms, has_rebooted in ((9000, False), (5, False), (9010, False), (5, False), (6, True)):
         session.put(Attitude(True, 1000 * boot_ms, (1, 0, 0, 0), (0, 0, 0)))
         assert session.session.has_rebooted is has_rebooted
+
+
+@given(
+    last_ms=st.one_of(st.integers(5_000, 2**32 - 1), st.integers(2**32 - 5_000, 2**32 - 1)),
+    first_ms=st.integers(1_001, 4_000),
+)
+def test_a_reboot_is_found_wherever_the_clock_stood(last_ms: int, first_ms: int) -> None:
+    """No vehicle sends its attitude within a second of its boot."""
+    session = Session()
+    for boot_ms in (last_ms, first_ms, first_ms + 10):
+        session.put(Attitude(True, 1000 * boot_ms, (1, 0, 0, 0), (0, 0, 0)))
+    assert session.session.has_rebooted is (last_ms - first_ms > 1000)
+
+
+@given(
+    start_ms=st.integers(2**32 - 1000, 2**32 - 1),
+    steps_ms=st.lists(st.integers(-15, 900), min_size=5, max_size=50),
+)
+def test_a_clock_that_wraps_has_not_rebooted(start_ms: int, steps_ms: list[int]) -> None:
+    session, clock_ms = Session(), start_ms
+    for step_ms in steps_ms:
+        clock_ms = max(clock_ms + step_ms, start_ms)
+        session.put(Attitude(True, 1000 * (clock_ms % 2**32), (1, 0, 0, 0), (0, 0, 0)))
+        assert not session.session.has_rebooted

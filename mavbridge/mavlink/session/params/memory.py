@@ -1,11 +1,11 @@
 """Remembers on disk which parameters the bridge has changed, for after a crash."""
 
 import json
-import os
 from pathlib import Path
 from typing import NamedTuple
 
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import sync_folder, write_durably
 from mavbridge.mavlink.session.params.writer import is_same
 
 _MOST_OURS = 8
@@ -66,30 +66,13 @@ class ParamMemory:
         """Replace the file at once and on the disk itself; no entry: remove it."""
         try:
             if changed:
-                self._write(changed)
+                entries = {name: change._asdict() for name, change in changed.items()}
+                write_durably(self.path, json.dumps({"parameters": entries}, indent=2))
             elif self.path.exists():
                 self.path.unlink()
-                self._sync_folder()
+                sync_folder(self.path.parent)
         except OSError as error:
             raise UserError(
                 f"cannot remember changed parameters in {self.path}: {error.strerror}; make its "
                 "folder writable, or name another one by XDG_STATE_HOME"
             ) from error
-
-    def _write(self, changed: dict[str, Changed]) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        entries = {name: change._asdict() for name, change in changed.items()}
-        temporary = self.path.with_suffix(f".{os.getpid()}")
-        with temporary.open("w", encoding="utf-8") as file:
-            json.dump({"parameters": entries}, file, indent=2)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(self.path)
-        self._sync_folder()
-
-    def _sync_folder(self) -> None:
-        folder = os.open(self.path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
