@@ -50,6 +50,8 @@ class LinkSettings:
     accepted_risks: tuple[Risk, ...] = ()
     state_folder: Path | None = None
     """Where the old values of parameters are remembered; None: nowhere, and nothing is set."""
+    known_params: frozenset[str] | None = None
+    """Parameters to ask for, of those that matter: a replay asks as the flight did. None: all."""
     signing: SigningFiles | None = None
     """Sign what is sent, and take only what is signed."""
 

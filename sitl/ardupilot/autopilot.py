@@ -14,10 +14,11 @@ from sitl.ardupilot.gesture import RudderGesture
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import Params
 from sitl.ardupilot.rc import ModeSwitch, RcEngine
+from sitl.ardupilot.simple import SimpleMode
 from sitl.ardupilot.sticks import Sticks, climb_rate_mps, read_sticks
 from sitl.clock import NS_PER_S
 from sitl.firmware import StatusText
-from sitl.rotation import Quat, Vec3, cos_tilt
+from sitl.rotation import Quat, Vec3, cos_tilt, to_euler
 from sitl.vehicle.config import STEP_NS, Battery, VehicleConfig
 from sitl.vehicle.dynamics import QUAD, BodyState, Quadrotor
 from sitl.vehicle.environment import SensorNoise, Wind
@@ -68,6 +69,7 @@ class Autopilot:
         """Fault: the estimator has no position any more, as long as this is set."""
         self.control = FlightControl(params)
         """Targets and thrust, for telemetry; only this autopilot commands it."""
+        self.simple = SimpleMode(params)
         self._mode_switch = ModeSwitch()
         self._gesture = RudderGesture()
         self._quad = Quadrotor(config.conditions)
@@ -110,6 +112,10 @@ class Autopilot:
     def set_receiver(self, values_us: Sequence[int]) -> None:
         """Move the pilot's sticks and switches (`RcEngine.set_receiver`)."""
         self.rc.set_receiver(values_us)
+
+    @property
+    def _yaw_rad(self) -> float:
+        return to_euler(self.sensed.ned_from_body_wxyz)[2]
 
     @property
     def uptime_ns(self) -> int:
@@ -179,6 +185,7 @@ class Autopilot:
             return False
         self.armed = True
         self._armed_ns = self._idle_since_ns = self.now_ns
+        self.simple.arm(self._yaw_rad)
         self.control.enter(self.mode, self.sensed)
         self._send_text(SEVERITY_INFO, "Arming motors")
         return True
@@ -263,7 +270,9 @@ class Autopilot:
         if not self.armed:
             self.control.reset(self.sensed)
             return STOPPED
-        sticks = read_sticks(self.rc, self.params)
+        sticks = self.simple.turned(
+            read_sticks(self.rc, self.params), self._yaw_rad, self.sensed.position_ned_m
+        )
         if self.landed:
             if not self._lifts_off(sticks):
                 if self.mode.lands or self._is_idle(sticks):
@@ -322,6 +331,7 @@ class Autopilot:
 
     def _read_radio(self) -> None:
         new_input = self.rc.update(self.now_ns)
+        self.simple.read_aux(self.rc.channels_us)
         self._read_mode_switch()
         if new_input:
             self._read_gesture()
@@ -349,7 +359,10 @@ class Autopilot:
         channel = self.params.integer("FLTMODE_CH")
         if not 1 <= channel <= len(self.rc.channels_us):
             return
+        before = self._mode_switch.position
         position = self._mode_switch.update(self.rc.channels_us[channel - 1], self.now_ns)
+        if self._mode_switch.position not in (None, before):
+            self.simple.read_mode_switch(self._mode_switch.position)
         if position is not None:
             with suppress(ValueError):  # a mode that this vehicle does not have
                 self.set_mode(Mode(self.params.integer(f"FLTMODE{position}")))

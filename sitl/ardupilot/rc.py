@@ -158,7 +158,7 @@ class ModeSwitch:
     _DEBOUNCE_NS = NS_PER_S // 5
 
     def __init__(self) -> None:
-        self._position: int | None = None
+        self.position: int | None = None
         self._candidate: int | None = None
         self._since_ns = 0
 
@@ -169,9 +169,9 @@ class ModeSwitch:
         position = 1 + bisect_left(self._HIGHEST_US, pwm_us)
         if position != self._candidate:
             self._candidate, self._since_ns = position, now_ns
-        if position == self._position or now_ns - self._since_ns < self._DEBOUNCE_NS:
+        if position == self.position or now_ns - self._since_ns < self._DEBOUNCE_NS:
             return None
-        before, self._position = self._position, position
+        before, self.position = self.position, position
         return None if before is None else position
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Output, VehicleStatus
-from mavbridge.mavlink.codec.messages import ParamRequest, ParamValue, ParamWrite
+from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
@@ -31,6 +31,9 @@ SAFE: dict[str, float] = {
     "GUID_TIMEOUT": 3.0,
     "RC7_OPTION": 0.0,
     "RC8_OPTION": 0.0,
+    "RC1_OPTION": 0.0,
+    "SIMPLE": 0.0,
+    "SUPER_SIMPLE": 0.0,
 }
 """Parameters with which a flight may begin."""
 
@@ -80,7 +83,7 @@ class ParamVehicle:
         self.now_ns = 0
         self.armed = False
         self.has_receiver: bool | None = None
-        self.requests: list[ParamRequest | ParamWrite] = []
+        self.requests: list[ParamRequest | ParamWrite | CommandRequest] = []
         self.integers: set[str] = set()
         """Parameters that stand byte for byte in the float."""
         self.refuses: set[str] = set()
@@ -120,7 +123,7 @@ class ParamVehicle:
                 self.params.receive(answer, report)
         for request in self.params.step(self.now_ns, report, unique_id=self.unique_id):
             self.requests.append(request)
-            if self._arrives():
+            if self._arrives() and not isinstance(request, CommandRequest):
                 self._answers += self._answer(request)
         self.now_ns += STEP_NS
 

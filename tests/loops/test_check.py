@@ -228,3 +228,24 @@ def test_an_output_that_the_firmware_has_not_is_a_no_go() -> None:
     rows = Bench().check(contract=Contract(), output="manual-control")
     assert rows["vehicle"].verdict == "no-go"
     assert "rc-override" in rows["vehicle"].advice
+
+
+@pytest.mark.parametrize(
+    ("params", "name", "flag"),
+    [
+        ({"SIMPLE": 63.0}, "SIMPLE", "SIMPLE=0"),
+        ({"SUPER_SIMPLE": 8.0}, "SUPER_SIMPLE", "SUPER_SIMPLE=0"),
+        ({"RC7_OPTION": 13.0}, "RC7_OPTION", "RC7_OPTION=0"),
+        ({"RC2_OPTION": 4.0}, "RC2_OPTION", "RC2_OPTION=0"),
+        ({"FLTMODE_CH": 3.0}, "FLTMODE_CH", "FLTMODE_CH=5"),
+    ],
+)
+def test_sticks_that_would_be_turned_are_a_no_go_and_its_flag_mends_it(
+    params: dict[str, float], name: str, flag: str
+) -> None:
+    row = Bench(params={**SAFE, **params}).check(contract=Contract())[name]
+    mended = Bench(params={**SAFE, **params}).check(contract=Contract(), set=(flag,))
+
+    assert row.verdict == "no-go"
+    assert f"--set {flag}" in row.advice
+    assert overall(list(mended.values())) != "no-go"

@@ -32,6 +32,9 @@ sent at once at any rate."""
 _TARGET_HZ = 50.0
 """ATTITUDE_TARGET and POSITION_TARGET_LOCAL_NED, for the echo check."""
 
+_SIMPLE_MODE_OFF = (3.0, 0.0)
+"""Function and position of its switch: low."""
+
 _MODES = ModeTable(
     {
         number: entry.name.removeprefix("COPTER_MODE_")
@@ -93,9 +96,10 @@ class ArduPilot(Profile):
         return StreamGroup(("RC_CHANNELS",), legacy, RC_CHANNELS_HZ)
 
     def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Calibration and dead zones of the channels that RCMAP_* names."""
+        """Calibration and dead zones of the channels that RCMAP_* names, and what turns sticks."""
         names = ardupilot_params.calibration_names(values)
-        return names + ardupilot_params.dead_zone_names(values)
+        settings = ardupilot_params.stick_setting_names(values)
+        return names + ardupilot_params.dead_zone_names(values) + settings
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
         """Calibration, and what decides how safe a flight is."""
@@ -111,8 +115,19 @@ class ArduPilot(Profile):
         """RCn_OPTION 46."""
         return ardupilot_params.override_switch(values)
 
+    def ignores_receiver(self, values: Mapping[str, float]) -> bool:
+        """RC_OPTIONS bit 0."""
+        return bool(int(values.get("RC_OPTIONS", 0)) & ardupilot_params.IGNORE_RECEIVER)
+
+    def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
+        """Simple mode off, which lasts until the mode switch moves, whatever the parameters are."""
+        is_simple = ardupilot_params.is_simple_setting
+        if is_simple(name, before) and not is_simple(name, now):
+            return CommandRequest(dialect.MAV_CMD_DO_AUX_FUNCTION, _SIMPLE_MODE_OFF)
+        return None
+
     def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
-        """Overrides that are ignored, and thrust that would be taken for a climb rate."""
+        """Overrides that are ignored or turned, and thrust that would be taken for a climb rate."""
         if context.output == "rc-override":
             yield from ardupilot_params.override_obstacles(values, context.source_system)
         elif context.output in ("attitude", "rates"):

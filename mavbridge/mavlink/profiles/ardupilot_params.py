@@ -8,17 +8,27 @@ from mavbridge.mavlink.codec.calibration import (
     RcCalibration,
     RcChannel,
 )
-from mavbridge.mavlink.profiles.profile import Danger, ParamContext, WantedParam
+from mavbridge.mavlink.profiles.profile import (
+    Danger,
+    ParamContext,
+    StickSetting,
+    WantedParam,
+    stick_obstacles,
+)
 
 STICKS = ("THROTTLE", "YAW", "PITCH", "ROLL")
 """RCMAP_* suffixes in the order of ``Sticks``."""
 _OPTION_CHANNELS = range(5, 17)
-"""Channels whose RCn_OPTION may hold the override switch."""
+"""Channels of a radio's switches; the first four are those of the sticks by default."""
 _CALIBRATION_PARTS = ("MIN", "TRIM", "MAX", "REVERSED")
 _OVERRIDE_SWITCH_OPTION = 46
 """RCn_OPTION "RC Override Enable": while the switch is low, all overrides are refused."""
-_IGNORE_OVERRIDES = 2
-"""Bit 1 of RC_OPTIONS."""
+IGNORE_RECEIVER, _IGNORE_OVERRIDES = 1, 2
+"""Bits 0 and 1 of RC_OPTIONS."""
+SIMPLE_NAMES = ("SIMPLE", "SUPER_SIMPLE")
+_SIMPLE_OPTIONS = (3.0, 13.0)
+"""RCn_OPTION "Simple Mode" and "Super Simple Mode"."""
+_TURNED = "pitch and roll sticks count in the axes of "
 _THRUST_AS_THRUST = 8
 """Bit 3 of GUID_OPTIONS; without it the thrust of SET_ATTITUDE_TARGET is a climb rate."""
 _CONTINUE_LANDING = 8
@@ -40,6 +50,7 @@ RISK_NAMES = ("RC_OVERRIDE_TIME", "RC_OPTIONS", "FS_THR_ENABLE")
 FIRST_NAMES = (
     *(f"RCMAP_{stick}" for stick in STICKS),
     *RISK_NAMES,
+    "FLTMODE_CH",
     *("RC_FS_TIMEOUT", "FS_THR_VALUE", "FS_OPTIONS", "THR_DZ", "MAV_GCS_SYSID_HI"),
     *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER"),
     *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
@@ -69,6 +80,12 @@ def dead_zone_names(values: Mapping[str, float]) -> tuple[str, ...]:
     """RCn_DZ of the stick channels, as far as RCMAP_* is known."""
     known = (values.get(f"RCMAP_{stick}") for stick in STICKS)
     return tuple(f"RC{int(number)}_DZ" for number in known if number is not None)
+
+
+def stick_setting_names(values: Mapping[str, float]) -> tuple[str, ...]:
+    """Names in ``stick_settings`` that are not read first, as far as RCMAP_* is known."""
+    names = (each.name for each in stick_settings(values))
+    return tuple(name for name in names if name not in FIRST_NAMES)
 
 
 def calibration(values: Mapping[str, float]) -> RcCalibration:
@@ -108,6 +125,38 @@ def override_switch(values: Mapping[str, float]) -> int | None:
     return next((n for n, option in options.items() if option == _OVERRIDE_SWITCH_OPTION), None)
 
 
+def stick_settings(values: Mapping[str, float]) -> Iterator[StickSetting]:
+    """Parameters that can turn our sticks, or let them work a switch as well.
+
+    The bits of SIMPLE_NAMES belong to positions of the pilot's mode switch, which may move at any
+    time. Simple mode's angle is the heading at arming, which is not told: it cannot be mapped.
+    """
+    yield StickSetting("SIMPLE", f"{_TURNED}the heading at arming", lambda bits: bits == 0, 0)
+    yield StickSetting("SUPER_SIMPLE", f"{_TURNED}the way home", lambda bits: bits == 0, 0)
+    sticks = {values[name]: name for name in map("RCMAP_{}".format, STICKS) if name in values}
+    for number in sorted({*_OPTION_CHANNELS, *map(int, sticks)}):
+        name = f"RC{number}_OPTION"
+        if number in sticks:
+            effect = f"the stick of {sticks[number]} would work a switch"
+            yield StickSetting(name, effect, lambda option: option == 0, 0)
+        else:
+            effect = f"with that switch, {_TURNED}the heading at arming or of the way home"
+            yield StickSetting(name, effect, lambda option: option not in _SIMPLE_OPTIONS, 0)
+    channel = values.get("FLTMODE_CH", 0)
+    yield StickSetting(
+        "FLTMODE_CH",
+        f"the stick of {sticks.get(channel)} would change the flight mode",
+        lambda number: number not in sticks,
+        next((number for number in range(5, 9) if number not in sticks), 0),
+    )
+
+
+def is_simple_setting(name: str, value: float) -> bool:
+    """True if the vehicle may be in Simple mode by this parameter."""
+    is_option = name.endswith("_OPTION") and value in _SIMPLE_OPTIONS
+    return is_option or (name in SIMPLE_NAMES and value != 0)
+
+
 def override_obstacles(values: Mapping[str, float], source_system: int) -> Iterator[str]:
     """Reasons, as far as parameters show, for which this vehicle would ignore our overrides."""
     low = current_names(values).get("MAV_GCS_SYSID")
@@ -126,6 +175,7 @@ def override_obstacles(values: Mapping[str, float], source_system: int) -> Itera
         )
     if values.get("RC_OVERRIDE_TIME") == 0:
         yield "RC_OVERRIDE_TIME is 0, which disables overrides: use --set RC_OVERRIDE_TIME=0.5"
+    yield from stick_obstacles(stick_settings(values), values)
 
 
 def thrust_obstacles(values: Mapping[str, float]) -> Iterator[str]:
@@ -165,6 +215,11 @@ def override_advice(values: Mapping[str, float]) -> Iterator[str]:
         yield (
             f"the vehicle has not sent {', '.join(missing)}: whether it holds its last sticks for "
             "ever if this computer dies is not known"
+        )
+    if missing := [name for name in SIMPLE_NAMES if name not in values]:
+        yield (
+            f"the vehicle has not sent {', '.join(missing)}: whether {_TURNED}the heading at "
+            "arming is not known"
         )
     time_s = values.get("RC_OVERRIDE_TIME", 0.0)
     if time_s > _LONGEST_S:
@@ -216,6 +271,8 @@ def wanted_params(values: Mapping[str, float], context: ParamContext) -> Iterato
         yield WantedParam(name, f"{context.source_system}, our system id")
         yield WantedParam("RC_OPTIONS", "bit 1 clear")
         yield WantedParam("RC_OVERRIDE_TIME", f"0.5; above 0, at most {_LONGEST_S:g} s")
+        for name in SIMPLE_NAMES:
+            yield WantedParam(name, "0")
         receiver = "" if context.has_receiver else ", without a receiver"
         yield WantedParam("FS_THR_ENABLE", f"not 0{receiver}")
         yield WantedParam("FS_OPTIONS", "any" if context.has_receiver else "24 (bit 3 set)")

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import ClassVar, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -74,6 +74,23 @@ def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
             "if this computer died, the vehicle would fly on with its last setpoint for "
             f"{time_s:g} s ({name}): use --set {name}=0.5",
         )
+
+
+class StickSetting(NamedTuple):
+    """A parameter that can give a stick another meaning than the policy's."""
+
+    name: str
+    effect: str
+    is_harmless: Callable[[float], bool]
+    mended: float
+
+
+def stick_obstacles(settings: Iterable[StickSetting], values: Mapping[str, float]) -> Iterator[str]:
+    """A sentence for each of the settings with which sticks mean something else."""
+    for name, effect, is_harmless, mended in settings:
+        value = values.get(name)
+        if value is not None and not is_harmless(value):
+            yield f"{name} is {value:g}: {effect}: use --set {name}={mended:g}"
 
 
 class WantedParam(NamedTuple):
@@ -163,6 +180,10 @@ class Profile(ABC):
 
         Each with the command that mends it; nobody can accept them.
         """
+
+    def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
+        """The command without which a parameter that was set for a flight has no effect."""
+        return None
 
     @abstractmethod
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:

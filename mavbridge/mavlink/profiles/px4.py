@@ -15,10 +15,12 @@ from mavbridge.mavlink.profiles.profile import (
     EventMeaning,
     ParamContext,
     Profile,
+    StickSetting,
     StreamGroup,
     WantedParam,
     optional_stream,
     setpoint_danger,
+    stick_obstacles,
 )
 from mavbridge.mavlink.profiles.px4_sticks import px4_curves
 from mavbridge.mavlink.profiles.sticks import StickCurves
@@ -37,6 +39,16 @@ _UNEVEN_HZ = 150.0
 _TARGET_HZ = 100.0
 _NO_MAVLINK_STICKS = {0: "RC only", 4: "sticks disabled"}
 """COM_RC_IN_MODE."""
+_STICK_SETTINGS = (
+    StickSetting(
+        "MAN_KILL_GEST_T",
+        "both sticks held down and outwards stop the motors, in flight too",
+        lambda time_s: time_s < 0,
+        -1,
+    ),
+)
+_NO_RESCALE = 1
+"""MPC_THR_CURVE."""
 _FATAL_ACTIONS = {5: "terminate the flight", 6: "disarm"}
 """NAV_RCL_ACT."""
 _FATAL_OFFBOARD_ACTIONS = {6: "terminate the flight", 7: "disarm"}
@@ -130,6 +142,7 @@ class Px4(Profile):
         *("MIS_TAKEOFF_ALT", "MPC_XY_MAN_EXPO", "MPC_VEL_MANUAL"),
         *("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_YAW_EXPO", "MPC_Z_MAN_EXPO"),
         *("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_DEADZONE", "MPC_HOLD_DZ"),
+        *("MAN_KILL_GEST_T", "MPC_TILTMAX_AIR", "MPC_THR_CURVE"),
     )
 
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
@@ -168,9 +181,12 @@ class Px4(Profile):
         return values.get("COM_RC_IN_MODE") in (1.0, 4.0)
 
     def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
-        """COM_RC_IN_MODE without MAVLink's sticks."""
+        """COM_RC_IN_MODE without MAVLink's sticks, and a gesture that a policy might make."""
+        if context.output != "manual-control":
+            return
+        yield from stick_obstacles(_STICK_SETTINGS, values)
         mode = values.get("COM_RC_IN_MODE")
-        if context.output == "manual-control" and mode in _NO_MAVLINK_STICKS:
+        if mode in _NO_MAVLINK_STICKS:
             yield (
                 f"COM_RC_IN_MODE is {mode:g} ({_NO_MAVLINK_STICKS[int(mode)]}): use "
                 "--set COM_RC_IN_MODE=1 (MAVLink only), or 6 with a receiver (MAVLink first)"
@@ -186,6 +202,7 @@ class Px4(Profile):
         if context.output == "manual-control":
             name, action = "COM_RC_LOSS_T", _FATAL_ACTIONS.get(int(values.get("NAV_RCL_ACT", 2)))
             act_name = "NAV_RCL_ACT"
+            yield from _stick_advice(values)
         elif context.output is not None:
             name, act_name = "COM_OF_LOSS_T", "COM_OBL_RC_ACT"
             action = _FATAL_OFFBOARD_ACTIONS.get(int(values.get(act_name, 0)))
@@ -265,6 +282,21 @@ class Px4(Profile):
         here = math.nan
         return CommandRequest(
             dialect.MAV_CMD_NAV_TAKEOFF, (here, 0, 0, here, here, here, amsl_m + height_m)
+        )
+
+
+def _stick_advice(values: Mapping[str, float]) -> Iterator[str]:
+    """Settings by which a stick does less, or something else, in one mode."""
+    full_deg, limit_deg = values.get("MPC_MAN_TILT_MAX", 0.0), values.get("MPC_TILTMAX_AIR")
+    if limit_deg is not None and limit_deg < full_deg:
+        yield (
+            f"MPC_TILTMAX_AIR is {limit_deg:g}: in ALTCTL it leans no further, and full stick is "
+            f"{full_deg:g} deg (MPC_MAN_TILT_MAX): use --set MPC_TILTMAX_AIR={full_deg:g}"
+        )
+    if values.get("MPC_THR_CURVE") == _NO_RESCALE:
+        yield (
+            "MPC_THR_CURVE is 1: in STABILIZED the middle of the throttle is half of full thrust, "
+            "and not hover thrust: use --set MPC_THR_CURVE=0"
         )
 
 

@@ -7,7 +7,7 @@ the operator or the flight process asked for, as far as the phases show it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -267,16 +267,13 @@ def _link(
 ) -> _WatchedLink:
     config: FlyConfig = source.config
     loops = config.rates.loops(is_dual=source.meta.mode == "dual")
-    return _WatchedLink(
-        transport,
-        clock,
-        link_settings(
-            config.link,
-            state_hz=loops.state_hz,
-            stick_hz=config.rates.stick_rate + loops.action_hz,
-            min_battery_percent=config.envelope.min_battery,
-        ),
+    settings = link_settings(
+        config.link,
+        state_hz=loops.state_hz,
+        stick_hz=config.rates.stick_rate + loops.action_hz,
+        min_battery_percent=config.envelope.min_battery,
     )
+    return _WatchedLink(transport, clock, replace(settings, known_params=source.known_params))
 
 
 class _RecordedTransport:

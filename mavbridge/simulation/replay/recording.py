@@ -29,6 +29,8 @@ from policy.contract import Contract
 STAMP_NS = 10 * NS_PER_MS
 """Most by which a packet's two stamps may differ: the log's are rounded to 4 us, and the clocks of
 user and system drift apart by less in an hour."""
+_PARAM_REQUEST_READ, _PARAM_ID = 20, slice(4, 20)
+"""Message, and place of the name in its payload."""
 LOOK_AHEAD = 64
 """Rows of the table among which a packet of the log is looked for: the log may have lost some."""
 
@@ -58,6 +60,8 @@ class ReplaySource:
     """Features of each camera of the contract; empty for a single-rate policy."""
     packets: tuple[RecordedPacket, ...]
     """In order of arrival."""
+    known_params: frozenset[str]
+    """Parameters that the flight had asked for: a later version asks for more."""
     gaps: tuple[str, ...]
     """What the recording has lost, in words: a replay may differ there."""
 
@@ -102,6 +106,7 @@ def open_source(folder: Path) -> ReplaySource:
         solves=tuple(row.solve for row in solve_rows),
         features=_features(folder, meta, meta.contract),
         packets=tuple(packets),
+        known_params=frozenset(_asked_params(folder / TLOG, system)),
         gaps=tuple(
             f"{count} {what} are not in the recording"
             for what, count in (
@@ -123,6 +128,13 @@ def _features(
         tuple(read_features(read_table(folder / features_of(name), replay_rows.FEATURES)))
         for name in (None, *contract.cameras[1:])
     )
+
+
+def _asked_params(log: Path, own_system: int) -> Iterator[str]:
+    for _, packet in read_tlog(log):
+        is_ours = packet.source.system == own_system
+        if is_ours and packet.message_id == _PARAM_REQUEST_READ:
+            yield packet.payload[_PARAM_ID].rstrip(b"\0").decode("ascii", "replace")
 
 
 def _received(

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.ardupilot.autopilot import Autopilot
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.link.endpoint import MavlinkEndpoint
+from sitl.ardupilot.simple import Axes
 
 ACCEPTED: int = mav.MAV_RESULT_ACCEPTED
 DENIED: int = mav.MAV_RESULT_DENIED
@@ -17,6 +18,7 @@ FAILED: int = mav.MAV_RESULT_FAILED
 FORCE = 21196.0  # param 2 of ARM_DISARM that overrules every check (MAVLink common.xml)
 FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: also while armed (ArduPilot)
 UINT16_MAX = 65535
+SIMPLE_MODE, SWITCH_LOW = 3.0, 0.0  # params of DO_AUX_FUNCTION
 
 Params7: TypeAlias = tuple[float, ...]  # param1..7 of a command, the first at index 0
 Handler: TypeAlias = Callable[[Params7, Autopilot, MavlinkEndpoint], int]
@@ -87,6 +89,14 @@ def _take_off(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int:
     return ACCEPTED if math.isfinite(height_m) and ap.take_off(height_m) else FAILED
 
 
+def _aux_function(params: Params7, ap: Autopilot, _link: MavlinkEndpoint) -> int:
+    """Simple mode off is the one function that this vehicle takes from a command."""
+    if params[:2] != (SIMPLE_MODE, SWITCH_LOW):
+        return FAILED
+    ap.simple.axes = Axes.VEHICLE
+    return ACCEPTED
+
+
 def _send(message_id: int) -> Handler:
     def handler(_params: Params7, _ap: Autopilot, link: MavlinkEndpoint) -> int:
         link.send_now(message_id)
@@ -109,6 +119,7 @@ _HANDLERS: dict[int, Handler] = {
     mav.MAV_CMD_NAV_TAKEOFF: _take_off,
     mav.MAV_CMD_NAV_LAND: lambda _params, ap, _link: mode_by_number(Mode.LAND, ap),
     mav.MAV_CMD_DO_SET_MODE: _set_mode,
+    mav.MAV_CMD_DO_AUX_FUNCTION: _aux_function,
     mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     mav.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     mav.MAV_CMD_GET_HOME_POSITION: _send(mav.MAVLINK_MSG_ID_HOME_POSITION),

@@ -4,12 +4,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.parameters import NAMES, ParamVehicle, lossy, status
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import Output, Risk
-from mavbridge.mavlink.codec.messages import ParamValue, ParamWrite
+from mavbridge.mavlink.codec.messages import CommandRequest, ParamValue, ParamWrite
 from mavbridge.mavlink.profiles import ardupilot_params
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.px4 import PX4
@@ -258,6 +259,29 @@ def test_a_vehicle_without_the_decisive_parameters_is_flown_with_a_warning() -> 
     assert len(vehicle.requests) == count  # not asked for in flight
 
 
+@pytest.mark.parametrize(
+    ("name", "before", "flag"),
+    [("SIMPLE", 63.0, "SIMPLE=0"), ("RC7_OPTION", 13.0, "RC7_OPTION=0"), ("THR_DZ", 90.0, "")],
+)
+def test_simple_mode_that_is_set_off_is_switched_off_as_well(
+    name: str, before: float, flag: str, tmp_path: Path
+) -> None:
+    """By its parameter alone it would last until the mode switch moves."""
+    wanted = flag or "THR_DZ=100"
+    key, _, value = wanted.partition("=")
+    vehicle = ParamVehicle(
+        {name: before, "SUPER_SIMPLE": 0.0}, folder=tmp_path, set_params=((key, float(value)),)
+    )
+    vehicle.run(10.0)
+    off = CommandRequest(dialect.MAV_CMD_DO_AUX_FUNCTION, (3.0, 0.0))
+
+    assert vehicle.writes == [(key, float(value))]
+    assert [r for r in vehicle.requests if isinstance(r, CommandRequest)] == [off] * (
+        3 if flag else 0
+    )
+    assert vehicle.problem() is None
+
+
 # --- changes after reading
 
 
@@ -295,6 +319,10 @@ def test_a_change_on_the_ground_is_taken_in() -> None:
         ("MAV_GCS_SYSID", 42.0),
         ("RC7_OPTION", 46.0),
         ("FS_THR_ENABLE", 0.0),
+        ("SIMPLE", 1.0),
+        ("SUPER_SIMPLE", 32.0),
+        ("RC8_OPTION", 13.0),
+        ("RC1_OPTION", 4.0),
     ],
 )
 def test_a_change_in_flight_that_matters_interrupts_for_good(name: str, value: float) -> None:

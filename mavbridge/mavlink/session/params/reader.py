@@ -14,7 +14,9 @@ _ATTEMPTS = 4
 class ParamReader:
     """Reads a list of parameters by name, a few at a time, and repeats requests that get lost."""
 
-    def __init__(self, names: tuple[str, ...]) -> None:
+    def __init__(self, names: tuple[str, ...], *, known: frozenset[str] | None = None) -> None:
+        self._known = known
+        """All that may be asked for; None: anything."""
         self._open: dict[str, tuple[int, int]] = {}
         """Time of the last request and number of requests."""
         self._names: set[str] = set()
@@ -24,6 +26,8 @@ class ParamReader:
 
     def request(self, names: tuple[str, ...]) -> None:
         """Read these parameters as well, those that were given up before included."""
+        if self._known is not None:
+            names = tuple(name for name in names if name in self._known)
         missing = [name for name in names if name not in self.values]
         self._open |= {name: (0, 0) for name in missing if name not in self._open}
         self._names |= set(names)

@@ -7,7 +7,7 @@ from mavbridge.core.address import serial_baud
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
-from mavbridge.mavlink.codec.messages import ParamRequest, ParamValue, ParamWrite
+from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
 from mavbridge.mavlink.profiles.profile import Danger, ParamContext, Profile, StreamGroup
 from mavbridge.mavlink.session.params.bandwidth import baud_danger
 from mavbridge.mavlink.session.params.checks import Assessment, assess
@@ -19,6 +19,8 @@ _AGAIN_NS = 2 * NS_PER_S
 """Between attempts to read parameters that the vehicle did not send."""
 _MOST_TOLD = 100
 """Texts of advice in a session: they name values, which may change any number of times."""
+_FOLLOW_UPS = 3
+"""Times that a command is sent, a second apart, since one may get lost."""
 
 
 class VehicleParams:
@@ -46,7 +48,7 @@ class VehicleParams:
         self._serial = baud_danger(
             serial_baud(config.connect), streams=streams, stick_hz=config.stick_hz
         )
-        self._reader = ParamReader(profile.params)
+        self._reader = ParamReader(profile.params, known=config.known_params)
         self._kinds: dict[str, int] = {}
         """MAV_PARAM_TYPE of each parameter that matters and was heard."""
         self._has_asked_more = False
@@ -57,6 +59,8 @@ class VehicleParams:
             folder=config.state_folder,
             report=report,
         )
+        self._follow_up: CommandRequest | None = None
+        self._follow_ups_left = self._follow_up_ns = 0
         self._advised: ParamContext | None = None
         self._told: set[str] = set()
         """Advice, each text once: whether there is a receiver is learnt later than the rest."""
@@ -102,6 +106,9 @@ class VehicleParams:
         self._changes.receive(param)
         if not self.is_read or old == self._reader.values.get(param.name):
             return
+        if old is not None and param.name in dict(self._config.set_params):
+            self._follow_up = self._profile.follow_up(param.name, old, param.value)
+            self._follow_ups_left, self._follow_up_ns = _FOLLOW_UPS, 0
         before, after = self._assessed, self._assess(status)
         is_armed = status is not None and status.armed
         if not is_armed or old is None or before is None:
@@ -127,7 +134,7 @@ class VehicleParams:
 
     def step(
         self, now_ns: int, status: VehicleStatus | None, *, unique_id: str | None
-    ) -> Iterator[ParamRequest | ParamWrite]:
+    ) -> Iterator[ParamRequest | ParamWrite | CommandRequest]:
         """Requests that are due.
 
         ``unique_id`` is the autopilot's own, empty if it has none, and None while it is not known.
@@ -149,6 +156,9 @@ class VehicleParams:
                 is_disarmed=status is not None and not status.armed,
             ):
                 yield self._as_written(request)
+        if self._follow_up and self._follow_ups_left and now_ns >= self._follow_up_ns:
+            self._follow_ups_left, self._follow_up_ns = self._follow_ups_left - 1, now_ns + NS_PER_S
+            yield self._follow_up
 
     def _as_written(self, request: ParamRequest | ParamWrite) -> ParamRequest | ParamWrite:
         """A write with the type that the firmware demands, if it does."""
@@ -213,7 +223,11 @@ class VehicleParams:
         assessment = self._current(status)
         if assessment.obstacles:
             is_sticks = self._output in ("rc-override", "manual-control")
-            what = "ignore our sticks" if is_sticks else "not fly by our setpoints"
+            what = (
+                "ignore our sticks, or take them otherwise"
+                if is_sticks
+                else "not fly by our setpoints"
+            )
             return f"the vehicle would {what}: {'; '.join(assessment.obstacles)}"
         if assessment.unusable is not None:
             return assessment.unusable

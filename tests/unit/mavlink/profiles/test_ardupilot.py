@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.vehicle import Output
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
-from mavbridge.mavlink.profiles.ardupilot_params import current_names
+from mavbridge.mavlink.profiles.ardupilot_params import current_names, stick_settings
 from mavbridge.mavlink.profiles.profile import ParamContext
 
 
@@ -35,6 +35,49 @@ def test_thrust_must_be_thrust(options: float | None, expected: str | None) -> N
                 assert found == ""
     assert list(ARDUPILOT.obstacles(values, context("velocity"))) == []
     assert list(ARDUPILOT.obstacles(values, context("rc-override"))) == []
+
+
+RCMAP = {"RCMAP_ROLL": 1.0, "RCMAP_PITCH": 2.0, "RCMAP_THROTTLE": 3.0, "RCMAP_YAW": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("SIMPLE", 63.0),
+        ("SIMPLE", 1.0),
+        ("SUPER_SIMPLE", 8.0),
+        ("RC7_OPTION", 3.0),
+        ("RC12_OPTION", 13.0),
+        ("RC3_OPTION", 153.0),  # the throttle arms
+        ("RC6_OPTION", 4.0),  # the yaw stick returns home
+        ("FLTMODE_CH", 6.0),
+    ],
+)
+def test_what_turns_a_stick_is_refused_with_what_mends_it(name: str, value: float) -> None:
+    settings = {each.name: each for each in stick_settings(RCMAP)}
+    (text,) = ARDUPILOT.obstacles(RCMAP | {name: value}, context("rc-override"))
+    mended = settings[name].mended
+
+    assert text.startswith(f"{name} is {value:g}: ")
+    assert text.endswith(f"use --set {name}={mended:g}")
+    assert list(ARDUPILOT.obstacles(RCMAP | {name: mended}, context("rc-override"))) == []
+    assert list(ARDUPILOT.obstacles(RCMAP | {name: value}, context("velocity"))) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("RC7_OPTION", 4.0), ("RC8_OPTION", 46.0), ("FLTMODE_CH", 5.0)]
+)
+def test_a_switch_of_the_pilots_own_is_none_of_our_sticks(name: str, value: float) -> None:
+    assert list(ARDUPILOT.obstacles(RCMAP | {name: value}, context("rc-override"))) == []
+
+
+def test_a_receiver_that_is_ignored_holds_no_stick() -> None:
+    assert [
+        ARDUPILOT.ignores_receiver({"RC_OPTIONS": bits}) for bits in (1.0, 33.0, 32.0, 2.0)
+    ] == [
+        *(True, True),
+        *(False, False),
+    ]
 
 
 @pytest.mark.parametrize(

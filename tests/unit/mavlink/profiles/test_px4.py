@@ -24,6 +24,13 @@ def test_sticks_of_mavlink_must_be_taken(mode: int) -> None:
     assert PX4.ignores_receiver({"COM_RC_IN_MODE": float(mode)}) == (mode in (1, 4))
 
 
+@pytest.mark.parametrize("time_s", [-1.0, 0.0, 2.0])
+def test_no_gesture_of_the_policys_may_stop_the_motors(time_s: float) -> None:
+    texts = list(PX4.obstacles({"MAN_KILL_GEST_T": time_s}, context("manual-control")))
+    assert ["--set MAN_KILL_GEST_T=-1" in text for text in texts] == [True] * (time_s >= 0)
+    assert list(PX4.obstacles({"MAN_KILL_GEST_T": time_s}, context("rates"))) == []
+
+
 @pytest.mark.parametrize(
     ("values", "output", "expected"),
     [
@@ -33,6 +40,14 @@ def test_sticks_of_mavlink_must_be_taken(mode: int) -> None:
         ({"COM_RC_LOSS_T": 0.1}, "manual-control", ["as short as that is a failsafe"]),
         ({"NAV_RCL_ACT": 6.0}, "manual-control", ["NAV_RCL_ACT is 6: it would disarm"]),
         ({"NAV_RCL_ACT": 5.0}, "manual-control", ["terminate the flight"]),
+        (
+            {"MPC_MAN_TILT_MAX": 35.0, "MPC_TILTMAX_AIR": 20.0},
+            "manual-control",
+            ["--set MPC_TILTMAX_AIR=35"],
+        ),
+        ({"MPC_MAN_TILT_MAX": 35.0, "MPC_TILTMAX_AIR": 45.0}, "manual-control", []),
+        ({"MPC_THR_CURVE": 1.0}, "manual-control", ["--set MPC_THR_CURVE=0"]),
+        ({"MPC_THR_CURVE": 1.0, "MPC_TILTMAX_AIR": 1.0}, "rates", []),
         ({"COM_RC_LOSS_T": 2.0, "NAV_RCL_ACT": 6.0}, "velocity", []),
         ({"COM_OF_LOSS_T": 5.0}, "velocity", ["--set COM_OF_LOSS_T=0.5"]),
         ({"COM_OBL_RC_ACT": 7.0}, "rates", ["COM_OBL_RC_ACT is 7: it would disarm"]),
