@@ -7,6 +7,7 @@ PORT ?= 14550
 POLICY ?= toge
 # toge-rates flies races.
 COURSE ?= $(if $(filter toge-rates,$(POLICY)),1001000007,1000007)
+# Longest flight in seconds: it ends with the course.
 DURATION ?= 60
 # Flags of mavbridge for this flight, as in FLAGS="--takeoff 5".
 FLAGS ?=
@@ -36,7 +37,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 		MAVProxy mavsdk
 	touch $@
 
-fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy flying it over UDP
+fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy flying its course over UDP
 	@mkdir -p out
 	@$(BIN)/python -m sitl course --course $(COURSE) --json > out/gates.json
 	@$(BIN)/python -m sitl --autopilot $(AUTOPILOT) --connect udpout:127.0.0.1:$(PORT) \

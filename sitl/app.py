@@ -136,7 +136,7 @@ def print_status(line: str) -> None:
 
 
 class _Status:
-    """Prints what changes: connections, mode, arming, crash and the vehicle's texts."""
+    """Prints what changes: connections, mode, arming and the vehicle's texts."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
@@ -144,7 +144,6 @@ class _Status:
         self._mode = vehicle.ap.mode_name
         self._armed = vehicle.ap.armed
         self._texts = 0
-        self._crashed = False
 
     def on_received(self, link_id: int) -> None:
         if link_id not in self._connected:
@@ -158,11 +157,9 @@ class _Status:
             print_status(f"mode {ap.mode_name}")
         if ap.armed != self._armed:
             print_status("armed" if ap.armed else "disarmed")
-        if log.crash is not None and not self._crashed:
-            print_status(f"crash: hit {log.crash.hit} at {log.crash.speed_mps:.1f} m/s")
         for text in log.texts[self._texts :]:
             print_status(str(text["text"]))
-        self._mode, self._armed, self._crashed = ap.mode_name, ap.armed, log.crashed
+        self._mode, self._armed = ap.mode_name, ap.armed
         self._texts = len(log.texts)
 
 

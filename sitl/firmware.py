@@ -25,6 +25,11 @@ class Autopilot(Protocol):
     """Fault: telemetry and control keep the last state, the physics goes on."""
 
     @property
+    def texts(self) -> list[StatusText]:
+        """Texts that every link is to send next."""
+        ...
+
+    @property
     def config(self) -> VehicleConfig:
         """What makes this vehicle differ from others."""
         ...

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from sitl.ardupilot.firmware import ArduCopter
 from sitl.clock import NS_PER_S
 from sitl.course.layout import AirborneStart, Course
-from sitl.firmware import Autopilot, Firmware, Params, Server
+from sitl.firmware import Autopilot, Firmware, Params, Server, StatusText
 from sitl.px4.firmware import Px4
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import BodyState
 
+SEVERITY_CRITICAL = 2
 MAX_CATCH_UP_NS = NS_PER_S
 """Simulated in one call; after a longer stall the rest follows in later calls."""
 
@@ -81,7 +82,11 @@ class SimulatedVehicle:
         behind_ns = min(now_ns - ap.now_ns, MAX_CATCH_UP_NS)
         for _ in range(behind_ns // ap.step_ns):
             ap.step()
+            had_crashed = self.log.crashed
             self.log.on_step(ap)
+            if (crash := self.log.crash) is not None and not had_crashed:
+                text = f"Crash: hit {crash.hit} at {crash.speed_mps:.1f} m/s"
+                ap.texts.append(StatusText(SEVERITY_CRITICAL, text))
         self.pose = Pose(stamp_ns=ap.now_ns, body=ap.truth)
         self.server.step(now_ns)
         if self.server.reboot_requested:

@@ -311,8 +311,8 @@ class FlyConfig:
     """HOST:PORT of a page with the live flight, for a browser: 127.0.0.1:9090 for one on this
     computer. The next port carries the data."""
     gates: Annotated[Path | None, Parameter(group=OUTPUT)] = None
-    """JSON of the gates that the Rerun viewer shows along the path, as ``python -m sitl course
-    --json`` prints it."""
+    """JSON of a course's gates, as ``python -m sitl course --json`` prints it. The viewer shows
+    them, the outcome counts them, and the flight ends a second after the last one."""
     record: Annotated[Path | None, Parameter(group=OUTPUT)] = None
     """Record the flight into this folder, new or empty: camera, ticks, raw MAVLink; needs the extra
     "record"."""

@@ -1,9 +1,12 @@
-"""Gates that stand along a flight, where somebody knows them: for views and reports alone."""
+"""Gates that stand along a flight, where somebody knows them, and which of them were passed."""
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Position
 from policy.files import read_json
@@ -17,6 +20,69 @@ class CourseGate(NamedTuple):
     """Heading of the passage: 0 = flown through towards north, + = clockwise."""
     size_m: float
     """Side of the opening."""
+
+
+class CourseProgress:
+    """Gates that a path has passed: in order, forward, inside the opening.
+
+    A gate that was flown around stays the next one. ``sitl.course.referee.GateCounter`` judges the
+    truth of a simulated vehicle by the same rule; a property holds the two equal.
+    """
+
+    def __init__(self, gates: Sequence[CourseGate]) -> None:
+        self._gates = tuple(gates)
+        self._last: tuple[Position, int] | None = None
+        self.passed_ns: list[int] = []
+
+    @property
+    def is_done(self) -> bool:
+        """There were gates, and all were passed."""
+        return 0 < len(self._gates) == len(self.passed_ns)
+
+    @property
+    def speed_mps(self) -> float | None:
+        """Along the straight legs from the first gate to the last one passed; None before two."""
+        passed_ns, passed = self.passed_ns, self._gates[: len(self.passed_ns)]
+        if len(passed) < 2 or passed_ns[-1] == passed_ns[0]:
+            return None
+        legs_m = [math.dist(a.center_ned_m, b.center_ned_m) for a, b in pairwise(passed)]
+        return sum(legs_m) * NS_PER_S / (passed_ns[-1] - passed_ns[0])
+
+    def update(self, position: Position | None, at_ns: int) -> None:
+        """Append a position, to which the path is straight; None interrupts the path."""
+        last = self._last
+        if last is not None and position == last[0]:
+            return  # told once more: it was there from the first time on
+        self._last = None if position is None else (position, at_ns)
+        if last is None or position is None:
+            return
+        start, start_ns = last
+        reached = 0.0
+        while len(self.passed_ns) < len(self._gates):
+            fraction = _crossing(self._gates[len(self.passed_ns)], start, position)
+            if fraction is None or fraction < reached:
+                return
+            reached = fraction
+            self.passed_ns.append(start_ns + round(fraction * (at_ns - start_ns)))
+
+
+def _crossing(gate: CourseGate, start: Position, end: Position) -> float | None:
+    """Fraction of the segment at which it passes forward through the opening, or None."""
+    (ahead_m, right_m, down_m), after = (_offset_m(gate, position) for position in (start, end))
+    if not ahead_m < 0.0 <= after[0]:
+        return None
+    fraction = ahead_m / (ahead_m - after[0])
+    right_m += fraction * (after[1] - right_m)
+    down_m += fraction * (after[2] - down_m)
+    half_m = gate.size_m / 2
+    return fraction if abs(right_m) <= half_m and abs(down_m) <= half_m else None
+
+
+def _offset_m(gate: CourseGate, position: Position) -> tuple[float, float, float]:
+    """Position from the gate's centre: forward through it, right, down."""
+    north_m, east_m, down_m = (a - b for a, b in zip(position, gate.center_ned_m, strict=True))
+    cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
+    return north_m * cos_yaw + east_m * sin_yaw, east_m * cos_yaw - north_m * sin_yaw, down_m
 
 
 def read_gates(path: Path) -> tuple[CourseGate, ...]:

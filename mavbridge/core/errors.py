@@ -36,6 +36,8 @@ class ExitCode(IntEnum):
     """The policy flew, and a fault ended its flight."""
     DIFFERENT = 5
     """A replay differs from its recording by more than the tolerance."""
+    CRASHED = 6
+    """The policy flew without a fault, and the vehicle hit something or was seen to crash."""
 
 
 class UserError(MavbridgeError):

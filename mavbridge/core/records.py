@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mavbridge.core.vehicle import Action, ActionTrace, Sticks
+from mavbridge.core.vehicle import Action, ActionTrace, FlightEnd, Sticks
 
 FloatArray: TypeAlias = NDArray[np.float32]
 ImageArray: TypeAlias = NDArray[np.uint8]
@@ -127,6 +127,41 @@ class Tick:
         if self.phase in ("waiting", "preparing"):
             return self.phase.upper()
         return "NEUTRAL" if self.phase in ("leaving", "holding") else "RELEASED"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightOutcome:
+    """How the policy flew, from its first action to its last one; None = not known."""
+
+    end: FlightEnd
+    reason: str
+    """The end in words."""
+    flown_s: float
+    height_m: float | None
+    """Above the estimator's origin, at the policy's last action."""
+    speed_mps: float | None
+    """At the policy's last action."""
+    mode: str | None
+    """Mode, arming and landing are the vehicle's last word in this run."""
+    is_armed: bool
+    is_landed: bool | None
+    gates_total: int | None
+    """None: no course was named."""
+    gates_passed: int | None
+    """In order, forward, inside the opening; None also where the vehicle tells no position."""
+    course_s: float | None
+    """From the first action to the last gate that was passed."""
+    course_speed_mps: float | None
+    """Along the straight legs from the first gate to the last one passed; None before two."""
+    crash: str | None
+    """How it was seen to have hit something, in words; None: no contact was seen or told."""
+
+    @property
+    def success(self) -> bool | None:
+        """False for a flight that failed, True for a whole course; else nobody can say."""
+        if self.crash is not None or self.end == "fault":
+            return False
+        return None if self.gates_passed is None else self.gates_passed == self.gates_total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

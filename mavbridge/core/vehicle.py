@@ -14,6 +14,10 @@ ActionKind: TypeAlias = Literal["sticks", "rates", "attitude", "velocity"]
 """Meaning of the four numbers of an action; ``Action`` has a class for each."""
 OnFault: TypeAlias = Literal["auto", "release", "hold", "land", "rtl"]
 """Action that follows the neutral sticks when a flight ends by our own doing."""
+FlightEnd: TypeAlias = Literal[
+    "course", "duration", "landed", "operator", "signal", "takeover", "disarmed", "fault"
+]
+"""How a flight of the policy ended: a planned end, the pilot or the vehicle, a fault of ours."""
 
 Risk: TypeAlias = Literal[
     "endless-override", "no-throttle-failsafe", "long-setpoint", "slow-serial"

@@ -26,7 +26,9 @@ from mavbridge.core.realtime import (
     settle_process,
     settle_thread,
 )
+from mavbridge.core.records import FlightOutcome
 from mavbridge.core.stopping import StopRequest, stop_on_signals
+from mavbridge.core.vehicle import FlightEnd
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.checks import check_flight, signing_note
@@ -180,6 +182,8 @@ class _Flight:
         self._stack = stack
         self._gate = gate.process
         self._has_hung = False
+        self._ending = Ending(reason="the gate has died", is_fault=True)
+        """What it was asked to end for; until then only its death ends it without a summary."""
         settings = flight_settings(config, executable)
         self._hang_ns = max(
             LEAST_HANG_NS,
@@ -190,7 +194,7 @@ class _Flight:
         self._encoder_hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * feature_ns)
         self._looked_ns = self._resumed_ns = clock.now_ns()
         self._observers = FlightObservers(config, executable, clock=clock, console=console)
-        stack.callback(self._observers.close_recorder)  # after the gate: it records the release
+        stack.callback(self._close_recorder)  # after the gate: it records the release
         contract = executable.contract
         self._cameras = contract.cameras
         past_ns = observation_ages_ns(contract)[0]
@@ -218,6 +222,20 @@ class _Flight:
             watch_solve=self._observers.watch_solve,
             watch_packets=self._observers.watch_packets,
         )
+
+    def _close_recorder(self) -> None:
+        self._observers.close_recorder(self._outcome)
+
+    @property
+    def _outcome(self) -> FlightOutcome | None:
+        """How the policy flew; None if it has not, as in a start that failed."""
+        if not self._observers.referee.has_flown:
+            return None
+        summary, asked = self._gate.summary, self._ending
+        end: FlightEnd = "fault" if asked.is_fault else asked.end
+        if summary is not None and summary.outcome.end is not None:
+            end = summary.outcome.end
+        return self._observers.referee.outcome(end, self._bridge.view.status)
 
     def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:
         config = self._config.camera
@@ -262,9 +280,13 @@ class _Flight:
         has_keys = not self._config.link.readonly and keyboard.start()
         screen.start(hint=KEYS_HINT if has_keys else None)
         ending = Ending(reason="the flight was ended by a signal")
+        referee = self._observers.referee
         while listener.is_alive and not stop.is_set():
             if (fault := self._fault(visions, policy)) is not None:
                 ending = Ending(reason=fault, is_fault=True)
+                break
+            if referee.is_course_over(self._clock.now_ns()):
+                ending = Ending(reason="the course is done", end="course")
                 break
             stop.wait(1 / STATUS_HZ)
         self._end(ending, listener, stop)
@@ -297,6 +319,7 @@ class _Flight:
             stop,
             reason=self._bridge.view.reason,
             readonly=self._config.link.readonly,
+            crash=self._observers.referee.crash,
         )
         if text is not None:
             self._observers.screen.show_message(text)
@@ -337,6 +360,7 @@ class _Flight:
 
     def _end(self, ending: Ending, listener: Worker, stop: StopRequest) -> None:
         """Have the gate give the sticks back, and wait for it while it holds any."""
+        self._ending = ending
         self._gate.send(ending)
         screen, view = self._observers.screen, self._bridge.view
         asked = stop.requests
@@ -390,4 +414,5 @@ class _Flight:
         if summary is not None and summary.ground_station is not None:
             screen.show_message(summary.ground_station)
         is_found = view.status.mode is not None
-        self._observers.finish(self._gate.summary, view.status.autopilot if is_found else None)
+        autopilot = view.status.autopilot if is_found else None
+        self._observers.finish(self._gate.summary, autopilot, self._outcome)

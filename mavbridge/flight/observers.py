@@ -24,10 +24,11 @@ from mavbridge.core.provenance import (
     versions,
     without_secrets,
 )
-from mavbridge.core.records import Solve
+from mavbridge.core.records import FlightOutcome, Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.outcome import FlightReferee, describe
 from mavbridge.flight.policies import policy_files
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.gate.wire import GateSummary
@@ -68,6 +69,8 @@ class FlightObservers:
         self._timing = FlightTiming(
             stick_hz=config.rates.stick_rate, action_hz=action_hz, vision_hz=vision_hz
         )
+        self._gates = None if config.gates is None else read_gates(config.gates)
+        self.referee = FlightReferee(self._gates)
         self._viewer: ObserverThread | None = None
         self._recorder: Recorder | None = None
         self._gate: GateProcess | None = None
@@ -80,7 +83,12 @@ class FlightObservers:
     def sinks(self) -> tuple[TickSink, ...]:
         """All observers that are open, for the bridge."""
         optional = (self._recorder, self._viewer)
-        return (self._timing, self.screen, *(sink for sink in optional if sink is not None))
+        return (
+            self._timing,
+            self.screen,
+            self.referee,
+            *(sink for sink in optional if sink is not None),
+        )
 
     @property
     def recorders(self) -> tuple[TickSink, ...]:
@@ -121,7 +129,7 @@ class FlightObservers:
             max_state_age_s=freshness.state_ns / NS_PER_S,
             max_feature_age_s=freshness.feature_ns / NS_PER_S,
             to_ned=action_frame(contract).to_gate,
-            gates=() if config.gates is None else read_gates(config.gates),
+            gates=self._gates or (),
         )
         view = RerunView(config.rerun, flight, serve=config.serve)
         if view.url is not None:
@@ -174,21 +182,23 @@ class FlightObservers:
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error
 
-    def close_recorder(self) -> None:
+    def close_recorder(self, outcome: FlightOutcome | None) -> None:
         """Finish the recording; after the gate has ended, so that it holds the release."""
         recorder, summary = self._recorder, self._gate.summary if self._gate else None
-        if recorder is None:
+        if recorder is None or self._config.record is None:
             return
         recorder.close(RECORDER_JOIN_S)
-        if recorder.meta.finished and summary is not None and self._config.record is not None:
-            self._write_parameters(recorder.meta, self._config.record, summary.params)
+        if recorder.meta.finished:
+            meta = recorder.meta if outcome is None else recorder.meta.with_outcome(outcome)
+            params = {} if summary is None else summary.params
+            self._write_end(replace(meta, parameters=params), self._config.record)
 
-    def _write_parameters(self, meta: "FlightMeta", folder: Path, params: dict[str, float]) -> None:
-        """Add to the meta data what the gate said at its end."""
+    def _write_end(self, meta: "FlightMeta", folder: Path) -> None:
+        """Add to the meta data what is known only when the gate has ended."""
         from mavbridge.recording.meta import write_meta
 
         try:
-            write_meta(folder, replace(meta, parameters=params))
+            write_meta(folder, meta)
         except OSError as error:
             self.screen.show_message(f"--record {folder}: {error.strerror}")
 
@@ -197,14 +207,16 @@ class FlightObservers:
         sources = map(without_secrets, self._config.camera.sources_of(names))
         return dict(zip(names, sources, strict=True))
 
-    def finish(self, summary: GateSummary | None, autopilot: str | None) -> None:
+    def finish(
+        self, summary: GateSummary | None, autopilot: str | None, outcome: FlightOutcome | None
+    ) -> None:
         """Show the report, and write it where --report names a file, if a vehicle was found.
 
         Without one nothing is kept of the flight.
         """
         try:
             if autopilot is not None:
-                self._report(summary, autopilot)
+                self._report(summary, autopilot, outcome)
             else:
                 self._discard()
         finally:  # whatever is raised is printed only then
@@ -217,7 +229,9 @@ class FlightObservers:
         if self._viewer is not None and self._config.rerun.endswith(".rrd"):
             Path(self._config.rerun).unlink(missing_ok=True)
 
-    def _report(self, summary: GateSummary | None, autopilot: str) -> None:
+    def _report(
+        self, summary: GateSummary | None, autopilot: str, outcome: FlightOutcome | None
+    ) -> None:
         viewer, recorder = self._viewer, self._recorder
         report = self._timing.report(
             mode=self._mode,
@@ -229,10 +243,13 @@ class FlightObservers:
                 rerun=viewer.dropped if viewer else None,
                 recorder=recorder.dropped if recorder else None,
             ),
+            outcome=outcome,
         )
         self.screen.show_report(report)
         if recorder is not None:
             self.screen.show_message(recorder.summary())
+        if outcome is not None:
+            self.screen.show_message(describe(outcome))
         if self._config.report is not None:
             try:
                 self._config.report.write_text(report_json(report))

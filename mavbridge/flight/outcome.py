@@ -1,13 +1,126 @@
-"""The exit status of a flight, and the sentence that explains it."""
+"""What became of a flight: its outcome, the line that states it, and the exit status."""
 
 import logging
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.course import CourseGate, CourseProgress
 from mavbridge.core.errors import ExitCode
+from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
-from mavbridge.gate.wire import GateSummary
+from mavbridge.core.vehicle import FlightEnd
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.wire import GateStatus, GateSummary
+from mavbridge.recording.crash import CrashWatch
 
 _log = logging.getLogger(__name__)
+RUN_OUT_NS = NS_PER_S
+"""From the last gate to the end of the flight: a crash just behind the gate still counts."""
+_ENDS: dict[FlightEnd, str] = {
+    "course": "the end of the course",
+    "duration": "--duration",
+    "landed": "a landing",
+    "operator": "the operator",
+    "signal": "a signal",
+    "takeover": "a takeover",
+    "disarmed": "disarming",
+    "fault": "a fault",
+}
+_UNPLANNED = ("takeover", "disarmed", "fault")
+
+
+class FlightReferee:
+    """A ``TickSink`` that follows the policy's flight to its outcome; other threads may ask it."""
+
+    def __init__(self, gates: Sequence[CourseGate] | None) -> None:
+        """``gates``: of the course, in order; None where no course was named."""
+        self._gates_total = len(gates) if gates else None
+        self._course = CourseProgress(gates or ())
+        self._crashes = CrashWatch()
+        self._began_ns = 0
+        self._flown: Tick | None = None
+        """The last one in which the policy had the sticks."""
+        self._has_position = self._is_flying = False
+        self._reason = ""
+
+    def emit(self, event: Event) -> None:
+        """Follow the ticks from the policy's first action on."""
+        if not isinstance(event, Tick):
+            return
+        was_flying, self._is_flying = self._is_flying, event.phase == Phase.FLYING.value
+        if self._is_flying:
+            self._began_ns = self._began_ns or event.sent_ns
+            self._flown = event
+            self._has_position = self._has_position or event.position_ned_m is not None
+        elif was_flying:
+            self._reason = event.release_reason or ""
+        if self._began_ns:
+            self._course.update(event.position_ned_m if self._is_flying else None, event.sent_ns)
+            self._crashes.see(event)
+
+    @property
+    def has_flown(self) -> bool:
+        """The policy has had the sticks."""
+        return self._flown is not None
+
+    @property
+    def crash(self) -> str | None:
+        """How the vehicle was seen to have hit something so far, in words."""
+        return self._crashes.reason
+
+    def is_course_over(self, now_ns: int) -> bool:
+        """The last gate was passed, and the run-out behind it is over."""
+        return self._course.is_done and now_ns - self._course.passed_ns[-1] >= RUN_OUT_NS
+
+    def outcome(self, end: FlightEnd, vehicle: GateStatus) -> FlightOutcome | None:
+        """The outcome of a flight that ended so; None if the policy has not flown."""
+        if (flown := self._flown) is None:
+            return None
+        position, state, passed_ns = flown.position_ned_m, flown.state, self._course.passed_ns
+        knows_gates = self._gates_total is not None and self._has_position
+        return FlightOutcome(
+            end=end,
+            reason=self._reason,
+            flown_s=(flown.sent_ns - self._began_ns) / NS_PER_S,
+            height_m=None if position is None else -position.down,
+            speed_mps=None if state is None else math.hypot(*state.values[:3].tolist()),
+            mode=vehicle.mode,
+            is_armed=vehicle.armed,
+            is_landed=vehicle.is_landed,
+            gates_total=self._gates_total,
+            gates_passed=len(passed_ns) if knows_gates else None,
+            course_s=(passed_ns[-1] - self._began_ns) / NS_PER_S if passed_ns else None,
+            course_speed_mps=self._course.speed_mps,
+            crash=self.crash,
+        )
+
+
+def describe(outcome: FlightOutcome) -> str:
+    """State the outcome in one line."""
+    course: list[str] = []
+    if outcome.gates_total is not None:
+        passed = "no position: ?" if outcome.gates_passed is None else outcome.gates_passed
+        in_s = "" if outcome.course_s is None else f" in {outcome.course_s:.1f} s"
+        course.append(f"{passed} of {outcome.gates_total} gates{in_s}")
+        if outcome.course_speed_mps is not None:
+            course.append(f"{outcome.course_speed_mps:.1f} m/s")
+    if outcome.crash is not None:
+        course.append(outcome.crash)
+    elif course:
+        course.append("no contact seen")
+    if outcome.end == "course":
+        return ", ".join(course)
+    left = [f"ended by {_ENDS[outcome.end]} after {outcome.flown_s:.1f} s"]
+    if outcome.height_m is not None:
+        left.append(f"at {outcome.height_m:.1f} m")
+    if outcome.speed_mps is not None:
+        left.append(f"{outcome.speed_mps:.1f} m/s")
+    state = "landed" if outcome.is_landed else "armed" if outcome.is_armed else "disarmed"
+    left.append(f"now {state} in {outcome.mode}")
+    text = "; ".join(", ".join(part) for part in (course, left) if part)
+    return f"{text}: {outcome.reason}" if outcome.end in _UNPLANNED else text
 
 
 class Verdict(NamedTuple):
@@ -19,7 +132,12 @@ class Verdict(NamedTuple):
 
 
 def flight_verdict(
-    summary: GateSummary | None, stop: StopRequest, *, reason: str, readonly: bool
+    summary: GateSummary | None,
+    stop: StopRequest,
+    *,
+    reason: str,
+    readonly: bool,
+    crash: str | None = None,
 ) -> Verdict:
     """Judge a flight that ended without an exception.
 
@@ -28,6 +146,7 @@ def flight_verdict(
         stop: the signals that have come.
         reason: why the policy does not fly now, from the last tick.
         readonly: nothing was sent, so there was nothing to fly.
+        crash: how the vehicle hit something since the policy's first action, in words.
     """
     interrupted = None if stop.signal_number is None else 128 + stop.signal_number
     if summary is None:
@@ -35,6 +154,8 @@ def flight_verdict(
     outcome = summary.outcome
     if outcome.faults:
         return Verdict(ExitCode.FAULT, "the policy's flight was ended by a fault")
+    if crash is not None and not readonly:
+        return Verdict(ExitCode.CRASHED, f"the vehicle has crashed: {crash}")
     if readonly and outcome.flights:
         return Verdict(ExitCode.DONE)
     if not outcome.flights:

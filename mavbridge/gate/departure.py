@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.vehicle import OnFault
+from mavbridge.core.vehicle import FlightEnd, OnFault
 from mavbridge.gate.facts import Facts, Hand, Move
 
 NEUTRAL_NS = 50 * NS_PER_MS
@@ -27,6 +27,8 @@ class Ending:
 
     reason: str
     is_fault: bool = False
+    end: FlightEnd = "signal"
+    """Code of an end that is no fault."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

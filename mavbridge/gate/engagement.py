@@ -8,6 +8,7 @@ from enum import Enum
 from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.vehicle import FlightEnd
 from mavbridge.gate.departure import Departure, DepartureSettings, Ending
 from mavbridge.gate.facts import Facts, Hand, Move
 from mavbridge.gate.outcome import Outcome
@@ -252,7 +253,8 @@ class Engagement:
     def _take_off(self, facts: Facts) -> Move:
         """The policy takes the sticks."""
         self.phase = Phase.FLYING
-        self.outcome = self.outcome._replace(flights=self.outcome.flights + 1, is_disarmed=False)
+        flights = self.outcome.flights + 1
+        self.outcome = self.outcome._replace(flights=flights, is_disarmed=False, end=None)
         self.reason = ""
         self._own_mode = facts.mode
         self._seen_interruption = facts.interruption
@@ -268,13 +270,13 @@ class Engagement:
         if (stop := self._stop_reason) is not None:
             return self._fail(facts, stop) if stop.is_fault else self._depart(facts, stop)
         if act == "release":
-            return self._depart(facts, Ending(reason=OPERATOR))
+            return self._depart(facts, Ending(reason=OPERATOR, end="operator"))
         if self._is_over(facts):
-            over = Ending(reason="the flight is over")
+            over = Ending(reason="the flight is over", end="duration")
             self.stop(over)
             return self._depart(facts, over)
         if facts.landing is not None:
-            return self._depart(facts, Ending(reason=facts.landing))
+            return self._depart(facts, Ending(reason=facts.landing, end="landed"))
         fault = facts.link_problem or facts.chunk_fault or facts.envelope_problem
         if fault is not None:
             return self._fail(facts, Ending(reason=fault, is_fault=True))
@@ -325,8 +327,9 @@ class Engagement:
 
         There silence would be the policy's last lean or body rate for one to three seconds.
         """
-        if not facts.armed and self.phase is Phase.FLYING:
-            self.outcome = self.outcome._replace(is_disarmed=True)
+        if self.phase is Phase.FLYING:
+            end: FlightEnd = "takeover" if facts.armed else "disarmed"
+            self.outcome = self.outcome._replace(is_disarmed=not facts.armed, end=end)
         if not self._follows_us(facts):
             return self._give_back(facts, reason)
         self._seen_interruption = facts.interruption
@@ -346,6 +349,9 @@ class Engagement:
         is_ours = (self._preparation.arms and facts.armed) or self._follows_us(facts)
         if self.phase is Phase.PREPARING and not is_ours:
             return self._give_back(facts, ending.reason)  # we never had the sticks in the air
+        if self.phase is Phase.FLYING and self.outcome.end is None:
+            end = "fault" if ending.is_fault else ending.end
+            self.outcome = self.outcome._replace(end=end)
         self.phase = Phase.LEAVING
         self.reason = ending.reason
         self._must_end = self._must_end and ending is not self._stop_reason

@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from mavbridge.core.vehicle import FlightEnd
+
 
 class Outcome(NamedTuple):
     """How the policy's flights went, from one act to its end each, as far as they have come."""
@@ -14,3 +16,5 @@ class Outcome(NamedTuple):
     """Those that ended by a fault of ours."""
     is_disarmed: bool = False
     """The last one ended because the vehicle was disarmed, by itself or by somebody."""
+    end: FlightEnd | None = None
+    """How the last one ended; None before that."""

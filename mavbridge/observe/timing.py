@@ -6,7 +6,7 @@ from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.records import Event, Tick
+from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
 
 MAX_RELEASES = 1000
@@ -90,6 +90,8 @@ class TimingReport:
     engine: str
     policy: str
     autopilot: str | None
+    outcome: FlightOutcome | None
+    """None where no policy has flown."""
     sticks: SticksReport
     action: ActionReport
     vision: VisionReport
@@ -175,6 +177,7 @@ class FlightTiming:
         autopilot: str | None,
         link: LinkStats | None,
         observer_drops: ObserverDrops,
+        outcome: FlightOutcome | None = None,
     ) -> TimingReport:
         """The figures so far; exact once the loops have stopped."""
         return TimingReport(
@@ -183,6 +186,7 @@ class FlightTiming:
             engine=engine,
             policy=policy,
             autopilot=autopilot,
+            outcome=outcome,
             sticks=self._sticks.report(),
             action=self._chunks.report(),
             vision=VisionReport(

@@ -2,11 +2,12 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.records import FlightOutcome
 from mavbridge.recording.folder import META
 from policy.contract import Contract
 from policy.errors import ContractError
@@ -56,10 +57,13 @@ class FlightMeta:
     packets_dropped: int | None = None
     """Each of the three counts what was lost before the last row of its file."""
     success: bool | None = None
-    """Whether it is an example to follow: by the course, by its pilot's mark, False by a crash."""
+    """Whether it is an example to follow: by its pilot's mark, else by the course and the outcome;
+    False after a crash or a fault."""
     crash: str | None = None
     """How it was seen to have crashed, in words."""
     gates_passed: int | None = None
+    outcome: FlightOutcome | None = None
+    """How the policy's flight ended; None where none flew, and in older flights."""
     conditions: dict[str, float] = field(default_factory=dict)
     """Physical quantities that were randomised, by name."""
     command: tuple[str, ...] = ()
@@ -74,6 +78,11 @@ class FlightMeta:
     """Source of each camera, by its name in the contract."""
     parameters: dict[str, float] = field(default_factory=dict)
     """Parameters of the autopilot that matter to the flight, by name, as read from it."""
+
+    def with_outcome(self, outcome: FlightOutcome) -> "FlightMeta":
+        """Add the outcome, and judge by it whether the flight is an example, if nobody has."""
+        success = outcome.success if self.success is None else self.success
+        return replace(self, outcome=outcome, success=success)
 
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:
@@ -130,6 +139,8 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
     try:
         if known.get("contract") is not None:
             known["contract"] = Contract.from_json(json.dumps(known["contract"]))
+        if known.get("outcome") is not None:
+            known["outcome"] = FlightOutcome(**known["outcome"])
         known["command"] = tuple(known.get("command", ()))
         meta = FlightMeta(**known)
     except (TypeError, ContractError) as error:

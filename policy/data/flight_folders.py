@@ -1,5 +1,6 @@
 """Reads the project's flight folders (docs/formats/flight_folder.md)."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -57,39 +58,56 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys(flight.resolve() for flight in found))
 
 
-def is_exemplary(folder: Path) -> bool:
-    """False for a flight that failed: flying into a gate's frame is not to be imitated.
+def failure_of(folder: Path) -> str | None:
+    """How a flight has failed; None: it may be imitated, which flying into a gate's frame may not.
 
-    It missed gates as a demonstration, its pilot has marked it as bad, it crashed, or it ended
-    before its policy sent anything. A policy's flight that an expert has labelled ("dagger") is
-    learnt from whatever became of it.
+    ``success``, where somebody wrote it, decides; else a crash, a fault that ended it, or the end
+    of its process. A policy's flight that an expert has labelled ("dagger") is learnt from whatever
+    became of it.
     """
     meta = _read_meta(folder)
+    outcome = meta.get("outcome")
+    outcome = outcome if isinstance(outcome, dict) else {}
+    source, success = meta.get("source"), meta.get("success")
     if meta.get("ticks") == 0:
-        return False
-    return meta.get("source") == "dagger" or meta.get("success") is not False
+        return "empty"
+    if source == "dagger" or success is True:
+        return None
+    if meta.get("crash") or outcome.get("crash"):
+        return "crashed"
+    if outcome.get("end") == "fault":
+        return "ended by a fault"
+    if source == "flight" and meta.get("finished") is False:
+        return "cut off"
+    if success is False:
+        return "marked as bad" if source == "pilot" else "off the course"
+    return None
 
 
 def leave_out_failed(
     folders: Sequence[Path], *, include_failed: bool
 ) -> tuple[list[Path], str | None]:
-    """The flights to learn from, and a line that says how many were left out.
+    """The flights to learn from, and a line that says how many were left out, and why.
 
     Raises:
         DatasetError: every flight has failed.
     """
-    exemplary = [folder for folder in folders if include_failed or is_exemplary(folder)]
-    failed = len(folders) - len(exemplary)
-    if folders and not exemplary:
-        raise DatasetError(
-            f"all {failed} flights have failed (crashed, marked as bad, or off the course): "
-            "--include-failed takes them all the same"
-        )
-    if not failed:
+    if include_failed:
+        return list(folders), None
+    failures = {folder: failure_of(folder) for folder in folders}
+    exemplary = [folder for folder in folders if failures[folder] is None]
+    counts = Counter(why for why in failures.values() if why is not None)
+    if not counts:
         return exemplary, None
+    failed = counts.total()
+    why = ", ".join(f"{count} {kind}" for kind, count in counts.most_common())
+    if not exemplary:
+        raise DatasetError(
+            f"all {failed} flights have failed ({why}): --include-failed takes them all the same"
+        )
     return exemplary, (
-        f"left out: {failed} of {len(folders)} flights that failed (crashed, marked as bad, or off "
-        "the course); --include-failed takes them in"
+        f"left out: {failed} of {len(folders)} flights that failed ({why}); --include-failed takes "
+        "them in"
     )
 
 

@@ -69,18 +69,34 @@ class ResnetUnet(nn.Module):
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition
 
+    def encode_observation(
+        self, image: Tensor, state: Tensor, action_history: Tensor | None = None
+    ) -> Tensor:
+        """Image, state, history [B, K, 4] or None (no action sent yet) -> condition [B, C].
+
+        Raises:
+            PolicyError: a shape is not the contract's.
+        """
+        contract = self.contract
+        if action_history is None:
+            action_history = state.new_zeros(len(state), contract.history_len, ACTION_DIM)
+        require_shape("image", image, 3, contract.image_height, contract.image_width)
+        require_shape("state", state, contract.state_dim)
+        require_shape("action_history", action_history, contract.history_len, ACTION_DIM)
+        visual = self.visual_projection(self.backbone(image))
+        return self.condition(visual, self.state_encoder(state), action_history)
+
     def predict(
-        self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int = 10
+        self,
+        image: Tensor,
+        state: Tensor,
+        action_history: Tensor | None = None,
+        num_diffusion_steps: int = 10,
     ) -> Tensor:
         """Image, state and history -> chunk [B, horizon, 4] in [-1, 1].
 
         Raises:
             PolicyError: a shape is not the contract's, or the steps are not 1..100.
         """
-        contract = self.contract
-        require_shape("image", image, 3, contract.image_height, contract.image_width)
-        require_shape("state", state, contract.state_dim)
-        require_shape("action_history", action_history, contract.history_len, ACTION_DIM)
-        visual = self.visual_projection(self.backbone(image))
-        condition = self.condition(visual, self.state_encoder(state), action_history)
+        condition = self.encode_observation(image, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)

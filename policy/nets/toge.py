@@ -86,11 +86,11 @@ class Toge(nn.Module):
         return feature
 
     def encode_and_fuse(
-        self, feature: Tensor, state: Tensor, action_history: Tensor | None
+        self, feature: Tensor, state: Tensor, action_history: Tensor | None = None
     ) -> Tensor:
         """Feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
 
-        No history is the same as sticks that were centred all the time: training shows both so.
+        None: no action was sent yet. Training shows that as sticks that were always centred.
         """
         require_shape("feature", feature, self.contract.feature_dim)
         require_shape("state", state, self.contract.state_dim)
@@ -98,6 +98,12 @@ class Toge(nn.Module):
             action_history = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
         require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
         return self.condition(feature, self.state_encoder(state), action_history)
+
+    def encode_observation(
+        self, image: Tensor, state: Tensor, action_history: Tensor | None = None
+    ) -> Tensor:
+        """``encode_visual``, then ``encode_and_fuse``: image, state, history -> condition."""
+        return self.encode_and_fuse(self.encode_visual(image), state, action_history)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
         """Feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
@@ -108,7 +114,7 @@ class Toge(nn.Module):
         self,
         feature: Tensor,
         state: Tensor,
-        action_history: Tensor | None,
+        action_history: Tensor | None = None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
         """Cached feature, newest state and history -> chunk [B, horizon, 4] in [-1, 1]."""
@@ -143,7 +149,7 @@ class Toge(nn.Module):
         self,
         image: Tensor,
         state: Tensor,
-        action_history: Tensor | None,
+        action_history: Tensor | None = None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
         """The image is encoded once, then as ``predict_fast``: bit for bit the same chunk."""

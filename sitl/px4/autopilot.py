@@ -10,6 +10,7 @@ from dataclasses import replace
 from enum import Enum
 
 from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.firmware import StatusText
 from sitl.px4.commander import Commander
 from sitl.px4.control import SIH_QUAD
 from sitl.px4.flight import STOPPED, FlightControl
@@ -109,6 +110,11 @@ class Autopilot:
     def armed(self) -> bool:
         """The motors may turn."""
         return self.commander.armed
+
+    @property
+    def texts(self) -> list[StatusText]:
+        """Texts that every link is to send next."""
+        return self.commander.texts
 
     @property
     def in_failsafe(self) -> bool:

@@ -32,7 +32,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.stopping import INTERRUPTED, StopRequest, stop_on_signals
 from policy.data.flight_data import FlightData
-from policy.data.flight_folders import find_flights, is_exemplary
+from policy.data.flight_folders import failure_of, find_flights
 from policy.world_model.config import WorldModelConfig
 
 ITERATIONS = 10
@@ -80,7 +80,7 @@ class _Evaluation:
         """Read, imagine and score everything."""
         config, model = self.config, self.model
         folders = find_flights(paths)
-        exemplary = [folder for folder in folders if is_exemplary(folder)]
+        exemplary = [folder for folder in folders if failure_of(folder) is None]
         reading = self._until_stopped(exemplary, "reading", len(exemplary))
         episodes = [read_episode(folder, model) for folder in reading]
         scorer, flights = self._score_windows(episodes)

@@ -19,7 +19,7 @@ class ExportConfig:
     task: str = "fly"
     """Task of the flights, in words, for policies that are given one."""
     include_failed: Annotated[bool, Parameter(negative="")] = False
-    """Export flights, too, that crashed, were marked as bad, or missed gates."""
+    """Export flights, too, that crashed, ended by a fault, were marked as bad, or missed gates."""
     image_size: int | None = None
     """Height and width of the images, as the policy is to see them; by default as recorded."""
     state: Literal["world", "body"] = "world"

@@ -30,16 +30,16 @@ class ImagineConfig:
     """Seconds into the flight, from its first frame with a state."""
     n_iter: int = 8
     """Iterations: a decision, and a simulation of its consequences."""
-    frames: int = 16
-    """Imagined frames of each iteration that are shown."""
     exe_steps: int = 1
-    """Steps that are executed before the next decision; --frames 1 shows these alone."""
+    """Steps that are executed before the next decision."""
+    frames: int | None = None
+    """Imagined frames that a segment of the video holds; by default the executed ones."""
     ddim_steps: int = 4
     """DDIM steps of the world model."""
     decode_video: bool = True
     """Write a video; without it only the rows are written."""
-    fast_policy_no_decode: bool = True
-    """Let the world model decide from its latents; otherwise they are decoded and encoded again."""
+    fast_policy_no_decode: bool = False
+    """Let the world model decide from its latents, without decoding and encoding them again."""
     serial: bool = False
     """Take the plain way, for comparison: decode everything at once, write it all at the end."""
     rerun: Annotated[str, Parameter(help="spawn, connect[=URL], FILE.rrd, or off.")] = "off"
@@ -48,7 +48,8 @@ class ImagineConfig:
         """Refuse values out of range."""
         check_range("start-at", self.start_at, 0, 86400, "s")
         check_range("n-iter", self.n_iter, 1, 1_000_000, "")
-        check_range("frames", self.frames, 1, 256, "")
+        if self.frames is not None:
+            check_range("frames", self.frames, 1, 256, "")
         check_range("exe-steps", self.exe_steps, 1, 256, "")
         check_range("ddim-steps", self.ddim_steps, 1, 1000, "")
 

@@ -42,7 +42,7 @@ def imagine(config: ImagineConfig) -> int:
     clock = MonotonicClock()
     plan = RolloutPlan(
         iterations=config.n_iter,
-        frames=config.frames,
+        frames=config.frames or config.exe_steps,
         exe_steps=config.exe_steps,
         ddim_steps=config.ddim_steps,
         seed=config.policy.seed,
@@ -51,8 +51,9 @@ def imagine(config: ImagineConfig) -> int:
     flight = open_flight(config.start)
     model = load_model(config.world_model, ddim_steps=plan.ddim_steps, device=config.policy.device)
     if plan.frames > model.config.frames:
+        flag = "--frames" if config.frames else "--exe-steps"
         raise UserError(
-            f"--frames {plan.frames} is more than the {model.config.frames} that the world model "
+            f"{flag} {plan.frames} is more than the {model.config.frames} that the world model "
             "imagines: lower it"
         )
     start = read_start(flight, model.config, config.start_at)

@@ -145,6 +145,7 @@ def _report(
         autopilot=meta.autopilot,
         link=None,
         observer_drops=ObserverDrops(rerun=None, recorder=_losses(flight)),
+        outcome=meta.outcome,
     )
     return replace(report, vision=_vision(frames, meta.visual_hz))
 

@@ -15,6 +15,7 @@ from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.series import FloatColumn, Series
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Percentiles
+from mavbridge.flight.outcome import describe
 
 MAX_POINTS = 20_000
 """Points of a line: four times the pixels of a wide screen. Longer flights keep both extremes."""
@@ -81,6 +82,8 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     yield "when", f"{meta.started_at}, {report.duration_s:.1f} s", False
     if meta.crash is not None:
         yield "crashed", meta.crash, True
+    if meta.outcome is not None:
+        yield "outcome", describe(meta.outcome), meta.success is False
     if not meta.finished:
         yield "recording", "cut off: shown up to its last whole batch of rows", True
     if meta.gates_passed is not None:

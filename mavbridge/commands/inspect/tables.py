@@ -11,6 +11,7 @@ from rich.text import Text
 from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.holders import HolderSpan
 from mavbridge.core.vehicle import Percentiles
+from mavbridge.flight.outcome import describe
 from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
 
 HOLDERS_SHOWN = 12
@@ -65,6 +66,8 @@ def _facts(flight: FlightAnalysis) -> Iterator[Text]:
         yield Text("cut off: it is shown up to its last whole batch of rows", style="yellow")
     if meta.crash is not None:
         yield Text(f"crashed: {meta.crash}", style="red")
+    if meta.outcome is not None:
+        yield Text(describe(meta.outcome))
     if meta.gates_passed is not None:
         result = {True: "finished", False: "not finished", None: "no verdict"}[meta.success]
         yield Text(f"course {meta.course_seed}: {meta.gates_passed} gates passed, {result}")

@@ -35,7 +35,8 @@ from policy.protocol import Executable
 
 PREPARE_NS = 10 * NS_PER_MS
 """Longest time between two looks at the link, as while no policy is loaded."""
-_OWN_ENDINGS = ("the flight was ended by", "the policy has ", "the encoder ", "the camera ")
+_PLANNED = ("the flight was ended by", "the course is done")
+_OWN_ENDINGS = (*_PLANNED, "the policy has ", "the encoder ", "the camera ")
 """How the reasons begin for which the flight process asks the gate to end."""
 
 
@@ -221,7 +222,7 @@ def _stop(before: Tick | None, tick: Tick) -> Ending | None:
     was = None if before is None else before.phase
     reason = tick.release_reason or ""
     if tick.phase != was and reason.startswith(_OWN_ENDINGS):
-        return Ending(reason=reason, is_fault=not reason.startswith(_OWN_ENDINGS[0]))
+        return Ending(reason=reason, is_fault=not reason.startswith(_PLANNED))
     if tick.phase == Phase.ENDED.value != was:  # the second of two stops counts for nothing
         return Ending(reason="the flight was ended by a signal")
     return None

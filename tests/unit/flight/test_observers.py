@@ -34,7 +34,7 @@ def observers(report: Path, said: io.StringIO) -> FlightObservers:
 
 def test_a_report_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     said = io.StringIO()
-    observers(tmp_path, said).finish(None, "ardupilot")
+    observers(tmp_path, said).finish(None, "ardupilot", None)
     assert f"--report {tmp_path}: Is a directory" in said.getvalue()
 
 
@@ -49,5 +49,5 @@ def test_the_terminal_is_given_back_even_if_the_report_fails(
     monkeypatch.setattr(watching.screen, "show_report", fail)
     monkeypatch.setattr(watching.screen, "close", closed.append)
     with pytest.raises(RuntimeError, match="a bug"):
-        watching.finish(None, "ardupilot")
+        watching.finish(None, "ardupilot", None)
     assert closed

@@ -1,15 +1,20 @@
-"""What a script is told about a flight."""
+"""What a script and a person are told about a flight."""
 
 import signal
+from typing import Any
 
+import numpy as np
 import pytest
 
+from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.fakes import FakeClock
+from mavbridge.core.course import CourseGate
+from mavbridge.core.records import FlightOutcome, Position, Tick
 from mavbridge.core.stopping import StopRequest
-from mavbridge.core.vehicle import LinkStats
-from mavbridge.flight.outcome import flight_verdict
+from mavbridge.core.vehicle import FlightEnd, LinkStats
+from mavbridge.flight.outcome import RUN_OUT_NS, FlightReferee, describe, flight_verdict
 from mavbridge.gate.outcome import Outcome
-from mavbridge.gate.wire import GateSummary
+from mavbridge.gate.wire import GateStatus, GateSummary
 
 FLOWN = Outcome(flights=1, has_left_ground=True)
 STATS = LinkStats(
@@ -72,3 +77,102 @@ def test_a_flight_that_sends_nothing_needs_no_air() -> None:
     assert flight_verdict(watched, stopped(None), reason="", readonly=True).exit_code == 0
     unseen = summary(Outcome())
     assert flight_verdict(unseen, stopped(None), reason="", readonly=True).exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("outcome", "number", "status"),
+    [
+        (FLOWN, None, 6),
+        (FLOWN, signal.SIGINT, 6),
+        (FLOWN._replace(is_disarmed=True), None, 6),
+        (FLOWN._replace(faults=1), None, 4),
+        (None, None, 3),
+    ],
+)
+def test_a_flight_that_hit_something_is_never_a_success(
+    outcome: Outcome | None, number: int | None, status: int
+) -> None:
+    words = None if outcome is None else summary(outcome)
+    verdict = flight_verdict(
+        words, stopped(number), reason="", readonly=False, crash="it hit gate 7"
+    )
+    assert verdict.exit_code == status
+
+
+GATES = [CourseGate(Position(north, 0.0, -2.0), 0.0, 2.4) for north in (4.0, 8.0)]
+HOVERING = GateStatus("ardupilot", "LOITER", True, False, (), None)
+
+
+def course_ticks(count: int, **changes: Any) -> list[Tick]:
+    """Flight to the north at 10 m/s, from 2 m up at the origin: gates after 0.4 and 0.8 s."""
+    speed = np.array([6.0, 8.0, 0.0, 1, 0, 0, 0, 0, 0, 0, 0, 0, -9.8], np.float32)
+    return [
+        make_tick(
+            index,
+            phase="flying",
+            position_ned_m=Position(0.1 * index, 0.0, -2.0),
+            state=make_state(values=speed),
+            **changes,
+        )
+        for index in range(count)
+    ]
+
+
+def judged(
+    ticks: list[Tick], end: FlightEnd, *, gates: list[CourseGate] | None = GATES
+) -> FlightOutcome:
+    referee = FlightReferee(gates)
+    for tick in ticks:
+        referee.emit(tick)
+    outcome = referee.outcome(end, HOVERING)
+    assert outcome is not None
+    return outcome
+
+
+def test_a_course_is_over_a_second_after_its_last_gate() -> None:
+    referee, ticks = FlightReferee(GATES), course_ticks(300)
+    over = [
+        tick.index for tick in ticks if referee.emit(tick) or referee.is_course_over(tick.sent_ns)
+    ]
+    assert over[0] == 80 + RUN_OUT_NS // 10_000_000
+    outcome = referee.outcome("course", HOVERING)
+    assert outcome is not None
+    assert (outcome.gates_passed, outcome.gates_total, outcome.success) == (2, 2, True)
+    assert outcome.course_s == pytest.approx(0.8)
+    assert outcome.course_speed_mps == pytest.approx(10.0)
+    assert describe(outcome) == "2 of 2 gates in 0.8 s, 10.0 m/s, no contact seen"
+
+
+def test_without_gates_a_flight_is_told_by_its_end() -> None:
+    outcome = judged(course_ticks(201), "duration", gates=None)
+    assert (outcome.gates_total, outcome.gates_passed, outcome.success) == (None, None, None)
+    assert (outcome.height_m, outcome.speed_mps) == (2.0, 10.0)
+    told = "ended by --duration after 2.0 s, at 2.0 m, 10.0 m/s, now armed in LOITER"
+    assert describe(outcome) == told
+    assert not FlightReferee(None).is_course_over(10**18)
+    assert FlightReferee(GATES).outcome("signal", HOVERING) is None, "nobody has flown"
+
+
+def test_a_fault_names_its_reason_and_is_no_example() -> None:
+    fault = make_released_tick(61, "no chunk for 100 ms", phase="leaving")
+    outcome = judged([*course_ticks(61), fault], "fault")
+    assert (outcome.end, outcome.success, outcome.gates_passed) == ("fault", False, 1)
+    assert describe(outcome) == (
+        "1 of 2 gates in 0.4 s, no contact seen; ended by a fault after 0.6 s, at 2.0 m, 10.0 m/s, "
+        "now armed in LOITER: no chunk for 100 ms"
+    )
+
+
+def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_gate() -> None:
+    hit = make_tick(90, phase="flying", texts=("vehicle: Crash: hit gate 1 at 9.9 m/s",))
+    outcome = judged([*course_ticks(90), hit], "course")
+    assert (outcome.gates_passed, outcome.success) == (2, False)
+    assert describe(outcome).endswith(", the vehicle said 'Crash: hit gate 1 at 9.9 m/s'")
+    before = make_released_tick(0, phase="waiting", texts=("vehicle: Crash: Disarming",))
+    assert judged([before, *course_ticks(100)], "course").crash is None
+
+
+def test_a_vehicle_without_a_position_passes_no_gate_and_misses_none() -> None:
+    outcome = judged([make_tick(k, phase="flying") for k in range(50)], "duration")
+    assert (outcome.gates_total, outcome.gates_passed, outcome.success) == (2, None, None)
+    assert describe(outcome).startswith("no position: ? of 2 gates, no contact seen; ended by")

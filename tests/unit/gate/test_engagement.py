@@ -372,18 +372,20 @@ def test_an_act_while_the_last_flight_ends_is_refused_aloud(phase: str) -> None:
 def test_a_flight_in_order_is_told_so() -> None:
     stepped = flying()
     stepped.run(1, is_landed=False)
-    stepped.engagement.stop(Ending(reason="the flight is over"))
+    stepped.engagement.stop(Ending(reason="the course is done", end="course"))
     stepped.run(1)
-    assert stepped.engagement.outcome == Outcome(flights=1, has_left_ground=True)
+    expected = Outcome(flights=1, has_left_ground=True, end="course")
+    assert stepped.engagement.outcome == expected
 
 
 @pytest.mark.parametrize(
     ("changes", "ended"),
     [
-        ({"chunk_fault": "no chunk for 100 ms"}, {"faults": 1}),
-        ({"link_problem": "lost"}, {"faults": 1}),
-        ({"armed": False}, {"is_disarmed": True}),
-        ({"mode": "LOITER"}, {}),  # the pilot has taken over, and goes on
+        ({"chunk_fault": "no chunk for 100 ms"}, {"faults": 1, "end": "fault"}),
+        ({"link_problem": "lost"}, {"faults": 1, "end": "fault"}),
+        ({"armed": False}, {"is_disarmed": True, "end": "disarmed"}),
+        ({"mode": "LOITER"}, {"end": "takeover"}),  # the pilot has taken over, and goes on
+        ({"landing": "the vehicle has landed"}, {"end": "landed"}),
     ],
 )
 def test_how_a_flight_ended_is_told(changes: dict[str, Any], ended: dict[str, Any]) -> None:
@@ -392,6 +394,21 @@ def test_how_a_flight_ended_is_told(changes: dict[str, Any], ended: dict[str, An
     stepped.run(0.1, **changes)
     expected = Outcome(flights=1, has_left_ground=True)._replace(**ended)
     assert stepped.engagement.outcome == expected
+
+
+def test_each_planned_end_has_its_code_until_the_next_flight() -> None:
+    stepped = flying()
+    stepped.step("release")
+    assert stepped.engagement.outcome.end == "operator"
+    stepped.run(2, is_released=True)
+    stepped.step("engage")
+    assert stepped.engagement.outcome.end is None
+    stepped.engagement.stop(Ending(reason="the flight was ended by a signal"))
+    stepped.step()
+    assert stepped.engagement.outcome.end == "signal"
+    timed = flying(duration_ns=NS_PER_S)
+    timed.run(1.1)
+    assert timed.engagement.outcome.end == "duration"
 
 
 def test_a_vehicle_that_stays_on_the_ground_is_told() -> None:

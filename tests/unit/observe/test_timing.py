@@ -235,7 +235,8 @@ def test_json_has_the_keys_of_the_report_in_order() -> None:
     timing.emit(make_tick(1))
     document = json.loads(report_json(report_of(timing, LINK)))
     assert list(document) == [
-        *("duration_s", "mode", "engine", "policy", "autopilot", "sticks", "action", "vision"),
+        *("duration_s", "mode", "engine", "policy", "autopilot", "outcome"),
+        *("sticks", "action", "vision"),
         *("feature_age_ms", "state_age_ms", "state_to_wire_ms", "link", "releases"),
         *("release_count", "observer_drops"),
     ]

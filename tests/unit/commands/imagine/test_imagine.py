@@ -83,7 +83,8 @@ def test_ours_and_serial_print_the_same_digest(
     for name in ("ours", "serial"):
         out = tmp_path / f"{name}.mp4"
         more = ("--serial",) if name == "serial" else ()
-        status, text = imagine("--out", str(out), "--n-iter", "3", "--seed", "5", *decider, *more)
+        flags = ("--n-iter", "3", "--frames", "16", "--seed", "5", *decider, *more)
+        status, text = imagine("--out", str(out), *flags)
         assert status == 0, text
         assert count_frames(out) == read_rows(out).num_rows == 48
         digests.append(digest(text))
@@ -108,11 +109,35 @@ def test_without_a_video_there_are_rows_and_nothing_is_decoded(
     imagine: Imagine, tmp_path: Path
 ) -> None:
     out = tmp_path / "a.mp4"
-    status, text = imagine("--out", str(out), "--n-iter", "2", "--no-decode-video")
+    flags = ("--n-iter", "2", "--exe-steps", "16", "--no-decode-video")
+    status, text = imagine("--out", str(out), *flags, "--fast-policy-no-decode")
     assert status == 0, text
     assert "32 rows, no video, 0 decoded" in text
     assert [path.name for path in tmp_path.iterdir()] == ["a.parquet"]
     assert read_rows(out).num_rows == 32
+
+
+@pytest.mark.parametrize(("flags", "decoded"), [((), 2), (("--fast-policy-no-decode",), 0)])
+def test_the_policy_path_decodes_unless_told_otherwise(
+    imagine: Imagine, tmp_path: Path, flags: tuple[str, ...], decoded: int
+) -> None:
+    """Two frames of the first of two segments: the context of the tiny world model."""
+    given = ("--n-iter", "2", "--exe-steps", "5", "--no-decode-video", *flags)
+    status, text = imagine("--out", str(tmp_path / "a.mp4"), *given)
+    assert status == 0, text
+    assert f"10 rows, no video, {decoded} decoded" in text
+
+
+@pytest.mark.parametrize("exe_steps", [1, 5])
+def test_a_segment_holds_the_executed_frames_by_default(
+    imagine: Imagine, tmp_path: Path, exe_steps: int
+) -> None:
+    out = tmp_path / "a.mp4"
+    status, text = imagine("--out", str(out), "--n-iter", "3", "--exe-steps", str(exe_steps))
+    assert status == 0, text
+    rows = read_rows(out)
+    assert count_frames(out) == rows.num_rows == 3 * exe_steps
+    assert all(rows["executed"].to_pylist())
 
 
 def test_rerun_shows_imagined_and_real_frames_states_and_sticks(
@@ -144,7 +169,7 @@ def test_ctrl_c_finishes_what_is_there(
         return sample(self, *arguments, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Sampler, "sample", interrupted)
-    status, text = imagine("--out", str(out), "--n-iter", "1000")
+    status, text = imagine("--out", str(out), "--n-iter", "1000", "--frames", "16")
     assert status == 130
     assert "interrupted" in text
     assert count_frames(out) == read_rows(out).num_rows == 48
@@ -173,6 +198,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
     [
         (["--exe-steps", "5", "--frames", "4"], "--exe-steps 5 is more than --frames 4"),
         (["--frames", "17"], "--frames 17 is more than the 16"),
+        (["--exe-steps", "17"], "--exe-steps 17 is more than the 16"),
         (["--exe-steps", "0"], "exe-steps must be between 1 and 256"),
         (["--n-iter", "0"], "n-iter must be between 1"),
         (["--ddim-steps", "101"], "1..100"),

@@ -27,11 +27,12 @@ def test_the_documented_command_imagines_what_might_come(
     decider: tuple[str, ...], tmp_path: Path
 ) -> None:
     out = tmp_path / "rollout.mp4"
+    flags = ("--n-iter", "2", "--exe-steps", "8", "--out", str(out), *decider)
     with pytest.raises(SystemExit) as stopped:
-        main(["imagine", "--start", str(START), "--n-iter", "2", "--out", str(out), *decider])
+        main(["imagine", "--start", str(START), *flags])
     assert stopped.value.code == 0
     rows, frames = read_rows(out), list(read_video(out))
-    assert rows.num_rows == len(frames) == 32
+    assert rows.num_rows == len(frames) == 16
     first_seen = resize(next(iter(open_flight(START).images())), 64, 64)
     assert psnr_db(frames[0], first_seen) > 15  # a tenth of a second on: the same place
     speed_mps = np.linalg.norm(np.array(rows["state"].to_pylist())[:, :3], axis=1)

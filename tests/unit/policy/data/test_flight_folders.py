@@ -17,8 +17,8 @@ from helpers.flight_folders import (
 )
 from policy.data.flight_data import DatasetError, common_frame, hold_out
 from policy.data.flight_folders import (
+    failure_of,
     find_flights,
-    is_exemplary,
     leave_out_failed,
     read_ages,
     read_flight,
@@ -90,11 +90,13 @@ def test_a_flight_left_behind_by_a_crash_is_read_to_its_last_whole_batch(tmp_pat
 def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_path: Path) -> None:
     for name, success in (("a", True), ("b", False), ("c", None)):
         write_meta(tmp_path / name, source="pilot", success=success)
-    folders = [tmp_path / name for name in "abc"]
+    for name in "de":
+        write_meta(tmp_path / name, source="flight", outcome={"end": "fault"})
+    folders = [tmp_path / name for name in "abcde"]
     kept, note = leave_out_failed(folders, include_failed=False)
     assert kept == [tmp_path / "a", tmp_path / "c"]
     assert note is not None
-    assert "1 of 3 flights" in note
+    assert "3 of 5 flights that failed (2 ended by a fault, 1 marked as bad)" in note
     assert "--include-failed" in note
     assert leave_out_failed(folders, include_failed=True) == (folders, None)
     assert leave_out_failed([], include_failed=False) == ([], None)
@@ -206,24 +208,33 @@ def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("meta", "exemplary"),
+    ("meta", "failure"),
     [
-        ({"source": "demonstration", "success": False}, False),
-        ({"source": "demonstration", "success": True}, True),
-        ({"source": "dagger", "success": False}, True),
-        ({"source": "dagger", "success": False, "ticks": 0}, False),
-        ({"source": "flight", "success": None}, True),
-        ({"source": "flight", "success": False, "crash": "it lay on its back"}, False),
-        ({"source": "pilot", "success": None}, True),
-        ({"source": "pilot", "success": True, "crash": "a hard landing"}, True),
-        ({"source": "pilot", "success": False}, False),
+        ({"source": "demonstration", "success": False}, "off the course"),
+        ({"source": "demonstration", "success": True}, None),
+        ({"source": "dagger", "success": False}, None),
+        ({"source": "dagger", "success": False, "ticks": 0}, "empty"),
+        ({"source": "flight", "success": None}, None),
+        ({"source": "flight", "success": None, "finished": True}, None),
+        ({"source": "flight", "success": None, "finished": False}, "cut off"),
+        ({"source": "flight", "success": None, "outcome": {"end": "duration"}}, None),
+        ({"source": "flight", "success": None, "outcome": {"end": "takeover"}}, None),
+        ({"source": "flight", "success": None, "outcome": {"end": "fault"}}, "ended by a fault"),
+        ({"source": "flight", "success": True, "outcome": {"end": "fault"}}, None),
+        ({"source": "flight", "outcome": {"end": "course", "crash": "hit gate 7"}}, "crashed"),
+        ({"source": "flight", "success": False, "outcome": {"end": "duration"}}, "off the course"),
+        ({"source": "flight", "success": False, "crash": "it lay on its back"}, "crashed"),
+        ({"source": "pilot", "success": None}, None),
+        ({"source": "pilot", "success": None, "finished": False}, None),
+        ({"source": "pilot", "success": True, "crash": "a hard landing"}, None),
+        ({"source": "pilot", "success": False}, "marked as bad"),
     ],
 )
 def test_a_failed_flight_is_nothing_to_imitate(
-    tmp_path: Path, meta: dict[str, object], exemplary: bool
+    tmp_path: Path, meta: dict[str, object], failure: str | None
 ) -> None:
     write_meta(tmp_path / "flight", **meta)
-    assert is_exemplary(tmp_path / "flight") is exemplary
+    assert failure_of(tmp_path / "flight") == failure
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,32 @@ def test_both_paths_agree_bit_for_bit(small_toge: Toge, steps: int, with_history
     assert direct.abs().max() <= 1.0
 
 
+@torch.inference_mode()
+@pytest.mark.parametrize("past", ["left out", "none", "centred", "some"])
+def test_an_observation_is_encoded_as_in_two_parts(small_toge: Toge, past: str) -> None:
+    image, state, history = sample(2)
+    given = {"left out": (), "none": (None,), "centred": (history * 0,), "some": (history,)}[past]
+    feature = small_toge.encode_visual(image)
+    observed = small_toge.encode_observation(image, state, *given)
+    assert torch.equal(observed, small_toge.encode_and_fuse(feature, state, *given))
+    is_padded = torch.equal(observed, small_toge.encode_observation(image, state, history * 0))
+    assert is_padded == (past != "some"), "no action sent yet reads as centred sticks"
+    chunk = small_toge.predict_fast(feature, state, *given)
+    assert torch.equal(chunk, small_toge.head.sample(observed, 10))
+    assert torch.equal(chunk, small_toge.predict(image, state, *given))
+
+
+@torch.inference_mode()
+def test_the_single_rate_network_takes_no_history_either() -> None:
+    image, state, history = sample()
+    contract = Contract(image_height=32, image_width=32)
+    net = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
+    net.seed_noise(1)
+    centred = net.encode_observation(image, state, history * 0)
+    assert torch.equal(net.encode_observation(image, state), centred)
+    assert torch.equal(net.predict(image, state), net.head.sample(centred, 10))
+
+
 def test_keeps_the_protocol_of_a_warm_start(small_toge: Toge) -> None:
     assert isinstance(small_toge, WarmStartPolicy)
     assert small_toge.noise_shares(10, 9)[0] > 0.9 > small_toge.noise_shares(10, 5)[0]

@@ -1,4 +1,5 @@
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course.layout import BAR_M, DEPTH_M, AirborneStart, Course, Gate
@@ -39,8 +40,8 @@ def test_a_straight_way(start, end, struck):
     assert struck_gate(COURSE, start, end) == struck
 
 
-def launched(position_ned_m, *, north_mps, next_gate):
-    config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0)
+def launched(position_ned_m, *, north_mps, next_gate, autopilot="ardupilot"):
+    config = VehicleConfig(autopilot=autopilot, estimator_ready_s=0.0, position_ready_s=0.0)
     vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config, course=COURSE)
     vehicle.launch(
         AirborneStart(
@@ -68,6 +69,22 @@ def test_hitting_a_frame_is_a_crash_and_the_gates_after_it_do_not_count():
     assert summary["crash"]["hit"] == "gate 0"
     assert summary["crash"]["speed_mps"] == pytest.approx(6.0, abs=1.0)
     assert summary["gates"]["passed"] == []
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_every_station_is_told_of_a_crash_once(firmware):
+    vehicle = launched((7.0, 1.1, -2.0), north_mps=6.0, next_gate=0, autopilot=firmware)
+    for _ in range(100):
+        heartbeat = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3)
+        vehicle.receive(0, heartbeat.pack(mav.MAVLink(None, srcSystem=255)), vehicle.ap.now_ns)
+        vehicle.step(vehicle.ap.now_ns + 4 * STEP_NS)
+    parser = mav.MAVLink(None)
+    told = [
+        (message.severity, message.text)
+        for message in parser.parse_buffer(vehicle.take_outgoing(0))
+        if message.get_type() == "STATUSTEXT" and "Crash" in message.text
+    ]
+    assert told == [(2, f"Crash: hit gate 0 at {vehicle.log.crash.speed_mps:.1f} m/s")]
 
 
 def test_a_launched_vehicle_flies_on_from_there():
