@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import get_args
 
 from sitl import UsageError
 from sitl.app import PilotOptions, print_status, run_vehicle
@@ -20,6 +21,7 @@ from sitl.vehicle.conditions import NOMINAL, held_out_conditions, random_conditi
 from sitl.vehicle.config import (
     IDLE_RECEIVER_US,
     MID_RECEIVER_US,
+    Px4Release,
     SigningKey,
     VehicleConfig,
 )
@@ -56,6 +58,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--connect-onboard", action="append", metavar="LINK", help=onboard_help)
     names = ("ardupilot", "px4")
     add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
+    release_help = "PX4 whose parameters, stick override and messages it has (default: 1.18)"
+    add("--px4-release", choices=get_args(Px4Release), default="1.18", help=release_help)
     add(
         "--report", type=Path, metavar="FILE", help="write a report (docs/formats/flight_report.md)"
     )
@@ -131,6 +135,7 @@ def _fly(args: argparse.Namespace) -> None:
         links + onboard,
         VehicleConfig(
             autopilot=args.autopilot,
+            px4_release=args.px4_release,
             onboard_links=frozenset(range(len(links), len(links + onboard))),
             receiver=receiver != "none",
             receiver_us=MID_RECEIVER_US if receiver == "mid" else IDLE_RECEIVER_US,

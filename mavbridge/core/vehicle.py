@@ -188,6 +188,8 @@ class VehicleStatus:
     """The estimator's own verdict on its horizontal position; None = it does not say."""
     battery_problem: str | None = None
     """The vehicle reports its battery as low or failed, in words for the user."""
+    stick_override_ns: int | None = None
+    """When it last said that moving sticks have changed its mode."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,9 +213,11 @@ class ModeRoles:
     """A mode of ``setpoint`` is entered only while setpoints flow already."""
     is_silence_failsafe: bool = False
     """Sticks that end are a failsafe, even where a receiver has the next ones."""
-    stick_rest_ns: int = 0
-    """For that long after a stick has moved, a mode that flies by itself takes the movement for the
-    pilot's hand, and is left at once."""
+    override: str = ""
+    """Entered from a mode that flies by itself when the vehicle takes moving sticks for the pilot's
+    hand; empty: it never does."""
+    needs_sticks_first: bool = False
+    """A mode that sticks fly is refused while the vehicle has none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,6 +238,8 @@ class LinkSnapshot:
     """The vehicle was seen to act on other sticks than ours since the release, or none was sent."""
     shows_last: bool = True
     """Since the release it shows our last sticks, or others that cannot be told from them."""
+    are_sticks_at_rest: bool = True
+    """Our last sticks have moved so little for so long that they pass for nobody's hand."""
     interruption: str | None = None
     """Why every engagement so far is over, or None: the vehicle has rebooted, or now sends from
     another address. Stays as it is once it has happened; a later one has another text."""

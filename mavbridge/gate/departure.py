@@ -16,6 +16,13 @@ SETPOINT_NS = 500 * NS_PER_MS
 """Longest stream of neutral setpoints that waits for the mode on PX4. A vehicle that has not
 answered by then does not hear us, and it goes back to OFFBOARD within 30 ms when it hears a
 setpoint after its own failsafe (COM_OF_LOSS_T, 1 s)."""
+STICK_REST_NS = NS_PER_S
+"""Longest wait for our sticks to be at rest before the safe mode is asked for all the same: a jump
+over the whole range is slower than PX4's least hand, 0.05 a second, after 0.6 s."""
+UNDONE_NS = NS_PER_S
+"""A safe mode that PX4 leaves this soon for moving sticks was left for our jump to neutral."""
+WORD_NS = 100 * NS_PER_MS
+"""Wait for the EVENT that tells it from another station's change of mode, which has none."""
 MIDDLE_STICK = 0.2
 """A receiver's throttle this near to the middle holds height or nearly so (ArduPilot's THR_DZ is
 0.2 of the stick's travel to each side)."""
@@ -52,6 +59,12 @@ class Departure:
         self._began_ns = 0
         self._request_due_ns = 0
         self._is_thrust_mode = False
+        self._asked_ns: int | None = None
+        """The safe mode was last asked for."""
+        self._entered_ns = 0
+        """It was asked for, or seen for the first time after that."""
+        self._undone_ns: int | None = None
+        """The vehicle was first seen in the mode that it enters for a moving stick."""
         self.mode: str | None = None
         """The safe mode that is asked for; a change to it is no takeover."""
         self.must_hold = False
@@ -65,8 +78,7 @@ class Departure:
     def begin(self, facts: Facts, ending: Ending) -> None:
         """Choose the safe mode for the vehicle as it is now."""
         self._began_ns = self._request_due_ns = facts.now_ns
-        if not self._settings.is_setpoint:
-            self._request_due_ns += facts.modes.stick_rest_ns
+        self._asked_ns = self._undone_ns = None
         self._is_thrust_mode = facts.mode in facts.modes.thrust
         has_receiver = facts.has_receiver is True
         is_setpoint = self._settings.is_setpoint
@@ -91,6 +103,35 @@ class Departure:
         by_choice = {"hold": roles.hold, "land": roles.land, "rtl": roles.rtl}
         self.mode = by_choice.get(choice) or None
 
+    def is_undone(self, facts: Facts) -> bool:
+        """True if the vehicle has left our mode for a hand that nobody moved, or may have.
+
+        It shows our sticks, and no others; its EVENT says that sticks were moved.
+        """
+        is_ours = facts.echo_confirmed and facts.overruled is None
+        if self.mode is None or self._asked_ns is None or not is_ours:
+            return False
+        if facts.mode != facts.modes.override:
+            if self._undone_ns is not None:  # back in our mode: another hand needs another word
+                self._asked_ns, self._undone_ns = facts.now_ns, None
+            return False
+        if self._undone_ns is None:
+            self._undone_ns = facts.now_ns
+        is_soon = self._undone_ns - self._entered_ns <= UNDONE_NS
+        is_undecided = facts.now_ns - self._undone_ns <= WORD_NS
+        return is_soon and (is_undecided or self._is_told(facts))
+
+    def _is_told(self, facts: Facts) -> bool:
+        told_ns = facts.stick_override_ns
+        return told_ns is not None and self._asked_ns is not None and told_ns >= self._asked_ns
+
+    def _are_at_rest(self, facts: Facts) -> bool:
+        """Neutral sticks have left, and pass for nobody's hand."""
+        if self._settings.is_setpoint or not facts.modes.override:
+            return True
+        is_bounded = facts.now_ns - self._began_ns >= STICK_REST_NS
+        return is_bounded or (facts.are_sticks_at_rest and facts.now_ns > self._began_ns)
+
     def step(self, facts: Facts) -> Move:
         """Neutral, and the mode until it is confirmed or refused."""
         is_confirmed = self.mode is None or facts.mode == self.mode
@@ -98,11 +139,15 @@ class Departure:
         if self.mode is not None and facts.refused_mode == self.mode:
             self.mode = facts.modes.land or None
         elapsed_ns = facts.now_ns - self._began_ns
-        self.is_done = self.is_done or elapsed_ns >= (
-            NEUTRAL_NS if is_confirmed else MODE_TIMEOUT_NS
-        )
-        # Where the throttle is thrust, neutral would climb or fall: the mode goes first.
-        is_level_only = self._is_thrust_mode and not (self.mode and is_confirmed)
+        is_undone = self.is_undone(facts)
+        if is_confirmed and self._asked_ns is not None and self._entered_ns <= self._asked_ns:
+            self._entered_ns = facts.now_ns
+        longest_ns = NEUTRAL_NS if is_confirmed else MODE_TIMEOUT_NS
+        self.is_done = not is_undone and (self.is_done or elapsed_ns >= longest_ns)
+        # Where the throttle is thrust, neutral would climb or fall: the mode goes first. Then it
+        # may still be a hand's to the vehicle.
+        is_safe = bool(self.mode) and is_confirmed and not facts.modes.override
+        is_level_only = self._is_thrust_mode and not is_safe
         hand: Hand | None = Hand.LEVEL if is_level_only else Hand.NEUTRAL
         if self._settings.is_setpoint and facts.is_landed:
             hand = Hand.IDLE  # the thrust that hovers would lift it
@@ -111,5 +156,9 @@ class Departure:
             hand = None
         if is_confirmed or self.is_done or facts.now_ns < self._request_due_ns:
             return Move(hand=hand)
+        if (is_undone and not self._is_told(facts)) or not self._are_at_rest(facts):
+            return Move(hand=hand)
+        if not is_undone:
+            self._asked_ns = self._entered_ns = facts.now_ns
         self._request_due_ns = facts.now_ns + MODE_SPACING_NS
         return Move(hand=hand, mode=self.mode)

@@ -308,7 +308,8 @@ class Engagement:
             return "the vehicle has been disarmed"
         if facts.is_failsafe and facts.armed:
             return f"a failsafe of the vehicle is active (mode {facts.mode})"
-        if self._own_mode is not None and facts.mode not in (self._own_mode, self._departure.mode):
+        is_ours = facts.mode in (self._own_mode, self._departure.mode)
+        if self._own_mode is not None and not is_ours and not self._departure.is_undone(facts):
             return f"mode changed from {self._own_mode} to {facts.mode}"
         return None
 
@@ -337,7 +338,7 @@ class Engagement:
 
     def _give_back(self, facts: Facts, reason: str) -> Move:
         """Release in this same step, and no mode command."""
-        had_sticks = self.phase is not Phase.PREPARING or self._preparation.arms
+        had_sticks = self.phase is not Phase.PREPARING or self._preparation.has_sticks
         self.phase = Phase.RELEASING
         self.reason = reason
         self._released_ns = facts.now_ns
@@ -346,7 +347,7 @@ class Engagement:
 
     def _depart(self, facts: Facts, ending: Ending) -> Move:
         """Our own fault or end: neutral, a safe mode, then the release."""
-        is_ours = (self._preparation.arms and facts.armed) or self._follows_us(facts)
+        is_ours = (self._preparation.has_sticks and facts.armed) or self._follows_us(facts)
         if self.phase is Phase.PREPARING and not is_ours:
             return self._give_back(facts, ending.reason)  # we never had the sticks in the air
         if self.phase is Phase.FLYING and self.outcome.end is None:

@@ -61,6 +61,10 @@ class Facts:
     """The vehicle shows the last sticks that we sent: held, or a receiver's that rests there."""
     landing: str | None = None
     """The vehicle has landed under the policy: a normal end."""
+    are_sticks_at_rest: bool = True
+    """Our last sticks pass for nobody's hand: a mode that flies by itself is not left for them."""
+    stick_override_ns: int | None = None
+    """When the vehicle last said that moving sticks have changed its mode."""
     slowness: str | None = None
     """Why the policy is too slow ever to fly."""
 

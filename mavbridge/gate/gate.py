@@ -197,6 +197,8 @@ class Gate:
             refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns),
             chunk_fault=overdue or self._chunks.fault(now_ns),
+            are_sticks_at_rest=link.are_sticks_at_rest,
+            stick_override_ns=status.stick_override_ns if status else None,
             slowness=self._chunks.slowness,
             envelope_problem=left.reason if left and left.kind == "fault" else None,
             landing=left.reason if left and left.kind == "landed" else None,

@@ -50,6 +50,8 @@ class Preparation:
         self._asked_mode: str | None = None
         self._flows_from_ns: int | None = None
         """First setpoint of those that a mode needs before it is entered."""
+        self._lends_sticks = False
+        """The mode was refused to a vehicle in the air that has no sticks: neutral ones flow."""
         self.arms = False
         """It was disarmed when this began: we keep it idle on the ground, and arm it."""
 
@@ -58,6 +60,12 @@ class Preparation:
         self.arms = not facts.armed
         self._is_up = self._settings.takeoff_m is None or not self.arms
         self._asked_mode = self._ground_m = self._flows_from_ns = None
+        self._lends_sticks = False
+
+    @property
+    def has_sticks(self) -> bool:
+        """Ours are the vehicle's while this goes on."""
+        return self.arms or self._lends_sticks
 
     @property
     def is_taking_off(self) -> bool:
@@ -98,6 +106,7 @@ class Preparation:
         self._watch_climb(facts)
         wanted = self.wanted_mode(facts)
         climb_m = self._settings.takeoff_m if self.is_taking_off and facts.armed else None
+        self._lend_sticks(facts, wanted)
         hand = self._hand(facts, wanted)
         if facts.armed and wanted is None and climb_m is None and objection is None:
             return Preparing(Move(hand=hand), "")
@@ -105,7 +114,7 @@ class Preparation:
         is_heard = facts.armed or facts.echo_confirmed
         if objection is not None or not is_heard or facts.now_ns < self._request_due_ns:
             return Preparing(Move(hand=hand), waits_for)
-        if hand is Hand.NEUTRAL and self._settings.is_setpoint:
+        if hand is Hand.NEUTRAL and (self._settings.is_setpoint or self._lends_sticks):
             if self._flows_from_ns is None:
                 self._flows_from_ns = facts.now_ns
             if facts.now_ns - self._flows_from_ns < FLOW_NS:
@@ -116,6 +125,17 @@ class Preparation:
         self._asked_mode = wanted
         is_arming = wanted is None and not facts.armed
         return Preparing(Move(hand=hand, mode=wanted, arm=is_arming, takeoff_m=climb_m), waits_for)
+
+    def _lend_sticks(self, facts: Facts, wanted: str | None) -> None:
+        """Send neutral sticks once a mode was refused that PX4 enters only with some.
+
+        From then on silence would be a failsafe.
+        """
+        is_refused = wanted is not None and facts.refused_mode == wanted == self._asked_mode
+        is_flown = wanted not in facts.modes.setpoint and not self._settings.is_setpoint
+        lacks_sticks = facts.modes.needs_sticks_first and facts.has_receiver is False
+        if is_refused and is_flown and lacks_sticks and not self.has_sticks:
+            self._lends_sticks, self._request_due_ns = True, facts.now_ns
 
     def _watch_climb(self, facts: Facts) -> None:
         if not facts.armed:
@@ -151,6 +171,6 @@ class Preparation:
             mode = wanted or facts.mode  # and once entered, it is kept only by them
             needs_flow = facts.modes.needs_setpoints_first and mode in facts.modes.setpoint
             return Hand.NEUTRAL if needs_flow else None
-        if not self.arms:
+        if not self.has_sticks:
             return None
-        return Hand.NEUTRAL if is_climbing else Hand.IDLE
+        return Hand.NEUTRAL if is_climbing or self._lends_sticks else Hand.IDLE

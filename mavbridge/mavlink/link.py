@@ -143,6 +143,7 @@ class MavlinkLink:
             echo_confirmed=output.echo_confirmed,
             is_released=output.is_released(vehicle, now_ns),
             shows_last=output.shows_last,
+            are_sticks_at_rest=output.are_sticks_at_rest(vehicle),
             interruption=self._interruption,
             modes=modes if output.is_sticks else replace(modes, is_silence_failsafe=False),
             refused_mode=self._commands.refused_mode,

@@ -209,7 +209,9 @@ class Commander:
     def _yield_to_pilot(self) -> None:
         """Fast sticks take an autonomous flight over; not in the Hold before the action."""
         is_held = self.lost_sticks.phase is Phase.HOLDING
-        is_autonomous = self.mode.is_auto or self.mode is Mode.OFFBOARD
+        bits = int(self._params.get("COM_RC_OVERRIDE", 0b11))  # 1.18: both, without a parameter
+        is_autonomous = bool(bits & 1) and self.mode.is_auto
+        is_autonomous = is_autonomous or (bool(bits & 2) and self.mode is Mode.OFFBOARD)
         if self._sticks.moved_fast and is_autonomous and not is_held and not self.landed:
             was_failsafe = self.in_failsafe
             self._intend(Mode.POSCTL if self.position_ready else Mode.ALTCTL)

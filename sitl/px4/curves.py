@@ -14,21 +14,22 @@ from sitl.vehicle.dynamics import GRAVITY_MPS2
 EXPO = 0.6
 
 
-def curve(value: float, dead_zone: float) -> float:
+def curve(value: float, dead_zone: float, expo: float = EXPO) -> float:
     """A stick in [-1, 1] behind dead zone and expo."""
     beyond = max(0.0, abs(value) - dead_zone) / (1.0 - dead_zone)
-    return math.copysign((1.0 - EXPO) * beyond + EXPO * beyond**3, value)
+    return math.copysign((1.0 - expo) * beyond + expo * beyond**3, value)
 
 
 def climb_mps(sticks: Sticks, params: Params) -> float:
     """Climb rate of ALTCTL and POSCTL, + up."""
-    share = curve(sticks.throttle, params["MAN_DEADZONE"])
+    share = curve(sticks.throttle, params.dead_zone, params.get("MPC_Z_MAN_EXPO", EXPO))
     return share * params["MPC_Z_VEL_MAX_UP" if share > 0.0 else "MPC_Z_VEL_MAX_DN"]
 
 
 def yaw_rate_radps(sticks: Sticks, params: Params) -> float:
     """Yaw rate of every mode but ACRO."""
-    return math.radians(params["MPC_MAN_Y_MAX"]) * curve(sticks.yaw, params["MAN_DEADZONE"])
+    share = curve(sticks.yaw, params.dead_zone, params.get("MPC_YAW_EXPO", EXPO))
+    return math.radians(params["MPC_MAN_Y_MAX"]) * share
 
 
 def lean_accel_mps2(sticks: Sticks, params: Params) -> tuple[float, float]:
@@ -59,7 +60,7 @@ def speed_mps(sticks: Sticks, params: Params) -> tuple[float, float]:
     length = math.hypot(sticks.forward, sticks.right)
     if length == 0.0:
         return 0.0, 0.0
-    speed = params["MPC_VEL_MANUAL"] * curve(min(1.0, length), params["MAN_DEADZONE"])
+    speed = params["MPC_VEL_MANUAL"] * curve(min(1.0, length), params.dead_zone)
     return speed * sticks.forward / length, speed * sticks.right / length
 
 

@@ -11,7 +11,9 @@ class Px4:
     """A `sitl.firmware.Firmware`."""
 
     def __init__(self, config: VehicleConfig, links: int, boot_ns: int, log: FlightLog) -> None:
-        self.params = Params(config.conditions, receiver=config.receiver)
+        self.params = Params(
+            config.conditions, receiver=config.receiver, release=config.px4_release
+        )
         self.ap = Autopilot(self.params, config, boot_ns)
         self.server = MavlinkServer(self.ap, links, log)
 

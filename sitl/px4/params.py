@@ -12,10 +12,13 @@ from types import MappingProxyType
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.config import Px4Release
 
+DEAD_ZONE = "MAN_DEADZONE"
 _INTEGERS: Mapping[str, int] = MappingProxyType(
     {
         "COM_FLTMODE_BOOT": 4,
+        "COM_RC_OVERRIDE": 1,  # bit 0: sticks take AUTO modes over, bit 1: OFFBOARD
         "COM_OBL_RC_ACT": 0,  # 0 position, 1 altitude, 2 stabilized, 3 RTL, 4 land, 5 hold
         "COM_RCL_EXCEPT": 0,  # bit 0 mission, 1 hold, 2 offboard: no failsafe when sticks are lost
         "COM_RC_IN_MODE": 1,  # source of sticks: see `sitl.px4.sticks`
@@ -44,8 +47,9 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "COM_FAIL_ACT_T": 5.0,  # s
         "COM_OF_LOSS_T": 1.0,  # s
         "COM_RC_LOSS_T": 0.5,  # s
+        "COM_RC_STICK_OV": 30.0,  # % of the stick a second
         "COM_SPOOLUP_TIME": 1.0,  # s
-        "MAN_DEADZONE": 0.1,  # of the stick, on each side of the middle
+        DEAD_ZONE: 0.1,  # of the stick, on each side of the middle
         "MAN_KILL_GEST_T": -1.0,
         "MAN_OVERRIDE_SPD": 1.0,  # full sticks a second; -1: off
         "MC_ACRO_EXPO": 0.0,
@@ -107,6 +111,10 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "RTL_RETURN_ALT": 30.0,
     }
 )
+_OLD_NAMES: Mapping[str, float] = MappingProxyType(
+    {"MPC_HOLD_DZ": 0.1, "MPC_YAW_EXPO": 0.6, "MPC_Z_MAN_EXPO": 0.6}
+)
+"""What releases before 1.17 have in place of DEAD_ZONE (upstream commit 2bf9fce577)."""
 _INT32_LIMIT = 1 << 31
 
 
@@ -116,6 +124,16 @@ def _float32(value: float) -> float:
     return float(rounded)
 
 
+_OLD_OVERRIDE, _NEW_OVERRIDE = ("COM_RC_OVERRIDE", "COM_RC_STICK_OV"), ("MAN_OVERRIDE_SPD",)
+_ABSENT: Mapping[Px4Release, tuple[str, ...]] = MappingProxyType(
+    {
+        "1.14": (*_NEW_OVERRIDE, DEAD_ZONE),
+        "1.15": (*_NEW_OVERRIDE, DEAD_ZONE),
+        "1.16": (*_NEW_OVERRIDE, DEAD_ZONE),
+        "1.17": _NEW_OVERRIDE,
+        "1.18": _OLD_OVERRIDE,
+    }
+)
 DEFAULT_RATE_P = _float32(_FLOATS["MC_ROLLRATE_P"])
 
 
@@ -153,9 +171,18 @@ def _varied(conditions: Conditions) -> dict[str, float]:
 class Params:
     """Named numbers in a fixed, sorted order (the order is PARAM_VALUE's index)."""
 
-    def __init__(self, conditions: Conditions = NOMINAL, *, receiver: bool = False) -> None:
+    def __init__(
+        self,
+        conditions: Conditions = NOMINAL,
+        *,
+        receiver: bool = False,
+        release: Px4Release = "1.18",
+    ) -> None:
         """With ``receiver`` its first four channels are mapped, in the order that is usual."""
         values: dict[str, float] = {**_INTEGERS, **_FLOATS, **_varied(conditions)}
+        for name in _ABSENT[release]:
+            del values[name]
+        values |= {} if DEAD_ZONE in values else _OLD_NAMES
         if receiver:
             values |= {"RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4}
             values["RC_CHAN_CNT"] = 8
@@ -166,6 +193,18 @@ class Params:
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def get(self, name: str, default: float) -> float:
+        """The value, or ``default`` where the release lacks the parameter."""
+        return self._values.get(name, default)
+
+    @property
+    def dead_zone(self) -> float:
+        """Of the stick, on each side of the middle."""
+        return self._values[DEAD_ZONE if DEAD_ZONE in self._values else "MPC_HOLD_DZ"]
 
     def integer(self, name: str) -> int:
         """The value of an INT32."""

@@ -2,7 +2,8 @@
 
 MAVLink has no notion of an override here: each link, and the receiver, is a source, COM_RC_IN_MODE
 says which may win, and the last values of the winner hold until it is declared lost. Timers and
-limits are those measured on PX4 1.18.
+limits are those measured on PX4 1.18, and the detectors of a pilot's hand those of
+``src/modules/manual_control`` there and in 1.14 to 1.17 (upstream commit cf50ecf41b).
 """
 
 import math
@@ -16,7 +17,11 @@ POLL_NS = NS_PER_S // 5
 """Sticks are looked at when they come, and this long after that, again and again."""
 GESTURE_NS = NS_PER_S
 GESTURE_LOW_THROTTLE, GESTURE_FULL_YAW, GESTURE_MOST_LEAN = -0.9, 0.9, 0.3
-FAST_SAMPLES = 3  # in a row that must move fast to count as the pilot's will
+FAST_SAMPLES = 3
+"""1.18: so many movements in a row the same way are a hand's (MIN_SIGN_CONSECUTIVE); samples at
+rest between them do not count, so that a stick which has come to rest keeps them."""
+OLD_TAU_S, TAU_S = 0.1, 0.05
+"""Of the low-pass of a stick's speed, before 1.18 and there."""
 
 _ANY_SOURCE_MODES = (2, 3, 5, 6, 7, 8)
 _KEEP_FIRST = 3
@@ -44,6 +49,28 @@ def from_manual_control(x: int, y: int, z: int, r: int) -> Sticks:
     return Sticks(forward, right, z / 500.0 - 1.0 if 0 <= z <= 1000 else 0.0, yaw)
 
 
+class StickSpeed:
+    """Low-passed speed of one stick: ``MovingDiff`` with its ``AlphaFilter``."""
+
+    def __init__(self) -> None:
+        self.per_s = 0.0
+        self.moves_one_way = 0
+        """Movements in a row in one direction."""
+        self._last: float | None = None
+        self._is_up = False
+
+    def update(self, value: float, dt_s: float, tau_s: float) -> None:
+        """Take a sample; the first one after a reset is no movement."""
+        last, self._last = self._last, value
+        if last is None or dt_s <= 0.0:
+            return
+        self.per_s += dt_s / (tau_s + dt_s) * ((value - last) / dt_s - self.per_s)
+        if value != last:
+            is_same_way = self.moves_one_way > 0 and (value > last) is self._is_up
+            self.moves_one_way = self.moves_one_way + 1 if is_same_way else 1
+            self._is_up = value > last
+
+
 class StickInput:
     """The sticks that PX4 acts on; stamps are nanoseconds of one clock."""
 
@@ -56,11 +83,12 @@ class StickInput:
         """Samples chosen so far: a reader sees by it that there is a new one."""
         self.sampled_ns = 0
         self.moved_fast = False
-        """The newest samples move faster than MAN_OVERRIDE_SPD."""
+        """A stick moves faster than COM_RC_STICK_OV, or MAN_OVERRIDE_SPD, allows."""
         self._source: int | None = None
         self._first_source: int | None = None
         self._never_ages = False
-        self._fast_samples = 0
+        self._speeds = tuple(StickSpeed() for _ in Sticks())
+        self._looked_ns = 0
         self._gesture = 0
         self._gesture_since_ns = 0
         self._gesture_done = False
@@ -84,11 +112,14 @@ class StickInput:
             self._choose(sticks, now_ns)
 
     def update(self, now_ns: int) -> None:
-        """Notice the loss of the winner."""
+        """Look at sticks that do not come, and notice the loss of the winner."""
+        if self.valid and now_ns - self._looked_ns >= POLL_NS:
+            self._look(now_ns)
         if self.valid and not self._never_ages and now_ns - self.sampled_ns >= self._lost_after_ns:
             self.valid = False
             self.moved_fast = False
-            self._gesture = self._fast_samples = 0
+            self._gesture = 0
+            self._speeds = tuple(StickSpeed() for _ in Sticks())
 
     def gesture(self, now_ns: int) -> int:
         """1: throttle down with full right yaw and no lean for a second, -1: full left; else 0.
@@ -125,14 +156,23 @@ class StickInput:
             return -math.inf if receiver == RC_SOURCE else 1e9
         return source if links == "low" else -source
 
+    def _look(self, now_ns: int) -> None:
+        """Judge the movement since the last look, by the detector of the release."""
+        is_old = "COM_RC_STICK_OV" in self._params
+        dt_s, self._looked_ns = (now_ns - self._looked_ns) / NS_PER_S, now_ns
+        limit = self._params["COM_RC_STICK_OV" if is_old else "MAN_OVERRIDE_SPD"]
+        limit_per_s = 0.01 * limit if is_old else limit
+        moves = 0 if is_old else FAST_SAMPLES
+        for speed, value in zip(self._speeds, self.sticks, strict=True):
+            speed.update(value, dt_s, OLD_TAU_S if is_old else TAU_S)
+        self.moved_fast = limit_per_s > 0.0 and any(
+            abs(speed.per_s) > limit_per_s and speed.moves_one_way >= moves
+            for speed in self._speeds
+        )
+
     def _choose(self, sticks: Sticks, now_ns: int) -> None:
-        interval_s = (now_ns - self.sampled_ns) / NS_PER_S
-        limit = self._params["MAN_OVERRIDE_SPD"]
-        travel = max(abs(new - old) for new, old in zip(sticks, self.sticks, strict=True))
-        is_fast = self.valid and limit > 0.0 and travel > limit * interval_s
-        self._fast_samples = self._fast_samples + 1 if is_fast else 0
-        self.moved_fast = self._fast_samples >= FAST_SAMPLES
         self.sticks, self.sampled_ns, self.valid = sticks, now_ns, True
+        self._look(now_ns)
         self._never_ages = False
         self.count += 1
         gesture = 0

@@ -19,6 +19,9 @@ ArduPilotRelease: TypeAlias = Literal["4.6", "4.7-dev", "4.7"]
 """Whose names and units of parameters an ArduPilot has; 4.5 has those of 4.6. The measured one, in
 development between the two, has the new names of the system ids and the old ones of the rest."""
 
+Px4Release: TypeAlias = Literal["1.14", "1.15", "1.16", "1.17", "1.18"]
+"""Whose parameters, stick override and messages a PX4 has; 1.18 is the one that was measured."""
+
 
 class Battery(NamedTuple):
     """The vehicle's word about its battery; it never empties by itself."""
@@ -45,6 +48,7 @@ class VehicleConfig:
 
     autopilot: AutopilotName = "ardupilot"
     ardupilot_release: ArduPilotRelease = "4.7-dev"
+    px4_release: Px4Release = "1.18"
     receiver: bool = True
     """An RC receiver is there. Without one ArduCopter's sticks latch and its radio fails; PX4 looks
     at it only if COM_RC_IN_MODE tells it to."""

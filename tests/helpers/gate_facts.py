@@ -32,7 +32,8 @@ PX4_MODES = ModeRoles(
     setpoint=("OFFBOARD",),
     needs_setpoints_first=True,
     is_silence_failsafe=True,
-    stick_rest_ns=300 * NS_PER_MS,
+    override="POSCTL",
+    needs_sticks_first=True,
 )
 STEP_NS = 10 * NS_PER_MS
 

@@ -26,7 +26,7 @@ from sitl.px4.autopilot import Autopilot as Px4
 from sitl.px4.modes import Mode as Px4Mode
 from sitl.px4.setpoints import AttitudeSetpoint, VelocitySetpoint
 from sitl.rotation import Quat, cos_tilt
-from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName
+from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, Px4Release
 
 LEANING = Program(motion=lambda _: Motion(push=Push("roll", 0.5)))
 """Lean 15 degrees to the right, or 2 m/s to the right: far from neutral in every record."""
@@ -102,6 +102,7 @@ class OutputFlight(GateFlight):
         in_air: bool = True,
         receiver_us: tuple[int, ...] | None = None,
         params: dict[str, float] | None = None,
+        px4_release: Px4Release = "1.18",
         **config: Any,
     ) -> None:
         """``config`` as in ``GateFlight``; ``receiver_us`` None is MID for ArduPilot."""
@@ -118,7 +119,7 @@ class OutputFlight(GateFlight):
         super().__init__(
             receiver_us=receiver_us,
             params=params,
-            vehicle=replace(NOMINAL_VEHICLE, autopilot=autopilot),
+            vehicle=replace(NOMINAL_VEHICLE, autopilot=autopilot, px4_release=px4_release),
             **config,
         )
         self._boot_ns = self.vehicle.ap.now_ns

@@ -11,8 +11,10 @@ from helpers import release_paths as paths
 from helpers.output_flights import COMBINATIONS, Aftermath, OutputFlight
 from mavbridge.gate.engagement import Phase
 from policy.contract import ActionKind
-from sitl.vehicle.config import AutopilotName
+from policy.scripted.programs import Motion, Program, Push
+from sitl.vehicle.config import AutopilotName, Px4Release
 
+FULL_YAW = Program(motion=lambda _: Motion(push=Push("yaw", 1.0)))
 GRACE_MS = 120
 """Three chunk periods or 100 ms, and 20 ms."""
 DEATH_MS = 60
@@ -63,6 +65,33 @@ def test_death_of_the_flight_process(autopilot: AutopilotName, kind: ActionKind)
     # PX4 would take the end of its only sticks for a failsafe.
     is_held = flight.is_px4 and kind == "sticks"
     assert flight.phase is (Phase.HOLDING if is_held else Phase.ENDED)
+
+
+@pytest.mark.parametrize("release", ["1.14", "1.17", "1.18"])
+@pytest.mark.parametrize("end", [paths.death, paths.end])
+def test_no_px4_takes_our_jump_to_neutral_for_a_hand(
+    release: Px4Release, end: Callable[[OutputFlight], None]
+) -> None:
+    """Full yaw is the longest rest: 0.57 of the policy's is 0.88 of the vehicle's stick."""
+    flight = OutputFlight("px4", "sticks", FULL_YAW, px4_release=release)
+    flight.fly(1.2)
+    assert flight.px4.stick_input.sticks.yaw > 0.85
+    at_s = flight.t_s
+    end(flight)
+    flight.run(2.0)
+    later = {sample.mode for sample in flight.samples if sample.t_s > at_s}
+    assert "POSCTL" not in later, flight.describe()
+    assert flight.px4.mode_name == ("AUTO.LOITER" if end is paths.death else "AUTO.LAND")
+
+
+def test_a_px4_without_sticks_is_lent_neutral_ones_for_a_mode_that_needs_some() -> None:
+    flight = OutputFlight("px4", "sticks", mode="ALTCTL")
+    flight.put_in_air()
+    flight._forget_sticks()
+    flight.until(lambda: flight.reason.startswith("not engaged"), within_s=10)
+    flight.act("engage")
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=2.0)
+    assert flight.px4.mode_name == "ALTCTL"
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)

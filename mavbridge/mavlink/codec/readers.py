@@ -145,7 +145,9 @@ def _param_error(m: dialect.MAVLink_param_error_message) -> Body | None:
 def _status_text(m: dialect.MAVLink_statustext_message) -> Body:
     # pymavlink has cut the zero bytes off, and made one character of each other byte.
     is_full = m.id != 0 and len(m.text) >= _TEXT_BYTES
-    text = "".join(c if c.isprintable() else UNPRINTABLE for c in m.text)  # no terminal's codes
+    ended = m.text.rstrip("\t") if is_full else m.text.rstrip()  # PX4 ends its texts with a tab
+    # The codes of a terminal are made visible.
+    text = "".join(c if c.isprintable() else UNPRINTABLE for c in ended)
     return StatusText(text, m.id, m.chunk_seq, is_full)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
-from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Action, Output, StickGains, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import STICK_END, Body, ManualControl
 from mavbridge.mavlink.codec.packets import Codec, manual_control_of, manual_control_sticks
@@ -34,6 +34,40 @@ _HELD_NS = 700 * NS_PER_MS
 """PX4 holds the last sticks for 0.5 s and a poll of 0.2 s (COM_RC_LOSS_T); echoes end with them."""
 
 
+_SPEED_TAU_S = 0.1
+"""Of PX4's low-pass of a stick's speed (``MovingDiff``); that of 1.18 is faster."""
+_REST_SHARE = 0.5
+"""Of a hand's speed. A jump that PX4 sees 70 ms later, since packets were lost, is below it too."""
+
+
+class StickSpeeds:
+    """Speed of the sticks that were sent, as PX4's detector of a pilot's hand computes it."""
+
+    def __init__(self) -> None:
+        self._last: ManualControl | None = None
+        self._at_ns = 0
+        self._per_s: tuple[float, ...] = (0.0,) * 4
+
+    @property
+    def fastest_per_s(self) -> float:
+        """Full sticks a second."""
+        return max(map(abs, self._per_s))
+
+    def sent(self, values: ManualControl, now_ns: int) -> None:
+        """Take sticks that have left."""
+        last, dt_s = self._last, (now_ns - self._at_ns) / NS_PER_S
+        self._last, self._at_ns = values, now_ns
+        if last is None or dt_s <= 0.0:
+            return
+        x, y, z, r = (value - before for value, before in zip(values, last, strict=True))
+        weight = dt_s / (_SPEED_TAU_S + dt_s)
+        moves = (x, y, 2 * z, r)  # z runs over half the range
+        self._per_s = tuple(
+            speed + weight * (move / STICK_END / dt_s - speed)
+            for speed, move in zip(self._per_s, moves, strict=True)
+        )
+
+
 class ManualControlOutput(StickOutput):
     """MANUAL_CONTROL. There is no release: one neutral packet where nobody else has sticks, then
     silence, which PX4 takes for lost sticks where it had only ours."""
@@ -53,6 +87,7 @@ class ManualControlOutput(StickOutput):
         super().__init__(codec, MANUAL_ECHO, gains)
         self._last = ManualControl(0, 0, STICK_END // 2, 0)
         self._sent_ns = 0
+        self._speeds = StickSpeeds()
         self._shown: tuple[int, Sticks] | None = None
         """Arrival of the sticks that it acts on, and these."""
         self._pilot: Sticks | None = None
@@ -64,6 +99,12 @@ class ManualControlOutput(StickOutput):
         """Note what has left."""
         super().sent(encoded, vehicle, now_ns)
         self._sent_ns = now_ns
+        self._speeds.sent(self._last, now_ns)
+
+    def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
+        """Slower than a hand, by the parameter that this version has."""
+        hand_per_s = vehicle.profile.hand_per_s(vehicle.known_params)
+        return self._speeds.fastest_per_s < _REST_SHARE * hand_per_s
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """The four sticks, rounded."""

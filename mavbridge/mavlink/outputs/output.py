@@ -120,6 +120,10 @@ class ActionOutput(ABC):
         """What it shows since the release is, or cannot be told from, our last."""
         return self.echo.shows_last
 
+    def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
+        """The vehicle takes what we last sent for nobody's hand."""
+        return True
+
     def overruled(self, now_ns: int) -> str | None:
         """The likely reason why it acts on something else than what we send, or None."""
         fault = self.echo.fault(now_ns)

@@ -44,6 +44,8 @@ class EventMeaning(NamedTuple):
     is_armed: bool | None = None
     """None: it does not say."""
     is_failsafe: bool = False
+    is_stick_override: bool = False
+    """Moving sticks have changed the mode."""
     text: str | None = None
     """For the user, where no STATUSTEXT says it."""
 
@@ -220,6 +222,10 @@ class Profile(ABC):
     def boosts_thrust(self, values: Mapping[str, float]) -> bool:
         """The vehicle divides the thrust of a setpoint by the cosine of its tilt."""
         return False
+
+    def hand_per_s(self, values: Mapping[str, float]) -> float:
+        """Speed, in full sticks a second, at which sticks leave a mode that flies by itself."""
+        return math.inf
 
     def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
         """Climb and descent in m/s to which it cuts velocity setpoints, as its echo shows them."""

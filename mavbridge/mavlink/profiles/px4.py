@@ -6,7 +6,6 @@ from typing import ClassVar
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.modes import ModeTable
@@ -58,11 +57,8 @@ _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4
 _LONGEST_S = 1.0
 _SHORTEST_S = 0.3
 """A gate on a busy computer may be late by a tenth of this; a link loses a few packets in a row."""
-_STICK_REST_NS = 300 * NS_PER_MS
-"""Sticks that jump to neutral from a movement the same way were taken for the pilot's hand 25 ms
-after AUTO.LOITER had followed 10 ms later: POSCTL, "Pilot took over using sticks". Their speed is
-low-passed with 50 ms, so a jump over the whole range is above MAN_OVERRIDE_SPD, 1 a second, for
-200 ms."""
+_SLOWEST_HAND_PER_S = 0.05
+"""Where neither parameter was read: the least that COM_RC_STICK_OV takes, 5 %."""
 
 _FIRST_MODES = ("MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED")
 _AUTO_MODES = ("TAKEOFF", "LOITER", "MISSION", "RTL", "LAND")
@@ -81,7 +77,8 @@ _MODES = ModeTable(
         setpoint=("OFFBOARD",),
         needs_setpoints_first=True,
         is_silence_failsafe=True,
-        stick_rest_ns=_STICK_REST_NS,
+        override="POSCTL",
+        needs_sticks_first=True,
     ),
     shift=16,
     sub_shift=24,
@@ -107,6 +104,7 @@ _EVENTS = {
     "commander_failsafe_enter_generic": EventMeaning(is_failsafe=True),
     "commander_failsafe_enter_generic_hold": EventMeaning(is_failsafe=True),
     "commander_failsafe_enter_autopilot_disengaged": EventMeaning(is_failsafe=True),
+    "commander_rc_override": EventMeaning(is_stick_override=True),
     "commander_rc_lost": EventMeaning(text="manual control lost"),
     "commander_rc_regained": EventMeaning(text="manual control regained"),
 }
@@ -139,6 +137,7 @@ class Px4(Profile):
         *("COM_RC_IN_MODE", "COM_RC_LOSS_T", "COM_RCL_EXCEPT", "NAV_RCL_ACT", "COM_FAIL_ACT_T"),
         *("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_DISARM_PRFLT", "COM_DISARM_LAND"),
         *("MAN_ARM_GESTURE", "MAN_OVERRIDE_SPD", "NAV_DLL_ACT", "MPC_THR_HOVER"),
+        *("COM_RC_OVERRIDE", "COM_RC_STICK_OV"),
         *("MIS_TAKEOFF_ALT", "MPC_XY_MAN_EXPO", "MPC_VEL_MANUAL"),
         *("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_YAW_EXPO", "MPC_Z_MAN_EXPO"),
         *("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_DEADZONE", "MPC_HOLD_DZ"),
@@ -266,6 +265,15 @@ class Px4(Profile):
     def hover_thrust(self, values: Mapping[str, float]) -> float | None:
         """MPC_THR_HOVER."""
         return values.get("MPC_THR_HOVER")
+
+    def hand_per_s(self, values: Mapping[str, float]) -> float:
+        """MAN_OVERRIDE_SPD of 1.18, negative: off; before it COM_RC_STICK_OV, a percentage, unless
+        bit 0 of COM_RC_OVERRIDE is off."""
+        if (hand_per_s := values.get("MAN_OVERRIDE_SPD")) is None:
+            is_on = int(values.get("COM_RC_OVERRIDE", 1)) & 1
+            hand_per_s = values.get("COM_RC_STICK_OV", 100.0 * _SLOWEST_HAND_PER_S) / 100.0
+            hand_per_s = hand_per_s if is_on else -1.0
+        return hand_per_s if hand_per_s > 0.0 else math.inf
 
     def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
         """MPC_Z_VEL_MAX_UP and _DN; never below 0, which would turn one into the other."""

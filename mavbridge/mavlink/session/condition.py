@@ -54,6 +54,7 @@ class VehicleCondition:
         self._is_failsafe = False
         self._changed_ns: int | None = None
         """When CURRENT_MODE or an EVENT has last told a change."""
+        self._stick_override_ns: int | None = None
         self._altitude: tuple[int, float] | None = None
         self.rc: tuple[int, RcChannels] | None = None
         self._rc_sticks: Sticks | None = None
@@ -117,6 +118,8 @@ class VehicleCondition:
             self._is_armed, self._changed_ns = meaning.is_armed, arrived_ns
         if meaning.is_failsafe:
             self._note_failsafe(arrived_ns)
+        if meaning.is_stick_override:
+            self._stick_override_ns = arrived_ns
 
     def _note_failsafe(self, arrived_ns: int) -> None:
         if not self._is_failsafe:
@@ -197,6 +200,7 @@ class VehicleCondition:
             position_ned_m=self._position_ned_m(now_ns, is_valid),
             is_position_valid=is_valid,
             battery_problem=self._battery_problem(now_ns),
+            stick_override_ns=self._stick_override_ns,
         )
 
     def _is_position_valid(self, now_ns: int) -> bool | None:

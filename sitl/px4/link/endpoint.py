@@ -6,7 +6,7 @@ from sitl.clock import NS_PER_S
 from sitl.link.endpoint import MAX_STATUSTEXT, VehicleEndpoint
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.events import Event
-from sitl.px4.link.messages import BUILDERS, event_message, topic_version
+from sitl.px4.link.messages import BUILDERS, BUILDERS_1_14, event_message, topic_version
 from sitl.px4.link.streams import GCS_HZ, ONBOARD_HZ, Streams
 
 _NEVER_STREAMED = (mav.MAVLINK_MSG_ID_HEARTBEAT,)
@@ -16,7 +16,8 @@ class MavlinkEndpoint(VehicleEndpoint[Autopilot]):
     """A link to a ground station, or to a companion computer, which gets other streams."""
 
     def __init__(self, ap: Autopilot, *, is_onboard: bool) -> None:
-        super().__init__(BUILDERS, "MAV_SYS_ID", ap.config.signing)
+        builders = BUILDERS_1_14 if ap.config.px4_release == "1.14" else BUILDERS
+        super().__init__(builders, "MAV_SYS_ID", ap.config.signing)
         self.heard: set[tuple[int, int]] = set()
         """Systems and components that have sent on this link."""
         self._is_onboard = is_onboard
@@ -47,7 +48,7 @@ class MavlinkEndpoint(VehicleEndpoint[Autopilot]):
 
     def set_interval(self, message_id: int, interval_us: int) -> bool:
         """Change a stream; False for a message that cannot be streamed."""
-        if message_id not in BUILDERS or message_id in _NEVER_STREAMED:
+        if message_id not in self._builders or message_id in _NEVER_STREAMED:
             return False
         self._streams.set_interval(message_id, interval_us, self._ap.now_ns)
         return True

@@ -28,6 +28,7 @@ from sitl.px4.link.streams import CURRENT_MODE, at_rate
 from sitl.px4.modes import Mode
 from sitl.px4.setpoints import VelocitySetpoint
 from sitl.rotation import conjugate, rotate, to_euler
+from sitl.vehicle.config import Px4Release
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 
 EVENT = 410
@@ -41,7 +42,13 @@ HOME = Home(47.397743, 8.545594, 489.4, field_ned_gauss=(0.215, 0.0118, 0.4307))
 GROUND_PRESSURE_HPA = 955.6
 TEMPERATURE_C = 25.0
 
-FIRMWARE_VERSION = 0x01120080  # 1.18.0 beta
+_FIRMWARE_VERSIONS: dict[Px4Release, int] = {
+    "1.14": 0x010E04FF,
+    "1.15": 0x010F04FF,
+    "1.16": 0x011001FF,
+    "1.17": 0x011100FF,
+    "1.18": 0x01120080,  # beta
+}
 CAPABILITIES = 0xE8FF
 
 _SENSORS_PRESENT, _SENSORS_ENABLED, _SENSORS_HEALTHY = 0x200C02F, 0x201C02F, 0x320C83F
@@ -277,7 +284,17 @@ def _autopilot_version(ap: Autopilot) -> Message:
     unique = ap.params.integer("MAV_SYS_ID")
     no_hash = [0] * 8
     return mav.MAVLink_autopilot_version_message(
-        CAPABILITIES, FIRMWARE_VERSION, 0, 0, 0, no_hash, no_hash, no_hash, 0, 0, unique
+        CAPABILITIES,
+        _FIRMWARE_VERSIONS[ap.config.px4_release],
+        0,
+        0,
+        0,
+        no_hash,
+        no_hash,
+        no_hash,
+        0,
+        0,
+        unique,
     )
 
 
@@ -315,6 +332,8 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     CURRENT_MODE: _current_mode,
 }
 """Every message that can be streamed or requested; None where there is nothing to report yet."""
+BUILDERS_1_14 = {key: build for key, build in BUILDERS.items() if key != CURRENT_MODE}
+"""CURRENT_MODE came with 1.15 (upstream commit bb900264e0)."""
 
 _SLOW_TOPICS = (
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,

@@ -49,9 +49,36 @@ def test_where_moving_sticks_would_leave_the_mode_it_is_asked_for_once_they_rest
     choice: Any, mode: str
 ) -> None:
     stepped = flying(PX4, departure=DepartureSettings(on_fault=choice))
-    moves = [stepped.step(**FAULT), *stepped.run(0.29)]
+    moves = [stepped.step(**FAULT)]  # at rest, but neutral has not left yet
+    moves += [stepped.step(**FAULT, are_sticks_at_rest=False) for _ in range(40)]
     assert {(move.hand, move.mode) for move in moves} == {(Hand.NEUTRAL, None)}
-    assert stepped.step() == Move(hand=Hand.NEUTRAL, mode=mode)
+    assert stepped.step(are_sticks_at_rest=True) == Move(hand=Hand.NEUTRAL, mode=mode)
+
+
+def leave_for_a_hand(*, is_told: bool, **changes: Any) -> list[Move]:
+    """AUTO.LOITER becomes POSCTL 20 ms after it was entered; what follows in 0.2 s."""
+    stepped = flying(PX4)
+    stepped.step(**FAULT)
+    while stepped.step().mode is None:
+        pass
+    stepped.step(mode="AUTO.LOITER")
+    changes["stick_override_ns"] = stepped.facts.now_ns if is_told else None
+    return [stepped.step(mode="POSCTL", **changes) for _ in range(20)]
+
+
+def test_a_mode_that_is_left_for_a_hand_of_nobody_is_asked_for_again() -> None:
+    moves = leave_for_a_hand(is_told=True)
+    assert "AUTO.LOITER" in {move.mode for move in moves}
+    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+
+
+@pytest.mark.parametrize(
+    "changes", [{"is_told": False}, {"is_told": True, "overruled": "other sticks"}]
+)
+def test_another_stations_mode_and_a_hand_of_the_pilots_win(changes: Any) -> None:
+    moves = leave_for_a_hand(**changes)
+    assert {move.mode for move in moves} == {None}
+    assert moves[-1].hand is not Hand.NEUTRAL
 
 
 @pytest.mark.parametrize(

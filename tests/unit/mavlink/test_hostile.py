@@ -66,6 +66,17 @@ def test_a_text_cannot_write_into_the_terminal() -> None:
     assert message.body == StatusText("\ufffd[2J a\ufffdb")
 
 
+@pytest.mark.parametrize(
+    ("data", "text_id"),
+    [(b"Pilot took over using sticks\t", 0), (b"Armed \t\r\n", 0), (b"x" * 49 + b"\t", 3)],
+)
+def test_a_text_ends_with_its_last_visible_character(data: bytes, text_id: int) -> None:
+    end = WireEnd()
+    (message,) = codec().decode_datagram(end.pack(end.mav.statustext_encode(6, data, text_id)))
+    assert isinstance(message.body, StatusText)
+    assert message.body.text == data.decode().rstrip()
+
+
 def test_a_piece_with_many_bytes_beyond_ascii_is_the_last_one_all_the_same() -> None:
     end = WireEnd()
     text = "Höhe überschritten, äöüÄÖÜß".encode()
