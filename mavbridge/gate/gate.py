@@ -62,6 +62,8 @@ class GateInput:
     """Why the flight process cannot compute a chunk."""
     act: Act | None = None
     stop: Ending | None = None
+    command_fault: str | None = None
+    """Error while the last command was made or sent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +145,7 @@ class Gate:
         if given.stop is not None:
             self._engagement.stop(given.stop)
         phase_before = self._engagement.phase
-        facts = self._facts(now_ns, given.link, overdue)
+        facts = self._facts(now_ns, given, overdue)
         move = self._engagement.step(facts, given.act)
         self._change_hand(move.hand, now_ns, given.link)
         phase = self._engagement.phase
@@ -170,8 +172,9 @@ class Gate:
             messages=self._take_messages(),
         )
 
-    def _facts(self, now_ns: int, link: LinkSnapshot, overdue: str | None) -> Facts:
-        status, left = link.status, None
+    def _facts(self, now_ns: int, given: GateInput, overdue: str | None) -> Facts:
+        link, left = given.link, None
+        status = link.status
         if status is not None:
             left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
         return Facts(
@@ -196,8 +199,8 @@ class Gate:
             shows_last=link.shows_last,
             refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns),
-            chunk_fault=overdue or self._chunks.fault(now_ns),
-            slowness=self._chunks.slowness,
+            chunk_fault=given.command_fault or overdue or self._chunks.fault(now_ns),
+            slowness=given.command_fault or self._chunks.slowness,
             envelope_problem=left.reason if left and left.kind == "fault" else None,
             landing=left.reason if left and left.kind == "landed" else None,
         )

@@ -65,9 +65,9 @@ class ActionSmoother:
             return type(u1)(*self._smoothed)
         decay = math.exp(-dt_s / tau_s)
         lag = tau_s / dt_s
-        return type(u1)(
-            *[
-                b - (b - a) * lag + (y - a + (b - a) * lag) * decay
-                for a, b, y in zip(u0, u1, self._smoothed, strict=True)
-            ]
+        filtered = (
+            (a, b, y, b - (b - a) * lag + (y - a + (b - a) * lag) * decay)
+            for a, b, y in zip(u0, u1, self._smoothed, strict=True)
         )
+        # An average of the three: rounding must not carry it beyond a limit that they keep.
+        return type(u1)(*[min(max(z, min(a, b, y)), max(a, b, y)) for a, b, y, z in filtered])
