@@ -108,6 +108,7 @@ class Gate:
         self._hand: Hand | None = None
         self._last = self._neutral
         """As last sent."""
+        self._is_readonly = settings.engagement.readonly
         self._messages: list[str] = []
 
     @property
@@ -134,6 +135,11 @@ class Gate:
     def last_setpoint(self) -> Action | None:
         """A setpoint at rest; None where the policy's actions are sticks, which can be released."""
         return None if isinstance(self._neutral, Sticks) else self._neutral
+
+    def unsent(self) -> None:
+        """The last decision did not leave: the next one starts from what left before it."""
+        if not self._is_readonly:
+            self._smoother.undo()
 
     def step(self, now_ns: int, given: GateInput) -> GateOutput:
         """Advance to this moment."""

@@ -196,6 +196,8 @@ class GateLoop:
         self._command_fault = None
         wanted = output.decision
         sent = None if wanted is None else self._attempt(self._link.send, wanted)
+        if isinstance(wanted, Command) and sent is None:
+            self._gate.unsent()
         if output.slot is not None or output.decision is not None or output.phase != self._phase:
             self._report_tick(output, woke_ns, at_ns, sent)
         self._follow(output)
