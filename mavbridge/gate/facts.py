@@ -54,7 +54,7 @@ class Facts:
     chunk_problem: str | None
     """Why a flight may not begin now: no fresh chunk."""
     chunk_fault: str | None
-    """Why a flight must end now: no chunk for longer than the grace."""
+    """Why a flight must end now: no chunk for longer than the grace, or a command that failed."""
     envelope_problem: str | None
     """Which limit of the flight envelope is exceeded."""
     shows_last: bool = True
@@ -66,7 +66,7 @@ class Facts:
     stick_override_ns: int | None = None
     """When the vehicle last said that moving sticks have changed its mode."""
     slowness: str | None = None
-    """Why the policy is too slow ever to fly."""
+    """Why the policy can never fly: too slow, or a command that failed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

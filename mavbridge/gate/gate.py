@@ -62,6 +62,8 @@ class GateInput:
     """Why the flight process cannot compute a chunk."""
     act: Act | None = None
     stop: Ending | None = None
+    command_fault: str | None = None
+    """Error while the last command was made or sent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +108,7 @@ class Gate:
         self._hand: Hand | None = None
         self._last = self._neutral
         """As last sent."""
+        self._is_readonly = settings.engagement.readonly
         self._messages: list[str] = []
 
     @property
@@ -133,6 +136,11 @@ class Gate:
         """A setpoint at rest; None where the policy's actions are sticks, which can be released."""
         return None if isinstance(self._neutral, Sticks) else self._neutral
 
+    def unsent(self) -> None:
+        """The last decision did not leave: the next one starts from what left before it."""
+        if not self._is_readonly:
+            self._smoother.undo()
+
     def step(self, now_ns: int, given: GateInput) -> GateOutput:
         """Advance to this moment."""
         # Judged before the news: a gate that stood still itself has let the grace run out.
@@ -143,7 +151,7 @@ class Gate:
         if given.stop is not None:
             self._engagement.stop(given.stop)
         phase_before = self._engagement.phase
-        facts = self._facts(now_ns, given.link, overdue)
+        facts = self._facts(now_ns, given, overdue)
         move = self._engagement.step(facts, given.act)
         self._change_hand(move.hand, now_ns, given.link)
         phase = self._engagement.phase
@@ -170,8 +178,9 @@ class Gate:
             messages=self._take_messages(),
         )
 
-    def _facts(self, now_ns: int, link: LinkSnapshot, overdue: str | None) -> Facts:
-        status, left = link.status, None
+    def _facts(self, now_ns: int, given: GateInput, overdue: str | None) -> Facts:
+        link, left = given.link, None
+        status = link.status
         if status is not None:
             left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
         return Facts(
@@ -196,10 +205,10 @@ class Gate:
             shows_last=link.shows_last,
             refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns),
-            chunk_fault=overdue or self._chunks.fault(now_ns),
+            chunk_fault=given.command_fault or overdue or self._chunks.fault(now_ns),
             are_sticks_at_rest=link.are_sticks_at_rest,
             stick_override_ns=status.stick_override_ns if status else None,
-            slowness=self._chunks.slowness,
+            slowness=given.command_fault or self._chunks.slowness,
             envelope_problem=left.reason if left and left.kind == "fault" else None,
             landing=left.reason if left and left.kind == "landed" else None,
         )

@@ -1,8 +1,10 @@
 """The gate with its two edges, the link to the vehicle and the channel to the flight process."""
 
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Protocol
+from pathlib import Path
+from typing import Protocol, TypeVar
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.vehicle import (
@@ -38,6 +40,8 @@ IDLE_PERIOD_NS = 10 * NS_PER_MS
 FINISH_NS = 4 * NS_PER_S
 """Longest that putting parameters back may take, or sending a release that was held up."""
 ABANDON_RELEASES, ABANDON_SPACING_NS = 10, 50 * NS_PER_MS
+_Given = TypeVar("_Given")
+_Sent = TypeVar("_Sent")
 _HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
 _ENGAGED = (*_HELD, Phase.RELEASING)
 
@@ -122,6 +126,8 @@ class GateLoop:
         self._watches_position = False
         self._phase = Phase.WAITING
         self._stop: Ending | None = None
+        self._command_fault: str | None = None
+        """Error of the last pass while a command was made or sent."""
         self._finish_until_ns: int | None = None
         self._is_clean = False
         self._modes = ModeRoles()
@@ -187,7 +193,11 @@ class GateLoop:
         output = self._gate.step(at_ns, given)
         if output.decision is not None and at_ns > now_ns:
             self._clock.sleep_until_ns(at_ns)
-        sent = None if output.decision is None else self._link.send(output.decision)
+        self._command_fault = None
+        wanted = output.decision
+        sent = None if wanted is None else self._attempt(self._link.send, wanted)
+        if isinstance(wanted, Command) and sent is None:
+            self._gate.unsent()
         if output.slot is not None or output.decision is not None or output.phase != self._phase:
             self._report_tick(output, woke_ns, at_ns, sent)
         self._follow(output)
@@ -196,16 +206,29 @@ class GateLoop:
         self._link.service()
         if output.phase is Phase.ENDED:
             self._finish(woke_ns)
-        return self._gate.next_ns - self._lead_ns
+        # A command that failed is answered in a pass that follows at once.
+        return woke_ns if self._command_fault else self._gate.next_ns - self._lead_ns
+
+    def _attempt(self, send: Callable[[_Given], _Sent], given: _Given) -> _Sent | None:
+        """Send it; an error is a fault of the flight, not the gate's end."""
+        try:
+            return send(given)
+        except Exception as error:  # noqa: BLE001 - the vehicle is held: end the flight in order
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            self._command_fault = (
+                f"a command could not be made, a bug of mavbridge: {type(error).__name__}: {error} "
+                f"({Path(at.filename).name}:{at.lineno})"
+            )
+            return None
 
     def _follow(self, output: GateOutput) -> None:
         """Send the requests, and show the messages."""
         if output.mode is not None:
-            self._link.set_mode(output.mode)
+            self._attempt(self._link.set_mode, output.mode)
         if output.arm:
             self._link.arm()
         if output.takeoff_m is not None:
-            self._link.takeoff(output.takeoff_m)
+            self._attempt(self._link.takeoff, output.takeoff_m)
         for text in output.messages:
             self._flight.send(encode_from_gate(GateMessage(text)))
 
@@ -267,7 +290,14 @@ class GateLoop:
                     pass  # settings that count already
         if self._flight.is_closed:
             self.stop(Ending(reason="the flight process has died", is_fault=True))
-        return GateInput(link=snapshot, chunk=chunk, absence=absence, act=act, stop=self._stop)
+        return GateInput(
+            link=snapshot,
+            chunk=chunk,
+            absence=absence,
+            act=act,
+            stop=self._stop,
+            command_fault=self._command_fault,
+        )
 
     def _report_tick(
         self, output: GateOutput, woke_ns: int, decided_ns: int, sent: Action | None

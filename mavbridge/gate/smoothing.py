@@ -36,13 +36,17 @@ class ActionSmoother:
         self.limits = settings.limits
         self._last_ns: int | None = None
         self._slewed = start
-        self._smoothed = start
+        self._smoothed = self._before = start
 
     def reset(self, start: Action) -> None:
         """Restart from what the vehicle does at present."""
         self._last_ns = None
         self._slewed = start
-        self._smoothed = start
+        self._smoothed = self._before = start
+
+    def undo(self) -> None:
+        """Restart from before the last step, whose output did not leave."""
+        self.reset(self._before)
 
     def step(self, raw: Action, now_ns: int) -> ActionTrace:
         """Filter one action, which must be finite; the first after a reset spans no time."""
@@ -54,6 +58,7 @@ class ActionSmoother:
         before = self._slewed
         slewed = self.limits.approach(before, clipped, dt_s)
         smoothed = self._low_pass(before, slewed, dt_s)
+        self._before = self._smoothed
         self._slewed, self._smoothed = slewed, smoothed
         return ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
 
@@ -65,9 +70,9 @@ class ActionSmoother:
             return type(u1)(*self._smoothed)
         decay = math.exp(-dt_s / tau_s)
         lag = tau_s / dt_s
-        return type(u1)(
-            *[
-                b - (b - a) * lag + (y - a + (b - a) * lag) * decay
-                for a, b, y in zip(u0, u1, self._smoothed, strict=True)
-            ]
+        filtered = (
+            (a, b, y, b - (b - a) * lag + (y - a + (b - a) * lag) * decay)
+            for a, b, y in zip(u0, u1, self._smoothed, strict=True)
         )
+        # An average of the three: rounding must not carry it beyond a limit that they keep.
+        return type(u1)(*[min(max(z, min(a, b, y)), max(a, b, y)) for a, b, y, z in filtered])

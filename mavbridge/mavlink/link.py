@@ -6,7 +6,7 @@ from dataclasses import replace
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.address import parse_address
-from mavbridge.core.clock import NS_PER_S, Clock, period_ns
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.vehicle import (
@@ -45,7 +45,7 @@ from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.settings import LinkSettings
-from mavbridge.mavlink.transport.connection import Connection, PacketLog
+from mavbridge.mavlink.transport.connection import REFUSED_NS, Connection, PacketLog
 from mavbridge.mavlink.transport.forwarding import Forwarding
 from mavbridge.mavlink.transport.sockets import Address, Transport
 
@@ -131,7 +131,8 @@ class MavlinkLink:
                 refused_mode=self._commands.refused_mode,
                 texts=texts,
             )
-        others = output.overruled(now_ns)
+        # A vehicle that gets nothing from us rightly follows somebody else.
+        others = None if self._connection.is_refused(now_ns) else output.overruled(now_ns)
         # Sticks that move do nothing in a mode of setpoints, which goes on with our last one.
         is_overruled = others is not None or (output.is_sticks and shared is not None)
         return LinkSnapshot(
@@ -159,6 +160,11 @@ class MavlinkLink:
         if (problem := vehicle.problem(now_ns)) is not None:
             hint = self._connection.hint
             return problem if hint is None else f"{problem}; {hint}"
+        if self._connection.is_refused(now_ns) and not self._config.readonly:
+            return (
+                f"this computer has refused every packet to the vehicle for "
+                f"{REFUSED_NS // NS_PER_MS} ms: no route, a firewall, or a full queue"
+            )
         return vehicle.output_problem(now_ns) or self._timesync.late_sending
 
     def _share_with(self, station: Forwarding, now_ns: int) -> str | None:

@@ -117,6 +117,8 @@ class FakeLink:
         self.services = 0
         self.restores = 0
         self.on_send: Callable[[], None] = lambda: None
+        self.takes: Callable[[Decision], bool] = lambda decision: True
+        """Whether a decision can be sent now; may raise."""
 
     def measure(self, *, age_ns: int = 0, yaw_rad: float = 0.0, down_mps: float = 0.0) -> None:
         """The vehicle sends its state, which arrives now and happened ``age_ns`` ago."""
@@ -183,6 +185,8 @@ class FakeLink:
 
     def send(self, decision: Decision) -> Action | None:
         self.on_send()
+        if not self.takes(decision):
+            return None
         self.decisions.append((self._clock.now_ns(), decision))
         return None if isinstance(decision, Release) else decision.action
 

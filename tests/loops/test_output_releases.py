@@ -4,12 +4,16 @@ Limits are those of docs/SAFETY.md; the vehicle leans 15 degrees or flies 2 m/s 
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
 from helpers import release_paths as paths
 from helpers.output_flights import COMBINATIONS, Aftermath, OutputFlight
+from mavbridge.core.vehicle import Action
 from mavbridge.gate.engagement import Phase
+from mavbridge.mavlink.codec.packets import CommandRefusedError
+from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import ActionKind
 from policy.scripted.programs import Motion, Program, Push
 from sitl.vehicle.config import AutopilotName, Px4Release
@@ -110,6 +114,28 @@ def test_chunks_that_are_not_numbers(autopilot: AutopilotName, kind: ActionKind)
     found = after(flight, paths.not_a_number)
     assert_safe(flight, found, mode=hold(flight), neutral_ms=GRACE_MS)
     assert "unusable chunks" in flight.reason
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
+def test_a_command_that_the_codec_refuses(autopilot: AutopilotName, kind: ActionKind) -> None:
+    flight = OutputFlight(autopilot, kind)
+
+    def refuse(flight: OutputFlight) -> None:
+        output = flight.link._sender.output
+        assert output is not None
+        encode = output.encode
+
+        def encode_or_refuse(action: Action, vehicle: VehicleSession, now_ns: int) -> Any:
+            if flight.phase is Phase.FLYING:  # as last told: the first neutral one is refused too
+                raise CommandRefusedError("1.0000000000000002 is not in [-1, 1]")
+            return encode(action, vehicle, now_ns)
+
+        output.encode = encode_or_refuse  # type: ignore[method-assign]
+
+    found = after(flight, refuse)
+    assert "CommandRefusedError" in flight.reason
+    assert_safe(flight, found, mode=hold(flight), neutral_ms=DEATH_MS)
+    assert not flight.gate.is_done
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from helpers.gate_facts import stick_smoothing
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.vehicle import NEUTRAL, Sticks
+from mavbridge.core.vehicle import NEUTRAL, AttitudeThrust, Sticks
 from mavbridge.gate.limits import LimitSettings
 from mavbridge.gate.smoothing import ActionSmoother, Smoothing
 
@@ -105,6 +105,25 @@ def test_sticks_stay_in_range_and_under_the_slew_limit(
             assert -1.0 <= after <= 1.0
             assert abs(after - before) <= reach + 1e-9
         last, last_ns = out, now_ns
+
+
+@given(
+    wanted=st.lists(st.tuples(*[st.floats(-1e6, 1e6)] * 4), min_size=2, max_size=20),
+    gaps_ns=st.lists(st.integers(0, 10**9), min_size=20, max_size=20),
+    tau_s=st.floats(0.0, 2.0),
+)
+@example(wanted=[(0.0,) * 4, (0.563010758859421,) * 4], gaps_ns=[0, 10], tau_s=1.7929980275164399)
+def test_rounding_carries_no_action_beyond_its_limits(
+    wanted: list[tuple[float, float, float, float]], gaps_ns: list[int], tau_s: float
+) -> None:
+    limits = LimitSettings(stick_slew_per_s=0.0).of("attitude")
+    start = AttitudeThrust(0.0, 0.0, 0.0, 0.0)
+    smoother, now_ns = ActionSmoother(Smoothing(limits=limits, tau_s=tau_s), start), 0
+    for raw, gap_ns in zip(wanted, gaps_ns, strict=False):
+        now_ns += gap_ns
+        out = smoother.step(AttitudeThrust(*raw), now_ns).smoothed
+        assert limits.low[0] <= out.thrust <= limits.high[0]
+        assert all(map(math.isfinite, out))
 
 
 def test_a_step_reaches_63_percent_after_tau() -> None:

@@ -3,14 +3,14 @@
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from helpers.stick_curves import PX4_DEFAULTS, copter_values, policy_motion, px4_motion
 from mavbridge.core.vehicle import StickGains, Sticks
-from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
-from mavbridge.mavlink.profiles.px4_sticks import px4_curves
-from mavbridge.mavlink.profiles.sticks import StickCurves
+from mavbridge.mavlink.profiles.ardupilot_sticks import YawExpo, ardupilot_curves
+from mavbridge.mavlink.profiles.px4_sticks import CubicExpo, px4_curves
+from mavbridge.mavlink.profiles.sticks import Half, StickCurves
 
 dead_zones = st.integers(0, 50).map(lambda hundredths: hundredths / 100.0)
 gains = st.builds(
@@ -77,8 +77,50 @@ def test_every_stick_stays_within_its_travel_and_on_its_side(
 ) -> None:
     for moved in (found.to_vehicle(given_sticks), found.to_policy(given_sticks)):
         for before, after in zip(given_sticks, moved, strict=True):
-            assert abs(after) <= 1.0 + 1e-9
+            assert -1.0 <= after <= 1.0
             assert before * after >= 0.0
+
+
+def below(value: float, ulps: int) -> float:
+    """So many floats below ``value``."""
+    for _ in range(ulps):
+        value = math.nextafter(value, 0.0)
+    return value
+
+
+bends = st.one_of(
+    st.none(),
+    st.sampled_from((0.96, 1.0)).map(CubicExpo),  # whose inverses were seen to round upwards
+    st.floats(0.001, 1.0).map(CubicExpo),
+    st.floats(-0.5, 0.95).map(YawExpo),
+)
+halves = st.builds(
+    Half, full=st.floats(0.1, 2000.0), start=dead_zones, end=st.floats(0.6, 1.0), bend=bends
+)
+
+
+@given(halves, st.integers(0, 40), st.floats(0.0, 1.0))
+@example(Half(150.0, 0.04, bend=CubicExpo(1.0)), 1, 0.0)
+def test_a_half_maps_its_travel_onto_its_motion_to_the_last_bit(
+    half: Half, ulps: int, share: float
+) -> None:
+    assert half.travel(half.full) == half.end
+    assert half.motion(half.end) == half.full
+    for motion in (below(half.full, ulps), share * half.full):
+        assert 0.0 <= half.travel(motion) <= half.end
+    for travel in (below(half.end, ulps), share * half.end):
+        assert 0.0 <= half.motion(travel) <= half.full
+
+
+ends = st.builds(
+    lambda sign, ulps: sign * below(1.0, ulps), st.sampled_from((-1, 1)), st.integers(0, 40)
+)
+
+
+@given(curves, st.builds(Sticks, throttle=ends, yaw=ends, pitch=ends, roll=ends))
+def test_sticks_near_their_stops_leave_no_travel(found: StickCurves, given_sticks: Sticks) -> None:
+    for moved in (found.to_vehicle(given_sticks), found.to_policy(given_sticks)):
+        assert all(-1.0 <= stick <= 1.0 for stick in moved)
 
 
 @given(curves, sticks)

@@ -127,12 +127,17 @@ class EchoCheck:
         value = wanted[at] + (nudge if wanted[at] <= rules.centre else -nudge)
         return (*wanted[:at], value, *wanted[at + 1 :])
 
+    def tried(self, now_ns: int) -> None:
+        """Note a command, also one that could not be sent: its echo is awaited from then on."""
+        if self._since_ns is None:
+            self._since_ns = now_ns
+            self._sent.clear()
+
     def sent(self, values: Shown, now_ns: int) -> None:
         """Note a command that was sent, by the values that will be shown of it."""
-        if self._since_ns is None:
-            self._since_ns, self.has_sent, self.is_released = now_ns, True, False
-            self._sent.clear()
-        elif now_ns - self._sent[-1][0] > _PAUSE_NS:
+        self.tried(now_ns)
+        self.has_sent, self.is_released = True, False
+        if self._sent and now_ns - self._sent[-1][0] > _PAUSE_NS:
             self._held = None
         self._sent.append((now_ns, values))
         while self._sent[0][0] < now_ns - MATCH_NS:

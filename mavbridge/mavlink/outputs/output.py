@@ -67,6 +67,11 @@ class ActionOutput(ABC):
             CommandRefusedError: an action that must not be sent.
         """
 
+    def refused(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
+        """Note an action that could not be sent."""
+        if encoded.shown is not None:
+            self.echo.tried(now_ns)
+
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note what has left."""
         if encoded.shown is not None:

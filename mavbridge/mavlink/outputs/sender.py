@@ -71,6 +71,8 @@ class ActionSender:
             return None
         self._release.acted(output.releases)
         if not self._connection.send(encoded.packet):
+            if not self._connection.is_down:  # which is told as that
+                output.refused(encoded, vehicle, self._clock.now_ns())
             return None
         output.sent(encoded, vehicle, self._clock.now_ns())
         return encoded.action

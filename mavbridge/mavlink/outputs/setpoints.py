@@ -61,13 +61,19 @@ class SetpointOutput(ActionOutput):
             self._ground_ns = now_ns
         return self._ground_ns is not None and now_ns - self._ground_ns <= self.takeoff_ns
 
+    def _has_echo(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> bool:
+        is_taking_off = self._is_taking_off(vehicle, now_ns)
+        return encoded.shown is not None and self._follows(vehicle, now_ns) and not is_taking_off
+
+    def refused(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
+        """Note an action that could not be sent."""
+        if self._has_echo(encoded, vehicle, now_ns):
+            super().refused(encoded, vehicle, now_ns)
+
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note what has left, for the echo where there is one to expect."""
         self._sent_ns = now_ns
-        is_taking_off = self._is_taking_off(vehicle, now_ns)
-        self._is_checked = (
-            encoded.shown is not None and self._follows(vehicle, now_ns) and not is_taking_off
-        )
+        self._is_checked = self._has_echo(encoded, vehicle, now_ns)
         if self._is_checked and encoded.shown is not None:
             self.echo.sent(encoded.shown, now_ns)
         else:

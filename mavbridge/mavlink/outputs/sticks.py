@@ -6,7 +6,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import IDLE, Action, StickGains, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
 from mavbridge.mavlink.outputs.echo import EchoRules
-from mavbridge.mavlink.outputs.output import ActionOutput
+from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
 from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
@@ -29,6 +29,8 @@ class StickOutput(ActionOutput):
         self._curves = IDENTITY
         self._curves_mode = ""
         self._curves_due_ns = 0
+        self._saturating: tuple[str, ...] = ()
+        """Sticks of the last action that ask for more than the vehicle can do."""
         self._new_notes: list[str] = []
         self._told: set[str] = set()
 
@@ -36,6 +38,11 @@ class StickOutput(ActionOutput):
         """A new session: its parameters and its mode count."""
         super().restart()
         self._curves_mode, self._curves_due_ns = "", 0
+
+    def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
+        """Note what has left."""
+        super().sent(encoded, vehicle, now_ns)
+        self.saturated.update(self._saturating)
 
     def take_notes(self) -> tuple[str, ...]:
         """What this vehicle cannot do that the policy may ask for, for the user; each once."""
@@ -65,6 +72,7 @@ class StickOutput(ActionOutput):
 
         ``IDLE`` is no motion that the policy means, but the stop at the bottom, for arming.
         """
+        self._saturating = ()
         if not isinstance(action, Sticks):
             raise CommandRefusedError(f"{type(action).__name__} are not sticks")
         if self._gains is None or action is IDLE:
@@ -73,7 +81,7 @@ class StickOutput(ActionOutput):
         curves = self._curves_of(vehicle, status.mode if status else "", now_ns)
         if curves.is_identity:
             return action, curves
-        self.saturated.update(curves.saturated(action))
+        self._saturating = curves.saturated(action)
         return curves.to_vehicle(action), curves
 
     def _curves_of(self, vehicle: VehicleSession, mode: str, now_ns: int) -> StickCurves:

@@ -54,7 +54,8 @@ class Half(NamedTuple):
         if travel >= self.end:
             return self.full
         share = (travel - self.start) / (self.end - self.start)
-        return self.full * (share if self.bend is None else self.bend.bent(share))
+        # Rounding may carry a share beyond 1; also in the inverse.
+        return self.full * min(share if self.bend is None else self.bend.bent(share), 1.0)
 
     def travel(self, motion: float) -> float:
         """Travel that asks for this motion: 0 for none, ``end`` for more than can be had."""
@@ -65,7 +66,7 @@ class Half(NamedTuple):
         share = motion / self.full
         if self.bend is not None:
             share = self.bend.straightened(share)
-        return self.start + share * (self.end - self.start)
+        return min(self.start + share * (self.end - self.start), self.end)
 
     def is_like(self, policy: "Half") -> bool:
         """So close to the policy's that its sticks need no mapping."""

@@ -67,7 +67,9 @@ class LinkCounters:
             echo_confirmed=echo_confirmed if self.sent else None,
             unusable_packets=unusable_packets,
             refused_signatures=refused_signatures,
-            saturated=tuple((name, n / self.sent) for name, n in sorted(saturated.items())),
+            saturated=tuple(
+                (name, n / self.sent) for name, n in sorted(saturated.items()) if self.sent
+            ),
             vehicle_clock_offset_ns=timesync.offset_ns,
             is_timesync_good=timesync.is_good,
             timesync_error_ms=None if error_ns is None else error_ns / NS_PER_MS,

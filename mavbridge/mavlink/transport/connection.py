@@ -15,6 +15,8 @@ REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 2 * NS_PER_MS
 """Longest stretch of reading: a flood must not keep the gate from its next slot. What is
 left stays with the kernel, which drops what it cannot hold."""
+REFUSED_NS = 100 * NS_PER_MS
+"""Time for which every packet is refused before that counts as a problem."""
 
 
 SIGNED_VEHICLE = (
@@ -58,6 +60,8 @@ class Connection:
         self._clock = clock
         self._log = log
         self._reopen_ns: int | None = None
+        self._refused_ns: int | None = None
+        """First of the packets that were refused since the last one that was taken."""
         self.peer: Address | None = None
         """The vehicle's address, to which packets are sent; None until it is found."""
         self.tap: Callable[[bytes], None] | None = None
@@ -84,6 +88,7 @@ class Connection:
             self._lose(error, now_ns)
             return
         self._was_open = True
+        self._refused_ns = None
         self._codec.forget_partial()
 
     def take_texts(self) -> tuple[str, ...]:
@@ -142,6 +147,10 @@ class Connection:
         """What may be the reason if the vehicle does not answer, or None."""
         return SIGNED_VEHICLE if self._codec.hears_signed else None
 
+    def is_refused(self, now_ns: int) -> bool:
+        """True if the system has taken none of our packets for ``REFUSED_NS``."""
+        return self._refused_ns is not None and now_ns - self._refused_ns >= REFUSED_NS
+
     def send(self, data: bytes) -> bool:
         """Send one packet; False: it was not sent."""
         if self.is_down:
@@ -151,6 +160,7 @@ class Connection:
         except TransportDownError as error:
             self._lose(error, self._clock.now_ns())
             return False
+        self._refused_ns = None if is_sent else self._refused_ns or self._clock.now_ns()
         if is_sent and self._log is not None:
             self._log.put(Packet(self._clock.now_ns(), data))
         return is_sent

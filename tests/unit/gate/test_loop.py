@@ -1,5 +1,6 @@
 """The gate between a vehicle and a flight process of fakes."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 from helpers.fakes import START_NS, FakeClock, FakeLink
 from helpers.gate_facts import engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
@@ -16,6 +18,7 @@ from mavbridge.core.vehicle import (
     AttitudeThrust,
     BodyRates,
     Command,
+    Decision,
     Release,
     Sticks,
     Velocity,
@@ -39,6 +42,7 @@ from mavbridge.gate.wire import (
     decode_from_gate,
     encode_to_gate,
 )
+from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.settings import LinkSettings
 
 MS = NS_PER_MS
@@ -383,6 +387,78 @@ def test_the_death_of_the_flight_process_is_a_fault() -> None:
     assert rig.link.requests == ["mode BRAKE"]  # not LAND, as at a normal end
     rig.run(1.0)
     assert rig.link.hands[-2:] == [Command(action=NEUTRAL), Release("the flight process has died")]
+    assert rig.loop.is_done
+
+
+# --- commands that cannot be made
+
+
+def refusing(error: Exception, *actions: Action) -> Callable[[Decision], bool]:
+    """A link that raises where it should send one of these actions; without any, each of them."""
+
+    def takes(decision: Decision) -> bool:
+        if isinstance(decision, Command) and (not actions or decision.action in actions):
+            raise error
+        return True
+
+    return takes
+
+
+@pytest.mark.parametrize("error", [CommandRefusedError("1.0000000000000002"), ZeroDivisionError()])
+def test_a_command_that_fails_ends_the_flight_in_order_and_not_the_gate(error: Exception) -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+    rig.link.takes = refusing(error, WANTED)
+    rig.run(0.02)
+    assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
+    assert rig.link.requests == ["mode BRAKE"]
+    rig.run(1.0)
+    assert rig.ticks[-1].phase is Phase.RELEASED
+    assert type(error).__name__ in rig.ticks[-1].reason
+    assert rig.loop.outcome.faults == 1
+    rig.loop.stop(Ending(reason="over"))
+    rig.run(0.1)
+    assert rig.loop.is_done
+    assert rig.link.restores
+
+
+def test_neutral_follows_in_the_same_moment() -> None:
+    rig = Rig().flying()
+    rig.link.takes = refusing(ZeroDivisionError(), WANTED)
+    while (due_ns := rig.loop.step()) > rig.clock.now_ns():
+        rig.clock.sleep_until_ns(due_ns)
+    rig.loop.step()
+    assert rig.link.decisions[-1] == (rig.clock.now_ns(), Command(action=NEUTRAL))
+
+
+def test_neutral_that_cannot_be_made_either_leaves_the_mode_and_the_release() -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+    rig.link.takes = refusing(CommandRefusedError("broken"))
+    rig.run(1.0)
+    assert rig.link.requests == ["mode BRAKE"]
+    assert isinstance(rig.link.hands[-1], Release)
+    assert rig.ticks[-1].phase is Phase.RELEASED
+
+
+def test_idle_sticks_that_cannot_be_made_end_the_way_into_a_flight() -> None:
+    rig = Rig(armed=False)
+    rig.link.takes = refusing(CommandRefusedError("broken"))
+    engagement = engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings(), arm=True)
+    rig.tell(replace(FLIGHT, engagement=engagement))
+    rig.run(1.5)
+    assert rig.loop.is_done
+    assert "broken" in (rig.loop.failure or "")
+
+
+def test_a_mode_that_cannot_be_asked_for_does_not_end_the_gate() -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+
+    def refuse(mode: str) -> None:
+        raise UserError(f"no mode {mode}")
+
+    rig.link.set_mode = refuse  # type: ignore[method-assign]
+    rig.loop.stop(Ending(reason="over", is_fault=True))
+    rig.run(6.0)
+    assert isinstance(rig.link.hands[-1], Release)
     assert rig.loop.is_done
 
 
