@@ -1,4 +1,4 @@
-"""The system takes none of our packets (no route, EPERM, a full queue), while the vehicle's come."""
+"""No packet of ours leaves (no route, EPERM, a full queue), while those of the vehicle come."""
 
 import pytest
 
