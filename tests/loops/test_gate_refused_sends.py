@@ -1,4 +1,4 @@
-"""The system takes none of our packets (no route, EPERM, a full queue), while the vehicle's come."""
+"""The system takes none of our packets (no route, EPERM, full queue), while the vehicle's come."""
 
 import pytest
 
