@@ -7,7 +7,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PolicyError
 from mavbridge.flight.settings import effective_freshness
-from mavbridge.gate.chunks import FreshnessLimits
+from mavbridge.gate.chunks import PERIOD_TOLERANCE, FreshnessLimits
 from policy.contract import Contract
 from policy.loading.request import LoadedPolicy
 from policy.loading.timing import SolveTimes
@@ -60,6 +60,7 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
             f"{action_hz:.3g} chunks a second, since this policy is meant to play each one for "
             f"{_text(contract.play_s)}; {flag} asks for another rate"
         )
+    _require_horizon(executable.name, contract, action_hz, flag)
     if times is None:
         return tuple(notes)
     figures = f"a chunk takes {_text(times.act_s)} here, an image {_text(times.encode_s)}"
@@ -73,7 +74,8 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
         fastest = _worst(contract, limits, times, action_hz=math.inf, image_hz=math.inf)
         is_by_rate = fastest.share <= CLEARLY
         advice = f"Ask for a higher {flag} or --visual-rate" if is_by_rate else FASTER
-        raise PolicyError(f"{executable.name} is too slow: {told}. {advice}")
+        fault = "has too short a horizon" if worst.by == "horizon" else "is too slow"
+        raise PolicyError(f"{executable.name} {fault}: {told}. {advice}")
     if worst.share > 1:
         notes.append(f"warning: {told}: it will coast")
     for what, asked_hz, each_s in (
@@ -84,6 +86,19 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
             reached = f"this computer makes some {1 / each_s:.2g}"
             notes.append(f"warning: asked for {asked_hz:.3g} {what} a second, {reached}: {figures}")
     return tuple(notes)
+
+
+def _require_horizon(name: str, contract: Contract, action_hz: float, flag: str) -> None:
+    """Raise PolicyError if a chunk ends before the next one is asked for."""
+    horizon_s = contract.horizon * contract.chunk_dt_s
+    if horizon_s < (1 - PERIOD_TOLERANCE) / action_hz:
+        least_hz = math.ceil(1 / horizon_s - 1e-6)
+        raise PolicyError(
+            f"{name} has a horizon of {_text(horizon_s)} ({contract.horizon} x "
+            f"{_text(contract.chunk_dt_s)}), shorter than the {_text(1 / action_hz)} between two "
+            f"solves at {action_hz:.3g} chunks a second: ask for {flag} {least_hz} or more, or "
+            "correct horizon and chunk_dt_s in its contract"
+        )
 
 
 def _worst(
@@ -104,11 +119,13 @@ def _worst(
     state_s = times.act_s + every_s
     image_s = times.encode_s + max(1 / image_hz, times.encode_s)
     sent, horizon_s = "when a stick leaves, ", contract.horizon * contract.chunk_dt_s
+    # A single action is held for its step from its arrival.
+    chunk_s = every_s * (1 - PERIOD_TOLERANCE) if contract.horizon == 1 else state_s
     ages = (
         _Age(f"{sent}the attitude is", state_s, played.state_ns / NS_PER_S),
         _Age(f"{sent}the velocity is", state_s, played.velocity_ns / NS_PER_S),
         _Age(f"{sent}the chunk is", every_s, played.chunk_ns / NS_PER_S),
-        _Age(f"{sent}the start of its chunk is", state_s, horizon_s, "horizon"),
+        _Age(f"{sent}the start of its chunk is", chunk_s, horizon_s, "horizon"),
         _Age("when a chunk is begun, the image is", image_s, limits.feature_ns / NS_PER_S),
         _Age(f"{sent}the image is", image_s + state_s, played.feature_ns / NS_PER_S),
     )

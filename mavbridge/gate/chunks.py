@@ -17,6 +17,8 @@ MAX_REFUSED = 5
 REFUSED_WINDOW_NS = NS_PER_S
 REFUSED_WINDOW_PERIODS = 10
 RECENT_GAPS = 8
+PERIOD_TOLERANCE = 0.01
+"""Share by which a horizon may be shorter than the chunk period: of one given as 0.033 s."""
 LEAST_GAPS = 2
 """Chunks must have come in time for so long before a flight may begin."""
 SLOW_CHUNKS = 5
@@ -69,9 +71,14 @@ class Chunk(NamedTuple):
     perhaps not finite."""
 
     @property
+    def horizon_ns(self) -> int:
+        """Time for which its actions act, one step each."""
+        return len(self.actions) * self.step_ns
+
+    @property
     def end_ns(self) -> int:
-        """End of the horizon: an action acts for one step."""
-        return self.first_ns + len(self.actions) * self.step_ns
+        """End of the horizon."""
+        return self.first_ns + self.horizon_ns
 
     def action_at(self, at_ns: int) -> Action:
         """Action at a time, linear between the actions, held at both ends."""
@@ -111,6 +118,10 @@ class ChunkBuffer:
         """Why the newest chunk was not taken; None if it was."""
         self.newest: Chunk | None = None
         self._taken_ns = 0
+        self._end_ns = 0
+        """End of the horizon of the newest chunk."""
+        self._uncovered_ns = 0
+        """Time beyond the horizons of the last chunks in a row that ended before the next came."""
         self._until_ns = 0
         """End of the grace of the newest chunk."""
         self._gaps_ns: deque[int] = deque(maxlen=RECENT_GAPS)
@@ -131,23 +142,46 @@ class ChunkBuffer:
             return False
         self._solve_ns = chunk.computed_ns - chunk.attitude_ns
         self._slow = self._slow + 1 if self._solve_ns > self._limits.state_ns else 0
+        end_ns = self._horizon_end_ns(chunk, now_ns)
         self._refusal = self._stale(chunk, now_ns)
+        if self._refusal is None and now_ns > end_ns:
+            self._refusal = f"the chunk came after its horizon{self._horizon(chunk)} had ended"
         if self._refusal is not None:
             return False
         if self.newest is not None:
             self._gaps_ns.append(now_ns - self._taken_ns)
-        self.newest, self._taken_ns = chunk, now_ns
-        limited_ns = max(now_ns, min(self._stale_ns(chunk), chunk.end_ns)) + LEAST_GRACE_NS
-        self._until_ns = min(now_ns + self.grace_ns, limited_ns)
+            gap_ns = now_ns - self._end_ns
+            uncovered_ns = self._uncovered_ns + gap_ns if gap_ns > 0 else 0
+            self._uncovered_ns = min(uncovered_ns, LEAST_GRACE_NS)
+        self.newest, self._taken_ns, self._end_ns = chunk, now_ns, end_ns
+        limited_ns = max(now_ns, min(self._stale_ns(chunk), end_ns)) + LEAST_GRACE_NS
+        self._until_ns = min(now_ns + self.grace_ns, limited_ns - self._uncovered_ns)
         return True
+
+    def _horizon_end_ns(self, chunk: Chunk, taken_ns: int) -> int:
+        """Moment until which a chunk that came at ``taken_ns`` has an action.
+
+        A single action is no plan in time: it is held for its step from when it came, and for half
+        a chunk period more, since solves wait for the next attitude.
+        """
+        if len(chunk.actions) == 1:
+            return taken_ns + chunk.step_ns + self._period_ns // 2
+        return chunk.end_ns
+
+    @staticmethod
+    def _horizon(chunk: Chunk) -> str:
+        steps, each_ms = len(chunk.actions), chunk.step_ns / NS_PER_MS
+        return f" of {chunk.horizon_ns / NS_PER_MS:.3g} ms ({steps} x {each_ms:.3g} ms)"
 
     def explain_absence(self, reason: str) -> None:
         """Note why the flight process has no chunk to offer."""
         self._refusal = reason
 
     @property
-    def slowness(self) -> str | None:
-        """Why the policy can never fly on this computer, or None."""
+    def impossibility(self) -> str | None:
+        """Why the policy can never fly on this computer at this rate, or None."""
+        if self._is_short and (short := self._shortness()) is not None:
+            return short
         if self._slow < SLOW_CHUNKS:
             return None
         return (
@@ -158,9 +192,9 @@ class ChunkBuffer:
         )
 
     def is_coasting(self, now_ns: int) -> bool:
-        """The chunk is older than its limits, or the next one is overdue by a period."""
+        """The chunk is beyond its limits or its horizon, or the next is overdue by a period."""
         chunk = self.newest
-        is_overdue = now_ns - self._taken_ns > 2 * self._period_ns
+        is_overdue = now_ns - self._taken_ns > 2 * self._period_ns or now_ns > self._end_ns
         return chunk is not None and (is_overdue or self._stale(chunk, now_ns) is not None)
 
     def problem(self, now_ns: int) -> str | None:
@@ -168,6 +202,8 @@ class ChunkBuffer:
         chunk = self.newest
         if (flood := self._malformed_lately(now_ns)) is not None:
             return flood
+        if (short := self._shortness()) is not None:
+            return short
         if chunk is None or now_ns > self._until_ns:
             return self._refusal or "no chunk from the policy yet"
         if len(self._gaps_ns) < LEAST_GAPS:
@@ -203,11 +239,35 @@ class ChunkBuffer:
         many = f"the policy returned {MAX_REFUSED} unusable chunks within a short time"
         return f"{many}: {self._malformation}"
 
-    def action_at(self, at_ns: int) -> Action | None:
-        """The action that acts at a time; None beyond the horizon of the newest chunk."""
-        if self.newest is None or at_ns > self.newest.end_ns:
+    @property
+    def _is_short(self) -> bool:
+        """The newest chunk's horizon is shorter than the period of solves."""
+        chunk, least_ns = self.newest, self._period_ns * (1 - PERIOD_TOLERANCE)
+        return chunk is not None and chunk.horizon_ns < least_ns
+
+    def _shortness(self) -> str | None:
+        """Figures of a policy whose chunks end before the next one comes, or None."""
+        chunk, gaps_ns = self.newest, sorted(self._gaps_ns)
+        if chunk is None or not gaps_ns:
             return None
-        return self.newest.action_at(at_ns)
+        gap_ns, covered_ns = gaps_ns[(len(gaps_ns) - 1) // 2], self._end_ns - self._taken_ns
+        if gap_ns <= covered_ns and not self._is_short:
+            return None
+        return (
+            f"the policy's horizon{self._horizon(chunk)} is too short for its rate: a chunk ends "
+            f"{covered_ns / NS_PER_MS:.0f} ms after it came, and chunks come "
+            f"{max(gap_ns, self._period_ns) / NS_PER_MS:.0f} ms apart; ask for a higher --rate or "
+            "--action-rate, or use a policy of a longer horizon"
+        )
+
+    def action_at(self, now_ns: int, lead_ns: int = 0) -> Action | None:
+        """The action that acts ``lead_ns`` from now, or the last one where the horizon ends before.
+
+        None beyond the horizon of the newest chunk.
+        """
+        if self.newest is None or now_ns > self._end_ns:
+            return None
+        return self.newest.action_at(now_ns + lead_ns)
 
     def _ages(self, chunk: Chunk) -> tuple[tuple[str, int, int], ...]:
         """What a chunk came from, when that happened, and how old it may be."""

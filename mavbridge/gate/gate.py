@@ -101,7 +101,8 @@ class Gate:
         self._neutral, self._idle = neutral_action(self._meaning), idle_action(self._meaning)
         self._smoother = ActionSmoother(settings.smoothing, self._neutral)
         self._lead_ns = round(settings.smoothing.tau_s * NS_PER_S)
-        """A chunk is sampled this far ahead of the send: the lag of our own low-pass."""
+        """A chunk is sampled this far ahead of the send, but not beyond its end: the lag of our own
+        low-pass."""
         self._envelope = Envelope(settings.envelope)
         self._engagement = Engagement(settings.engagement)
         self._grid = StickGrid(settings.stick_period_ns, now_ns)
@@ -208,7 +209,7 @@ class Gate:
             chunk_fault=given.command_fault or overdue or self._chunks.fault(now_ns),
             are_sticks_at_rest=link.are_sticks_at_rest,
             stick_override_ns=status.stick_override_ns if status else None,
-            slowness=given.command_fault or self._chunks.slowness,
+            slowness=given.command_fault or self._chunks.impossibility,
             envelope_problem=left.reason if left and left.kind == "fault" else None,
             landing=left.reason if left and left.kind == "landed" else None,
         )
@@ -265,7 +266,7 @@ class Gate:
             case Hand.LEVEL:
                 action = self._level(is_thrust=True)
             case Hand.POLICY:
-                raw = self._chunks.action_at(now_ns + self._lead_ns)
+                raw = self._chunks.action_at(now_ns, self._lead_ns)
                 # Beyond the horizon level sticks bridge the rest of the grace.
                 level = self._level(is_thrust=is_thrust)
                 if raw is None and self._meaning.kind == "rates":  # an attitude: not filtered

@@ -1,4 +1,4 @@
-"""No packet of ours leaves (no route, EPERM, a full queue), while those of the vehicle come."""
+"""The system takes none of our packets (no route, EPERM, full queue), while the vehicle's come."""
 
 import pytest
 

@@ -77,8 +77,34 @@ def test_one_that_clearly_cannot_keep_its_limits_is_refused_with_the_figures(
 
 def test_chunks_must_come_before_the_horizon_of_the_last_one_ends() -> None:
     short = replace(playing(0.8), horizon=16)
-    with pytest.raises(PolicyError, match=r"1\.4 s old, beyond the 800 ms of its horizon"):
-        notes_of(0, 400, hz=1, contract=short)
+    with pytest.raises(PolicyError, match=r"1\.3 s old, beyond the 800 ms of its horizon"):
+        notes_of(0, 500, hz=1.25, contract=short)
+
+
+@pytest.mark.parametrize("act_ms", [0.01, None])
+@pytest.mark.parametrize(
+    ("horizon", "dt_s", "hz", "least"),
+    [(1, 0.02, None, 50), (1, 0.02, 30, 50), (2, 0.0125, 20, 40)],
+)
+def test_a_horizon_shorter_than_the_time_between_solves_is_refused_as_that(
+    act_ms: float | None, horizon: int, dt_s: float, hz: float | None, least: int
+) -> None:
+    contract = replace(CONTRACT, horizon=horizon, chunk_dt_s=dt_s)
+    with pytest.raises(PolicyError, match=f"between two solves .* --rate {least} or more") as told:
+        notes_of(0, act_ms, hz=hz, is_dual=False, contract=contract)
+    assert "slow" not in str(told.value)
+    assert f"{horizon} x {dt_s * 1e3:.0f}" in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("dt_s", "hz"),
+    [(0.05, 20), (0.0333, 30), (0.033333, None), (0.02, 50), (0.01, 100), (1.0, None)],
+)
+def test_a_policy_of_one_step_needs_no_words_where_its_step_covers_the_time_between_solves(
+    dt_s: float, hz: float | None
+) -> None:
+    contract = replace(CONTRACT, horizon=1, chunk_dt_s=dt_s)
+    assert notes_of(0, 0.1, hz=hz, is_dual=False, contract=contract) == ""
 
 
 def test_a_slow_policy_may_be_slow_where_it_plays_its_chunks_for_long() -> None:

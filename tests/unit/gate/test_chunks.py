@@ -55,6 +55,106 @@ def test_beyond_the_horizon_there_is_no_action() -> None:
     assert held.action_at((1000 + 16 * 50) * MS + 1) is None
 
 
+def test_the_lead_ends_with_the_chunk_and_a_chunk_that_covers_now_is_flown() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1005), 1005 * MS)
+    for at_ms, lead_ms, roll in ((1000, 50, 0.05), (1700, 50, 0.75), (1799, 800, 0.75)):
+        action = held.action_at(at_ms * MS, lead_ms * MS)
+        assert isinstance(action, Sticks)
+        assert action.roll == pytest.approx(roll)
+
+
+@pytest.mark.parametrize("period_ms", [10, 20, 33, 50])
+def test_a_single_action_is_held_for_its_step_from_its_arrival_and_half_a_period(
+    period_ms: int,
+) -> None:
+    held = buffer(period_ms)
+    held.offer(chunk(1, 1000, step_ns=period_ms * MS, actions=(NEUTRAL,)), 1000 * MS)
+    end_ns = 1000 * MS + period_ms * MS * 3 // 2
+    assert (held.action_at(end_ns, 50 * MS), held.is_coasting(end_ns)) == (NEUTRAL, False)
+    assert (held.action_at(end_ns + 1), held.is_coasting(end_ns + 1)) == (None, True)
+
+
+def test_beyond_the_horizon_it_coasts_although_the_next_one_is_not_due() -> None:
+    held = buffer(500)
+    held.offer(chunk(1, 1000, actions=(NEUTRAL,) * 2, step_ns=20 * MS), 1000 * MS)
+    assert not held.is_coasting(1035 * MS)
+    assert held.is_coasting(1035 * MS + 1)
+    assert held.fault(1135 * MS) is None
+    assert held.fault(1135 * MS + 1) is not None
+
+
+def test_chunks_that_come_after_their_own_end_do_not_prolong_the_grace() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    for serial, now_ms in enumerate(range(1010, 1110, 10), start=2):
+        over = chunk(serial, now_ms, actions=(NEUTRAL,) * 4, step_ns=MS)
+        assert not held.offer(over, now_ms * MS)
+    assert held.fault(1100 * MS) is None
+    assert held.fault(1100 * MS + 1) is not None
+
+
+@pytest.mark.parametrize(
+    ("steps", "step_us", "period_ms", "is_possible"),
+    [(1, 20_000, 20, True), (1, 20_000, 33, False), (1, 33_300, 33, True), (16, 50_000, 10, True)],
+)
+def test_a_horizon_shorter_than_the_time_between_solves_never_flies(
+    steps: int, step_us: int, period_ms: int, is_possible: bool
+) -> None:
+    held = buffer(period_ms)
+    for serial, now_ms in enumerate(range(1000, 1000 + 4 * period_ms, period_ms), start=1):
+        actions = (NEUTRAL,) * steps
+        held.offer(chunk(serial, now_ms, actions=actions, step_ns=step_us * 1000), now_ms * MS)
+    assert (held.impossibility is None) == is_possible
+    assert (held.problem(now_ms * MS) is None) == is_possible
+    if not is_possible:
+        assert "20 ms (1 x 20 ms)" in (held.impossibility or "")
+        assert "33 ms apart" in (held.impossibility or "")
+
+
+def test_a_horizon_that_ends_before_the_next_chunk_comes_begins_no_flight() -> None:
+    short = {"actions": (NEUTRAL,) * 2, "step_ns": 20 * MS}
+    for latency_ms, is_covered in ((5, True), (25, False)):
+        held = buffer(33)
+        for serial, now_ms in enumerate(range(1000, 1166, 33), start=1):
+            held.offer(
+                chunk(serial, now_ms, first_ns=(now_ms - latency_ms) * MS, **short), now_ms * MS
+            )
+        assert (held.problem(now_ms * MS) is None) == is_covered
+        assert held.impossibility is None, "the solves may become faster"
+
+
+@given(
+    steps=st.integers(1, 6),
+    step_ms=st.integers(1, 60),
+    period_ms=st.sampled_from((10, 20, 33, 50)),
+    latency_ms=st.integers(0, 60),
+    lead_ms=st.sampled_from((0, 50, 800)),
+)
+def test_level_sticks_are_coasting_and_last_100_ms_in_all(
+    steps: int, step_ms: int, period_ms: int, latency_ms: int, lead_ms: int
+) -> None:
+    held, level_ms, is_over = buffer(period_ms), 0, False
+    for now_ms in range(1000, 6000):
+        if now_ms % period_ms == 0:
+            actions = (Sticks(0.0, 0.0, 0.0, 0.3),) * steps
+            first_ns = (now_ms - latency_ms) * MS
+            made = chunk(now_ms, now_ms, actions=actions, step_ns=step_ms * MS, first_ns=first_ns)
+            held.offer(made, now_ms * MS)
+        is_over = is_over or (held.newest is not None and held.fault(now_ms * MS) is not None)
+        if held.newest is None or is_over:
+            continue
+        if held.action_at(now_ms * MS, lead_ms * MS) is None:
+            level_ms += 1
+            assert held.is_coasting(now_ms * MS)
+    covered_ms = steps * step_ms - latency_ms if steps > 1 else step_ms + period_ms // 2
+    assert level_ms <= 100 + period_ms
+    if covered_ms >= period_ms:
+        assert (level_ms, is_over) == (0, False)
+    elif covered_ms < period_ms - 1:
+        assert is_over or held.newest is None
+
+
 @pytest.mark.parametrize("age", ["attitude_ns", "velocity_ns", "image_ns", "computed_ns"])
 def test_each_age_is_judged_when_the_chunk_arrives(age: str) -> None:
     limit_ms = {"attitude_ns": 100, "velocity_ns": 250, "image_ns": 300, "computed_ns": 300}[age]
@@ -74,21 +174,21 @@ def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve(
     slow = buffer()
     for serial in range(1, 5):
         slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 905) * MS), 0)
-    assert slow.slowness is None
+    assert slow.impossibility is None
     slow.offer(chunk(9, 9000, attitude_ns=8095 * MS), 9000 * MS)
-    assert "the newest 905 ms after its attitude" in (slow.slowness or "")
+    assert "the newest 905 ms after its attitude" in (slow.impossibility or "")
     slow.offer(chunk(10, 9100), 9100 * MS)
-    assert slow.slowness is None
+    assert slow.impossibility is None
     for serial in range(11, 15):  # they count anew
         slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 101) * MS), 0)
-    assert slow.slowness is None
+    assert slow.impossibility is None
 
 
 def test_solves_that_just_keep_the_limit_of_the_attitude_are_not_too_slow() -> None:
     held = buffer()
     for serial in range(1, 8):
         held.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 100) * MS), 0)
-    assert held.slowness is None
+    assert held.impossibility is None
 
 
 def test_a_contract_with_longer_limits_flies_it() -> None:
@@ -255,11 +355,13 @@ def test_no_action_is_flown_beyond_the_horizon_or_100_ms_beyond_a_limit(
     kept_ns = min(
         attitude_ns + limits.state_ns, image_ns + limits.feature_ns, computed_ns + limits.chunk_ns
     )
-    assert held.offer(offered, now_ns) == (now_ns <= kept_ns)
+    covers = steps == 1 or now_ns <= offered.end_ns
+    assert held.offer(offered, now_ns) == (now_ns <= kept_ns and covers)
     for at_ns in range(now_ns, now_ns + 3000 * MS, 25 * MS):
         if held.fault(at_ns) is None and held.action_at(at_ns) is not None:
             assert at_ns <= kept_ns + LEAST_GRACE_NS
-            assert at_ns <= offered.end_ns
+            held_ns = now_ns + offered.step_ns + period_ms * MS // 2
+            assert at_ns <= (held_ns if steps == 1 else offered.end_ns)
             assert at_ns <= now_ns + max(LEAST_GRACE_NS, GRACE_PERIODS * period_ms * MS)
 
 
@@ -290,7 +392,7 @@ def test_a_malformed_chunk_is_not_flown(changes: dict[str, object]) -> None:
 
 
 def test_the_shortest_step_is_one_of_a_nanosecond() -> None:
-    assert buffer().offer(chunk(1, 1000, step_ns=1), 1000 * MS) is True
+    assert buffer().offer(chunk(1, 1000, step_ns=1, first_ns=1000 * MS), 1000 * MS) is True
 
 
 def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -> None:

@@ -555,12 +555,13 @@ def test_body_rates_are_bridged_by_a_level_attitude() -> None:
     gate = Stepped(meaning=ActionMeaning(kind="rates", hover_thrust=0.4), smoothing=rates)
     for k in range(3):
         gate.step(10 * k, gate.chunk(10 * k, turn))
-    engaged = gate.step(30, gate.chunk(30, turn, actions=1), act="engage")
+    engaged = gate.step(30, gate.chunk(30, turn, actions=2), act="engage")
     assert engaged.decision == Command(action=turn)
-    beyond = gate.step(50)
+    beyond = gate.step(70)
     assert beyond.decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
     assert beyond.trace is not None
-    assert gate.step(60, gate.chunk(60, turn)).decision == Command(action=turn)
+    assert beyond.is_coasting
+    assert gate.step(80, gate.chunk(80, turn)).decision == Command(action=turn)
 
 
 def test_the_level_attitude_that_bridges_body_rates_is_not_filtered_with_them() -> None:
@@ -568,8 +569,8 @@ def test_the_level_attitude_that_bridges_body_rates_is_not_filtered_with_them() 
     rates = Smoothing(limits=LimitSettings().of("rates"), tau_s=0.05)
     gate = Stepped(meaning=ActionMeaning(kind="rates", hover_thrust=0.4), smoothing=rates)
     gate.engaged(sticks=turn)
-    gate.step(40, gate.chunk(40, turn, actions=1))
-    assert gate.step(60).decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    gate.step(40, gate.chunk(40, turn, actions=2))
+    assert gate.step(80).decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
 
 
 def of_velocities(mode: str, **rules: Any) -> Stepped:
