@@ -1,13 +1,15 @@
 """The one door to files that people name: paths, text encodings, damage, JSON and TOML."""
 
 import codecs
+import errno
 import json
 import os
+import stat
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from safetensors import SafetensorError, safe_open
 
@@ -35,13 +37,26 @@ def library_name(path: Path) -> str:
     return os.path.abspath(path)  # noqa: PTH100 - Path.absolute keeps ".."
 
 
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading without ever waiting: a pipe without a writer has no end of it.
+
+    Raises:
+        OSError: it cannot be opened, or is a pipe, a device or a folder.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "it is a folder, a pipe or a device, not a file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
 def stand_in(path: Path) -> tuple[str, str] | None:
     """Return what lies in place of a file's content and the remedy, or None.
 
     Recognises empty files, Git LFS pointers, and web pages saved under a file's name.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(_HEAD_BYTES).lstrip().lower()
     except OSError:
         return None
@@ -87,7 +102,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         OSError: it cannot be opened.
         ValueError: it is not UTF-8, or larger than ``max_bytes``; the message says what it is.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise ValueError(f"it is larger than {max_bytes // 1024} KiB")

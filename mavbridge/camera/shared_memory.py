@@ -14,6 +14,7 @@ from mavbridge.camera.deadlines import STALL_NS
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.records import Frame, ImageArray
+from policy.text_files import open_regular
 
 MAGIC = b"MBSHM\0\0\1"
 HEADER = struct.Struct("<8sIIII")
@@ -155,7 +156,7 @@ class _Segment:
     def __init__(self, path: Path) -> None:
         self._name = path.name
         try:
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 self.status = os.fstat(file.fileno())
                 size_bytes = self.status.st_size
                 width, height = _checked_size(path.name, file.read(HEADER.size), size_bytes)
@@ -247,7 +248,7 @@ def _checked_size(name: str, header: bytes, file_bytes: int) -> tuple[int, int]:
 def _absent(path: Path) -> str:
     others = []
     for other in sorted(path.parent.iterdir()):
-        with suppress(OSError), other.open("rb") as file:
+        with suppress(OSError), open_regular(other) as file:
             if file.read(len(MAGIC)) == MAGIC:
                 others.append(other.name)
     return (

@@ -40,6 +40,8 @@ _TEXT_BYTES = 50
 MOST_VALUE = 1e9
 """Largest angle, rate, speed, position or force in SI units: far beyond any vehicle, and its square
 is still a number in the float32 with which policies compute."""
+MOST_NORM_ERROR = 0.1
+"""A quaternion within it is normalised; one farther from length 1 is no attitude."""
 UNPRINTABLE = "\N{REPLACEMENT CHARACTER}"
 """Stands for control characters, with which a text could write into the user's terminal."""
 _HIGHRES_ACCEL_FIELDS = 0b111
@@ -68,9 +70,12 @@ def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body
     quaternion = (m.q1, m.q2, m.q3, m.q4)
     rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
     _require_usable(*quaternion, *rate)
-    if not 0.9 < math.hypot(*quaternion) < 1.1:
+    norm = math.hypot(*quaternion)
+    if not abs(norm - 1.0) < MOST_NORM_ERROR:
         raise UnusableError
-    return Attitude(True, 1000 * m.time_boot_ms, quaternion, rate)
+    w, x, y, z = quaternion
+    unit = (w / norm, x / norm, y / norm, z / norm)
+    return Attitude(True, 1000 * m.time_boot_ms, unit, rate)
 
 
 def _attitude(m: dialect.MAVLink_attitude_message) -> Body:

@@ -2,6 +2,7 @@ import os
 import struct
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -302,6 +303,32 @@ def test_a_folder_is_refused(path, clock):
     with pytest.raises(CameraError, match="cannot be opened"):
         SharedMemoryCamera(path.name, clock=clock)
     path.rmdir()
+
+
+def free_after(seconds, path, is_over):
+    """Let a reader go on that waits for a writer of the pipe."""
+    if not is_over.wait(seconds):
+        os.close(os.open(path, os.O_WRONLY))
+
+
+@pytest.mark.parametrize("is_named", [True, False])
+def test_a_pipe_among_the_segments_is_not_waited_for(path, clock, is_named):
+    os.mkfifo(path)
+    is_over = threading.Event()
+    rescuer = threading.Thread(target=free_after, args=(5.0, path, is_over))
+    rescuer.start()
+    try:
+        if is_named:
+            with pytest.raises(CameraError, match="a pipe or a device, not a file"):
+                SharedMemoryCamera(path.name, clock=clock)
+        else:
+            camera = SharedMemoryCamera("nobody", clock=clock)
+            assert "there is none" in camera.waiting_reason
+    finally:
+        is_waited_for = not rescuer.is_alive()
+        is_over.set()
+        rescuer.join()
+    assert not is_waited_for
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "..", ".x"])

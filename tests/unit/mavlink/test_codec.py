@@ -1,5 +1,5 @@
 import struct
-from math import inf, nan, pi, sqrt
+from math import hypot, inf, nan, pi, sqrt
 from typing import Any
 
 import pytest
@@ -211,6 +211,26 @@ def test_unusable_values_are_counted_and_dropped(
     (incoming,) = ours.decode(WireEnd().pack(message))
     assert incoming.body is None
     assert ours.bad_data_count == 1
+
+
+@given(
+    direction=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: hypot(*q) > 0.1),
+    norm=st.one_of(st.floats(0.0, 2.0), st.floats(0.89, 1.11)),
+)
+def test_every_attitude_that_is_taken_is_of_length_one(
+    direction: tuple[float, ...], norm: float
+) -> None:
+    sent_q = [norm * part / hypot(*direction) for part in direction]
+    (incoming,) = codec().decode(
+        WireEnd().pack(m.attitude_quaternion_encode(7, *sent_q, 0.1, 0.2, 0.3))
+    )
+    if abs(norm - 1.0) > 0.1 + 1e-6:
+        assert incoming.body is None
+    elif abs(norm - 1.0) < 0.1 - 1e-6:
+        assert isinstance(incoming.body, Attitude)
+        taken = incoming.body.ned_from_body_wxyz
+        assert hypot(*taken) == pytest.approx(1.0, abs=1e-12)
+        assert [norm * part for part in taken] == pytest.approx(sent_q, abs=1e-6)
 
 
 def test_a_target_that_is_none_is_no_fault() -> None:

@@ -1,11 +1,56 @@
+import os
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from mavbridge.__main__ import main
 from policy.errors import ContractError
-from policy.files import MAX_TOML_BYTES, parse_json, read_json, read_text, read_toml, user_path
+from policy.files import (
+    MAX_TOML_BYTES,
+    open_regular,
+    parse_json,
+    read_json,
+    read_text,
+    read_toml,
+    user_path,
+)
 from policy.foreign.interface import read_interface
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Iterator[Path]:
+    """A named pipe that nobody writes to; a reader that would wait is freed after 5 s."""
+    path = tmp_path / "pipe.toml"
+    os.mkfifo(path)
+    freed = threading.Event()
+
+    def free() -> None:
+        if not freed.wait(5.0):
+            os.close(os.open(path, os.O_WRONLY))
+
+    thread = threading.Thread(target=free)
+    thread.start()
+    yield path
+    freed.set()
+    thread.join()
+
+
+def test_a_pipe_is_no_file_and_is_not_waited_for(pipe: Path) -> None:
+    for path in (pipe, Path("/dev/null"), pipe.parent):
+        with pytest.raises(OSError, match="not a file"):
+            open_regular(path)
+
+
+def test_settings_from_a_pipe_are_refused_at_once(
+    pipe: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["--config", str(pipe)])
+    assert "not a file" in capsys.readouterr().err
+    with pytest.raises(ContractError, match="not a file"):
+        read_interface(pipe)
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 100_000, "[" * 2_000 + "1,"])
