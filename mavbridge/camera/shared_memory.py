@@ -14,7 +14,7 @@ from mavbridge.camera.deadlines import STALL_NS
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.records import Frame, ImageArray
-from policy.text_files import open_regular
+from policy.files import open_regular
 
 MAGIC = b"MBSHM\0\0\1"
 HEADER = struct.Struct("<8sIIII")
