@@ -36,6 +36,8 @@ class FreshnessLimits:
     """Image, since its exposure."""
     chunk_ns: int
     """Since the chunk was computed."""
+    stall_ns: int = LEAST_GRACE_NS
+    """Longest time to fly on along a chunk when no newer one comes."""
 
     def while_played(self, play_ns: int) -> "FreshnessLimits":
         """Limits at the moment of sending, where a chunk is meant to be played for so long."""
@@ -44,6 +46,7 @@ class FreshnessLimits:
             velocity_ns=self.velocity_ns + play_ns,
             feature_ns=self.feature_ns + play_ns,
             chunk_ns=self.chunk_ns + play_ns,
+            stall_ns=self.stall_ns,
         )
 
 
@@ -111,8 +114,10 @@ class ChunkBuffer:
         """Why the newest chunk was not taken; None if it was."""
         self.newest: Chunk | None = None
         self._taken_ns = 0
-        self._until_ns = 0
+        self._grace_until_ns = 0
         """End of the grace of the newest chunk."""
+        self._until_ns = 0
+        """When the flight ends without a newer one: after the grace, or a stall."""
         self._gaps_ns: deque[int] = deque(maxlen=RECENT_GAPS)
         """Times between the last chunks that were taken."""
         self._slow = 0
@@ -124,26 +129,32 @@ class ChunkBuffer:
         """Take a chunk if it may be flown; returns whether it was taken."""
         if self.newest is not None and chunk.serial <= self.newest.serial:
             return False
-        self._refusal = self._malformed(chunk)
-        if self._refusal is not None:
+        if (malformation := self._malformed(chunk)) is not None:
             self._refused_ns.append(now_ns)
-            self._malformation = self._refusal
+            self._malformation = malformation
+            self.explain_absence(malformation, now_ns)
             return False
         self._solve_ns = chunk.computed_ns - chunk.attitude_ns
         self._slow = self._slow + 1 if self._solve_ns > self._limits.state_ns else 0
-        self._refusal = self._stale(chunk, now_ns)
-        if self._refusal is not None:
+        if (staleness := self._stale(chunk, now_ns)) is not None:
+            self.explain_absence(staleness, now_ns)
             return False
+        self._refusal = None
         if self.newest is not None:
             self._gaps_ns.append(now_ns - self._taken_ns)
         self.newest, self._taken_ns = chunk, now_ns
         limited_ns = max(now_ns, min(self._stale_ns(chunk), chunk.end_ns)) + LEAST_GRACE_NS
-        self._until_ns = min(now_ns + self.grace_ns, limited_ns)
+        self._until_ns = self._grace_until_ns = min(now_ns + self.grace_ns, limited_ns)
+        if max(self._gaps_ns, default=0) <= self.grace_ns:  # no stall so soon after another one
+            planned_ns = min(now_ns + self._limits.stall_ns, chunk.end_ns)
+            self._until_ns = max(self._grace_until_ns, planned_ns)
         return True
 
-    def explain_absence(self, reason: str) -> None:
-        """Note why the flight process has no chunk to offer."""
+    def explain_absence(self, reason: str, now_ns: int) -> None:
+        """Note why there is no chunk; whoever says so does not stall, and has the grace alone."""
         self._refusal = reason
+        graced_ns = max(self._grace_until_ns, now_ns - self._period_ns + self.grace_ns)
+        self._until_ns = min(self._until_ns, graced_ns)
 
     @property
     def slowness(self) -> str | None:
@@ -168,11 +179,11 @@ class ChunkBuffer:
         chunk = self.newest
         if (flood := self._malformed_lately(now_ns)) is not None:
             return flood
-        if chunk is None or now_ns > self._until_ns:
+        if chunk is None or now_ns > self._grace_until_ns:
             return self._refusal or "no chunk from the policy yet"
         if len(self._gaps_ns) < LEAST_GAPS:
             return "the policy has only just begun"
-        bridged_ns = self._until_ns - self._taken_ns
+        bridged_ns = self._grace_until_ns - self._taken_ns
         if (gap_ns := max(self._gaps_ns)) > bridged_ns:
             advice = "it is too slow here for its rate; ask for a lower one"
             if bridged_ns < self.grace_ns:
