@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from policy.errors import ContractError
 from policy.files import parse_json
 
-CONTRACT_VERSION = 4
-READABLE_VERSIONS = (1, 2, 3, 4)
+CONTRACT_VERSION = 5
+READABLE_VERSIONS = (1, 2, 3, 4, 5)
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -111,6 +111,8 @@ OBSERVATION_TERMS = (
     *("image_crop", "image_fit", "image_channels", "state_extras", "play_s"),
 )
 """Fields that came with version 4: what a policy sees, and how long it plays one chunk."""
+STALL_TERMS = ("max_stall_s",)
+"""Field that came with version 5: how long a chunk is flown on without a newer one."""
 _TUPLES = ("cameras", "camera_rates_hz", "image_crop", "state_extras")
 
 
@@ -189,6 +191,9 @@ class Contract:
     """Oldest image, since its exposure."""
     max_chunk_age_s: float = 0.3
     """Longest time since the chunk was computed."""
+    max_stall_s: float = 0.1
+    """Longest time to fly on along a chunk when no newer one comes; never beyond its horizon. The
+    ages of a chunk are judged as it is taken, and grow by as much meanwhile."""
     max_tilt_deg: float | None = None
     """Largest lean, in degrees, before the policy loses the sticks. For this and the next three,
     None leaves the limit to the flight's configuration; a number may widen it."""
@@ -285,6 +290,7 @@ class Contract:
             ("max_velocity_age_s", self.max_velocity_age_s, MAX_AGE_LIMIT_S, "seconds"),
             ("max_feature_age_s", self.max_feature_age_s, MAX_AGE_LIMIT_S, "seconds"),
             ("max_chunk_age_s", self.max_chunk_age_s, MAX_AGE_LIMIT_S, "seconds"),
+            ("max_stall_s", self.max_stall_s, MAX_AGE_LIMIT_S, "seconds"),
             ("max_tilt_deg", self.max_tilt_deg, 180.0, "degrees"),
             ("max_speed_mps", self.max_speed_mps, 1e3, "m/s"),
             ("max_height_m", self.max_height_m, 1e5, "m"),
@@ -366,6 +372,7 @@ class Contract:
         known -= set(FLIGHT_TERMS) if version < 2 else set()
         known -= set(ACTION_TERMS) if version < 3 else set()
         known -= set(OBSERVATION_TERMS) if version < 4 else set()
+        known -= set(STALL_TERMS) if version < 5 else set()
         if unknown := sorted(set(data) - known):
             raise ContractError(
                 f"unknown contract keys {unknown}; those of version {version} are {sorted(known)}"

@@ -46,6 +46,8 @@ class Limits:
     """Oldest image feature to act on, in seconds since exposure."""
     max_chunk_age: float | None = None
     """Longest time to act on one chunk of actions, in seconds since it was computed."""
+    max_stall: float | None = None
+    """Longest time in seconds to fly on along one chunk when no newer one comes."""
     max_frozen_state: Annotated[float, Parameter(group=RARE)] = 0.5
     """Longest time in seconds for which the attitude may stay exactly the same while the vehicle
     turns; 0 = no limit."""
@@ -62,6 +64,7 @@ class Limits:
             ("max-velocity-age", self.max_velocity_age),
             ("max-feature-age", self.max_feature_age),
             ("max-chunk-age", self.max_chunk_age),
+            ("max-stall", self.max_stall),
         ):
             if age is not None:
                 check_range(name, age, 0.01, 60, "s")

@@ -218,17 +218,20 @@ def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
         UserError: a flag would loosen a limit of the contract.
     """
     return FreshnessLimits(
-        state_ns=_tightened_ns(contract.max_state_age_s, "attitude", limits.max_attitude_age),
-        velocity_ns=_tightened_ns(contract.max_velocity_age_s, "velocity", limits.max_velocity_age),
-        feature_ns=_tightened_ns(contract.max_feature_age_s, "feature", limits.max_feature_age),
-        chunk_ns=_tightened_ns(contract.max_chunk_age_s, "chunk", limits.max_chunk_age),
+        state_ns=_tightened_ns(contract.max_state_age_s, "attitude-age", limits.max_attitude_age),
+        velocity_ns=_tightened_ns(
+            contract.max_velocity_age_s, "velocity-age", limits.max_velocity_age
+        ),
+        feature_ns=_tightened_ns(contract.max_feature_age_s, "feature-age", limits.max_feature_age),
+        chunk_ns=_tightened_ns(contract.max_chunk_age_s, "chunk-age", limits.max_chunk_age),
+        stall_ns=_tightened_ns(contract.max_stall_s, "stall", limits.max_stall),
     )
 
 
 def _tightened_ns(allowed_s: float, what: str, asked_s: float | None) -> int:
     if asked_s is not None and asked_s > allowed_s:
         raise UserError(
-            f"--max-{what}-age {asked_s:g} is looser than the {allowed_s:g} s of this policy's "
+            f"--max-{what} {asked_s:g} is looser than the {allowed_s:g} s of this policy's "
             "contract: give less, or leave it out"
         )
     return round((allowed_s if asked_s is None else asked_s) * NS_PER_S)
@@ -249,4 +252,5 @@ def contract_with_ages(contract: Contract, limits: Limits) -> Contract:
         max_velocity_age_s=either_s(limits.max_velocity_age, contract.max_velocity_age_s),
         max_feature_age_s=either_s(limits.max_feature_age, contract.max_feature_age_s),
         max_chunk_age_s=either_s(limits.max_chunk_age, contract.max_chunk_age_s),
+        max_stall_s=either_s(limits.max_stall, contract.max_stall_s),
     )

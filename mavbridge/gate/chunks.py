@@ -38,6 +38,8 @@ class FreshnessLimits:
     """Image, since its exposure."""
     chunk_ns: int
     """Since the chunk was computed."""
+    stall_ns: int = LEAST_GRACE_NS
+    """Longest time to fly on along a chunk when no newer one comes."""
 
     def while_played(self, play_ns: int) -> "FreshnessLimits":
         """Limits at the moment of sending, where a chunk is meant to be played for so long."""
@@ -46,6 +48,7 @@ class FreshnessLimits:
             velocity_ns=self.velocity_ns + play_ns,
             feature_ns=self.feature_ns + play_ns,
             chunk_ns=self.chunk_ns + play_ns,
+            stall_ns=self.stall_ns,
         )
 
 
@@ -122,8 +125,10 @@ class ChunkBuffer:
         """End of the horizon of the newest chunk."""
         self._uncovered_ns = 0
         """Time beyond the horizons of the last chunks in a row that ended before the next came."""
-        self._until_ns = 0
+        self._grace_until_ns = 0
         """End of the grace of the newest chunk."""
+        self._until_ns = 0
+        """When the flight ends without a newer one: after the grace, or a stall."""
         self._gaps_ns: deque[int] = deque(maxlen=RECENT_GAPS)
         """Times between the last chunks that were taken."""
         self._slow = 0
@@ -135,19 +140,21 @@ class ChunkBuffer:
         """Take a chunk if it may be flown; returns whether it was taken."""
         if self.newest is not None and chunk.serial <= self.newest.serial:
             return False
-        self._refusal = self._malformed(chunk)
-        if self._refusal is not None:
+        if (malformation := self._malformed(chunk)) is not None:
             self._refused_ns.append(now_ns)
-            self._malformation = self._refusal
+            self._malformation = malformation
+            self.explain_absence(malformation, now_ns)
             return False
         self._solve_ns = chunk.computed_ns - chunk.attitude_ns
         self._slow = self._slow + 1 if self._solve_ns > self._limits.state_ns else 0
         end_ns = self._horizon_end_ns(chunk, now_ns)
-        self._refusal = self._stale(chunk, now_ns)
-        if self._refusal is None and now_ns > end_ns:
-            self._refusal = f"the chunk came after its horizon{self._horizon(chunk)} had ended"
-        if self._refusal is not None:
+        staleness = self._stale(chunk, now_ns)
+        if staleness is None and now_ns > end_ns:
+            staleness = f"the chunk came after its horizon{self._horizon(chunk)} had ended"
+        if staleness is not None:
+            self.explain_absence(staleness, now_ns)
             return False
+        self._refusal = None
         if self.newest is not None:
             self._gaps_ns.append(now_ns - self._taken_ns)
             gap_ns = now_ns - self._end_ns
@@ -155,7 +162,11 @@ class ChunkBuffer:
             self._uncovered_ns = min(uncovered_ns, LEAST_GRACE_NS)
         self.newest, self._taken_ns, self._end_ns = chunk, now_ns, end_ns
         limited_ns = max(now_ns, min(self._stale_ns(chunk), end_ns)) + LEAST_GRACE_NS
-        self._until_ns = min(now_ns + self.grace_ns, limited_ns - self._uncovered_ns)
+        self._grace_until_ns = min(now_ns + self.grace_ns, limited_ns - self._uncovered_ns)
+        self._until_ns = self._grace_until_ns
+        if max(self._gaps_ns, default=0) <= self.grace_ns:  # no stall so soon after another one
+            planned_ns = min(now_ns + self._limits.stall_ns, end_ns)
+            self._until_ns = max(self._grace_until_ns, planned_ns)
         return True
 
     def _horizon_end_ns(self, chunk: Chunk, taken_ns: int) -> int:
@@ -173,9 +184,11 @@ class ChunkBuffer:
         steps, each_ms = len(chunk.actions), chunk.step_ns / NS_PER_MS
         return f" of {chunk.horizon_ns / NS_PER_MS:.3g} ms ({steps} x {each_ms:.3g} ms)"
 
-    def explain_absence(self, reason: str) -> None:
-        """Note why the flight process has no chunk to offer."""
+    def explain_absence(self, reason: str, now_ns: int) -> None:
+        """Note why there is no chunk; whoever says so does not stall, and has the grace alone."""
         self._refusal = reason
+        graced_ns = max(self._grace_until_ns, now_ns - self._period_ns + self.grace_ns)
+        self._until_ns = min(self._until_ns, graced_ns)
 
     @property
     def impossibility(self) -> str | None:
@@ -204,11 +217,11 @@ class ChunkBuffer:
             return flood
         if (short := self._shortness()) is not None:
             return short
-        if chunk is None or now_ns > self._until_ns:
+        if chunk is None or now_ns > self._grace_until_ns:
             return self._refusal or "no chunk from the policy yet"
         if len(self._gaps_ns) < LEAST_GAPS:
             return "the policy has only just begun"
-        bridged_ns = self._until_ns - self._taken_ns
+        bridged_ns = self._grace_until_ns - self._taken_ns
         if (gap_ns := max(self._gaps_ns)) > bridged_ns:
             advice = "it is too slow here for its rate; ask for a lower one"
             if bridged_ns < self.grace_ns:

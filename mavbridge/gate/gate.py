@@ -15,6 +15,7 @@ from mavbridge.core.vehicle import (
     Decision,
     LinkSnapshot,
     Output,
+    Reading,
     Release,
     Sticks,
 )
@@ -30,6 +31,8 @@ from mavbridge.gate.smoothing import ActionSmoother, Smoothing
 
 PILOT_FRESH_NS = 500 * NS_PER_MS
 """Oldest RC_CHANNELS that still tells where the pilot's sticks are."""
+STOOD_STILL_NS = 60 * NS_PER_MS
+"""A step this late, beyond the slowest grid, says that the gate stood still, and heard nobody."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +109,8 @@ class Gate:
         self._envelope = Envelope(settings.envelope)
         self._engagement = Engagement(settings.engagement)
         self._grid = StickGrid(settings.stick_period_ns, now_ns)
+        self._stepped_ns = self._heard_ns = now_ns
+        """The last step; the last one after which the gate can tell silence of the vehicle."""
         self._hand: Hand | None = None
         self._last = self._neutral
         """As last sent."""
@@ -148,11 +153,12 @@ class Gate:
         overdue = self._chunks.fault(now_ns)
         has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
         if given.absence is not None:
-            self._chunks.explain_absence(given.absence)
+            self._chunks.explain_absence(given.absence, now_ns)
         if given.stop is not None:
             self._engagement.stop(given.stop)
         phase_before = self._engagement.phase
-        facts = self._facts(now_ns, given, overdue)
+        silence = self._silence(now_ns, given.link.telemetry.ned_from_body_wxyz)
+        facts = self._facts(now_ns, given, overdue or silence)
         move = self._engagement.step(facts, given.act)
         self._change_hand(move.hand, now_ns, given.link)
         phase = self._engagement.phase
@@ -178,6 +184,16 @@ class Gate:
             takeoff_m=move.takeoff_m,
             messages=self._take_messages(),
         )
+
+    def _silence(self, now_ns: int, attitude: Reading | None) -> str | None:
+        """Why the flight must end now, or None: a plan bridges a stall of ours, not a dead link."""
+        if now_ns - self._stepped_ns > STOOD_STILL_NS:
+            self._heard_ns = now_ns
+        self._stepped_ns = now_ns
+        silent_ns = self._chunks.grace_ns
+        if attitude is None or now_ns - max(self._heard_ns, attitude.arrived_ns) <= silent_ns:
+            return None
+        return f"no attitude from the vehicle for {silent_ns // NS_PER_MS} ms"
 
     def _facts(self, now_ns: int, given: GateInput, overdue: str | None) -> Facts:
         link, left = given.link, None

@@ -1,19 +1,23 @@
 """Durations of simulated work, which takes no time by itself."""
 
 import math
+from bisect import bisect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import repeat
 
 import numpy as np
 
-from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 
 _Z99 = 2.3263478740408408
 """99 % of a normal distribution lie below this many standard deviations."""
 _BLOCK = 1024
 """Samples drawn at once: in numpy a single one costs as much as a hundred."""
+
+STALLS_APART_S = (1.5, 4.5)
+"""From the end of one stall to the next one, evenly distributed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,3 +61,22 @@ class Delays:
     """Message between the flight process and the gate, either way."""
     uplink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
     downlink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
+    stall_ns: int = 0
+    """Length of the stalls of the flight process, every 3 s at random; 0 = none."""
+
+
+class Stalls:
+    """Stalls of the flight process: what would reach it, or leave it, does so when they end."""
+
+    def __init__(self, stall_ns: int, start_ns: int, random: np.random.Generator) -> None:
+        self._stall_ns = stall_ns
+        self._starts_ns = [start_ns]
+        self._random = random
+
+    def end_ns(self, at_ns: int) -> int:
+        """End of the stall that lasts at a time; the time itself between stalls."""
+        starts_ns = self._starts_ns
+        while self._stall_ns and starts_ns[-1] <= at_ns:
+            apart_ns = round(self._random.uniform(*STALLS_APART_S) * NS_PER_S)
+            starts_ns.append(starts_ns[-1] + self._stall_ns + apart_ns)
+        return max(at_ns, starts_ns[max(bisect(starts_ns, at_ns) - 1, 0)] + self._stall_ns)

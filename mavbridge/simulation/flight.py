@@ -19,7 +19,7 @@ from mavbridge.gate.departure import Ending
 from mavbridge.gate.loop import GateLoop
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
-from mavbridge.simulation.delays import Delays
+from mavbridge.simulation.delays import Delays, Stalls
 from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper, sender
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.referee import EpisodeResult, Referee
@@ -108,6 +108,7 @@ class SimulatedFlight:
         downlink = DelayedChannel(self.clock, delays.downlink.samples_ns(self._random(1)))
         self._transport = MemoryTransport(self.clock, to_vehicle=uplink, from_vehicle=downlink)
         self._downlink = downlink
+        self._stalls = Stalls(delays.stall_ns, self.clock.now_ns(), self._random(9))
         self._stepper = VehicleStepper(
             self.clock, self.vehicle, boot_ns, to_vehicle=uplink, from_vehicle=downlink
         )
@@ -171,8 +172,9 @@ class SimulatedFlight:
             arm=True,
         )
         loops = config.rates.loops(is_dual=executable.dual_rate, play_s=executable.contract.play_s)
-        to_gate = DelayedChannel(world, hop.samples_ns(self._random(7)))
-        to_flight = DelayedChannel(world, hop.samples_ns(self._random(8)))
+        stalled_ns = self._stalls.end_ns
+        to_gate = DelayedChannel(world, hop.samples_ns(self._random(7)), stalled_ns)
+        to_flight = DelayedChannel(world, hop.samples_ns(self._random(8)), stalled_ns)
         flight_port = MemoryPort(outgoing=to_gate, incoming=to_flight)
         link = MavlinkLink(
             self._transport,
@@ -250,6 +252,7 @@ class SimulatedFlight:
             period_ns=camera_period_ns,
             phase_ns=int(self._random(10 * number + 2).integers(camera_period_ns)),
             delays_ns=self._settings.delays.camera.samples_ns(self._random(10 * number + 3)),
+            stalled_until_ns=self._stalls.end_ns,
             to_end_ns=round(conditions.frame_time_s / 2 * NS_PER_S),
             mount=mount,
         )

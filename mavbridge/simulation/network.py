@@ -12,9 +12,16 @@ VEHICLE: Address = ("sitl", 1)
 class DelayedChannel:
     """One direction of the network, or of the channel between two processes."""
 
-    def __init__(self, clock: SteppedClock, delays_ns: Iterator[int]) -> None:
+    def __init__(
+        self,
+        clock: SteppedClock,
+        delays_ns: Iterator[int],
+        stalled_until_ns: Callable[[int], int] = int,
+    ) -> None:
+        """``stalled_until_ns``: arrival of what would arrive at a time; by default that time."""
         self._clock = clock
         self._delays_ns = delays_ns
+        self._stalled_until_ns = stalled_until_ns
         self._in_flight: deque[tuple[int, bytes]] = deque()
         self._last_arrival_ns = 0
         self.on_arrival: Callable[[], None] | None = None
@@ -22,7 +29,7 @@ class DelayedChannel:
 
     def send(self, data: bytes) -> None:
         """Send a datagram; it arrives after its delay, and never before an earlier one."""
-        arrival_ns = self._clock.now_ns() + next(self._delays_ns)
+        arrival_ns = self._stalled_until_ns(self._clock.now_ns() + next(self._delays_ns))
         self._last_arrival_ns = max(self._last_arrival_ns, arrival_ns)
         self._in_flight.append((self._last_arrival_ns, data))
         if self.on_arrival is not None:

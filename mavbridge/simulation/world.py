@@ -162,10 +162,12 @@ class SimulatedCamera:
         period_ns: int,
         phase_ns: int,
         delays_ns: Iterator[int],
+        stalled_until_ns: Callable[[int], int] = int,
         to_end_ns: int = 0,
         mount: Quat = IDENTITY,
     ) -> None:
         self._clock = clock
+        self._stalled_until_ns = stalled_until_ns
         self._to_end_ns = to_end_ns
         self._mount = mount
         self._pose = pose
@@ -192,7 +194,7 @@ class SimulatedCamera:
             watch(exposure)
         now_ns = self._clock.now_ns()
         arrival_ns = now_ns + self._to_end_ns + next(self._delays_ns)
-        self._clock.schedule(arrival_ns, lambda: self._arrive(exposure))
+        self._clock.schedule(self._stalled_until_ns(arrival_ns), lambda: self._arrive(exposure))
         self._clock.schedule(now_ns + self._period_ns, self._expose)
 
     def _arrive(self, exposure: Exposure) -> None:

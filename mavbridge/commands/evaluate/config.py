@@ -67,6 +67,9 @@ class EvaluateConfig:
     vision_time: float | None = None
     """Milliseconds that an image takes to encode, always (simulated clock); by default as on two
     shared cores: 11, and 25 at the 99th percentile."""
+    stalls: float = 0.0
+    """Milliseconds for which the flight process stands still, at a random moment every 3 s
+    (simulated clock); --max-stall may be looser than the policy's here, too."""
     workers: WorkersConfig = field(default_factory=WorkersConfig)
     json: Path | None = None
     """Write all results here as JSON."""
@@ -81,6 +84,7 @@ class EvaluateConfig:
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("max-time", self.max_time, 1, 3600, "s")
         check_range("vision-delay", self.vision_delay, 0, 5000, "ms")
+        check_range("stalls", self.stalls, 0, 5000, "ms")
         if self.resume and self.json is None:
             raise UserError("--resume needs the --json FILE to go on with")
         if self.vision_time is not None:
@@ -93,10 +97,11 @@ class EvaluateConfig:
             check_range("gusts", self.gusts, 0, 10, "m/s")
             if self.is_wall_clock:
                 raise UserError("--gusts needs --clock simulated")
-        if self.is_wall_clock and (self.vision_delay or self.vision_time is not None):
+        has_vision = bool(self.vision_delay) or self.vision_time is not None
+        if self.is_wall_clock and (has_vision or self.stalls):
             raise UserError(
-                "--vision-delay and --vision-time need --clock simulated: real encoders take their "
-                "time"
+                "--vision-delay, --vision-time and --stalls need --clock simulated: real encoders "
+                "take their time"
             )
         if self.is_wall_clock and self.workers.is_parallel:
             raise UserError(

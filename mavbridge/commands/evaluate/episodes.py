@@ -94,7 +94,7 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
     settings = SimulationSettings(
         rates=config.rates,
         limits=config.limits,
-        delays=replace(delays, vision=vision),
+        delays=replace(delays, vision=vision, stall_ns=round(config.stalls * NS_PER_MS)),
         raw_sticks=config.raw_sticks,
         draw_images=not is_scripted(config.policy),
     )

@@ -15,7 +15,7 @@ _STICKS = (
 """What full sticks did, and in which modes: written into every draft."""
 _LIMITS = (
     *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
-    *ENVELOPE_TERMS,
+    *("max_stall_s", *ENVELOPE_TERMS),
 )
 """Written where the flights had others than the usual ones."""
 

@@ -26,7 +26,7 @@ PACKAGES = ("msgpack", "websockets")
 
 TERMS = (
     *("play_s", "modes", "max_state_age_s", "max_velocity_age_s", "max_feature_age_s"),
-    *("max_chunk_age_s", *ENVELOPE_TERMS),
+    *("max_chunk_age_s", "max_stall_s", *ENVELOPE_TERMS),
 )
 """Fields of the contract of our own server that a contract file may replace: when it may fly."""
 

@@ -8,29 +8,37 @@ from mavbridge.gate.chunks import FreshnessLimits
 from policy.contract import Contract
 
 CONTRACT = Contract(
-    max_state_age_s=0.2, max_velocity_age_s=0.4, max_feature_age_s=2, max_chunk_age_s=1.5
+    max_state_age_s=0.2,
+    max_velocity_age_s=0.4,
+    max_feature_age_s=2,
+    max_chunk_age_s=1.5,
+    max_stall_s=0.5,
 )
+STALL_MS = 500
 
 
-def in_ms(state: int, velocity: int, feature: int, chunk: int) -> FreshnessLimits:
+def in_ms(
+    state: int, velocity: int, feature: int, chunk: int, stall: int = STALL_MS
+) -> FreshnessLimits:
     return FreshnessLimits(
         state_ns=state * NS_PER_MS,
         velocity_ns=velocity * NS_PER_MS,
         feature_ns=feature * NS_PER_MS,
         chunk_ns=chunk * NS_PER_MS,
+        stall_ns=stall * NS_PER_MS,
     )
 
 
 def test_ages_are_the_contracts_where_no_flag_speaks() -> None:
     assert effective_freshness(CONTRACT, Limits()) == in_ms(200, 400, 2000, 1500)
-    assert effective_freshness(Contract(), Limits()) == in_ms(100, 250, 300, 300)
+    assert effective_freshness(Contract(), Limits()) == in_ms(100, 250, 300, 300, 100)
 
 
 def test_flags_tighten_one_by_one() -> None:
     limits = Limits(max_attitude_age=0.05, max_chunk_age=1.5)
     assert effective_freshness(CONTRACT, limits) == in_ms(50, 400, 2000, 1500)
-    limits = Limits(max_velocity_age=0.3, max_feature_age=0.25)
-    assert effective_freshness(CONTRACT, limits) == in_ms(200, 300, 250, 1500)
+    limits = Limits(max_velocity_age=0.3, max_feature_age=0.25, max_stall=0.2)
+    assert effective_freshness(CONTRACT, limits) == in_ms(200, 300, 250, 1500, 200)
 
 
 @pytest.mark.parametrize(
@@ -40,6 +48,7 @@ def test_flags_tighten_one_by_one() -> None:
         (Limits(max_velocity_age=0.5), "--max-velocity-age 0.5 is looser than the 0.4 s"),
         (Limits(max_feature_age=5), "--max-feature-age 5 is looser than the 2 s"),
         (Limits(max_chunk_age=1.6), "--max-chunk-age 1.6 is looser than the 1.5 s"),
+        (Limits(max_stall=0.6), "--max-stall 0.6 is looser than the 0.5 s"),
     ],
 )
 def test_a_flag_that_would_loosen_is_refused(limits: Limits, message: str) -> None:

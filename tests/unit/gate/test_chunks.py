@@ -10,6 +10,7 @@ from mavbridge.gate.chunks import (
     GRACE_PERIODS,
     LEAST_GRACE_NS,
     MAX_REFUSED,
+    RECENT_GAPS,
     Chunk,
     ChunkBuffer,
     FreshnessLimits,
@@ -248,6 +249,76 @@ def test_chunks_that_are_farther_apart_than_one_may_be_flown_begin_no_flight() -
     assert "ask for a higher rate" in (slow.problem(2000 * MS) or "")
 
 
+STALL = replace(LIMITS, stall_ns=300 * MS)
+
+
+def test_a_stall_is_flown_through_along_the_chunk() -> None:
+    held = buffer(10, STALL)
+    held.offer(chunk(1, 1000), 1000 * MS)
+    for at_ms in range(1021, 1301):
+        assert held.fault(at_ms * MS) is None
+        assert held.is_coasting(at_ms * MS)
+    assert held.action_at(1295 * MS) == pytest.approx((0.0, 0.0, 0.0, 0.3))
+    assert "300 ms" in (held.fault(1300 * MS + 1) or "")
+
+
+@pytest.mark.parametrize(("steps", "until_ms"), [(1, 1100), (4, 1195), (6, 1295), (16, 1300)])
+def test_no_stall_is_flown_through_beyond_the_horizon(steps: int, until_ms: int) -> None:
+    held = buffer(10, STALL)
+    held.offer(chunk(1, 1000, actions=(NEUTRAL,) * steps), 1000 * MS)
+    assert held.fault(until_ms * MS) is None
+    assert held.fault(until_ms * MS + 1) is not None
+
+
+@pytest.mark.parametrize(
+    ("refusal", "heard_ms", "until_ms"),
+    [
+        ("absence", 1010, 1100),
+        ("absence", 1130, 1220),
+        ("absence", 1250, 1300),
+        ("stale", 1010, 1100),
+        ("stale", 1130, 1220),
+        ("malformed", 1010, 1100),
+        ("malformed", 1250, 1300),
+    ],
+)
+def test_a_flight_process_that_has_no_chunk_to_give_is_not_stalled_and_gets_the_grace(
+    refusal: str, heard_ms: int, until_ms: int
+) -> None:
+    held = buffer(10, STALL)
+    held.offer(chunk(1, 1000), 1000 * MS)
+    for serial, at_ms in enumerate((heard_ms, heard_ms + 10), start=2):
+        if refusal == "absence":
+            held.explain_absence("the image feature is older than 300 ms", at_ms * MS)
+        else:
+            bad = {"actions": (NAN,)} if refusal == "malformed" else {"image_ns": 600 * MS}
+            assert not held.offer(chunk(serial, at_ms, **bad), at_ms * MS)
+    assert held.fault(until_ms * MS) is None
+    assert held.fault(until_ms * MS + 1) is not None
+    held.offer(chunk(9, until_ms), until_ms * MS)
+    assert held.fault((until_ms + 100) * MS) is None, "the next one that may be flown ends it"
+
+
+def test_a_second_stall_is_flown_through_only_after_eight_chunks_in_time() -> None:
+    held, now_ms = buffer(10, STALL), 1000
+    held.offer(chunk(1, now_ms), now_ms * MS)
+    now_ms += 250
+    for serial in range(2, 2 + RECENT_GAPS):
+        held.offer(chunk(serial, now_ms), now_ms * MS)
+        assert held.fault((now_ms + 100) * MS) is None
+        assert held.fault((now_ms + 101) * MS) is not None
+        now_ms += 10
+    held.offer(chunk(99, now_ms), now_ms * MS)
+    assert held.fault((now_ms + 300) * MS) is None
+
+
+def test_a_policy_whose_chunks_come_as_seldom_as_a_stall_begins_no_flight() -> None:
+    held = buffer(10, STALL)
+    for serial, now_ms in enumerate((1000, 1250, 1500), start=1):
+        held.offer(chunk(serial, now_ms), now_ms * MS)
+    assert "come up to 250 ms apart, beyond the 100 ms" in (held.problem(1500 * MS) or "")
+
+
 def began(period_ms: int, *gaps_ms: int, **changes: object) -> tuple[ChunkBuffer, int]:
     """A buffer with chunks so far apart, the newest with changes, and the moment that it came."""
     held, now_ms = buffer(period_ms), 1000
@@ -334,13 +405,15 @@ ages = st.integers(0, 400).map(lambda ms: ms * MS)
 @given(
     period_ms=st.integers(2, 2000),
     play_ns=ages,
+    stall_ns=ages,
     taken=st.tuples(ages, ages, ages),
     steps=st.integers(1, 16),
 )
-def test_no_action_is_flown_beyond_the_horizon_or_100_ms_beyond_a_limit(
-    period_ms: int, play_ns: int, taken: tuple[int, int, int], steps: int
+def test_no_action_is_flown_beyond_the_horizon_nor_100_ms_beyond_a_limit_but_for_a_stall(
+    period_ms: int, play_ns: int, stall_ns: int, taken: tuple[int, int, int], steps: int
 ) -> None:
-    limits, now_ns = LIMITS.while_played(play_ns), 1000 * MS
+    limits = replace(LIMITS, stall_ns=stall_ns).while_played(play_ns)
+    now_ns = 1000 * MS
     held = buffer(period_ms, limits)
     attitude_ns, image_ns, computed_ns = (now_ns - age_ns for age_ns in taken)
     offered = chunk(
@@ -359,10 +432,11 @@ def test_no_action_is_flown_beyond_the_horizon_or_100_ms_beyond_a_limit(
     assert held.offer(offered, now_ns) == (now_ns <= kept_ns and covers)
     for at_ns in range(now_ns, now_ns + 3000 * MS, 25 * MS):
         if held.fault(at_ns) is None and held.action_at(at_ns) is not None:
-            assert at_ns <= kept_ns + LEAST_GRACE_NS
             held_ns = now_ns + offered.step_ns + period_ms * MS // 2
             assert at_ns <= (held_ns if steps == 1 else offered.end_ns)
-            assert at_ns <= now_ns + max(LEAST_GRACE_NS, GRACE_PERIODS * period_ms * MS)
+            graced_ns = now_ns + max(LEAST_GRACE_NS, GRACE_PERIODS * period_ms * MS)
+            graced_ns = min(graced_ns, kept_ns + LEAST_GRACE_NS)
+            assert at_ns <= max(graced_ns, now_ns + stall_ns)
 
 
 def test_stale_chunks_that_keep_coming_do_not_prolong_the_grace() -> None:
@@ -420,8 +494,8 @@ def test_an_older_chunk_never_replaces_a_newer_one() -> None:
 
 def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:
     held = buffer()
-    held.explain_absence("no image feature yet")
+    held.explain_absence("no image feature yet", 0)
     assert held.problem(0) == "no image feature yet"
     held.offer(chunk(1, 1000), 1000 * MS)
-    held.explain_absence("the image has been frozen for 0.6 s")
+    held.explain_absence("the image has been frozen for 0.6 s", 1010 * MS)
     assert "frozen" in (held.fault(1200 * MS) or "")

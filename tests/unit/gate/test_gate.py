@@ -53,6 +53,7 @@ class Stepped:
         meaning: ActionMeaning | None = None,
         status: dict[str, Any] | None = None,
         roles: ModeRoles = COPTER_MODES,
+        freshness: FreshnessLimits = AGES,
         **rules: Any,
     ) -> None:
         engagement = engagement_settings(
@@ -62,7 +63,7 @@ class Stepped:
             meaning=meaning or ActionMeaning(),
             stick_period_ns=10 * MS,
             chunk_period_ns=10 * MS,
-            freshness=AGES,
+            freshness=freshness,
             smoothing=smoothing or stick_smoothing(),
             envelope=EnvelopeLimits(),
             watches_home_height=False,
@@ -222,6 +223,44 @@ def test_a_gate_that_stood_still_beyond_the_grace_does_not_fly_on_with_a_fresh_c
     assert late.decision == Command(action=NEUTRAL)
     assert "no chunk of the policy that may be flown" in late.reason
     assert gate.step(2040, gate.chunk(2040)).decision in (Command(action=NEUTRAL), None)
+
+
+STALL = replace(AGES, stall_ns=300 * MS)
+
+
+def heard(at_ms: float) -> Telemetry:
+    return Telemetry(ned_from_body_wxyz=Reading(START_NS + round(at_ms * MS), (1.0, 0.0, 0.0, 0.0)))
+
+
+def test_a_stall_of_the_flight_process_is_flown_through_and_a_silent_vehicle_is_not() -> None:
+    def flies_until_ms(heard_until_ms: int) -> int:
+        gate = Stepped(freshness=STALL).engaged()
+        for at_ms in range(40, 1000, 10):
+            gate.telemetry = heard(min(at_ms, heard_until_ms))
+            output = gate.step(at_ms)
+            if gate.gate.phase is not Phase.FLYING:
+                break
+            assert output.is_coasting == (at_ms > 50)
+        assert ("no attitude from the vehicle" in output.reason) == (heard_until_ms < 230)
+        return at_ms - 10
+
+    assert flies_until_ms(1000) == 330, "300 ms after its last chunk"
+    assert flies_until_ms(100) == 200, "100 ms after the vehicle's last attitude"
+
+
+@pytest.mark.parametrize(("stood_still_ms", "flies"), [(130, True), (260, True), (301, False)])
+def test_a_computer_that_stood_still_flies_on_when_chunk_and_vehicle_come_back(
+    stood_still_ms: int, flies: bool
+) -> None:
+    gate = Stepped(freshness=STALL).engaged()
+    gate.telemetry = heard(30)  # a vehicle on the same computer stood still, too
+    gate.step(30 + stood_still_ms)
+    assert (gate.gate.phase is Phase.FLYING) == flies
+    if flies:
+        fresh_ms = 60 + stood_still_ms
+        gate.telemetry = heard(fresh_ms)
+        assert not gate.step(fresh_ms, gate.chunk(fresh_ms)).is_coasting
+        assert gate.gate.phase is Phase.FLYING
 
 
 def test_the_next_step_is_due_at_the_next_slot() -> None:

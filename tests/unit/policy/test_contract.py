@@ -12,6 +12,7 @@ from policy.contract import (
     OBSERVATION_TERMS,
     ROTATION,
     SINCE_EXPOSURE_NAMES,
+    STALL_TERMS,
     STATE_NAMES,
     VELOCITY_CHANGE,
     Contract,
@@ -32,13 +33,14 @@ def test_round_trips_through_its_header_form() -> None:
         max_velocity_age_s=1,
         max_feature_age_s=60.0,
         max_chunk_age_s=2.0,
+        max_stall_s=0.5,
         max_tilt_deg=180,
         max_speed_mps=30.0,
         max_height_m=300.0,
         max_distance_m=5000.0,
     )
     assert Contract.from_json(contract.to_json()) == contract
-    assert json.loads(contract.to_json())["version"] == 4
+    assert json.loads(contract.to_json())["version"] == 5
 
 
 def header_of_version_1(**changes: object) -> dict[str, Any]:
@@ -46,14 +48,14 @@ def header_of_version_1(**changes: object) -> dict[str, Any]:
     return {
         name: value
         for name, value in header.items()
-        if name not in (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS)
+        if name not in (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS, *STALL_TERMS)
     } | {"version": 1}
 
 
 def test_version_1_flies_sticks_in_the_modes_that_hold_altitude() -> None:
     contract = Contract.from_json(json.dumps(header_of_version_1(horizon=8)))
     assert contract == Contract(horizon=8)
-    assert contract.version == 4
+    assert contract.version == 5
     assert (contract.action, contract.modes) == ("sticks", ("ALT_HOLD", "ALTCTL"))
     ages_s = (contract.max_state_age_s, contract.max_velocity_age_s)
     assert (*ages_s, contract.max_feature_age_s, contract.max_chunk_age_s) == (0.1, 0.25, 0.3, 0.3)
@@ -119,7 +121,7 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
         ({"state_extras": ["speed"]}, "goal, height, altitude"),
         ({"state_extras": ["goal", "goal"]}, "each once"),
         ({"play_s": 0.9}, "at most the 0.8 s of a chunk"),
-        ({"version": 5}, "version 5 is not supported"),
+        ({"version": 6}, "version 6 is not supported"),
         ({"state_frame": "nwu"}, "ned_frd"),
         ({"arrays": "jax"}, "numpy"),
         ({"horizon": 0}, "horizon must be an integer in"),
@@ -133,7 +135,7 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
         ({"image_std_rgb": [0.2, 0.2, float("nan")]}, "finite"),
         ({"since_exposure": 1}, "since_exposure must be true or false"),
         ({"colour": "bgr"}, "unknown contract keys"),
-        ({"version": "2"}, "this build reads versions 1, 2, 3, 4"),
+        ({"version": "2"}, "this build reads versions 1, 2, 3, 4, 5"),
         ({"action": "torque"}, "'torque' is unknown; use one of sticks, rates, attitude, velocity"),
         ({"action": "velocity", "modes": ["GUIDED_NOGPS"]}, "known are GUIDED, OFFBOARD"),
         ({"velocity_frame": "body"}, "velocity_frame 'body' is unknown"),
@@ -149,6 +151,7 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
         ({"max_chunk_age_s": float("nan")}, "max_chunk_age_s must be in"),
         ({"max_chunk_age_s": True}, "max_chunk_age_s must be in"),
         ({"max_chunk_age_s": "long"}, "max_chunk_age_s must be in"),
+        ({"max_stall_s": 0}, "max_stall_s must be in"),
         ({"max_tilt_deg": 181}, r"max_tilt_deg must be in \(0, 180\] degrees"),
         ({"max_speed_mps": -1}, "max_speed_mps must be in"),
         ({"max_height_m": float("inf")}, "max_height_m must be in"),

@@ -177,8 +177,10 @@ def test_the_old_names_of_the_clocks_work_with_a_notice(
         (["--clock", "wall", "--gusts", "1"], "--gusts needs --clock simulated"),
         (["--gusts", "-1"], "--gusts must be between 0 and 10 m/s"),
         (["--resume"], "--resume needs the --json FILE"),
-        (["--clock", "wall", "--vision-delay", "50"], "--vision-delay and --vision-time need"),
-        (["--clock", "wall", "--vision-time", "50"], "--vision-delay and --vision-time need"),
+        (["--clock", "wall", "--vision-delay", "50"], "--vision-time and --stalls need"),
+        (["--clock", "wall", "--vision-time", "50"], "--vision-time and --stalls need"),
+        (["--clock", "wall", "--stalls", "100"], "--stalls need --clock simulated"),
+        (["--stalls", "-1"], "--stalls must be between 0 and 5000 ms"),
         (["--vision-delay", "-1"], "--vision-delay must be between 0 and 5000 ms"),
         (["--conditions", "stormy"], "--conditions"),
         (["--action-rate", "0"], "between 0.5 and 500 Hz"),
@@ -203,6 +205,6 @@ def test_help_lists_the_flags(capsys: pytest.CaptureFixture[str]) -> None:
     assert status == 0
     flags = """--clock --episodes --workers --ray --json --plot --seed --policy --conditions
         --vision-delay --vision-time --courses --checkpoint --engine --head-steps --dual-rate
-        --max-time"""
+        --max-time --stalls --max-stall"""
     assert [flag for flag in flags.split() if flag not in text] == []
     assert "--realtime" not in text
