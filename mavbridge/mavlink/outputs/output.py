@@ -67,6 +67,14 @@ class ActionOutput(ABC):
             CommandRefusedError: an action that must not be sent.
         """
 
+    @abstractmethod
+    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """The packet of an action at rest, for later: nothing is noted, and no nudge is in it.
+
+        Raises:
+            CommandRefusedError: as ``encode``.
+        """
+
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note what has left."""
         if encoded.shown is not None:
