@@ -250,6 +250,17 @@ class LinkSnapshot:
     """Status texts of the vehicle and warnings of the link since the last snapshot."""
 
 
+class Outlet(NamedTuple):
+    """Where packets to the vehicle leave, for a process that may send in place of the gate."""
+
+    opened: int
+    """Number of times that the link was opened: another number is another socket or port."""
+    fd: int | None
+    """None while it is closed."""
+    receiver: tuple[str, int] | None
+    """Address for datagrams; None on a stream."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionTrace:
     """One action on its way from the policy to the wire."""

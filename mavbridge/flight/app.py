@@ -120,7 +120,7 @@ def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate
         tlog_fd=tlog_fd,
         wall_offset_ns=wall_offset_ns(clock),
     )
-    process = GateProcess(settings)
+    process = GateProcess(settings, clock)
     stack.callback(process.close)
     if tlog_pipe is not None:
         tlog_pipe.writer.close()
@@ -401,7 +401,7 @@ class _Flight:
             left = f"still armed in {view.status.mode}{height}"
             if summary is not None:
                 screen.show_message(f"control given back, {left}")
-            elif view.phase is Phase.HOLDING:
+            elif view.phase is Phase.HOLDING and not self._gate.wait(0):
                 holder = f"the gate (process {self._gate.pid})"
                 screen.show_message(f"{left}: {holder} goes on sending neutral sticks")
         if summary is not None:

@@ -1,20 +1,26 @@
 """The gate process as its parent sees it: started, fed with chunks, listened to, waited for."""
 
+import os
 import select
 import socket
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import child_environment
 from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.gate.channel import SocketPort, channel_pair
+from mavbridge.gate.engagement import Phase
 from mavbridge.gate.settings import GateSettings
 from mavbridge.gate.wire import (
     FromGate,
     GateError,
     GateSummary,
+    GateTick,
+    LastWords,
     ToGate,
     decode_from_gate,
     encode_to_gate,
@@ -29,6 +35,18 @@ CLOSE_S = 5.0
 """Longest wait for a gate that holds no sticks to end and free its port."""
 
 
+REAP_S = 0.2
+"""Longest wait for a gate whose channel is closed to be gone: nothing is sent while it lives."""
+LATEST_NS = 500 * NS_PER_MS
+"""Oldest sign of life of a gate that is spoken for: a vehicle may have left our sticks since, by
+its own timeout or by its pilot."""
+_STILL_OURS = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
+OWN_TIMEOUT = (
+    "the vehicle keeps the last sticks or setpoint until its own timeout (ArduPilot: "
+    "RC_OVERRIDE_TIME, GUID_TIMEOUT; PX4: COM_RC_LOSS_T, COM_OF_LOSS_T)"
+)
+
+
 class GateDiedError(MavbridgeError):
     """The gate process is gone without having ended in order."""
 
@@ -38,10 +56,15 @@ class GateDiedError(MavbridgeError):
 class GateProcess:
     """Starts the gate; ``send`` may be called by any thread, ``listen`` runs in one of its own."""
 
-    def __init__(self, settings: GateSettings) -> None:
+    def __init__(self, settings: GateSettings, clock: Clock) -> None:
         """Start the process; it looks for the vehicle from then on."""
         ours, theirs = channel_pair()
-        self._port = SocketPort(ours)
+        self._clock = clock
+        self._port = SocketPort(ours, takes_files=True)
+        self._words: LastWords | None = None
+        self._outlet: int | None = None
+        """The gate's open socket or port, while the vehicle is held."""
+        self._newest: GateTick | None = None
         self._lock = threading.Lock()
         self._process = _spawn(theirs, settings)
         theirs.close()
@@ -98,11 +121,10 @@ class GateProcess:
         if self.error is not None:
             raise self.error
         if self.summary is None and not stop.is_set():
-            raise GateDiedError(
-                "the gate process has died: the vehicle keeps the last sticks or setpoint until "
-                "its own timeout (ArduPilot: RC_OVERRIDE_TIME, GUID_TIMEOUT; PX4: COM_RC_LOSS_T, "
-                "COM_OF_LOSS_T)"
-            )
+            left = self._speak()
+            signal = -(self._process.returncode or 0)
+            by = f" (signal {signal})" if signal > 0 else ""
+            raise GateDiedError(f"the gate process has died{by}: {left}")
         if self.summary is not None and self.summary.failure is not None:
             raise PeerError(self.summary.failure)
 
@@ -112,8 +134,62 @@ class GateProcess:
                 self.summary = message
             case GateError():
                 self.error = _as_exception(message)
+            case LastWords():
+                self._keep(message)
+            case GateTick():
+                self._newest = message
+                view.receive(message)
             case _:
                 view.receive(message)
+
+    def _keep(self, words: LastWords) -> None:
+        """Take the gate's last words, and the file through which they leave."""
+        self._words = words
+        if words.brings_file or not words.packets:
+            self._close_outlet()
+        if words.brings_file and self._port.files:
+            self._outlet = self._port.files.popleft()
+
+    def _close_outlet(self) -> None:
+        if self._outlet is not None:
+            os.close(self._outlet)
+            self._outlet = None
+
+    def _speak(self) -> str:
+        """Send the last words of a gate that is gone, once; returns what was done, for the user."""
+        died_ns, words, newest = self._clock.now_ns(), self._words, self._newest
+        if words is None or newest is None or not words.packets:
+            return "it held no sticks"
+        if newest.phase is not words.phase and newest.phase not in _STILL_OURS:
+            return "it had given the sticks back"
+        if not self.wait(REAP_S):
+            return f"it does not end, so nothing was sent in its place; {OWN_TIMEOUT}"
+        silent_ns = self._clock.now_ns() - newest.sent_ns
+        if silent_ns > LATEST_NS:
+            silent_s = silent_ns / NS_PER_S
+            return f"silent for {silent_s:.1f} s, too long to speak for it; {OWN_TIMEOUT}"
+        sent = 0
+        for after_ns, packet in words.packets:
+            self._clock.sleep_until_ns(died_ns + after_ns)
+            sent += self._transmit(packet, words.receiver)
+        if sent == 0:
+            return f"its last words could not be sent; {OWN_TIMEOUT}"
+        asked = f", and {words.mode} asked for" if words.mode else ""
+        return (
+            f"its last words were sent in its place (neutral{asked}), but nobody hears the answer: "
+            "take the vehicle over"
+        )
+
+    def _transmit(self, packet: bytes, receiver: tuple[str, int] | None) -> bool:
+        """Send one packet through the gate's socket or port; never waits."""
+        if self._outlet is None:
+            return False
+        with suppress(OSError):
+            if receiver is None:
+                return os.write(self._outlet, packet) == len(packet)
+            with socket.socket(fileno=os.dup(self._outlet)) as udp:
+                return udp.sendto(packet, receiver) == len(packet)
+        return False
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for the process to end by itself; returns whether it has."""
@@ -127,6 +203,7 @@ class GateProcess:
         """Close the channel: a gate that still runs takes it for our death, and ends by itself."""
         self._port.close()
         self.wait(CLOSE_S)
+        self._close_outlet()
 
 
 def _spawn(end: socket.socket, settings: GateSettings) -> subprocess.Popen[bytes]:

@@ -20,6 +20,7 @@ from mavbridge.gate.wire import (
     GateStatus,
     GateSummary,
     GateTick,
+    LastWords,
 )
 from mavbridge.mavlink.codec.messages import LocalVelocity, Measurement
 from mavbridge.mavlink.codec.packets import Codec
@@ -136,7 +137,7 @@ class VehicleView:
                 self.status = message
             case GateMessage(text):
                 self._texts.append(text)
-            case GateError() | GateSummary():
+            case GateError() | GateSummary() | LastWords():
                 pass  # its end is the business of whoever has started it
             case packets:
                 self._receive_packets(packets)

@@ -3,13 +3,15 @@
 Taking the sticks needs an explicit act; losing them is final until the next one.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Literal, TypeAlias
 
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.gate.departure import Departure, DepartureSettings, Ending
+from mavbridge.gate.departure import STICK_REST_NS, Departure, DepartureSettings, Ending
 from mavbridge.gate.facts import Facts, Hand, Move
 from mavbridge.gate.outcome import Outcome
 from mavbridge.gate.preparation import Preparation, PreparationSettings
@@ -27,6 +29,12 @@ UNHEARD_RELEASE_TIMEOUT_NS = 4 * NS_PER_S
 as well: longer than it holds ours on its own (RC_OVERRIDE_TIME, 3 s by default)."""
 LOST_NS = 30 * NS_PER_S
 """A vehicle that was held for so long without a word from it is gone: nothing can be held."""
+_REHEARSED_MS = (0, 20, 40, *range(100, 2000, 50))
+"""Moments after the gate's death at which its last words are said; the first of them close
+together, since a packet that the gate sent in part swallows the next one."""
+_ASKED_NS = 250 * NS_PER_MS
+"""How long they ask for a mode: any longer, and they could undo a mode that the pilot chose."""
+_RELEASES = 5
 OPERATOR = "released by the operator"
 ON_US, OFF_US = 1800, 1200
 """ArduPilot's thresholds of a high and of a low switch."""
@@ -406,3 +414,29 @@ class Engagement:
         if self.phase is not Phase.FLYING:
             return self._take_off(facts)
         return Move(hand=Hand.POLICY)
+
+    # --- for the death of the gate
+
+    def rehearse(self, facts: Facts) -> Iterator[tuple[int, Move]]:
+        """Yield the moves, with their delays in ns, that end the flight if the gate dies now.
+
+        A copy of this machine takes the death for a fault, and hears nothing more of the vehicle.
+        """
+        twin = deepcopy(self, {id(self._settings): self._settings})
+        if self.phase in (Phase.PREPARING, Phase.FLYING):
+            twin.stop(Ending(reason="the gate has died", is_fault=True))
+        facts = replace(facts, are_sticks_at_rest=False)  # they jump to neutral, unseen by us
+        rest_ns = STICK_REST_NS if facts.modes.override else 0
+        until_ns = rest_ns + _ASKED_NS
+        for after_ns in (after_ms * NS_PER_MS for after_ms in _REHEARSED_MS):
+            if after_ns > until_ns:
+                break
+            move = twin.step(replace(facts, now_ns=facts.now_ns + after_ns), None)
+            if twin.phase not in (Phase.LEAVING, Phase.HOLDING):
+                until_ns = after_ns
+                break
+            yield after_ns, move
+        must_release = twin.phase is Phase.LEAVING and not twin._departure.must_hold
+        if twin.phase is Phase.RELEASING or must_release:
+            for k in range(_RELEASES):
+                yield until_ns + k * 50 * NS_PER_MS, Move(hand=Hand.RELEASE)

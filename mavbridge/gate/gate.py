@@ -4,6 +4,7 @@ One class for the gate process, the simulation and the tests. It never waits: ev
 and the caller steps it whenever something has arrived and at ``next_ns``.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -112,6 +113,8 @@ class Gate:
         self._stepped_ns = self._heard_ns = now_ns
         """The last step; the last one after which the gate can tell silence of the vehicle."""
         self._hand: Hand | None = None
+        self._facts_seen: Facts | None = None
+        """Those of the last step."""
         self._last = self._neutral
         """As last sent."""
         self._is_readonly = settings.engagement.readonly
@@ -137,10 +140,13 @@ class Gate:
         """How the flights went so far."""
         return self._engagement.outcome
 
-    @property
-    def last_setpoint(self) -> Action | None:
-        """A setpoint at rest; None where the policy's actions are sticks, which can be released."""
-        return None if isinstance(self._neutral, Sticks) else self._neutral
+    def rehearse(self) -> Iterator[tuple[int, Decision | None, str | None]]:
+        """Yield the decisions and the modes to ask for, with their delays in ns, that end the
+        flight if the gate dies now."""
+        if self._facts_seen is None:
+            return
+        for after_ns, move in self._engagement.rehearse(self._facts_seen):
+            yield after_ns, self._at_rest(move.hand), move.mode
 
     def unsent(self) -> None:
         """The last decision did not leave: the next one starts from what left before it."""
@@ -158,7 +164,7 @@ class Gate:
             self._engagement.stop(given.stop)
         phase_before = self._engagement.phase
         silence = self._silence(now_ns, given.link.telemetry.ned_from_body_wxyz)
-        facts = self._facts(now_ns, given, overdue or silence)
+        facts = self._facts_seen = self._facts(now_ns, given, overdue or silence)
         move = self._engagement.step(facts, given.act)
         self._change_hand(move.hand, now_ns, given.link)
         phase = self._engagement.phase
@@ -293,6 +299,13 @@ class Gate:
                 return Command(action=trace.smoothed), trace
         self._last = action
         return Command(action=action), None
+
+    def _at_rest(self, hand: Hand | None) -> Decision | None:
+        """What a hand other than the policy's would send now; nothing is noted."""
+        if hand is None or hand is Hand.RELEASE:
+            return None if hand is None else Release(self._engagement.reason)
+        resting = {Hand.IDLE: self._idle, Hand.NEUTRAL: self._neutral}
+        return Command(action=resting.get(hand) or self._level(is_thrust=True))
 
     def _level(self, *, is_thrust: bool) -> Action:
         """Neutral, with the last throttle where that is thrust."""

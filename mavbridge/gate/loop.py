@@ -1,7 +1,7 @@
 """The gate with its two edges, the link to the vehicle and the channel to the flight process."""
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -14,9 +14,8 @@ from mavbridge.core.vehicle import (
     Decision,
     ForwardedPacket,
     LinkSnapshot,
-    ModeRoles,
+    Outlet,
     Output,
-    Release,
 )
 from mavbridge.gate.channel import Port
 from mavbridge.gate.chunks import Chunk
@@ -29,6 +28,7 @@ from mavbridge.gate.wire import (
     GateMessage,
     GateStatus,
     GateTick,
+    LastWords,
     decode_to_gate,
     encode_from_gate,
     encode_packets,
@@ -39,11 +39,14 @@ IDLE_PERIOD_NS = 10 * NS_PER_MS
 """Between two looks at the link before a policy is loaded."""
 FINISH_NS = 4 * NS_PER_S
 """Longest that putting parameters back may take, or sending a release that was held up."""
-ABANDON_RELEASES, ABANDON_SPACING_NS = 10, 50 * NS_PER_MS
 _Given = TypeVar("_Given")
 _Sent = TypeVar("_Sent")
+WORDS_NS, THRUST_WORDS_NS = NS_PER_S, 100 * NS_PER_MS
+"""Oldest last words: signatures must be no older than a minute, and what tells the safe mode may
+change. In modes where the throttle is thrust they repeat the last one, which should be near."""
 _HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
 _ENGAGED = (*_HELD, Phase.RELEASING)
+_TAKEN = (*_ENGAGED, Phase.PREPARING)
 
 
 class GateLink(Protocol):
@@ -93,6 +96,18 @@ class GateLink(Protocol):
     def announce(self, text: str) -> None:
         """Tell every ground station."""
 
+    @property
+    def outlet(self) -> Outlet:
+        """Where packets to the vehicle leave now."""
+
+    def rehearse(
+        self, plan: Iterable[tuple[int, Decision | None, str | None]]
+    ) -> tuple[tuple[int, bytes], ...]:
+        """Encode decisions and requests for a mode, for another process to send."""
+
+    def transmit(self, packet: bytes) -> bool:
+        """Send a packet of ``rehearse`` now."""
+
 
 class GateLoop:
     """One pass at every wake: receive, decide, send, report. Used by one thread."""
@@ -130,7 +145,12 @@ class GateLoop:
         """Error of the last pass while a command was made or sent."""
         self._finish_until_ns: int | None = None
         self._is_clean = False
-        self._modes = ModeRoles()
+        self._words: tuple[tuple[int, bytes], ...] = ()
+        """Packets with their delays that bring the vehicle into safety if this process dies."""
+        self._words_basis: object = None
+        self._words_due_ns = 0
+        self._words_outlet: Outlet | None = None
+        """That the flight process has open."""
         self.is_done = False
         """The sticks are given back, and nobody wants more flights."""
 
@@ -153,23 +173,43 @@ class GateLoop:
         self._stop = self._stop or ending
 
     def abandon(self) -> None:
-        """Give the sticks back without any state machine: the gate ends by a bug of its own.
+        """Say the last words without any state machine: the gate ends by a bug of its own."""
+        with suppress(Exception):
+            self._prepare_words(self._link.outlet)
+        died_ns = self._clock.now_ns()
+        for after_ns, packet in self._words:
+            self._clock.sleep_until_ns(died_ns + after_ns)
+            with suppress(Exception):
+                self._link.transmit(packet)
 
-        Ten times over half a second, as any packet may be lost; not where none was ever held. The
-        last setpoint would be followed until the vehicle's own timeout, so one at rest goes before,
-        and the vehicle is asked to hold unless somebody has taken it over.
-        """
-        last = self._gate.last_setpoint if self._gate is not None else None
-        if last is not None and self._phase is Phase.FLYING:
-            with suppress(Exception):
-                self._link.send(Command(action=last))
-        for _ in range(ABANDON_RELEASES if self._phase is not Phase.WAITING else 0):
-            if last is not None and self._modes.hold and self._phase in _HELD:
-                with suppress(Exception):
-                    self._link.set_mode(self._modes.hold)
-            with suppress(Exception):
-                self._link.send(Release("the gate has failed"))
-            self._clock.sleep_until_ns(self._clock.now_ns() + ABANDON_SPACING_NS)
+    def _renew_words(self, snapshot: LinkSnapshot, output: GateOutput) -> None:
+        """Prepare the last words where what they rest on has changed, and from time to time."""
+        now_ns, status, outlet = self._clock.now_ns(), snapshot.status, self._link.outlet
+        basis: tuple[object, ...] = (output.phase, outlet)
+        if status is not None:
+            basis += (status.mode, status.armed, status.is_landed, status.has_receiver)
+            basis += (status.is_position_valid,)
+        is_old = output.slot is not None and now_ns >= self._words_due_ns
+        if basis != self._words_basis or is_old:
+            is_thrust = status is not None and status.mode in snapshot.modes.thrust
+            self._words_due_ns = now_ns + (THRUST_WORDS_NS if is_thrust else WORDS_NS)
+            self._words_basis = basis
+            self._prepare_words(outlet)
+
+    def _prepare_words(self, outlet: Outlet) -> None:
+        """Leave with the flight process what it shall send if this process dies."""
+        if self._gate is None:
+            return
+        is_held = self._gate.phase in _TAKEN and outlet.fd is not None
+        plan = tuple(self._gate.rehearse()) if is_held else ()
+        before, self._words = self._words, self._link.rehearse(plan)
+        if not (before or self._words):
+            return
+        mode = next((mode for _, _, mode in plan if mode is not None), None)
+        is_new = bool(self._words) and outlet != self._words_outlet
+        words = LastWords(self._gate.phase, mode, outlet.receiver, is_new, self._words)
+        is_told = self._flight.send(encode_from_gate(words), outlet.fd if is_new else None)
+        self._words_outlet = outlet if is_told and self._words else None
 
     def step(self) -> int:
         """One pass; returns when the next one is due at the latest.
@@ -179,7 +219,6 @@ class GateLoop:
         """
         woke_ns = self._clock.now_ns()
         snapshot = self._link.poll()
-        self._modes = snapshot.modes
         self._report_vehicle(snapshot)
         given = self._receive(snapshot)
         if self._gate is None:
@@ -204,6 +243,7 @@ class GateLoop:
         if output.phase is not self._phase:
             self._change_phase(output)
         self._link.service()
+        self._renew_words(snapshot, output)
         if output.phase is Phase.ENDED:
             self._finish(woke_ns)
         # A command that failed is answered in a pass that follows at once.

@@ -83,6 +83,21 @@ class GateMessage(NamedTuple):
     text: str
 
 
+class LastWords(NamedTuple):
+    """What the flight process sends the vehicle if the gate dies; replaces the words before."""
+
+    phase: Phase
+    """That of the gate when it prepared them."""
+    mode: str | None
+    """The safe mode that they ask for."""
+    receiver: tuple[str, int] | None
+    """Address for the datagrams; None on a stream."""
+    brings_file: bool
+    """The open socket or port of the link comes with this message."""
+    packets: tuple[tuple[int, bytes], ...]
+    """Each with its delay in ns from the death; none: nothing is held, nothing is to be said."""
+
+
 class GateError(NamedTuple):
     """The gate ends because of this."""
 
@@ -117,7 +132,13 @@ class GateSummary:
 
 ToGate: TypeAlias = GateSettings | FlightSettings | Chunk | Absence | Act | Ending
 FromGate: TypeAlias = (
-    tuple[ForwardedPacket, ...] | GateTick | GateStatus | GateMessage | GateError | GateSummary
+    tuple[ForwardedPacket, ...]
+    | GateTick
+    | GateStatus
+    | GateMessage
+    | LastWords
+    | GateError
+    | GateSummary
 )
 
 
@@ -262,13 +283,19 @@ def _decode_packets(data: bytes) -> Iterator[ForwardedPacket]:
         at += length
 
 
-def encode_from_gate(message: GateStatus | GateMessage | GateError | GateSummary) -> bytes:
+def encode_from_gate(
+    message: GateStatus | GateMessage | LastWords | GateError | GateSummary,
+) -> bytes:
     """One message of the gate that comes seldom."""
     match message:
         case GateStatus():
             return b"V" + json.dumps(message).encode()
         case GateMessage():
             return b"M" + json.dumps(message).encode()
+        case LastWords(phase, _, _, _, packets):
+            texts = [(after_ns, packet.hex()) for after_ns, packet in packets]
+            words = message._replace(phase=phase.value, packets=texts)  # type: ignore[arg-type]
+            return b"W" + json.dumps(words).encode()
         case GateError():
             return b"X" + json.dumps(message).encode()
         case GateSummary():
@@ -298,6 +325,11 @@ def _decode_from_gate(data: bytes) -> FromGate:
             return GateStatus(autopilot, mode, armed, is_landed, channels, rc_sticks, has_position)
         case b"M":
             return GateMessage(*json.loads(data[1:]))
+        case b"W":
+            phase, mode, receiver, brings_file, texts = json.loads(data[1:])
+            packets = tuple((int(after_ns), bytes.fromhex(text)) for after_ns, text in texts)
+            address = None if receiver is None else (str(receiver[0]), int(receiver[1]))
+            return LastWords(Phase(phase), mode, address, bool(brings_file), packets)
         case b"X":
             return GateError(*json.loads(data[1:]))
         case b"Z":

@@ -1,6 +1,7 @@
 """The vehicle as the gate sees it. One thread owns socket and codec."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -17,6 +18,7 @@ from mavbridge.core.vehicle import (
     LinkSnapshot,
     LinkStats,
     ModeRoles,
+    Outlet,
     Output,
 )
 from mavbridge.mavlink.codec.messages import (
@@ -30,10 +32,10 @@ from mavbridge.mavlink.codec.messages import (
     SpecificForce,
     Timesync,
 )
-from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
 from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.outputs.sender import ActionSender
-from mavbridge.mavlink.session.commands import ModeAndArm
+from mavbridge.mavlink.session.commands import ModeAndArm, mode_request
 from mavbridge.mavlink.session.discovery import (
     Hearing,
     Namesakes,
@@ -379,6 +381,34 @@ class MavlinkLink:
             self._command(self._commands.takeoff(request, now_ns))
         elif self._commands.is_time_to_explain(now_ns):
             self._report("no takeoff yet: the vehicle does not tell its height above the sea")
+
+    def rehearse(
+        self, plan: Iterable[tuple[int, Decision | None, str | None]]
+    ) -> tuple[tuple[int, bytes], ...]:
+        """Encode decisions and requests for a mode, with their delays, for another process to send
+        if this one dies; nothing is sent or noted. One that the codec refuses is left out."""
+        if (vehicle := self._vehicle) is None or self._config.readonly:
+            return ()
+        packets: list[tuple[int, bytes | None]] = []
+        with self._codec.rehearsing():
+            for after_ns, decision, mode in plan:
+                with suppress(CommandRefusedError):
+                    if decision is not None:
+                        packets.append((after_ns, self._sender.rehearse(decision)))
+                if mode is not None:
+                    request = mode_request(vehicle.profile.modes.command(mode))
+                    packet = self._codec.encode_request(vehicle.identity.source, request)
+                    packets.append((after_ns, packet))
+        return tuple((after_ns, packet) for after_ns, packet in packets if packet is not None)
+
+    @property
+    def outlet(self) -> Outlet:
+        """Where packets to the vehicle leave now."""
+        return self._connection.outlet
+
+    def transmit(self, packet: bytes) -> bool:
+        """Send a packet of ``rehearse`` now; False: it was not sent."""
+        return self._connection.send(packet)
 
     def _command(self, request: CommandRequest | None) -> None:
         if request is None or self._vehicle is None or self._config.readonly:

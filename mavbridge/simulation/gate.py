@@ -19,7 +19,7 @@ class MemoryPort:
         self._incoming = incoming
         self.is_closed = False
 
-    def send(self, message: bytes) -> bool:
+    def send(self, message: bytes, fd: int | None = None) -> bool:
         """Send one message; always succeeds."""
         self._outgoing.send(message)
         return True

@@ -69,6 +69,10 @@ class MemoryTransport:
         """Nothing that ``select`` could wait for."""
         return None
 
+    def receiver(self, peer: Address | None) -> Address | None:
+        """See ``Transport``."""
+        return peer
+
     def wait(self, until_ns: int) -> None:
         """Let time pass until a datagram has arrived, or until ``until_ns``.
 

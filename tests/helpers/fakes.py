@@ -1,7 +1,7 @@
 """Test doubles: a virtual clock, a recording sink, a vehicle in memory."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -19,6 +19,7 @@ from mavbridge.core.vehicle import (
     ForwardedPacket,
     LinkSnapshot,
     LinkStats,
+    Outlet,
     Output,
     Reading,
     Release,
@@ -114,6 +115,9 @@ class FakeLink:
         self.decisions: list[tuple[int, Decision]] = []
         self.requests: list[str] = []
         self.announced: list[str] = []
+        self.transmitted: list[tuple[int, str]] = []
+        """Last words that were said, as text."""
+        self.outlet = Outlet(1, 7, ("127.0.0.1", 1))
         self.services = 0
         self.restores = 0
         self.on_send: Callable[[], None] = lambda: None
@@ -205,6 +209,22 @@ class FakeLink:
 
     def announce(self, text: str) -> None:
         self.announced.append(text)
+
+    def rehearse(
+        self, plan: Iterable[tuple[int, Decision | None, str | None]]
+    ) -> tuple[tuple[int, bytes], ...]:
+        """Each decision and each mode as text."""
+        return tuple(
+            (after_ns, str(part).encode())
+            for after_ns, *parts in plan
+            for part in parts
+            if part is not None
+        )
+
+    def transmit(self, packet: bytes) -> bool:
+        self.on_send()
+        self.transmitted.append((self._clock.now_ns(), packet.decode()))
+        return True
 
     def begin_restore(self) -> None:
         self.restores += 1

@@ -8,6 +8,7 @@ vehicle's own record and the bytes that left.
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from mavbridge.flight.settings import flight_settings, link_settings
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Phase
 from mavbridge.gate.loop import GateLoop
-from mavbridge.gate.wire import GateMessage, GateTick, ToGate, encode_to_gate
+from mavbridge.gate.wire import GateMessage, GateTick, LastWords, ToGate, encode_to_gate
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.clock import AheadClock, SteppedClock
@@ -194,6 +195,14 @@ class GateFlight:
         self.is_flight_process_stopped = True
         self.gate_port.is_closed = True
         self._wake()
+
+    def kill_gate(self) -> None:
+        """The gate is killed, and the flight process sends its last words after 2 ms."""
+        self.gate.is_done = True
+        words = [r for r in self.gate_port.reports if isinstance(r, LastWords)][-1]
+        for after_ns, packet in words.packets:
+            at_ns = self.clock.now_ns() + 2 * MS + after_ns
+            self.clock.schedule(at_ns, partial(self.up.send, packet))
 
     # --- time
 

@@ -67,6 +67,9 @@ class Wire:
     def fileno(self) -> int | None:
         return None
 
+    def receiver(self, peer: Address | None) -> Address | None:
+        return peer
+
     def drain(self) -> Iterator[Received]:
         return iter(())
 

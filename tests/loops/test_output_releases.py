@@ -277,3 +277,14 @@ def test_px4s_sticks_shown_again_after_a_gap_are_no_takeover(gap_s: float, is_he
     assert flight.phase is Phase.HOLDING, flight.describe()
     assert flight.samples[-1].mode == "AUTO.LOITER"
     assert not any(s.failsafe for s in flight.samples)
+
+
+@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+def test_death_of_the_gate(autopilot: AutopilotName, kind: ActionKind) -> None:
+    flight = OutputFlight(autopilot, kind)
+    found = after(flight, OutputFlight.kill_gate)
+    assert found.neutral_ms is not None, found
+    assert found.neutral_ms <= 20, found
+    assert not found.flew_again, found
+    assert found.final_mode == hold(flight), (found, flight.describe())
+    assert found.lean_held_ms <= 20 + 250, found

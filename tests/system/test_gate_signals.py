@@ -78,7 +78,7 @@ def test_the_gate_starts_at_once_and_stays_small() -> None:
         vehicle.bind(("127.0.0.1", 0))
         vehicle.settimeout(START_LIMIT_S)
         address = f"udpout:127.0.0.1:{vehicle.getsockname()[1]}"
-        gate = GateProcess(GateSettings(link=LinkSettings(connect=address)))
+        gate = GateProcess(GateSettings(link=LinkSettings(connect=address)), Clock())
         try:
             vehicle.recv(1024)  # its heartbeat
             peak_mb = Process(gate.pid, Clock()).peak_memory_mb()

@@ -59,7 +59,7 @@ def main(*, port: int, out: Path) -> None:
     )
     settings = gate_settings(config, is_dual=True, tlog_fd=None, wall_offset_ns=0)
     link = replace(settings.link, state_hz=ATTITUDE_HZ)
-    gate = GateProcess(replace(settings, link=link))
+    gate = GateProcess(replace(settings, link=link), MonotonicClock())
     try:
         bridge = link_bridge(config, gate, meter)
         gate.send(flight_settings(config, ROLL_RATE))

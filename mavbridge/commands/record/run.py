@@ -144,7 +144,7 @@ class _Session:
         """Why the last begin was refused."""
         self.screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
         viewer = self._open_viewer()
-        self._gate = GateProcess(listening_gate(config, clock))
+        self._gate = GateProcess(listening_gate(config, clock), clock)
         stack.callback(self._gate.close)
         self._gate.wait_until_open()
         camera = self._open_camera(console)

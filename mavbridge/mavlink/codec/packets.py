@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -22,7 +23,7 @@ from mavbridge.mavlink.codec.messages import (
     StreamRequest,
 )
 from mavbridge.mavlink.codec.readers import READERS, UnusableError
-from mavbridge.mavlink.codec.signing import Signing, is_signed
+from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing, is_signed
 
 RELEASE_US = 0
 """RC_CHANNELS_OVERRIDE ch 1-8: give the channel back to the receiver."""
@@ -86,6 +87,22 @@ class Codec:
         self.hears_signed = False
         """A packet came with a signature that nobody here can judge, for want of a key."""
         self._text_id = 0
+
+    @contextmanager
+    def rehearsing(self) -> Iterator[None]:
+        """Context manager: encode packets that another process may send later.
+
+        They use up no sequence number, and are signed as a stream of their own.
+        """
+        sequence = self._mav.seq
+        if self.signing is not None:
+            self.signing.link_id = LAST_WORDS_LINK_ID
+        try:
+            yield
+        finally:
+            self._mav.seq = sequence
+            if self.signing is not None:
+                self.signing.link_id = LINK_ID
 
     def forget_partial(self) -> None:
         """Drop an unfinished packet: the next bytes do not continue it."""

@@ -25,6 +25,9 @@ MOST_LAG_TICKS = 60 * 10**9 // TICK_NS
 """A stream that was never heard may begin a minute behind our own clock."""
 _RADIO_STATUS = 109
 """Made by the telemetry radio itself, which knows no key; nothing is decided by it."""
+LINK_ID, LAST_WORDS_LINK_ID = 0, 1
+"""Of the packets that the gate sends, and of those that the flight process sends if it dies, which
+are signed before: a stream of their own, within ``MOST_LAG_TICKS`` of the other."""
 Stream: TypeAlias = tuple[int, int, int]
 """Link id, system and component: timestamps grow within each."""
 Refusal: TypeAlias = Literal["unsigned", "wrong key", "replayed", "clock behind"]
@@ -46,7 +49,6 @@ class Signing:
         self,
         key: bytes,
         *,
-        link_id: int = 0,
         unix_ns: Callable[[], int],
         state: SigningState = SigningState(),  # noqa: B008 - immutable
     ) -> None:
@@ -54,12 +56,12 @@ class Signing:
 
         Args:
             key: shared with the vehicle.
-            link_id: of the packets that we send.
             unix_ns: the time of day; may be wrong, or step back at a restart.
             state: of an earlier process with this key.
         """
         self._key = key
-        self._link_id = link_id
+        self.link_id = LINK_ID
+        """Of the packets that are signed."""
         self._unix_ns = unix_ns
         self._sent_ticks = state.sent_ticks
         self._remembered = dict(state.heard_ticks)
@@ -83,7 +85,7 @@ class Signing:
             packet[:1]
             + bytes(body)
             + crc.to_bytes(_CHECKSUM_BYTES, "little")
-            + bytes((self._link_id,))
+            + bytes((self.link_id,))
             + self._sent_ticks.to_bytes(_TIMESTAMP_BYTES, "little")
         )
         return unsealed + self._hash(unsealed)

@@ -151,6 +151,14 @@ class AttitudeOutput(SetpointOutput):
         is_checked = is_checked and not self._shows_rates
         return Encoded(packet, action._replace(thrust=policy_thrust), shown if is_checked else None)
 
+    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """See `ActionOutput`; level, with the vehicle's own heading."""
+        if not isinstance(action, AttitudeThrust) or self._measured_rad is None:
+            return None
+        level = quaternion_from_euler(0.0, 0.0, self._measured_rad)
+        thrust = min((self._scale or 1.0) * action.thrust, 1.0)
+        return self._codec.encode_attitude(vehicle.identity.source, level, thrust, now_ns=now_ns)
+
     def _encode_rates(
         self,
         action: BodyRates,

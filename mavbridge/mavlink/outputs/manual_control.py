@@ -116,6 +116,11 @@ class ManualControlOutput(StickOutput):
         self._last = values
         return Encoded(packet, curves.to_policy(manual_control_sticks(values)), shown)
 
+    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """See `ActionOutput`."""
+        values = manual_control_of(self._resting(action))
+        return self._codec.encode_manual_control(vehicle.identity.source.system, values)
+
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare the sticks that the vehicle acts on; they carry no stamp of its own."""
         if not isinstance(body, ManualControl):

@@ -72,6 +72,14 @@ class ActionOutput(ABC):
         if encoded.shown is not None:
             self.echo.tried(now_ns)
 
+    @abstractmethod
+    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """The packet of an action at rest, for later: nothing is noted, and no nudge is in it.
+
+        Raises:
+            CommandRefusedError: as ``encode``.
+        """
+
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note what has left."""
         if encoded.shown is not None:

@@ -64,6 +64,13 @@ class OverrideOutput(StickOutput):
         self._calibration, self._last = calibration, pwm_us
         return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), shown)
 
+    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """See `ActionOutput`."""
+        if (calibration := vehicle.calibration) is None:
+            return None
+        pwm_us = pwm_of(self._resting(action), calibration)
+        return self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
+
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare RC_CHANNELS with what was sent."""
         if isinstance(body, RcChannels) and vehicle.calibration is not None:

@@ -77,6 +77,15 @@ class ActionSender:
         output.sent(encoded, vehicle, self._clock.now_ns())
         return encoded.action
 
+    def rehearse(self, decision: Decision) -> bytes | None:
+        """The packet of an action at rest or of a release, for later: nothing is noted."""
+        vehicle, output, now_ns = self._vehicle, self.output, self._clock.now_ns()
+        if vehicle is None or output is None:
+            return None
+        if isinstance(decision, Release):
+            return output.release_packet(vehicle, now_ns)
+        return output.encode_resting(decision.action, vehicle, now_ns)
+
     def _level(self, output: ActionOutput, vehicle: VehicleSession) -> None:
         """Send what goes ahead of the first release, where the output has it."""
         if self._release.left < output.releases:

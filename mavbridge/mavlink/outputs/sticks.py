@@ -65,6 +65,13 @@ class StickOutput(ActionOutput):
             pilot_sticks=None if pilot is None else curves.to_policy(pilot),
         )
 
+    def _resting(self, action: Action) -> Sticks:
+        """The vehicle's sticks for an action, by the curves in use."""
+        if not isinstance(action, Sticks):
+            raise CommandRefusedError(f"{type(action).__name__} are not sticks")
+        is_same = action is IDLE or self._curves.is_identity
+        return action if is_same else self._curves.to_vehicle(action)
+
     def _wanted(
         self, action: Action, vehicle: VehicleSession, now_ns: int
     ) -> tuple[Sticks, StickCurves]:

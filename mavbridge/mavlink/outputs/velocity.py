@@ -49,6 +49,14 @@ class VelocityOutput(SetpointOutput):
         )
         return Encoded(packet, sent, shown)
 
+    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """See `ActionOutput`."""
+        if not isinstance(action, Velocity):
+            return None
+        return self._codec.encode_velocity(
+            vehicle.identity.source, action, is_heading_frame=self._is_heading_frame, now_ns=now_ns
+        )
+
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare the velocity down, if the target has one (a takeoff has a position)."""
         if not isinstance(body, VelocityTarget):

@@ -16,6 +16,11 @@ _FORGET_NS = 3 * NS_PER_S
 """A refusal counts no longer once the mode was not asked for during this time."""
 
 
+def mode_request(numbers: tuple[int, int]) -> CommandRequest:
+    """The request for a mode by its two numbers."""
+    return CommandRequest(_SET_MODE, (dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *numbers))
+
+
 class ModeAndArm:
     """Requests of a mode or of arming, each not too soon after the same one before."""
 
@@ -28,11 +33,10 @@ class ModeAndArm:
 
     def set_mode(self, mode: str, numbers: tuple[int, int], now_ns: int) -> CommandRequest | None:
         """The request for a mode, unless it was sent just now."""
-        flags = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         last_ns = self._sent[_SET_MODE][0] if _SET_MODE in self._sent else now_ns
         if mode != self._mode or now_ns - last_ns > _FORGET_NS:
             self._mode, self.refused_mode = mode, None
-        return self._request(CommandRequest(_SET_MODE, (flags, *numbers)), now_ns, _MODE_SPACING_NS)
+        return self._request(mode_request(numbers), now_ns, _MODE_SPACING_NS)
 
     def arm(self, now_ns: int) -> CommandRequest | None:
         """The request to arm, unless it was sent just now."""

@@ -5,7 +5,7 @@ from typing import Protocol, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import Packet
+from mavbridge.core.vehicle import Outlet, Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.signing import Refusal
@@ -70,7 +70,7 @@ class Connection:
         """Messages for the user, until `take_texts`."""
         self.received_bytes = self.received_packets = 0
         self._told: list[str] = []
-        self._was_open = False
+        self._opened = 0
         self._open(clock.now_ns())
 
     @property
@@ -83,11 +83,11 @@ class Connection:
         try:
             self._transport.open()
         except (TransportDownError, UserError) as error:
-            if isinstance(error, UserError) and not self._was_open:
+            if isinstance(error, UserError) and not self._opened:
                 raise
             self._lose(error, now_ns)
             return
-        self._was_open = True
+        self._opened += 1
         self._refused_ns = None
         self._codec.forget_partial()
 
@@ -100,6 +100,12 @@ class Connection:
     def fileno(self) -> int | None:
         """Descriptor to wait for with ``select``; None while there is none."""
         return None if self.is_down else self._transport.fileno()
+
+    @property
+    def outlet(self) -> Outlet:
+        """Where packets leave now."""
+        fd = self.fileno()
+        return Outlet(self._opened, fd, None if fd is None else self._transport.receiver(self.peer))
 
     def _lose(self, error: TransportDownError | UserError, now_ns: int) -> None:
         self._transport.close()

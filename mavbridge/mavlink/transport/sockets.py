@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import fcntl
 import os
 import select
 import socket
@@ -82,6 +83,9 @@ class Transport(Protocol):
     def fileno(self) -> int | None:
         """Descriptor that turns readable when ``drain`` has something to yield; None if closed."""
 
+    def receiver(self, peer: Address | None) -> Address | None:
+        """Address to which ``send`` sends; None on a stream, or if there is none yet."""
+
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Hand one whole packet to the kernel; False: dropped, because it cannot be sent now.
 
@@ -107,12 +111,21 @@ class _Base(Generic[_Handle]):
         """See `Transport`."""
         return None if self._handle is None else self._handle.fileno()
 
-    def close(self) -> None:
+    def receiver(self, peer: Address | None) -> Address | None:
         """See `Transport`."""
+        return None
+
+    def close(self) -> None:
+        """See `Transport`. The flight process may have the file open, too: it is ended first."""
         if self._handle is not None:
             with contextlib.suppress(OSError):  # the port may be gone already
+                self._end(self._handle)
+            with contextlib.suppress(OSError):
                 self._handle.close()
             self._handle = None
+
+    def _end(self, handle: _Handle) -> None:
+        """End what would outlive ``close`` for as long as another process has the file open."""
 
 
 class UdpTransport(_Base[socket.socket]):
@@ -167,9 +180,13 @@ class UdpTransport(_Base[socket.socket]):
                 return now_ns - min(max(queued_ns, 0), NS_PER_S)
         return now_ns
 
+    def receiver(self, peer: Address | None) -> Address | None:
+        """See `Transport`."""
+        return peer if self._listen else self._address
+
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Send one datagram to the peer, if there is one and it can be reached now."""
-        receiver = peer if self._listen else self._address
+        receiver = self.receiver(peer)
         if self._handle is None or receiver is None:
             return False
         try:
@@ -230,6 +247,9 @@ class TcpTransport(_StreamTransport[socket.socket]):
         self._handle, self._is_connected, self._unsent = tcp, False, b""
         self._was_open = True
         self._heard_ns = self._clock.now_ns()
+
+    def _end(self, handle: socket.socket) -> None:
+        handle.shutdown(socket.SHUT_RDWR)
 
     def _unreachable(self, code: int) -> PeerError:
         host, port = self._address
@@ -307,6 +327,9 @@ class SerialTransport(_StreamTransport[serial.Serial]):
         self._backlog.clear()
         self._written.clear()
         self._emptied_ns = self._clock.now_ns()
+
+    def _end(self, handle: serial.Serial) -> None:
+        fcntl.flock(handle.fileno(), fcntl.LOCK_UN)  # that of ``exclusive``
 
     def _obstacle(self, error: OSError | ValueError) -> str:
         """What keeps the port from us, and what to do about it."""

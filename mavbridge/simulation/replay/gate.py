@@ -306,6 +306,10 @@ class _RecordedTransport:
         """Nothing that ``select`` could wait for."""
         return None
 
+    def receiver(self, peer: Address | None) -> Address | None:
+        """Nobody."""
+        return None
+
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Let the time of sending pass."""
         if self.sent_ns is not None:
@@ -329,7 +333,7 @@ class _RecordedPort:
         self.is_closed = False
         self._tick: GateTick | None = None
 
-    def send(self, message: bytes) -> bool:
+    def send(self, message: bytes, fd: int | None = None) -> bool:
         """Keep a tick; everything else has no reader."""
         decoded = decode_from_gate(message)
         if isinstance(decoded, GateTick):

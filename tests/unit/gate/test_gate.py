@@ -572,11 +572,6 @@ def test_the_first_arming_engages_where_that_was_asked_for() -> None:
     assert gate.step(30, gate.chunk(30), armed=True).phase is Phase.FLYING
 
 
-def test_sticks_have_no_setpoint_to_rest_in() -> None:
-    assert Stepped().gate.last_setpoint is None
-    assert of_velocities("OFFBOARD").gate.last_setpoint == Velocity(0.0, 0.0, 0.0, 0.0)
-
-
 def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     gate = Stepped().gate
     link = LinkSnapshot(telemetry=Telemetry(), status=None, problem="waiting for a heartbeat")

@@ -11,6 +11,7 @@ from mavbridge.core.vehicle import (
     ActionMeaning,
     Decision,
     LinkSnapshot,
+    Outlet,
     Output,
     Sticks,
     Telemetry,
@@ -47,6 +48,7 @@ class ReadyVehicle:
     is_engaged = False
     autopilot = "ardupilot"
     is_restored = True
+    outlet = Outlet(1, None, None)
 
     def __init__(self, clock: FakeClock) -> None:
         self._clock = clock
@@ -70,6 +72,12 @@ class ReadyVehicle:
     def announce(self, text: str) -> None:
         pass
 
+    def rehearse(self, plan: object) -> tuple[tuple[int, bytes], ...]:
+        return ()
+
+    def transmit(self, packet: bytes) -> bool:
+        return True
+
 
 class FewChunks:
     """A flight process that sends its settings, three chunks and the act, and then nothing."""
@@ -81,7 +89,7 @@ class FewChunks:
         chunks = [Chunk(k, *[START_NS] * 4, START_NS, DAY_NS, actions) for k in (1, 2, 3)]
         self._inbox = [encode_to_gate(message) for message in (FLIGHT, *chunks, "engage")]
 
-    def send(self, _message: bytes) -> bool:
+    def send(self, _message: bytes, fd: int | None = None) -> bool:
         return True
 
     def receive(self) -> list[bytes]:

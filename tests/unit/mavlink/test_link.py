@@ -92,6 +92,9 @@ class Vehicle:
     def fileno(self) -> int | None:
         return 7
 
+    def receiver(self, peer: Address | None) -> Address | None:
+        return peer
+
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         if self.is_down or self.is_deaf:
             return False

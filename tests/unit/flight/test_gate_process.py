@@ -1,0 +1,223 @@
+"""The death of the gate as the flight process takes it: the last words leave by the gate's link."""
+
+import os
+import pty
+import socket
+import subprocess
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from helpers.fakes import START_NS, FakeClock
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.flight import gate_process
+from mavbridge.flight.gate_process import LATEST_NS, GateDiedError, GateProcess
+from mavbridge.gate.channel import SocketPort
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.settings import GateSettings
+from mavbridge.gate.wire import GateError, GateTick, LastWords, encode_from_gate, encode_tick
+from mavbridge.mavlink.settings import LinkSettings
+
+MS = NS_PER_MS
+PACKETS = ((0, b"neutral"), (20 * MS, b"neutral"), (100 * MS, b"mode"))
+WHOLE = [b"neutral", b"neutral", b"mode"]
+
+
+class Child:
+    """The gate's process, which is gone when it is killed."""
+
+    pid, returncode = 4321, None
+
+    def wait(self, timeout_s: float) -> int:
+        if self.returncode is None:
+            raise subprocess.TimeoutExpired("gate", timeout_s)
+        return self.returncode
+
+
+class View:
+    def receive(self, message: Any) -> None:
+        pass
+
+
+@dataclass
+class Rig:
+    """A flight process, and the gate's end of the channel."""
+
+    clock: FakeClock = field(default_factory=FakeClock)
+    child: Any = field(default_factory=Child)
+    port: Any = None
+    gate: Any = None
+
+    def tell(
+        self,
+        phase: Phase = Phase.FLYING,
+        fd: int | None = None,
+        receiver: tuple[str, int] | None = None,
+        packets: tuple[tuple[int, bytes], ...] = PACKETS,
+    ) -> None:
+        words = LastWords(phase, "BRAKE", receiver, fd is not None, packets)
+        assert self.port.send(encode_from_gate(words), fd)
+
+    def tick(self, phase: Phase = Phase.FLYING) -> None:
+        now_ns = self.clock.now_ns()
+        self.port.send(
+            encode_tick(
+                GateTick(
+                    index=0,
+                    due_ns=now_ns,
+                    woke_ns=now_ns,
+                    decided_ns=now_ns,
+                    sent_ns=now_ns,
+                    missed_slots=0,
+                    is_slot=True,
+                    is_coasting=False,
+                    chunk_serial=None,
+                    trace=None,
+                    sent=None,
+                    phase=phase,
+                    reason="",
+                )
+            )
+        )
+
+    def die(self, returncode: int | None = -9) -> str:
+        """Returns what the user is told."""
+        self.child.returncode = returncode
+        self.port.close()
+        with pytest.raises(GateDiedError) as told:
+            self.gate.listen(threading.Event(), View())
+        return str(told.value)
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    made = Rig()
+
+    def spawn(end: socket.socket, _settings: GateSettings) -> Any:
+        made.port = SocketPort(end.dup())
+        return made.child
+
+    monkeypatch.setattr(gate_process, "_spawn", spawn)
+    made.gate = GateProcess(GateSettings(link=LinkSettings(connect="udp:127.0.0.1:1")), made.clock)
+    yield made
+    made.port.close()
+    made.child.returncode = 0
+    made.gate.close()
+
+
+@dataclass
+class Link:
+    """The gate's open socket or port, and the vehicle's end."""
+
+    fd: int
+    receiver: tuple[str, int] | None
+    heard: Callable[[], list[bytes]]
+    close: Callable[[], None]
+
+
+def udp() -> Link:
+    ours = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    vehicle = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for end in (ours, vehicle):
+        end.bind(("127.0.0.1", 0))
+        end.setblocking(False)
+    port = ours.getsockname()
+
+    def heard() -> list[bytes]:
+        received = []
+        while True:
+            try:
+                data, sender = vehicle.recvfrom(100)
+            except BlockingIOError:
+                return received
+            assert sender == port
+            received.append(data)
+
+    return Link(ours.detach(), vehicle.getsockname(), heard, vehicle.close)
+
+
+def tcp() -> Link:
+    server = socket.create_server(("127.0.0.1", 0))
+    ours = socket.create_connection(server.getsockname())
+    vehicle = server.accept()[0]
+    server.close()
+    return Link(ours.detach(), None, lambda: [vehicle.recv(100)], vehicle.close)
+
+
+def serial() -> Link:
+    vehicle, ours = pty.openpty()
+    tty.setraw(ours)
+    os.set_blocking(vehicle, False)
+
+    def heard() -> list[bytes]:
+        received = []
+        with suppress(BlockingIOError):
+            while True:
+                received.append(os.read(vehicle, 100))
+        return received
+
+    return Link(ours, None, heard, lambda: os.close(vehicle))
+
+
+@pytest.fixture(params=[udp, tcp, serial])
+def link(request: pytest.FixtureRequest) -> Iterator[Link]:
+    made: Link = request.param()
+    yield made
+    made.close()
+
+
+def test_the_last_words_leave_by_the_link_of_a_gate_that_is_gone(rig: Rig, link: Link) -> None:
+    rig.tell(fd=link.fd, receiver=link.receiver)
+    os.close(link.fd)  # the gate's own dies with it
+    rig.tick()
+    text = rig.die()
+    assert b"".join(link.heard()) == b"".join(WHOLE)
+    assert rig.clock.now_ns() == START_NS + 100 * MS
+    assert "signal 9" in text
+    assert "BRAKE" in text
+
+
+def test_newer_words_replace_those_before_and_keep_the_link(rig: Rig, link: Link) -> None:
+    rig.tell(fd=link.fd, receiver=link.receiver)
+    os.close(link.fd)
+    rig.tell(receiver=link.receiver, packets=((0, b"newer"),))
+    rig.tick()
+    rig.die()
+    assert b"".join(link.heard()) == b"newer"
+
+
+@pytest.mark.parametrize("case", ["released", "given back", "old", "alive", "a bug", "silent"])
+def test_nothing_is_sent_where_it_would_be_wrong(rig: Rig, case: str) -> None:
+    link = udp()
+    rig.tell(fd=link.fd, receiver=link.receiver)
+    os.close(link.fd)
+    if case != "silent":
+        rig.tick()
+    if case == "released":
+        rig.tell(Phase.RELEASED, packets=())
+    elif case == "given back":  # and the newer words did not get through
+        rig.tick(Phase.RELEASED)
+    elif case == "old":
+        rig.clock.advance_ns(LATEST_NS + MS)
+    if case == "a bug":  # it has said them itself
+        rig.port.send(encode_from_gate(GateError("bug", "Traceback")))
+    text = rig.die(None if case == "alive" else -9)
+    assert link.heard() == []
+    assert ("its own timeout" in text) == (case in ("old", "alive"))
+    link.close()
+
+
+def test_the_duplicate_is_closed_as_soon_as_nothing_is_held(rig: Rig) -> None:
+    link = tcp()
+    rig.tell(fd=link.fd)
+    os.close(link.fd)
+    rig.tell(Phase.RELEASED, packets=())
+    rig.tick(Phase.RELEASED)
+    rig.die()
+    assert link.heard() == [b""]  # the vehicle sees the end of the connection
+    link.close()
