@@ -5,7 +5,6 @@ carries its ``Contract`` in the header, and the bridge refuses one that it canno
 """
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, get_args
@@ -92,6 +91,11 @@ ACTION_MODES: dict[ActionKind, tuple[str, ...]] = {
     "attitude": ATTITUDE_MODES,
     "velocity": ("GUIDED", "OFFBOARD"),
 }
+LEAST = 1e-3
+"""Smallest time in seconds, and smallest of any other quantity that something is divided by."""
+LEAST_RATE_HZ = 0.01
+MOST_PIXEL = 1e3
+"""Largest mean and deviation of an image, whose pixels are in [0, 1]."""
 MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 FLIGHT_TERMS = (
@@ -206,6 +210,14 @@ class Contract:
 
     def __post_init__(self) -> None:
         """Refuse values that no runtime could serve."""
+        try:
+            self._require_values()
+            self._require_observation()
+            self._require_flight_terms()
+        except (TypeError, ValueError, OverflowError, AttributeError) as error:
+            raise ContractError(f"malformed contract: {error}") from error
+
+    def _require_values(self) -> None:
         if self.modes == () and self.action in ACTION_MODES:
             modes = ("ALT_HOLD", "ALTCTL") if self.action == "sticks" else ACTION_MODES[self.action]
             object.__setattr__(self, "modes", modes)
@@ -232,45 +244,51 @@ class Contract:
             ("observation_steps", 1, 16),
         ):
             value = getattr(self, name)
-            if not isinstance(value, int) or not low <= value <= high:
+            if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
                 raise ContractError(f"{name} must be an integer in {low}..{high}, got {value!r}")
         for name in ("chunk_dt_s", "history_dt_s", "observation_dt_s"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and 0 < value <= 1):
-                raise ContractError(f"{name} must be in (0, 1] seconds, got {value!r}")
-        self._require_observation()
-        self._require_flight_terms()
+            if not _is_within(value, LEAST, 1.0):
+                raise ContractError(f"{name} must be in [{LEAST:g}, 1] seconds, got {value!r}")
 
     def _require_observation(self) -> None:
-        if not all(map(math.isfinite, (*self.image_mean_rgb, *self.image_std_rgb))):
-            raise ContractError("image_mean_rgb and image_std_rgb must be finite numbers")
-        if min(self.image_std_rgb) <= 0:
-            raise ContractError(f"image_std_rgb must be positive, got {self.image_std_rgb}")
+        for name, low in (("image_mean_rgb", -MOST_PIXEL), ("image_std_rgb", 1e-6)):
+            rgb = getattr(self, name)
+            if len(rgb) != 3 or not all(_is_within(value, low, MOST_PIXEL) for value in rgb):
+                raise ContractError(
+                    f"{name} must be three numbers in [{low:g}, {MOST_PIXEL:g}], got {rgb!r}"
+                )
         for name in _TUPLES:
             if not isinstance(getattr(self, name), tuple):
                 raise ContractError(f"{name} must be a list, got {getattr(self, name)!r}")
         crop = self.image_crop
-        if len(crop) != 4 or not (0 <= crop[0] < crop[2] <= 1 and 0 <= crop[1] < crop[3] <= 1):
+        is_crop = len(crop) == 4 and all(_is_within(share, 0, 1) for share in crop)
+        if not is_crop or min(crop[2] - crop[0], crop[3] - crop[1]) < LEAST:
             raise ContractError(
-                f"image_crop must be top, left, bottom, right within [0, 1], got {self.image_crop}"
+                "image_crop must be top, left, bottom, right within [0, 1], at least "
+                f"{LEAST:g} apart, got {self.image_crop}"
             )
         names = self.cameras
         if not names or len(set(names)) < len(names) or not all(map(str.isidentifier, names)):
             raise ContractError(f"cameras must be one or more different names, got {names!r}")
         rates_hz = self.camera_rates_hz
-        if len(rates_hz) not in (0, len(names)) or not all(0 < hz <= 240 for hz in rates_hz):
+        if len(rates_hz) not in (0, len(names)) or not all(
+            _is_within(hz, LEAST_RATE_HZ, 240) for hz in rates_hz
+        ):
             raise ContractError(
-                f"camera_rates_hz must be a rate in (0, 240] Hz for each of {names}, got {rates_hz}"
+                f"camera_rates_hz must be a rate in [{LEAST_RATE_HZ:g}, 240] Hz for each of "
+                f"{names}, got {rates_hz}"
             )
         extras = self.state_extras
         if len(set(extras)) < len(extras) or not set(extras) <= set(EXTRA_NAMES):
             raise ContractError(
                 f"state_extras must be some of {', '.join(EXTRA_NAMES)}, each once, got {extras!r}"
             )
-        if not 0 <= self.play_s <= self.horizon * self.chunk_dt_s:
+        longest_s = self.horizon * self.chunk_dt_s
+        if not _is_within(self.play_s, 0, longest_s) or 0 < self.play_s < LEAST:
             raise ContractError(
-                f"play_s must be at most the {self.horizon * self.chunk_dt_s:g} s of a chunk, got "
-                f"{self.play_s!r}"
+                f"play_s must be 0, or at least {LEAST:g} and at most the {longest_s:g} s of a "
+                f"chunk, got {self.play_s!r}"
             )
 
     def _require_flight_terms(self) -> None:
@@ -303,12 +321,13 @@ class Contract:
         ):
             if value is None and name in ENVELOPE_TERMS:
                 continue
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if value is None or not is_number or not 0 < value <= high:
-                raise ContractError(f"{name} must be in (0, {high:g}] {unit}, got {value!r}")
+            if not _is_within(value, LEAST, high):
+                raise ContractError(
+                    f"{name} must be in [{LEAST:g}, {high:g}] {unit}, got {value!r}"
+                )
         for name in ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"):
             share = getattr(self, name)
-            if not isinstance(share, int | float) or not 0 <= share < 0.9:
+            if not _is_within(share, 0, 0.9) or share == 0.9:
                 raise ContractError(f"{name} must be in [0, 0.9) of the travel, got {share!r}")
 
     @property
@@ -381,20 +400,17 @@ class Contract:
             if isinstance(data.get(name), list):
                 data[name] = tuple(data[name])
         for name in ("image_mean_rgb", "image_std_rgb"):
-            if name in data:
-                data[name] = _rgb(name, data[name])
+            if isinstance(data.get(name), list):
+                data[name] = tuple(data[name])
         try:
             return cls(**data)
         except TypeError as error:
             raise ContractError(f"malformed contract: {error}") from error
 
 
-def _rgb(name: str, value: object) -> tuple[float, float, float]:
-    if isinstance(value, list) and len(value) == 3:
-        numbers = [float(number) for number in value if isinstance(number, int | float)]
-        if len(numbers) == 3:
-            return numbers[0], numbers[1], numbers[2]
-    raise ContractError(f"{name} must be three numbers, got {value!r}")
+def _is_within(value: object, low: float, high: float) -> bool:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and low <= value <= high  # type: ignore[operator]  # False for NaN
 
 
 def history_ages_ns(length: int, dt_s: float) -> Sequence[int]:

@@ -289,6 +289,37 @@ def test_another_vehicle_of_the_same_system_id_has_a_file_of_its_own(tmp_path: P
     assert "RC_OVERRIDE_TIME" in remembered(tmp_path)
 
 
+@pytest.mark.parametrize(("then", "now"), [("", "ab12"), ("ab12", "")])
+@pytest.mark.parametrize("flag", ["restore", "set"])
+def test_a_leftover_is_found_although_the_unique_id_got_lost_once(
+    then: str, now: str, flag: str, tmp_path: Path
+) -> None:
+    crashed = start(tmp_path)
+    crashed.unique_id = then
+    crashed.run(6.0)
+    assert crashed.values["RC_OVERRIDE_TIME"] == 0.5
+    more: dict[str, Any] = {"set_params": (("RC_OVERRIDE_TIME", 0.5),)}
+    later = again(crashed, **(more if flag == "set" else {"restore_params": True}))
+    later.unique_id = now
+    later.run(6.0)
+    assert later.problem() is None
+    end(later)
+    assert later.values["RC_OVERRIDE_TIME"] == 3.0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_another_vehicle_shows_does_not_take_a_leftover_without_an_id(tmp_path: Path) -> None:
+    crashed = start(tmp_path)
+    crashed.unique_id = ""
+    crashed.run(6.0)
+    before = (tmp_path / "vehicle-1.json").read_text()
+    other = ParamVehicle({"RC_OVERRIDE_TIME": 1.0}, folder=tmp_path, restore_params=True)
+    other.unique_id = "cd34"
+    other.run(6.0)
+    assert other.writes == []
+    assert (tmp_path / "vehicle-1.json").read_text() == before
+
+
 # --- the file
 
 

@@ -1,6 +1,7 @@
 """Parameters that are set for one flight and put back after it."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from enum import Enum, auto
 from pathlib import Path
 
@@ -46,6 +47,8 @@ class TemporaryParams:
         self._memory: ParamMemory | None = None
         self._changed: dict[str, Changed] = {}
         """Contents of the file."""
+        self._elsewhere: list[tuple[ParamMemory, dict[str, Changed]]] = []
+        """Files of this system id that may be of this vehicle: its unique id can get lost."""
         self._leftovers: tuple[str, ...] = ()
         self._failures: dict[str, str] = {}
         """Why a wanted parameter is not set, by name."""
@@ -74,7 +77,15 @@ class TemporaryParams:
                 self._file_problem = str(error)
             else:
                 self._report(str(error))
-        return (*self._wanted, *self._changed)
+        kind, system, *unique_id = vehicle.split("-")
+        others = f"{kind}-{system}.json" if unique_id else f"{vehicle}-*.json"
+        for memory in map(ParamMemory, sorted(self._folder.glob(others))):
+            try:
+                self._elsewhere.append((memory, memory.load()))
+            except UserError as error:
+                self._report(str(error))
+        names = [name for _, changed in self._elsewhere for name in changed]
+        return (*self._wanted, *self._changed, *names)
 
     def problem(self) -> str | None:
         """Why a flight may not begin yet, or None."""
@@ -126,6 +137,7 @@ class TemporaryParams:
 
     def _sort_out_leftovers(self, values: Mapping[str, float]) -> None:
         """Tell what an earlier flight has left changed, and forget what is in order again."""
+        self._adopt(values)
         in_order = [
             name
             for name, change in self._changed.items()
@@ -150,6 +162,24 @@ class TemporaryParams:
                 "left over from an earlier flight that did not end in order: "
                 f"{', '.join(texts)}; --restore-params puts it back"
             )
+
+    def _adopt(self, values: Mapping[str, float]) -> None:
+        """Take over what stands in a file without the unique id, or under one that is lost now.
+
+        Only what the vehicle really shows; the rest may be another vehicle's, and stays there.
+        """
+        for memory, changed in self._elsewhere:
+            ours = {
+                name: change
+                for name, change in changed.items()
+                if name in values and change.is_ours(values[name])
+            }
+            if not ours:
+                continue
+            self._changed = ours | self._changed
+            self._save()
+            with suppress(UserError):  # it is then found there once more
+                memory.save({name: changed[name] for name in changed if name not in ours})
 
     # --- setting
 
