@@ -15,4 +15,15 @@ gate alone sends to the autopilot: it samples the newest chunk while the policy 
 gives them back in order when the pilot takes them or anything fails (docs/SAFETY.md).
 """  # noqa: E501 - the picture is wider than the text
 
+import os
+import sys
+
+left_out: list[str] = []
+"""The working directory, if `python -m mavbridge` has put it first: modules that lie there beside
+somebody's weights are not ours to run."""
+if sys.argv[:1] == ["-m"] and not sys.flags.safe_path:  # so while Python looks for the module
+    _root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))  # noqa: PTH100, PTH120
+    left_out = [entry for entry in sys.path[:1] if entry != _root]
+    sys.path[: len(left_out)] = []
+
 __version__ = "0.1.0"

@@ -1,15 +1,18 @@
 """Entry point: expected errors are one message and their status; anything else is our bug."""
 
+import os
 import signal
 import sys
 from collections.abc import Sequence
 from functools import partial
 
-from mavbridge.core.own_packages import hidden_package
+from mavbridge.core.own_packages import OUR_SAFE_PATH, SAFE_PATH, hidden_package
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; by default that of the process."""
+    if arguments is None:  # our process: its children import nothing from the working directory
+        os.environ.setdefault(SAFE_PATH, OUR_SAFE_PATH)
     if (problem := hidden_package()) is not None:
         sys.stderr.write(f"error: {problem}\n")
         sys.exit(2)  # ExitCode.REFUSED, which cannot be imported yet

@@ -27,6 +27,7 @@ from mavbridge.camera.pipe_frames import (
 )
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
+from mavbridge.core.processes import user_environment
 
 FORM = "pipe:COMMAND (MJPEG) or pipe:WIDTHxHEIGHT:FORMAT:COMMAND (raw pictures)"
 FIRST_NS, SILENT_NS = 10 * NS_PER_S, 2 * NS_PER_S
@@ -116,6 +117,7 @@ class PipeSource:
         try:
             self._process = subprocess.Popen(
                 command.words,
+                env=user_environment(),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import mavbridge
 from mavbridge.core.errors import UserError
+from mavbridge.core.own_packages import OUR_SAFE_PATH, SAFE_PATH
 
 IMPORT_ROOT = Path(mavbridge.__file__).parents[1]
 """The folder that holds this mavbridge: the source tree, or site-packages."""
@@ -29,8 +30,14 @@ def child_environment() -> dict[str, str]:
     import_path = (str(IMPORT_ROOT), os.environ.get("PYTHONPATH", ""))
     return os.environ | {
         "PYTHONPATH": os.pathsep.join(filter(None, import_path)),
-        "PYTHONSAFEPATH": "1",
+        SAFE_PATH: "1",
     }
+
+
+def user_environment() -> dict[str, str]:
+    """Our environment as the user has set it, for a program of the user's."""
+    is_ours = os.environ.get(SAFE_PATH) == OUR_SAFE_PATH
+    return {k: v for k, v in os.environ.items() if not (is_ours and k == SAFE_PATH)}
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """From the flags of a command to a loaded policy."""
 
-import sys
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -45,9 +44,6 @@ def configured_contract(wanted: PolicyConfig) -> Contract:
 
 
 def _request(wanted: PolicyConfig) -> PolicyRequest:
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)  # a user's module:Class lies in the working directory
     return PolicyRequest(
         spec=wanted.policy,
         checkpoint=wanted.checkpoint,

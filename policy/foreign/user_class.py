@@ -1,6 +1,6 @@
 """A policy of the user's own: any class with the members of ``policy.protocol``.
 
-package.module:Class   imported as Python imports it
+package.module:Class   imported as Python imports it, or from the working directory
 package:Class          from the package's ``__init__``
 path/to/file.py:Class  a file; its folder joins the search path, so that it finds what lies there
 """
@@ -10,6 +10,8 @@ import importlib.util
 import inspect
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
@@ -45,7 +47,9 @@ def check_user_class(spec: str) -> None:
             f"--policy {spec}: {package} is a package of mavbridge; a file of that name flies by "
             f"its path: --policy ./{package}.py:{spec.rpartition(':')[2]}"
         )
-    if package not in sys.modules and importlib.util.find_spec(package) is None:
+    with _working_directory():
+        is_known = package in sys.modules or importlib.util.find_spec(package) is not None
+    if not is_known:
         raise PolicyError(
             f"--policy {spec}: there is no module {package}; put its folder on PYTHONPATH or "
             f"install it, name its file (./file.py:Class), or write {FORMS}"
@@ -68,7 +72,8 @@ def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> Sin
             if isinstance(where, Path):
                 module = _import_file(where)
             else:
-                module = importlib.import_module(where)
+                with _working_directory():
+                    module = importlib.import_module(where)
     except PolicyError as error:
         raise PolicyError(f"--policy {spec}: {error}; {_import_hint(error.__cause__)}") from error
     found = getattr(module, class_name, None)
@@ -81,6 +86,23 @@ def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> Sin
         )
         raise PolicyError(f"--policy {spec}: no class {class_name} there; it has {classes}")
     return _instance(spec, found, checkpoint, seed)
+
+
+@contextmanager
+def _working_directory() -> Iterator[None]:
+    """Search it too, after everything that is installed; only where a module of it is named.
+
+    At any other time a module that lies beside weights would run for a package that is missing.
+    """
+    here = str(Path.cwd())
+    is_added = here not in sys.path
+    if is_added:
+        sys.path.append(here)
+    try:
+        yield
+    finally:
+        if is_added:
+            sys.path.remove(here)
 
 
 def _split(spec: str) -> tuple[Path | str, str]:

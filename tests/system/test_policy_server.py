@@ -20,6 +20,7 @@ import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from helpers.policy_servers import Gate, Reply, chunk_of, our_server, scripted_server
+from mavbridge.commands.serve import server
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.processes import free_port
 from policy.contract import Contract, FloatArray
@@ -396,6 +397,31 @@ def test_a_policy_that_remembers_serves_one_client_alone() -> None:
         assert first.recv(PATIENT_S)
         with pytest.raises(ConnectionClosed, match="served already: 1"):
             second.recv(PATIENT_S)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:8000", ""])
+def test_a_web_page_is_refused_and_holds_no_place(origin: str) -> None:
+    remembers = replace(served_echo(), reset=lambda: None)
+    with our_server(remembers) as port:
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(port, Origin=origin).__enter__()
+        with connect(port) as client:
+            assert unpack(client.recv(PATIENT_S))
+
+
+def test_who_asks_for_nothing_gives_his_place_to_who_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "UNASKED_S", 0.0)
+    remembers = replace(served_echo(), reset=lambda: None)
+    with our_server(remembers) as port, connect(port) as idle:
+        assert idle.recv(PATIENT_S)
+        with connect(port) as asks:
+            assert asks.recv(PATIENT_S)
+            with pytest.raises(ConnectionClosed, match="asked for nothing"):
+                idle.recv(PATIENT_S)
+            asks.send(b"?")
+            assert asks.recv(PATIENT_S)  # an answer or a complaint: it has its place
+            with connect(port) as late, pytest.raises(ConnectionClosed, match="served already: 1"):
+                late.recv(PATIENT_S)
 
 
 def test_a_server_with_a_key_lets_in_who_has_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -30,6 +31,7 @@ FLAGS = (
     *("--disable-component-update", "--disable-sync", "--enable-logging=stderr"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 )
+EVIL = "http://evil.example"
 DEADLINE_S = 90
 """The page is tens of megabytes of WebAssembly, which a busy machine compiles for long."""
 
@@ -86,6 +88,24 @@ def test_a_browser_runs_the_viewer_and_takes_the_stream(
         finally:
             end(browser)
     assert joined, log.read_text(errors="replace")[-2000:]
+
+
+@pytest.mark.parametrize("service", ["WriteMessages", "ReadMessages"])
+def test_pages_of_other_origins_neither_read_nor_write(
+    view: RerunView, address: ServeAddress, service: str
+) -> None:
+    """A browser asks so before such a request, and sends none without the origin in the answer."""
+    url = f"http://{address.host}:{address.data_port}"
+    path = f"/rerun.sdk_comms.v1alpha1.MessageProxyService/{service}"
+    for origin, is_allowed in ((f"http://127.0.0.1:{address.port}", True), (EVIL, False)):
+        request = urllib.request.Request(url + path, method="OPTIONS")
+        request.add_header("Origin", origin)
+        request.add_header("Access-Control-Request-Method", "POST")
+        request.add_header("Access-Control-Request-Headers", "content-type,x-grpc-web")
+        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        with opener.open(request, timeout=DEADLINE_S) as answer:
+            allowed = answer.headers.get("Access-Control-Allow-Origin")
+        assert (allowed == origin) is is_allowed
 
 
 def test_the_server_ends_with_the_view(address: ServeAddress) -> None:

@@ -20,6 +20,8 @@ SPARE_BYTES = 2**20
 PING_S = 5.0
 """A client that has not been heard of for two or three of these is gone, and its place is free."""
 CLOSE_S = 1.0
+UNASKED_S = 5.0
+"""After this a client that has asked for nothing gives its place to another one."""
 HEALTH_PATH = "/healthz"
 
 
@@ -47,6 +49,8 @@ class PolicyServer:
         self._api_key = api_key
         self._report = report
         self._clients = 0
+        self._unasked: dict[ServerConnection, float] = {}
+        """Clients that have asked for nothing yet, with the time at which each came."""
 
     async def listen(self, host: str, port: int) -> Server:
         """Listen from now on.
@@ -75,7 +79,13 @@ class PolicyServer:
             ) from error
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuse a client without the key; answer those that only ask whether a server is here."""
+        """Refuse pages of a browser, which alone name an origin, and clients without the key.
+
+        Whoever only asks whether a server is here gets an answer.
+        """
+        if origins := request.headers.get_all("Origin"):
+            self._report(f"{_name(connection)} was refused: a web page of {origins[0][:60]!r}")
+            return connection.respond(http.HTTPStatus.FORBIDDEN, "this serves no web pages\n")
         if request.path == HEALTH_PATH:
             return connection.respond(http.HTTPStatus.OK, "OK\n")
         given = request.headers.get("Authorization", "")
@@ -88,22 +98,35 @@ class PolicyServer:
 
     async def _talk(self, connection: ServerConnection) -> None:
         if self._clients == self._answers.max_clients:
+            await self._make_room()
+        if self._clients == self._answers.max_clients:
             reason = f"the most are served already: {self._clients}"
             await connection.close(CloseCode.TRY_AGAIN_LATER, reason)
             return
         self._clients += 1
+        self._unasked[connection] = asyncio.get_running_loop().time()
         self._report(f"{_name(connection)} has connected")
         try:
             with suppress(ConnectionClosed):
                 await connection.send(self._answers.metadata)
                 async for request in connection:
+                    self._unasked.pop(connection, None)
                     # One at a time from each client: the queue has room for all.
                     answer = self._answers.submit(request)
                     reply: bytes | str = await asyncio.wrap_future(answer)
                     await connection.send(reply)
         finally:
             self._clients -= 1
+            self._unasked.pop(connection, None)
             self._report(f"{_name(connection)} has gone")
+
+    async def _make_room(self) -> None:
+        """End the clients that only hold a place."""
+        latest = asyncio.get_running_loop().time() - UNASKED_S
+        idle = [each for each, came in self._unasked.items() if came < latest]
+        for each in idle:
+            await each.close(CloseCode.TRY_AGAIN_LATER, "it has asked for nothing, and others wait")
+        await asyncio.sleep(0)  # for their own tasks to leave
 
 
 def _name(connection: ServerConnection) -> str:

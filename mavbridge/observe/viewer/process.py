@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Sequence
 
 from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.processes import child_environment
 
 SPAWN_TIMEOUT_S = 15.0
 SETTLE_S = 1.0
@@ -26,6 +27,7 @@ def start_listening(
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
             command,
+            env=child_environment(),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=errors,

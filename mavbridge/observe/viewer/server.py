@@ -1,7 +1,9 @@
 """Rerun's web viewer and the server that feeds it (``--serve``), in a process of their own.
 
 The server keeps what it was sent for browsers that come late, so memory is bounded there, outside
-the flight; a browser that does not keep up holds up the server, never the flight's loops.
+the flight; a browser that does not keep up holds up the server, never the flight's loops. It shows
+what any program sends to the port of the data; pages of other origins cannot, and nothing of it
+reaches the flight.
 """
 
 import socket
@@ -93,8 +95,9 @@ class WebServer:
             "--web-viewer-port": str(address.port),
             "--server-memory-limit": SERVER_MEMORY,
         }
-        if address.host not in LOOPBACK:  # pages of other computers may not read the data else
-            options["--cors-allow-origin"] = f"http://*:{address.port}"
+        if address.host not in LOOPBACK:  # its own page may not read the data else
+            host = "*" if address.host in _ANY else _bracketed(address.host)
+            options["--cors-allow-origin"] = f"http://{host}:{address.port}"
         binary = _binary()
         flags = [word for option in options.items() for word in option]
         self._process: subprocess.Popen[bytes] = start_listening(
