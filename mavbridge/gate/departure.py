@@ -59,6 +59,8 @@ class Departure:
         self._began_ns = 0
         self._request_due_ns = 0
         self._is_thrust_mode = False
+        self._has_failed = False
+        """A command could not be made on this way out."""
         self._asked_ns: int | None = None
         """The safe mode was last asked for."""
         self._entered_ns = 0
@@ -79,6 +81,7 @@ class Departure:
         """Choose the safe mode for the vehicle as it is now."""
         self._began_ns = self._request_due_ns = facts.now_ns
         self._asked_ns = self._undone_ns = None
+        self._has_failed = False
         self._is_thrust_mode = facts.mode in facts.modes.thrust
         has_receiver = facts.has_receiver is True
         is_setpoint = self._settings.is_setpoint
@@ -130,6 +133,9 @@ class Departure:
         if self._settings.is_setpoint or not facts.modes.override:
             return True
         is_bounded = facts.now_ns - self._began_ns >= STICK_REST_NS
+        self._has_failed = self._has_failed or facts.command_failed
+        if self._has_failed:
+            return is_bounded  # when neutral left is not known
         return is_bounded or (facts.are_sticks_at_rest and facts.now_ns > self._began_ns)
 
     def step(self, facts: Facts) -> Move:

@@ -61,6 +61,8 @@ class Facts:
     """The vehicle shows the last sticks that we sent: held, or a receiver's that rests there."""
     landing: str | None = None
     """The vehicle has landed under the policy: a normal end."""
+    command_failed: bool = False
+    """The last command could not be made: the vehicle has not been sent it."""
     are_sticks_at_rest: bool = True
     """Our last sticks pass for nobody's hand: a mode that flies by itself is not left for them."""
     stick_override_ns: int | None = None

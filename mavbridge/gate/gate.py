@@ -229,6 +229,7 @@ class Gate:
             refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns),
             chunk_fault=given.command_fault or overdue or self._chunks.fault(now_ns),
+            command_failed=given.command_fault is not None,
             are_sticks_at_rest=link.are_sticks_at_rest,
             stick_override_ns=status.stick_override_ns if status else None,
             slowness=given.command_fault or self._chunks.impossibility,

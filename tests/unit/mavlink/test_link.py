@@ -177,7 +177,7 @@ class Rig:
         self.link = MavlinkLink(
             self.vehicle,
             self.clock,
-            LinkSettings(connect="memory", **config),
+            LinkSettings(connect="udp:127.0.0.1:14550", **config),
             packet_log=self.packet_log,
             forward=self.forwarded.append,
             ground_station=station,
@@ -714,7 +714,7 @@ def test_a_port_that_was_taken_meanwhile_is_waited_for() -> None:
 def test_no_vehicle_is_an_error_with_advice() -> None:
     rig = Rig(connect_timeout_s=2.0)
     rig.vehicle.is_alive = False
-    with pytest.raises(PeerError, match="no vehicle on memory after 2 s: heard nothing"):
+    with pytest.raises(PeerError, match=r"14550 after 2 s: .* without a heartbeat"):
         rig.run(3.0)
 
 

@@ -200,7 +200,7 @@ def test_a_corrupt_file_is_refused(
 def test_a_lying_header_length_is_refused(small_toge: Toge, tmp_path: Path) -> None:
     path = tmp_path / "bad.safetensors"
     path.write_bytes(struct.pack("<Q", 1 << 60) + b"{}")
-    with pytest.raises(CheckpointError, match="not a readable safetensors file"):
+    with pytest.raises(CheckpointError, match="cannot be read"):
         load_checkpoint(path, fallback=small_toge.config)
 
 
