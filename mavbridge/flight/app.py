@@ -297,6 +297,7 @@ class _Flight:
             stop,
             reason=self._bridge.view.reason,
             readonly=self._config.link.readonly,
+            record=self._config.record,
         )
         if text is not None:
             self._observers.screen.show_message(text)

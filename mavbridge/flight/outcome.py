@@ -1,6 +1,8 @@
 """The exit status of a flight, and the sentence that explains it."""
 
 import logging
+import shlex
+from pathlib import Path
 from typing import NamedTuple
 
 from mavbridge.core.errors import ExitCode
@@ -19,7 +21,12 @@ class Verdict(NamedTuple):
 
 
 def flight_verdict(
-    summary: GateSummary | None, stop: StopRequest, *, reason: str, readonly: bool
+    summary: GateSummary | None,
+    stop: StopRequest,
+    *,
+    reason: str,
+    readonly: bool,
+    record: Path | None = None,
 ) -> Verdict:
     """Judge a flight that ended without an exception.
 
@@ -28,13 +35,16 @@ def flight_verdict(
         stop: the signals that have come.
         reason: why the policy does not fly now, from the last tick.
         readonly: nothing was sent, so there was nothing to fly.
+        record: folder of the recording, if there is one.
     """
     interrupted = None if stop.signal_number is None else 128 + stop.signal_number
     if summary is None:
         return Verdict(interrupted or ExitCode.NOT_FLOWN)
     outcome = summary.outcome
     if outcome.faults:
-        return Verdict(ExitCode.FAULT, "the policy's flight was ended by a fault")
+        shown = f"; see it with: mavbridge inspect {shlex.quote(str(record))}" if record else ""
+        fault = f"the policy's flight was ended by a fault: {outcome.fault}{shown}"
+        return Verdict(ExitCode.FAULT, fault)
     if readonly and outcome.flights:
         return Verdict(ExitCode.DONE)
     if not outcome.flights:

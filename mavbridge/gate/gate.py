@@ -109,6 +109,7 @@ class Gate:
         self._hand: Hand | None = None
         self._last = self._neutral
         """As last sent."""
+        self._stepped_ns = now_ns
         self._is_readonly = settings.engagement.readonly
         self._messages: list[str] = []
 
@@ -145,10 +146,10 @@ class Gate:
     def step(self, now_ns: int, given: GateInput) -> GateOutput:
         """Advance to this moment."""
         # Judged before the news: a gate that stood still itself has let the grace run out.
-        overdue = self._chunks.fault(now_ns)
+        overdue = self._overdue(now_ns, given)
         has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
         if given.absence is not None:
-            self._chunks.explain_absence(given.absence)
+            self._chunks.explain_absence(given.absence, now_ns)
         if given.stop is not None:
             self._engagement.stop(given.stop)
         phase_before = self._engagement.phase
@@ -179,9 +180,38 @@ class Gate:
             messages=self._take_messages(),
         )
 
+    def _overdue(self, now_ns: int, given: GateInput) -> str | None:
+        """Which input of the policy's flight is too late, or None."""
+        before_ns, self._stepped_ns = self._stepped_ns, now_ns
+        if self._engagement.phase is not Phase.FLYING or not self._chunks.is_over(now_ns):
+            return None
+        stood_ns, seen = now_ns - before_ns, given.link.telemetry
+        readings = {
+            "attitude": (seen.ned_from_body_wxyz, seen.rate_body_radps),
+            "velocity": (seen.velocity_ned_mps, seen.specific_force_body_mps2),
+        }
+        late = self._chunks.lateness(
+            now_ns,
+            stood_ns=stood_ns,
+            heard_ns={
+                name: min(reading.arrived_ns for reading in pair if reading is not None)
+                for name, pair in readings.items()
+                if any(pair)
+            },
+        )
+        if late is None:
+            return None
+        # A chunk from the middle of the time shows that the rest of the computer ran.
+        middle_ns, chunk = before_ns + stood_ns // 2, given.chunk
+        if late.place == "computer" and chunk is not None and chunk.computed_ns > middle_ns:
+            late = late._replace(place="gate")
+        return late.text
+
     def _facts(self, now_ns: int, given: GateInput, overdue: str | None) -> Facts:
-        link, left = given.link, None
+        link, left, chunk_fault = given.link, None, given.command_fault or overdue
         status = link.status
+        if chunk_fault is None and self._engagement.phase is Phase.FLYING:
+            chunk_fault = self._chunks.fault(now_ns)
         if status is not None:
             left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
         return Facts(
@@ -206,7 +236,7 @@ class Gate:
             shows_last=link.shows_last,
             refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns),
-            chunk_fault=given.command_fault or overdue or self._chunks.fault(now_ns),
+            chunk_fault=chunk_fault,
             slowness=given.command_fault or self._chunks.impossibility,
             envelope_problem=left.reason if left and left.kind == "fault" else None,
             landing=left.reason if left and left.kind == "landed" else None,

@@ -14,3 +14,5 @@ class Outcome(NamedTuple):
     """Those that ended by a fault of ours."""
     is_disarmed: bool = False
     """The last one ended because the vehicle was disarmed, by itself or by somebody."""
+    fault: str = ""
+    """The last of those faults."""

@@ -380,8 +380,8 @@ def test_a_flight_in_order_is_told_so() -> None:
 @pytest.mark.parametrize(
     ("changes", "ended"),
     [
-        ({"chunk_fault": "no chunk for 100 ms"}, {"faults": 1}),
-        ({"link_problem": "lost"}, {"faults": 1}),
+        ({"chunk_fault": "attitude too old"}, {"faults": 1, "fault": "attitude too old"}),
+        ({"link_problem": "lost"}, {"faults": 1, "fault": "lost"}),
         ({"armed": False}, {"is_disarmed": True}),
         ({"mode": "LOITER"}, {}),  # the pilot has taken over, and goes on
     ],
