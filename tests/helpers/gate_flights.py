@@ -63,6 +63,16 @@ def climbing_first(t_s: float) -> tuple[float, float, float, float]:
     return (0.9, 0.0, 0.0, 0.0) if t_s < 2.5 else (0.0, 0.0, 0.0, 0.25)
 
 
+class StoppableStepper(GateStepper):
+    """A gate that may stand still, as under SIGSTOP."""
+
+    is_stopped = False
+
+    def step(self) -> None:
+        if not self.is_stopped:
+            super().step()
+
+
 class GateFlight:
     """One flight of one vehicle; nothing happens until ``run`` or ``until`` is called."""
 
@@ -145,7 +155,8 @@ class GateFlight:
         policy = PolicyStepper(
             self.clock, self._policy_clock, self._port, bridge.policy, bridge.view
         )
-        stepper = GateStepper(self.clock, self.gate)
+        stepper = StoppableStepper(self.clock, self.gate)
+        self.gate_stepper = stepper
         to_flight.on_arrival = lambda: None if self.is_flight_process_stopped else policy.receive()
         to_gate.on_arrival = self.down.on_arrival = stepper.step
         self._wake = stepper.step
@@ -193,6 +204,13 @@ class GateFlight:
         """The flight process is killed: the gate reads the end of file."""
         self.is_flight_process_stopped = True
         self.gate_port.is_closed = True
+        self._wake()
+
+    def stand_still(self, seconds: float) -> None:
+        """Both processes stand still, as the machine does in a long stall; then they go on."""
+        self.is_flight_process_stopped = self.gate_stepper.is_stopped = True
+        self.run(seconds)
+        self.is_flight_process_stopped = self.gate_stepper.is_stopped = False
         self._wake()
 
     # --- time
