@@ -181,7 +181,7 @@ def decode_video(path: Path) -> Iterator[ImageArray]:
         DatasetError: no video at all.
     """
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), format="mp4")  # a playlist would name other files
     except (av.FFmpegError, OSError) as error:
         raise DatasetError(f"{path}: not a readable video ({error})") from error
     with container:
