@@ -144,13 +144,15 @@ class VehicleView:
     def _receive_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
         before_ns = self.attitude_ns
         for arrived_ns, happened_ns, data in packets:
+            known_ns = self.attitude_ns
             for message in self._codec.decode_datagram(data):
                 if isinstance(message.body, Measurement):
                     self._telemetry.receive(message.body, arrived_ns, happened_ns)
                     if isinstance(message.body, LocalVelocity) and message.body.position_ned_m:
                         self.height_m = -message.body.position_ned_m[2]
+            if self.attitude_ns != known_ns:  # after each, whatever came with it: repeatable
+                self._on_attitude()
         if self.attitude_ns != before_ns:
-            self._on_attitude()
             with self._news:
                 self._news.notify_all()
         self._watch_packets(packets)
