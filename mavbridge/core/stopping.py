@@ -83,6 +83,22 @@ def stop_on_signals() -> Iterator[StopRequest]:
             signal.signal(number, handler)
 
 
+def interrupt_once() -> None:
+    """Let the first Ctrl-C raise KeyboardInterrupt, and a later one end the process at once.
+
+    A second KeyboardInterrupt would cut the clean-up of the first short with a traceback. Like any
+    other death of this process, the end is noticed by the gate.
+    """
+    clock = MonotonicClock()
+
+    def interrupt(*_: object) -> NoReturn:
+        end_ns = clock.now_ns() + ONE_REQUEST_NS
+        signal.signal(signal.SIGINT, lambda *_: clock.now_ns() < end_ns or os._exit(INTERRUPTED))
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
+
+
 def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
     """End the process with ``status``, after ``say`` has printed, whoever reads the console or not.
 

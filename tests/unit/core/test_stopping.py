@@ -4,10 +4,12 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
 from helpers.fakes import FakeClock
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.stopping import ONE_REQUEST_NS, StopRequest, stop_on_signals
 
 WAITING = """
@@ -46,6 +48,60 @@ def test_any_number_of_signals_at_once_is_one_stop(module: str, context: str, as
         finally:
             waiting.kill()
     assert output == "ended\n"
+
+
+INTERRUPTED_START = """
+import sys, time, types
+from mavbridge.core.errors import UserError
+def meta(arguments):
+    try:
+        print("started", flush=True)
+        time.sleep(60)
+    finally:
+        print("cleaning up", flush=True)
+        {clean_up}
+sys.modules["mavbridge.cli"] = types.SimpleNamespace(cli=types.SimpleNamespace(meta=meta))
+sys.argv = ["mavbridge"]
+from mavbridge.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("clean_up", "pauses_s", "is_cleaned"),
+    [
+        ("time.sleep(60)", (0.4,), False),
+        ("time.sleep(0.1); raise UserError('at the end')\n        time.sleep(60)", (), None),
+        ("time.sleep(1); print('clean', flush=True)", (0.01, 0.02), True),
+        ("sys.exit(130)\n        ", (0.4,), None),
+    ],
+)
+def test_a_second_ctrl_c_while_a_start_ends_is_no_traceback(
+    clean_up: str, pauses_s: tuple[float, ...], is_cleaned: bool | None
+) -> None:
+    """Soon after the first it is the same request; later it ends the process at once."""
+    program = INTERRUPTED_START.format(clean_up=clean_up)
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as starting:
+        assert starting.stdout is not None
+        assert starting.stdout.readline() == "started\n"
+        starting.send_signal(signal.SIGINT)
+        assert starting.stdout.readline() == "cleaning up\n"
+        for pause_s in pauses_s:
+            time.sleep(pause_s)
+            starting.send_signal(signal.SIGINT)
+        try:
+            output, complaint = starting.communicate(timeout=20)
+        finally:
+            starting.kill()
+    assert "Traceback" not in complaint
+    if is_cleaned is not None:
+        assert starting.returncode == 130
+        assert ("clean\n" in output) is is_cleaned
 
 
 def test_a_signal_wakes_who_waits() -> None:
