@@ -117,7 +117,7 @@ def _read_info(folder: Path, camera_key: str | None) -> _Info:
     camera = _choose_camera(folder, features, camera_key)
     for key in ("data_path", "video_path"):
         if not _PATH.fullmatch(template := str(data.get(key) or "")):
-            raise DatasetError(f"{path}: {key} {template[:100]!r} is not understood")
+            raise DatasetError(f"{path} does not say where its files are: {key} {template[:99]!r}")
     return _Info(
         folder=folder,
         fps=float(fps),

@@ -134,7 +134,7 @@ def test_a_dataset_names_no_file_outside_and_no_endless_one(
     folder = write(tmp_path / "dataset")
     info = json.loads((folder / "meta/info.json").read_text())
     (folder / "meta/info.json").write_text(json.dumps({**info, key: template}))
-    with pytest.raises(DatasetError, match=r"lies outside the dataset|is not understood"):
+    with pytest.raises(DatasetError, match=r"lies outside the dataset|where its files are"):
         read_dataset(folder)
 
 
