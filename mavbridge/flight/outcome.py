@@ -58,7 +58,9 @@ class FlightReferee:
             self._reason = event.release_reason or ""
         if self._began_ns:
             self._course.update(event.position_ned_m if self._is_flying else None, event.sent_ns)
-            self._crashes.see(event)
+            # A hand that disarms ends what follows at once: only our own flight can crash.
+            ours = (Phase.FLYING.value, Phase.LEAVING.value)
+            self._crashes.see(event, counts_falls=event.phase in ours)
 
     @property
     def has_flown(self) -> bool:

@@ -26,10 +26,13 @@ class CrashWatch:
         self._was_armed = False
         self._disarmed_ns: int | None = None
 
-    def see(self, tick: Tick) -> None:
-        """Take one tick."""
+    def see(self, tick: Tick, *, counts_falls: bool = True) -> None:
+        """Take one tick; without ``counts_falls`` a fall after a disarming is somebody's will."""
+        fallen = self._fallen(tick)
         if self.reason is None:
-            self.reason = self._said(tick) or self._overturned(tick) or self._fallen(tick)
+            self.reason = self._said(tick) or self._overturned(tick)
+            if counts_falls:
+                self.reason = self.reason or fallen
 
     def _said(self, tick: Tick) -> str | None:
         for text in tick.texts:

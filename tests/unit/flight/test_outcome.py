@@ -176,3 +176,19 @@ def test_a_vehicle_without_a_position_passes_no_gate_and_misses_none() -> None:
     outcome = judged([make_tick(k, phase="flying") for k in range(50)], "duration")
     assert (outcome.gates_total, outcome.gates_passed, outcome.success) == (2, None, None)
     assert describe(outcome).startswith("no position: ? of 2 gates, no contact seen; ended by")
+
+
+@pytest.mark.parametrize(
+    ("phase", "is_crash"),
+    [("flying", True), ("leaving", True), ("holding", False), ("releasing", False)],
+)
+def test_a_fall_after_a_disarming_is_a_crash_of_our_own_flight_alone(
+    phase: str, is_crash: bool
+) -> None:
+    falling = make_state(values=course_ticks(1)[0].state.values)  # type: ignore[union-attr]
+    after = [
+        make_tick(50 + k, phase=phase, armed=False, state=falling, position_ned_m=None)
+        for k in range(20)
+    ]
+    outcome = judged([*course_ticks(50, armed=True), *after], "duration")
+    assert (outcome.crash is not None) == is_crash
