@@ -42,7 +42,7 @@ class FlightReferee:
         self._began_ns = 0
         self._flown: Tick | None = None
         """The last one in which the policy had the sticks."""
-        self._has_position = self._is_flying = False
+        self._has_position = self._is_flying = self._is_disarmed = False
         self._reason = ""
 
     def emit(self, event: Event) -> None:
@@ -58,9 +58,11 @@ class FlightReferee:
             self._reason = event.release_reason or ""
         if self._began_ns:
             self._course.update(event.position_ned_m if self._is_flying else None, event.sent_ns)
-            # A hand that disarms ends what follows at once: only our own flight can crash.
-            ours = (Phase.FLYING.value, Phase.LEAVING.value)
-            self._crashes.see(event, counts_falls=event.phase in ours)
+            is_ours = event.phase in (Phase.FLYING.value, Phase.LEAVING.value)
+            if is_ours or not self._is_disarmed:
+                self._crashes.see(event, counts_falls=is_ours)
+            # Where a hand disarms what we hold or have released, the fall is its doing.
+            self._is_disarmed = not is_ours and not event.armed
 
     @property
     def has_flown(self) -> bool:

@@ -190,5 +190,7 @@ def test_a_fall_after_a_disarming_is_a_crash_of_our_own_flight_alone(
         make_tick(50 + k, phase=phase, armed=False, state=falling, position_ned_m=None)
         for k in range(20)
     ]
+    if not is_crash:
+        after.append(make_released_tick(71, "", phase=phase, texts=("vehicle: Crash: hit ground",)))
     outcome = judged([*course_ticks(50, armed=True), *after], "duration")
     assert (outcome.crash is not None) == is_crash
