@@ -46,8 +46,8 @@ mavbridge --connect /dev/ttyACM0,921600 --policy my_module:MyPolicy --readonly
 
 EXIT_CODES = """Exit status: 0 done, and a flight flown and ended in order; 1 a bug of mavbridge;
 2 a flag, file or policy that cannot be used; 3 no flight: vehicle, camera or network absent, never
-off the ground, or disarmed under the policy; 4 flown, and ended by a fault; 128 + its number: a
-signal before the flight.
+off the ground, or disarmed under the policy; 4 flown, and ended by a fault; 6 flown, and
+crashed; 128 + its number: a signal before the flight.
 """
 
 

@@ -51,15 +51,20 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def stand_in(path: Path) -> tuple[str, str] | None:
-    """Return what lies in place of a file's content and the remedy, or None.
+    """Return what lies in place of a file's content and the remedy, as ``stand_in_of``, or None."""
+    try:
+        with open_regular(path) as file:
+            return stand_in_of(file.read(_HEAD_BYTES))
+    except OSError:
+        return None
+
+
+def stand_in_of(head: bytes) -> tuple[str, str] | None:
+    """Return what a file that begins so holds in place of its content and the remedy, or None.
 
     Recognises empty files, Git LFS pointers, and web pages saved under a file's name.
     """
-    try:
-        with open_regular(path) as file:
-            start = file.read(_HEAD_BYTES).lstrip().lower()
-    except OSError:
-        return None
+    start = head[:_HEAD_BYTES].lstrip().lower()
     if not start:
         return "empty, or cut short", "copy it again"
     if start.startswith(b"version https://git-lfs.github.com/"):
@@ -72,17 +77,25 @@ def stand_in(path: Path) -> tuple[str, str] | None:
     return None
 
 
-def why_unreadable(path: Path, error: Exception, remedy: str = "copy it again") -> str:
+def last_line(error: Exception) -> str:
+    """Return the last line of an error's text, or its type where it has none."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__
+
+
+def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:
     """Return why a library could not read a file: its real content if known, else one line of the
-    library's own words with the remedy."""
+    library's own words. ``kind`` is the format that was expected."""
     if isinstance(error, OSError) and error.strerror and not path.is_file():
         return f"{path}: {error.strerror.lower()}"
     if (found := stand_in(path)) is not None:
         what, advice = found
         return f"{path} is {what}: {advice}"
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    words = lines[-1] if lines else type(error).__name__
-    return f"{path} cannot be read ({words}); it may be damaged or cut short: {remedy}"
+    expected = f" as {kind}" if kind else ""
+    return (
+        f"{path} cannot be read{expected} ({last_line(error)}); it may be damaged or cut short: "
+        "copy it again"
+    )
 
 
 @contextmanager
@@ -108,7 +121,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise ValueError(f"it is larger than {max_bytes // 1024} KiB")
     if data.startswith(_WIDE_MARKS):
         raise ValueError("it is UTF-16 or UTF-32: save it as UTF-8")
-    if data.strip() and (found := stand_in(path)) is not None:
+    if data.strip() and (found := stand_in_of(data)) is not None:
         raise ValueError(f"it is {found[0]}: {found[1]}")
     try:
         return data.decode("utf-8-sig")

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from policy.files import read_json, stand_in
+from policy.files import read_json, stand_in_of
 
 HEAD_BYTES = 4096
 MAX_HEADER_BYTES = 100_000_000
@@ -69,7 +69,7 @@ def recognise(path: Path) -> str | None:
 def _file(path: Path) -> tuple[str, str] | None:
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
-    if (found := stand_in(path)) is not None:
+    if (found := stand_in_of(head)) is not None:
         return found
     if head.lstrip().startswith(b"<?xml") and b"<net " in head.lower():
         return "an OpenVINO model", f"fly the ONNX file that it was made of, or {OWN_CLASS}"

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from policy.contract import ACTION_DIM, IMAGENET_MEAN_RGB, IMAGENET_STD_RGB
-from policy.errors import CheckpointError
 from policy.foreign.drafts.entries import (
     Entry,
     action_entries,
@@ -15,6 +14,7 @@ from policy.foreign.drafts.entries import (
     state_entries,
 )
 from policy.foreign.interface import UNANSWERED
+from policy.foreign.onnx.files import read_graph
 
 
 class _Port(NamedTuple):
@@ -82,16 +82,10 @@ def _size(name: str, port: _Port, axis: int) -> Entry:
 
 def _ports(files: Sequence[Path]) -> tuple[list[_Port], list[_Port]]:
     """Inputs and outputs of all graphs."""
-    from openvino import Core
-
     inputs: list[_Port] = []
     outputs: list[_Port] = []
     for file in files:
-        try:
-            model = Core().read_model(file)
-        except RuntimeError as error:
-            reason = str(error).strip().splitlines()[0]
-            raise CheckpointError(f"{file} cannot be read as ONNX: {reason}") from error
+        model = read_graph(file)
         for kind, ports, found in (
             ("input", model.inputs, inputs),
             ("output", model.outputs, outputs),

@@ -10,15 +10,26 @@ DIR/policy.json      as ``description`` says; a denoiser needs its schedule
 DIR/mavbridge.toml   the contract, as of --contract, where policy.json has none
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from policy.errors import CheckpointError
-from policy.files import read_text
+from policy.files import read_text, stand_in, why_unreadable
 from policy.foreign.description import DESCRIPTION, Description, describe
+
+if TYPE_CHECKING:
+    import openvino as ov
 
 ENCODER, DENOISER, HEAD, WHOLE = "encoder.onnx", "denoiser.onnx", "head.onnx", "policy.onnx"
 KINDS = f"{ENCODER} and {DENOISER}, {ENCODER} and {HEAD}, or {WHOLE} alone"
+
+_EXTERNAL = re.compile(rb"\x0a\x08location\x12([\x01-\x7f])(.{0,127})", re.DOTALL)
+_OFFSET, _LENGTH = (
+    re.compile(rb"\x0a\x06" + key + rb"\x12[\x01-\x14](\d+)") for key in (b"offset", b"length")
+)
+"""Entries of ``TensorProto.external_data`` (onnx.proto): a key and its value, both texts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,3 +86,42 @@ def _graphs(spec: str, path: Path) -> tuple[Path | None, Path]:
         return None, whole
     there = sorted(each.name for each in path.glob("*.onnx"))
     raise CheckpointError(f"--policy {spec}: the folder must hold {KINDS}; it holds {there}")
+
+
+def read_graph(path: Path) -> "ov.Model":
+    """Read an ONNX file and the files of its weights.
+
+    Raises:
+        CheckpointError: one of them is missing, cut short, or no such file.
+    """
+    from openvino import Core  # not needed to find the files
+
+    _require_external_data(path)
+    try:
+        return Core().read_model(path)
+    except RuntimeError as error:
+        raise CheckpointError(why_unreadable(path, error, "ONNX")) from error
+
+
+def _require_external_data(path: Path) -> None:
+    """Raise CheckpointError if a file with tensors of the graph is missing or too short."""
+    content = path.read_bytes()
+    needed: dict[str, int] = {}
+    for found in _EXTERNAL.finditer(content):
+        name = found[2][: found[1][0]].decode(errors="replace")
+        entry = content[found.end(1) : found.end(1) + found[1][0] + 80]
+        entry = entry.partition(b"\x0a\x08location")[0]  # of the next tensor
+        ends = [int(each[1]) if (each := key.search(entry)) else 0 for key in (_OFFSET, _LENGTH)]
+        needed[name] = max(needed.get(name, 0), sum(ends))
+    for name, size in needed.items():
+        beside = path.parent / name
+        if not beside.is_file():
+            raise CheckpointError(
+                f"{path}: {name} is missing beside it, and holds its weights: copy both files"
+            )
+        has = beside.stat().st_size
+        if has < size:
+            what, advice = stand_in(beside) or ("cut short", "copy it again")
+            raise CheckpointError(
+                f"{beside} is {what} ({has} bytes, {path.name} needs {size}): {advice}"
+            )

@@ -14,17 +14,13 @@ from policy.engines.executable import Precision, Shape
 from policy.engines.openvino_compile import Graph, GraphCompiler
 from policy.engines.signal_stack import signal_stack_kept
 from policy.errors import CheckpointError, PolicyError
-from policy.files import stand_in, why_unreadable
+from policy.files import last_line
+from policy.foreign.onnx.files import read_graph
 
 _ALONE = {2: "state", 4: "image"}
 """Role of the only input of a graph, by its number of axes, where its name says nothing."""
 _HIDDEN_IN = re.compile(r"(.+)_in(_\d+)?")
 _FLOATS = ("f16", "bf16", "f32", "f64")
-_EXTERNAL = re.compile(rb"\x0a\x08location\x12([\x01-\x7f])(.{0,127})", re.DOTALL)
-_OFFSET, _LENGTH = (
-    re.compile(rb"\x0a\x06" + key + rb"\x12[\x01-\x14](\d+)") for key in (b"offset", b"length")
-)
-"""Entries of ``TensorProto.external_data`` (onnx.proto): a key and its value, both texts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,11 +84,7 @@ class GraphFile:
     @signal_stack_kept()
     def __init__(self, path: Path, ports: Ports) -> None:
         self._path = path
-        _require_external_data(path)
-        try:
-            model = ov.Core().read_model(path)
-        except RuntimeError as error:
-            raise CheckpointError(why_unreadable(path, error)) from error
+        model = read_graph(path)
         pairs = self._hidden_pairs(model, ports)
         visible = [port for port in model.inputs if not port.get_names() & set(pairs)]
         roles = [
@@ -234,7 +226,7 @@ class GraphFile:
             theirs = [str(port.get_partial_shape()) for port in model.inputs]
             raise CheckpointError(
                 f"{self._path} takes {theirs}, and by the contract its inputs would be {asked}: "
-                f"{_reason(error)}"
+                f"{last_line(error)}"
             ) from error
 
 
@@ -242,30 +234,6 @@ def require_roles(file: GraphFile, path: Path, roles: tuple[str, ...]) -> None:
     """Refuse a graph that does not take an input without which it cannot be what it should be."""
     if missing := [role for role in roles if role not in file.roles]:
         raise PolicyError(f"{path} takes {file.roles}, but not the {' and the '.join(missing)}")
-
-
-def _require_external_data(path: Path) -> None:
-    """Raise CheckpointError if a file with tensors of the graph is missing or too short."""
-    content = path.read_bytes()
-    needed: dict[str, int] = {}
-    for found in _EXTERNAL.finditer(content):
-        name = found[2][: found[1][0]].decode(errors="replace")
-        entry = content[found.end(1) : found.end(1) + found[1][0] + 80]
-        entry = entry.partition(b"\x0a\x08location")[0]  # of the next tensor
-        ends = [int(each[1]) if (each := key.search(entry)) else 0 for key in (_OFFSET, _LENGTH)]
-        needed[name] = max(needed.get(name, 0), sum(ends))
-    for name, size in needed.items():
-        beside = path.parent / name
-        if not beside.is_file():
-            raise CheckpointError(
-                f"{path}: {name} is missing beside it, and holds its weights: copy both files"
-            )
-        has = beside.stat().st_size
-        if has < size:
-            what, advice = stand_in(beside) or ("cut short", "copy it again")
-            raise CheckpointError(
-                f"{beside} is {what} ({has} bytes, {path.name} needs {size}): {advice}"
-            )
 
 
 def _sizes(port: "ov.Output", open_size: int) -> Shape:
@@ -277,11 +245,6 @@ def _sizes(port: "ov.Output", open_size: int) -> Shape:
 
 def _twice(roles: list[str]) -> str:
     return next(role for role in roles if roles.count(role) > 1)
-
-
-def _reason(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__
 
 
 def _digest(path: Path, model: ov.Model) -> str:

@@ -13,6 +13,7 @@ from onnx import TensorProto
 from helpers import foreign_graphs as graphs
 from policy.engines.executable import level_state
 from policy.errors import PolicyError
+from policy.foreign.drafts.onnx import onnx_entries
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
 from policy.protocol import Executable
@@ -149,6 +150,14 @@ def test_what_cannot_fly_is_refused_by_its_cause(tmp_path: Path, case: str) -> N
     write(tmp_path)
     with pytest.raises(PolicyError, match=told):
         load(f"onnx:{tmp_path}")
+
+
+@pytest.mark.parametrize("case", [each for each in REFUSED if "external" in each])
+def test_a_draft_of_its_contract_names_the_same_cause(tmp_path: Path, case: str) -> None:
+    write, told = REFUSED[case]
+    write(tmp_path)
+    with pytest.raises(PolicyError, match=told):
+        onnx_entries([tmp_path / "policy.onnx"])
 
 
 def test_a_tuple_of_torchscript_needs_to_be_told_apart(tmp_path: Path) -> None:
