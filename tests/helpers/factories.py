@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick, VehicleState, VisionTick
 from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
+from mavbridge.gate.engagement import Phase
+from mavbridge.gate.wire import GateTick
 
 START_NS = 1_000 * NS_PER_S
 TICK_NS = 10 * NS_PER_MS
@@ -103,3 +105,23 @@ def about_z(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotations [B, 4] by angles [B] about the third axis."""
     zero = np.zeros_like(angle_rad)
     return np.stack([np.cos(angle_rad / 2), zero, zero, np.sin(angle_rad / 2)], axis=-1)
+
+
+def make_gate_tick(at_ns: int, **changes: Any) -> GateTick:
+    """A slot that the gate served in time, with nothing to send."""
+    tick = GateTick(
+        index=0,
+        due_ns=at_ns,
+        woke_ns=at_ns,
+        decided_ns=at_ns,
+        sent_ns=at_ns,
+        missed_slots=0,
+        is_slot=True,
+        is_coasting=False,
+        chunk_serial=None,
+        trace=None,
+        sent=None,
+        phase=Phase.WAITING,
+        reason="",
+    )
+    return replace(tick, **changes)

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from helpers.factories import make_gate_tick
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.flight import gate_process
@@ -20,7 +21,7 @@ from mavbridge.flight.gate_process import LATEST_NS, GateDiedError, GateProcess
 from mavbridge.gate.channel import SocketPort
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.settings import GateSettings
-from mavbridge.gate.wire import GateError, GateTick, LastWords, encode_from_gate, encode_tick
+from mavbridge.gate.wire import GateError, LastWords, encode_from_gate, encode_tick
 from mavbridge.mavlink.settings import LinkSettings
 
 MS = NS_PER_MS
@@ -64,26 +65,7 @@ class Rig:
         assert self.port.send(encode_from_gate(words), fd)
 
     def tick(self, phase: Phase = Phase.FLYING) -> None:
-        now_ns = self.clock.now_ns()
-        self.port.send(
-            encode_tick(
-                GateTick(
-                    index=0,
-                    due_ns=now_ns,
-                    woke_ns=now_ns,
-                    decided_ns=now_ns,
-                    sent_ns=now_ns,
-                    missed_slots=0,
-                    is_slot=True,
-                    is_coasting=False,
-                    chunk_serial=None,
-                    trace=None,
-                    sent=None,
-                    phase=phase,
-                    reason="",
-                )
-            )
-        )
+        self.port.send(encode_tick(make_gate_tick(self.clock.now_ns(), phase=phase)))
 
     def die(self, returncode: int | None = -9) -> str:
         """Returns what the user is told."""

@@ -139,16 +139,14 @@ def test_of_two_loops_with_one_lock_only_the_one_that_computes_is_encoding():
     assert nothing_either is None
 
 
-@pytest.mark.parametrize("ahead_ms", [-600, 0, 20, 21, 400, 3_000, 55 * 365 * 86_400_000])
-@pytest.mark.parametrize("is_watched", [False, True])
-def test_a_stamp_more_than_20_ms_ahead_is_a_fault_of_the_camera(ahead_ms, is_watched):
-    clock, cache = FakeClock(), FeatureCache()
+def stamped_ahead(clock, cache, ahead_ms, image_watch=None):
+    """A loop whose camera stamps each image by so many ms in the future."""
     camera = StillCamera(clock, np.zeros((8, 8, 3), np.uint8))
-    read = camera.read
+    read, left_ms = camera.read, list(ahead_ms)
     camera.read = lambda timeout_ns: replace(
-        read(timeout_ns), captured_ns=clock.now_ns() + ahead_ms * NS_PER_MS
+        read(timeout_ns), captured_ns=clock.now_ns() + left_ms.pop(0) * NS_PER_MS
     )
-    loop = VisionLoop(
+    return VisionLoop(
         camera=camera,
         encode=lambda rgb: np.zeros((1, 8), np.float32),
         cache=cache,
@@ -156,8 +154,15 @@ def test_a_stamp_more_than_20_ms_ahead_is_a_fault_of_the_camera(ahead_ms, is_wat
         clock=clock,
         period_ns=lambda: FRAME_NS,
         encoder_lock=threading.Lock(),
-        image_watch=watch() if is_watched else None,
+        image_watch=image_watch,
     )
+
+
+@pytest.mark.parametrize("ahead_ms", [-600, 0, 20, 21, 400, 3_000, 55 * 365 * 86_400_000])
+@pytest.mark.parametrize("is_watched", [False, True])
+def test_a_stamp_more_than_20_ms_ahead_is_a_fault_of_the_camera(ahead_ms, is_watched):
+    clock, cache = FakeClock(), FeatureCache()
+    loop = stamped_ahead(clock, cache, [ahead_ms], watch() if is_watched else None)
     loop.step()
     feature = cache.latest()
     assert feature is not None
@@ -169,22 +174,9 @@ def test_a_stamp_more_than_20_ms_ahead_is_a_fault_of_the_camera(ahead_ms, is_wat
 
 def test_of_a_camera_that_goes_back_to_right_stamps_the_next_feature_is_flown_by():
     clock, cache = FakeClock(), FeatureCache()
-    camera = StillCamera(clock, np.zeros((8, 8, 3), np.uint8))
-    read, ahead_ms = camera.read, [0, 500, 0]
-    camera.read = lambda timeout_ns: replace(
-        read(timeout_ns), captured_ns=clock.now_ns() + ahead_ms.pop(0) * NS_PER_MS
-    )
-    loop = VisionLoop(
-        camera=camera,
-        encode=lambda rgb: np.zeros((1, 8), np.float32),
-        cache=cache,
-        sink=ListSink(),
-        clock=clock,
-        period_ns=lambda: FRAME_NS,
-        encoder_lock=threading.Lock(),
-    )
+    loop = stamped_ahead(clock, cache, [0, 500, 0])
     seen = []
-    while ahead_ms:
+    for _ in range(3):
         loop.step()
         seen.append(cache.latest().fault is not None)
     assert seen == [False, True, False]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
+from helpers.factories import make_gate_tick
 from helpers.fakes import START_NS, ListSink
 from helpers.wire import WireEnd
 from mavbridge.commands.record.pilot_view import STICKS_FRESH_NS, PilotView
@@ -12,8 +13,7 @@ from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
-from mavbridge.gate.engagement import Phase
-from mavbridge.gate.wire import GateMessage, GateStatus, GateTick
+from mavbridge.gate.wire import GateMessage, GateStatus
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 
 STICKS = Sticks(0.1, 0.2, 0.3, 0.4)
@@ -35,23 +35,7 @@ class Viewed:
         )
 
     def tick(self, at_ns: int) -> Tick:
-        self.view.receive(
-            GateTick(
-                index=0,
-                due_ns=at_ns,
-                woke_ns=at_ns,
-                decided_ns=at_ns,
-                sent_ns=at_ns,
-                missed_slots=0,
-                is_slot=True,
-                is_coasting=False,
-                chunk_serial=None,
-                trace=None,
-                sent=None,
-                phase=Phase.WAITING,
-                reason="no image feature yet",
-            )
-        )
+        self.view.receive(make_gate_tick(at_ns, reason="no image feature yet"))
         event = self.sink.events[-1]
         assert isinstance(event, Tick)
         return event
