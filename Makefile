@@ -13,6 +13,8 @@ DURATION ?= 60
 FLAGS ?=
 # Firmware of the simulated vehicle: ardupilot or px4.
 AUTOPILOT ?= ardupilot
+# ArduPilot would hold the last sticks or setpoint for 3 s if this computer died.
+BRIEF := $(if $(filter ardupilot,$(AUTOPILOT)),--set RC_OVERRIDE_TIME=0.5 --set GUID_TIMEOUT=0.5)
 # ArduPilot takes the thrust of body rates for a climb rate without this.
 BY_RATES := $(if $(filter toge-rates/ardupilot,$(POLICY)/$(AUTOPILOT)),--set GUID_OPTIONS=8)
 SOAK_MINUTES ?= 60
@@ -44,7 +46,7 @@ fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy 
 		--camera shm:fpv-$(PORT) --course $(COURSE) --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --policy $(POLICY) \
-		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(BY_RATES) $(FLAGS) \
+		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(BRIEF) $(BY_RATES) $(FLAGS) \
 		--rerun out/flight.rrd --gates out/gates.json --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
 	echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \
