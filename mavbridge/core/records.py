@@ -75,6 +75,7 @@ class Tick:
     due_ns: int
     woke_ns: int
     missed_slots: int
+    """Of the stick grid, since the last tick, if the policy moved the sticks at both."""
     predict_ns: int | None
     """Duration of the policy's part; None when it did not run."""
     sent_ns: int

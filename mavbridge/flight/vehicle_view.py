@@ -85,6 +85,8 @@ class VehicleView:
         self.status = GateStatus("none", None, False, None, (), None)
         self.height_m: float | None = None
         """Above the estimator's origin, where it has a position."""
+        self._was_flown = False
+        """The policy moved the sticks at the last tick."""
         self.phase = Phase.WAITING
         self.reason = ""
         self.flights = 0
@@ -162,6 +164,7 @@ class VehicleView:
         self.phase, self.reason = tick.phase, tick.reason
         self._history.append(tick.sent, tick.sent_ns)
         self._sink.emit(self._join(tick))
+        self._was_flown = tick.trace is not None
         self._serial += 1
 
     def _state_at(self, now_ns: int) -> VehicleState | None:
@@ -184,7 +187,7 @@ class VehicleView:
             due_ns=sent.due_ns,
             woke_ns=sent.woke_ns,
             decided_ns=sent.decided_ns,
-            missed_slots=sent.missed_slots,
+            missed_slots=sent.missed_slots if self._was_flown and sent.trace else 0,
             predict_ns=solve.predict_ns if solve else None,
             sent_ns=sent.sent_ns,
             feature_frame_id=solve.feature_frame_id if solve else None,

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from helpers.factories import make_state, make_trace
 from helpers.fakes import START_NS, ListSink
@@ -17,6 +18,8 @@ from mavbridge.flight.state import Freshness
 from mavbridge.flight.vehicle_view import MAX_SOLVES, SolveInputs, VehicleView
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.wire import GateError, GateMessage, GateStatus, GateTick
+from mavbridge.observe.terminal import FlightScreen
+from mavbridge.observe.timing import FlightTiming, ObserverDrops
 
 MS = NS_PER_MS
 STICKS = Sticks(0.2, 0.2, 0.2, 0.2)
@@ -36,6 +39,7 @@ TICK = GateTick(
     reason="",
 )
 NOBODY = replace(TICK, chunk_serial=None, trace=None, sent=None, phase=Phase.WAITING, reason="wait")
+LATER = replace(TICK, index=6, due_ns=START_NS + 20 * MS, sent_ns=START_NS + 21 * MS)
 SOLVE = SolveInputs(
     serial=7,
     state=make_state(START_NS - 5 * MS),
@@ -102,8 +106,9 @@ def test_bytes_that_are_no_packet_change_nothing() -> None:
 def test_a_tick_of_flight_is_told_with_the_inputs_of_its_chunk() -> None:
     viewed = Viewed()
     viewed.view.remember(SOLVE)
-    viewed.receive(GateStatus("ArduPilot", "ALT_HOLD", True, False, (1500,) * 8, STICKS), TICK)
-    (tick,) = viewed.sink.ticks
+    status = GateStatus("ArduPilot", "ALT_HOLD", True, False, (1500,) * 8, STICKS)
+    viewed.receive(status, replace(TICK, index=3), TICK)
+    tick = viewed.sink.ticks[1]
     assert tick.state is SOLVE.state
     assert (tick.feature_frame_id, tick.predict_ns) == (12, 3 * MS)
     assert (tick.feature_captured_ns, tick.chunk_computed_ns) == (
@@ -200,3 +205,28 @@ def test_an_attitude_wakes_who_waits_for_it() -> None:
 def _wait_and_tell(view: VehicleView, tell: Callable[[], None]) -> None:
     if view.wait_for_attitude(newer_than_ns=0, timeout_ns=60_000 * MS):
         tell()
+
+
+def test_status_line_report_and_recording_count_the_missed_slots_of_the_flight_alone() -> None:
+    """Not those before it, nor those of the way out, of the release and after it."""
+    timing = FlightTiming(action_hz=100.0, vision_hz=30.0, stick_hz=100.0)
+    screen = FlightScreen(Console(), action_hz=100.0, vision_hz=30.0, readonly=False)
+    viewed = Viewed()
+    for one in (NOBODY, TICK, LATER, replace(LATER, index=9, missed_slots=2), NOBODY, NOBODY):
+        viewed.receive(one)
+    leaving = replace(NOBODY, phase=Phase.LEAVING, sent=STICKS, missed_slots=10)
+    viewed.receive(leaving, leaving, TICK, replace(LATER, missed_slots=0))
+    for tick in viewed.sink.ticks:
+        timing.emit(tick)
+        screen.emit(tick)
+    assert [tick.missed_slots for tick in viewed.sink.ticks] == [0, 0, 1, 2, 0, 0, 0, 0, 0, 0]
+    report = timing.report(
+        mode="dual",
+        engine="",
+        policy="",
+        autopilot=None,
+        link=None,
+        observer_drops=ObserverDrops(rerun=None, recorder=None),
+    )
+    assert report.sticks.missed_slots == 3
+    assert screen.status_line().plain.count("missed 3") == 1
