@@ -195,7 +195,7 @@ class Contract:
     """Oldest image, since its exposure."""
     max_chunk_age_s: float = 0.3
     """Longest time since the chunk was computed."""
-    max_stall_s: float = 0.1
+    max_stall_s: float = 0.25
     """Longest time to fly on along a chunk when no newer one comes; never beyond its horizon. The
     ages of a chunk are judged as it is taken, and grow by as much meanwhile."""
     max_tilt_deg: float | None = None

@@ -87,7 +87,14 @@ class PolicyLoop:
         """When the last step ended; read by another thread."""
 
     def run(self, stop: threading.Event) -> None:
-        """Solve until told to stop."""
+        """Solve until told to stop; the gate is told of a failure, which is no stall."""
+        try:
+            self._run(stop)
+        except BaseException:
+            self._send(Absence("the policy's loop has failed"))
+            raise
+
+    def _run(self, stop: threading.Event) -> None:
         self.alive_ns = self._clock.now_ns()
         while not stop.is_set():
             looks_ns = self._clock.now_ns() + WAIT_NS

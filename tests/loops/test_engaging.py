@@ -62,7 +62,7 @@ def no_velocity(flight: VirtualFlight) -> None:
     ("lose", "seconds", "told"),
     [
         (stale_attitude, 0.2, "attitude is older than 100 ms"),
-        (no_attitude, 0.1, "no chunk of the policy"),
+        (no_attitude, 0.1, "no attitude from the vehicle for 100 ms"),
         (no_velocity, 0.35, "velocity is older than 250 ms"),
     ],
 )

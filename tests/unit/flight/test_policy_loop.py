@@ -271,3 +271,16 @@ def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() ->
     nothing = Absence("no attitude from the vehicle")
     assert told == [1, nothing, 2, nothing]
     assert rig.loop.alive_ns > before_ns
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, SystemExit, MemoryError])
+def test_a_policy_that_fails_is_told_to_the_gate_at_once(failure: type[BaseException]) -> None:
+    rig = Rig().see().measure()
+
+    def fail(*_: object) -> FloatArray:
+        raise failure
+
+    rig.loop._act = fail
+    with pytest.raises(failure):
+        rig.loop.run(threading.Event())
+    assert rig.sent == [Absence("the policy's loop has failed")]

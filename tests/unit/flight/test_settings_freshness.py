@@ -31,7 +31,7 @@ def in_ms(
 
 def test_ages_are_the_contracts_where_no_flag_speaks() -> None:
     assert effective_freshness(CONTRACT, Limits()) == in_ms(200, 400, 2000, 1500)
-    assert effective_freshness(Contract(), Limits()) == in_ms(100, 250, 300, 300, 100)
+    assert effective_freshness(Contract(), Limits()) == in_ms(100, 250, 300, 300, 250)
 
 
 def test_flags_tighten_one_by_one() -> None:
