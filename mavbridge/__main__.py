@@ -17,15 +17,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.stderr.write(f"error: {problem}\n")
         sys.exit(2)  # ExitCode.REFUSED, which cannot be imported yet
     # Only now: these import the packages that may be hidden.
-    from rich.console import Console
-    from rich.markup import escape
-
-    from mavbridge.cli import cli
     from mavbridge.core.errors import MavbridgeError
     from mavbridge.core.provenance import without_secrets
-    from mavbridge.core.stopping import end_process
+    from mavbridge.core.stopping import end_process, interrupt_once
 
+    if arguments is None:
+        interrupt_once()
     try:
+        from rich.console import Console
+        from rich.markup import escape
+
+        from mavbridge.cli import cli
+
         status = cli.meta(arguments)
     except KeyboardInterrupt:
         end_process(128 + signal.SIGINT)

@@ -83,6 +83,27 @@ def stop_on_signals() -> Iterator[StopRequest]:
             signal.signal(number, handler)
 
 
+def interrupt_once(clock: Clock | None = None) -> None:
+    """Let the first Ctrl-C raise KeyboardInterrupt, and a later one end the process at once.
+
+    A second KeyboardInterrupt would cut the clean-up of the first short with a traceback. The gate
+    notices the end like any other death of this process.
+    """
+    clock = MonotonicClock() if clock is None else clock
+    first_ns: int | None = None
+
+    def interrupt(*_: object) -> None:
+        nonlocal first_ns
+        now_ns = clock.now_ns()
+        if first_ns is None:
+            first_ns = now_ns
+            raise KeyboardInterrupt
+        if now_ns - first_ns >= ONE_REQUEST_NS:
+            os._exit(INTERRUPTED)
+
+    signal.signal(signal.SIGINT, interrupt)
+
+
 def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
     """End the process with ``status``, after ``say`` has printed, whoever reads the console or not.
 

@@ -8,7 +8,13 @@ import sys
 import pytest
 
 from helpers.fakes import FakeClock
-from mavbridge.core.stopping import ONE_REQUEST_NS, StopRequest, stop_on_signals
+from mavbridge.core.stopping import (
+    INTERRUPTED,
+    ONE_REQUEST_NS,
+    StopRequest,
+    interrupt_once,
+    stop_on_signals,
+)
 
 WAITING = """
 import sys
@@ -46,6 +52,64 @@ def test_any_number_of_signals_at_once_is_one_stop(module: str, context: str, as
         finally:
             waiting.kill()
     assert output == "ended\n"
+
+
+INTERRUPTED_START = """
+import sys, threading, types
+def meta(arguments):
+    try:
+        print("started", flush=True)
+        threading.Event().wait(60)
+    finally:
+        print("cleaning up", flush=True)
+        sys.stdin.readline()
+        print("clean", flush=True)
+sys.modules["mavbridge.cli"] = types.SimpleNamespace(cli=types.SimpleNamespace(meta=meta))
+sys.argv = ["mavbridge"]
+from mavbridge.__main__ import main
+main()
+"""
+
+
+def test_a_second_ctrl_c_while_a_start_cleans_up_is_no_traceback() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED_START],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as starting:
+        assert starting.stdout is not None
+        assert starting.stdout.readline() == "started\n"
+        starting.send_signal(signal.SIGINT)
+        assert starting.stdout.readline() == "cleaning up\n"
+        starting.send_signal(signal.SIGINT)
+        try:
+            _, complaint = starting.communicate("\n", timeout=20)
+        finally:
+            starting.kill()
+    assert "Traceback" not in complaint
+    assert starting.returncode == INTERRUPTED
+
+
+def test_ctrl_c_is_one_request_for_a_moment_and_then_an_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, statuses = FakeClock(), list[int]()
+    monkeypatch.setattr("mavbridge.core.stopping.os._exit", statuses.append)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        interrupt_once(clock)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        clock.advance_ns(ONE_REQUEST_NS - 1)
+        signal.raise_signal(signal.SIGINT)
+        assert statuses == []
+        clock.advance_ns(1)
+        signal.raise_signal(signal.SIGINT)
+        assert statuses == [INTERRUPTED]
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_signal_wakes_who_waits() -> None:
