@@ -29,6 +29,7 @@ from mavbridge.commands.serve.config import ServeConfig
 from mavbridge.commands.train.checks import prepare as prepare_training
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
+from mavbridge.config.trust import untrusted_settings
 from mavbridge.core.errors import UserError
 from mavbridge.core.log import run_log
 from mavbridge.core.realtime import require_supported_system
@@ -306,6 +307,7 @@ def contract(source: Path, config: ContractConfig | None = None) -> int:
 def with_config(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
     config: Annotated[Path | None, Parameter(group=RARE)] = None,
+    trust_config: Annotated[bool, Parameter(negative="", group=RARE)] = False,
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"), negative="", group=RARE)] = False,
     log_file: Annotated[Path | None, Parameter(group=RARE)] = None,
 ) -> int:
@@ -314,6 +316,8 @@ def with_config(
     Args:
         tokens: the rest of the command line.
         config: TOML file with flags as keys; flags given on the command line win.
+        trust_config: let that file name programs (a policy in Python, pipe: cameras), other
+            computers, and places outside the working directory to write to.
         verbose: show details: engine, vehicle, streams, parameters.
         log_file: add what is shown, details and times to this file.
     """
@@ -321,12 +325,19 @@ def with_config(
     cli.config = []
     if config is not None:
         try:
-            settings = _with_home(read_toml(user_path(config)))
+            document = read_toml(user_path(config))
         except OSError as error:
             raise UserError(f"--config {config}: {error.strerror}") from error
         except ValueError as error:
             raise UserError(f"--config {config} is not TOML: {error}") from error
-        cli.config = [Dict(settings, use_commands_as_keys=False, source=str(config))]
+        for flag, value, what in [] if trust_config else untrusted_settings(document, tokens):
+            raise UserError(
+                f"--config {config}: {flag} {value!r} names {what}, which a file may not do by "
+                f"itself: give {flag} on the command line, or --trust-config if you know the file"
+            )
+        cli.config = [
+            Dict(_with_home(document), use_commands_as_keys=False, source=str(config)),
+        ]
     with run_log(log_file, verbose=verbose):
         status: int | None = cli(_with_home(list(_current_spelling(tokens))))
     return status or 0

@@ -101,6 +101,8 @@ def write_meta(folder: Path, meta: FlightMeta) -> None:
 def read_meta(folder: Path) -> FlightMeta:
     """Read ``meta.json``; raises FlightError if there is none, or it is not one of ours."""
     try:
+        if odd := [each.name for each in folder.iterdir() if not (each.is_file() or each.is_dir())]:
+            raise FlightError(f"{folder / odd[0]} is neither a file nor a folder: leave it out")
         document: Any = read_json(folder / META)
     except OSError as error:
         raise FlightError(_unreadable(folder)) from error

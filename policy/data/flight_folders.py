@@ -200,7 +200,7 @@ def decode_video(path: Path) -> Iterator[ImageArray]:
         DatasetError: no video at all.
     """
     try:
-        container = av.open(library_name(path))
+        container = av.open(library_name(path), format="mp4")  # a playlist would name other files
     except (av.FFmpegError, OSError) as error:
         raise DatasetError(why_unreadable(path, error)) from error
     with container:

@@ -1,6 +1,8 @@
 """Reads LeRobot datasets of format v3 with the contract's features; an episode is a flight."""
 
 import math
+import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -26,6 +28,8 @@ from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArr
 from policy.data.tables import file_digest, numbers, parse_state_frame, read_json, stamps, vectors
 from policy.files import library_name, why_unreadable
 
+_PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
+"""Templates of paths: fields of these names, a few digits wide."""
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
 
@@ -112,6 +116,9 @@ def _read_info(folder: Path, camera_key: str | None) -> _Info:
     _require_vector(folder, features, names.STATE_KEY, STATE_NAMES)
     _require_vector(folder, features, names.ACTION_KEY, ACTION_NAMES)
     camera = _choose_camera(folder, features, camera_key)
+    for key in ("data_path", "video_path"):
+        if not _PATH.fullmatch(template := str(data.get(key) or "")):
+            raise DatasetError(f"{path} does not say where its files are: {key} {template[:99]!r}")
     return _Info(
         folder=folder,
         fps=float(fps),
@@ -188,6 +195,9 @@ def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
         length = int(values["length"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise DatasetError(f"{name}: meta does not say where its files are: {error!r}") from error
+    for path in (data, video):
+        if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(info.folder)):
+            raise DatasetError(f"{name}: {path} lies outside the dataset")
     if not video.is_file():
         raise DatasetError(f"{name}: {video} is not there: copy the dataset again, whole")
     return _Row(
@@ -269,7 +279,7 @@ def _decode(info: _Info, row: _Row) -> Iterator[ImageArray]:
 def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
     """Yield the frames nearest to ``from_timestamp + k / fps``, as LeRobot's reader does."""
     try:
-        with av.open(library_name(row.video)) as container:
+        with av.open(library_name(row.video), format="mp4") as container:
             stream = container.streams.video[0]
             tick_s = float(stream.time_base or 0)
             container.seek(max(0, round(row.from_s / tick_s) - 1), backward=True, stream=stream)

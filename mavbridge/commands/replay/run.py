@@ -12,6 +12,7 @@ from mavbridge.commands.replay.config import ReplayConfig, ReplayFrom
 from mavbridge.commands.replay.others import replay_dataset, replay_log
 from mavbridge.commands.replay.results import ReplayResult, print_replay, to_json
 from mavbridge.config.flight import FlyConfig
+from mavbridge.config.trust import foreign_policy
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.records import FeatureFrame
@@ -68,6 +69,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     if is_lerobot(folder):
         return replay_dataset(folder, other_config(FlyConfig(), config), config)
     source = open_source(folder)
+    config = _trusted(source, config)
     chosen = _source_of(source, config)
     print_status(f"replaying {len(source.ticks)} ticks of {folder} through the gate")
     steps = replay_gate(source)
@@ -104,6 +106,36 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     )
     _write(result, config)
     return ExitCode.DONE if result.is_equal else ExitCode.DIFFERENT
+
+
+def _trusted(source: ReplaySource, asked: ReplayConfig) -> ReplayConfig:
+    """What is asked for, without the flight's own policy where that was named once more.
+
+    Raises:
+        UserError: the recording names a policy that is more than data, or weights that are no file.
+    """
+    flown = source.config.policy
+    if (asked.policy, asked.checkpoint, asked.contract) == (
+        *(flown.policy, flown.checkpoint, flown.contract),
+    ):
+        return replace(asked, policy=None, checkpoint=None, contract=None)
+    if asked.policy is not None or asked.source == "chunks":
+        return asked
+    files = {"checkpoint": flown.checkpoint, "contract": flown.contract}
+    if (what := foreign_policy(flown.policy)) is not None:
+        given = [f"--{name} {path}" for name, path in files.items() if path is not None]
+        raise UserError(
+            f"{source.folder} says that it was flown by {flown.policy}, {what}, which a recording "
+            "may not choose: if you know it, name it too: "
+            f"{' '.join([f'--policy {flown.policy}', *given])}; or use --from chunks, which asks "
+            "no policy"
+        )
+    for name, path in files.items():
+        if path is not None and getattr(asked, name) is None and not path.is_file():
+            raise UserError(
+                f"{source.folder} was flown with --{name} {path}, which is no file here: name it"
+            )
+    return asked
 
 
 def _source_of(source: ReplaySource, config: ReplayConfig) -> ReplayFrom:

@@ -127,7 +127,7 @@ def read_video(path: Path, frames: int | None = None) -> Iterator[ImageArray]:
         with (
             path.open("rb") as file,
             mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ) as whole,
-            av.open(whole, "r") as container,
+            av.open(whole, "r", format="mp4") as container,
         ):
             for frame in islice(container.decode(video=0), wanted):
                 yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)

@@ -50,7 +50,7 @@ class LogVideo:
         self._start_ns = START_NS + round(start_s * NS_PER_S)
         self._frames = 0
         try:
-            self._container = av.open(library_name(path))
+            self._container = av.open(library_name(path), options={"protocol_whitelist": "file"})
             self._images = self._decode()
             self._next = next(self._images, None)
         except (av.FFmpegError, OSError, IndexError) as error:
