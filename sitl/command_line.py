@@ -66,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
     end_help = "stop one second after the last gate, or at a crash"
     add("--end-with-course", action="store_true", help=end_help)
-    receiver_help = "RC receiver: throttle down, every stick centred, or none (default: idle; "
+    receiver_help = "RC receiver: throttle down, every stick centred, or none (default: mid; "
     receiver_help += "none with PX4, which looks at one only if COM_RC_IN_MODE tells it to)"
     add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
     rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/rc_input.py)"
@@ -130,7 +130,7 @@ def _fly(args: argparse.Namespace) -> None:
     if args.pilot and (args.rc_in or args.receiver):
         raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
     has_receiver = args.autopilot != "px4" or args.pilot
-    receiver = args.receiver or ("idle" if has_receiver else "none")
+    receiver = args.receiver or ("mid" if has_receiver else "none")
     run_vehicle(
         links + onboard,
         VehicleConfig(
@@ -138,7 +138,7 @@ def _fly(args: argparse.Namespace) -> None:
             px4_release=args.px4_release,
             onboard_links=frozenset(range(len(links), len(links + onboard))),
             receiver=receiver != "none",
-            receiver_us=MID_RECEIVER_US if receiver == "mid" else IDLE_RECEIVER_US,
+            receiver_us=IDLE_RECEIVER_US if receiver == "idle" else MID_RECEIVER_US,
             vehicle_type=args.vehicle_type,
             signing=args.signing_key_file and _signing_key(args.signing_key_file),
             conditions=args.conditions,

@@ -302,10 +302,10 @@ class FlyConfig:
     """Engage when the vehicle is armed for the first time."""
     on_fault: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
     """After a fault of ours, first neutral sticks, then: release, hold (BRAKE, AUTO.LOITER), land
-    or rtl. auto: release to a receiver whose throttle is near the middle, else hold; setpoints are
-    not released but hold."""
+    or rtl. auto: release to a receiver that works and whose throttle is near the middle, else
+    hold. In the air release does so too; setpoints are not released but hold."""
     then: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
-    """The same at a normal end. auto: release to a receiver, land without one."""
+    """The same at a normal end, where auto and release land instead of holding."""
     duration: Annotated[float | None, Parameter(group=ENGAGING)] = None
     """Seconds to fly, from the first action of the policy; by default until Ctrl-C."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"

@@ -169,9 +169,14 @@ class VehicleStatus:
 
     mode: str
     armed: bool
+    mode_arrived_ns: int | None = None
+    """Arrival of the newest message that tells the mode."""
     rc_sticks: Sticks | None = None
     """Sticks that the vehicle acts on (RC_CHANNELS through its calibration)."""
     rc_channels_us: tuple[int, ...] = ()
+    """Readings of the receiver's channels, 0 where there is none; empty when they are old."""
+    channels_arrived_ns: int | None = None
+    """Arrival of these."""
     rc_arrived_ns: int | None = None
     is_failsafe: bool = False
     """HEARTBEAT.system_status is critical or worse: a failsafe of the vehicle is active."""
@@ -180,6 +185,8 @@ class VehicleStatus:
     has_receiver: bool | None = None
     """A radio receiver delivers the pilot's sticks, as seen before our first override; None = not
     known, or we sent sticks before it could be seen."""
+    is_receiver_sick: bool = False
+    """SYS_STATUS says now that the receiver does not work."""
     pilot_sticks: Sticks | None = None
     """The receiver's sticks as last seen while we sent none."""
     position_ned_m: tuple[float, float, float] | None = None

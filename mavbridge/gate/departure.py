@@ -10,8 +10,17 @@ NEUTRAL_NS = 50 * NS_PER_MS
 """Least time of neutral sticks before they are given back."""
 MODE_SPACING_NS = 100 * NS_PER_MS
 """Between two requests for the safe mode; ArduPilot answers within 10 ms."""
+SLOW_SPACING_NS = NS_PER_S
+"""The same once a vehicle with a good link has not confirmed it for the timeout."""
 MODE_TIMEOUT_NS = 3 * NS_PER_S
-"""Longest wait for the safe mode; HEARTBEAT, which confirms it, may come at 1 Hz."""
+"""Longest wait for the safe mode of a vehicle that is heard; HEARTBEAT, which confirms it, may come
+at 1 Hz."""
+BLIND_NS = 3 * NS_PER_S
+"""Longest that a vehicle which is not heard is asked for a mode, where a receiver takes over from
+sticks that stay away: a failsafe for want of a ground station comes after 5 s."""
+FAILSAFE_BLIND_NS = 500 * NS_PER_MS
+"""The same where its own failsafe follows, which must not be undone: after 0.5 s (COM_RC_LOSS_T) or
+1 s (RC_FS_TIMEOUT, COM_OF_LOSS_T)."""
 SETPOINT_NS = 500 * NS_PER_MS
 """Longest stream of neutral setpoints that waits for the mode on PX4. A vehicle that has not
 answered by then does not hear us, and it goes back to OFFBOARD within 30 ms when it hears a
@@ -43,9 +52,9 @@ class DepartureSettings:
     """Actions after a fault, and at a normal end."""
 
     on_fault: OnFault = "auto"
-    """auto: release to a receiver whose throttle is near the middle, else hold."""
+    """auto: release to a hand that would hold the vehicle, else hold."""
     then: OnFault = "auto"
-    """auto: release to a receiver, land without one."""
+    """auto: release to a hand that would hold the vehicle, else land."""
     is_setpoint: bool = False
     """The policy's actions are setpoints: there is nothing to release to, so that a mode which
     holds stands for release, and silence follows it."""
@@ -69,8 +78,16 @@ class Departure:
         """The vehicle was first seen in the mode that it enters for a moving stick."""
         self.mode: str | None = None
         """The safe mode that is asked for; a change to it is no takeover."""
+        self._asks_until_ns = 0
+        """End of the quick requests: a vehicle that is heard has had its time to confirm."""
+        self.is_silence_failsafe = False
+        """The vehicle takes the end of our sticks for a failsafe."""
+        self._may_release = False
+        """The receiver's sticks would hold the vehicle in the mode of the flight."""
         self.must_hold = False
-        """Neutral must go on after it, since silence would be a failsafe."""
+        """Neutral must go on: silence is a failsafe, or the receiver would drop the vehicle."""
+        self.note: str | None = None
+        """Why it is not released, although the flag says so; the reader resets it."""
         self.is_done = False
 
     def forget(self) -> None:
@@ -85,17 +102,19 @@ class Departure:
         self._is_thrust_mode = facts.mode in facts.modes.thrust
         has_receiver = facts.has_receiver is True
         is_setpoint = self._settings.is_setpoint
-        self.must_hold = not is_setpoint and (not has_receiver or facts.modes.is_silence_failsafe)
+        self.is_silence_failsafe = not has_receiver or facts.modes.is_silence_failsafe
+        self._asks_until_ns = facts.now_ns + MODE_TIMEOUT_NS
         self.is_done = False
         choice = self._settings.on_fault if ending.is_fault else self._settings.then
-        if choice == "auto":
-            is_middle = facts.pilot_sticks is not None and (
-                abs(facts.pilot_sticks.throttle) <= MIDDLE_STICK
-            )
-            if ending.is_fault:
-                choice = "release" if has_receiver and is_middle else "hold"
-            else:
-                choice = "release" if has_receiver else "land"
+        objection = self._hand_objection(facts)
+        self._may_release = objection is None
+        if choice == "release" and facts.is_landed:
+            self._may_release = True
+        elif choice in ("auto", "release"):
+            instead: OnFault = "hold" if ending.is_fault else "land"
+            if objection is not None and choice == "release":
+                self.note = f"{instead} instead of release in the air: {objection}"
+            choice = "release" if objection is None else instead
         # In a mode of setpoints or of the autopilot's takeoff a pilot's sticks would do nothing.
         is_deaf = facts.mode in (*facts.modes.setpoint, *facts.modes.takeoff)
         if choice == "release" and (is_setpoint or is_deaf):
@@ -138,33 +157,71 @@ class Departure:
             return is_bounded  # when neutral left is not known
         return is_bounded or (facts.are_sticks_at_rest and facts.now_ns > self._began_ns)
 
-    def step(self, facts: Facts) -> Move:
-        """Neutral, and the mode until it is confirmed or refused."""
+    def _hand_objection(self, facts: Facts) -> str | None:
+        """Why the pilot's sticks would not hold the vehicle in its present mode, or None."""
+        if facts.has_receiver is not True:
+            return "there is no receiver"
+        if facts.is_landed:
+            return None
+        if facts.is_receiver_sick:
+            return "the receiver is lost"
+        if facts.modes.is_silence_failsafe and not self._settings.is_setpoint:
+            return "the vehicle takes the end of our sticks for a failsafe"
+        if facts.mode in facts.modes.thrust:
+            return f"in {facts.mode} the throttle is thrust"
+        if facts.pilot_sticks is None:
+            return "the receiver's throttle is not known"
+        throttle = facts.pilot_sticks.throttle
+        if abs(throttle) > MIDDLE_STICK:
+            percent, most = 100 * throttle, 100 * MIDDLE_STICK
+            return f"the receiver's throttle rests at {percent:+.0f} % (limit {most:.0f} %)"
+        return None
+
+    def _may_ask(self, facts: Facts, unheard_ns: int | None) -> bool:
+        """The mode is known, or the vehicle's own failsafe cannot have acted yet."""
+        has_failsafe = self.is_silence_failsafe or facts.modes.needs_setpoints_first
+        blind_ns = FAILSAFE_BLIND_NS if has_failsafe else BLIND_NS
+        return unheard_ns is None or facts.now_ns - unheard_ns <= blind_ns
+
+    def step(self, facts: Facts, unheard_ns: int | None = None) -> Move:
+        """Neutral, and the mode until it is confirmed or refused.
+
+        ``unheard_ns``: last word of a vehicle that has not told its mode since; None: it is known.
+        """
         is_confirmed = self.mode is None or facts.mode == self.mode
+        is_safe = self._may_release or (self.mode is not None and is_confirmed)
+        self.must_hold = not self._settings.is_setpoint and (
+            self.is_silence_failsafe or not is_safe
+        )
+        if unheard_ns is not None:  # its time to answer begins when it is heard
+            self._asks_until_ns = facts.now_ns + MODE_TIMEOUT_NS
         # No vehicle refuses to land: an answer that says so is a late one, to the mode before.
-        if self.mode is not None and facts.refused_mode == self.mode:
+        if not is_confirmed and facts.refused_mode == self.mode:
             self.mode = facts.modes.land or None
         elapsed_ns = facts.now_ns - self._began_ns
         is_undone = self.is_undone(facts)
         if is_confirmed and self._asked_ns is not None and self._entered_ns <= self._asked_ns:
             self._entered_ns = facts.now_ns
-        longest_ns = NEUTRAL_NS if is_confirmed else MODE_TIMEOUT_NS
-        self.is_done = not is_undone and (self.is_done or elapsed_ns >= longest_ns)
+        is_late = facts.now_ns >= self._asks_until_ns
+        is_over = elapsed_ns >= NEUTRAL_NS if is_confirmed else is_late
+        self.is_done = not is_undone and (self.is_done or is_over)
         # Where the throttle is thrust, neutral would climb or fall: the mode goes first. Then it
         # may still be a hand's to the vehicle.
-        is_safe = bool(self.mode) and is_confirmed and not facts.modes.override
-        is_level_only = self._is_thrust_mode and not is_safe
+        is_entered = bool(self.mode) and is_confirmed and not facts.modes.override
+        is_level_only = self._is_thrust_mode and not is_entered
         hand: Hand | None = Hand.LEVEL if is_level_only else Hand.NEUTRAL
         if self._settings.is_setpoint and facts.is_landed:
             hand = Hand.IDLE  # the thrust that hovers would lift it
         may_pull_back = self._settings.is_setpoint and facts.modes.needs_setpoints_first
         if may_pull_back and elapsed_ns > SETPOINT_NS:
             hand = None
-        if is_confirmed or self.is_done or facts.now_ns < self._request_due_ns:
+        is_due = facts.now_ns >= self._request_due_ns and self._may_ask(facts, unheard_ns)
+        if is_confirmed or not is_due:
             return Move(hand=hand)
         if (is_undone and not self._is_told(facts)) or not self._are_at_rest(facts):
             return Move(hand=hand)
         if not is_undone:
             self._asked_ns = self._entered_ns = facts.now_ns
-        self._request_due_ns = facts.now_ns + MODE_SPACING_NS
+        is_slow = is_late and facts.link_problem is None  # each refusal prints a reason
+        self._request_due_ns = facts.now_ns + (SLOW_SPACING_NS if is_slow else MODE_SPACING_NS)
         return Move(hand=hand, mode=self.mode)

@@ -10,6 +10,7 @@ from enum import Enum
 from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.switch import Switch
 from mavbridge.core.vehicle import FlightEnd
 from mavbridge.gate.departure import STICK_REST_NS, Departure, DepartureSettings, Ending
 from mavbridge.gate.facts import Facts, Hand, Move
@@ -35,9 +36,15 @@ together, since a packet that the gate sent in part swallows the next one."""
 _ASKED_NS = 250 * NS_PER_MS
 """How long they ask for a mode: any longer, and they could undo a mode that the pilot chose."""
 _RELEASES = 5
+SILENCE_NS = 250 * NS_PER_MS
+"""After a silence of the vehicle, or a standstill of our own, of this length its mode is not known
+until it is told anew: its own failsafe may have acted, after 0.5 s at the earliest."""
+BACKLOG_NS = 50 * NS_PER_MS
+"""After a standstill, time for what was under way to come out of pipes and sockets."""
 OPERATOR = "released by the operator"
-ON_US, OFF_US = 1800, 1200
-"""ArduPilot's thresholds of a high and of a low switch."""
+REST_NS = 1_800 * NS_PER_MS
+"""Least rest of the engage switch, low, before going high is an act: receivers that dropped out for
+0.6 to 1.5 s, with a preset that puts the switch low, have looked like a hand."""
 
 
 class Phase(Enum):
@@ -72,7 +79,7 @@ class EngagementSettings:
     arm: bool = False
     """Arm once and engage once, as soon as everything is ready."""
     engage_channel: int | None = None
-    """Receiver channel, from 1, that engages when it goes from low to high."""
+    """Receiver channel, from 1, that engages when it goes high after a rest low."""
     engage_on_arm: bool = False
     """Engage when the vehicle is armed for the first time."""
     readonly: bool = False
@@ -96,13 +103,18 @@ class Engagement:
         self._prepare_timeout_ns = self._prepare_until_ns = 0
         self._released_ns = 0
         self._heard_ns = 0
-        """While holding: the link was last without a problem."""
+        """While leaving or holding: the link was last without a problem."""
+        self._stepped_ns: int | None = None
+        self._unheard_ns: int | None = None
+        """The vehicle's last word before a silence or a standstill; None: its mode is known."""
+        self._news_from_ns = 0
+        """What has arrived before tells of the time before the silence."""
         self._was_armed: bool | None = None
         """As last seen; None before the vehicle was found."""
         self._has_been_armed = False
         self._was_ready = False
         """The vehicle was armed at the last step of preparing."""
-        self._switch_is_low = False
+        self._switch = Switch(rest_ns=REST_NS)
         self._seen_interruption: str | None = None
         self._stop_reason: Ending | None = None
         self._must_end = False
@@ -129,6 +141,7 @@ class Engagement:
         """Advance to the facts of this moment."""
         if self._settings.readonly:
             return self._watch(facts)
+        self._listen(facts)
         act = self._explicit_act(facts, act)
         if act == "engage" and self.phase in (Phase.LEAVING, Phase.HOLDING, Phase.RELEASING):
             self.refusal = f"not engaged: the last flight is still ending ({self.phase.value})"
@@ -144,17 +157,26 @@ class Engagement:
             case Phase.RELEASING:
                 return self._release(facts)
 
+    def _listen(self, facts: Facts) -> None:
+        """Find out whether the mode is that of now."""
+        now_ns, stepped_ns = facts.now_ns, self._stepped_ns
+        heard_ns = now_ns if facts.heard_ns is None else facts.heard_ns
+        mode_ns = now_ns if facts.mode_ns is None else facts.mode_ns
+        self._stepped_ns = now_ns
+        stood_still = stepped_ns is not None and now_ns - stepped_ns > SILENCE_NS
+        if stood_still or now_ns - heard_ns > SILENCE_NS:
+            if self._unheard_ns is None:
+                self._unheard_ns = heard_ns if stepped_ns is None else min(heard_ns, stepped_ns)
+            self._news_from_ns = now_ns + (BACKLOG_NS if stood_still else 0)
+        elif mode_ns > self._news_from_ns:
+            self._unheard_ns = None
+
     # --- explicit acts
 
     def _explicit_act(self, facts: Facts, act: Act | None) -> Act | None:
         """The operator's act, or that of the switch, or of the first arming."""
-        channel = self._settings.engage_channel
-        if channel is not None and len(facts.rc_channels_us) >= channel:
-            value_us = facts.rc_channels_us[channel - 1]
-            if value_us > ON_US and self._switch_is_low:
-                self._switch_is_low, act = False, act or "engage"
-            elif 0 < value_us < OFF_US:
-                self._switch_is_low = True
+        if self._is_switched_on(facts):
+            act = act or "engage"
         is_first_arming = facts.armed and self._was_armed is False and not self._has_been_armed
         if is_first_arming and self._settings.engage_on_arm:
             act = act or "engage"
@@ -163,13 +185,35 @@ class Engagement:
             self._has_been_armed = self._has_been_armed or facts.armed
         return act
 
+    def _is_switched_on(self, facts: Facts) -> bool:
+        """The engage switch has gone high, by a hand.
+
+        Low takes the sticks back at once, whoever says it; for an act the receiver has to be well.
+        """
+        channel = self._settings.engage_channel
+        if channel is None or len(facts.rc_channels_us) < channel:
+            return False
+        arrived_ns = facts.now_ns if facts.channels_ns is None else facts.channels_ns
+        was_off = self._switch.is_off
+        is_act = self._switch.read(facts.rc_channels_us[channel - 1], arrived_ns)
+        if facts.is_failsafe or facts.is_receiver_sick:
+            self._switch.forget()
+            is_act = False
+        if was_off and not self._switch.is_off and not is_act:
+            self.refusal = (
+                f"not engaged: the engage switch (channel {channel}) did not rest low for "
+                f"{REST_NS / NS_PER_S:g} s with a receiver that works: leave it low for 2 s, then "
+                "switch it on"
+            )
+        return is_act
+
     def _objection(self, facts: Facts) -> str | None:
         """Why the policy may not take the sticks of an armed vehicle now, or None."""
         if facts.link_problem is not None:
             return facts.link_problem
         if facts.is_failsafe:
             return "a failsafe of the vehicle is active"
-        if self._switch_is_low:
+        if self._switch.is_off:
             return f"the engage switch (channel {self._settings.engage_channel}) is off"
         return facts.chunk_problem or facts.envelope_problem
 
@@ -310,7 +354,7 @@ class Engagement:
             return facts.overruled
         if facts.is_switched_off:
             return "the pilot's override switch is off"
-        if self._switch_is_low and self.phase is Phase.FLYING:
+        if self._switch.is_off and self.phase is Phase.FLYING:
             return "the pilot's engage switch is off"
         if not facts.armed and self.phase is not Phase.PREPARING:
             return "the vehicle has been disarmed"
@@ -365,13 +409,16 @@ class Engagement:
         self.reason = ending.reason
         self._must_end = self._must_end and ending is not self._stop_reason
         self._departure.begin(facts, ending)
+        self._heard_ns = facts.now_ns
+        self.refusal, self._departure.note = self._departure.note or self.refusal, None
         return self._leave(facts, None)
 
     def _leave(self, facts: Facts, act: Act | None) -> Move:
         if self.phase is Phase.HOLDING and (act == "release" or self._must_end):
             # What held after a fault now ends as a flight without a fault does.
             return self._depart(facts, self._stop_reason or Ending(reason=OPERATOR))
-        if self.phase is Phase.LEAVING or facts.link_problem is None:
+        has_link = self.phase is Phase.LEAVING or facts.link_problem is None
+        if has_link and self._unheard_ns is None:
             self._heard_ns = facts.now_ns
         taken = self._takeover(facts)
         if facts.now_ns - self._heard_ns >= LOST_NS:
@@ -380,7 +427,7 @@ class Engagement:
             return self._give_back(facts, f"{self.reason}; then {taken}")
         if facts.mode == self._departure.mode:
             self._own_mode = facts.mode
-        move = self._departure.step(facts)
+        move = self._departure.step(facts, self._unheard_ns)
         if self._departure.is_done:
             if self.phase is Phase.LEAVING and self._departure.mode not in (None, facts.mode):
                 self.refusal = f"the vehicle has not confirmed {self._departure.mode} in time"
@@ -425,7 +472,8 @@ class Engagement:
         twin = deepcopy(self, {id(self._settings): self._settings})
         if self.phase in (Phase.PREPARING, Phase.FLYING):
             twin.stop(Ending(reason="the gate has died", is_fault=True))
-        facts = replace(facts, are_sticks_at_rest=False)  # they jump to neutral, unseen by us
+        # Sticks jump to neutral, unseen by us; the flight process says the words at once, or never.
+        facts = replace(facts, are_sticks_at_rest=False, heard_ns=None, mode_ns=None)
         rest_ns = STICK_REST_NS if facts.modes.override else 0
         until_ns = rest_ns + _ASKED_NS
         for after_ns in (after_ms * NS_PER_MS for after_ms in _REHEARSED_MS):
@@ -436,7 +484,8 @@ class Engagement:
                 until_ns = after_ns
                 break
             yield after_ns, move
-        must_release = twin.phase is Phase.LEAVING and not twin._departure.must_hold
+        # The mode was asked for three times: it passes for confirmed.
+        must_release = twin.phase is Phase.LEAVING and not twin._departure.is_silence_failsafe
         if twin.phase is Phase.RELEASING or must_release:
             for k in range(_RELEASES):
                 yield until_ns + k * 50 * NS_PER_MS, Move(hand=Hand.RELEASE)

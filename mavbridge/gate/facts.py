@@ -44,6 +44,7 @@ class Facts:
     pilot_sticks: Sticks | None
     """Sticks of the receiver, as last seen while we sent none."""
     rc_channels_us: tuple[int, ...]
+    """Fresh readings, 0 where there is none."""
     is_position_valid: bool
     height_m: float | None
     """Above the estimator's origin; None without a valid position."""
@@ -57,6 +58,14 @@ class Facts:
     """Why a flight must end now: no chunk for longer than the grace, or a command that failed."""
     envelope_problem: str | None
     """Which limit of the flight envelope is exceeded."""
+    heard_ns: int | None = None
+    """Arrival of the newest packet; None: now."""
+    mode_ns: int | None = None
+    """Arrival of the newest word about the mode; None: now."""
+    channels_ns: int | None = None
+    """Arrival of ``rc_channels_us``; None: now."""
+    is_receiver_sick: bool = False
+    """The vehicle says now that its receiver does not work."""
     shows_last: bool = True
     """The vehicle shows the last sticks that we sent: held, or a receiver's that rests there."""
     landing: str | None = None

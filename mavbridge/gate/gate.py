@@ -220,6 +220,10 @@ class Gate:
             has_receiver=status.has_receiver if status else None,
             pilot_sticks=status.pilot_sticks if status else None,
             rc_channels_us=status.rc_channels_us if status else (),
+            heard_ns=_newest(link),
+            mode_ns=status.mode_arrived_ns if status else None,
+            channels_ns=status.channels_arrived_ns if status else None,
+            is_receiver_sick=status is not None and status.is_receiver_sick,
             is_position_valid=status is not None and status.is_position_valid is not False,
             height_m=-status.position_ned_m[2] if status and status.position_ned_m else None,
             is_landed=status.is_landed if status else None,
@@ -321,3 +325,11 @@ class Gate:
             self._messages.append(refusal)
         messages, self._messages = tuple(self._messages), []
         return messages
+
+
+def _newest(link: LinkSnapshot) -> int | None:
+    """Arrival of the newest of what comes all the time."""
+    status, attitude = link.status, link.telemetry.ned_from_body_wxyz
+    stamps = (status.mode_arrived_ns, status.channels_arrived_ns) if status else ()
+    arrivals = [stamp for stamp in (*stamps, attitude and attitude.arrived_ns) if stamp is not None]
+    return max(arrivals, default=None)

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from helpers.contract_peers import Companion, ExternalPeer, MockPeer, Peer
 from helpers.copter_companion import CopterCompanion
 from helpers.px4_companion import Px4Companion
-from sitl.vehicle.config import AutopilotName, VehicleConfig
+from sitl.vehicle.config import IDLE_RECEIVER_US, AutopilotName, VehicleConfig
 
 PEER, ALLOW, RECEIVER = (
     "MAVBRIDGE_TEST_PEER",
@@ -86,7 +86,9 @@ def _stage(item: pytest.Item) -> int:
 def _peer(request: pytest.FixtureRequest, autopilot: AutopilotName, *, receiver: bool) -> Peer:
     if EXTERNAL in request.config.stash:
         return request.config.stash[EXTERNAL].peer
-    return MockPeer(VehicleConfig(autopilot=autopilot, receiver=receiver))
+    return MockPeer(
+        VehicleConfig(autopilot=autopilot, receiver=receiver, receiver_us=IDLE_RECEIVER_US)
+    )
 
 
 def _need(request: pytest.FixtureRequest, permission: str) -> None:

@@ -93,7 +93,9 @@ class Console:
 def test_mavproxy_reads_parameters_changes_mode_and_arms(tmp_path):
     need("mavproxy.py")
     port = free_port(socket.SOCK_STREAM)
-    vehicle = running(sys.executable, "-m", "sitl", "--connect", f"tcpin:127.0.0.1:{port}")
+    vehicle = running(
+        sys.executable, "-m", "sitl", "--receiver", "idle", "--connect", f"tcpin:127.0.0.1:{port}"
+    )
     with vehicle as sitl:
         assert Console(sitl).has("ready", DEADLINE_S)
         proxy = running(
@@ -115,7 +117,9 @@ def test_mavproxy_reads_parameters_changes_mode_and_arms(tmp_path):
 def test_mavsdk_gets_parameters_telemetry_and_arms():
     need("python")
     port = free_port(socket.SOCK_DGRAM)
-    vehicle = running(sys.executable, "-m", "sitl", "--connect", f"udpout:127.0.0.1:{port}")
+    vehicle = running(
+        sys.executable, "-m", "sitl", "--receiver", "idle", "--connect", f"udpout:127.0.0.1:{port}"
+    )
     with vehicle as sitl:
         assert Console(sitl).has("ready", DEADLINE_S)
         client = running(str(PEERS / "python"), str(CLIENT), f"udpin://127.0.0.1:{port}")

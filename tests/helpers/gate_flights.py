@@ -64,6 +64,16 @@ def climbing_first(t_s: float) -> tuple[float, float, float, float]:
     return (0.9, 0.0, 0.0, 0.0) if t_s < 2.5 else (0.0, 0.0, 0.0, 0.25)
 
 
+class StoppableStepper(GateStepper):
+    """A gate that may stand still, as under SIGSTOP."""
+
+    is_stopped = False
+
+    def step(self) -> None:
+        if not self.is_stopped:
+            super().step()
+
+
 class GateFlight:
     """One flight of one vehicle; nothing happens until ``run`` or ``until`` is called."""
 
@@ -146,7 +156,8 @@ class GateFlight:
         policy = PolicyStepper(
             self.clock, self._policy_clock, self._port, bridge.policy, bridge.view
         )
-        stepper = GateStepper(self.clock, self.gate)
+        stepper = StoppableStepper(self.clock, self.gate)
+        self.gate_stepper = stepper
         to_flight.on_arrival = lambda: None if self.is_flight_process_stopped else policy.receive()
         to_gate.on_arrival = self.down.on_arrival = stepper.step
         self._wake = stepper.step
@@ -203,6 +214,13 @@ class GateFlight:
         for after_ns, packet in words.packets:
             at_ns = self.clock.now_ns() + 2 * MS + after_ns
             self.clock.schedule(at_ns, partial(self.up.send, packet))
+
+    def stand_still(self, seconds: float) -> None:
+        """Both processes stand still, as the machine does in a long stall; then they go on."""
+        self.is_flight_process_stopped = self.gate_stepper.is_stopped = True
+        self.run(seconds)
+        self.is_flight_process_stopped = self.gate_stepper.is_stopped = False
+        self._wake()
 
     # --- time
 

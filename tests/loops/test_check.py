@@ -18,7 +18,7 @@ from mavbridge.simulation.world import NOMINAL_VEHICLE, VehicleStepper
 from policy.contract import Contract
 from sitl.ardupilot.autopilot import Autopilot
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import AutopilotName
+from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName
 
 OVERRIDE = 70
 """RC_CHANNELS_OVERRIDE."""
@@ -39,7 +39,12 @@ class Bench:
         self.vehicle = SimulatedVehicle(
             links=1,
             boot_ns=self.clock.now_ns(),
-            config=replace(NOMINAL_VEHICLE, autopilot=autopilot, receiver=receiver),
+            config=replace(
+                NOMINAL_VEHICLE,
+                autopilot=autopilot,
+                receiver=receiver,
+                receiver_us=MID_RECEIVER_US,
+            ),
         )
         for name, value in (params or {}).items():
             assert self.vehicle.params.set(name, value), name

@@ -75,18 +75,41 @@ def test_the_switch_engages_by_going_high_while_armed_in_an_allowed_mode() -> No
     assert flight.phase is Phase.WAITING, "it was high when it was first seen"
 
     flight.receiver(ch7=LOW)
-    flight.run(0.5)
+    flight.run(2)
     assert flight.phase is Phase.WAITING
     flight.receiver(ch7=HIGH)
-    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.2)
+    took_s = flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
+    assert took_s > 0.2, "the debounce"
     flight.run(1)
 
     flight.receiver(ch7=LOW)
     took_s = flight.until(lambda: flight.phase is Phase.RELEASED, within_s=0.3)
     assert took_s < 0.2
     assert flight.reason == "the pilot's engage switch is off"
+    flight.run(2)
     flight.receiver(ch7=HIGH)
-    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.2)
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
+
+
+@pytest.mark.parametrize("dropout", [{"ch7": 988}, {"ch7": 988, "ch3": 950}, {"ch7": 65535}])
+@pytest.mark.parametrize(("is_flying", "seconds"), [(True, 0.6), (False, 1.5)])
+def test_a_receiver_that_drops_out_and_comes_back_engages_nothing(
+    dropout: dict[str, int], is_flying: bool, seconds: float
+) -> None:
+    flight = GateFlight(engage_channel=SWITCH)
+    flight.receiver(ch7=LOW if is_flying else HIGH)
+    flight.launch()
+    if is_flying:
+        flight.receiver(ch7=HIGH)
+        flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
+    flight.run(0.5)
+    flight.receiver(**dropout)
+    flight.run(seconds)
+    flight.receiver(**dict.fromkeys(dropout, 1500) | {"ch7": HIGH})
+    flight.run(0.5)
+    flight.ap.set_mode(Mode.ALT_HOLD)  # the pilot leaves what a failsafe has chosen
+    flight.run(0.5)
+    assert flight.view.flights == is_flying, flight.describe()
 
 
 def test_engage_on_arm_counts_the_first_arming_alone() -> None:

@@ -381,6 +381,9 @@ def test_the_link_is_lost_and_neutral_and_a_mode_are_sent_all_the_same() -> None
     flight.run(8)
 
     assert flight.ap.mode is Mode.BRAKE
+    assert flight.phase is Phase.LEAVING, "it is not given up"
+    flight.down.is_silent = False
+    flight.run(5)
     assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4]
     assert flight.sticks_sent()[-1][1] == pytest.approx(NEUTRAL, abs=0.01)
     assert flight.phase is Phase.RELEASED

@@ -28,7 +28,7 @@ def fault(flight: GateFlight) -> None:
         (MID_RECEIVER_US, {"on_fault": "land"}, Mode.LAND),
         (MID_RECEIVER_US, {"on_fault": "rtl"}, Mode.RTL),
         (IDLE_RECEIVER_US, {}, Mode.BRAKE),
-        (IDLE_RECEIVER_US, {"on_fault": "release"}, Mode.ALT_HOLD),
+        (IDLE_RECEIVER_US, {"on_fault": "release"}, Mode.BRAKE),
     ],
 )
 def test_after_a_fault_neutral_then_the_mode_then_the_receivers_sticks(

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.commands.check.terms import Terms
 from mavbridge.core.vehicle import LinkSnapshot, VehicleStatus
+from mavbridge.gate.departure import MIDDLE_STICK
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
 _TEXTS_SHOWN = 4
@@ -60,14 +61,27 @@ def _state_row(status: VehicleStatus) -> Row:
 def _receiver_row(status: VehicleStatus) -> Row:
     expected = "a pilot who can take over"
     if status.has_receiver:
-        return _row("radio receiver", "there", expected)
+        throttle = status.pilot_sticks.throttle if status.pilot_sticks else None
+        if throttle is None or abs(throttle) <= MIDDLE_STICK:
+            return _row("radio receiver", "there", expected)
+        return _row(
+            "radio receiver",
+            f"throttle at {100 * throttle:+.0f} %",
+            f"throttle within {100 * MIDDLE_STICK:.0f} % of the middle in flight",
+            "warn",
+            "sticks are not released to such a throttle in the air; if this computer died, the "
+            "vehicle would get it after RC_OVERRIDE_TIME (ArduPilot; measured over an idle one: on "
+            "the ground after 4.7 s with 0.5, 15 m farther and sinking with 3): put the throttle "
+            "in the middle before the policy flies",
+        )
     return _row(
         "radio receiver",
         "none seen" if status.has_receiver is False else "not known",
         expected,
         "warn",
         "without a receiver nobody takes over by stick, and neutral sticks go on after a flight "
-        "until the vehicle is disarmed or its mode is changed",
+        "until the vehicle is disarmed or its mode is changed; if this computer died, its radio "
+        "failsafe would act (ArduPilot: RTL after RC_FS_TIMEOUT, 1 s, whatever RC_OVERRIDE_TIME)",
     )
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.gate.engagement import OFF_US, ON_US
+from mavbridge.core.switch import Position, Switch
 
 QUIT_KEY, TOGGLE_KEY, GOOD_KEY, BAD_KEY = "q", "r", "g", "b"
 KEYS = (QUIT_KEY, TOGGLE_KEY, " ", GOOD_KEY, BAD_KEY)
@@ -15,7 +15,6 @@ MIDDLE_NS = 300 * NS_PER_MS
 """A switch that is on its way from high to low passes the middle within this time."""
 
 Mark: TypeAlias = Literal["good", "bad"]
-Position: TypeAlias = Literal["low", "middle", "high"]
 _MARKS: dict[str, Mark] = {GOOD_KEY: "good", BAD_KEY: "bad"}
 
 
@@ -25,7 +24,7 @@ class Seen(NamedTuple):
     now_ns: int
     armed: bool
     switch_us: int
-    """The channel of the switch; 0 = not known."""
+    """The channel of the switch; 0 = no reading."""
     is_recording: bool
     keys: str = ""
     """Typed since the last moment, in order."""
@@ -50,7 +49,9 @@ class EpisodeControl:
     def __init__(self, *, has_switch: bool, on_arm: bool) -> None:
         self._has_switch = has_switch
         self._on_arm = on_arm
+        self._switch = Switch(rests=("low", "middle"))
         self._position: Position | None = None
+        """As last read, whatever came between."""
         self._middle_since_ns: int | None = None
         """When the switch came from high to the middle."""
         self._was_armed = False
@@ -93,13 +94,12 @@ class EpisodeControl:
         )
 
     def _by_switch(self, seen: Seen) -> Orders:
-        before, now = self._position, _position(seen.switch_us, self._position)
+        is_act = self._switch.read(seen.switch_us, seen.now_ns)
+        before, now = self._position, self._switch.position or self._position
         self._position = now
-        if before is None or now is None:
-            return Orders()  # a switch that is high already begins nothing
         if now == "high":
             self._middle_since_ns = None
-            return Orders(begin="the switch") if before != "high" else Orders()
+            return Orders(begin="the switch") if is_act else Orders()
         if before == "high":
             self._middle_since_ns = seen.now_ns if now == "middle" else None
             return Orders(end="the switch") if seen.is_recording else Orders()
@@ -125,12 +125,3 @@ class EpisodeControl:
             return Orders()
         self._disarmed_ns = None
         return Orders(end="disarmed") if seen.is_recording else Orders()
-
-
-def _position(value_us: int, before: Position | None) -> Position | None:
-    """Where the switch stands; as before where its channel is not known."""
-    if value_us <= 0:
-        return before
-    if value_us > ON_US:
-        return "high"
-    return "low" if value_us < OFF_US else "middle"

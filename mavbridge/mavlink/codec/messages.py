@@ -69,7 +69,8 @@ class SpecificForce(NamedTuple):
 
 
 class RcChannels(NamedTuple):
-    """RC_CHANNELS (65): the channels that the vehicle acts on, in microseconds; 0 = absent."""
+    """RC_CHANNELS (65): the channels that the vehicle acts on, in microseconds; 0 = no reading of a
+    radio (unused, 65535, out of range)."""
 
     channels_us: tuple[int, ...]
     boot_us: int = 0

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.rotation import quaternion_from_euler
+from mavbridge.core.switch import RADIO_US
 from mavbridge.mavlink.codec.messages import (
     STICK_END,
     Altitude,
@@ -117,7 +118,8 @@ def _milli_g_imu(
 
 def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
     values = (getattr(m, f"chan{number}_raw") for number in range(1, 19))
-    return RcChannels(tuple(values)[: m.chancount or 18], 1000 * m.time_boot_ms)
+    channels_us = tuple(us if us in RADIO_US else 0 for us in values)
+    return RcChannels(channels_us[: m.chancount or 18], 1000 * m.time_boot_ms)
 
 
 def _manual_control(m: dialect.MAVLink_manual_control_message) -> Body:

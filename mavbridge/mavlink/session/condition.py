@@ -5,6 +5,7 @@ from typing import TypeAlias
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.switch import GAP_NS, RADIO_US
 from mavbridge.core.vehicle import Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
     Altitude,
@@ -37,8 +38,6 @@ change: the autopilot tells it before its heartbeats know, and a network may swa
 POSITION_FRESH_NS = 500 * NS_PER_MS
 SLOW_FRESH_NS = 2 * NS_PER_S
 """Landed state, estimator and battery come at 5 and 2 Hz: silent for longer, they are not known."""
-RADIO_US = range(800, 2201)
-"""Range of a radio; a channel without a source shows 0."""
 _HORIZONTAL_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS
 
 
@@ -50,6 +49,7 @@ class VehicleCondition:
         self._min_battery_percent = min_battery_percent
         self.heartbeat: tuple[int, Heartbeat] | None = None
         self._custom_mode = 0
+        self._mode_ns: int | None = None
         self._is_armed = False
         self._is_failsafe = False
         self._changed_ns: int | None = None
@@ -96,7 +96,7 @@ class VehicleCondition:
         changed_ns = self._changed_ns
         if changed_ns is not None and arrived_ns - changed_ns < SETTLE_NS and not is_first:
             return
-        self._custom_mode = body.custom_mode
+        self._custom_mode, self._mode_ns = body.custom_mode, arrived_ns
         self._is_armed = bool(body.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
         self._is_failsafe = body.system_status >= dialect.MAV_STATE_CRITICAL
 
@@ -104,6 +104,7 @@ class VehicleCondition:
         """Take CURRENT_MODE, which also tells that the vehicle has left the mode by itself."""
         if self.heartbeat is None:
             return
+        self._mode_ns = arrived_ns
         if body.custom_mode != self._custom_mode:
             self._custom_mode, self._changed_ns = body.custom_mode, arrived_ns
         intended = body.intended_custom_mode
@@ -152,6 +153,13 @@ class VehicleCondition:
         return self._is_rc_plausible if self._is_rc_healthy is not False else False
 
     @property
+    def _is_receiver_sick(self) -> bool:
+        if self._system is None:
+            return False
+        system, bit = self._system[1], dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+        return bool(system.present & bit) and not system.healthy & bit
+
+    @property
     def is_ready_to_arm(self) -> bool | None:
         """The autopilot's own checks before arming are passed; None = it does not say."""
         if self._system is None:
@@ -186,16 +194,20 @@ class VehicleCondition:
         if self.heartbeat is None:
             return None
         rc_ns, rc = self.rc or (None, RcChannels(()))
+        is_shown = rc_ns is not None and now_ns - rc_ns <= GAP_NS
         is_valid = self._is_position_valid(now_ns)
         return VehicleStatus(
             mode=self._profile.modes.name(self._custom_mode),
             armed=self._is_armed,
+            mode_arrived_ns=self._mode_ns,
             rc_sticks=self._rc_sticks,
-            rc_channels_us=rc.channels_us,
+            rc_channels_us=rc.channels_us if is_shown else (),
+            channels_arrived_ns=rc_ns,
             rc_arrived_ns=rc_ns,
             is_failsafe=self._is_failsafe,
             is_landed=self._is_landed(now_ns),
             has_receiver=self.has_receiver,
+            is_receiver_sick=self._is_receiver_sick,
             pilot_sticks=self._pilot_sticks,
             position_ned_m=self._position_ned_m(now_ns, is_valid),
             is_position_valid=is_valid,

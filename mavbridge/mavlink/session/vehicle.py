@@ -10,6 +10,7 @@ from dataclasses import replace
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.switch import Switch
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
@@ -45,8 +46,6 @@ HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
 _VERSION_ATTEMPTS = 8
 """Its unique id names the file of remembered parameters: worth more than one lost packet."""
-_SWITCH_ON_US, _SWITCH_OFF_US = 1800, 1200
-"""ArduPilot's thresholds of a high and a low auxiliary switch; between them nothing changes."""
 
 
 class VehicleSession:
@@ -88,7 +87,7 @@ class VehicleSession:
         )
         self._receiver_due_ns: int | None = None
         """End of the wait for a receiver to show; None until the streams are granted."""
-        self._is_switch_on = False
+        self._switch = Switch()
         """Override switch; between high and low it stays as it was, as in the vehicle."""
         self._boot_ms = 0
         self._old_stamps = 0
@@ -150,10 +149,8 @@ class VehicleSession:
             is_released=self.is_released,
         )
         if (switch := self._params.override_switch) is not None:
-            switch_us = self._switch_us(switch)
-            self._is_switch_on = switch_us >= _SWITCH_ON_US or (
-                self._is_switch_on and not 0 < switch_us < _SWITCH_OFF_US
-            )
+            in_range = switch <= len(rc.channels_us)
+            self._switch.read(rc.channels_us[switch - 1] if in_range else 0, arrived_ns)
 
     def _watch_boot(self, boot_ms: int) -> None:
         if later_by_us(1000 * boot_ms, 1000 * self._boot_ms) < -RESTART_STEP_US:
@@ -256,17 +253,11 @@ class VehicleSession:
     def switch_problem(self) -> str | None:
         """The override switch that keeps our sticks out, or None."""
         switch = self._params.override_switch
-        if switch is not None and not self._is_switch_on:
+        if switch is not None and not self._switch.is_on:
             return f"the override switch (RC{switch}) is off: switch it on to fly"
         return None
-
-    def _switch_us(self, number: int) -> int:
-        """An auxiliary channel in us; 0 = not known."""
-        channels_us = self.condition.rc[1].channels_us if self.condition.rc else ()
-        return channels_us[number - 1] if len(channels_us) >= number else 0
 
     @property
     def is_switched_off(self) -> bool:
         """The pilot's override switch is low: the vehicle ignores our sticks."""
-        switch = self._params.override_switch
-        return switch is not None and 0 < self._switch_us(switch) < _SWITCH_OFF_US
+        return self._params.override_switch is not None and self._switch.is_off

@@ -34,7 +34,14 @@ FAULT = {"chunk_fault": "no chunk"}
         (MIDDLE, "hold", "BRAKE"),
         (MIDDLE, "land", "LAND"),
         (MIDDLE, "rtl", "RTL"),
-        (NO_RECEIVER, "release", None),
+        (NO_RECEIVER, "release", "BRAKE"),
+        (IDLE_RECEIVER, "release", "BRAKE"),
+        (replace(MIDDLE, is_receiver_sick=True), "release", "BRAKE"),
+        (replace(AIRBORNE, pilot_sticks=None), "auto", "BRAKE"),
+        (replace(IDLE_RECEIVER, is_landed=True), "auto", None),
+        (replace(IDLE_RECEIVER, is_landed=None), "auto", "BRAKE"),
+        (replace(NO_RECEIVER, is_landed=True), "auto", "BRAKE"),
+        (replace(NO_RECEIVER, is_landed=True), "release", None),
     ],
 )
 def test_the_mode_after_a_fault(facts: Any, choice: Any, mode: str | None) -> None:
@@ -83,7 +90,15 @@ def test_another_stations_mode_and_a_hand_of_the_pilots_win(changes: Any) -> Non
 
 @pytest.mark.parametrize(
     ("facts", "choice", "mode"),
-    [(IDLE_RECEIVER, "auto", None), (NO_RECEIVER, "auto", "LAND"), (MIDDLE, "rtl", "RTL")],
+    [
+        (MIDDLE, "auto", None),
+        (IDLE_RECEIVER, "auto", "LAND"),
+        (IDLE_RECEIVER, "release", "LAND"),
+        (replace(IDLE_RECEIVER, is_landed=True), "auto", None),
+        (NO_RECEIVER, "auto", "LAND"),
+        (NO_RECEIVER, "release", "LAND"),
+        (MIDDLE, "rtl", "RTL"),
+    ],
 )
 def test_the_mode_at_a_normal_end(facts: Any, choice: Any, mode: str | None) -> None:
     stepped = flying(facts, departure=DepartureSettings(then=choice))
@@ -106,16 +121,31 @@ def test_a_refused_mode_becomes_land() -> None:
     assert stepped.step(mode="LAND", refused_mode=None).hand is Hand.RELEASE
 
 
-@pytest.mark.parametrize(("hold", "moves"), [("", 6), ("BRAKE", 6)])
-def test_where_the_vehicle_has_no_such_mode_the_receiver_gets_the_sticks(
-    hold: str, moves: int
-) -> None:
+@pytest.mark.parametrize("hold", ["", "BRAKE"])
+def test_where_the_vehicle_has_no_such_mode_neutral_holds_it(hold: str) -> None:
     facts = replace(IDLE_RECEIVER, modes=replace(COPTER_MODES, hold=hold, land=""))
     stepped = flying(facts)
     stepped.step(**FAULT)
-    hands = [move.hand for move in stepped.run(0.1, refused_mode="BRAKE")]
-    assert hands[moves] is Hand.RELEASE
-    assert stepped.phase is Phase.RELEASING
+    assert {move.hand for move in stepped.run(5, refused_mode="BRAKE")} == {Hand.NEUTRAL}
+    assert stepped.phase is Phase.HOLDING
+
+
+@pytest.mark.parametrize("settings", [{}, {"on_fault": "release", "then": "release"}])
+@pytest.mark.parametrize("is_fault", [True, False])
+@pytest.mark.parametrize("throttle", [-1.0, -0.21, 0.21, 1.0, None])
+def test_no_hand_gets_the_sticks_that_would_not_hold_the_vehicle(
+    throttle: float | None, is_fault: bool, settings: Any
+) -> None:
+    sticks = None if throttle is None else NEUTRAL._replace(throttle=throttle)
+    stepped = flying(
+        replace(AIRBORNE, pilot_sticks=sticks), departure=DepartureSettings(**settings)
+    )
+    stepped.engagement.stop(Ending(reason="over", is_fault=is_fault))
+    mode = stepped.step().mode
+    assert mode == ("BRAKE" if is_fault else "LAND")
+    assert ("throttle" in (stepped.engagement.refusal or "")) == bool(settings)
+    assert {move.hand for move in stepped.run(40)} == {Hand.NEUTRAL}, "never confirmed"
+    assert stepped.step(mode=mode).hand is Hand.RELEASE
 
 
 def test_a_late_refusal_does_not_stop_the_landing() -> None:
@@ -132,9 +162,11 @@ def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
     stepped.step(**FAULT)
     stepped.run(2.98)
     assert stepped.phase is Phase.LEAVING
-    stepped.run(0.03)
-    assert stepped.phase is Phase.RELEASING
+    assert {move.hand for move in stepped.run(0.03)} == {Hand.NEUTRAL}
+    assert stepped.phase is Phase.HOLDING
     assert stepped.engagement.refusal == "the vehicle has not confirmed BRAKE in time"
+    assert sum(move.mode == "BRAKE" for move in stepped.run(5)) == 5, "asked for again"
+    assert stepped.step(mode="BRAKE").hand is Hand.RELEASE
     stepped.run(1)
     assert stepped.phase is Phase.RELEASED
     assert "whether it took the release is not known" in stepped.engagement.refusal
@@ -174,8 +206,9 @@ def test_where_silence_is_a_failsafe_neutral_goes_on_until_disarmed(
     assert stepped.step(armed=False).hand is Hand.RELEASE
 
 
-def test_without_a_receiver_a_release_holds_neutral_in_the_same_mode() -> None:
-    stepped = flying(NO_RECEIVER, departure=DepartureSettings(on_fault="release"))
+def test_on_the_ground_a_release_without_a_receiver_holds_neutral_in_the_same_mode() -> None:
+    landed = replace(NO_RECEIVER, is_landed=True)
+    stepped = flying(landed, departure=DepartureSettings(on_fault="release"))
     stepped.step(**FAULT)
     assert {(move.hand, move.mode) for move in stepped.run(20)} == {(Hand.NEUTRAL, None)}
     assert stepped.phase is Phase.HOLDING
@@ -213,8 +246,15 @@ def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral(mode: str) ->
     assert stepped.step(mode="BRAKE").hand in (Hand.NEUTRAL, Hand.RELEASE)
 
 
-def test_where_the_throttle_is_thrust_it_stays_until_a_release_without_a_mode() -> None:
+def test_where_the_throttle_is_thrust_no_hand_holds_the_vehicle() -> None:
     stepped = flying(replace(MIDDLE, mode="STABILIZE"), modes=("STABILIZE",))
+    moves = [stepped.step(**FAULT), *stepped.run(5)]
+    assert {move.hand for move in moves} == {Hand.LEVEL}
+    assert moves[0].mode == "BRAKE"
+
+
+def test_where_the_throttle_is_thrust_it_stays_until_a_release_on_the_ground() -> None:
+    stepped = flying(replace(MIDDLE, mode="STABILIZE", is_landed=True), modes=("STABILIZE",))
     moves = [stepped.step(**FAULT), *stepped.run(0.06)]
     assert [move.hand for move in moves] == [Hand.LEVEL] * 5 + [Hand.RELEASE] * 2
 
@@ -225,12 +265,97 @@ def test_a_mode_that_is_there_already_is_not_asked_for() -> None:
     assert {move.mode for move in moves} == {None}
 
 
-def test_an_unconfirmed_mode_is_not_asked_for_while_neutral_holds() -> None:
+def test_an_unconfirmed_mode_is_asked_for_once_a_second_while_neutral_holds() -> None:
     stepped = flying(NO_RECEIVER)
     stepped.step(**FAULT)
     stepped.run(3.1)
     assert stepped.phase is Phase.HOLDING
-    assert {(move.hand, move.mode) for move in stepped.run(5)} == {(Hand.NEUTRAL, None)}
+    moves = stepped.run(5)
+    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    assert sum(move.mode == "BRAKE" for move in moves) == 5
+    stepped.step(mode="BRAKE")
+    assert {move.mode for move in stepped.run(5)} == {None}
+
+
+# --- a vehicle that is not heard, and our own standstill
+
+
+def silence(stepped: Any, seconds: float) -> list[Move]:
+    """No packet of the vehicle for a while."""
+    now_ns = stepped.facts.now_ns
+    moves: list[Move] = stepped.run(seconds, heard_ns=now_ns, mode_ns=now_ns)
+    return moves
+
+
+def standstill(stepped: Any, seconds: float, **changes: Any) -> Move:
+    """The gate does not run for a while; the first step after it."""
+    facts = stepped.facts
+    now_ns = facts.now_ns + round(seconds * 1e9)
+    stepped.facts = replace(facts, now_ns=now_ns)
+    move: Move = stepped.step(mode_ns=now_ns - 1_000_000, **changes)
+    return move
+
+
+@pytest.mark.parametrize(
+    ("facts", "blind_s"), [(IDLE_RECEIVER, 3.0), (NO_RECEIVER, 0.5), (PX4, 0.5)]
+)
+def test_a_vehicle_that_is_not_heard_is_asked_only_until_its_own_failsafe(
+    facts: Any, blind_s: float
+) -> None:
+    stepped = flying(facts)
+    stepped.step(**FAULT)
+    moves = silence(stepped, 20)
+    assert stepped.phase is Phase.LEAVING, "it is not given up"
+    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    asked = [k / 100 for k, move in enumerate(moves) if move.mode is not None]
+    assert blind_s - 0.11 <= asked[-1] <= blind_s
+    assert {move.mode for move in stepped.run(0.1, heard_ns=None)} == {None}, "not which mode"
+    found = stepped.step(mode_ns=None)
+    assert (found.hand, found.mode) == (Hand.NEUTRAL, facts.modes.hold)
+
+
+@pytest.mark.parametrize(
+    ("facts", "own"), [(NO_RECEIVER, "RTL"), (NO_RECEIVER, "LAND"), (PX4, "AUTO.RTL")]
+)
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_a_failsafe_of_its_own_is_its_way_out_after_a_silence(
+    facts: Any, own: str, is_ours: bool
+) -> None:
+    stepped = flying(facts)
+    stepped.step(**FAULT)
+    if is_ours:
+        silence(stepped, 4)
+    else:
+        standstill(stepped, 4)
+    news = {"heard_ns": None, "mode_ns": None, "mode": own, "is_failsafe": True}
+    assert stepped.step(**news) == Move(hand=Hand.RELEASE)
+    assert {move.mode for move in stepped.run(5)} == {None}
+
+
+@pytest.mark.parametrize("facts", [NO_RECEIVER, PX4])
+def test_after_a_standstill_of_ours_what_had_arrived_tells_no_mode(facts: Any) -> None:
+    stepped = flying(facts)
+    first = standstill(stepped, 4, **FAULT)
+    assert (first.hand, first.mode) == (Hand.NEUTRAL, None), "the mode is of before"
+    assert {move.mode for move in stepped.run(1)} == {None}
+    assert stepped.step(mode_ns=None).mode == facts.modes.hold
+
+
+def test_a_vehicle_that_is_heard_again_has_its_time_to_answer() -> None:
+    stepped = flying(IDLE_RECEIVER)
+    stepped.step(**FAULT)
+    silence(stepped, 10)
+    moves = stepped.run(2.9, heard_ns=None, mode_ns=None)
+    assert sum(move.mode == "BRAKE" for move in moves) == 29
+    assert stepped.phase is Phase.LEAVING
+
+
+def test_a_vehicle_that_has_vanished_is_not_asked_for_ever() -> None:
+    stepped = flying(IDLE_RECEIVER)
+    stepped.step(**FAULT)
+    assert silence(stepped, 29)[-1].hand is Hand.NEUTRAL
+    stepped.run(6)
+    assert "lost for 30 s" in stepped.reason
 
 
 def test_a_refusal_that_comes_after_the_mode_is_there_asks_for_nothing() -> None:

@@ -134,16 +134,93 @@ def test_an_act_that_cannot_be_followed_is_refused_and_forgotten(
 def test_the_switch_engages_by_going_high_while_armed_and_releases_by_going_low() -> None:
     stepped = Stepped(replace(AIRBORNE, rc_channels_us=HIGH), engage_channel=8)
     assert set(stepped.run(1)) == {NOTHING}  # it was high from the start
-    stepped.step(rc_channels_us=LOW)
-    assert stepped.step(rc_channels_us=HIGH) == Move(hand=Hand.POLICY)
+    stepped.run(2, rc_channels_us=LOW)
+    assert stepped.run(0.21, rc_channels_us=HIGH)[-1] == Move(hand=Hand.POLICY)
     assert stepped.step(rc_channels_us=LOW) == Move(hand=Hand.RELEASE)
     assert "engage switch" in stepped.reason
 
 
+def test_a_switch_that_was_never_high_needs_the_debounce_alone() -> None:
+    stepped = Stepped(replace(AIRBORNE, rc_channels_us=LOW), engage_channel=8)
+    stepped.run(0.21)
+    assert set(stepped.run(0.2, rc_channels_us=HIGH)) == {NOTHING}
+    assert stepped.step() == Move(hand=Hand.POLICY)
+
+
+LOST = (1500,) * 7
+"""Channels without the switch's."""
+
+
+@pytest.mark.parametrize("unused_us", [0, 1, 799, 2201, 2500, 32767, 40000, 65534, 65535])
+@pytest.mark.parametrize("before", [LOW, HIGH])
+def test_only_a_radios_range_is_a_reading(unused_us: int, before: tuple[int, ...]) -> None:
+    stepped = Stepped(replace(AIRBORNE, rc_channels_us=before), engage_channel=8)
+    stepped.run(3)
+    assert set(stepped.run(3, rc_channels_us=(*LOST, unused_us))) == {NOTHING}
+    assert set(stepped.run(1, rc_channels_us=HIGH)) == {NOTHING}, "after a gap"
+    stepped.run(2, rc_channels_us=LOW)
+    assert Move(hand=Hand.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
+
+
+@pytest.mark.parametrize("seconds", [0.02, 0.3, 0.6, 1.0, 1.5, 1.7])
+@pytest.mark.parametrize("is_flying", [False, True])
+def test_a_dropout_that_puts_the_switch_low_is_no_act(seconds: float, is_flying: bool) -> None:
+    stepped = Stepped(replace(AIRBORNE, rc_channels_us=HIGH), engage_channel=8)
+    stepped.run(1)
+    if is_flying:
+        stepped.step("engage")
+    first, *rest = stepped.run(seconds, rc_channels_us=LOW)
+    assert first == (Move(hand=Hand.RELEASE) if is_flying else NOTHING), "low is taken at its word"
+    assert {move.hand for move in (*rest, *stepped.run(2, rc_channels_us=HIGH))} <= {
+        None,
+        Hand.RELEASE,
+    }
+    assert stepped.engagement.outcome.flights == is_flying
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [
+        {"is_failsafe": True},
+        {"is_receiver_sick": True},
+        {"rc_channels_us": ()},
+        {"rc_channels_us": LOW, "channels_ns": 1},
+    ],
+)
+@pytest.mark.parametrize("again_s", [0.0, 0.3, 1.7])
+def test_a_receiver_that_was_lost_has_to_show_the_switch_low_again(
+    lost: dict[str, Any], again_s: float
+) -> None:
+    stepped = Stepped(replace(AIRBORNE, rc_channels_us=LOW), engage_channel=8)
+    stepped.run(3)
+    stepped.run(0.6, **lost)
+    well = {"is_failsafe": False, "is_receiver_sick": False, "channels_ns": None}
+    stepped.run(again_s, rc_channels_us=LOW, **well)
+    assert set(stepped.run(1, rc_channels_us=HIGH, **well)) == {NOTHING}
+    assert "rest low" in (stepped.engagement.refusal or "")
+    stepped.run(2, rc_channels_us=LOW)
+    assert Move(hand=Hand.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
+
+
+def test_a_switch_that_bounces_is_no_act() -> None:
+    stepped = Stepped(replace(AIRBORNE, rc_channels_us=LOW), engage_channel=8)
+    stepped.run(3)
+    for _ in range(20):
+        assert set(stepped.run(0.19, rc_channels_us=HIGH)) == {NOTHING}
+        stepped.step(rc_channels_us=(1500,) * 8)
+
+
+def test_the_dwell_counts_arrivals_and_not_the_time_that_an_old_value_stays() -> None:
+    stepped = Stepped(replace(AIRBORNE, rc_channels_us=LOW, channels_ns=0), engage_channel=8)
+    stepped.run(0.45)
+    now_ns = stepped.facts.now_ns
+    assert set(stepped.run(0.45, rc_channels_us=HIGH, channels_ns=now_ns)) == {NOTHING}
+
+
 def test_a_switch_that_went_high_while_disarmed_does_not_engage_later() -> None:
     stepped = Stepped(replace(ON_GROUND, rc_channels_us=LOW), engage_channel=8)
-    stepped.step()
-    stepped.step(rc_channels_us=HIGH)
+    stepped.run(0.3)
+    stepped.run(0.3, rc_channels_us=HIGH)
     assert set(stepped.run(2, armed=True)) == {NOTHING}
 
 

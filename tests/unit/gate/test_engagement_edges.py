@@ -36,7 +36,9 @@ def holding(**settings: Any) -> Stepped:
     ("low_us", "high_us", "engages"),
     [
         (1199, 1801, True),
-        (1, 1801, True),
+        (800, 2200, True),
+        (1, 1801, False),  # no reading of a radio
+        (1199, 2201, False),
         (1200, 1801, False),
         (1199, 1800, False),
         (0, 2000, False),  # a channel that the receiver does not have
@@ -46,8 +48,8 @@ def test_the_switch_engages_from_below_1200_to_above_1800(
     low_us: int, high_us: int, engages: bool
 ) -> None:
     stepped = Stepped(replace(AIRBORNE, rc_channels_us=(low_us,)), engage_channel=1)
-    stepped.step()
-    stepped.step(rc_channels_us=(high_us,))
+    stepped.run(0.3)
+    stepped.run(0.3, rc_channels_us=(high_us,))
     assert (stepped.phase is Phase.FLYING) == engages
 
 
@@ -59,13 +61,13 @@ def test_a_switch_on_a_channel_that_does_not_arrive_is_not_off() -> None:
 
 def test_a_switch_engages_once_each_time_it_goes_high() -> None:
     stepped = Stepped(replace(AIRBORNE, rc_channels_us=LOW), engage_channel=8)
-    stepped.step()
-    stepped.step(rc_channels_us=HIGH)
+    stepped.run(0.3)
+    stepped.run(0.3, rc_channels_us=HIGH)
     stepped.step(mode="LOITER")
     stepped.run(0.1, is_released=True)
     assert set(stepped.run(1, mode="ALT_HOLD")) == {NOTHING}
-    stepped.step(rc_channels_us=LOW)
-    assert stepped.step(rc_channels_us=HIGH) == Move(hand=Hand.POLICY)
+    stepped.run(2, rc_channels_us=LOW)
+    assert Move(hand=Hand.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
 
 
 @pytest.mark.parametrize("way", ["switch", "arming"])
@@ -75,7 +77,9 @@ def test_the_key_that_releases_wins_over_what_would_engage_in_the_same_step(way:
         engage_channel=8,
         engage_on_arm=True,
     )
-    stepped.step()
+    stepped.run(0.3)
+    if way == "switch":
+        stepped.run(0.2, rc_channels_us=HIGH)
     assert stepped.step("release", armed=True, rc_channels_us=HIGH) == NOTHING
     assert set(stepped.run(1)) == {NOTHING}
 
@@ -94,8 +98,8 @@ def test_a_vehicle_that_appears_armed_has_not_been_armed_for_us() -> None:
 
 def test_a_switch_that_goes_low_on_the_way_out_changes_nothing() -> None:
     stepped = Stepped(replace(NO_RECEIVER, rc_channels_us=LOW), engage_channel=8)
-    stepped.step()
-    stepped.step(rc_channels_us=HIGH)
+    stepped.run(0.3)
+    stepped.run(0.3, rc_channels_us=HIGH)
     stepped.step(**FAULT)
     assert stepped.step(rc_channels_us=LOW).hand is Hand.NEUTRAL
     assert stepped.phase is Phase.LEAVING

@@ -318,9 +318,9 @@ def test_a_vehicle_that_does_not_show_our_last_sticks_is_released_for_longer() -
 
 def test_the_engage_switch_of_the_receiver_engages() -> None:
     gate = Stepped(engage_channel=5)
-    for k in range(4):
-        gate.step(10 * k, gate.chunk(10 * k), rc_channels_us=(1500,) * 4 + (1000,))
-    gate.step(40, gate.chunk(40), rc_channels_us=(1500,) * 4 + (2000,))
+    for k in range(60):
+        us = 1000 if k < 30 else 2000
+        gate.step(10 * k, gate.chunk(10 * k), rc_channels_us=(1500,) * 4 + (us,))
     assert gate.gate.phase is Phase.FLYING
 
 

@@ -217,3 +217,10 @@ def test_a_lean_up_to_the_hard_limit_leaves() -> None:
     codec().encode_attitude(TARGET, leaning(84.9), 0.5, now_ns=0)
     with pytest.raises(CommandRefusedError, match="leans too far"):
         codec().encode_attitude(TARGET, leaning(85.1), 0.5, now_ns=0)
+
+
+@pytest.mark.parametrize("us", [1, 799, 2201, 32767, 65535])
+def test_a_channel_out_of_a_radios_range_is_no_reading(us: int) -> None:
+    body = read(m.rc_channels_encode(7, 8, 800, 2200, us, *[1500] * 5, *[us] * 10, 255))
+    assert isinstance(body, RcChannels)
+    assert body.channels_us == (800, 2200, 0, *[1500] * 5)

@@ -455,7 +455,7 @@ def test_the_override_switch_decides() -> None:
     rig.vehicle.channels[6] = 1000
     assert "override switch (RC7) is off" in (rig.run(9.0).problem or "")
     rig.vehicle.channels[6] = 2000
-    assert rig.run(0.1).problem is None
+    assert rig.run(0.3).problem is None
 
 
 def test_a_silent_vehicle_is_lost_after_three_beats_and_found_again() -> None:

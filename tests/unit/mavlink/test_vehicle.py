@@ -89,6 +89,12 @@ class Session:
     def rc(self, channels_us: tuple[int, ...]) -> None:
         self.put(RcChannels(channels_us, self.now_ns // 1000), "RC_CHANNELS")
 
+    def turn_switch(self, us: int) -> None:
+        """Channel 7 stays there for longer than the debounce."""
+        for _ in range(15):
+            self.now_ns += 20 * MS
+            self.rc((*RECEIVER[:6], us, 1500))
+
     def answer_requests(self) -> None:
         for request in self.session.step(self.now_ns):
             if isinstance(request, ParamRequest) and request.name in self.params:
@@ -461,14 +467,19 @@ def test_a_refused_mode_is_known_until_another_is_asked_for_or_it_is_granted() -
 
 @pytest.mark.parametrize(
     ("switch_us", "is_off", "may_fly"),
-    [(1000, True, False), (1500, False, False), (2000, False, True), (0, False, False)],
+    [
+        (1000, True, False),
+        (1500, False, False),
+        (2000, False, True),
+        *((unused_us, False, False) for unused_us in (0, 799, 2201, 32767, 65535)),
+    ],
 )
 def test_the_override_switch_is_told_apart(switch_us: int, is_off: bool, may_fly: bool) -> None:
     session = Session(is_ready=False)
     session.params["RC7_OPTION"] = 46.0
     for _ in range(2):  # the search for a receiver takes as long again
         session.shake_hands()
-    session.rc((*RECEIVER[:6], switch_us, 1500))
+    session.turn_switch(switch_us)
     assert session.session.is_switched_off is is_off
     assert (session.problem is None) is may_fly
 
@@ -479,10 +490,23 @@ def test_the_middle_of_the_override_switch_changes_nothing() -> None:
     session.shake_hands()
     session.now_ns += 2 * S
     for switch_us, may_fly in ((1500, False), (2000, True), (1500, True), (0, True), (1000, False)):
-        session.rc((*RECEIVER[:6], switch_us, 1500))
-        assert (session.problem is None) is may_fly
-    session.rc((*RECEIVER[:6], 1500, 1500))
-    assert session.problem is not None
+        session.turn_switch(switch_us)
+        assert (session.session.switch_problem is None) is may_fly
+    session.turn_switch(1500)
+    assert session.session.switch_problem is not None
+
+
+def test_the_override_switch_is_on_after_the_debounce_and_off_at_once() -> None:
+    session = Session(is_ready=False)
+    session.params["RC7_OPTION"] = 46.0
+    session.shake_hands()
+    session.rc((*RECEIVER[:6], 2000, 1500))
+    assert session.session.switch_problem is not None
+    session.turn_switch(2000)
+    assert session.session.switch_problem is None
+    session.now_ns += 20 * MS
+    session.rc((*RECEIVER[:6], 1000, 1500))
+    assert session.session.is_switched_off
 
 
 def test_without_a_switch_nothing_is_switched_off() -> None:

@@ -109,7 +109,7 @@ def test_a_playlist_in_place_of_a_video_is_not_followed(
         "concat": f"ffconcat version 1.0\nfile {url}\n",
     }[kind]
     (tmp_path / "camera.mp4").write_text(text)
-    with pytest.raises(DatasetError, match="not a readable video"):
+    with pytest.raises(DatasetError, match="cannot be read"):
         list(decode_video(tmp_path / "camera.mp4"))
 
 

@@ -68,20 +68,20 @@ def test_a_key_that_could_not_begin_is_not_remembered() -> None:
 def test_a_switch_records_while_it_is_high() -> None:
     session = Session(has_switch=True)
     assert session.step(switch_us=LOW) == []
-    assert session.step(switch_us=MIDDLE, times=2) == []
+    assert session.step(switch_us=MIDDLE, times=5) == []
     assert session.step(switch_us=HIGH, times=5) == ["begin"]
     assert session.step(switch_us=MIDDLE, times=3) == ["end"], "passing through the middle"
     assert session.step(switch_us=LOW, times=20) == []
-    assert session.step(switch_us=HIGH) == ["begin"]
+    assert session.step(switch_us=HIGH, times=5) == ["begin"]
     assert session.step(switch_us=LOW) == ["end"]
 
 
 def test_the_middle_of_the_switch_marks_as_bad() -> None:
     session = Session(has_switch=True)
-    session.step(switch_us=LOW)
-    assert session.step(switch_us=HIGH) == ["begin"]
+    session.step(switch_us=LOW, times=5)
+    assert session.step(switch_us=HIGH, times=5) == ["begin"]
     assert session.step(switch_us=MIDDLE, times=20) == ["end", "bad"]
-    assert session.step(switch_us=HIGH) == ["begin"], "the next one"
+    assert session.step(switch_us=HIGH, times=5) == ["begin"], "the next one"
     assert session.step(switch_us=LOW) == ["end"]
     assert session.step(switch_us=MIDDLE, times=20) == [], "it did not come from high"
 
@@ -89,11 +89,33 @@ def test_the_middle_of_the_switch_marks_as_bad() -> None:
 def test_a_switch_that_is_high_already_begins_nothing_nor_does_a_lost_radio_end() -> None:
     session = Session(has_switch=True)
     assert session.step(switch_us=HIGH, times=5) == []
-    session.step(switch_us=LOW)
-    assert session.step(switch_us=HIGH) == ["begin"]
+    session.step(switch_us=LOW, times=5)
+    assert session.step(switch_us=HIGH, times=5) == ["begin"]
     assert session.step(switch_us=0, times=20) == []
     assert session.step(switch_us=HIGH) == []
     assert session.step(switch_us=LOW) == ["end"]
+
+
+@pytest.mark.parametrize(
+    ("before", "between", "times"),
+    [
+        (LOW, (65535, 2201, 32767), 40),  # nobody drives the channel
+        (LOW, (HIGH, LOW), 40),  # a contact that bounces
+        (HIGH, (LOW, LOW, LOW), 1),  # a dropout shorter than the debounce
+        (LOW, (0,) * 11 + (HIGH,) * 20, 1),  # a radio that was away in between
+    ],
+)
+def test_what_is_no_hand_begins_no_episode(
+    before: int, between: tuple[int, ...], times: int
+) -> None:
+    session = Session(has_switch=True)
+    session.step(switch_us=before, times=20)
+    done = [act for us in between * times for act in session.step(switch_us=us)]
+    if before == HIGH:
+        done += session.step(switch_us=HIGH, times=20)
+    assert done == []
+    session.step(switch_us=LOW, times=5)
+    assert session.step(switch_us=HIGH, times=5) == ["begin"]
 
 
 def test_armed_is_recording_and_a_second_longer() -> None:
@@ -110,7 +132,7 @@ def test_armed_is_recording_and_a_second_longer() -> None:
 @pytest.mark.parametrize("switch", [True, False])
 def test_what_could_not_begin_begins_when_it_can_for_as_long_as_it_is_wanted(switch: bool) -> None:
     session = Session(has_switch=switch, on_arm=not switch)
-    session.step(switch_us=LOW)
+    session.step(switch_us=LOW, times=5)
     session.may_begin = False
     assert session.step(switch_us=HIGH, armed=True, times=5) == []
     session.may_begin = True

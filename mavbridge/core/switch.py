@@ -1,0 +1,69 @@
+"""Readings of a receiver's channels, and the switches among them."""
+
+from typing import Literal, TypeAlias
+
+from mavbridge.core.clock import NS_PER_MS
+
+RADIO_US = range(800, 2201)
+"""Readings of a radio. Any other number (0, 65535) is a channel that nobody drives: no reading."""
+ON_US, OFF_US = 1800, 1200
+"""ArduPilot's thresholds of a high and of a low switch."""
+DWELL_NS = 200 * NS_PER_MS
+"""Debounce, as in ArduPilot."""
+GAP_NS = 500 * NS_PER_MS
+"""Longest pause between two readings: 10 at 20 Hz, the slowest rate that is asked for."""
+
+Position: TypeAlias = Literal["low", "middle", "high"]
+
+
+class Switch:
+    """A switch, debounced by the arrivals of its readings.
+
+    Going high is an act only after a rest: a receiver that drops out and comes back moves its
+    channels as a hand would.
+    """
+
+    def __init__(self, *, rest_ns: int = DWELL_NS, rests: tuple[Position, ...] = ("low",)) -> None:
+        """``rest_ns``: least time in a position of ``rests`` before the act of going high again.
+
+        The debounce is enough for one that was never high: no dropout is behind it.
+        """
+        self._again_ns, self._rests = rest_ns, rests
+        self._rest_ns = DWELL_NS
+        self._has_rested = False
+        self._since_ns = 0
+        self._newest_ns: int | None = None
+        self.position: Position | None = None
+        """By the newest reading; None before the first and once the receiver is lost."""
+        self.is_off = False
+        """It was low, and has not been high for the dwell since."""
+        self.is_on = False
+        """It was high for the dwell, and has not been low since."""
+
+    def read(self, value_us: int, arrived_ns: int) -> bool:
+        """Take a reading, or the same one again; True at the act of going high."""
+        if value_us not in RADIO_US:
+            return False
+        if self._newest_ns is not None and arrived_ns - self._newest_ns > GAP_NS:
+            self.forget()
+        position: Position = (
+            "high" if value_us > ON_US else "low" if value_us < OFF_US else "middle"
+        )
+        if position != self.position:
+            self.position, self._since_ns = position, arrived_ns
+        self._newest_ns = arrived_ns
+        held_ns = arrived_ns - self._since_ns
+        if position == "low":
+            self.is_off, self.is_on = True, False
+        if position in self._rests:
+            self._has_rested |= held_ns >= self._rest_ns
+        elif position == "high" and held_ns >= DWELL_NS:
+            self._rest_ns = self._again_ns
+            self.is_off, self.is_on = False, True
+            is_act, self._has_rested = self._has_rested, False
+            return is_act
+        return False
+
+    def forget(self) -> None:
+        """The receiver is lost: no rest from before counts."""
+        self.position, self._has_rested, self._rest_ns = None, False, self._again_ns

@@ -1,0 +1,154 @@
+"""Ten seconds after every ending, with every receiver: no vehicle in the air is left to fall."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import pytest
+
+from helpers.gate_flights import NAN, GateFlight, climbing_first, leaning
+from helpers.output_flights import OutputFlight
+from mavbridge.gate.engagement import Phase
+from sitl.vehicle.config import IDLE_RECEIVER_US
+
+AFTER_S = 10.0
+MOST_IMPACT_MPS = 1.0
+"""Both firmwares touch down at 0.5 to 0.7 m/s (LAND_SPEED, MPC_LAND_SPEED)."""
+MOST_LOST_M = 2.0
+"""BRAKE stops within 1.8 m from 2.5 m/s of descent under an idle throttle, the worst that a silence
+can leave."""
+MOST_SINK_MPS = 1.6
+"""A landing from a height: 1.5 m/s (WPNAV_SPEED_DN, MPC_Z_V_AUTO_DN)."""
+LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
+
+
+class Ending(NamedTuple):
+    """A way in which a flight ends by our own doing."""
+
+    act: Callable[[GateFlight], object]
+    settings: dict[str, Any] = {}  # noqa: RUF012
+
+
+def cut(seconds: float) -> Callable[[GateFlight], None]:
+    """Nothing passes either way for a while."""
+
+    def act(flight: GateFlight) -> None:
+        flight.up.is_silent = flight.down.is_silent = True
+        flight.run(seconds)
+        flight.up.is_silent = flight.down.is_silent = False
+
+    return act
+
+
+def deaf(flight: GateFlight) -> None:
+    """Nothing of ours arrives for a while; the vehicle is heard."""
+    flight.up.is_silent = True
+    flight.run(4.0)
+    flight.up.is_silent = False
+
+
+def hang(flight: GateFlight) -> None:
+    flight.is_flight_process_stopped = True
+    flight.run(0.5)
+    flight.is_flight_process_stopped = False
+
+
+def fault(flight: GateFlight) -> None:
+    flight.stop("the camera is gone", is_fault=True)
+
+
+def not_a_number(flight: GateFlight) -> None:
+    if isinstance(flight, OutputFlight):
+        flight.return_nan()
+    else:
+        flight.policy = lambda _: NAN
+
+
+ENDINGS = {
+    "death": Ending(GateFlight.die),
+    "hang": Ending(hang),
+    "NaN": Ending(not_a_number),
+    "end": Ending(GateFlight.stop),
+    "end, release": Ending(GateFlight.stop, {"then": "release"}),
+    "key": Ending(lambda flight: flight.act("release")),
+    "fault, release": Ending(fault, {"on_fault": "release"}),
+    "cut 1.5 s": Ending(cut(1.5)),
+    "cut 3.5 s": Ending(cut(3.5)),
+    "deaf 4 s": Ending(deaf),
+    "standstill 1.5 s": Ending(lambda flight: flight.stand_still(1.5)),
+    "standstill 4 s": Ending(lambda flight: flight.stand_still(4.0)),
+}
+OUTAGES = {name for name in ENDINGS if name.endswith(" s")}
+
+
+def in_the_air(receiver: str, settings: dict[str, Any]) -> GateFlight:
+    """The policy flies ArduPilot in ALT_HOLD, over a receiver whose throttle rests so."""
+    if receiver == "absent":
+        flight = GateFlight(climbing_first, receiver_us=None, arm=True, **settings)
+        return flight.take_off(5.0)
+    flight = GateFlight(leaning, **settings).launch()
+    if receiver == "idle":
+        flight.receiver(ch3=IDLE_RECEIVER_US[2])
+        flight.run(0.2)
+    flight.act("engage")
+    flight.run(1.2)
+    assert flight.phase is Phase.FLYING, flight.describe()
+    return flight
+
+
+def judge(flight: GateFlight, ending: Ending) -> list[str]:
+    """Bring the flight to its end, and judge the ten seconds after it; returns the later modes."""
+    before = len(flight.modes)
+    ending.act(flight)
+    start_m = lowest_m = flight.height_m
+    sink_mps = 0.0
+    for _ in range(round(AFTER_S / 0.05)):
+        flight.run(0.05)
+        lowest_m = min(lowest_m, flight.height_m)
+        if start_m - lowest_m > MOST_LOST_M:
+            sink_mps = max(sink_mps, flight.ap.truth.velocity_ned_mps[2])
+    modes = flight.modes[before:]
+    impact_mps = flight.vehicle.log.summary(flight.vehicle.ap, 0)["impact_speed_mps"]
+    assert impact_mps <= MOST_IMPACT_MPS, (modes, flight.describe())
+    if not modes or modes[-1] not in LANDINGS:
+        assert start_m - lowest_m <= MOST_LOST_M, (modes, flight.describe())
+    assert sink_mps <= MOST_SINK_MPS, (modes, flight.describe())
+    assert flight.phase is not Phase.FLYING
+    return modes
+
+
+@pytest.mark.parametrize("receiver", ["idle", "middle", "absent"])
+@pytest.mark.parametrize("name", ENDINGS)
+def test_after_an_ending_ardupilot_holds_or_lands(name: str, receiver: str) -> None:
+    ending = ENDINGS[name]
+    modes = judge(in_the_air(receiver, ending.settings), ending)
+    is_end = name in ("end", "end, release", "key")
+    if name in OUTAGES and receiver == "absent":
+        assert modes == ["RTL"], "its own failsafe is its way out, and stays"
+    elif receiver == "middle" and name not in OUTAGES:
+        assert modes == [], "the hand holds it in the mode of the flight"
+    elif receiver != "middle":
+        assert modes == (["LAND"] if is_end else ["BRAKE"])
+
+
+@pytest.mark.parametrize("name", ENDINGS)
+def test_after_an_ending_px4_holds_or_lands(name: str) -> None:
+    ending = ENDINGS[name]
+    modes = judge(OutputFlight("px4", "sticks", **ending.settings).fly(1.2), ending)
+    if name in OUTAGES:
+        assert modes[:1] == ["AUTO.LOITER"], "its own failsafe"
+        assert set(modes) <= {"AUTO.LOITER", "AUTO.RTL"}
+    else:
+        is_end = name in ("end", "end, release", "key")
+        assert modes == (["AUTO.LAND"] if is_end else ["AUTO.LOITER"])
+
+
+@pytest.mark.parametrize("receiver", [None, IDLE_RECEIVER_US])
+@pytest.mark.parametrize("name", ["death", "end", "cut 1.5 s"])
+def test_after_an_ending_px4_does_so_by_setpoints_too(
+    name: str, receiver: tuple[int, ...] | None
+) -> None:
+    ending = ENDINGS[name]
+    flight = OutputFlight("px4", "velocity", receiver_us=receiver).fly(1.2)
+    modes = judge(flight, ending)
+    assert modes
+    assert modes[-1] in ("AUTO.LOITER", "AUTO.LAND", "AUTO.RTL", "POSCTL")
