@@ -320,6 +320,7 @@ class _Flight:
             reason=self._bridge.view.reason,
             readonly=self._config.link.readonly,
             crash=self._observers.referee.crash,
+            record=self._config.record,
         )
         if text is not None:
             self._observers.screen.show_message(text)

@@ -2,7 +2,9 @@
 
 import logging
 import math
+import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
@@ -142,6 +144,7 @@ def flight_verdict(
     reason: str,
     readonly: bool,
     crash: str | None = None,
+    record: Path | None = None,
 ) -> Verdict:
     """Judge a flight that ended without an exception.
 
@@ -151,13 +154,16 @@ def flight_verdict(
         reason: why the policy does not fly now, from the last tick.
         readonly: nothing was sent, so there was nothing to fly.
         crash: how the vehicle hit something since the policy's first action, in words.
+        record: folder of the recording, if there is one.
     """
     interrupted = None if stop.signal_number is None else 128 + stop.signal_number
     if summary is None:
         return Verdict(interrupted or ExitCode.NOT_FLOWN)
     outcome = summary.outcome
     if outcome.faults:
-        return Verdict(ExitCode.FAULT, "the policy's flight was ended by a fault")
+        shown = f"; see it with: mavbridge inspect {shlex.quote(str(record))}" if record else ""
+        fault = f"the policy's flight was ended by a fault: {outcome.fault}{shown}"
+        return Verdict(ExitCode.FAULT, fault)
     if crash is not None and not readonly:
         return Verdict(ExitCode.CRASHED, f"the vehicle has crashed: {crash}")
     if readonly and outcome.flights:

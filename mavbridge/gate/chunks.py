@@ -2,8 +2,9 @@
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind
@@ -94,6 +95,47 @@ class Chunk(NamedTuple):
         return type(first)(*[(1.0 - weight) * a + weight * b for a, b in pairs])
 
 
+_Input: TypeAlias = Literal["attitude", "velocity", "image", "chunk", "horizon"]
+Place: TypeAlias = Literal["computer", "gate", "flight process", "solve", "link", "camera"]
+
+
+class Lateness(NamedTuple):
+    """The input that became too old to fly by, and where its time went."""
+
+    name: _Input
+    """chunk: none came for the grace. horizon: the last one ended before."""
+    age_ns: int
+    limit_ns: int
+    place: Place
+    stall_ns: int
+    """Time that was spent there."""
+    said: str = ""
+    """Why the flight process computed no chunk, in its own words."""
+
+    @property
+    def text(self) -> str:
+        """One sentence for the user."""
+        age_ms, limit_ms, stall_ms = (
+            round(ns / NS_PER_MS) for ns in (self.age_ns, self.limit_ns, self.stall_ns)
+        )
+        what, limit = self.name, f"limit {limit_ms} ms"
+        if what == "horizon":
+            what, limit = "chunk", f"its horizon ends after {limit_ms} ms"
+        spent: dict[Place, str] = {
+            "computer": "the computer stood still for",
+            "gate": "the gate stood still for",
+            "flight process": "the flight process stood still, or solved, for",
+            "solve": "the solve took",
+            "link": f"the link delivered no {what} for",
+            "camera": "the camera delivered nothing for",
+        }
+        where = f": {spent[self.place]} {stall_ms} ms"
+        if self.said and self.place == "flight process":
+            where = ""  # it speaks
+        said = f"{self.said}; " if self.said else ""
+        return f"{said}{what} {age_ms} ms old ({limit}){where}"
+
+
 class ChunkBuffer:
     """Holds the newest chunk that may be flown, and judges it at every send.
 
@@ -119,7 +161,13 @@ class ChunkBuffer:
         """What was wrong with the last malformed chunk."""
         self._refusal: str | None = None
         """Why the newest chunk was not taken; None if it was."""
+        self._is_stale = False
+        """It was refused for its age."""
         self.newest: Chunk | None = None
+        self._seen: Chunk | None = None
+        """The newest well-formed chunk, taken or not."""
+        self._word_ns = 0
+        """When the flight process last sent anything."""
         self._taken_ns = 0
         self._end_ns = 0
         """End of the horizon of the newest chunk."""
@@ -140,6 +188,7 @@ class ChunkBuffer:
         """Take a chunk if it may be flown; returns whether it was taken."""
         if self.newest is not None and chunk.serial <= self.newest.serial:
             return False
+        self._word_ns, self._is_stale = now_ns, False
         if (malformation := self._malformed(chunk)) is not None:
             self._refused_ns.append(now_ns)
             self._malformation = malformation
@@ -147,12 +196,14 @@ class ChunkBuffer:
             return False
         self._solve_ns = chunk.computed_ns - chunk.attitude_ns
         self._slow = self._slow + 1 if self._solve_ns > self._limits.state_ns else 0
-        end_ns = self._horizon_end_ns(chunk, now_ns)
+        end_ns, self._seen = self._horizon_end_ns(chunk, now_ns), chunk
         staleness = self._stale(chunk, now_ns)
+        is_stale = staleness is not None
         if staleness is None and now_ns > end_ns:
             staleness = f"the chunk came after its horizon{self._horizon(chunk)} had ended"
         if staleness is not None:
             self.explain_absence(staleness, now_ns)
+            self._is_stale = is_stale
             return False
         self._refusal = None
         if self.newest is not None:
@@ -186,7 +237,7 @@ class ChunkBuffer:
 
     def explain_absence(self, reason: str, now_ns: int) -> None:
         """Note why there is no chunk; whoever says so does not stall, and has the grace alone."""
-        self._refusal = reason
+        self._refusal, self._is_stale, self._word_ns = reason, False, now_ns
         graced_ns = max(self._grace_until_ns, now_ns - self._period_ns + self.grace_ns)
         self._until_ns = min(self._until_ns, graced_ns)
 
@@ -238,11 +289,45 @@ class ChunkBuffer:
         """Why the flight must end now, or None: the grace is over, or too much was malformed."""
         if (flood := self._malformed_lately(now_ns)) is not None:
             return flood
-        if self.newest is None or now_ns > self._until_ns:
-            bridged_ms = (self._until_ns - self._taken_ns) // NS_PER_MS
-            late = f"no chunk of the policy that may be flown for {bridged_ms} ms"
-            return late if self._refusal is None else f"{late}: {self._refusal}"
-        return None
+        late = self.lateness(now_ns)
+        return None if late is None else late.text
+
+    def is_over(self, now_ns: int) -> bool:
+        """True if the grace has ended."""
+        return self.newest is None or now_ns > self._until_ns
+
+    def lateness(
+        self, now_ns: int, *, stood_ns: int = 0, heard_ns: Mapping[str, int] | None = None
+    ) -> Lateness | None:
+        """The input that ended the grace, or None while it lasts.
+
+        Args:
+            now_ns: the moment.
+            stood_ns: time for which the gate had not looked at anything until now.
+            heard_ns: arrival of the vehicle's newest attitude and velocity, by these names.
+        """
+        if not self.is_over(now_ns):
+            return None
+        said = "" if self._is_stale else self._refusal or ""
+        silent_ns = now_ns - self._word_ns
+        if self._seen is None:
+            return Lateness("chunk", silent_ns, self.grace_ns, "flight process", silent_ns, said)
+        name, happened_ns, limit_ns = min(self._ages(self._seen), key=lambda age: age[1] + age[2])
+        is_stall = self._until_ns > self._grace_until_ns  # which the ages may outgrow
+        if is_stall or now_ns <= happened_ns + limit_ns:
+            is_over = now_ns > self._end_ns
+            name, happened_ns = "horizon" if is_over else "chunk", self._taken_ns
+            limit_ns = (self._end_ns if is_over else self._until_ns) - self._taken_ns
+        spent: dict[Place, int] = {
+            "flight process": silent_ns,
+            "solve": self._solve_ns,
+            "link": now_ns - (heard_ns or {}).get(name, now_ns),
+            "camera": self._word_ns - happened_ns if name == "image" else 0,
+        }
+        place = max(spent, key=lambda each: spent[each])
+        if 2 * stood_ns >= spent[place]:
+            place, spent["computer"] = "computer", stood_ns
+        return Lateness(name, now_ns - happened_ns, limit_ns, place, spent[place], said)
 
     def _malformed_lately(self, now_ns: int) -> str | None:
         window_ns = max(REFUSED_WINDOW_NS, REFUSED_WINDOW_PERIODS * self._period_ns)
@@ -282,7 +367,7 @@ class ChunkBuffer:
             return None
         return self.newest.action_at(now_ns + lead_ns)
 
-    def _ages(self, chunk: Chunk) -> tuple[tuple[str, int, int], ...]:
+    def _ages(self, chunk: Chunk) -> tuple[tuple[_Input, int, int], ...]:
         """What a chunk came from, when that happened, and how old it may be."""
         limits = self._limits
         return (

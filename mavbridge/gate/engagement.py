@@ -335,7 +335,8 @@ class Engagement:
         return Move(hand=Hand.POLICY)
 
     def _fail(self, facts: Facts, ending: Ending) -> Move:
-        self.outcome = self.outcome._replace(faults=self.outcome.faults + 1)
+        faults = self.outcome.faults + 1
+        self.outcome = self.outcome._replace(faults=faults, fault=ending.reason)
         return self._depart(facts, ending)
 
     def _is_over(self, facts: Facts) -> bool:

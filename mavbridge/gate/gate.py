@@ -20,7 +20,7 @@ from mavbridge.core.vehicle import (
     Release,
     Sticks,
 )
-from mavbridge.gate.chunks import Chunk, ChunkBuffer, FreshnessLimits
+from mavbridge.gate.chunks import Chunk, ChunkBuffer, FreshnessLimits, Lateness
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
 from mavbridge.gate.envelope import Envelope, EnvelopeInput, EnvelopeLimits
@@ -156,14 +156,15 @@ class Gate:
     def step(self, now_ns: int, given: GateInput) -> GateOutput:
         """Advance to this moment."""
         # Judged before the news: a gate that stood still itself has let the grace run out.
-        overdue = self._chunks.fault(now_ns)
+        stood_ns, self._stepped_ns = now_ns - self._stepped_ns, now_ns
+        overdue = self._overdue(now_ns, stood_ns, given)
         has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
         if given.absence is not None:
             self._chunks.explain_absence(given.absence, now_ns)
         if given.stop is not None:
             self._engagement.stop(given.stop)
         phase_before = self._engagement.phase
-        silence = self._silence(now_ns, given.link.telemetry.ned_from_body_wxyz)
+        silence = self._silence(now_ns, stood_ns, given.link.telemetry.ned_from_body_wxyz)
         facts = self._facts_seen = self._facts(now_ns, given, overdue or silence)
         move = self._engagement.step(facts, given.act)
         self._change_hand(move.hand, now_ns, given.link)
@@ -191,19 +192,47 @@ class Gate:
             messages=self._take_messages(),
         )
 
-    def _silence(self, now_ns: int, attitude: Reading | None) -> str | None:
+    def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> str | None:
         """Why the flight must end now, or None: a plan bridges a stall of ours, not a dead link."""
-        if now_ns - self._stepped_ns > STOOD_STILL_NS:
+        if stood_ns > STOOD_STILL_NS:
             self._heard_ns = now_ns
-        self._stepped_ns = now_ns
-        silent_ns = self._chunks.grace_ns
-        if attitude is None or now_ns - max(self._heard_ns, attitude.arrived_ns) <= silent_ns:
+        limit_ns = self._chunks.grace_ns
+        if attitude is None or now_ns - max(self._heard_ns, attitude.arrived_ns) <= limit_ns:
             return None
-        return f"no attitude from the vehicle for {silent_ns // NS_PER_MS} ms"
+        age_ns = now_ns - attitude.arrived_ns
+        return Lateness("attitude", age_ns, limit_ns, "link", age_ns).text
+
+    def _overdue(self, now_ns: int, stood_ns: int, given: GateInput) -> str | None:
+        """Which input of the policy's flight is too late, or None."""
+        if self._engagement.phase is not Phase.FLYING or not self._chunks.is_over(now_ns):
+            return None
+        seen = given.link.telemetry
+        readings = {
+            "attitude": (seen.ned_from_body_wxyz, seen.rate_body_radps),
+            "velocity": (seen.velocity_ned_mps, seen.specific_force_body_mps2),
+        }
+        late = self._chunks.lateness(
+            now_ns,
+            stood_ns=stood_ns,
+            heard_ns={
+                name: min(reading.arrived_ns for reading in pair if reading is not None)
+                for name, pair in readings.items()
+                if any(pair)
+            },
+        )
+        if late is None:
+            return None
+        # A chunk from the middle of the time shows that the rest of the computer ran.
+        middle_ns, chunk = now_ns - stood_ns // 2, given.chunk
+        if late.place == "computer" and chunk is not None and chunk.computed_ns > middle_ns:
+            late = late._replace(place="gate")
+        return late.text
 
     def _facts(self, now_ns: int, given: GateInput, overdue: str | None) -> Facts:
-        link, left = given.link, None
+        link, left, chunk_fault = given.link, None, given.command_fault or overdue
         status = link.status
+        if chunk_fault is None and self._engagement.phase is Phase.FLYING:
+            chunk_fault = self._chunks.fault(now_ns)
         if status is not None:
             left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
         return Facts(
@@ -232,7 +261,7 @@ class Gate:
             shows_last=link.shows_last,
             refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns),
-            chunk_fault=given.command_fault or overdue or self._chunks.fault(now_ns),
+            chunk_fault=chunk_fault,
             command_failed=given.command_fault is not None,
             are_sticks_at_rest=link.are_sticks_at_rest,
             stick_override_ns=status.stick_override_ns if status else None,

@@ -18,3 +18,5 @@ class Outcome(NamedTuple):
     """The last one ended because the vehicle was disarmed, by itself or by somebody."""
     end: FlightEnd | None = None
     """How the last one ended; None before that."""
+    fault: str = ""
+    """The last of those faults."""

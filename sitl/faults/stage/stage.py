@@ -26,7 +26,7 @@ TIMEOUT_S = 90.0
 STARTS = 3
 LEANING = 100
 """Steering messages that lean, in a row: the policy holds its lean."""
-STALLED = ("no attitude from the vehicle", "no chunk of the policy that may be flown")
+STALLED = ("delivered no attitude", "stood still")
 ORDERLY = (0, 4)
 """Exit statuses of a flight that ended in order; 4: a busy machine made the gate end it before."""
 MARK = "SITL_FAULT_MARK"

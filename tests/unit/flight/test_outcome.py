@@ -1,6 +1,7 @@
 """What a script and a person are told about a flight."""
 
 import signal
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,14 @@ def test_the_status_says_what_a_script_needs(
     assert verdict.exit_code == status
     assert (told or "") in (verdict.text or "")
     assert (told is None) == (verdict.text is None)
+
+
+@pytest.mark.parametrize("record", [None, Path("flights/a b")])
+def test_a_fault_is_told_with_its_cause_and_the_command_that_shows_it(record: Path | None) -> None:
+    words = summary(FLOWN._replace(faults=1, fault="attitude 104 ms old (limit 100 ms)"))
+    told = flight_verdict(words, stopped(None), reason="", readonly=False, record=record).text
+    end = "" if record is None else "; see it with: mavbridge inspect 'flights/a b'"
+    assert (told or "").endswith(f": attitude 104 ms old (limit 100 ms){end}")
 
 
 def test_a_flight_that_sends_nothing_needs_no_air() -> None:

@@ -374,7 +374,8 @@ def test_no_flight_begins_beyond_any_limit_of_age(age: str, name: str, limit_ms:
 
 
 def test_where_there_never_was_a_chunk_there_is_a_fault_and_no_action() -> None:
-    assert buffer().fault(0) == "no chunk of the policy that may be flown for 0 ms"
+    assert buffer().lateness(0) == ("chunk", 0, 100 * MS, "flight process", 0, "")
+    assert buffer().fault(0) is not None
     assert buffer().action_at(0) is None
 
 
@@ -444,7 +445,7 @@ def test_stale_chunks_that_keep_coming_do_not_prolong_the_grace() -> None:
     held.offer(chunk(1, 1000), 1000 * MS)
     for serial, now_ms in enumerate(range(1010, 1110, 10), start=2):
         assert not held.offer(chunk(serial, now_ms, image_ns=600 * MS), now_ms * MS)
-    assert "the image is 500 ms old" in (held.fault(1101 * MS) or "")
+    assert held.lateness(1101 * MS) == (*("image", 501 * MS, 300 * MS, "camera", 500 * MS, ""),)
 
 
 @pytest.mark.parametrize(
@@ -499,3 +500,74 @@ def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:
     held.offer(chunk(1, 1000), 1000 * MS)
     held.explain_absence("the image has been frozen for 0.6 s", 1010 * MS)
     assert "frozen" in (held.fault(1200 * MS) or "")
+
+
+# --- what a fault names
+
+
+def test_a_silent_flight_process_is_named_with_the_input_that_ran_out_first() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert held.lateness(1100 * MS) is None
+    late = held.lateness(1104 * MS)
+    assert late == ("attitude", 109 * MS, 100 * MS, "flight process", 104 * MS, "")
+    assert held.fault(1104 * MS) == (
+        "attitude 109 ms old (limit 100 ms): the flight process stood still, or solved, for 104 ms"
+    )
+
+
+def test_a_gate_that_did_not_look_names_the_computer() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    late = held.lateness(1131 * MS, stood_ns=131 * MS)
+    assert late == ("attitude", 136 * MS, 100 * MS, "computer", 131 * MS, "")
+    late = held.lateness(1131 * MS, stood_ns=10 * MS)
+    assert late is not None
+    assert late.place == "flight process"
+
+
+@pytest.mark.parametrize("name", ["attitude", "velocity"])
+def test_a_link_that_delivers_nothing_is_named_although_the_flight_process_speaks(
+    name: str,
+) -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000, velocity_ns=(995 if name == "attitude" else 760) * MS), 1000 * MS)
+    held.explain_absence(f"no {name} from the vehicle", 1090 * MS)
+    late = held.lateness(1110 * MS, heard_ns={"attitude": 1100 * MS, name: 960 * MS})
+    assert late is not None
+    assert late[3:] == ("link", 150 * MS, f"no {name} from the vehicle")
+    assert (late.name, late.limit_ns) == (name, (100 if name == "attitude" else 250) * MS)
+    assert late.text.endswith(f": the link delivered no {name} for 150 ms")
+
+
+def test_a_camera_that_delivers_nothing_is_named() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000, image_ns=710 * MS), 1000 * MS)
+    held.explain_absence("the image feature is older than 300 ms", 1100 * MS)
+    late = held.lateness(1104 * MS, stood_ns=10 * MS)
+    assert late is not None
+    assert late[:5] == ("image", 394 * MS, 300 * MS, "camera", 390 * MS)
+
+
+def test_a_solve_that_took_too_long_is_named() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    held.offer(chunk(2, 1090, attitude_ns=940 * MS), 1090 * MS)
+    assert held.lateness(1104 * MS) == ("attitude", 164 * MS, 100 * MS, "solve", 150 * MS, "")
+
+
+def test_what_the_flight_process_says_comes_first() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    held.explain_absence("the policy's server is gone", 1050 * MS)
+    told = held.fault(1104 * MS)
+    assert told == "the policy's server is gone; attitude 109 ms old (limit 100 ms)"
+
+
+def test_a_grace_that_ends_within_all_limits_names_the_chunk_or_its_horizon() -> None:
+    held = buffer(10, LIMITS.while_played(NS_PER_S))
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert (held.lateness(1101 * MS) or ())[:3] == ("chunk", 101 * MS, 100 * MS)
+    held = buffer(100, LIMITS.while_played(NS_PER_S))
+    held.offer(chunk(1, 1000, actions=(NEUTRAL,) * 2), 1000 * MS)
+    assert (held.lateness(1196 * MS) or ())[:3] == ("horizon", 196 * MS, 95 * MS)

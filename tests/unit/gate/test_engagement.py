@@ -458,8 +458,11 @@ def test_a_flight_in_order_is_told_so() -> None:
 @pytest.mark.parametrize(
     ("changes", "ended"),
     [
-        ({"chunk_fault": "no chunk for 100 ms"}, {"faults": 1, "end": "fault"}),
-        ({"link_problem": "lost"}, {"faults": 1, "end": "fault"}),
+        (
+            {"chunk_fault": "attitude too old"},
+            {"faults": 1, "end": "fault", "fault": "attitude too old"},
+        ),
+        ({"link_problem": "lost"}, {"faults": 1, "end": "fault", "fault": "lost"}),
         ({"armed": False}, {"is_disarmed": True, "end": "disarmed"}),
         ({"mode": "LOITER"}, {"end": "takeover"}),  # the pilot has taken over, and goes on
         ({"landing": "the vehicle has landed"}, {"end": "landed"}),

@@ -294,7 +294,7 @@ def test_a_chunk_is_the_end_of_the_reason_for_there_being_none() -> None:
     rig.tell(Absence("the image was black"), rig.chunk())
     rig.run(0.2)
     assert rig.ticks[-1].phase is not Phase.FLYING
-    assert "no chunk" in rig.ticks[-1].reason
+    assert "chunk 110 ms old (limit 100 ms)" in rig.ticks[-1].reason
     assert "black" not in rig.ticks[-1].reason
 
 
