@@ -4,6 +4,7 @@ import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from itertools import groupby
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
@@ -146,14 +147,18 @@ class VehicleView:
 
     def _receive_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
         before_ns = self.attitude_ns
-        for arrived_ns, happened_ns, data in packets:
-            for message in self._codec.decode_datagram(data):
-                if isinstance(message.body, Measurement):
-                    self._telemetry.receive(message.body, arrived_ns, happened_ns)
-                    if isinstance(message.body, LocalVelocity) and message.body.position_ned_m:
-                        self.height_m = -message.body.position_ned_m[2]
+        for _, datagram in groupby(packets, key=lambda packet: packet.arrived_ns):
+            known_ns = self.attitude_ns
+            for arrived_ns, happened_ns, data in datagram:
+                for message in self._codec.decode_datagram(data):
+                    if isinstance(message.body, Measurement):
+                        self._telemetry.receive(message.body, arrived_ns, happened_ns)
+                        if isinstance(message.body, LocalVelocity) and message.body.position_ned_m:
+                            self.height_m = -message.body.position_ned_m[2]
+            # After each datagram: which of them came in one batch is not in a recording.
+            if self.attitude_ns != known_ns:
+                self._on_attitude()
         if self.attitude_ns != before_ns:
-            self._on_attitude()
             with self._news:
                 self._news.notify_all()
         self._watch_packets(packets)

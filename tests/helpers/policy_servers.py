@@ -12,9 +12,11 @@ from websockets.exceptions import ConnectionClosed
 
 from mavbridge.commands.serve.answers import AnswerLoop
 from mavbridge.commands.serve.server import PolicyServer
-from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.workers import Worker
+from policy.errors import PolicyError
 from policy.foreign.websocket.messages import Message, pack, unpack
+from policy.loading.request import LoadedPolicy
 from policy.protocol import Executable
 
 Reply = bytes | str | tuple[bytes, ...] | None
@@ -124,3 +126,14 @@ class Gate:
         number = self.requests
         assert self.is_open.wait(START_S)
         return chunk_of(number)
+
+
+def when_it_listens(connect: Callable[[], LoadedPolicy]) -> LoadedPolicy:
+    """Connect to a server that is starting; it refuses connections until it listens."""
+    clock = MonotonicClock()
+    until_ns = clock.now_ns() + 30 * NS_PER_S
+    while clock.now_ns() < until_ns:
+        with suppress(PolicyError):
+            return connect()
+        clock.sleep_until_ns(clock.now_ns() + NS_PER_S // 10)
+    return connect()

@@ -2,18 +2,15 @@
 
 import math
 import sys
-from collections.abc import Callable
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from helpers.policy_servers import when_it_listens
 from mavbridge.core.processes import free_port, running
 from mavbridge.core.records import Event, Tick
 from mavbridge.simulation.flight import SimulatedFlight
-from policy.errors import PolicyError
 from policy.loading.load import load_policy
 from policy.loading.request import LoadedPolicy, PolicyRequest
 from sitl.vehicle.dynamics import BodyState
@@ -94,14 +91,3 @@ def test_the_server_policy_climbs_and_turns(tmp_path: Path) -> None:
         states = fly(when_it_listens(lambda: load(f"ws://127.0.0.1:{port}")))
     assert_holds_3_m(states)
     assert turned_deg(states) > 20
-
-
-def when_it_listens(connect: Callable[[], LoadedPolicy]) -> LoadedPolicy:
-    """Connect to a server that is starting; it refuses connections until it listens."""
-    clock = MonotonicClock()
-    until_ns = clock.now_ns() + 30 * NS_PER_S
-    while clock.now_ns() < until_ns:
-        with suppress(PolicyError):
-            return connect()
-        clock.sleep_until_ns(clock.now_ns() + NS_PER_S // 10)
-    return connect()

@@ -15,6 +15,9 @@ from mavbridge.simulation.replay.policy import SolvePair
 Array: TypeAlias = NDArray[np.float64]
 STAGES = ("raw", "clipped", "slewed", "smoothed")
 INPUTS = ("state", "stamps", "states", "history", "images", "elapsed")
+PAST_INPUTS = ("states", "history")
+"""Given to a policy of the same contract as they were recorded. Those that are built again may be
+others where a solve without a chunk, or a tick on its way, is not in the recording."""
 
 
 @dataclass(frozen=True, kw_only=True)

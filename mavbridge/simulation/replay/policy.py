@@ -2,9 +2,12 @@
 
 ``VehicleView``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and ``PolicyLoop`` run as
 in the flight, composed by ``build_bridge``. Taken from the recording: when each solve began and
-ended; what had reached the flight process by then (the stamps of the state and the newest image
-tell it); when packets arrived and what moment they tell about; and which sticks had been sent.
-Solves that returned no chunk are not in a recording, and are not repeated.
+ended; what had reached the flight process by then (the state, its stamps and the newest image tell
+it); when packets arrived and what moment they tell about; and which sticks had been sent. Solves
+that returned no chunk are not in a recording, and are not repeated.
+
+A policy of the recorded contract computes from the recorded states and history, another one from
+those that are built here. Both are compared.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,10 +19,13 @@ import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import FeatureFrame, FloatArray, Frame, Solve, Tick, VehicleState
-from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.observation import observation_ages_ns
+from mavbridge.flight.settings import effective_freshness
+from mavbridge.flight.state import Freshness
+from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.engagement import Phase
@@ -81,6 +87,7 @@ class _Loop:
         self._solve: Solve | None = None
         self._refusal: str | None = None
         self._act = executable.act
+        self._takes_recorded = executable.contract == contract
         span_ns = observation_ages_ns(contract)[0]
         self.caches = [FeatureCache(span_ns=span_ns) for _ in contract.cameras]
         bridge = build_bridge(
@@ -114,6 +121,8 @@ class _Loop:
         """
         recorded = self._now
         is_afresh = recorded is not None and recorded.elapsed_s is None
+        if recorded is not None and self._takes_recorded:
+            states, history = recorded.states.copy(), recorded.history.copy()
         chunk = self._act(encoded, states, history, None if is_afresh else elapsed_s)
         if recorded is not None:
             self._clock.sleep_until_ns(recorded.computed_ns)
@@ -124,7 +133,9 @@ class _Loop:
             self._refusal = message.reason
 
     def _keep(self, solve: Solve) -> None:
-        self._solve = solve
+        recorded = self._now
+        is_afresh = recorded is not None and recorded.elapsed_s is None
+        self._solve = replace(solve, elapsed_s=None) if is_afresh else solve  # as `act` was given
 
 
 class _NoCamera:
@@ -164,7 +175,14 @@ class _News:
         self._view = view
         self._shelves = shelves
         self._packets = [p for p in source.packets if p.happened_ns is not None]
-        self._stamps = _state_stamps(self._packets)
+        self._telemetry = _telemetry(self._packets)
+        self._stamps = np.array([_stamps_ns(now) for now in self._telemetry]).reshape(-1, 4)
+        limits = effective_freshness(source.contract, source.config.limits)
+        self._reader = StateReader(
+            source.contract,
+            freshness=Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns),
+            goal_ned_m=source.config.goal_ned_m,
+        )
         self._next_packet = 0
         self._ticks = source.ticks
         self._begins = flying_since(source.ticks)
@@ -173,7 +191,7 @@ class _News:
     def bring(self, solve: Solve, *, is_begin: bool) -> str | None:
         """Deliver what this solve had seen; or say what the recording lacks."""
         self._bring_ticks(solve.started_ns, is_begin=is_begin)
-        if not self._bring_packets(solve.state):
+        if not self._bring_packets(solve):
             return "the recording lacks the packets of its state"
         for shelf, frame_id in zip(self._shelves, solve.frame_ids[-1], strict=True):
             if not shelf.bring(frame_id):
@@ -193,15 +211,29 @@ class _News:
             self._next_tick += 1
             self._view.receive(_gate_tick(tick))
 
-    def _bring_packets(self, state: VehicleState) -> bool:
+    def _has_extras(self, place: int, solve: Solve) -> bool:
+        """After this packet the extra inputs, which come in messages of their own, are the solve's.
+
+        Their one recorded stamp is that of the oldest, so that the values have to agree as well.
+        """
+        if not solve.state.extras:
+            return True
+        now = self._reader.read(self._telemetry[place], solve.started_ns, has_position=True)
+        return isinstance(now, VehicleState) and (
+            (now.extras, now.extras_ns) == (solve.state.extras, solve.state.extras_ns)
+        )
+
+    def _bring_packets(self, solve: Solve) -> bool:
+        state = solve.state
         wanted = (state.attitude_ns, state.rate_ns, state.velocity_ns, state.specific_force_ns)
         first, last = (
             int(np.searchsorted(self._stamps[:, 0], state.attitude_ns, side)) for side in _SIDES
         )
-        found = np.flatnonzero((self._stamps[first:last] == wanted).all(axis=1))
-        if not len(found):
+        places = first + np.flatnonzero((self._stamps[first:last] == wanted).all(axis=1))
+        found = next((place for place in places.tolist() if self._has_extras(place, solve)), None)
+        if found is None:
             return False
-        end = max(self._next_packet, first + int(found[0]) + 1)
+        end = max(self._next_packet, found + 1)
         arrived = self._packets[self._next_packet : end]
         self._next_packet = end
         for _, group in groupby(arrived, key=lambda packet: packet.arrived_ns):
@@ -211,23 +243,25 @@ class _News:
         return True
 
 
-def _state_stamps(
-    packets: Sequence[RecordedPacket],
-) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """[N, 4]: attitude_ns, rate_ns, velocity_ns, specific_force_ns of a state after each packet."""
+def _telemetry(packets: Sequence[RecordedPacket]) -> list[Telemetry]:
+    """What was known after each packet."""
     codec, telemetry = Codec(source_system=0, source_component=0), TelemetryCollector()
-    stamps = np.zeros((len(packets), 4), np.int64)
-    for number, packet in enumerate(packets):
+    known = []
+    for packet in packets:
         for message in codec.decode_datagram(packet.data):
             if isinstance(message.body, Measurement):
                 telemetry.receive(message.body, packet.arrived_ns, packet.happened_ns or 0)
-        now = telemetry.snapshot()
-        readings = (
-            *(now.ned_from_body_wxyz, now.rate_body_radps),
-            *(now.velocity_ned_mps, now.specific_force_body_mps2),
-        )
-        stamps[number] = [0 if reading is None else reading.happened_ns for reading in readings]
-    return stamps
+        known.append(telemetry.snapshot())
+    return known
+
+
+def _stamps_ns(now: Telemetry) -> list[int]:
+    """Stamps of attitude, rate, velocity and specific force; 0 where there is none."""
+    readings = (
+        *(now.ned_from_body_wxyz, now.rate_body_radps),
+        *(now.velocity_ned_mps, now.specific_force_body_mps2),
+    )
+    return [0 if reading is None else reading.happened_ns for reading in readings]
 
 
 def _gate_tick(tick: Tick) -> GateTick:

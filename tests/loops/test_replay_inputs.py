@@ -1,0 +1,279 @@
+"""A replay gives each solve what it was given in flight, whatever the contract asks for."""
+
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from helpers.fakes import ListSink
+from helpers.policy_servers import when_it_listens
+from helpers.recordings import make_meta
+from mavbridge.config.flight import FlyConfig
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.processes import free_port, running
+from mavbridge.core.records import FeatureFrame, Solve, Tick, VisionTick
+from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.flight.history import SentHistory
+from mavbridge.flight.state import Freshness
+from mavbridge.flight.vehicle_view import VehicleView
+from mavbridge.simulation import flight as simulation
+from mavbridge.simulation.clock import SteppedClock
+from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
+from mavbridge.simulation.replay.compare import PAST_INPUTS, PolicyComparison, compare_policy
+from mavbridge.simulation.replay.policy import replay_policy
+from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
+from mavbridge.simulation.world import make_vehicle
+from policy.contract import Contract
+from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.errors import NoChunkError
+from policy.loading.load import load_policy
+from policy.loading.request import PolicyRequest
+from policy.protocol import Executable
+from sitl.vehicle.config import AutopilotName
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FLIGHT_S = 1.0
+BASE = Contract(arrays="numpy", feature_dim=3, image_height=32, image_width=32, horizon=16)
+
+
+class Attentive:
+    """Climbs, and lets every number that it is given, and its own memory, move the action a bit."""
+
+    def __init__(self, contract: Contract) -> None:
+        self.contract = contract
+        self._solves = 0
+
+    def reset(self) -> None:
+        self._solves = 0
+
+    def encode_visual(self, image: np.ndarray, camera: int = 0) -> np.ndarray:
+        mean = image.mean(axis=(0, 2, 3)).astype(np.float32)
+        return (mean + camera)[None]
+
+    def predict_fast(self, feature: Any, state: Any, history: Any, steps: int) -> np.ndarray:
+        self._solves += 1
+        seen = [float(np.nan_to_num(each).sum()) for each in (feature, state, history)]
+        moved = 0.02 * np.sin(np.array([*seen, self._solves], np.float32))
+        at_rest = (
+            [0.6, 0, 0, 0] if self.contract.action in ("rates", "attitude") else [0.3, 0, 0, 0]
+        )
+        if self.contract.action == "velocity":
+            at_rest = [0, 0, -0.5, 0]
+        state[...] = 0.0  # what a policy does with its own arrays is its business
+        return np.tile((np.array(at_rest, np.float32) + moved).astype(np.float32), (1, 16, 1))
+
+    predict = predict_fast
+
+
+class Hesitant(Attentive):
+    """Has no chunk now and then: those solves are not in a recording."""
+
+    def predict_fast(self, feature: Any, state: Any, history: Any, steps: int) -> np.ndarray:
+        if 0.0 < float(state.sum()) % 1.0 < 0.1:  # not on the dummy sample
+            raise NoChunkError("not now")
+        return super().predict_fast(feature, state, history, steps)
+
+
+@dataclass
+class Flown:
+    """What a recording holds of a flight, kept in memory."""
+
+    sink: ListSink = field(default_factory=ListSink)
+    solves: list[Solve] = field(default_factory=list)
+    packets: list[ForwardedPacket] = field(default_factory=list)
+
+    def source(self, executable: Executable, goal: str | None) -> ReplaySource:
+        cameras: list[list[FeatureFrame]] = [[] for _ in executable.contract.cameras]
+        for event in self.sink.events:
+            if isinstance(event, VisionTick) and event.feature is not None:
+                frame = FeatureFrame(
+                    frame_id=event.frame_id,
+                    captured_ns=event.captured_ns,
+                    ready_ns=event.ready_ns,
+                    value=event.feature,
+                    fault=event.fault,
+                )
+                cameras[event.camera].append(frame)
+        mode = "dual" if executable.dual_rate else "single"
+        return ReplaySource(
+            folder=Path("in memory"),
+            meta=make_meta(contract=executable.contract, mode=mode, autopilot="ardupilot"),
+            contract=executable.contract,
+            config=FlyConfig(arm=True, goal=goal),
+            ticks=tuple(event for event in self.sink.events if isinstance(event, Tick)),
+            solves=tuple(self.solves),
+            features=tuple(map(tuple, cameras)),
+            packets=tuple(
+                RecordedPacket(p.arrived_ns, p.happened_ns, p.data) for p in self.packets
+            ),
+            known_params=frozenset(),
+            gaps=(),
+        )
+
+
+def flown_and_repeated(
+    monkeypatch: pytest.MonkeyPatch,
+    make: Callable[[], Executable],
+    *,
+    goal: str | None = None,
+    autopilot: AutopilotName = "ardupilot",
+) -> PolicyComparison:
+    """A short flight, and every solve of it once more."""
+    flown, compose = Flown(), simulation.build_bridge
+
+    def recorded(*arguments: Any, **named: Any) -> Any:
+        return compose(
+            *arguments,
+            **named,
+            all_cameras=[flown.sink],
+            watch_solve=flown.solves.append,
+            watch_packets=flown.packets.extend,
+        )
+
+    monkeypatch.setattr(simulation, "build_bridge", recorded)
+    settings = SimulationSettings(goal=goal, least_camera_px=32)
+    vehicle = make_vehicle(autopilot=autopilot)
+    one = SimulatedFlight(course_seed=3, seed=1, settings=settings, vehicle=vehicle)
+    executable = make()
+    one.fly(executable, max_time_s=FLIGHT_S, sinks=(flown.sink,))
+    source = flown.source(executable, goal)
+    clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
+    return compare_policy(replay_policy(source, make(), clock, source.features))
+
+
+def attentive(kind: type[Attentive] = Attentive, **changes: Any) -> Callable[[], Executable]:
+    settings = ExecutionSettings(name="attentive", dual_rate=changes.pop("dual_rate", True))
+    contract = replace(BASE, modes=(), **changes)
+    return lambda: make_numpy_executable(kind(contract), settings)
+
+
+def assert_equal(compared: PolicyComparison, *, least: int = 50) -> None:
+    assert (compared.missing, compared.inputs_differ) == ({}, {})
+    assert compared.equal_chunks == compared.solves >= least
+
+
+TWO_EYES = {"cameras": ("front", "down"), "camera_rates_hz": (30.0, 10.0)}
+PAST = {"observation_steps": 3, "observation_dt_s": 0.07}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"dual_rate": False},
+        {"state_extras": ("height",)},
+        {"state_extras": ("altitude",)},
+        {"state_extras": ("goal",)},
+        {"state_extras": ("altitude", "height")},
+        {"state_extras": ("height", "goal", "altitude")},
+        {"state_extras": ("height",), **PAST},
+        {"state_extras": ("height",), "state_frame": "enu_flu", "since_exposure": True},
+        {"state_frame": "enu_flu"},
+        {"since_exposure": True},
+        PAST,
+        {"since_exposure": True, **PAST},
+        TWO_EYES,
+        {"state_extras": ("height",), **TWO_EYES, **PAST},
+        {"history_len": 1, "history_dt_s": 0.001},
+        {"history_len": 64, "history_dt_s": 0.003},
+    ],
+    ids=lambda changes: ", ".join(changes) or "plain",
+)
+def test_every_field_of_the_state_is_repeated_bit_for_bit(
+    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
+) -> None:
+    goal = "5,2,-3" if "goal" in changes.get("state_extras", ()) else None
+    compared = flown_and_repeated(monkeypatch, attentive(**changes), goal=goal)
+    assert_equal(compared)
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"since_exposure": True}, {"state_extras": ("height",), **PAST}]
+)
+def test_what_solves_without_a_chunk_had_seen_does_not_change_the_others(
+    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
+) -> None:
+    """What they saw counts in later past states, and is not recorded: these are taken as given."""
+    compared = flown_and_repeated(monkeypatch, attentive(Hesitant, **changes))
+    assert compared.missing == {}
+    assert set(compared.inputs_differ) <= set(PAST_INPUTS)
+    assert compared.equal_chunks == compared.solves >= 50
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "changes"),
+    [
+        ("px4", {"state_extras": ("height", "altitude")}),
+        ("px4", {"action": "rates"}),
+        ("ardupilot", {"action": "rates", "state_frame": "enu_flu"}),
+        ("ardupilot", {"action": "attitude", "state_extras": ("height",)}),
+        ("px4", {"action": "velocity", "state_frame": "enu_flu"}),
+    ],
+)
+def test_every_kind_of_action_is_repeated_bit_for_bit(
+    monkeypatch: pytest.MonkeyPatch, autopilot: AutopilotName, changes: dict[str, Any]
+) -> None:
+    compared = flown_and_repeated(monkeypatch, attentive(**changes), autopilot=autopilot)
+    assert_equal(compared)
+
+
+@pytest.mark.parametrize("name", ["numpy_policy.py:ClimbAndTurn", "torch_policy.py:TowardsLight"])
+def test_the_examples_are_repeated_bit_for_bit(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    request = PolicyRequest(spec=f"{EXAMPLES}/{name}", dual_rate=True)
+
+    def load() -> Executable:
+        return load_policy(request, now_s=lambda: 0.0).executable
+
+    assert_equal(flown_and_repeated(monkeypatch, load))
+
+
+def test_the_example_on_a_server_is_repeated_bit_for_bit(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for package in ("websockets", "msgpack"):
+        pytest.importorskip(package)
+    port = free_port()
+    with ExitStack() as stack:
+        command = (sys.executable, str(EXAMPLES / "server_policy.py"), str(port))
+        stack.enter_context(running(*command, log=tmp_path / "server.log"))
+
+        def load() -> Executable:
+            request = PolicyRequest(spec=f"ws://127.0.0.1:{port}")
+            loaded = when_it_listens(lambda: load_policy(request, now_s=lambda: 0.0))
+            return stack.enter_context(loaded).executable
+
+        compared = flown_and_repeated(monkeypatch, load)
+    # The server runs in real time: on a busy machine it is late now and then, in either run.
+    late = sum(compared.missing.values())
+    assert all("has not answered within" in why for why in compared.missing)
+    assert set(compared.inputs_differ) <= {"elapsed"}
+    assert compared.equal_chunks == compared.solves - late >= 50
+
+
+def test_what_reaches_the_policy_in_one_batch_does_not_change_past_states() -> None:
+    """Attitudes of one batch are all remembered: a replay does not know what came together."""
+    pushed: list[int] = []
+    view = VehicleView(
+        history=SentHistory(length=4, dt_s=0.05),
+        sink=ListSink(),
+        state_frame="ned_frd",
+        freshness=Freshness(attitude_ns=NS_PER_S, velocity_ns=NS_PER_S),
+        on_attitude=lambda: pushed.append(view.attitude_ns),
+    )
+    codec = mav.MAVLink(None, srcSystem=1, srcComponent=1)
+    packets = tuple(
+        ForwardedPacket(stamp_ms, stamp_ms, attitude(stamp_ms).pack(codec))
+        for stamp_ms in (10, 20, 30)
+    )
+    view.receive(packets)
+    assert pushed == [10, 20, 30]
+
+
+def attitude(boot_ms: int) -> mav.MAVLink_attitude_message:
+    return mav.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
