@@ -292,3 +292,16 @@ def test_death_of_the_gate(autopilot: AutopilotName, kind: ActionKind) -> None:
     assert not found.flew_again, found
     assert found.final_mode == hold(flight), (found, flight.describe())
     assert found.lean_held_ms <= 20 + 250, found
+
+
+@pytest.mark.parametrize("phase_ms", [0, 150, 430, 810])
+@pytest.mark.parametrize("kind", ["sticks", "rates"])
+def test_a_takeover_on_px4_without_current_mode_is_seen_within_100_ms(
+    kind: ActionKind, phase_ms: int
+) -> None:
+    """Its HEARTBEAT comes once a second: 204 to 947 ms of the policy's sticks, by its phase."""
+    flight = OutputFlight("px4", kind, px4_release="1.14").fly(1.5 + phase_ms / 1000)
+    flight.pilot_changes_mode()
+    began_s = flight.now_s
+    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=2.0)
+    assert flight.now_s - began_s <= 0.1

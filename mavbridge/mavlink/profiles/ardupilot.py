@@ -12,6 +12,9 @@ from mavbridge.mavlink.profiles import ardupilot_params
 from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
 from mavbridge.mavlink.profiles.modes import ModeTable
 from mavbridge.mavlink.profiles.profile import (
+    NO_HEALTH,
+    NO_LANDING,
+    NO_POSITION_WORD,
     Danger,
     ParamContext,
     Profile,
@@ -80,9 +83,9 @@ class ArduPilot(Profile):
             StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
             StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
             StreamGroup(radio, dialect.MAV_DATA_STREAM_RC_CHANNELS, pilot_hz or RC_CHANNELS_HZ),
-            optional_stream("SYS_STATUS", 2.0),
-            optional_stream("EXTENDED_SYS_STATE", 5.0),
-            optional_stream("EKF_STATUS_REPORT", 5.0),
+            optional_stream("SYS_STATUS", 2.0, without=NO_HEALTH),
+            optional_stream("EXTENDED_SYS_STATE", 5.0, without=NO_LANDING),
+            optional_stream("EKF_STATUS_REPORT", 5.0, without=NO_POSITION_WORD),
             optional_stream("HEARTBEAT", HEARTBEAT_HZ),
         )
 

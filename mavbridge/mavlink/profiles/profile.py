@@ -27,11 +27,27 @@ class StreamGroup(NamedTuple):
     least_hz: float | None = None
     """It comes only when something is new, and at least so often; below this it is asked for again.
     None: it comes all the time, and a share of ``rate_hz`` decides."""
+    without: str = ""
+    """What does not hold, or what is done, while it stays away; the user is told once."""
+    stand_in: str | None = None
+    """Message that is asked for one by one while it stays away."""
 
 
-def optional_stream(message: str, rate_hz: float, *, least_hz: float | None = None) -> StreamGroup:
+def optional_stream(
+    message: str,
+    rate_hz: float,
+    *,
+    least_hz: float | None = None,
+    without: str = "",
+    stand_in: str | None = None,
+) -> StreamGroup:
     """Group of one message that no flight waits for."""
-    return StreamGroup((message,), None, rate_hz, is_optional=True, least_hz=least_hz)
+    return StreamGroup((message,), None, rate_hz, True, least_hz, without, stand_in)
+
+
+NO_LANDING = "a landing does not end the flight"
+NO_POSITION_WORD = "the loss of its position estimate is not seen"
+NO_HEALTH = "a low battery and a receiver that fails are not seen"
 
 
 HOME_HEIGHT = optional_stream("GLOBAL_POSITION_INT", 20.0, least_hz=5.0)

@@ -10,6 +10,9 @@ from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.modes import ModeTable
 from mavbridge.mavlink.profiles.profile import (
+    NO_HEALTH,
+    NO_LANDING,
+    NO_POSITION_WORD,
     Danger,
     EventMeaning,
     ParamContext,
@@ -155,11 +158,18 @@ class Px4(Profile):
             StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), None, fast_hz),
             StreamGroup(("LOCAL_POSITION_NED",), None, slow_hz),
             StreamGroup(("HIGHRES_IMU", "SCALED_IMU"), None, fast_hz),
-            optional_stream("CURRENT_MODE", CURRENT_MODE_HZ, least_hz=1.0),
+            optional_stream(
+                "CURRENT_MODE",
+                CURRENT_MODE_HZ,
+                least_hz=1.0,
+                without="PX4 before 1.15, or MAVLink 1; a takeover shows in HEARTBEAT, which is "
+                "asked for 20 times a second",
+                stand_in="HEARTBEAT",
+            ),
             optional_stream("RC_CHANNELS", pilot_hz or RC_CHANNELS_HZ, least_hz=0.0),
-            optional_stream("SYS_STATUS", 2.0),
-            optional_stream("EXTENDED_SYS_STATE", 5.0),
-            optional_stream("ESTIMATOR_STATUS", 5.0),
+            optional_stream("SYS_STATUS", 2.0, without=NO_HEALTH),
+            optional_stream("EXTENDED_SYS_STATE", 5.0, without=NO_LANDING),
+            optional_stream("ESTIMATOR_STATUS", 5.0, without=NO_POSITION_WORD),
             optional_stream("GLOBAL_POSITION_INT", 2.0, least_hz=0.0),
         )
 

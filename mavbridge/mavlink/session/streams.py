@@ -1,6 +1,6 @@
 """Requests telemetry at the rate of the action loop, and again whenever it slows down."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -18,6 +18,9 @@ _ENOUGH = 0.7
 """Share of the granted rate below which another station is assumed to have changed it."""
 _ALIKE = 0.2
 """Streams whose shares differ by less than this part of their mean have one cause."""
+_AWAY_NS = 250 * NS_PER_MS
+_STAND_IN_NS = 50 * NS_PER_MS
+"""Between two requests for a message that stands in for one that has been away for so long."""
 _SCALED_WINDOWS = 2
 """So many windows in a row at one share are a link that is full; one may be a hiccup."""
 _LOSSY = 0.1
@@ -36,6 +39,9 @@ class _Stream:
         """An optional group that the vehicle does not grant."""
         self.received: dict[str, int] = {}
         """By message: a vehicle may send a second one of the group unasked."""
+        self.newest_ns = 0
+        self.stand_in_due_ns = 0
+        self.is_absence_told = False
         self._choice = 0
 
     def request(self) -> Request:
@@ -139,7 +145,7 @@ class StreamRequester:
         """Every group that is needed is granted."""
         return all(stream.is_settled or stream.group.is_optional for stream in self._streams)
 
-    def receive(self, name: str, sequence: int) -> None:
+    def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
         """Count one message."""
         if self._sequence is not None:
             self._lost += (sequence - self._sequence - 1) % 256
@@ -147,6 +153,7 @@ class StreamRequester:
         self._received += 1
         if (stream := self._by_message.get(name)) is not None:
             stream.received[name] = stream.received.get(name, 0) + 1
+            stream.newest_ns = arrived_ns
 
     def receive_ack(self, ack: CommandAck) -> None:
         """Take the vehicle's answer to the open request."""
@@ -178,6 +185,16 @@ class StreamRequester:
             self._pending = None
         return request
 
+    def stand_ins(self, now_ns: int) -> Iterator[Request]:
+        """Yield requests for what stands in for streams that stay away."""
+        for stream in self._streams:
+            name = stream.group.stand_in
+            if name is None or not stream.is_settled or now_ns < stream.stand_in_due_ns:
+                continue
+            if now_ns - stream.newest_ns >= _AWAY_NS:
+                stream.stand_in_due_ns = now_ns + _STAND_IN_NS
+                yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (float(message_id(name)),))
+
     def _check_rates(self, now_ns: int) -> None:
         if not self.is_settled:
             self._window_ns = None
@@ -192,16 +209,23 @@ class StreamRequester:
             stream.received.clear()
 
     def _judge(self, span_s: float) -> None:
-        """Ask again for what came too slowly in a window."""
+        """Ask again for what came too slowly in a window, and tell what has not come at all."""
         share = self._common_share(span_s)
         self._scaled_windows = self._scaled_windows + 1 if share is not None else 0
         if share is not None and self._scaled_windows >= _SCALED_WINDOWS:
             self._tell(share)
             return
         for stream in self._streams:
+            if stream.group.without and not stream.received and share is None:
+                self._tell_absence(stream)
             if stream.is_slow(span_s):
                 stream.is_settled = False
                 self.renewals += not stream.group.is_optional
+
+    def _tell_absence(self, stream: _Stream) -> None:
+        if not stream.is_absence_told:
+            stream.is_absence_told = True
+            self._report(f"{stream.group.messages[0]} does not come: {stream.group.without}")
 
     def _common_share(self, span_s: float) -> float | None:
         """The part of their rates at which all needed streams came, if a full link explains it."""

@@ -108,7 +108,7 @@ class VehicleSession:
 
     def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
         """Take one message from this vehicle."""
-        self._streams.receive(message.name, message.sequence)
+        self._streams.receive(message.name, message.sequence, arrived_ns)
         body = message.body
         if isinstance(body, ConditionMessage):
             self.condition.receive(body, arrived_ns, may_be_ours=self.is_receiver_hidden)
@@ -174,6 +174,7 @@ class VehicleSession:
             return
         if (request := self._streams.step(now_ns)) is not None:
             yield request
+        yield from self._streams.stand_ins(now_ns)
         if self._receiver_due_ns is None and self._streams.is_settled:
             self._receiver_due_ns = now_ns + RECEIVER_WAIT_NS
 

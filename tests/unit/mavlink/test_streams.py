@@ -88,9 +88,9 @@ def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
     requested = []
     for tick in range(3000):
         for message in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU"):
-            requester.receive(message, 0)
+            requester.receive(message, 0, 0)
         if tick % 2:
-            requester.receive("RC_CHANNELS", 0)
+            requester.receive("RC_CHANNELS", 0, 0)
         if (request := requester.step(tick * 10 * NS_PER_MS)) is None:
             continue
         requested.append(request)
@@ -113,7 +113,7 @@ def test_a_watched_stream_that_stops_is_asked_for_again_and_not_lost() -> None:
     requester, requested_s = StreamRequester(wanted), []
     for tick in range(1000):
         if tick < 300 and tick % 50 == 0:
-            requester.receive("SYS_STATUS", 0)
+            requester.receive("SYS_STATUS", 0, 0)
         if requester.step(tick * 10 * NS_PER_MS) is not None:
             requested_s.append(tick // 100)
             requester.receive_ack(ack(0))
@@ -156,7 +156,7 @@ def test_a_stream_that_slows_down_is_requested_again() -> None:
         now_ns = tick * 10 * NS_PER_MS
         # a ground station sets 4 Hz after three seconds
         if tick < 300 or tick % 25 == 0:
-            requester.receive("ATTITUDE_QUATERNION", 0)
+            requester.receive("ATTITUDE_QUATERNION", 0, 0)
         if requester.step(now_ns) is not None:
             renewed.append(now_ns // S)
             requester.receive_ack(ack(0))
@@ -216,6 +216,9 @@ class Link:
         self._sequence = 0
         self._names = {message_id(name): name for group in groups for name in group.messages}
         self._now_ns = 0
+        self.silent: set[int] = set()
+        """Messages that the vehicle grants and does not send."""
+        self.stand_ins = 0
 
     def run(self, duration_s: float, *, loses_every: int | None = None) -> None:
         for _ in range(round(duration_s * 1000)):
@@ -225,17 +228,23 @@ class Link:
                 self.asked.append((int(request.params[0]), 1e6 / request.params[1]))
                 self.rates_hz[int(request.params[0])] = 1e6 / request.params[1]
                 self.requester.receive_ack(ack(0))
+            self.stand_ins += len(list(self.requester.stand_ins(self._now_ns)))
             self.share = min(1.0, self.capacity_hz / max(sum(self.rates_hz.values()), 1.0))
             for number, rate_hz in self.rates_hz.items():
+                if number in self.silent:
+                    continue
                 self._due[number] = self._due.get(number, 0.0) + rate_hz * self.share / 1000
                 if self._due[number] >= 1.0:
                     self._due[number] -= 1.0
                     self._sequence += 1
                     if loses_every is None or self._sequence % loses_every:
-                        self.requester.receive(self._names[number], self._sequence % 256)
+                        self._deliver(self._names[number])
                         if number == message_id("ATTITUDE_QUATERNION"):
                             self._sequence += 1
-                            self.requester.receive("ATTITUDE", self._sequence % 256)  # unasked
+                            self._deliver("ATTITUDE")  # unasked
+
+    def _deliver(self, name: str) -> None:
+        self.requester.receive(name, self._sequence % 256, self._now_ns)
 
 
 def test_a_link_that_slows_all_streams_down_is_told_of_once_and_left_alone() -> None:
@@ -253,6 +262,22 @@ def test_a_link_that_slows_all_streams_down_is_told_of_once_and_left_alone() -> 
     link.rates_hz[31] = 4.0
     link.run(5.0)
     assert link.rates_hz[31] == 100.0  # one that is slow alone is still asked for again
+
+
+def test_what_stays_away_is_told_once_and_stood_in_for_while_it_does() -> None:
+    groups = PX4.streams(state_hz=100)
+    (mode,) = [group for group in groups if group.stand_in]
+    link = Link(groups, capacity_hz=1e4)
+    link.silent = {message_id(mode.messages[0]), message_id("EXTENDED_SYS_STATE")}
+    link.run(8.0)
+    assert [text.partition(" does not come")[0] for text in link.texts] == [
+        "CURRENT_MODE",
+        "EXTENDED_SYS_STATE",
+    ]
+    assert link.stand_ins == pytest.approx(8.0 * 20, rel=0.05)
+    link.silent, before = set(), link.stand_ins
+    link.run(1.0)
+    assert link.stand_ins - before <= 20 * 0.3
 
 
 def test_packets_that_get_lost_are_no_reason_to_ask_for_less() -> None:
