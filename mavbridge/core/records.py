@@ -195,8 +195,8 @@ class Solve:
     """That of its chunk, which rises by one."""
     started_ns: int
     computed_ns: int
-    is_first: bool
-    """``reset`` was called since the last one: a flight begins."""
+    reset_ns: int
+    """When the policy was last reset before it, for a flight; 0: when it was loaded."""
     elapsed_s: float | None
     """Time since the attitude of the chunk that it may build on; None where there is none."""
     state: VehicleState

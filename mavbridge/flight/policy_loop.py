@@ -75,11 +75,9 @@ class PolicyLoop:
         self._send = send
         self._settings = settings
         self._watch = watch
-        self._is_reset = True
-        """``reset`` was called since the last solve."""
         self._frozen = FrozenStateCheck(max_frozen_ns=settings.max_frozen_ns)
         self._serial = 0
-        self._flights = 0
+        self._reset_ns = 0
         self._due_ns: int | None = None
         """Slot of the next solve; an attitude up to a quarter of a period before it will do."""
         self._chunk_state_ns: int | None = None
@@ -123,11 +121,10 @@ class PolicyLoop:
         period_ns, due_ns = self._settings.period_ns, self._due_ns or now_ns
         # A hundredth of tolerance for the vehicle's clock; after a pause the grid starts anew.
         self._due_ns = max(due_ns, now_ns - period_ns // 2) + period_ns * 99 // 100
-        if self._view.flights != self._flights:
-            self._flights = self._view.flights
+        if self._view.starting_ns > self._reset_ns:
+            self._reset_ns = now_ns
             self._chunk_state_ns = None
             self._reset()
-            self._is_reset = True
         has_position = self._view.status.has_position
         state = self._reader.read(self._view.telemetry(), now_ns, has_position=has_position)
         observation = self._observe(state, now_ns) if isinstance(state, VehicleState) else state
@@ -187,16 +184,16 @@ class PolicyLoop:
             image_ns=observation.image_ns,
             computed_ns=done_ns,
             step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
+            reset_ns=self._reset_ns,
         )
         self._send(chunk)
         if self._watch is not None:
-            is_first, self._is_reset = self._is_reset, False
             self._watch(
                 Solve(
                     serial=chunk.serial,
                     started_ns=now_ns,
                     computed_ns=done_ns,
-                    is_first=is_first,
+                    reset_ns=chunk.reset_ns,
                     elapsed_s=elapsed_s,
                     state=state,
                     states=_kept(observation.states),
@@ -218,6 +215,7 @@ def make_chunk(
     image_ns: int,
     computed_ns: int,
     step_ns: int,
+    reset_ns: int,
 ) -> Chunk:
     """The chunk of a solve from ``state``, with the oldest stamp of each input that it came from.
 
@@ -228,6 +226,7 @@ def make_chunk(
         image_ns: exposure of the oldest among the newest images of all cameras.
         computed_ns: end of the solve.
         step_ns: time from one action to the next.
+        reset_ns: when the policy was last reset before it; 0: when it was loaded.
     """
     velocity_ns = min(state.velocity_ns, state.specific_force_ns)
     return Chunk(
@@ -239,6 +238,7 @@ def make_chunk(
         first_ns=state.attitude_ns,
         step_ns=step_ns,
         actions=actions,
+        reset_ns=reset_ns,
     )
 
 

@@ -90,6 +90,8 @@ class VehicleView:
         """The policy moved the sticks at the last tick."""
         self.phase = Phase.WAITING
         self.reason = ""
+        self.starting_ns = 0
+        """The policy is to be reset for a flight, as of then; 0: it is not."""
         self.flights = 0
         """Number of times that the policy took the sticks."""
 
@@ -167,6 +169,7 @@ class VehicleView:
         if tick.phase is Phase.FLYING and self.phase is not Phase.FLYING:
             self.flights += 1
         self.phase, self.reason = tick.phase, tick.reason
+        self.starting_ns = tick.starting_ns
         self._history.append(tick.sent, tick.sent_ns)
         self._sink.emit(self._join(tick))
         self._was_flown = tick.trace is not None

@@ -73,6 +73,8 @@ class Chunk(NamedTuple):
     actions: tuple[Action, ...]
     """All of one kind, in NED and FRD axes, in time order, as the policy put them out: not clipped,
     perhaps not finite."""
+    reset_ns: int = 0
+    """When the policy was last reset before the solve; 0: not since it was loaded."""
 
     @property
     def horizon_ns(self) -> int:

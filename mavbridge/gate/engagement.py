@@ -112,6 +112,8 @@ class Engagement:
         self._was_armed: bool | None = None
         """As last seen; None before the vehicle was found."""
         self._has_been_armed = False
+        self.starting_ns: int | None = None
+        """When all was ready but the policy, which is reset then; None before and after."""
         self._was_ready = False
         """The vehicle was armed at the last step of preparing."""
         self._switch = Switch(rest_ns=REST_NS)
@@ -250,7 +252,7 @@ class Engagement:
         elif (objection := self._mode_objection(facts)) is not None:
             self.refusal = f"not engaged: {objection}"
         else:
-            return self._take_off(facts)
+            return self._begin_preparing(facts, ACT_TIMEOUT_NS)
         return Move()
 
     def _waiting_reason(self, facts: Facts) -> str:
@@ -282,10 +284,18 @@ class Engagement:
         if is_late or self._preparation.impossibility(facts) is not None:
             return self._give_up_preparing(facts)
         preparing = self._preparation.step(facts, self._objection(facts))
-        if not preparing.waits_for:
+        self.reason = preparing.waits_for or "waiting for the policy's first chunk after its reset"
+        if self._is_started(facts, is_ready=not preparing.waits_for):
             return self._take_off(facts)
-        self.reason = preparing.waits_for
         return preparing.move
+
+    def _is_started(self, facts: Facts, *, is_ready: bool) -> bool:
+        """The policy was reset once all else was ready, and has solved since."""
+        if not is_ready:
+            self.starting_ns = None
+        elif self.starting_ns is None:
+            self.starting_ns = facts.now_ns
+        return is_ready and facts.is_policy_reset
 
     def _give_up_preparing(self, facts: Facts) -> Move:
         """The vehicle, or an input, was not ready in time."""
@@ -304,7 +314,7 @@ class Engagement:
 
     def _take_off(self, facts: Facts) -> Move:
         """The policy takes the sticks."""
-        self.phase = Phase.FLYING
+        self.phase, self.starting_ns = Phase.FLYING, None
         flights = self.outcome.flights + 1
         self.outcome = self.outcome._replace(flights=flights, is_disarmed=False, end=None)
         self.reason = ""
@@ -458,10 +468,10 @@ class Engagement:
         objection = self._objection(facts)
         if objection is not None:
             self.phase, self.reason = Phase.WAITING, objection
-            return Move()
-        if self.phase is not Phase.FLYING:
-            return self._take_off(facts)
-        return Move(hand=Hand.POLICY)
+        if self.phase is Phase.FLYING:
+            return Move(hand=Hand.POLICY)
+        is_started = self._is_started(facts, is_ready=objection is None)
+        return self._take_off(facts) if is_started else Move()
 
     # --- for the death of the gate
 

@@ -66,6 +66,8 @@ class Facts:
     """Arrival of ``rc_channels_us``; None: now."""
     is_receiver_sick: bool = False
     """The vehicle says now that its receiver does not work."""
+    is_policy_reset: bool = True
+    """The newest chunk was solved after a reset for the flight that starts."""
     shows_last: bool = True
     """The vehicle shows the last sticks that we sent: held, or a receiver's that rests there."""
     landing: str | None = None

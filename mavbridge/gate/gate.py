@@ -92,6 +92,8 @@ class GateOutput:
     """Height to which the autopilot is to climb by its own means, to request."""
     messages: tuple[str, ...]
     """For the user."""
+    starting_ns: int
+    """The policy gets the sticks with its first chunk after a reset from then on; 0: not now."""
 
 
 class Gate:
@@ -190,6 +192,7 @@ class Gate:
             arm=move.arm,
             takeoff_m=move.takeoff_m,
             messages=self._take_messages(),
+            starting_ns=self._engagement.starting_ns or 0,
         )
 
     def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> str | None:
@@ -233,6 +236,8 @@ class Gate:
         status = link.status
         if chunk_fault is None and self._engagement.phase is Phase.FLYING:
             chunk_fault = self._chunks.fault(now_ns)
+        starting_ns, newest = self._engagement.starting_ns, self._chunks.newest
+        reset_ns = 0 if newest is None else newest.reset_ns
         if status is not None:
             left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
         return Facts(
@@ -266,6 +271,7 @@ class Gate:
             are_sticks_at_rest=link.are_sticks_at_rest,
             stick_override_ns=status.stick_override_ns if status else None,
             slowness=given.command_fault or self._chunks.impossibility,
+            is_policy_reset=reset_ns >= (now_ns if starting_ns is None else starting_ns),
             envelope_problem=left.reason if left and left.kind == "fault" else None,
             landing=left.reason if left and left.kind == "landed" else None,
         )

@@ -357,6 +357,7 @@ class GateLoop:
             sent=sent,
             phase=output.phase,
             reason=output.reason,
+            starting_ns=output.starting_ns,
         )
         self._flight.send(encode_tick(tick))
 

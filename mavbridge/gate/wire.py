@@ -27,8 +27,8 @@ from mavbridge.gate.gate import FlightSettings
 from mavbridge.gate.outcome import Outcome
 from mavbridge.gate.settings import GateSettings
 
-_CHUNK = struct.Struct("<cBqqqqqqqH")
-_TICK = struct.Struct("<cqqqqqqB?iBBB20d")
+_CHUNK = struct.Struct("<cBqqqqqqqqH")
+_TICK = struct.Struct("<cqqqqqqqB?iBBB20d")
 _PACKET = struct.Struct("<qqH")
 _PHASES = tuple(Phase)
 _CLASSES = tuple(ACTION_CLASSES.values())
@@ -62,6 +62,9 @@ class GateTick:
     phase: Phase
     reason: str
     """Why the policy does not fly; empty while it does."""
+    starting_ns: int = 0
+    """All has been ready since then: the policy gets the sticks with its first chunk after a reset
+    from then on; 0 where it has them, or all is not ready."""
 
 
 class GateStatus(NamedTuple):
@@ -146,7 +149,7 @@ def encode_to_gate(message: ToGate) -> bytes:
     """One message of the flight process."""
     match message:
         case Chunk():
-            stamps = message[:7]
+            stamps = (*message[:7], message.reset_ns)
             count = len(message.actions)
             values = [value for action in message.actions for value in action]
             kind = _class_index(message.actions[0]) if count else 0
@@ -193,9 +196,8 @@ def _class_index(action: Action) -> int:
 
 
 def _decode_chunk(data: bytes) -> Chunk:
-    _, kind, serial, attitude_ns, velocity_ns, image_ns, computed_ns, first_ns, step_ns, count = (
-        _CHUNK.unpack_from(data)
-    )
+    _, kind, *stamps, count = _CHUNK.unpack_from(data)
+    serial, attitude_ns, velocity_ns, image_ns, computed_ns, first_ns, step_ns, reset_ns = stamps
     make = _CLASSES[kind]
     values = struct.unpack(f"<{4 * count}d", data[_CHUNK.size :])
     return Chunk(
@@ -207,6 +209,7 @@ def _decode_chunk(data: bytes) -> Chunk:
         first_ns=first_ns,
         step_ns=step_ns,
         actions=tuple(make(*values[4 * k : 4 * k + 4]) for k in range(count)),
+        reset_ns=reset_ns,
     )
 
 
@@ -224,7 +227,7 @@ def encode_tick(tick: GateTick) -> bytes:
         stages = (*trace.raw, *trace.clipped, *trace.slewed, *trace.smoothed)
     packed = _TICK.pack(
         b"T",
-        *(tick.index, tick.due_ns, tick.woke_ns, tick.decided_ns, tick.sent_ns),
+        *(tick.index, tick.due_ns, tick.woke_ns, tick.decided_ns, tick.sent_ns, tick.starting_ns),
         *(0 if serial is None else serial, flags, serial is not None, tick.missed_slots),
         _PHASES.index(tick.phase),
         0 if trace is None else _class_index(trace.raw),
@@ -236,10 +239,8 @@ def encode_tick(tick: GateTick) -> bytes:
 
 
 def _decode_tick(data: bytes) -> GateTick:
-    _, index, due_ns, woke_ns, decided_ns, sent_ns, serial, flags, has_chunk, missed, *rest = (
-        _TICK.unpack_from(data)
-    )
-    phase, traced, sent_kind, *values = rest
+    _, index, due_ns, woke_ns, decided_ns, sent_ns, starting_ns, *rest = _TICK.unpack_from(data)
+    serial, flags, has_chunk, missed, phase, traced, sent_kind, *values = rest
     fours = [values[4 * k : 4 * k + 4] for k in range(5)]
     raw, clipped, slewed, smoothed = (_CLASSES[traced](*four) for four in fours[:4])
     trace = ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
@@ -253,6 +254,7 @@ def _decode_tick(data: bytes) -> GateTick:
         missed_slots=missed,
         is_slot=bool(flags & _IS_SLOT),
         is_coasting=bool(flags & _IS_COASTING),
+        starting_ns=starting_ns,
         chunk_serial=serial if has_chunk else None,
         trace=trace if flags & _HAS_TRACE else None,
         sent=sent if flags & _HAS_SENT else None,

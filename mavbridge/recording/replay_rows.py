@@ -12,7 +12,7 @@ from policy.contract import ACTION_DIM, STATE_DIM, Contract
 
 _NUMBERS = pa.list_(pa.float32())
 _STATE_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
-_PLAIN = ("serial", "started_ns", "computed_ns", "image_ns", "first_ns", "step_ns")
+_PLAIN = ("serial", "started_ns", "computed_ns", "reset_ns", "image_ns", "first_ns", "step_ns")
 _ARRAYS = ("states", "history", "actions")
 _V1 = 0xFE
 
@@ -24,7 +24,6 @@ def _required(kind: pa.DataType, *names: str) -> list[pa.Field]:
 SOLVES = pa.schema(
     [
         *_required(pa.int64(), *_PLAIN),
-        *_required(pa.bool_(), "is_first"),
         pa.field("elapsed_s", pa.float64()),
         *_required(pa.list_(pa.float32(), STATE_DIM), "state"),
         *_required(pa.int64(), *_STATE_STAMPS),
@@ -87,7 +86,7 @@ def solves_batch(rows: Sequence[SolveRow]) -> pa.RecordBatch:
     """Rows of consecutive solves."""
     solves = [row.solve for row in rows]
     states = [solve.state for solve in solves]
-    plain = (*_PLAIN, "is_first", "elapsed_s")
+    plain = (*_PLAIN, "elapsed_s")
     columns: dict[str, Any] = {name: [getattr(solve, name) for solve in solves] for name in plain}
     columns |= {name: [getattr(state, name) for state in states] for name in _STATE_STAMPS}
     columns |= {name: _lists([getattr(solve, name) for solve in solves]) for name in _ARRAYS}
@@ -165,7 +164,7 @@ def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
             solve = Solve(
                 state=state,
                 frame_ids=tuple(map(tuple, row["frame_ids"])),
-                **{name: row[name] for name in (*_PLAIN, "is_first", "elapsed_s")},
+                **{name: row[name] for name in (*_PLAIN, "elapsed_s")},
                 **{name: arrays[name][number].reshape(shapes[name]) for name in _ARRAYS},
             )
             yield SolveRow(solve, row["dropped_before"])

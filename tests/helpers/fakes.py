@@ -28,6 +28,8 @@ from mavbridge.core.vehicle import (
 )
 
 START_NS = 1_000 * NS_PER_S
+FOREVER_NS = 2**62
+"""``reset_ns`` of chunks for a gate that is to engage at once."""
 
 
 class FakeClock:

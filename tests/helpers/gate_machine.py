@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from helpers.fakes import START_NS, FakeClock, level_telemetry
+from helpers.fakes import FOREVER_NS, START_NS, FakeClock, level_telemetry
 from helpers.flown_vehicle import FlownVehicle
 from helpers.gate_facts import engagement_settings
 from helpers.wire import ARDUPILOT as CALIBRATION
@@ -215,6 +215,7 @@ class GateWorld:
             first_ns=now_ns,
             step_ns=20 * MS,
             actions=(action,) * HORIZON,
+            reset_ns=FOREVER_NS,
         )
         made = fresh._replace(**changes)
         self.chunks[self.serial % CODES] = made

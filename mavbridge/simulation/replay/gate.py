@@ -64,6 +64,7 @@ def chunk_of(solve: Solve, contract: Contract) -> Chunk:
         image_ns=solve.image_ns,
         computed_ns=solve.computed_ns,
         step_ns=solve.step_ns,
+        reset_ns=solve.reset_ns,
     )
 
 

@@ -17,7 +17,6 @@ from typing import Literal
 
 import numpy as np
 
-from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import FeatureFrame, FloatArray, Frame, Solve, Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
@@ -34,12 +33,10 @@ from mavbridge.mavlink.codec.messages import Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.simulation.clock import SteppedClock
-from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource, flying_since
+from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from policy.protocol import Executable
 
 _SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
-HELD_NS = 50 * NS_PER_MS
-"""Longest time for which the news that a flight began may have been on its way to the policy."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,8 +67,10 @@ def replay_policy(
     news = _News(
         source, loop.view, [_Shelf(f, c) for f, c in zip(features, loop.caches, strict=True)]
     )
-    for number, solve in enumerate(source.solves):
-        if (missing := news.bring(solve, is_begin=number > 0 and solve.is_first)) is not None:
+    for solve in source.solves:
+        missing = news.bring(solve)
+        loop.view.starting_ns = solve.reset_ns
+        if missing is not None:
             yield SolvePair(recorded=solve, replayed=None, refusal=missing)
             continue
         yield loop.repeat(solve)
@@ -185,12 +184,11 @@ class _News:
         )
         self._next_packet = 0
         self._ticks = source.ticks
-        self._begins = flying_since(source.ticks)
         self._next_tick = 0
 
-    def bring(self, solve: Solve, *, is_begin: bool) -> str | None:
+    def bring(self, solve: Solve) -> str | None:
         """Deliver what this solve had seen; or say what the recording lacks."""
-        self._bring_ticks(solve.started_ns, is_begin=is_begin)
+        self._bring_ticks(solve.started_ns)
         if not self._bring_packets(solve):
             return "the recording lacks the packets of its state"
         for shelf, frame_id in zip(self._shelves, solve.frame_ids[-1], strict=True):
@@ -198,15 +196,10 @@ class _News:
                 return f"the recording lacks the feature of frame {frame_id}"
         return None
 
-    def _bring_ticks(self, now_ns: int, *, is_begin: bool) -> None:
-        """Ticks until now; the one that begins a flight comes with the solve that was the first."""
+    def _bring_ticks(self, now_ns: int) -> None:
         while self._next_tick < len(self._ticks):
             tick = self._ticks[self._next_tick]
-            is_first = self._next_tick in self._begins
-            wait_ns = HELD_NS if is_first else 0
-            if is_first and is_begin:
-                wait_ns, is_begin = -HELD_NS, False
-            if tick.sent_ns > now_ns - wait_ns:
+            if tick.sent_ns > now_ns:
                 return
             self._next_tick += 1
             self._view.receive(_gate_tick(tick))

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -168,12 +167,3 @@ def _received(
         arrived_ns = rough_ns if found is None else found.arrived_ns
         latest_ns = max(latest_ns, arrived_ns)
         yield RecordedPacket(latest_ns, found and found.happened_ns, packet.data)
-
-
-def flying_since(ticks: tuple[Tick, ...]) -> frozenset[int]:
-    """Places of the ticks with which the policy has taken the sticks."""
-    begins = {0} if ticks[0].phase == "flying" else set()
-    for number, (before, tick) in enumerate(pairwise(ticks), start=1):
-        if tick.phase == "flying" and before.phase != "flying":
-            begins.add(number)
-    return frozenset(begins)

@@ -118,8 +118,9 @@ class Rig:
             chunk_serial=None,
             trace=None,
             sent=None,
-            phase=Phase.FLYING,
+            phase=Phase.PREPARING,
             reason="",
+            starting_ns=self.clock.now_ns(),
         )
         self.view.receive(tick)
 
@@ -219,6 +220,9 @@ def test_a_flight_that_begins_resets_the_policy_once() -> None:
     run_on(rig, 7)
     run_on(rig, 7)
     assert rig.resets == 1
+    resets_ns = [chunk.reset_ns for chunk in rig.sent if isinstance(chunk, Chunk)]
+    assert resets_ns[0] == 0
+    assert START_NS < resets_ns[1] == resets_ns[2] <= rig.clock.now_ns()
     assert rig.elapsed_s == [None, None, pytest.approx(0.01)]
 
 

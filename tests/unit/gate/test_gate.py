@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from helpers.fakes import AIRBORNE_STATUS, START_NS
+from helpers.fakes import AIRBORNE_STATUS, FOREVER_NS, START_NS
 from helpers.gate_facts import COPTER_MODES, PX4_MODES, engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import (
@@ -92,6 +92,7 @@ class Stepped:
             first_ns=now_ns - 3 * MS,
             step_ns=20 * MS,
             actions=(sticks,) * actions,
+            reset_ns=FOREVER_NS,
         )
 
     def step(
@@ -197,6 +198,19 @@ def test_without_a_stop_neutral_is_held_on_and_on() -> None:
     held = [gate.step(at_ms, mode="BRAKE") for at_ms in range(40, 1000, 10)]
     assert held[-1].phase is Phase.HOLDING
     assert {(output.decision, output.mode) for output in held[10:]} == {(LEFT, None)}
+
+
+def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> None:
+    gate = Stepped()
+    for at_ms in (0, 10, 20):
+        gate.step(at_ms, gate.chunk(at_ms)._replace(reset_ns=0))
+    asked = gate.step(30, gate.chunk(30)._replace(reset_ns=0), act="engage")
+    assert (asked.phase, asked.starting_ns) == (Phase.PREPARING, START_NS + 30 * MS)
+    held = gate.step(40, gate.chunk(40)._replace(reset_ns=START_NS + 30 * MS - 1))
+    assert (held.phase, held.decision) == (Phase.PREPARING, None)
+    flown = gate.step(50, gate.chunk(50)._replace(reset_ns=START_NS + 41 * MS))
+    assert (flown.phase, flown.starting_ns) == (Phase.FLYING, 0)
+    assert flown.chunk_serial == 6
 
 
 def test_a_chunk_that_is_not_taken_is_not_news() -> None:

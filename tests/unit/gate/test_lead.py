@@ -3,7 +3,7 @@
 import pytest
 
 from helpers.factories import START_NS
-from helpers.fakes import FakeClock
+from helpers.fakes import FOREVER_NS, FakeClock
 from helpers.gate_facts import engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import (
@@ -86,7 +86,8 @@ class FewChunks:
 
     def __init__(self) -> None:
         actions = (Sticks(0.1, 0.0, 0.0, 0.0),)
-        chunks = [Chunk(k, *[START_NS] * 4, START_NS, DAY_NS, actions) for k in (1, 2, 3)]
+        stamps = (*[START_NS] * 5, DAY_NS)
+        chunks = [Chunk(k, *stamps, actions, FOREVER_NS) for k in (1, 2, 3)]
         self._inbox = [encode_to_gate(message) for message in (FLIGHT, *chunks, "engage")]
 
     def send(self, _message: bytes, fd: int | None = None) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from helpers.fakes import START_NS, FakeClock, FakeLink
+from helpers.fakes import FOREVER_NS, START_NS, FakeClock, FakeLink
 from helpers.gate_facts import engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
@@ -122,6 +122,7 @@ class Rig:
             first_ns=now_ns,
             step_ns=50 * MS,
             actions=(self.wanted,) * 4,
+            reset_ns=FOREVER_NS,
         )
         return chunk._replace(**changes)
 

@@ -45,7 +45,7 @@ def make_solve(serial: int) -> Solve:
         serial=serial,
         started_ns=START_NS + 10 * serial,
         computed_ns=START_NS + 10 * serial + 3,
-        is_first=serial == 1,
+        reset_ns=serial // 2,
         elapsed_s=None if serial == 1 else 0.1 / serial,
         state=state,
         states=random.random((1, *CONTRACT.state_shape), np.float32),

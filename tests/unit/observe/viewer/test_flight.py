@@ -362,7 +362,7 @@ def make_solve(serial: int, actions: list[list[float]], **changes: Any) -> Solve
         "serial": serial,
         "started_ns": first_ns,
         "computed_ns": first_ns + 2 * NS_PER_MS,
-        "is_first": False,
+        "reset_ns": 0,
         "elapsed_s": 0.01,
         "state": make_state(first_ns),
         "states": np.zeros((1, 13), np.float32),
