@@ -78,6 +78,8 @@ class PolicyLoop:
         self._frozen = FrozenStateCheck(max_frozen_ns=settings.max_frozen_ns)
         self._serial = 0
         self._reset_ns = 0
+        self._seen_ns = 0
+        """Arrival of the newest attitude at the last step."""
         self._due_ns: int | None = None
         """Slot of the next solve; an attitude up to a quarter of a period before it will do."""
         self._chunk_state_ns: int | None = None
@@ -108,7 +110,14 @@ class PolicyLoop:
     @property
     def start_ns(self) -> int:
         """An attitude that arrives from then on starts the next solve."""
-        return 1 if self._due_ns is None else self._due_ns - self._settings.period_ns // 4
+        if self._due_ns is None or self._is_starting:
+            return self._seen_ns + 1
+        return self._due_ns - self._settings.period_ns // 4
+
+    @property
+    def _is_starting(self) -> bool:
+        """The gate waits for a reset, and the first chunk after it."""
+        return self._view.starting_ns > self._reset_ns
 
     @property
     def has_news(self) -> bool:
@@ -117,11 +126,13 @@ class PolicyLoop:
 
     def step(self) -> None:
         """One solve from what is newest now, or the reason why there is none."""
-        now_ns = self._clock.now_ns()
-        period_ns, due_ns = self._settings.period_ns, self._due_ns or now_ns
+        now_ns, is_starting = self._clock.now_ns(), self._is_starting
+        self._seen_ns = self._view.attitude_ns
+        period_ns = self._settings.period_ns
+        due_ns = now_ns if self._due_ns is None or is_starting else self._due_ns
         # A hundredth of tolerance for the vehicle's clock; after a pause the grid starts anew.
         self._due_ns = max(due_ns, now_ns - period_ns // 2) + period_ns * 99 // 100
-        if self._view.starting_ns > self._reset_ns:
+        if is_starting:
             self._reset_ns = now_ns
             self._chunk_state_ns = None
             self._reset()

@@ -290,7 +290,7 @@ class GateFlight:
         """Launch, engage by the key, and let the policy fly; long enough for the echo."""
         self.launch()
         self.act("engage")
-        self.until(lambda: self.phase is Phase.FLYING, within_s=0.1)
+        self.until(lambda: self.phase is Phase.FLYING, within_s=3.0)
         self.run(seconds)
         assert self.phase is Phase.FLYING, self.describe()
         return self
@@ -411,7 +411,8 @@ class GateFlight:
             self.station(lambda mav: mav.rc_channels_override_encode(1, 1, *us, 0, 0, 0, 0))
             self.clock.schedule(self.clock.now_ns() + round(NS_PER_S / rate_hz), send)
 
-        send()
+        # In the middle between two sends of ours: just before one it would never be shown.
+        self.clock.schedule(self.clock.now_ns() + 13 * MS // 2, send)
 
     def receiver(self, **channels_us: int) -> None:
         """Move sticks and switches of the transmitter: ch3=1500."""

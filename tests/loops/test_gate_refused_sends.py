@@ -68,7 +68,7 @@ def test_before_an_act_they_refuse_it() -> None:
     assert flight.phase is Phase.FLYING
 
 
-@pytest.mark.parametrize("gap_s", [0.03, 0.06, 0.09])
+@pytest.mark.parametrize("gap_s", [0.03, 0.06, 0.07])
 @pytest.mark.parametrize("flown_s", [0.0, 1.0], ids=["from the act on", "in flight"])
 def test_the_sticks_go_on_from_where_the_vehicles_are(gap_s: float, flown_s: float) -> None:
     """From the receiver's, or from our last ones, and no faster than ever."""

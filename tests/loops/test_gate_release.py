@@ -38,7 +38,7 @@ def test_after_a_fault_neutral_then_the_mode_then_the_receivers_sticks(
     before_ns, before_s = flight.clock.now_ns(), flight.t_s
     fault(flight)
 
-    sent = flight.sticks_sent(before_ns + MS)
+    sent = flight.sticks_sent(before_ns + 1)
     assert sent[0][1] == pytest.approx(NEUTRAL, abs=0.01)
     assert sent[0][0] - before_ns < 10 * MS
     assert all(sticks == pytest.approx(NEUTRAL, abs=0.01) for _, sticks in sent)

@@ -31,9 +31,10 @@ def test_thirty_hertz_vision_feeds_a_hundred_chunks_a_second() -> None:
     flown = flight.flown
     serials = [tick.chunk_serial or 0 for tick in flown]
     assert serials == list(range(serials[0], serials[-1] + 1))
-    # The first feature is ready after 25 ms, and three chunks in time must have come.
-    assert serials[0] == 3
-    assert len(flown) == pytest.approx(1000 - 3 - 2, abs=1)
+    # The first feature is ready after 25 ms, three chunks in time must have come, and then the
+    # first one after the reset.
+    assert serials[0] == 4
+    assert len(flown) == pytest.approx(1000 - 4 - 2, abs=1)
     uses = [sum(t.feature_frame_id == k for t in flown) for k in range(10, 200)]
     assert set(uses) == {3, 4}
 
