@@ -187,7 +187,7 @@ def played(hz: float, *, horizon: int = 64) -> PlayedFlight:
     flight.launch()
     flight.run(2.5 / hz)
     flight.act("engage")
-    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.1)
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=2.0)
     return flight
 
 
