@@ -87,6 +87,7 @@ def open_stream(url: str, *, clock: Clock) -> CaptureSource:
     timeouts = [
         *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, OPEN_TIMEOUT_MS),
         *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, READ_TIMEOUT_MS),
+        *(cv2.CAP_PROP_N_THREADS, 1),  # each further one holds a frame back
     ]
     name, source, options = without_secrets(url), url, LOW_LATENCY_OPTIONS
     if "://" not in url:
@@ -97,6 +98,7 @@ def open_stream(url: str, *, clock: Clock) -> CaptureSource:
         raise CameraError(
             f"stream {name} cannot be opened within {OPEN_TIMEOUT_MS / 1000:g} s: check the "
             "address, that the sender is running, and that it sends video"
+            + ("; H.264 over RTP is opened by its .sdp file" if url.startswith("rtp:") else "")
         )
     failure = f"ended, or was silent for {READ_TIMEOUT_MS / 1000:g} s"
     return CaptureSource(capture, f"stream {name}", failure, clock)
