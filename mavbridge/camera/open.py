@@ -17,6 +17,8 @@ from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.extras import require_packages
 from mavbridge.core.ports import Camera
+from mavbridge.core.provenance import without_secrets
+from mavbridge.core.records import Frame
 
 STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
 SCREEN_PACKAGES = {"mss": "mss", "Xlib": "python-xlib"}
@@ -85,6 +87,7 @@ def open_camera(
     timeout_s: float = 10.0,
     latency_ms: float = 0.0,
     report: Callable[[str], None] = lambda _: None,
+    is_depth: bool | None = None,
 ) -> Camera:
     """Open the source that ``spec`` names, and wait for its first frame, which is dropped.
 
@@ -99,31 +102,51 @@ def open_camera(
             opened is tried again, and shared memory may appear.
         latency_ms: time from exposure to arrival, subtracted from the stamps.
         report: gets a line of a countdown for every second of the wait.
+        is_depth: whether the policy takes depth or RGB; None: either.
 
     Raises:
-        UserError: as ``check_camera``.
+        UserError: as ``check_camera``, or its images are of the other kind.
         CameraError: no frame came in time, or the source cannot be used.
     """
     check_camera(spec, latency_ms=latency_ms)
-    camera = _open(spec, image_size=image_size, clock=clock)
-    if isinstance(camera, Grabber | SharedMemoryCamera):
-        live: LiveCamera = camera
-        try:
-            wait_for_first_frame(live, clock=clock, timeout_s=timeout_s, report=report)
-        except BaseException:
-            camera.close()
-            raise
+    camera = _open(spec, image_size=image_size, clock=clock, is_depth=is_depth)
+    first: Frame | None = None
+    try:
+        if isinstance(camera, Grabber | SharedMemoryCamera):
+            live: LiveCamera = camera
+            first = wait_for_first_frame(live, clock=clock, timeout_s=timeout_s, report=report)
+        if spec != NO_CAMERA:
+            _require_kind(spec, first, is_depth)
+    except BaseException:
+        camera.close()
+        raise
     if latency_ms == 0.0:
         return camera
     return LatencyCompensatedCamera(camera, latency_ns=round(latency_ms * NS_PER_MS))
 
 
-def _open(spec: str, *, image_size: int, clock: Clock) -> Camera:
+def _require_kind(spec: str, first: Frame | None, is_depth: bool | None) -> None:
+    """Refuse depth for a policy of RGB, and the reverse; a source without ``first`` is RGB."""
+    shape = (0, 0, 3) if first is None else first.rgb.shape
+    if is_depth is None or is_depth == (len(shape) == 2):
+        return
+    size = f" of {shape[1]}x{shape[0]}" if first else ""
+    found, wanted = (f"RGB images{size}", "depth") if is_depth else (f"depth{size}", "RGB images")
+    advice = (
+        "16-bit depth, such as pipe:640x480:gray16le:COMMAND" if is_depth else "a colour camera"
+    )
+    raise UserError(
+        f"--camera {without_secrets(spec)} delivers {found}, and the policy's contract takes "
+        f"{wanted} (image_channels): name {advice}, or mend the contract"
+    )
+
+
+def _open(spec: str, *, image_size: int, clock: Clock, is_depth: bool | None) -> Camera:
     kind, _, rest = spec.partition(":")
     if kind == "shm":
         return SharedMemoryCamera(rest, clock=clock)
     if spec == NO_CAMERA:
-        return BlankCamera(image_size=image_size, clock=clock)
+        return BlankCamera(image_size=image_size, clock=clock, is_depth=bool(is_depth))
     if kind == "screen":
         from mavbridge.camera.screen import ScreenCamera
 
