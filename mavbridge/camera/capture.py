@@ -19,6 +19,8 @@ from policy.files import library_name
 OPEN_TIMEOUT_MS = 5000
 READ_TIMEOUT_MS = 2000
 FFMPEG_OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+FFMPEG_LOG_VARIABLE = "OPENCV_FFMPEG_LOGLEVEL"
+FFMPEG_QUIET = "-8"
 LOW_LATENCY_OPTIONS = "rtsp_flags;prefer_tcp|fflags;nobuffer|flags;low_delay"
 """No buffering in the demuxer, no reordering delay in the decoder. Setting options drops OpenCV's
 default, which is the first of these."""
@@ -109,16 +111,17 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
     """FFmpeg options for the captures opened inside, unless the user has set some.
 
     OpenCV reads them from the environment alone. They must not stay there: a file that is opened
-    with ``nobuffer`` loses its first frames.
+    with ``nobuffer`` loses its first frames. FFmpeg is silenced as well: it would complain of each
+    frame of a stream that is joined between two key frames.
     """
-    if FFMPEG_OPTIONS_VARIABLE in os.environ:
-        yield
-        return
-    os.environ[FFMPEG_OPTIONS_VARIABLE] = options
+    wanted = {FFMPEG_OPTIONS_VARIABLE: options, FFMPEG_LOG_VARIABLE: FFMPEG_QUIET}
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(added)
     try:
         yield
     finally:
-        del os.environ[FFMPEG_OPTIONS_VARIABLE]
+        for name in added:
+            del os.environ[name]
 
 
 def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> ImageArray:

@@ -190,15 +190,19 @@ def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
     monkeypatch.delenv(capture.FFMPEG_OPTIONS_VARIABLE, raising=False)
     if set_by_user is not None:
         monkeypatch.setenv(capture.FFMPEG_OPTIONS_VARIABLE, set_by_user)
-    options = []
+    monkeypatch.delenv(capture.FFMPEG_LOG_VARIABLE, raising=False)
+    options, log_levels = [], []
 
     def open_capture(*arguments):
         options.append(os.environ[capture.FFMPEG_OPTIONS_VARIABLE])
+        log_levels.append(os.environ[capture.FFMPEG_LOG_VARIABLE])
         return FakeDevice(*arguments)
 
     monkeypatch.setattr(cv2, "VideoCapture", open_capture)
     source = open_stream("udp://0.0.0.0:5600", clock=FakeClock())
     assert options == [seen]
+    assert log_levels == ["-8"]
+    assert capture.FFMPEG_LOG_VARIABLE not in os.environ
     assert os.environ.get(capture.FFMPEG_OPTIONS_VARIABLE) == set_by_user
     assert source.next_image().captured_ns == START_NS
     with pytest.raises(CameraError, match="ended, or was silent"):
