@@ -14,10 +14,8 @@ class BlankCamera:
 
     def __init__(self, *, image_size: int, clock: Clock, is_depth: bool = False) -> None:
         self._clock = clock
-        side = (image_size, image_size)
-        self._rgb: CameraImage = np.zeros((*side, 3), np.uint8)
-        if is_depth:
-            self._rgb = np.zeros(side, np.uint16)
+        shape = (image_size, image_size, *(() if is_depth else (3,)))
+        self._rgb: CameraImage = np.zeros(shape, np.uint16 if is_depth else np.uint8)
         self._rgb.flags.writeable = False
         self._due_ns = clock.now_ns()
         self._frame_id = 0

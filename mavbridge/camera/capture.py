@@ -20,7 +20,6 @@ OPEN_TIMEOUT_MS = 5000
 READ_TIMEOUT_MS = 2000
 FFMPEG_OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 FFMPEG_LOG_VARIABLE = "OPENCV_FFMPEG_LOGLEVEL"
-FFMPEG_QUIET = "-8"
 LOW_LATENCY_OPTIONS = "rtsp_flags;prefer_tcp|fflags;nobuffer|flags;low_delay"
 """No buffering in the demuxer, no reordering delay in the decoder. Setting options drops OpenCV's
 default, which is the first of these."""
@@ -114,7 +113,7 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
     with ``nobuffer`` loses its first frames. FFmpeg is silenced as well: it would complain of each
     frame of a stream that is joined between two key frames.
     """
-    wanted = {FFMPEG_OPTIONS_VARIABLE: options, FFMPEG_LOG_VARIABLE: FFMPEG_QUIET}
+    wanted = {FFMPEG_OPTIONS_VARIABLE: options, FFMPEG_LOG_VARIABLE: "-8"}
     added = {name: value for name, value in wanted.items() if name not in os.environ}
     os.environ.update(added)
     try:

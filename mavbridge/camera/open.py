@@ -9,6 +9,7 @@ from mavbridge.camera.blank import BlankCamera
 from mavbridge.camera.capture import open_device, open_stream, present_devices
 from mavbridge.camera.deadlines import LiveCamera, wait_for_first_frame
 from mavbridge.camera.grabber import Grabber
+from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
 from mavbridge.camera.latency import LatencyCompensatedCamera
 from mavbridge.camera.pipe import PipeCamera, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
@@ -28,7 +29,8 @@ FORMS = (
     "a device (0, /dev/video0, /dev/v4l/by-id/NAME), a stream (rtsp://, rtp://, udp://, tcp://, "
     "http://, https://, an .sdp file), "
     "a video file, shm:NAME, screen:WINDOW TITLE (screen: alone = the whole screen), pipe:COMMAND "
-    "(MJPEG from a program), or none for a policy that looks at no image"
+    "(MJPEG from a program), jpeg-udp:[HOST:]PORT (a simulator's chunks of JPEG), or none for a "
+    "policy that looks at no image"
 )
 
 
@@ -47,6 +49,9 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
         )
     if kind == "pipe":
         parse_pipe(spec.partition(":")[2])
+        return
+    if kind == "jpeg-udp":
+        parse_jpeg_udp(spec.partition(":")[2])
         return
     if kind == "screen":
         require_packages("--camera screen:", SCREEN_PACKAGES)
@@ -153,6 +158,9 @@ def _open(spec: str, *, image_size: int, clock: Clock, is_depth: bool | None) ->
         return ScreenCamera(rest, clock=clock)
     if kind == "pipe":
         return PipeCamera(parse_pipe(rest), clock=clock)
+    if kind == "jpeg-udp":
+        host, port = parse_jpeg_udp(rest)
+        return Grabber(partial(JpegUdpSource, host, port, clock=clock), clock=clock)
     if _is_stream(spec):
         return Grabber(partial(open_stream, spec, clock=clock), clock=clock)
     if _is_device(spec):

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import torch
 from onnx import helper
+from torch import Tensor
 
 from helpers.fakes import ListSink
 from helpers.foreign_graphs import FLOAT, save_graph
@@ -15,7 +17,13 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.simulation import flight as simulated
 from mavbridge.simulation.flight import SimulatedFlight
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.engines.executable import (
+    ExecutionSettings,
+    encode_all,
+    level_state,
+    make_numpy_executable,
+)
+from policy.engines.torch_eager import make_torch_executable
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
 from policy.protocol import Executable
@@ -82,6 +90,40 @@ def test_a_policy_in_python_flies_by_metres() -> None:
     assert 0.5 < height_m < 4
     assert {vision.rgb.dtype for vision in sink.visions} == {np.dtype(np.uint16)}
     assert {vision.fault for vision in sink.visions} == {None}
+
+
+class TwoRates(torch.nn.Module):
+    """Gives what it is given: the mean distance of each camera at each time."""
+
+    contract = replace(
+        DEPTH,
+        arrays="torch",
+        feature_dim=1,
+        cameras=("front", "down"),
+        observation_steps=2,
+    )
+
+    def encode_visual(self, image: Tensor, camera: int) -> Tensor:
+        assert image.shape == (1, 1, SIDE, SIDE)
+        assert image.dtype == torch.float32
+        return image.mean(dim=(2, 3))
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return feature.reshape(1, 1, 4).expand(-1, self.contract.horizon, -1)
+
+    def predict(self, image: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return self.predict_fast(image.mean(dim=(3, 4, 5)), state, history, steps)
+
+
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_a_policy_in_torch_gets_metres_of_all_cameras_and_times(dual_rate: bool) -> None:
+    settings = ExecutionSettings(name="deep", dual_rate=dual_rate)
+    executable = make_torch_executable(TwoRates(), settings)
+    metres = np.array([[1, 2], [3, 4]], np.uint16)
+    images = np.broadcast_to(1000 * metres[..., None, None], (2, 2, 40, 50)).astype(np.uint16)
+    state, history = level_state(TwoRates.contract), np.zeros((1, 4, 4), np.float32)
+    chunk = executable.act(encode_all(executable, images), state, history, None)
+    assert chunk[0, 0] == pytest.approx([1, 2, 3, 4])
 
 
 def actor(path: Path, *, kind: int = FLOAT) -> None:
