@@ -13,7 +13,7 @@ from mavbridge.camera.grabber import Image
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.provenance import without_secrets
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 from policy.files import library_name
 
 OPEN_TIMEOUT_MS = 5000
@@ -123,11 +123,13 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
             del os.environ[name]
 
 
-def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> ImageArray:
-    """The grabbed frame as [H, W, 3] RGB; raises CameraError if it cannot be decoded."""
+def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> CameraImage:
+    """The grabbed frame in RGB, or of depth; raises CameraError if it cannot be decoded."""
     decoded, bgr = capture.retrieve()
     if not decoded:
         raise CameraError(f"{name}: a frame cannot be decoded")
+    if bgr.ndim == 2:
+        return np.asarray(bgr, dtype=np.uint16)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 

@@ -38,7 +38,6 @@ _POLL_S = 0.1
 _RECEIVE_BUFFER_BYTES = 4 << 20
 _MOST_QUEUED = 4096
 """Datagrams read behind a whole frame: a sender faster than this computer is not followed on."""
-_MAX_DATAGRAM_BYTES = 65_535
 _ADDRESS = re.compile(r"(?:\[([^\[\]\s]+)\]:|([^:\[\]\s]+):)?(\d{1,5})", re.ASCII)
 _log = logging.getLogger(__name__)
 
@@ -189,13 +188,12 @@ class JpegUdpSource:
         self._frames = FrameAssembler()
         self._stamps = SenderClock()
         self._datagrams = 0
-        self._socket: socket.socket | None = None
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+        self._socket.setblocking(False)
         try:
-            family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-            self._socket = socket.socket(family, socket.SOCK_DGRAM)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
-            self._socket.setblocking(False)
-            self._socket.bind(address)
+            self._socket.bind((host, port))
         except OSError as error:
             self.close()
             raise CameraError(f"{self._name} cannot be opened: {error.strerror}") from error
@@ -230,11 +228,9 @@ class JpegUdpSource:
         return newest
 
     def _receive(self, *, is_waiting: bool) -> bytes | None:
-        if self._socket is None:
-            raise CameraError(f"{self._name} is closed")
         try:
             ready, _, _ = select.select([self._socket], [], [], _POLL_S if is_waiting else 0.0)
-            return self._socket.recv(_MAX_DATAGRAM_BYTES) if ready else None
+            return self._socket.recv(1 << 16) if ready else None
         except BlockingIOError:  # its checksum was wrong
             return None
         except OSError as error:
@@ -257,6 +253,4 @@ class JpegUdpSource:
         """See `ImageSource`."""
         if self._frames.malformed or self._frames.incomplete:
             _log.info("%s: %s", self._name, self._counts)
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        self._socket.close()

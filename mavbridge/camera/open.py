@@ -8,7 +8,7 @@ from pathlib import Path
 from mavbridge.camera.blank import BlankCamera
 from mavbridge.camera.capture import open_device, open_stream, present_devices
 from mavbridge.camera.deadlines import LiveCamera, wait_for_first_frame
-from mavbridge.camera.grabber import Grabber
+from mavbridge.camera.grabber import Grabber, Image
 from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
 from mavbridge.camera.latency import LatencyCompensatedCamera
 from mavbridge.camera.pipe import PipeCamera, parse_pipe
@@ -115,7 +115,7 @@ def open_camera(
     """
     check_camera(spec, latency_ms=latency_ms)
     camera = _open(spec, image_size=image_size, clock=clock, is_depth=is_depth)
-    first: Frame | None = None
+    first: Image | Frame | None = camera.upcoming if isinstance(camera, VideoFileCamera) else None
     try:
         if isinstance(camera, Grabber | SharedMemoryCamera):
             live: LiveCamera = camera
@@ -130,7 +130,7 @@ def open_camera(
     return LatencyCompensatedCamera(camera, latency_ns=round(latency_ms * NS_PER_MS))
 
 
-def _require_kind(spec: str, first: Frame | None, is_depth: bool | None) -> None:
+def _require_kind(spec: str, first: Image | Frame | None, is_depth: bool | None) -> None:
     """Refuse depth for a policy of RGB, and the reverse; a source without ``first`` is RGB."""
     shape = (0, 0, 3) if first is None else first.rgb.shape
     if is_depth is None or is_depth == (len(shape) == 2):

@@ -75,8 +75,7 @@ def parse_pipe(text: str) -> PipeCommand:
             raise UserError(f"{spec}: {name!r} is no format of raw pictures; there are {known}")
         if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
             raise UserError(f"{spec}: no picture has {width}x{height} pixels")
-        raw_format = RAW_FORMATS[name]
-        is_halved = raw_format.bits in (12, 16) and not raw_format.is_depth
+        is_halved = RAW_FORMATS[name].bits in (12, 16) and not RAW_FORMATS[name].is_depth
         if is_halved and (width % 2 or height % 2):
             raise UserError(f"{spec}: pictures in {name} have an even width and height")
         raw = (width, height, name)

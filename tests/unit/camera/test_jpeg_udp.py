@@ -105,6 +105,15 @@ def test_what_is_malformed_is_counted_and_ignored(datagram):
     assert put_all(frames, chunks(8, payload(8), part=9)) == [8]
 
 
+@given(st.lists(st.binary(max_size=80), max_size=20))
+def test_no_bytes_raise_or_hide_the_next_frame(datagrams):
+    frames = FrameAssembler()
+    for datagram in datagrams:
+        frames.put(datagram, START_NS)
+    later_ns = START_NS + RESTART_NS
+    assert put_all(frames, chunks(8, payload(8), part=9), later_ns) == [8]
+
+
 def test_chunks_that_outgrow_their_picture_are_dropped():
     frames = FrameAssembler()
     header = HEADER.pack(5, 0, 3, 10, 8, 0), HEADER.pack(5, 1, 3, 10, 8, 0)

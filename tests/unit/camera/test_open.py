@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from helpers.camera_senders import depth_scene, scene
+from helpers.camera_senders import SIDE, depth_scene, scene
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import open as camera_open
 from mavbridge.camera.latency import LatencyCompensatedCamera
@@ -16,6 +16,7 @@ from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
+from mavbridge.recording.video.file import FragmentedMp4
 from sitl.camera.shm import FramePublisher
 
 
@@ -197,8 +198,22 @@ def test_a_camera_of_the_other_kind_is_refused_with_its_figures(is_depth):
     publisher.close()
 
 
+def test_the_video_of_a_depth_flight_plays_as_depth(tmp_path):
+    path = tmp_path / "camera.mp4"
+    video = FragmentedMp4(path, height=SIDE, width=SIDE, hz=30, is_depth=True)
+    for number in range(3):
+        video.append(depth_scene(number), number * NS_PER_S // 30)
+    video.close()
+    with pytest.raises(UserError, match=f"delivers depth of {SIDE}x{SIDE}, .* takes RGB"):
+        open_camera(str(path), image_size=32, clock=FakeClock(), is_depth=False)
+    camera = open_camera(str(path), image_size=32, clock=FakeClock(), is_depth=True)
+    for number in range(3):
+        assert np.array_equal(camera.read(NS_PER_S).rgb, depth_scene(number))
+    camera.close()
+
+
 def test_a_video_file_is_no_depth_and_no_camera_is_of_either_kind(video):
-    with pytest.raises(UserError, match=r"delivers RGB images, .* takes depth"):
+    with pytest.raises(UserError, match=r"delivers RGB images of 32x32, .* takes depth"):
         open_camera(video, image_size=32, clock=FakeClock(), is_depth=True)
     shapes = []
     for is_depth in (False, True):
