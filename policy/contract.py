@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from policy.errors import ContractError
 from policy.files import parse_json
 
-CONTRACT_VERSION = 5
-READABLE_VERSIONS = (1, 2, 3, 4, 5)
+CONTRACT_VERSION = 6
+READABLE_VERSIONS = (1, 2, 3, 4, 5, 6)
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -72,10 +72,12 @@ IMAGENET_MEAN_RGB = (0.485, 0.456, 0.406)
 IMAGENET_STD_RGB = (0.229, 0.224, 0.225)
 
 FloatArray = NDArray[np.float32]
+CameraImage = NDArray[np.uint8 | np.uint16]
+"""[H, W, 3] uint8 in RGB, or a depth image [H, W] uint16."""
 ImageFit = Literal["stretch", "crop", "pad"]
 """How an image takes the shape that a policy wants: by other proportions, by cutting its longer
 sides off evenly, or by black bars."""
-ImageChannels = Literal["rgb", "bgr"]
+ImageChannels = Literal["rgb", "bgr", "depth"]
 StateFrame = Literal["ned_frd", "enu_flu"]
 Arrays = Literal["numpy", "torch"]
 STICK_MODES = (
@@ -117,6 +119,8 @@ OBSERVATION_TERMS = (
 """Fields that came with version 4: what a policy sees, and how long it plays one chunk."""
 STALL_TERMS = ("max_stall_s",)
 """Field that came with version 5: how long a chunk is flown on without a newer one."""
+DEPTH_TERMS = ("depth_unit_m",)
+"""Field that came with version 6, with the value "depth" of ``image_channels``."""
 _TUPLES = ("cameras", "camera_rates_hz", "image_crop", "state_extras")
 
 
@@ -143,7 +147,11 @@ class Contract:
     and width. It is cut out before the image is resized."""
     image_fit: ImageFit = "stretch"
     image_channels: ImageChannels = "rgb"
-    """Order of the three channels; the mean and deviation are by colour, whatever the order."""
+    """Order of the three channels; the mean and deviation are by colour, whatever the order. With
+    "depth" there is one channel, the distance along the optical axis in metres, float32, neither
+    scaled nor shifted; 0 where it is not known. It takes a camera of depth."""
+    depth_unit_m: float = 0.001
+    """Metres of one step of a depth camera's 16-bit pixels; 0.001 is millimetres."""
     cameras: tuple[str, ...] = ("front",)
     """Names of the cameras, in the order of their features; all images are of one size."""
     camera_rates_hz: tuple[float, ...] = ()
@@ -212,6 +220,7 @@ class Contract:
         """Refuse values that no runtime could serve."""
         try:
             self._require_values()
+            self._require_images()
             self._require_observation()
             self._require_flight_terms()
         except (TypeError, ValueError, OverflowError, AttributeError) as error:
@@ -251,7 +260,7 @@ class Contract:
             if not _is_within(value, LEAST, 1.0):
                 raise ContractError(f"{name} must be in [{LEAST:g}, 1] seconds, got {value!r}")
 
-    def _require_observation(self) -> None:
+    def _require_images(self) -> None:
         for name, low in (("image_mean_rgb", -MOST_PIXEL), ("image_std_rgb", 1e-6)):
             rgb = getattr(self, name)
             if len(rgb) != 3 or not all(_is_within(value, low, MOST_PIXEL) for value in rgb):
@@ -261,6 +270,14 @@ class Contract:
         for name in _TUPLES:
             if not isinstance(getattr(self, name), tuple):
                 raise ContractError(f"{name} must be a list, got {getattr(self, name)!r}")
+        if not _is_within(self.depth_unit_m, 1e-6, 1.0):
+            raise ContractError(f"depth_unit_m must be in [1e-06, 1] m, got {self.depth_unit_m!r}")
+        scaling = (self.image_mean_rgb, self.image_std_rgb)
+        if self.is_depth and scaling != (IMAGENET_MEAN_RGB, IMAGENET_STD_RGB):
+            raise ContractError(
+                "image_channels 'depth' gives metres as they are: leave image_mean_rgb and "
+                f"image_std_rgb out, got {scaling[0]} and {scaling[1]}"
+            )
         crop = self.image_crop
         is_crop = len(crop) == 4 and all(_is_within(share, 0, 1) for share in crop)
         if not is_crop or min(crop[2] - crop[0], crop[3] - crop[1]) < LEAST:
@@ -268,6 +285,8 @@ class Contract:
                 "image_crop must be top, left, bottom, right within [0, 1], at least "
                 f"{LEAST:g} apart, got {self.image_crop}"
             )
+
+    def _require_observation(self) -> None:
         names = self.cameras
         if not names or len(set(names)) < len(names) or not all(map(str.isidentifier, names)):
             raise ContractError(f"cameras must be one or more different names, got {names!r}")
@@ -355,10 +374,20 @@ class Contract:
         return self._stacked(self.feature_dim * len(self.cameras))
 
     @property
+    def is_depth(self) -> bool:
+        """It takes depth images."""
+        return self.image_channels == "depth"
+
+    @property
+    def picture_shape(self) -> tuple[int, ...]:
+        """Shape of a camera's image once it is fitted: [H, W, 3], or [H, W] of depth."""
+        return (self.image_height, self.image_width, *(() if self.is_depth else (3,)))
+
+    @property
     def image_shape(self) -> tuple[int, ...]:
         """Shape of what ``predict`` takes, without the batch: [3, H, W], [N, 3, H, W] with several
-        cameras, and a T before that with several observations."""
-        each = (3, self.image_height, self.image_width)
+        cameras, and a T before that with several observations; of depth 1 in place of 3."""
+        each = (1 if self.is_depth else 3, self.image_height, self.image_width)
         return self._stacked(*(each if len(self.cameras) == 1 else (len(self.cameras), *each)))
 
     def _stacked(self, *shape: int) -> tuple[int, ...]:
@@ -392,6 +421,7 @@ class Contract:
         known -= set(ACTION_TERMS) if version < 3 else set()
         known -= set(OBSERVATION_TERMS) if version < 4 else set()
         known -= set(STALL_TERMS) if version < 5 else set()
+        known -= set(DEPTH_TERMS) if version < 6 else set()
         if unknown := sorted(set(data) - known):
             raise ContractError(
                 f"unknown contract keys {unknown}; those of version {version} are {sorted(known)}"

@@ -9,16 +9,17 @@ through here too.
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import Contract, FloatArray
+from policy.contract import CameraImage, Contract, FloatArray
 from policy.errors import PolicyError
 from policy.rotation import matrix_columns
 
+_Pixel = TypeVar("_Pixel", np.uint8, np.uint8 | np.uint16)
 STATE_SCALE = (
     *(5.0, 5.0, 5.0),  # m/s: a brisk pace through gates
     *(1.0, 1.0, 1.0, 1.0),  # a unit quaternion
@@ -74,16 +75,18 @@ def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
     return np.array(rows, dtype=np.float32)
 
 
-def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:
-    """RGB image [H, W, 3] uint8 of any size -> [1, 3, image_height, image_width] float32.
+def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:
+    """Camera's image of any size -> float32 [1, 3, image_height, image_width]; depth [1, 1, ...].
 
     It is fitted by ``fit_image``, then normalised as ``(value / 255 - mean) / std`` by the
-    contract, with the channels in the contract's order.
+    contract, with the channels in the contract's order; depth becomes metres.
 
     Raises:
-        PolicyError: the array is not an RGB uint8 image.
+        PolicyError: the array is not an image of the contract's kind.
     """
-    fitted = fit_image(rgb, contract)
+    fitted = fit_image(image, contract)
+    if contract.is_depth:
+        return np.multiply(fitted, np.float32(contract.depth_unit_m), dtype=np.float32)[None, None]
     scale, offset = _scale_offset(contract)
     planes = np.empty((1, 3, contract.image_height, contract.image_width), np.float32)
     for place, colour in enumerate((0, 1, 2) if contract.image_channels == "rgb" else (2, 1, 0)):
@@ -93,7 +96,16 @@ def image_to_input(rgb: NDArray[np.uint8], contract: Contract) -> FloatArray:
 
 
 def input_to_bytes(planes: FloatArray, contract: Contract) -> FloatArray:
-    """Undo the normalisation of ``image_to_input``: [..., 3, H, W] -> whole numbers 0 to 255."""
+    """Undo the normalisation of ``image_to_input``: [..., 3, H, W] -> whole numbers 0 to 255.
+
+    Raises:
+        PolicyError: the contract's images are depth, which has no bytes.
+    """
+    if contract.is_depth:
+        raise PolicyError(
+            "it takes its image as uint8, and the contract's is depth in metres: export it with "
+            "an image of type float"
+        )
     scale, offset = _scale_offset(contract)
     colours = [0, 1, 2] if contract.image_channels == "rgb" else [2, 1, 0]
     per_plane = (3, 1, 1)
@@ -102,20 +114,33 @@ def input_to_bytes(planes: FloatArray, contract: Contract) -> FloatArray:
     return whole
 
 
-def fit_image(rgb: NDArray[np.uint8], contract: Contract) -> NDArray[np.uint8]:
-    """RGB image [H, W, 3] of any size -> the contract's part of it [image_height, image_width, 3].
+def dummy_images(contract: Contract) -> CameraImage:
+    """Grey images, or distances of 2000 units, of all cameras at all observations.
+
+    Axes before those of ``Contract.picture_shape`` are as in ``Contract.image_shape``.
+    """
+    shape = (*contract.image_shape[:-3], *contract.picture_shape)
+    return np.full(shape, 2000, np.uint16) if contract.is_depth else np.full(shape, 128, np.uint8)
+
+
+def fit_image(image: CameraImage, contract: Contract) -> CameraImage:
+    """Camera's image of any size -> the contract's part of it, of ``Contract.picture_shape``.
 
     Raises:
-        PolicyError: the array is not an RGB uint8 image.
+        PolicyError: the array is not an image of the contract's kind.
     """
-    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
+    kind = (np.dtype(np.uint16), ()) if contract.is_depth else (np.dtype(np.uint8), (3,))
+    if image.ndim < 2 or (image.dtype, image.shape[2:]) != kind or 0 in image.shape:
+        wanted = (
+            "uint16 [height, width]: depth" if contract.is_depth else "uint8 [height, width, 3]"
+        )
         raise PolicyError(
-            f"an image must be uint8 [height, width, 3] in RGB, got {rgb.dtype} {list(rgb.shape)}: "
-            "convert it in the camera source"
+            f"an image must be {wanted} by image_channels {contract.image_channels!r}, got "
+            f"{image.dtype} {list(image.shape)}: use a camera of that kind"
         )
     height, width = contract.image_height, contract.image_width
     top, left, bottom, right = contract.image_crop
-    image = rgb[_part(len(rgb), top, bottom), _part(rgb.shape[1], left, right)]
+    image = image[_part(len(image), top, bottom), _part(image.shape[1], left, right)]
     tall, wide = height / image.shape[0], width / image.shape[1]
     if contract.image_fit == "stretch" or tall == wide:
         return resize(image, height, width)
@@ -127,7 +152,7 @@ def fit_image(rgb: NDArray[np.uint8], contract: Contract) -> NDArray[np.uint8]:
     least = min(tall, wide)
     inner = resize(image, _at_least_1(image.shape[0] * least), _at_least_1(image.shape[1] * least))
     above, beside = (height - inner.shape[0]) // 2, (width - inner.shape[1]) // 2
-    padded = np.zeros((height, width, 3), np.uint8)
+    padded = np.zeros(contract.picture_shape, image.dtype)
     padded[above : above + inner.shape[0], beside : beside + inner.shape[1]] = inner
     return padded
 
@@ -150,15 +175,17 @@ def _at_least_1(pixels: float) -> int:
     return max(round(pixels), 1)
 
 
-def resize(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """[H, W, 3] -> [height, width, 3]; the same array where there is nothing to do."""
+def resize(rgb: NDArray[_Pixel], height: int, width: int) -> NDArray[_Pixel]:
+    """[H, W, 3] -> [height, width, 3], or [H, W] of depth; the same array if it has that size."""
     if rgb.shape[:2] == (height, width):
         return rgb
     shrinks = rgb.shape[0] > height or rgb.shape[1] > width
     # Area averaging does not alias when shrinking; it is nearest-neighbour when enlarging.
     interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    if rgb.ndim == 2:  # between a near and a far pixel, or an unknown one, there is no distance
+        interpolation = cv2.INTER_NEAREST
     resized = cv2.resize(np.ascontiguousarray(rgb), (width, height), interpolation=interpolation)
-    return resized.astype(np.uint8, copy=False)
+    return resized.astype(rgb.dtype, copy=False)
 
 
 @lru_cache(maxsize=8)

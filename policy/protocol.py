@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from policy.contract import Contract, FloatArray
+from policy.contract import CameraImage, Contract, FloatArray
 
 
 @runtime_checkable
@@ -44,7 +43,7 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
     """
 
     def encode_visual(self, image: Any) -> Any:
-        """Image [B, 3, H, W] -> feature [B, F]."""
+        """Image [B, 3, H, W], or of depth [B, 1, H, W] -> feature [B, F]."""
 
     def predict_fast(
         self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
@@ -87,8 +86,8 @@ class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
 class Encode(Protocol):
     """``Executable.encode``."""
 
-    def __call__(self, rgb: NDArray[np.uint8], camera: int = 0, /) -> FloatArray:
-        """RGB image of one of ``contract.cameras`` -> its encoded image."""
+    def __call__(self, image: CameraImage, camera: int = 0, /) -> FloatArray:
+        """Image of one of ``contract.cameras`` -> its encoded image."""
 
 
 @runtime_checkable
@@ -136,8 +135,9 @@ class Executable:
     engine: str
     dual_rate: bool
     encode: Encode
-    """RGB [any height, any width, 3] of one camera -> float32 [1, feature_dim], or without a fast
-    path the image [1, 3, image_height, image_width]; ``join`` makes of them what ``act`` takes."""
+    """Image of any size of one camera -> float32 [1, feature_dim], or without a fast path the image
+    [1, 3, image_height, image_width] (depth: 1 for 3); ``join`` makes of them what ``act`` takes.
+    """
     act: Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
     """(joined images [1, *contract.feature_shape], or without a fast path [1,
     *contract.image_shape]; state [1, *contract.state_shape]; history [1, K, 4]; seconds from the

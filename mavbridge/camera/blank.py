@@ -4,7 +4,7 @@ import numpy as np
 
 from mavbridge.camera.deadlines import wait_until_due
 from mavbridge.core.clock import NS_PER_S, Clock
-from mavbridge.core.records import Frame
+from mavbridge.core.records import CameraImage, Frame
 
 FRAME_NS = NS_PER_S // 30
 
@@ -12,9 +12,10 @@ FRAME_NS = NS_PER_S // 30
 class BlankCamera:
     """Delivers a black frame at each moment of a grid; one that nobody took in time is dropped."""
 
-    def __init__(self, *, image_size: int, clock: Clock) -> None:
+    def __init__(self, *, image_size: int, clock: Clock, is_depth: bool = False) -> None:
         self._clock = clock
-        self._rgb = np.zeros((image_size, image_size, 3), np.uint8)
+        shape = (image_size, image_size, *(() if is_depth else (3,)))
+        self._rgb: CameraImage = np.zeros(shape, np.uint16 if is_depth else np.uint8)
         self._rgb.flags.writeable = False
         self._due_ns = clock.now_ns()
         self._frame_id = 0

@@ -13,12 +13,13 @@ from mavbridge.camera.grabber import Image
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.provenance import without_secrets
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 from policy.files import library_name
 
 OPEN_TIMEOUT_MS = 5000
 READ_TIMEOUT_MS = 2000
 FFMPEG_OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+FFMPEG_LOG_VARIABLE = "OPENCV_FFMPEG_LOGLEVEL"
 LOW_LATENCY_OPTIONS = "rtsp_flags;prefer_tcp|fflags;nobuffer|flags;low_delay"
 """No buffering in the demuxer, no reordering delay in the decoder. Setting options drops OpenCV's
 default, which is the first of these."""
@@ -87,6 +88,7 @@ def open_stream(url: str, *, clock: Clock) -> CaptureSource:
     timeouts = [
         *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, OPEN_TIMEOUT_MS),
         *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, READ_TIMEOUT_MS),
+        *(cv2.CAP_PROP_N_THREADS, 1),  # each further one holds a frame back
     ]
     name, source, options = without_secrets(url), url, LOW_LATENCY_OPTIONS
     if "://" not in url:
@@ -97,6 +99,7 @@ def open_stream(url: str, *, clock: Clock) -> CaptureSource:
         raise CameraError(
             f"stream {name} cannot be opened within {OPEN_TIMEOUT_MS / 1000:g} s: check the "
             "address, that the sender is running, and that it sends video"
+            + ("; H.264 over RTP is opened by its .sdp file" if url.startswith("rtp:") else "")
         )
     failure = f"ended, or was silent for {READ_TIMEOUT_MS / 1000:g} s"
     return CaptureSource(capture, f"stream {name}", failure, clock)
@@ -107,23 +110,26 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
     """FFmpeg options for the captures opened inside, unless the user has set some.
 
     OpenCV reads them from the environment alone. They must not stay there: a file that is opened
-    with ``nobuffer`` loses its first frames.
+    with ``nobuffer`` loses its first frames. FFmpeg is silenced as well: it would complain of each
+    frame of a stream that is joined between two key frames.
     """
-    if FFMPEG_OPTIONS_VARIABLE in os.environ:
-        yield
-        return
-    os.environ[FFMPEG_OPTIONS_VARIABLE] = options
+    wanted = {FFMPEG_OPTIONS_VARIABLE: options, FFMPEG_LOG_VARIABLE: "-8"}
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(added)
     try:
         yield
     finally:
-        del os.environ[FFMPEG_OPTIONS_VARIABLE]
+        for name in added:
+            del os.environ[name]
 
 
-def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> ImageArray:
-    """The grabbed frame as [H, W, 3] RGB; raises CameraError if it cannot be decoded."""
+def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> CameraImage:
+    """The grabbed frame in RGB, or of depth; raises CameraError if it cannot be decoded."""
     decoded, bgr = capture.retrieve()
     if not decoded:
         raise CameraError(f"{name}: a frame cannot be decoded")
+    if bgr.ndim == 2:
+        return np.asarray(bgr, dtype=np.uint16)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 

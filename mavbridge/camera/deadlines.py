@@ -6,6 +6,7 @@ from typing import Protocol
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.ports import Camera
+from mavbridge.core.records import Frame
 
 REOPENED_NS = 10 * NS_PER_S
 """Limit for the first frame of a source that was opened again: exposure control, negotiation."""
@@ -26,8 +27,8 @@ class LiveCamera(Camera, Protocol):
 
 def wait_for_first_frame(
     camera: LiveCamera, *, clock: Clock, timeout_s: float, report: Callable[[str], None]
-) -> None:
-    """Read until a frame comes, and drop it; every second ``report`` gets a line of a countdown.
+) -> Frame:
+    """Return the first frame; every second until then ``report`` gets a line of a countdown.
 
     The reason for the wait is reported when it changes. Raises CameraError if none comes in time,
     or as ``read`` does.
@@ -35,8 +36,8 @@ def wait_for_first_frame(
     deadline_ns = clock.now_ns() + round(timeout_s * NS_PER_S)
     told: str | None = None
     while (left_ns := deadline_ns - clock.now_ns()) > 0:
-        if camera.read(left_ns % NS_PER_S or NS_PER_S) is not None:
-            return
+        if (frame := camera.read(left_ns % NS_PER_S or NS_PER_S)) is not None:
+            return frame
         left_s = round((deadline_ns - clock.now_ns()) / NS_PER_S)
         if left_s > 0:
             reason = camera.waiting_reason

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 from mavbridge.camera.deadlines import REOPENED_NS, STALL_NS
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
-from mavbridge.core.records import Frame, ImageArray
+from mavbridge.core.records import CameraImage, Frame
 
 REOPEN_DELAYS_S = (0.5, 1.0, 2.0, 4.0)
 JOIN_S = 3.0
@@ -17,8 +17,8 @@ class Image(NamedTuple):
     """A frame as its source delivers it."""
 
     captured_ns: int
-    rgb: ImageArray
-    """[H, W, 3] uint8 RGB, owned by the receiver."""
+    rgb: CameraImage
+    """Owned by the receiver."""
 
 
 class ImageSource(Protocol):

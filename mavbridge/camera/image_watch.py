@@ -3,7 +3,7 @@
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 
 TAKEOFF_NS = 2 * NS_PER_S
 """Time from the last word that the vehicle is landed in which its image may still be at rest: the
@@ -31,29 +31,29 @@ class ImageWatch:
     TAKEOFF_NS later than that.
 
     Blank: for longer than the limit nearly all pixels have been dark (a cap on the lens, no
-    exposure) or of one colour (a lost video signal, a decoder without a key frame, dense fog). That
-    counts on the ground as well.
+    exposure) or of one colour (a lost video signal, a decoder without a key frame, dense fog), or
+    of a depth image unknown. That counts on the ground as well.
     """
 
     def __init__(self, *, max_frozen_s: float, max_black_s: float) -> None:
         self._max_frozen_s = max_frozen_s
         self._max_black_s = max_black_s
-        self._last: ImageArray | None = None
+        self._last: CameraImage | None = None
         self._changed_ns = 0
         self._grounded_ns: int | None = None
         self._blank_since_ns: int | None = None
 
-    def check(self, rgb: ImageArray, captured_ns: int, *, is_airborne: bool) -> str | None:
+    def check(self, rgb: CameraImage, captured_ns: int, *, is_airborne: bool) -> str | None:
         """Reason not to fly by this image, or None; call it with each image, in order.
 
-        ``rgb`` is [H, W, 3] uint8; it is kept for the next call and must not be changed.
+        ``rgb`` is kept for the next call and must not be changed.
         ``is_airborne`` is False also where that is not known.
         """
         blank = self._blank(rgb, captured_ns) if self._max_black_s > 0 else None
         frozen = self._frozen(rgb, captured_ns, is_airborne) if self._max_frozen_s > 0 else None
         return blank or frozen
 
-    def _frozen(self, rgb: ImageArray, captured_ns: int, is_airborne: bool) -> str | None:
+    def _frozen(self, rgb: CameraImage, captured_ns: int, is_airborne: bool) -> str | None:
         last, self._last = self._last, rgb
         if last is None or not _is_same(last, rgb):
             self._changed_ns = captured_ns
@@ -66,7 +66,7 @@ class ImageWatch:
             return None
         return f"the image has been frozen for {(captured_ns - self._changed_ns) / NS_PER_S:.1f} s"
 
-    def _blank(self, rgb: ImageArray, captured_ns: int) -> str | None:
+    def _blank(self, rgb: CameraImage, captured_ns: int) -> str | None:
         if not is_blank(rgb):
             self._blank_since_ns = None
             return None
@@ -75,20 +75,26 @@ class ImageWatch:
         blank_s = (captured_ns - self._blank_since_ns) / NS_PER_S
         if blank_s <= self._max_black_s:
             return None
-        return f"the image has been black or of one colour for {blank_s:.1f} s"
+        what = "without any depth" if rgb.ndim == 2 else "black or of one colour"
+        return f"the image has been {what} for {blank_s:.1f} s"
 
 
-def _is_same(one: ImageArray, other: ImageArray) -> bool:
+def _is_same(one: CameraImage, other: CameraImage) -> bool:
     """Compare all pixels, but only where some rows do not differ already."""
     step = max(1, len(one) // SAMPLED_ROWS)
     return np.array_equal(one[::step], other[::step]) and np.array_equal(one, other)
 
 
-def is_blank(rgb: ImageArray) -> bool:
-    """Return whether nearly all pixels are dark, or all of one colour."""
-    height, width, _ = rgb.shape
-    grid = rgb[:: max(1, height // GRID), :: max(1, width // GRID)].reshape(-1, 3)
+def is_blank(rgb: CameraImage) -> bool:
+    """Return whether nearly all pixels are dark, or all of one colour, or of unknown depth.
+
+    Equal depths are no fault: so shows a wall.
+    """
+    height, width = rgb.shape[:2]
+    grid = rgb[:: max(1, height // GRID), :: max(1, width // GRID)].reshape(-1, *rgb.shape[2:])
     enough = SHOWING_SHARE * grid.size
+    if rgb.ndim == 2:
+        return bool(np.count_nonzero(grid) < enough)
     if np.count_nonzero(grid > DARK) < enough:
         return True
     values = grid.astype(np.float32)

@@ -8,7 +8,8 @@ from pathlib import Path
 from mavbridge.camera.blank import BlankCamera
 from mavbridge.camera.capture import open_device, open_stream, present_devices
 from mavbridge.camera.deadlines import LiveCamera, wait_for_first_frame
-from mavbridge.camera.grabber import Grabber
+from mavbridge.camera.grabber import Grabber, Image
+from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
 from mavbridge.camera.latency import LatencyCompensatedCamera
 from mavbridge.camera.pipe import PipeCamera, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
@@ -17,6 +18,8 @@ from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.extras import require_packages
 from mavbridge.core.ports import Camera
+from mavbridge.core.provenance import without_secrets
+from mavbridge.core.records import Frame
 
 STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
 SCREEN_PACKAGES = {"mss": "mss", "Xlib": "python-xlib"}
@@ -26,7 +29,8 @@ FORMS = (
     "a device (0, /dev/video0, /dev/v4l/by-id/NAME), a stream (rtsp://, rtp://, udp://, tcp://, "
     "http://, https://, an .sdp file), "
     "a video file, shm:NAME, screen:WINDOW TITLE (screen: alone = the whole screen), pipe:COMMAND "
-    "(MJPEG from a program), or none for a policy that looks at no image"
+    "(MJPEG from a program), jpeg-udp:[HOST:]PORT (a simulator's chunks of JPEG), or none for a "
+    "policy that looks at no image"
 )
 
 
@@ -45,6 +49,9 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
         )
     if kind == "pipe":
         parse_pipe(spec.partition(":")[2])
+        return
+    if kind == "jpeg-udp":
+        parse_jpeg_udp(spec.partition(":")[2])
         return
     if kind == "screen":
         require_packages("--camera screen:", SCREEN_PACKAGES)
@@ -85,6 +92,7 @@ def open_camera(
     timeout_s: float = 10.0,
     latency_ms: float = 0.0,
     report: Callable[[str], None] = lambda _: None,
+    is_depth: bool | None = None,
 ) -> Camera:
     """Open the source that ``spec`` names, and wait for its first frame, which is dropped.
 
@@ -99,37 +107,60 @@ def open_camera(
             opened is tried again, and shared memory may appear.
         latency_ms: time from exposure to arrival, subtracted from the stamps.
         report: gets a line of a countdown for every second of the wait.
+        is_depth: whether the policy takes depth or RGB; None: either.
 
     Raises:
-        UserError: as ``check_camera``.
+        UserError: as ``check_camera``, or its images are of the other kind.
         CameraError: no frame came in time, or the source cannot be used.
     """
     check_camera(spec, latency_ms=latency_ms)
-    camera = _open(spec, image_size=image_size, clock=clock)
-    if isinstance(camera, Grabber | SharedMemoryCamera):
-        live: LiveCamera = camera
-        try:
-            wait_for_first_frame(live, clock=clock, timeout_s=timeout_s, report=report)
-        except BaseException:
-            camera.close()
-            raise
+    camera = _open(spec, image_size=image_size, clock=clock, is_depth=is_depth)
+    first: Image | Frame | None = camera.upcoming if isinstance(camera, VideoFileCamera) else None
+    try:
+        if isinstance(camera, Grabber | SharedMemoryCamera):
+            live: LiveCamera = camera
+            first = wait_for_first_frame(live, clock=clock, timeout_s=timeout_s, report=report)
+        if spec != NO_CAMERA:
+            _require_kind(spec, first, is_depth)
+    except BaseException:
+        camera.close()
+        raise
     if latency_ms == 0.0:
         return camera
     return LatencyCompensatedCamera(camera, latency_ns=round(latency_ms * NS_PER_MS))
 
 
-def _open(spec: str, *, image_size: int, clock: Clock) -> Camera:
+def _require_kind(spec: str, first: Image | Frame | None, is_depth: bool | None) -> None:
+    """Refuse depth for a policy of RGB, and the reverse; a source without ``first`` is RGB."""
+    shape = (0, 0, 3) if first is None else first.rgb.shape
+    if is_depth is None or is_depth == (len(shape) == 2):
+        return
+    size = f" of {shape[1]}x{shape[0]}" if first else ""
+    found, wanted = (f"RGB images{size}", "depth") if is_depth else (f"depth{size}", "RGB images")
+    advice = (
+        "16-bit depth, such as pipe:640x480:gray16le:COMMAND" if is_depth else "a colour camera"
+    )
+    raise UserError(
+        f"--camera {without_secrets(spec)} delivers {found}, and the policy's contract takes "
+        f"{wanted} (image_channels): name {advice}, or mend the contract"
+    )
+
+
+def _open(spec: str, *, image_size: int, clock: Clock, is_depth: bool | None) -> Camera:
     kind, _, rest = spec.partition(":")
     if kind == "shm":
         return SharedMemoryCamera(rest, clock=clock)
     if spec == NO_CAMERA:
-        return BlankCamera(image_size=image_size, clock=clock)
+        return BlankCamera(image_size=image_size, clock=clock, is_depth=bool(is_depth))
     if kind == "screen":
         from mavbridge.camera.screen import ScreenCamera
 
         return ScreenCamera(rest, clock=clock)
     if kind == "pipe":
         return PipeCamera(parse_pipe(rest), clock=clock)
+    if kind == "jpeg-udp":
+        host, port = parse_jpeg_udp(rest)
+        return Grabber(partial(JpegUdpSource, host, port, clock=clock), clock=clock)
     if _is_stream(spec):
         return Grabber(partial(open_stream, spec, clock=clock), clock=clock)
     if _is_device(spec):

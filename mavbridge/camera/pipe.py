@@ -1,7 +1,9 @@
 """``pipe:COMMAND``: frames from the standard output of any program, such as a CSI camera's own.
 
-    pipe:COMMAND                         MJPEG
+    pipe:COMMAND                         MJPEG or PNG
     pipe:WIDTHxHEIGHT:FORMAT:COMMAND     raw pictures; FORMAT by FFmpeg's name, such as rgb24
+
+A grey PNG of 16 bits and the raw format gray16le are depth images.
 
 The command is split as a shell would split it, and run without one.
 """
@@ -20,16 +22,17 @@ from typing import NamedTuple
 from mavbridge.camera.grabber import Grabber, Image
 from mavbridge.camera.pipe_frames import (
     MAX_BAD_FRAMES,
+    MAX_SIDE_PX,
     RAW_FORMATS,
     FrameCutter,
-    JpegCutter,
+    PictureCutter,
     RawCutter,
 )
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.processes import user_environment
 
-FORM = "pipe:COMMAND (MJPEG) or pipe:WIDTHxHEIGHT:FORMAT:COMMAND (raw pictures)"
+FORM = "pipe:COMMAND (MJPEG or PNG) or pipe:WIDTHxHEIGHT:FORMAT:COMMAND (raw pictures)"
 FIRST_NS, SILENT_NS = 10 * NS_PER_S, 2 * NS_PER_S
 """Longest wait for the first byte, and for each one after it."""
 END_S = 1.0
@@ -48,12 +51,12 @@ class PipeCommand(NamedTuple):
 
     words: tuple[str, ...]
     raw: tuple[int, int, str] | None
-    """Width, height and format; None: MJPEG."""
+    """Width, height and format; None: MJPEG or PNG."""
 
     def cutter(self) -> FrameCutter:
         """A new cutter for its output."""
         if self.raw is None:
-            return JpegCutter()
+            return PictureCutter()
         width, height, name = self.raw
         return RawCutter(width, height, RAW_FORMATS[name])
 
@@ -70,9 +73,10 @@ def parse_pipe(text: str) -> PipeCommand:
         if name not in RAW_FORMATS:
             known = ", ".join(RAW_FORMATS)
             raise UserError(f"{spec}: {name!r} is no format of raw pictures; there are {known}")
-        if not (0 < width <= 8192 and 0 < height <= 8192):
+        if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
             raise UserError(f"{spec}: no picture has {width}x{height} pixels")
-        if RAW_FORMATS[name].bits in (12, 16) and (width % 2 or height % 2):
+        is_halved = RAW_FORMATS[name].bits in (12, 16) and not RAW_FORMATS[name].is_depth
+        if is_halved and (width % 2 or height % 2):
             raise UserError(f"{spec}: pictures in {name} have an even width and height")
         raw = (width, height, name)
     try:

@@ -1,20 +1,29 @@
-"""Cuts the output of a camera program into frames: MJPEG, or raw pictures of one size."""
+"""Cuts the output of a camera program into frames: JPEG or PNG, or raw pictures of one size."""
 
 import re
+import struct
 from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
 
 from mavbridge.core.errors import CameraError
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 
 MAX_JPEG_BYTES = 16 << 20
 MAX_BETWEEN_BYTES = 4096
-"""Most bytes between two JPEGs: multipart headers."""
+"""Most bytes between two pictures: multipart headers."""
+MAX_SIDE_PX = 8192
 MAX_BAD_FRAMES = 10
 """Frames in a row that cannot be decoded."""
 _SOI, _EOI, _SOS, _FILL = b"\xff\xd8", 0xD9, 0xDA, 0xFF
+_SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+"""Markers of the segment that says a JPEG's size."""
+_SIDES = struct.Struct(">HH")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_IHDR = struct.Struct(">16xIIBB")
+"""Width, height, bits of a sample and kind of colour (0: grey) of a PNG."""
+_START = re.compile(re.escape(_SOI) + b"|" + re.escape(_PNG))
 _MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 """In the coded data of a scan, where 00 and the restart markers D0 to D7 are data."""
 
@@ -25,7 +34,9 @@ class RawFormat(NamedTuple):
     bits: int
     """For each pixel."""
     conversion: int | None
-    """OpenCV's code of the conversion to RGB; None: it is RGB."""
+    """OpenCV's code of the conversion to RGB; None: it is RGB, or the depth of ``is_depth``."""
+    is_depth: bool = False
+    """One little-endian number for each pixel."""
 
 
 RAW_FORMATS = {
@@ -35,8 +46,39 @@ RAW_FORMATS = {
     "yuv420p": RawFormat(12, cv2.COLOR_YUV2RGB_I420),
     "nv12": RawFormat(12, cv2.COLOR_YUV2RGB_NV12),
     "yuyv422": RawFormat(16, cv2.COLOR_YUV2RGB_YUY2),
+    "gray16le": RawFormat(16, None, is_depth=True),
 }
 """By FFmpeg's names."""
+
+
+def decode_picture(data: bytes) -> CameraImage | None:
+    """A JPEG or PNG as [H, W, 3] uint8 RGB, or [H, W] uint16 if it is a grey PNG of 16 bits.
+
+    None if it is damaged, or larger than MAX_SIDE_PX a side, which is seen before it is decoded.
+    """
+    is_png = data.startswith(_PNG) and len(data) > _IHDR.size
+    sides = _IHDR.unpack_from(data)[:2] if is_png else _jpeg_sides(data)
+    if not 0 < min(sides) <= max(sides) <= MAX_SIDE_PX:
+        return None
+    is_depth = is_png and _IHDR.unpack_from(data)[2:] == (16, 0)
+    flag = cv2.IMREAD_UNCHANGED if is_depth else cv2.IMREAD_COLOR
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
+    if pixels is None:
+        return None
+    if is_depth:
+        return np.asarray(pixels, dtype=np.uint16)
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def _jpeg_sides(data: bytes) -> tuple[int, int]:
+    """Height and width from the first segment that says them; zeros: there is none."""
+    at = len(_SOI)
+    while data.startswith(_SOI) and at + 9 <= len(data) and data[at] == _FILL:
+        if data[at + 1] in _SOF:
+            return _SIDES.unpack_from(data, at + 5)
+        is_fill = data[at + 1] == _FILL
+        at += 1 if is_fill else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return 0, 0
 
 
 class FrameCutter(Protocol):
@@ -52,8 +94,8 @@ class FrameCutter(Protocol):
     def take(self) -> tuple[bytes, int] | None:
         """The newest whole frame and when its first byte came; None: there is none yet."""
 
-    def decode(self, frame: bytes) -> ImageArray | None:
-        """[H, W, 3] uint8 RGB; None if it is damaged."""
+    def decode(self, frame: bytes) -> CameraImage | None:
+        """[H, W, 3] uint8 RGB or [H, W] uint16 depth; None if it is damaged."""
 
     def rest(self) -> str:
         """What was left over at the end of the stream, for a message."""
@@ -90,9 +132,11 @@ class RawCutter:
         newest, self._newest = self._newest, None
         return newest
 
-    def decode(self, frame: bytes) -> ImageArray:
+    def decode(self, frame: bytes) -> CameraImage:
         """See `FrameCutter`; any bytes are a picture."""
         height, width = self._shape
+        if self._format.is_depth:
+            return np.frombuffer(frame, "<u2").reshape(height, width).astype(np.uint16)
         array = np.frombuffer(frame, np.uint8)
         conversion = self._format.conversion
         if conversion is None:
@@ -112,15 +156,15 @@ class RawCutter:
         )
 
 
-class JpegCutter:
-    """JPEG pictures one after the other, with or without the headers of a multipart stream."""
+class PictureCutter:
+    """JPEG or PNG pictures one after the other, with or without headers of a multipart stream."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._first_ns = 0
         self._at = 0
         """Where the search goes on; 0 while the start of a picture is looked for."""
-        self._in_scan = False
+        self._in_scan = self._is_png = False
         self._newest: tuple[bytes, int] | None = None
 
     @property
@@ -134,25 +178,27 @@ class JpegCutter:
         while True:
             if self._at == 0 and not self._find_start(arrived_ns):
                 return
-            if not self._find_end():
+            if not (self._find_png_end() if self._is_png else self._find_end()):
                 if len(self._buffer) > MAX_JPEG_BYTES:
-                    raise CameraError(f"no JPEG ended within {MAX_JPEG_BYTES >> 20} MiB")
+                    raise CameraError(f"no picture ended within {MAX_JPEG_BYTES >> 20} MiB")
                 return
             self._newest = bytes(self._buffer[: self._at]), self._first_ns
             del self._buffer[: self._at]
             self._at, self._in_scan = 0, False
 
     def _find_start(self, arrived_ns: int) -> bool:
-        start = self._buffer.find(_SOI)
-        if start < 0:
+        start = _START.search(self._buffer)
+        if start is None:
             if len(self._buffer) > MAX_BETWEEN_BYTES:
+                begin = bytes(self._buffer[:8]).hex(" ")
                 raise CameraError(
-                    f"its output is no MJPEG: it begins with {bytes(self._buffer[:8]).hex(' ')}; "
-                    "for raw pictures write pipe:WIDTHxHEIGHT:FORMAT:COMMAND"
+                    f"its output is no MJPEG and no PNG: it begins with {begin}; for raw pictures "
+                    "write pipe:WIDTHxHEIGHT:FORMAT:COMMAND"
                 )
             return False
-        del self._buffer[:start]
-        self._at, self._first_ns = len(_SOI), arrived_ns
+        self._at, self._first_ns = len(start[0]), arrived_ns
+        self._is_png = start[0] == _PNG
+        del self._buffer[: start.start()]
         return True
 
     def _find_end(self) -> bool:
@@ -184,17 +230,25 @@ class JpegCutter:
             self._at += 2 + length
             self._in_scan = marker == _SOS
 
+    def _find_png_end(self) -> bool:
+        """Walk over the chunks of the picture; True: it ends at ``_at``."""
+        buffer, kind = self._buffer, b""
+        while kind != b"IEND":
+            kind = bytes(buffer[self._at + 4 : self._at + 8])
+            end = self._at + 12 + int.from_bytes(buffer[self._at : self._at + 4], "big")
+            if len(kind) < 4 or end > len(buffer):
+                return False
+            self._at = end
+        return True
+
     def take(self) -> tuple[bytes, int] | None:
         """See `FrameCutter`."""
         newest, self._newest = self._newest, None
         return newest
 
-    def decode(self, frame: bytes) -> ImageArray | None:
+    def decode(self, frame: bytes) -> CameraImage | None:
         """See `FrameCutter`."""
-        bgr = cv2.imdecode(np.frombuffer(frame, np.uint8), cv2.IMREAD_COLOR)
-        if bgr is None:
-            return None
-        return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        return decode_picture(frame)
 
     def rest(self) -> str:
         """See `FrameCutter`."""

@@ -13,7 +13,7 @@ import numpy as np
 from mavbridge.camera.deadlines import STALL_NS
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
-from mavbridge.core.records import Frame, ImageArray
+from mavbridge.core.records import CameraImage, Frame
 from policy.files import open_regular
 
 MAGIC = b"MBSHM\0\0\1"
@@ -21,7 +21,8 @@ HEADER = struct.Struct("<8sIIII")
 """Magic, width, height, channels, slots."""
 HEADER_BYTES = 64
 SLOT_HEADER_BYTES = 32
-CHANNELS = 3
+PIXELS: dict[int, tuple[str, tuple[int, ...]]] = {3: ("u1", (3,)), 1: ("<u2", ())}
+"""Type and axes of a pixel by the number of channels: RGB, and depth."""
 SLOTS = 4
 MAX_SIDE_PX = 16384
 CLOSED = 2
@@ -159,12 +160,12 @@ class _Segment:
             with open_regular(path) as file:
                 self.status = os.fstat(file.fileno())
                 size_bytes = self.status.st_size
-                width, height = _checked_size(path.name, file.read(HEADER.size), size_bytes)
+                slot = _checked_slot(path.name, file.read(HEADER.size), size_bytes)
                 self._map = mmap.mmap(file.fileno(), size_bytes, access=mmap.ACCESS_READ)
         except OSError as error:
             raise CameraError(f"shm:{path.name}: cannot be opened: {error}") from error
         self._header = np.frombuffer(self._map, np.int64, HEADER_BYTES // 8)
-        self._slots = np.frombuffer(self._map, _slot_type(width, height), SLOTS, HEADER_BYTES)
+        self._slots = np.frombuffer(self._map, slot, SLOTS, HEADER_BYTES)
 
     def newest_id(self) -> int:
         """Newest frame; 0 = none yet. Raises CameraError where the file has shrunk."""
@@ -175,7 +176,7 @@ class _Segment:
         memory_barrier()
         return newest_id
 
-    def copy(self, frame_id: int) -> tuple[int, ImageArray] | None:
+    def copy(self, frame_id: int) -> tuple[int, CameraImage] | None:
         """captured_ns and pixels of a frame; None if the writer used its slot meanwhile."""
         slot = self._slots[frame_id % SLOTS : frame_id % SLOTS + 1]
         seq = int(slot["seq"][0])
@@ -183,7 +184,7 @@ class _Segment:
         if seq % 2 or slot["frame_id"][0] != frame_id:
             return None
         captured_ns = int(slot["captured_ns"][0])
-        rgb: ImageArray = slot["rgb"][0].copy()
+        rgb: CameraImage = slot["rgb"][0].copy()
         memory_barrier()
         if slot["seq"][0] != seq or slot["frame_id"][0] != frame_id:
             return None
@@ -210,39 +211,40 @@ def memory_barrier() -> None:
         pass
 
 
-def _slot_type(width: int, height: int) -> np.dtype[np.void]:
-    pixels = (np.uint8, (height, width, CHANNELS))
-    header_bytes = SLOT_HEADER_BYTES + width * height * CHANNELS
+def _slot_type(width: int, height: int, channels: int) -> np.dtype[np.void]:
+    kind, axes = PIXELS[channels]
+    pixels = np.dtype((kind, (height, width, *axes)))
     return np.dtype(
         {
             "names": ["seq", "frame_id", "captured_ns", "rgb"],
             "formats": ["<i8", "<i8", "<i8", pixels],
             "offsets": [0, 8, 16, SLOT_HEADER_BYTES],
-            "itemsize": -(-header_bytes // 64) * 64,
+            "itemsize": -(-(SLOT_HEADER_BYTES + pixels.itemsize) // 64) * 64,
         }
     )
 
 
-def _checked_size(name: str, header: bytes, file_bytes: int) -> tuple[int, int]:
-    """Width and height from the header, checked against the length of the file."""
+def _checked_slot(name: str, header: bytes, file_bytes: int) -> np.dtype[np.void]:
+    """Layout of a slot by the header, checked against the length of the file."""
     if len(header) < HEADER.size or not header.startswith(MAGIC):
         raise CameraError(
             f"shm:{name}: not a frame segment (docs/formats/shm_camera.md): wrong magic"
         )
     _, width, height, channels, slots = HEADER.unpack(header)
-    if (channels, slots) != (CHANNELS, SLOTS):
+    if channels not in PIXELS or slots != SLOTS:
         raise CameraError(
-            f"shm:{name}: has {channels} channels and {slots} slots, must have {CHANNELS} and "
-            f"{SLOTS}"
+            f"shm:{name}: has {channels} channels and {slots} slots, must have 3 (RGB) or 1 "
+            f"(depth) and {SLOTS}"
         )
     if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         raise CameraError(f"shm:{name}: impossible frame size {width}x{height}")
-    expected_bytes = HEADER_BYTES + SLOTS * _slot_type(width, height).itemsize
+    slot = _slot_type(width, height, channels)
+    expected_bytes = HEADER_BYTES + SLOTS * slot.itemsize
     if file_bytes != expected_bytes:
         raise CameraError(
             f"shm:{name}: {width}x{height} frames take {expected_bytes} bytes, it has {file_bytes}"
         )
-    return width, height
+    return slot
 
 
 def _absent(path: Path) -> str:

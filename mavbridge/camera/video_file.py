@@ -15,6 +15,8 @@ from policy.files import library_name
 
 DEFAULT_FPS = 30.0
 """For files with neither stamps nor a rate."""
+DEPTH_FORMAT = int.from_bytes(b"Y1\0\x10", "little")
+"""FFmpeg's gray16le, as in the camera.mp4 of a flight by depth."""
 
 
 class VideoFileCamera:
@@ -30,14 +32,17 @@ class VideoFileCamera:
         self._path = path
         self._clock = clock
         self._capture = cv2.VideoCapture(library_name(path))
+        if self._capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == DEPTH_FORMAT:
+            self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         has_rate = math.isfinite(fps) and fps > 0
         self._interval_ns = round(NS_PER_S / (fps if has_rate else DEFAULT_FPS))
         self._start_ns: int | None = None
         self._frame_count = 0
         self.dropped_frames = 0
-        self._upcoming = self._decode(previous_ns=None)
-        if self._upcoming is None:
+        self.upcoming = self._decode(previous_ns=None)
+        """The next image, stamped with its time in the file; None at the end."""
+        if self.upcoming is None:
             self._capture.release()
             raise CameraError(f"{path} contains no video that can be decoded")
 
@@ -45,18 +50,18 @@ class VideoFileCamera:
         """See `mavbridge.core.ports.Camera`."""
         if self._start_ns is None:
             self._start_ns = self._clock.now_ns()
-        if self._upcoming is None:
+        if self.upcoming is None:
             raise CameraError(f"{self._path}: video ended after {self._frame_count} frames")
-        if not wait_until_due(self._clock, self._start_ns + self._upcoming.captured_ns, timeout_ns):
+        if not wait_until_due(self._clock, self._start_ns + self.upcoming.captured_ns, timeout_ns):
             return None
-        newest, played_ns = self._upcoming, self._clock.now_ns() - self._start_ns
+        newest, played_ns = self.upcoming, self._clock.now_ns() - self._start_ns
         self._frame_count += 1
-        self._upcoming = self._decode(previous_ns=newest.captured_ns)
-        while self._upcoming is not None and self._upcoming.captured_ns <= played_ns:
-            newest = self._upcoming
+        self.upcoming = self._decode(previous_ns=newest.captured_ns)
+        while self.upcoming is not None and self.upcoming.captured_ns <= played_ns:
+            newest = self.upcoming
             self.dropped_frames += 1
             self._frame_count += 1
-            self._upcoming = self._decode(previous_ns=newest.captured_ns)
+            self.upcoming = self._decode(previous_ns=newest.captured_ns)
         captured_ns = self._start_ns + newest.captured_ns
         return Frame(frame_id=self._frame_count, captured_ns=captured_ns, rgb=newest.rgb)
 

@@ -216,9 +216,10 @@ class CameraConfig:
 
     camera: Annotated[tuple[str, ...], Parameter(negative="", show_default=" ".join)] = ("0",)
     """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
-    screen:WINDOW TITLE, pipe:COMMAND (MJPEG from a program) or pipe:640x480:rgb24:COMMAND (raw), or
-    none for a policy that looks at no image. For a policy with several cameras give each by its
-    name in the contract: --camera front=0 --camera down=/dev/video2."""
+    screen:WINDOW TITLE, pipe:COMMAND (MJPEG or PNG from a program) or pipe:640x480:rgb24:COMMAND
+    (raw; gray16le: depth), jpeg-udp:[HOST:]PORT (a simulator's chunks of JPEG), or none for a
+    policy that looks at no image. For a policy with several cameras give each by its name in the
+    contract: --camera front=0 --camera down=/dev/video2."""
     window_name: Annotated[str | None, Parameter(group=RARE)] = None
     """Same as --camera "screen:WINDOW TITLE"."""
     camera_timeout: Annotated[float, Parameter(group=RARE)] = 10.0

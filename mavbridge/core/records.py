@@ -14,6 +14,9 @@ from mavbridge.core.vehicle import Action, ActionTrace, FlightEnd, Sticks
 
 FloatArray: TypeAlias = NDArray[np.float32]
 ImageArray: TypeAlias = NDArray[np.uint8]
+"""[H, W, 3] in RGB."""
+CameraImage: TypeAlias = NDArray[np.uint8 | np.uint16]
+"""[H, W, 3] uint8 in RGB; or [H, W] uint16, the depth of each pixel in units of the camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,8 +26,8 @@ class Frame:
     frame_id: int
     captured_ns: int
     """Exposure, or failing that, arrival."""
-    rgb: ImageArray
-    """[H, W, 3] uint8, RGB, read-only."""
+    rgb: CameraImage
+    """Read-only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,8 +180,8 @@ class VisionTick:
     ready_ns: int
     dropped_frames: int
     """Frames dropped by the source since it was opened."""
-    rgb: ImageArray
-    """[H, W, 3] uint8, read-only: what the policy saw, before resizing."""
+    rgb: CameraImage
+    """What the policy saw, before resizing; read-only."""
     camera: int = 0
     """Its place among the cameras of the contract; ``serial`` and all others are of this camera."""
     feature: FloatArray | None = None

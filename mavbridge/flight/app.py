@@ -246,6 +246,7 @@ class _Flight:
             timeout_s=config.camera_timeout,
             latency_ms=config.camera_latency,
             report=lambda line: console.print(Text(line)),
+            is_depth=contract.is_depth,
         )
         self._stack.callback(camera.close)
         _log.debug("camera %s is open", without_secrets(source))

@@ -11,7 +11,7 @@ from mavbridge.config.rates import LoopRates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
-from mavbridge.core.records import FloatArray, ImageArray, Solve, VehicleState
+from mavbridge.core.records import CameraImage, FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
@@ -200,7 +200,7 @@ def _push_state(states: StateHistory, reader: StateReader, view: VehicleView) ->
         states.push(state)
 
 
-def _encoder(executable: Executable, camera: int) -> Callable[[ImageArray], FloatArray]:
+def _encoder(executable: Executable, camera: int) -> Callable[[CameraImage], FloatArray]:
     return executable.encode if camera == 0 else lambda rgb: executable.encode(rgb, camera)
 
 

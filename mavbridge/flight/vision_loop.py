@@ -6,7 +6,7 @@ from collections.abc import Callable
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.ports import Camera, TickSink
-from mavbridge.core.records import FeatureFrame, FloatArray, ImageArray, VisionTick
+from mavbridge.core.records import CameraImage, FeatureFrame, FloatArray, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
 
 READ_TIMEOUT_NS = 100 * NS_PER_MS
@@ -27,7 +27,7 @@ class VisionLoop:
         self,
         *,
         camera: Camera,
-        encode: Callable[[ImageArray], FloatArray],
+        encode: Callable[[CameraImage], FloatArray],
         cache: FeatureCache,
         sink: TickSink,
         clock: Clock,
@@ -41,7 +41,7 @@ class VisionLoop:
 
         Args:
             camera: read by this loop alone.
-            encode: image [H, W, 3] to feature.
+            encode: image to feature.
             cache: gets every feature; one whose image is at fault says so.
             sink: gets a tick for every feature.
             clock: time of the start and end of the encoding.

@@ -5,13 +5,14 @@ import math
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import Event, ImageArray, Tick
+from mavbridge.core.records import CameraImage, Event, Tick
 from policy.contract import RATE
 
 FULL_TURN_RADPS = 1.5
 """Body rate that asks for the highest rate; at 10 Hz it is 9 degrees from frame to frame."""
 FULL_CHANGE_PER_S = 1.0
-"""Mean change of the pixels, in full scales a second, that asks for the highest rate."""
+"""Mean change of the pixels, in full scales a second, that asks for the highest rate; the full
+scale of depth is the farthest pixel."""
 BUDGET = 0.8
 """Share of one core that the encoder may take."""
 CALM_TAU_S = 0.5
@@ -33,7 +34,7 @@ class AdaptiveRate:
         self._turn_radps = 0.0
         self._demand = 1.0  # before the first measurements, the highest rate
         self._encode_s = 0.0
-        self._last: tuple[int, ImageArray] | None = None
+        self._last: tuple[int, CameraImage] | None = None
 
     @property
     def is_adaptive(self) -> bool:
@@ -55,7 +56,8 @@ class AdaptiveRate:
         if last is None or last[1].shape != small.shape:
             return
         gap_s = max((event.captured_ns - last[0]) / NS_PER_S, 1e-3)
-        change_per_s = float(np.abs(small.astype(np.int16) - last[1]).mean() / 255 / gap_s)
+        full = 255 if small.ndim == 3 else max(int(small.max()), 1)
+        change_per_s = float(np.abs(small.astype(np.int32) - last[1]).mean() / full / gap_s)
         wanted = max(self._turn_radps / FULL_TURN_RADPS, change_per_s / FULL_CHANGE_PER_S)
         calmed = self._demand * math.exp(-gap_s / CALM_TAU_S)
         self._demand = max(min(1.0, wanted), calmed)

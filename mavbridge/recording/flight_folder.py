@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavbridge.core.records import ImageArray
+import numpy as np
+
+from mavbridge.core.records import CameraImage, ImageArray
 from mavbridge.recording import rows
 from mavbridge.recording.folder import TICKS, VIDEO, frames_of, video_of
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
@@ -36,9 +38,16 @@ class RecordedFlight:
         """The row of each image."""
         return read_frames(self.frames)
 
-    def images(self) -> Iterator[ImageArray]:
-        """The images one by one, [H, W, 3] uint8 RGB; raises VideoError if the video is damaged."""
+    def images(self) -> Iterator[CameraImage]:
+        """The images one by one; raises VideoError if the video is damaged."""
         return read_video(self.folder / self.video, self.frames.num_rows)
+
+    def rgb_images(self) -> Iterator[ImageArray]:
+        """As ``images``; raises FlightError if they are depth images."""
+        for image in self.images():
+            if image.ndim == 2:
+                raise FlightError(f"{self.folder / self.video} holds depth: this takes RGB images")
+            yield np.asarray(image, np.uint8)
 
 
 def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:

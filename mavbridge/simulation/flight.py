@@ -11,7 +11,7 @@ from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.ports import TickSink
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.settings import flight_settings, link_settings
@@ -272,7 +272,7 @@ class SimulatedFlight:
         action_ns = self._settings.delays.action.samples_ns(self._random(5))
         is_dual = executable.dual_rate
 
-        def encode(rgb: ImageArray, camera: int = 0, /) -> FloatArray:
+        def encode(rgb: CameraImage, camera: int = 0, /) -> FloatArray:
             vision_clocks[camera].ahead_ns += next(vision_ns[camera]) if is_dual else 0
             return executable.encode(rgb, camera)
 

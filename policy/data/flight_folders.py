@@ -197,7 +197,7 @@ def decode_video(path: Path) -> Iterator[ImageArray]:
     """Yield the frames [H, W, 3] RGB of a video, as far as it is readable.
 
     Raises:
-        DatasetError: no video at all.
+        DatasetError: no video at all, or one of depth.
     """
     try:
         container = av.open(library_name(path), format="mp4")  # a playlist would name other files
@@ -214,6 +214,8 @@ def decode_video(path: Path) -> Iterator[ImageArray]:
                 return  # cut short by a crash: what came before it counts
             if frame is None:
                 return
+            if frame.format.name.startswith("gray16"):
+                raise DatasetError(f"{path} holds depth: training and export take RGB images")
             yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
 
 

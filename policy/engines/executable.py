@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, QUATERNION, Contract, FloatArray
+from policy.contract import ACTION_DIM, QUATERNION, CameraImage, Contract, FloatArray
 from policy.engines.warm_start import Segment, WarmStart, make_solve
 from policy.errors import PolicyError, user_code
-from policy.preprocess import image_to_input
+from policy.preprocess import dummy_images, image_to_input
 from policy.protocol import (
     DualRatePolicy,
     Executable,
@@ -73,7 +72,7 @@ def make_executable(
         raise PolicyError(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
         )
-    image = ((1, 3, contract.image_height, contract.image_width),)
+    image = ((1, *contract.image_shape[-3:]),)
     encode = [compile_vision(method, image) for method in encoders(vision)]
     fast = ((1, *contract.feature_shape), *rest)
     if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
@@ -160,10 +159,10 @@ def assemble(
         PolicyError: a function failed on the sample, or returned the wrong shape or no numbers.
     """
 
-    def encode_rgb(rgb: NDArray[np.uint8], camera: int = 0, /) -> FloatArray:
+    def encode_image(image: CameraImage, camera: int = 0, /) -> FloatArray:
         with user_code(f"{settings.name} failed on an image"):
-            image = image_to_input(rgb, contract)
-            return encode[camera](image) if encode else image
+            planes = image_to_input(image, contract)
+            return encode[camera](planes) if encode else planes
 
     def act_on(
         encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
@@ -176,22 +175,21 @@ def assemble(
         name=settings.name,
         engine=engine,
         dual_rate=settings.dual_rate,
-        encode=encode_rgb,
+        encode=encode_image,
         act=act_on,
     )
     _try(executable)
     return executable
 
 
-def encode_all(executable: Executable, rgb: NDArray[np.uint8]) -> FloatArray:
+def encode_all(executable: Executable, images: CameraImage) -> FloatArray:
     """One image for each camera at each observation -> what ``act`` takes.
 
-    ``rgb`` is [H, W, 3], before that [N] for several cameras, before that [T] for several
-    observations, as ``Contract.image_shape``.
+    ``images`` has the axes of ``preprocess.dummy_images``, and may be of another size.
     """
     contract = executable.contract
     steps, cameras = contract.observation_steps, len(contract.cameras)
-    images = rgb.reshape(steps, cameras, *rgb.shape[-3:])
+    images = images.reshape(steps, cameras, *images.shape[-len(contract.picture_shape) :])
     return executable.join(
         [[executable.encode(image, camera) for camera, image in enumerate(row)] for row in images]
     )
@@ -206,15 +204,15 @@ def level_state(contract: Contract) -> FloatArray:
 
 def _try(executable: Executable) -> None:
     contract = executable.contract
-    shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
-    rgb, state = np.full(shape, 128, np.uint8), level_state(contract)
+    images, state = dummy_images(contract), level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     try:
         if executable.dual_rate:
             for camera in range(len(contract.cameras)):
-                feature = executable.encode(rgb.reshape(-1, *shape[-3:])[0], camera)
+                image = images.reshape(-1, *contract.picture_shape)[0]
+                feature = executable.encode(image, camera)
                 _require(executable, "encode_visual", feature, (1, contract.feature_dim))
-        encoded = encode_all(executable, rgb)
+        encoded = encode_all(executable, images)
         chunks = [executable.act(encoded, state, history, elapsed_s) for elapsed_s in (None, 0.01)]
     except PolicyError as error:
         raise PolicyError(

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from policy.contract import (
     ACTION_DIM,
     QUATERNION,
     SINCE_EXPOSURE_DIM,
     STATE_DIM,
+    CameraImage,
     Contract,
     FloatArray,
 )
@@ -26,11 +26,12 @@ SAMPLES = 4
 class ParitySamples:
     """Synthetic inputs that exercise every input of a policy; the same for the same contract.
 
-    They are rgb [samples, H, W, 3], state [samples, state_dim] and history [samples, K, 4]. With
-    several cameras or observations rgb and state have axes as in ``Contract.image_shape``.
+    They are rgb [samples, H, W, 3] or depth in its place, state [samples, state_dim] and history
+    [samples, K, 4]. With several cameras or observations there are axes as in
+    ``Contract.image_shape``.
     """
 
-    rgb: NDArray[np.uint8]
+    rgb: CameraImage
     state: FloatArray
     history: FloatArray
 
@@ -54,8 +55,9 @@ def make_parity_samples(contract: Contract) -> ParitySamples:
         parts.append(since)
     extras = contract.state_dim - sum(part.shape[-1] for part in parts)
     parts.append(random.normal(0.0, 5.0, (*states, extras)))  # metres
+    pixels: CameraImage = rgb.astype(np.uint8)
     return ParitySamples(
-        rgb=rgb.astype(np.uint8),
+        rgb=64 * pixels[..., 0].astype(np.uint16) if contract.is_depth else pixels,
         state=np.concatenate(parts, axis=-1).astype(np.float32),
         history=history.astype(np.float32),
     )

@@ -36,7 +36,7 @@ def make_stepwise_executable(
         PolicyError: the policy failed on the dummy sample.
     """
     contract = policy.contract
-    image = ((1, 3, contract.image_height, contract.image_width),)
+    image = ((1, *contract.image_shape[-3:]),)
     encode = [compile_vision(method, image) for method in encoders(policy)]
     with user_code(f"{settings.name} failed to prepare its solver"):
         act = _act(policy, compile_action, compile_end, settings)

@@ -220,7 +220,7 @@ def _with_feature(name: str, encode: "_Call", interface: Interface) -> Interface
     if contract.feature_dim > 0:
         return interface
     with user_code(f"{name}: visual_encoder failed on a dummy image"), torch.inference_mode():
-        image = torch.zeros(1, 3, contract.image_height, contract.image_width)
+        image = torch.zeros(1, *contract.image_shape[-3:])
         dim = encode(image).flatten(1).shape[1]
     return replace(interface, contract=replace(contract, feature_dim=dim))
 

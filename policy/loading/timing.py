@@ -9,6 +9,7 @@ import numpy as np
 from policy.contract import ACTION_DIM
 from policy.engines.executable import encode_all, level_state
 from policy.errors import NoChunkError
+from policy.preprocess import dummy_images
 from policy.protocol import Executable
 
 REPETITIONS = 5
@@ -34,15 +35,14 @@ def measure_times(executable: Executable, now_s: Callable[[], float]) -> SolveTi
     By a clock that stands still, as in simulations, it is asked only once.
     """
     contract = executable.contract
-    shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
-    rgb, state = np.full(shape, 128, np.uint8), level_state(contract)
+    images, state = dummy_images(contract), level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     encode_s: list[float] = []
     act_s: list[float] = []
     begun_s = now_s()
     while len(act_s) < REPETITIONS and (not act_s or 0 < now_s() - begun_s < MOST_S):
         before_s = now_s()
-        encoded = encode_all(executable, rgb)
+        encoded = encode_all(executable, images)
         encoded_s = now_s()
         try:
             executable.act(encoded, state, history, ELAPSED_S)

@@ -23,10 +23,12 @@ class StateEncoder(nn.Module):
 
     def __init__(self, dim: int, contract: Contract) -> None:
         super().__init__()
-        if len(contract.cameras) > 1 or contract.observation_steps > 1 or contract.state_extras:
+        is_plain = len(contract.cameras) == 1 and contract.observation_steps == 1
+        if not is_plain or contract.state_extras or contract.is_depth:
             raise ContractError(
-                "the networks of this project take the newest image of one camera and the newest "
-                f"state; the contract asks for cameras {list(contract.cameras)}, "
+                "the networks of this project take the newest image of one camera in colour and "
+                f"the newest state; the contract asks for {contract.image_channels} of cameras "
+                f"{list(contract.cameras)}, "
                 f"{contract.observation_steps} observations and extras "
                 f"{list(contract.state_extras)}: use a policy class of your own"
             )

@@ -1,5 +1,6 @@
 """Writer of frames in shared memory: docs/formats/shm_camera.md is the format."""
 
+import math
 import mmap
 import os
 import struct
@@ -23,24 +24,26 @@ SEQ, FRAME_ID, CAPTURED_NS = 0, 1, 2  # fields of a slot, in units of 8 bytes
 
 
 class FramePublisher:
-    """Publishes RGB frames of one size under a name; used by one thread."""
+    """Publishes frames of one size under a name, in RGB or of depth; used by one thread."""
 
-    def __init__(self, name: str, width: int, height: int) -> None:
+    def __init__(self, name: str, width: int, height: int, *, is_depth: bool = False) -> None:
         if min(width, height) < 1:
             raise UsageError(f"a frame needs at least one pixel, got {width}x{height}")
         if not name or "/" in name or name.startswith("."):
             raise UsageError(f"shm:{name}: want a name such as fpv, without '/' or a leading '.'")
         folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
         self._path = (folder if folder.is_dir() else Path(tempfile.gettempdir())) / name
-        self._shape = (height, width, CHANNELS)
-        size = height * width * CHANNELS
+        self._type = np.dtype("<u2" if is_depth else "u1")
+        self._shape = (height, width) if is_depth else (height, width, CHANNELS)
+        size = math.prod(self._shape) * self._type.itemsize
         stride = -(-(SLOT_HEADER_BYTES + size) // 64) * 64
-        self._map, self._inode = _create(self._path, width, height, HEADER_BYTES + SLOTS * stride)
+        header = struct.pack("<IIII", width, height, 1 if is_depth else CHANNELS, SLOTS)
+        self._map, self._inode = _create(self._path, header, HEADER_BYTES + SLOTS * stride)
         self._header = np.frombuffer(self._map, np.int64, HEADER_BYTES // 8)
         starts = range(HEADER_BYTES, HEADER_BYTES + SLOTS * stride, stride)
         self._fields = [np.frombuffer(self._map, np.int64, 4, start) for start in starts]
         self._pixels = [
-            np.frombuffer(self._map, np.uint8, size, start + SLOT_HEADER_BYTES).reshape(self._shape)
+            np.ndarray(self._shape, self._type, self._map, start + SLOT_HEADER_BYTES)
             for start in starts
         ]
         self._frame_id = 0
@@ -51,16 +54,18 @@ class FramePublisher:
         """The file that readers map."""
         return self._path
 
-    def publish(self, rgb: NDArray[np.uint8], captured_ns: int, *, is_whole: bool = True) -> None:
-        """Copy a frame [height, width, 3] uint8 and make it the newest.
+    def publish(
+        self, rgb: NDArray[np.uint8 | np.uint16], captured_ns: int, *, is_whole: bool = True
+    ) -> None:
+        """Copy a frame [height, width, 3] uint8, or [height, width] uint16, and make it the newest.
 
         One that is not whole stays marked as being written, as by a writer that stops meanwhile.
 
         Raises:
             ValueError: another shape or type than announced, or closed before.
         """
-        if rgb.shape != self._shape or rgb.dtype != np.uint8:
-            raise ValueError(f"want uint8 {self._shape}, got {rgb.dtype} {rgb.shape}")
+        if rgb.shape != self._shape or rgb.dtype != self._type:
+            raise ValueError(f"want {self._type} {self._shape}, got {rgb.dtype} {rgb.shape}")
         if not self._fields:
             raise ValueError("publish after close")
         self._frame_id += 1
@@ -94,12 +99,12 @@ class FramePublisher:
             pass
 
 
-def _create(path: Path, width: int, height: int, size: int) -> tuple[mmap.mmap, int]:
+def _create(path: Path, header: bytes, size: int) -> tuple[mmap.mmap, int]:
     """Lay the file out under another name, then rename it: no reader sees half a header."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     with draft.open("w+b") as file:
         file.truncate(size)
-        file.write(MAGIC + struct.pack("<IIIIQQ", width, height, CHANNELS, SLOTS, 0, LIVE))
+        file.write(MAGIC + header + struct.pack("<QQ", 0, LIVE))
         file.flush()
         mapped = mmap.mmap(file.fileno(), size)
         inode = os.fstat(file.fileno()).st_ino

@@ -16,6 +16,7 @@ from mavbridge.flight.policies import load_configured_policy
 from policy.contract import ACTION_DIM
 from policy.engines.executable import encode_all, level_state
 from policy.errors import PolicyError
+from policy.preprocess import dummy_images
 from policy.protocol import Executable
 
 EAGER: Engine = "torch"
@@ -78,9 +79,8 @@ def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[st
 def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
     full = _load(replace(policy, num_diffusion_steps=policy.steps, head_steps=0), lives)
     contract = full.contract
-    shape = (*contract.image_shape[:-3], contract.image_height, contract.image_width, 3)
-    images = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
-    rgb, state = images.reshape(-1, *shape[-3:])[0], level_state(contract)
+    images, state = dummy_images(contract), level_state(contract)
+    image = images.reshape(-1, *contract.picture_shape)[0]
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     feature = encode_all(full, images)
     engine = full.engine if policy.engine == "auto" else policy.engine
@@ -91,7 +91,7 @@ def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
     if not full.dual_rate:
         return [case(BOTH, lambda: full.act(encode_all(full, images), state, history, None))]
     cases = [
-        case(ENCODE, lambda: full.encode(rgb)),
+        case(ENCODE, lambda: full.encode(image)),
         case(CHUNK, lambda: full.act(feature, state, history, None)),
     ]
     if policy.warm_steps is not None:

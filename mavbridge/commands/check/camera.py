@@ -40,6 +40,8 @@ class CameraNeeds:
     """Oldest image to act on."""
     is_flown_by: bool = True
     """A black image is a fault."""
+    is_depth: bool | None = None
+    """It takes depth, or RGB; None: no policy says."""
 
 
 @dataclass(kw_only=True)
@@ -51,6 +53,7 @@ class Seen:
     """From the stamp to the read."""
     height_px: int = 0
     width_px: int = 0
+    is_depth: bool = False
     is_blank: bool = False
     dropped: int = 0
     failure: str | None = None
@@ -93,6 +96,7 @@ def _open(need: CameraNeeds, config: CameraConfig, clock: Clock) -> Camera:
         clock=clock,
         timeout_s=config.camera_timeout,
         latency_ms=config.camera_latency,
+        is_depth=need.is_depth,
     )
 
 
@@ -124,7 +128,7 @@ def _watch(camera: Camera, seen: Seen, clock: Clock, stop: threading.Event) -> N
             seen.ages_ns.append(clock.now_ns() - frame.captured_ns)
             seen.captured_ns.append(frame.captured_ns)
             seen.height_px, seen.width_px = frame.rgb.shape[:2]
-            seen.is_blank = is_blank(frame.rgb)
+            seen.is_depth, seen.is_blank = frame.rgb.ndim == 2, is_blank(frame.rgb)
     except CameraError as error:
         seen.failure = str(error)
     seen.dropped = camera.dropped_frames - dropped_before
@@ -159,10 +163,11 @@ def _image_row(need: CameraNeeds, seen: Seen) -> Row:
     if need.is_flown_by and min(seen.height_px, seen.width_px) < need.side_px:
         advice = "the image is smaller than what the policy takes, and is enlarged for it"
     if seen.is_blank:
-        advice = "the image is black or of one colour: is the lens covered?"
+        what = "without any depth" if seen.is_depth else "black or of one colour"
+        advice = f"the image is {what}: is the lens covered?"
     return _row(
         need,
-        f"{seen.width_px}x{seen.height_px}",
+        f"{seen.width_px}x{seen.height_px}{' depth' if seen.is_depth else ''}",
         f"{need.side_px} px a side or more",
         part="image",
         verdict="no-go" if seen.is_blank and need.is_flown_by else "warn" if advice else "go",

@@ -81,6 +81,7 @@ def _camera_needs(config: FlyConfig, policy: PolicyFindings) -> list[CameraNeeds
     contract = policy.contract
     if set(config.camera.sources) == {NO_CAMERA}:
         return []
+    is_depth = None if contract is None else contract.is_depth
     if contract is None:
         if config.camera == CameraConfig():
             return []
@@ -98,6 +99,7 @@ def _camera_needs(config: FlyConfig, policy: PolicyFindings) -> list[CameraNeeds
             side_px=least_source_px(contract),
             max_age_s=contract.max_feature_age_s,
             is_flown_by=looks_at_images(config),
+            is_depth=is_depth,
         )
         for name, source, rate_hz in zip(names, sources, rates_hz, strict=False)
     ]

@@ -98,7 +98,7 @@ def with_images(
         waiting = deque(group)
         needed = {int(window.frames[step]) for window in waiting for step in steps}
         kept: dict[int, ImageArray] = {}
-        for frame, rgb in enumerate(open_flight(folder).images()):
+        for frame, rgb in enumerate(open_flight(folder).rgb_images()):
             if frame in needed:
                 kept[frame] = resize(rgb, size, size)
             while waiting and waiting[0].frames[-1] <= frame:

@@ -104,7 +104,7 @@ def _sent_before(flight: RecordedFlight, now_ns: int) -> tuple[tuple[int, Sticks
 
 def _images(flight: RecordedFlight, frames: list[int], size: int) -> NDArray[np.uint8]:
     found: dict[int, ImageArray] = {}
-    for index, rgb in enumerate(flight.images()):
+    for index, rgb in enumerate(flight.rgb_images()):
         if index in frames:
             found[index] = resize(rgb, size, size)
         if index >= frames[-1]:
@@ -124,7 +124,7 @@ class RealFrames:
 
     def __init__(self, flight: RecordedFlight, config: WorldModelConfig, newest_ns: int) -> None:
         self._captured_ns: NDArray[np.int64] = flight.frames["captured_ns"].to_numpy()
-        self._images: Iterator[ImageArray] = flight.images()
+        self._images: Iterator[ImageArray] = flight.rgb_images()
         self._config = config
         self._newest_ns = newest_ns
         self._decoded = 0

@@ -52,7 +52,7 @@ class FilmConfig:
 
     camera: str = "0"
     """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
-    screen:WINDOW TITLE, or pipe:COMMAND."""
+    screen:WINDOW TITLE, pipe:COMMAND, or jpeg-udp:[HOST:]PORT."""
     camera_size: int = 224
     """Pixels a side that the image must cover; a device is asked for such a mode."""
     camera_timeout: Annotated[float, Parameter(group=RARE)] = 10.0

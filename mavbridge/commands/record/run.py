@@ -180,6 +180,7 @@ class _Session:
             timeout_s=film.camera_timeout,
             latency_ms=film.camera_latency,
             report=lambda line: console.print(Text(line)),
+            is_depth=False,
         )
         self._stack.callback(camera.close)
         return camera

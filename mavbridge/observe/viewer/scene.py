@@ -9,7 +9,7 @@ import rerun as rr
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
-from mavbridge.core.records import ImageArray, Position, Tick, VisionTick
+from mavbridge.core.records import CameraImage, ImageArray, Position, Tick, VisionTick
 from mavbridge.core.rotation import Quaternion, heading_rad
 from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.columns import Columns
@@ -166,12 +166,20 @@ def _gates(gates: Sequence[CourseGate]) -> rr.LineStrips3D:
     )
 
 
-def _fitting(rgb: ImageArray) -> ImageArray:
+def _fitting(image: CameraImage) -> ImageArray:
+    """The image in RGB, as wide as is shown; depth darker the farther, with unknown black."""
+    rgb = np.asarray(image, np.uint8) if image.ndim == 3 else _shaded(image)
     height, width = rgb.shape[:2]
     if width <= MAX_IMAGE_WIDTH:
         return rgb
     size = (MAX_IMAGE_WIDTH, max(1, round(height * MAX_IMAGE_WIDTH / width)))
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _shaded(depth: CameraImage) -> ImageArray:
+    shares = 1.0 - depth.astype(np.float32) / max(int(depth.max()), 1)
+    grey = np.where(depth > 0, 55 + 200 * shares, 0).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
 
 
 def _jpeg(rgb: ImageArray) -> bytes:

@@ -1,5 +1,7 @@
 """H.264 in fragmented MP4, one fragment a frame: what has been appended stays readable.
 
+Depth images are kept as they are, in FFV1: 16 bits, without loss.
+
 Layout: ISO/IEC 14496-12. A moov box without samples, then a moof and an mdat box for each frame.
 The muxer holds a frame back until the next one gives its duration, so a file that was cut off
 lacks at most its last frame.
@@ -10,7 +12,7 @@ from collections.abc import Iterator
 from fractions import Fraction
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
@@ -18,7 +20,7 @@ from av.container import OutputContainer
 from av.error import FFmpegError
 
 from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 
 CRF = "20"
 """Constant quality; 17 to 18 is taken for visually lossless, 23 is x264's default."""
@@ -33,6 +35,7 @@ _OPTIONS: dict[str, object] = {
     "threads": "1",
     "g": str(GOP_FRAMES),
 }
+_DEPTH = "gray16le"
 _FRAGMENTED = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
 WRITE_ERRORS = (OSError, FFmpegError)
 _BOX_HEADER_BYTES = 8
@@ -47,7 +50,9 @@ class VideoError(MavbridgeError):
 class FragmentedMp4:
     """A video file that grows by a frame at a time; methods may raise ``WRITE_ERRORS``."""
 
-    def __init__(self, path: Path, *, height: int, width: int, hz: float) -> None:
+    def __init__(
+        self, path: Path, *, height: int, width: int, hz: float, is_depth: bool = False
+    ) -> None:
         """Create the file, which must not exist, for frames with even sides.
 
         ``hz`` is the nominal frame rate; the frames' own stamps decide.
@@ -56,23 +61,29 @@ class FragmentedMp4:
         self._container: OutputContainer = av.open(
             self._file, "w", format="mp4", options=_FRAGMENTED
         )
-        stream = self._container.add_stream("libx264", Fraction(hz).limit_denominator(1000))
-        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
-        stream.options = _OPTIONS
+        rate = Fraction(hz).limit_denominator(1000)
+        if is_depth:
+            stream = self._container.add_stream("ffv1", rate)
+        else:
+            stream = self._container.add_stream("libx264", rate)
+            stream.options = _OPTIONS
+        stream.height, stream.width = height, width
+        stream.pix_fmt = _DEPTH if is_depth else "yuv420p"
         stream.codec_context.time_base = TIME_BASE
         self._stream = stream
         self._first_ns: int | None = None
         self._last_pts = -1
 
-    def append(self, rgb: ImageArray, captured_ns: int) -> None:
-        """Encode one frame, [H, W, 3] uint8, and hand it to the kernel.
+    def append(self, rgb: CameraImage, captured_ns: int) -> None:
+        """Encode one frame and hand it to the kernel.
 
         A stamp that is not after the last frame's is moved behind it.
         """
         if self._first_ns is None:
             self._first_ns = captured_ns
         pts = max(self._last_pts + 1, (captured_ns - self._first_ns) * 9 // 100_000)
-        frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
+        pixels: Any = rgb
+        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24" if rgb.ndim == 3 else _DEPTH)
         frame.pts, frame.time_base = pts, TIME_BASE
         self._container.mux(self._stream.encode(frame))
         self._file.flush()
@@ -111,8 +122,8 @@ def _frame_ends(path: Path) -> list[int]:
     return ends
 
 
-def read_video(path: Path, frames: int | None = None) -> Iterator[ImageArray]:
-    """Frames of a file of ``FragmentedMp4``, whole or cut off: [H, W, 3] uint8 RGB.
+def read_video(path: Path, frames: int | None = None) -> Iterator[CameraImage]:
+    """Frames of a file of ``FragmentedMp4``, whole or cut off, as they were appended.
 
     ``frames`` is the number to read, by default all whole ones. Raises VideoError if the file
     cannot be read, or ends before that.
@@ -130,7 +141,10 @@ def read_video(path: Path, frames: int | None = None) -> Iterator[ImageArray]:
             av.open(whole, "r", format="mp4") as container,
         ):
             for frame in islice(container.decode(video=0), wanted):
-                yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
+                if frame.format.name == _DEPTH:
+                    yield frame.to_ndarray().astype(np.uint16, copy=False)
+                else:
+                    yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
                 seen += 1
     except (OSError, ValueError, FFmpegError) as error:  # ValueError: the file is empty
         raise VideoError(f"{path} cannot be decoded after {seen} frames: {error}") from error

@@ -4,7 +4,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 from mavbridge.recording.rows import DEMONSTRATION_FRAMES, FRAMES, FrameRow, frames_batch
 from mavbridge.recording.tables import READ_ERRORS, TableWriter
 from mavbridge.recording.video.file import WRITE_ERRORS, FragmentedMp4
@@ -38,12 +38,14 @@ class FrameFiles:
         self._table: TableWriter | None = None
         self._rows: list[FrameRow] = []
 
-    def append(self, rgb: ImageArray, row: FrameRow) -> None:
-        """Write a frame [H, W, 3] with even sides; its row follows within half a second."""
+    def append(self, rgb: CameraImage, row: FrameRow) -> None:
+        """Write a frame with even sides; its row follows within half a second."""
         if self._video is None:
             height, width = rgb.shape[:2]
             job = self._job
-            self._video = FragmentedMp4(job.video, height=height, width=width, hz=job.hz)
+            self._video = FragmentedMp4(
+                job.video, height=height, width=width, hz=job.hz, is_depth=rgb.ndim == 2
+            )
         self._video.append(rgb, row.captured_ns)
         if self._job.rows is not None:
             self._rows.append(row)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 
 MAX_SLOTS = 32
 MIN_SLOTS = 4
@@ -26,24 +26,29 @@ class RingShape(NamedTuple):
     slots: int
     height: int
     width: int
+    is_depth: bool = False
+
+    @property
+    def frame(self) -> "np.dtype[np.void]":
+        """Type and axes of a frame."""
+        each = (np.uint16, ()) if self.is_depth else (np.uint8, (3,))
+        return np.dtype((each[0], (self.height, self.width, *each[1])))
 
 
 class FrameRing:
-    """Slots of [H, W, 3] uint8, mapped."""
+    """Slots of one frame each, mapped."""
 
     def __init__(self, memory: SharedMemory, shape: RingShape) -> None:
         """Use ``create`` in the producer, and ``attach`` in the consumer."""
         self.shape = shape
         self._memory = memory
         self._is_linked = False
-        self._frames: ImageArray | None = np.ndarray(
-            (shape.slots, shape.height, shape.width, 3), np.uint8, memory.buf
-        )
+        self._frames: CameraImage | None = np.ndarray(shape.slots, shape.frame, memory.buf)
 
     @classmethod
-    def create(cls, height: int, width: int) -> "FrameRing":
+    def create(cls, height: int, width: int, *, is_depth: bool = False) -> "FrameRing":
         """Acquire the memory, in the producer; OSError if there is not enough."""
-        frame_bytes = height * width * 3
+        frame_bytes = height * width * (2 if is_depth else 3)
         slots = max(MIN_SLOTS, min(MAX_SLOTS, MAX_BYTES // frame_bytes))
         memory = SharedMemory(create=True, size=slots * frame_bytes)
         # Take the pages now: a page that is not there when it is first written ends the process.
@@ -56,7 +61,7 @@ class FrameRing:
             memory.close()
             memory.unlink()
             raise
-        ring = cls(memory, RingShape(memory.name, slots, height, width))
+        ring = cls(memory, RingShape(memory.name, slots, height, width, is_depth))
         ring._is_linked = True
         return ring
 
@@ -65,11 +70,11 @@ class FrameRing:
         """Map the memory, in the consumer; OSError if it is gone."""
         return cls(SharedMemory(name=shape.name), shape)
 
-    def slot(self, index: int) -> ImageArray:
-        """View of one slot, [H, W, 3]; not to be kept beyond ``close``."""
+    def slot(self, index: int) -> CameraImage:
+        """View of one slot; not to be kept beyond ``close``."""
         if self._frames is None:
             raise ValueError("the ring is closed")
-        frame: ImageArray = self._frames[index]
+        frame: CameraImage = self._frames[index]
         return frame
 
     def unlink(self) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tlog import TlogJob
 from mavbridge.recording.video.frame_files import VideoJob
@@ -78,13 +78,13 @@ class FrameSender:
         """Frames offered and not, or not yet, in the file."""
         return self._offered - self.written
 
-    def submit(self, rgb: ImageArray, row: FrameRow) -> bool:
+    def submit(self, rgb: CameraImage, row: FrameRow) -> bool:
         """Hand a frame over; it may be overwritten afterwards.
 
-        A frame of another size than the first is dropped and counted online, a bug offline.
+        A frame of another size or kind than the first is dropped and counted online, a bug offline.
 
         Args:
-            rgb: [H, W, 3] uint8; an odd last row or column is cut off, which H.264 cannot have.
+            rgb: the image; an odd last row or column is cut off, which H.264 cannot have.
             row: its other facts; drops of the ring are added to ``dropped_before``.
 
         Returns:
@@ -95,7 +95,7 @@ class FrameSender:
         height, width = rgb.shape[:2]
         rgb = rgb[: height // 2 * 2, : width // 2 * 2]
         ring = self._ring or self._open(rgb)
-        is_same_size = rgb.shape[:2] == self.size
+        is_same_size = rgb.shape == ring.shape.frame.shape
         if self._pressure == "offline":
             if not is_same_size:
                 raise ValueError(f"a frame of {rgb.shape} in a video of {self.size}")
@@ -109,10 +109,10 @@ class FrameSender:
         self._send(Submit(slot, replace(row, dropped_before=dropped)))
         return True
 
-    def _open(self, rgb: ImageArray) -> FrameRing:
+    def _open(self, rgb: CameraImage) -> FrameRing:
         height, width = rgb.shape[:2]
         try:
-            ring = self._ring = FrameRing.create(height, width)
+            ring = self._ring = FrameRing.create(height, width, is_depth=rgb.ndim == 2)
         except OSError as error:
             self._failure = WriterError(
                 f"no shared memory for frames of {width}x{height}: {error.strerror}; a container "

@@ -40,7 +40,7 @@ def onnx_entries(files: Sequence[Path]) -> list[Entry]:
         CheckpointError: one of them cannot be read.
     """
     inputs, outputs = _ports(files)
-    images = [port for port in inputs if len(port.shape) >= 4 and port.shape[-3] == 3]
+    images = [port for port in inputs if len(port.shape) >= 4 and port.shape[-3] in (1, 3)]
     states = [port for port in inputs if "state" in port.name and len(port.shape) >= 2]
     histories = [port for port in inputs if "history" in port.name and len(port.shape) >= 2]
     chunks = [port for port in outputs if port.shape[-1:] == (ACTION_DIM,) and len(port.shape) > 1]
@@ -53,13 +53,21 @@ def onnx_entries(files: Sequence[Path]) -> list[Entry]:
     ):
         entries += [_size(name, port, axis) for port in ports[:1]]
     for port in images[:1]:
-        entries += [*_NORMALISATION, *camera_entries([port.name], port.where)]
+        kind = _NORMALISATION if port.shape[-3] == 3 else [_DEPTH]
+        entries += [*kind, *camera_entries([port.name], port.where)]
     for port in states[:1]:
         key = Entry(table="state", name="key", value=port.name, origin="read", why=port.where)
         entries += [key, *state_entries(None, port.shape[-1] or 0, port.where)]
     return entries
 
 
+_DEPTH = Entry(
+    table="contract",
+    name="image_channels",
+    value="depth",
+    origin="guessed",
+    why="it takes one channel: depth in metres, 0 where it is not known",
+)
 _NORMALISATION = [
     Entry(
         table="contract",

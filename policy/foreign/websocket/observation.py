@@ -1,7 +1,8 @@
 """An observation as ``predict`` takes it, to and from the message of a request.
 
 Each camera's image has a key of its own and is uint8, [H, W, 3] or [T, H, W, 3] with several
-observations, cut and sized by the contract and in its order of channels. The state is float32 [S]
+observations, cut and sized by the contract and in its order of channels; depth is float32 in
+metres, [H, W] or [T, H, W]. The state is float32 [S]
 or [T, S]. The keys are those of ``foreign.interface``.
 """
 
@@ -29,9 +30,10 @@ def to_message(
     ``history`` [K, 4] is for our own server.
     """
     contract = interface.contract
-    images = to_uint8(image, contract)
+    images = image[..., 0, :, :] if contract.is_depth else to_uint8(image, contract)
     # [N, H, W, 3] and [T, N, H, W, 3] only with several cameras
-    per_camera = [images] if len(contract.cameras) == 1 else list(np.moveaxis(images, -4, 0))
+    cameras = -1 - len(contract.picture_shape)
+    per_camera = [images] if len(contract.cameras) == 1 else list(np.moveaxis(images, cameras, 0))
     message: Message = dict(zip(interface.camera_keys, per_camera, strict=True))
     message[interface.state_key] = interface.to_state(state)
     if interface.prompt:
@@ -51,13 +53,18 @@ def from_message(
     """
     contract = interface.contract
     stack = () if contract.observation_steps == 1 else (contract.observation_steps,)
-    shape = (*stack, contract.image_height, contract.image_width, 3)
-    images = [_array(message, key, shape, "u").astype(np.uint8) for key in interface.camera_keys]
-    stacked = images[0] if len(images) == 1 else np.stack(images, axis=-4)
+    shape, kind = (*stack, *contract.picture_shape), "f" if contract.is_depth else "u"
+    images = [_array(message, key, shape, kind) for key in interface.camera_keys]
+    cameras = -1 - len(contract.picture_shape)
+    stacked = images[0] if len(images) == 1 else np.stack(images, axis=cameras)
     state = _array(message, interface.state_key, contract.state_shape, "f").astype(np.float32)
     history_shape = (contract.history_len, ACTION_DIM)
     history = _array(message, HISTORY_KEY, history_shape, "f").astype(np.float32)
-    return from_uint8(stacked, contract)[None], state[None], history[None]
+    if contract.is_depth:
+        planes: FloatArray = stacked.astype(np.float32)[..., None, :, :]
+    else:
+        planes = from_uint8(stacked.astype(np.uint8), contract)
+    return planes[None], state[None], history[None]
 
 
 def _array(message: Message, key: str, shape: tuple[int, ...], kind: str) -> NDArray[np.generic]:

@@ -7,10 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
+from helpers.camera_senders import SIDE, RtpSender, repeating
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import capture
 from mavbridge.camera.capture import device_mode, exposure_ns, open_device, open_stream
 from mavbridge.camera.grabber import Grabber
+from mavbridge.camera.open import open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError
 
@@ -188,19 +190,62 @@ def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
     monkeypatch.delenv(capture.FFMPEG_OPTIONS_VARIABLE, raising=False)
     if set_by_user is not None:
         monkeypatch.setenv(capture.FFMPEG_OPTIONS_VARIABLE, set_by_user)
-    options = []
+    monkeypatch.delenv(capture.FFMPEG_LOG_VARIABLE, raising=False)
+    options, log_levels = [], []
 
     def open_capture(*arguments):
         options.append(os.environ[capture.FFMPEG_OPTIONS_VARIABLE])
+        log_levels.append(os.environ[capture.FFMPEG_LOG_VARIABLE])
         return FakeDevice(*arguments)
 
     monkeypatch.setattr(cv2, "VideoCapture", open_capture)
     source = open_stream("udp://0.0.0.0:5600", clock=FakeClock())
     assert options == [seen]
+    assert log_levels == ["-8"]
+    assert capture.FFMPEG_LOG_VARIABLE not in os.environ
     assert os.environ.get(capture.FFMPEG_OPTIONS_VARIABLE) == set_by_user
     assert source.next_image().captured_ns == START_NS
     with pytest.raises(CameraError, match="ended, or was silent"):
         source.next_image()
+
+
+@pytest.mark.system
+def test_h264_over_rtp_by_its_sdp_comes_in_order_and_one_frame_at_most_is_held_back(
+    tmp_path, monkeypatch
+):
+    monkeypatch.delenv(capture.FFMPEG_OPTIONS_VARIABLE, raising=False)
+    sender, clock = RtpSender(17220), MonotonicClock()
+    sdp = sender.describe(tmp_path / "camera.sdp")
+    numbers = iter(range(1 << 20))
+
+    def send():
+        sender.send(level_scene(number := next(numbers)))
+        return number
+
+    with repeating(lambda _: send()):
+        camera = open_camera(str(sdp), image_size=64, clock=clock, timeout_s=20)
+    while camera.read(NS_PER_S) is not None:  # what was on its way
+        pass
+    sent, read, last_ns = [], [], clock.now_ns()
+    for _ in range(12):
+        sent.append(send())
+        frame = camera.read(NS_PER_S)
+        assert frame is not None, "more than one frame is held back"
+        assert last_ns < frame.captured_ns <= clock.now_ns()
+        last_ns = frame.captured_ns
+        read.append(level_of(frame.rgb))
+    assert read[1:] in ([number % 8 for number in sent[1:]], [number % 8 for number in sent[:-1]])
+    camera.close()
+    sender.close()
+
+
+def level_scene(number):
+    """Grey of one of eight levels, which H.264 keeps apart."""
+    return np.full((SIDE, SIDE, 3), 16 + 30 * (number % 8), np.uint8)
+
+
+def level_of(rgb):
+    return round((float(rgb.mean()) - 16) / 30)
 
 
 def test_a_stream_that_nobody_sends_is_refused():

@@ -143,3 +143,19 @@ def test_a_limit_of_zero_turns_its_part_off():
     assert "black" in first_fault(ImageWatch(max_frozen_s=0, max_black_s=0.5), [black] * 40)[1]
     assert first_fault(ImageWatch(max_frozen_s=0, max_black_s=0.5), [SCENE] * 40) is None
     assert first_fault(ImageWatch(max_frozen_s=0, max_black_s=0), [black] * 40) is None
+
+
+@pytest.mark.parametrize(
+    ("depth", "fault"),
+    [
+        (np.zeros((48, 64), np.uint16), True),
+        (np.full((48, 64), 1500, np.uint16), False),  # a wall
+        (np.full((48, 64), 3, np.uint16), False),  # in coarse units
+    ],
+)
+def test_depth_that_is_nowhere_known_is_a_fault_and_a_wall_is_none(depth, fault):
+    watch = ImageWatch(max_frozen_s=0.0, max_black_s=0.5)
+    assert is_blank(depth) is fault
+    found = first_fault(watch, [depth.copy() for _ in range(20)])
+    assert (found is not None) is fault
+    assert not fault or "without any depth" in found[1]

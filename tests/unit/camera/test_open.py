@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from helpers.camera_senders import SIDE, depth_scene, scene
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import open as camera_open
 from mavbridge.camera.latency import LatencyCompensatedCamera
@@ -13,8 +14,9 @@ from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.config.flight import CameraConfig
-from mavbridge.core.clock import NS_PER_MS, MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
+from mavbridge.recording.video.file import FragmentedMp4
 from sitl.camera.shm import FramePublisher
 
 
@@ -179,3 +181,42 @@ def test_the_screen_without_its_packages_names_the_extra(monkeypatch, package):
 def test_settings_that_no_camera_has_are_refused(settings, complaint):
     with pytest.raises(UserError, match=complaint):
         CameraConfig(**settings)
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
+@pytest.mark.parametrize("is_depth", [True, False])
+def test_a_camera_of_the_other_kind_is_refused_with_its_figures(is_depth):
+    name = f"mb-test-kind-{is_depth}"
+    publisher = FramePublisher(name, 24, 16, is_depth=is_depth)
+    publisher.publish(depth_scene(0)[:16, :24] if is_depth else scene(0)[:16, :24], START_NS)
+    for wanted in (is_depth, None):
+        camera = open_camera(f"shm:{name}", image_size=16, clock=FakeClock(), is_depth=wanted)
+        camera.close()
+    found = "depth of 24x16" if is_depth else "RGB images of 24x16"
+    with pytest.raises(UserError, match=rf"shm:{name} delivers {found}, .*\(image_channels\)"):
+        open_camera(f"shm:{name}", image_size=16, clock=FakeClock(), is_depth=not is_depth)
+    publisher.close()
+
+
+def test_the_video_of_a_depth_flight_plays_as_depth(tmp_path):
+    path = tmp_path / "camera.mp4"
+    video = FragmentedMp4(path, height=SIDE, width=SIDE, hz=30, is_depth=True)
+    for number in range(3):
+        video.append(depth_scene(number), number * NS_PER_S // 30)
+    video.close()
+    with pytest.raises(UserError, match=f"delivers depth of {SIDE}x{SIDE}, .* takes RGB"):
+        open_camera(str(path), image_size=32, clock=FakeClock(), is_depth=False)
+    camera = open_camera(str(path), image_size=32, clock=FakeClock(), is_depth=True)
+    for number in range(3):
+        assert np.array_equal(camera.read(NS_PER_S).rgb, depth_scene(number))
+    camera.close()
+
+
+def test_a_video_file_is_no_depth_and_no_camera_is_of_either_kind(video):
+    with pytest.raises(UserError, match=r"delivers RGB images of 32x32, .* takes depth"):
+        open_camera(video, image_size=32, clock=FakeClock(), is_depth=True)
+    shapes = []
+    for is_depth in (False, True):
+        camera = open_camera("none", image_size=32, clock=FakeClock(), is_depth=is_depth)
+        shapes.append((camera.read(NS_PER_MS).rgb.dtype, camera.read(NS_PER_S).rgb.shape))
+    assert shapes == [(np.uint8, (32, 32, 3)), (np.uint16, (32, 32))]

@@ -14,10 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers.camera_senders import SIDE, depth_scene, encoded, scene
 from helpers.fakes import FakeClock
 from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.camera.pipe import PipeCommand, PipeSource, parse_pipe
-from mavbridge.camera.pipe_frames import RAW_FORMATS, JpegCutter, RawCutter
+from mavbridge.camera.pipe_frames import RAW_FORMATS, PictureCutter, RawCutter
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 from sitl.faults.stage.processes import child_of
@@ -72,6 +73,7 @@ def source(command: str) -> Iterator[PipeSource]:
         ("{} -c 1", None),
         ("640x480:rgb24:{} -c 1", (640, 480, "rgb24")),
         ("640x480:nv12:{} -c 1", (640, 480, "nv12")),
+        ("33x17:gray16le:{} -c 1", (33, 17, "gray16le")),
     ],
 )
 def test_a_command_is_split_without_a_shell(text: str, raw: tuple[int, int, str] | None) -> None:
@@ -103,14 +105,18 @@ def test_what_cannot_run_is_refused_before_anything_is_loaded(text: str, told: s
     st.lists(st.integers(0, 255), min_size=1, max_size=4),
     st.lists(st.integers(1, 700), min_size=1, max_size=20),
     st.booleans(),
+    st.booleans(),
 )
 def test_pictures_are_found_however_their_bytes_come(
-    levels: list[int], sizes: list[int], is_multipart: bool
+    levels: list[int], sizes: list[int], is_multipart: bool, is_png: bool
 ) -> None:
     header = b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" if is_multipart else b""
-    frames = [with_thumbnail(jpeg(level)) for level in levels]
+    frames = [
+        encoded(depth_scene(level), ".png") if is_png else with_thumbnail(jpeg(level))
+        for level in levels
+    ]
     data = b"".join(header + frame for frame in frames)
-    cutter, found, at, number = JpegCutter(), [], 0, 0
+    cutter, found, at, number = PictureCutter(), [], 0, 0
     while at < len(data):
         size = sizes[number % len(sizes)]
         cutter.put(data[at : at + size], number)
@@ -125,7 +131,7 @@ def test_pictures_are_found_however_their_bytes_come(
 def test_a_frame_is_as_old_as_its_first_byte_and_the_newest_wins() -> None:
     for cutter, frames in (
         (RawCutter(2, 2, RAW_FORMATS["gray"]), [b"abcd", b"efgh", b"ijkl"]),
-        (JpegCutter(), [jpeg(10), jpeg(20), jpeg(30)]),
+        (PictureCutter(), [jpeg(10), jpeg(20), jpeg(30)]),
     ):
         cutter.put(frames[0][:2], 1)
         cutter.put(frames[0][2:] + frames[1][:2], 5)
@@ -156,10 +162,26 @@ def test_every_raw_format_shows_the_colours() -> None:
     assert shown.shape == rgb.shape
 
 
+def test_depth_comes_as_png_of_16_bits_or_raw_and_no_other_picture_is_depth() -> None:
+    depth = depth_scene(3)
+    shown = PictureCutter().decode(encoded(depth, ".png"))
+    raw = RawCutter(SIDE, SIDE, RAW_FORMATS["gray16le"]).decode(depth.astype("<u2").tobytes())
+    for found in (shown, raw):
+        assert found is not None
+        assert found.dtype == np.uint16
+        assert np.array_equal(found, depth)
+    for colours in (np.dstack([depth] * 3), (depth >> 8).astype(np.uint8), scene(1)):
+        done, data = cv2.imencode(".png", colours)
+        assert done
+        picture = PictureCutter().decode(data.tobytes())
+        assert picture is not None
+        assert (picture.dtype, picture.shape) == (np.uint8, (SIDE, SIDE, 3))
+
+
 @pytest.mark.parametrize("data", [b"no pictures here " * 400, b"\xff\xd8junk"])
 def test_garbage_ends_in_a_clear_error(data: bytes) -> None:
     with pytest.raises(CameraError, match="no MJPEG"):
-        JpegCutter().put(data, 0)
+        PictureCutter().put(data, 0)
 
 
 # --- the program

@@ -107,3 +107,14 @@ def test_the_flag(given_rate: float | str, limits: tuple[float, float]) -> None:
 def test_a_bad_flag(given_rate: float | str) -> None:
     with pytest.raises(UserError, match="visual-rate"):
         Rates(visual_rate=given_rate)
+
+
+@pytest.mark.parametrize(("change", "hz"), [(0, 10.0), (60_000, 60.0)])
+def test_depth_is_compared_without_overflow(change: int, hz: float) -> None:
+    rate = AdaptiveRate(min_hz=10, max_hz=60)
+    for k in range(150):
+        depth = np.full((64, 64), 2_000 + change * (k % 2), np.uint16)
+        at_ns = k * NS_PER_S // 30
+        stamps = {"captured_ns": at_ns, "started_ns": at_ns, "ready_ns": at_ns + NS_PER_MS}
+        rate.emit(replace(make_vision_tick(), rgb=depth, **stamps))
+    assert rate.rate_hz == pytest.approx(hz, abs=0.1)

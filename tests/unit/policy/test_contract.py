@@ -15,6 +15,7 @@ from policy.checkpoints.header import read_contract
 from policy.contract import (
     ACTION_TERMS,
     AGE,
+    DEPTH_TERMS,
     FLIGHT_TERMS,
     OBSERVATION_TERMS,
     ROTATION,
@@ -49,7 +50,7 @@ def test_round_trips_through_its_header_form() -> None:
         max_distance_m=5000.0,
     )
     assert Contract.from_json(contract.to_json()) == contract
-    assert json.loads(contract.to_json())["version"] == 5
+    assert json.loads(contract.to_json())["version"] == 6
 
 
 def header_of_version_1(**changes: object) -> dict[str, Any]:
@@ -57,14 +58,15 @@ def header_of_version_1(**changes: object) -> dict[str, Any]:
     return {
         name: value
         for name, value in header.items()
-        if name not in (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS, *STALL_TERMS)
+        if name
+        not in (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS, *STALL_TERMS, *DEPTH_TERMS)
     } | {"version": 1}
 
 
 def test_version_1_flies_sticks_in_the_modes_that_hold_altitude() -> None:
     contract = Contract.from_json(json.dumps(header_of_version_1(horizon=8)))
     assert contract == Contract(horizon=8)
-    assert contract.version == 5
+    assert contract.version == 6
     assert (contract.action, contract.modes) == ("sticks", ("ALT_HOLD", "ALTCTL"))
     ages_s = (contract.max_state_age_s, contract.max_velocity_age_s)
     assert (*ages_s, contract.max_feature_age_s, contract.max_chunk_age_s) == (0.1, 0.25, 0.3, 0.3)
@@ -124,13 +126,18 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
         ({"image_crop": [0.5, 0.0, 0.5, 1.0]}, "top, left, bottom, right"),
         ({"image_crop": [0.0, 0.0, float("nan"), 1.0]}, "top, left, bottom, right"),
         ({"image_fit": "squash"}, "'stretch' or 'crop' or 'pad'"),
-        ({"image_channels": "gbr"}, "'rgb' or 'bgr'"),
+        ({"image_channels": "gbr"}, "'rgb' or 'bgr' or 'depth'"),
+        ({"image_channels": "depth", "image_mean_rgb": [0.0, 0.0, 0.0]}, "image_mean_rgb"),
+        ({"image_channels": "depth", "image_std_rgb": [1.0, 1.0, 1.0]}, "image_std_rgb"),
+        ({"depth_unit_m": 0.0}, "depth_unit_m must be in"),
+        ({"depth_unit_m": float("nan")}, "depth_unit_m must be in"),
+        ({"version": 5, "depth_unit_m": 0.001}, "unknown contract keys"),
         ({"observation_steps": 0}, "observation_steps must be an integer in 1..16"),
         ({"observation_dt_s": 0}, "observation_dt_s must be in"),
         ({"state_extras": ["speed"]}, "goal, height, altitude"),
         ({"state_extras": ["goal", "goal"]}, "each once"),
         ({"play_s": 0.9}, "at most the 0.8 s of a chunk"),
-        ({"version": 6}, "version 6 is not supported"),
+        ({"version": 7}, "version 7 is not supported"),
         ({"state_frame": "nwu"}, "ned_frd"),
         ({"arrays": "jax"}, "numpy"),
         ({"horizon": 0}, "horizon must be an integer in"),
@@ -144,7 +151,7 @@ def test_the_appended_names_lie_where_their_slices_say() -> None:
         ({"image_std_rgb": [0.2, 0.2, float("nan")]}, "three numbers in"),
         ({"since_exposure": 1}, "since_exposure must be true or false"),
         ({"colour": "bgr"}, "unknown contract keys"),
-        ({"version": "2"}, "this build reads versions 1, 2, 3, 4, 5"),
+        ({"version": "2"}, "this build reads versions 1, 2, 3, 4, 5, 6"),
         ({"action": "torque"}, "'torque' is unknown; use one of sticks, rates, attitude, velocity"),
         ({"action": "velocity", "modes": ["GUIDED_NOGPS"]}, "known are GUIDED, OFFBOARD"),
         ({"velocity_frame": "body"}, "velocity_frame 'body' is unknown"),
@@ -228,3 +235,11 @@ def test_every_value_of_every_field_makes_a_contract_or_an_error(
 def test_refuses_what_is_no_json_object(text: str) -> None:
     with pytest.raises(ContractError):
         Contract.from_json(text)
+
+
+@pytest.mark.parametrize("changes", [{}, {"cameras": ("left", "right"), "observation_steps": 2}])
+def test_depth_has_one_channel_in_place_of_three(changes: dict[str, Any]) -> None:
+    colour, depth = Contract(**changes), Contract(image_channels="depth", **changes)
+    assert depth.image_shape == (*colour.image_shape[:-3], 1, *colour.image_shape[-2:])
+    assert (colour.picture_shape, depth.picture_shape) == ((224, 224, 3), (224, 224))
+    assert Contract.from_json(depth.to_json()) == depth

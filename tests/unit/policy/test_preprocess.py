@@ -1,9 +1,12 @@
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.preprocess import image_to_input
+from policy.preprocess import image_to_input, input_to_bytes
 
 CONTRACT = Contract(image_height=32, image_width=48)
 
@@ -154,3 +157,47 @@ def test_the_right_proportions_need_no_fitting(fit: str) -> None:
     np.testing.assert_array_equal(
         pixels(image, plain(image_fit=fit)), pixels(image, plain(image_fit="stretch"))
     )
+
+
+DEPTH = Contract(image_height=32, image_width=48, image_channels="depth")
+
+
+def test_depth_is_metres_and_the_unknown_is_zero() -> None:
+    depth = np.full((32, 48), 1500, np.uint16)
+    depth[0, 0], depth[0, 1] = 0, 65535
+    planes = image_to_input(depth, DEPTH)
+    assert (planes.shape, planes.dtype) == ((1, 1, 32, 48), np.float32)
+    assert planes[0, 0, 0, :3].tolist() == pytest.approx([0.0, 65.535, 1.5])
+    fine = replace(DEPTH, depth_unit_m=0.0002)
+    np.testing.assert_allclose(image_to_input(depth, fine), planes / 5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("fit", ["stretch", "crop", "pad"])
+@pytest.mark.parametrize("size", [(64, 96), (480, 640), (16, 24), (31, 100)])
+def test_no_distance_is_made_up_between_two(size: tuple[int, int], fit: Any) -> None:
+    depth = np.random.default_rng(0).choice(np.array([0, 1000, 9000], np.uint16), size)
+    planes = image_to_input(depth, replace(DEPTH, image_fit=fit))
+    assert planes.shape == (1, 1, 32, 48)
+    assert set(np.unique(planes.round(3))) <= {np.float32(0), np.float32(1), np.float32(9)}
+
+
+@pytest.mark.parametrize(
+    ("image", "contract"),
+    [
+        (np.zeros((32, 48), np.uint16), CONTRACT),
+        (np.zeros((32, 48, 3), np.uint16), CONTRACT),
+        (np.zeros((32, 48, 3), np.uint8), DEPTH),
+        (np.zeros((32, 48), np.uint8), DEPTH),
+        (np.zeros((32, 48), np.float32), DEPTH),
+        (np.zeros((32, 48, 1), np.uint16), DEPTH),
+        (np.zeros((0, 48), np.uint16), DEPTH),
+    ],
+)
+def test_an_image_of_the_other_kind_is_refused(image: Any, contract: Contract) -> None:
+    with pytest.raises(PolicyError, match=rf"{image.dtype} \[{image.shape[0]}, "):
+        image_to_input(image, contract)
+
+
+def test_depth_has_no_bytes() -> None:
+    with pytest.raises(PolicyError, match="type float"):
+        input_to_bytes(np.zeros((1, 1, 32, 48), np.float32), DEPTH)

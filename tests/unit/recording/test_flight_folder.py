@@ -17,7 +17,14 @@ from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.meta import FlightError, read_meta, write_meta
 from mavbridge.recording.rows import LATER, TICKS, FrameTruth, TickLabels
 from mavbridge.recording.tlog import open_tlog_pipe
-from policy.contract import ACTION_TERMS, FLIGHT_TERMS, OBSERVATION_TERMS, STALL_TERMS, Contract
+from policy.contract import (
+    ACTION_TERMS,
+    DEPTH_TERMS,
+    FLIGHT_TERMS,
+    OBSERVATION_TERMS,
+    STALL_TERMS,
+    Contract,
+)
 
 
 def record(folder: Path, *, ticks: int = 30, frames: int = 10) -> FlightWriter:
@@ -229,8 +236,8 @@ def test_what_is_no_flight_says_what_is_wanted(flight: Path) -> None:
 def test_a_flight_whose_contract_is_of_version_1_is_read(flight: Path) -> None:
     path = flight / "meta.json"
     contract = json.loads(path.read_text())["contract"]
-    assert contract["version"] == 5
-    later = (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS, *STALL_TERMS)
+    assert contract["version"] == 6
+    later = (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS, *STALL_TERMS, *DEPTH_TERMS)
     old = {name: value for name, value in contract.items() if name not in later}
     _meta(contract={**old, "version": 1})(flight)
     assert open_flight(flight).meta.contract == make_meta().contract

@@ -7,6 +7,8 @@ import pytest
 from helpers.factories import FRAME_NS, START_NS
 from helpers.recordings import number_of, picture
 from mavbridge.recording.video.file import FragmentedMp4, VideoError, count_frames, read_video
+from policy.data.flight_data import DatasetError
+from policy.data.flight_folders import decode_video
 
 
 def write(path: Path, count: int) -> FragmentedMp4:
@@ -82,3 +84,19 @@ def test_errors_say_what_is_wrong(tmp_path: Path) -> None:
         list(read_video(path, 5))
     with pytest.raises(FileExistsError):
         FragmentedMp4(path, height=48, width=64, hz=30)
+
+
+def test_depth_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    path = tmp_path / "camera.mp4"
+    random = np.random.default_rng(0)
+    depths = [random.integers(0, 1 << 16, (48, 64), np.uint16) for _ in range(4)]
+    video = FragmentedMp4(path, height=48, width=64, hz=30, is_depth=True)
+    for k, depth in enumerate(depths):
+        video.append(depth, START_NS + k * FRAME_NS)
+        assert count_frames(path) == k
+    video.close()
+    back = list(read_video(path))
+    assert {each.dtype for each in back} == {np.dtype(np.uint16)}
+    assert np.array_equal(back, depths)
+    with pytest.raises(DatasetError, match="holds depth"):
+        next(decode_video(path))

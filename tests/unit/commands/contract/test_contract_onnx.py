@@ -13,11 +13,11 @@ from policy.foreign.interface import read_interface
 onnx = pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
 
 
-def graph(path: Path, height: int | str = 96) -> Path:
+def graph(path: Path, height: int | str = 96, channels: int = 3) -> Path:
     """Takes what a policy takes, and gives a constant chunk of 8 actions."""
     helper, float32 = onnx.helper, onnx.TensorProto.FLOAT
     shapes = {
-        "rgb_front": [1, 3, height, 128],
+        "rgb_front": [1, channels, height, 128],
         "robot_state": [1, 2],
         "action_history": [1, 4, 4],
     }
@@ -55,3 +55,11 @@ def test_a_file_that_is_no_graph_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"policy\.onnx cannot be read as ONNX"):
         contract(path, ContractConfig())
     assert [each.name for each in tmp_path.iterdir()] == ["policy.onnx"]
+
+
+def test_one_channel_is_guessed_to_be_depth(tmp_path: Path) -> None:
+    path = graph(tmp_path / "policy.onnx", channels=1)
+    assert contract(path, ContractConfig()) == 0
+    drafted = tomllib.loads((tmp_path / "mavbridge.toml").read_text())["contract"]
+    assert drafted["image_channels"] == "depth"
+    assert not {"image_mean_rgb", "image_std_rgb"} & set(drafted)

@@ -250,6 +250,15 @@ def test_images_are_stamped_with_their_exposure_and_keep_their_colours(rrd: Path
     assert bgr[24, 32] == pytest.approx([0, 0, 200], abs=6)
 
 
+def test_depth_is_shown_brighter_the_nearer_and_unknown_as_black(rrd: Path) -> None:
+    depth = np.full((48, 64), 2000, np.uint16)
+    depth[:, 32:], depth[:, 48:] = 8000, 0
+    seen = show(rrd, [make_tick(0), make_vision_tick(1, rgb=depth)])
+    near, far, unknown = image(seen.columns[CAMERA])[24, [8, 40, 60], 0].astype(int)
+    assert near > far + 50 > unknown + 80
+    assert unknown < 10
+
+
 def image(columns: dict[str, list[Any]]) -> np.ndarray[Any, Any]:
     """The first image of an entity, as BGR."""
     encoded = np.array(columns["EncodedImage:blob"][0][0], dtype=np.uint8)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,25 @@ def test_an_observation_arrives_as_it_was_sent(steps: int, cameras: tuple[str, .
     received = from_message(interface, message)
     for got, sent in zip(received, (image, state, history), strict=True):
         assert np.array_equal(got, sent[None])
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+@pytest.mark.parametrize("cameras", [("front",), ("front", "down")])
+def test_depth_is_sent_in_metres(steps: int, cameras: tuple[str, ...]) -> None:
+    contract = replace(contract_of(steps, cameras), image_channels="depth")
+    interface, rng = Interface(contract=contract), np.random.default_rng(0)
+    image = rng.uniform(0, 65, contract.image_shape).astype(np.float32)
+    state = rng.normal(size=contract.state_shape).astype(np.float32)
+    history = rng.normal(size=(4, 4)).astype(np.float32)
+    message = unpack(pack(to_message(interface, image, state, history=history)))
+    sent: Any = message[f"observation.images.{cameras[-1]}"]
+    assert sent.dtype == np.float32
+    assert np.array_equal(
+        sent, (image if len(cameras) == 1 else image[..., 1, :, :, :])[..., 0, :, :]
+    )
+    received = from_message(interface, message)
+    for got, given in zip(received, (image, state, history), strict=True):
+        assert np.array_equal(got, given[None])
 
 
 def test_keys_and_names_are_those_of_the_contract_file() -> None:

@@ -1,0 +1,256 @@
+"""``jpeg-udp:[HOST:]PORT``: pictures in chunks over UDP, as racing simulators send them.
+
+A datagram is ``HEADER`` and a part of a JPEG or PNG. Chunks may be lost, repeated or out of order.
+"""
+
+import logging
+import re
+import select
+import socket
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import pairwise
+from struct import Struct
+from typing import NamedTuple
+
+from mavbridge.camera.capture import MAX_DRIVER_AGE_NS
+from mavbridge.camera.grabber import Image
+from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES, MAX_JPEG_BYTES, decode_picture
+from mavbridge.core.address import LOOPBACK
+from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.errors import CameraError, UserError
+
+FORM = "jpeg-udp:[HOST:]PORT, such as jpeg-udp:5600 or jpeg-udp:[::1]:5600"
+HEADER = Struct("<IHHIIQ")
+"""Frame id, chunk, chunks, bytes of the picture, bytes of this chunk, stamp in nanoseconds."""
+MAX_PARTIAL = 4
+"""Frames that may be incomplete at a time: with MAX_JPEG_BYTES each, the bound of the memory."""
+RESTART_NS = NS_PER_S
+"""Time without a whole frame after which a lower frame id is a sender that has started again."""
+SILENT_NS = 2 * NS_PER_S
+"""Longest wait for a whole frame."""
+WINDOW_NS = NS_PER_S
+WINDOWS = 5
+"""Windows over which the least delay is taken."""
+MAX_DRIFT_NS = WINDOW_NS // 100
+"""Most by which the least delay changes from window to window, of a clock as fast as ours."""
+_POLL_S = 0.1
+_RECEIVE_BUFFER_BYTES = 4 << 20
+_MOST_QUEUED = 4096
+"""Datagrams read behind a whole frame: a sender faster than this computer is not followed on."""
+_ADDRESS = re.compile(r"(?:\[([^\[\]\s]+)\]:|([^:\[\]\s]+):)?(\d{1,5})", re.ASCII)
+_log = logging.getLogger(__name__)
+
+
+def parse_jpeg_udp(text: str) -> tuple[str, int]:
+    """Host and port of what follows ``jpeg-udp:``; this computer alone without a host.
+
+    Raises:
+        UserError: it is malformed.
+    """
+    match = _ADDRESS.fullmatch(text)
+    if match is None or not 0 < int(match[3]) < 65536:
+        raise UserError(f"--camera {f'jpeg-udp:{text}'!r}: use {FORM}")
+    return match[1] or match[2] or LOOPBACK, int(match[3])
+
+
+class FrameKey(NamedTuple):
+    """Header fields that all chunks of one frame share."""
+
+    frame_id: int
+    chunks: int
+    size_bytes: int
+    stamp_ns: int
+    """By the sender's clock."""
+
+
+@dataclass(slots=True)
+class Assembly:
+    """The chunks of a frame that have come so far."""
+
+    key: FrameKey
+    arrived_ns: int
+    """Arrival of the first one."""
+    parts: dict[int, bytes] = field(default_factory=dict)
+    size_bytes: int = 0
+
+    @property
+    def picture(self) -> bytes:
+        """All chunks in their order."""
+        return b"".join(self.parts[chunk] for chunk in range(self.key.chunks))
+
+
+class FrameAssembler:
+    """Puts frames together from datagrams in any order; each is newer than the one before."""
+
+    def __init__(self) -> None:
+        self.malformed = 0
+        """Datagrams ignored, and frames whose chunks do not add up to their size."""
+        self.incomplete = 0
+        """Frames given up with chunks missing."""
+        self._partial: dict[FrameKey, Assembly] = {}
+        """Least recently continued first."""
+        self._last: FrameKey | None = None
+        self._whole_ns = 0
+
+    def put(self, datagram: bytes, arrived_ns: int) -> Assembly | None:
+        """Take in a datagram; return the frame that it completes.
+
+        A malformed datagram is counted and ignored, one of a frame that is not news is ignored.
+        """
+        header = HEADER.unpack_from(datagram.ljust(HEADER.size, b"\0"))
+        frame_id, chunk, chunks, size_bytes, length, stamp_ns = header
+        payload = datagram[HEADER.size : HEADER.size + length]  # a sender may pad its datagrams
+        is_chunk = chunk < chunks and 0 < length == len(payload)
+        if not is_chunk or not max(chunks, length) <= size_bytes <= MAX_JPEG_BYTES:
+            self.malformed += 1
+            return None
+        key = FrameKey(frame_id, chunks, size_bytes, stamp_ns)
+        if not self._is_news(key, arrived_ns):
+            return None
+        frame = self._partial.pop(key, None) or Assembly(key, arrived_ns)
+        if chunk not in frame.parts:
+            frame.parts[chunk] = payload
+            frame.size_bytes += length
+        return self._kept(frame, arrived_ns)
+
+    def _kept(self, frame: Assembly, now_ns: int) -> Assembly | None:
+        """Return a whole frame, and give older ones up; keep one that lacks chunks."""
+        key, is_whole = frame.key, len(frame.parts) == frame.key.chunks
+        if frame.size_bytes > key.size_bytes or (is_whole and frame.size_bytes < key.size_bytes):
+            self.malformed += 1
+            return None
+        kept = self._partial
+        if is_whole:
+            self._last, self._whole_ns = key, now_ns
+            kept = {key: each for key, each in kept.items() if self._is_news(key, now_ns)}
+        else:
+            kept[key] = frame
+        while len(kept) > MAX_PARTIAL:
+            del kept[next(iter(kept))]
+            self.incomplete += 1
+        self.incomplete += len(self._partial) - len(kept)
+        self._partial = kept
+        return frame if is_whole else None
+
+    def _is_news(self, key: FrameKey, now_ns: int) -> bool:
+        """Return whether the frame is newer than the last whole one; ids wrap around."""
+        last = self._last
+        if last is None or 0 < (key.frame_id - last.frame_id) % (1 << 32) < 1 << 31:
+            return True
+        return key != last and now_ns - self._whole_ns >= RESTART_NS
+
+
+class SenderClock:
+    """Maps the stamps of a sender to our clock, if they can be mapped.
+
+    A stamp that is plausible as one of our clock is one. A foreign clock as fast as ours is mapped
+    by the least delay of the last seconds, so that a frame that was slower on its way shows as
+    older; the least delay itself is unknown, and counts as none. Until that is established, and
+    for a clock that stands still or has another speed (a slow simulator), the arrival counts.
+    """
+
+    def __init__(self) -> None:
+        self._leasts_ns: deque[int] = deque(maxlen=WINDOWS)
+        """Least delay of each window, by two clocks."""
+        self._least_ns = self._window_ns = self._result_ns = 0
+
+    def exposure_ns(self, stamp_ns: int, arrived_ns: int) -> int:
+        """The stamp by our clock, or the arrival; not before the last result, nor in the future."""
+        delay_ns = arrived_ns - stamp_ns
+        age_ns = (
+            delay_ns if 0 <= delay_ns <= MAX_DRIVER_AGE_NS else self._age_ns(delay_ns, arrived_ns)
+        )
+        self._result_ns = min(max(arrived_ns - age_ns, self._result_ns + 1), arrived_ns)
+        return self._result_ns
+
+    def _age_ns(self, delay_ns: int, arrived_ns: int) -> int:
+        """Return the delay beyond the least one; 0 if the clocks differ in speed."""
+        if abs(delay_ns - self._least_ns) > MAX_DRIVER_AGE_NS:
+            self._leasts_ns.clear()
+            self._least_ns, self._window_ns = delay_ns, arrived_ns
+        self._least_ns = min(self._least_ns, delay_ns)
+        age_ns = delay_ns - min(*self._leasts_ns, self._least_ns, delay_ns)
+        if arrived_ns - self._window_ns >= WINDOW_NS:
+            self._leasts_ns.append(self._least_ns)
+            self._least_ns, self._window_ns = delay_ns, arrived_ns
+        drifts_ns = [abs(after - before) for before, after in pairwise(self._leasts_ns)]
+        return age_ns if min(drifts_ns, default=WINDOW_NS) <= MAX_DRIFT_NS else 0
+
+
+class JpegUdpSource:
+    """Implements `ImageSource` over a UDP port; the newest whole frame wins."""
+
+    def __init__(self, host: str, port: int, *, clock: Clock) -> None:
+        """Bind the port; raises CameraError if it cannot be."""
+        self._name = f"jpeg-udp:{f'[{host}]' if ':' in host else host}:{port}"
+        self._clock = clock
+        self._frames = FrameAssembler()
+        self._stamps = SenderClock()
+        self._datagrams = 0
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind((host, port))
+        except OSError as error:
+            self.close()
+            raise CameraError(f"{self._name} cannot be opened: {error.strerror}") from error
+
+    def next_image(self) -> Image:
+        """See `ImageSource`."""
+        silent_after_ns = self._clock.now_ns() + SILENT_NS
+        for _ in range(MAX_BAD_FRAMES + 1):
+            frame = self._newest_frame(silent_after_ns)
+            if (pixels := decode_picture(frame.picture)) is not None:
+                stamp_ns = self._stamps.exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
+                return Image(captured_ns=stamp_ns, rgb=pixels)
+        raise CameraError(f"{self._name}: {MAX_BAD_FRAMES + 1} pictures in a row are damaged")
+
+    def _newest_frame(self, silent_after_ns: int) -> Assembly:
+        """Receive until a frame is whole, then what is there already: it may hold a newer one."""
+        newest: Assembly | None = None
+        more = _MOST_QUEUED
+        while newest is None or more > 0:
+            datagram = self._receive(is_waiting=newest is None)
+            now_ns = self._clock.now_ns()
+            if datagram is not None:
+                self._datagrams += 1
+                newest = self._frames.put(datagram, now_ns) or newest
+                more -= newest is not None
+            elif newest is not None:
+                break
+            if newest is None and now_ns > silent_after_ns:
+                raise CameraError(
+                    f"{self._name}: no whole frame in {SILENT_NS / NS_PER_S:g} s: {self._counts}"
+                )
+        return newest
+
+    def _receive(self, *, is_waiting: bool) -> bytes | None:
+        try:
+            ready, _, _ = select.select([self._socket], [], [], _POLL_S if is_waiting else 0.0)
+            return self._socket.recv(1 << 16) if ready else None
+        except BlockingIOError:  # its checksum was wrong
+            return None
+        except OSError as error:
+            raise CameraError(f"{self._name}: {error.strerror}") from error
+
+    @property
+    def _counts(self) -> str:
+        if not self._datagrams:
+            return (
+                "no datagram has come: check that the sender sends to this address (from other "
+                "computers: jpeg-udp:0.0.0.0:PORT)"
+            )
+        return (
+            f"of {self._datagrams} datagrams {self._frames.malformed} were malformed (a header of "
+            f"{HEADER.size} bytes and a chunk are expected), {self._frames.incomplete} frames "
+            "incomplete"
+        )
+
+    def close(self) -> None:
+        """See `ImageSource`."""
+        if self._frames.malformed or self._frames.incomplete:
+            _log.info("%s: %s", self._name, self._counts)
+        self._socket.close()

@@ -1,0 +1,137 @@
+"""Senders of camera images on loopback: chunks of JPEG over UDP, and H.264 over RTP."""
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from struct import Struct
+from types import TracebackType
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+
+HEADER = Struct("<IHHIIQ")
+"""As the format's description has it: not taken from the code that is tested."""
+SIDE = 64
+HZ = 30
+
+
+def chunks(frame_id: int, data: bytes, *, part: int = 1400, stamp_ns: int = 0) -> list[bytes]:
+    """The datagrams of one picture."""
+    parts = [data[at : at + part] for at in range(0, len(data), part)]
+    return [
+        HEADER.pack(frame_id % (1 << 32), place, len(parts), len(data), len(each), stamp_ns) + each
+        for place, each in enumerate(parts)
+    ]
+
+
+def encoded(image: np.ndarray, suffix: str = ".jpg") -> bytes:
+    """An RGB image as JPEG or PNG, or a depth image as PNG."""
+    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(suffix, bgr)
+    return data.tobytes()
+
+
+def scene(number: int) -> np.ndarray:
+    """An RGB image that shows something, and another thing for each number."""
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    planes = [rows * 3 + number * 16, columns * 3, (rows + columns) * 2 - number * 16]
+    return np.stack([plane % 256 for plane in planes], axis=-1).astype(np.uint8)
+
+
+def depth_scene(number: int) -> np.ndarray:
+    """A slope from 2 m on in millimetres, another one for each number; a corner is unknown."""
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    depth = (2000 + 50 * rows + columns + number).astype(np.uint16)
+    depth[:8, :8] = 0
+    return depth
+
+
+@contextmanager
+def repeating(act: Callable[[int], None], *, hz: float = HZ) -> Iterator[None]:
+    """Call ``act`` with 0, 1, 2 ... at this rate from a thread, while the context lasts."""
+    stop, clock = threading.Event(), MonotonicClock()
+
+    def run() -> None:
+        due_ns, number = clock.now_ns(), 0
+        while not stop.wait(max(0, due_ns - clock.now_ns()) / NS_PER_S):
+            act(number)
+            number += 1
+            due_ns += round(NS_PER_S / hz)
+
+    thread = threading.Thread(target=run, name="test-sender", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(5)
+
+
+class UdpSender:
+    """Sends pictures as a racing simulator does: in reverse order of chunks, each one twice."""
+
+    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self._address = (host, port)
+        self._socket = socket.socket(
+            socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM
+        )
+
+    def send(self, frame_id: int, data: bytes, *, stamp_ns: int = 0) -> None:
+        for chunk in chunks(frame_id, data, stamp_ns=stamp_ns)[::-1]:
+            for _ in range(2):
+                self.send_raw(chunk)
+
+    def send_raw(self, datagram: bytes) -> None:
+        self._socket.sendto(datagram, self._address)
+
+    def __enter__(self) -> "UdpSender":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: object, trace: TracebackType | None
+    ) -> None:
+        self._socket.close()
+
+
+class RtpSender:
+    """H.264 over RTP; the session description that a receiver needs comes from ``describe``."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._container = av.open(f"rtp://127.0.0.1:{port}", "w", format="rtp")
+        stream: Any = self._container.add_stream("libx264", HZ)
+        stream.width = stream.height = SIDE * 2
+        stream.pix_fmt = "yuv420p"
+        stream.options = {
+            "preset": "ultrafast",
+            "tune": "zerolatency",
+            "g": "10",
+            "x264-params": "repeat-headers=1",
+        }
+        self._stream = stream
+        self._count = 0
+
+    def describe(self, path: Path) -> Path:
+        path.write_text(
+            "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=camera\nc=IN IP4 127.0.0.1\nt=0 0\n"
+            f"m=video {self._port} RTP/AVP 96\na=rtpmap:96 H264/90000\n"
+            "a=fmtp:96 packetization-mode=1\n"
+        )
+        return path
+
+    def send(self, rgb: np.ndarray) -> None:
+        frame = av.VideoFrame.from_ndarray(np.kron(rgb, np.ones((2, 2, 1), np.uint8)), "rgb24")
+        frame.pts, frame.time_base = self._count, Fraction(1, HZ)
+        self._count += 1
+        for packet in self._stream.encode(frame):
+            self._container.mux(packet)
+
+    def close(self) -> None:
+        self._container.close()

@@ -1,0 +1,179 @@
+"""Policies that see distances, flown on the stepped clock: of Python and of ONNX."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import helper
+from torch import Tensor
+
+from helpers.fakes import ListSink
+from helpers.foreign_graphs import FLOAT, save_graph
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.simulation import flight as simulated
+from mavbridge.simulation.flight import SimulatedFlight
+from policy.contract import Contract
+from policy.engines.executable import (
+    ExecutionSettings,
+    encode_all,
+    level_state,
+    make_numpy_executable,
+)
+from policy.engines.torch_eager import make_torch_executable
+from policy.loading.load import load_policy
+from policy.loading.request import PolicyRequest
+from policy.protocol import Executable
+from sitl.camera.fpv import FpvRenderer
+from sitl.rotation import Quat, Vec3
+
+SIDE = 32
+HELD_M = 4.0
+"""The mean distance to the ground, in the lower half of the image, that the policies hold."""
+GAIN = 0.25
+"""Throttle for each metre that lacks."""
+DEPTH = Contract(
+    arrays="numpy", image_channels="depth", image_height=SIDE, image_width=SIDE, horizon=16
+)
+
+
+class GroundDepth(FpvRenderer):
+    """The distance to the ground along the optical axis in millimetres; 0 beyond 65.5 m."""
+
+    def render(self, position_ned_m: Vec3, ned_from_body_wxyz: Quat, *_: Any) -> Any:
+        from sitl.camera.fpv import rotation_matrix
+
+        down = (rotation_matrix(ned_from_body_wxyz) @ self._body_from_camera)[2]
+        per_u, per_v, offset = down @ self._ray_from_pixel
+        falls = per_u * self._u_px + (per_v * self._v_px + offset)
+        depth_m = max(-position_ned_m[2], 0.12) / np.maximum(falls, 1e-6)
+        return np.where(depth_m < 65.5, 1000 * depth_m, 0).astype(np.uint16)
+
+
+@pytest.fixture(autouse=True)
+def depth_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulated, "FpvRenderer", GroundDepth)
+
+
+class HoldsDistance:
+    """Climbs until the ground below is as far as it should be."""
+
+    def __init__(self, contract: Contract = DEPTH) -> None:
+        self.contract = contract
+        self.seen: list[np.ndarray] = []
+
+    def predict(self, image: Any, state: Any, history: Any, steps: int) -> np.ndarray:
+        self.seen.append(image)
+        chunk = np.zeros((1, self.contract.horizon, 4), np.float32)
+        chunk[..., 0] = np.clip(GAIN * (HELD_M - image[..., SIDE // 2 :, :].mean()), -0.5, 0.5)
+        return chunk
+
+
+def height_flown_m(executable: Executable, *sinks: ListSink) -> float:
+    flight = SimulatedFlight(course_seed=3, seed=0)
+    result = flight.fly(executable, max_time_s=8.0, sinks=sinks)
+    assert result.outcome == "timed out", result
+    return -flight.vehicle.ap.truth.position_ned_m[2]
+
+
+def test_a_policy_in_python_flies_by_metres() -> None:
+    policy, sink = HoldsDistance(), ListSink()
+    executable = make_numpy_executable(policy, ExecutionSettings(name="deep", dual_rate=False))
+    height_m = height_flown_m(executable, sink)
+    assert {image.shape for image in policy.seen} == {(1, 1, SIDE, SIDE)}
+    assert {image.dtype for image in policy.seen} == {np.dtype(np.float32)}
+    held_m = policy.seen[-1][..., SIDE // 2 :, :].mean()
+    assert held_m == pytest.approx(HELD_M, abs=1.0)
+    assert 0.5 < height_m < 4
+    assert {vision.rgb.dtype for vision in sink.visions} == {np.dtype(np.uint16)}
+    assert {vision.fault for vision in sink.visions} == {None}
+
+
+class TwoRates(torch.nn.Module):
+    """Gives what it is given: the mean distance of each camera at each time."""
+
+    contract = replace(
+        DEPTH,
+        arrays="torch",
+        feature_dim=1,
+        cameras=("front", "down"),
+        observation_steps=2,
+    )
+
+    def encode_visual(self, image: Tensor, camera: int) -> Tensor:
+        assert image.shape == (1, 1, SIDE, SIDE)
+        assert image.dtype == torch.float32
+        return image.mean(dim=(2, 3))
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return feature.reshape(1, 1, 4).expand(-1, self.contract.horizon, -1)
+
+    def predict(self, image: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return self.predict_fast(image.mean(dim=(3, 4, 5)), state, history, steps)
+
+
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_a_policy_in_torch_gets_metres_of_all_cameras_and_times(dual_rate: bool) -> None:
+    settings = ExecutionSettings(name="deep", dual_rate=dual_rate)
+    executable = make_torch_executable(TwoRates(), settings)
+    metres = np.array([[1, 2], [3, 4]], np.uint16)
+    images = np.broadcast_to(1000 * metres[..., None, None], (2, 2, 40, 50)).astype(np.uint16)
+    state, history = level_state(TwoRates.contract), np.zeros((1, 4, 4), np.float32)
+    chunk = executable.act(encode_all(executable, images), state, history, None)
+    assert chunk[0, 0] == pytest.approx([1, 2, 3, 4])
+
+
+def actor(path: Path, *, kind: int = FLOAT) -> None:
+    """depth [1, 1, 32, 32] -> actions [1, 4]: as ``HoldsDistance``, by the mean of all pixels."""
+    nodes = [
+        helper.make_node("Cast", ["depth"], ["metres"], to=FLOAT),
+        helper.make_node("ReduceMean", ["metres"], ["mean"], keepdims=0),
+        helper.make_node("Sub", ["held", "mean"], ["lacks"]),
+        helper.make_node("Mul", ["lacks", "gain"], ["throttle"]),
+        helper.make_node("Clip", ["throttle", "least", "most"], ["actions"]),
+    ]
+    weights = {
+        "held": np.full((1, 4), HELD_M / 2, np.float32),  # the upper half is the sky: 0 m
+        "gain": np.array([[2 * GAIN, 0, 0, 0]], np.float32),
+        "least": np.float32(-0.5),
+        "most": np.float32(0.5),
+    }
+    inputs = {"depth": (kind, (1, 1, SIDE, SIDE))}
+    save_graph(path, nodes, inputs, {"actions": (FLOAT, (1, 4))}, weights)
+
+
+def request(folder: Path) -> PolicyRequest:
+    (folder / "mavbridge.toml").write_text(
+        '[contract]\nhorizon = 1\nchunk_dt_s = 0.05\nimage_channels = "depth"\n'
+        f"image_height = {SIDE}\nimage_width = {SIDE}\n"
+        '[images]\nfront = "depth"\n'
+    )
+    return PolicyRequest(spec=f"onnx:{folder / 'policy.onnx'}")
+
+
+def test_a_graph_flies_by_metres(tmp_path: Path) -> None:
+    actor(tmp_path / "policy.onnx")
+    with load_policy(request(tmp_path), now_s=lambda: 0.0) as loaded:
+        assert loaded.executable.contract.is_depth
+        height_m = height_flown_m(loaded.executable)
+    assert 0.5 < height_m < 4
+
+
+def test_a_graph_that_takes_bytes_is_no_policy_of_depth(tmp_path: Path) -> None:
+    actor(tmp_path / "policy.onnx", kind=onnx.TensorProto.UINT8)
+    with pytest.raises(MavbridgeError, match="depth in metres"):
+        load_policy(request(tmp_path), now_s=lambda: 0.0)
+
+
+def test_a_simulated_camera_of_colour_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulated, "FpvRenderer", FpvRenderer)
+    settings = ExecutionSettings(name="deep", dual_rate=False)
+    with pytest.raises(MavbridgeError, match=r"uint16 .* got uint8"):
+        height_flown_m(make_numpy_executable(HoldsDistance(), settings))
+    monkeypatch.setattr(simulated, "FpvRenderer", GroundDepth)
+    colour = make_numpy_executable(HoldsDistance(replace(DEPTH, image_channels="rgb")), settings)
+    with pytest.raises(MavbridgeError, match=r"uint8 .* got uint16"):
+        height_flown_m(colour)

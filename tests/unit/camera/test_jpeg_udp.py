@@ -1,0 +1,323 @@
+"""Pictures in chunks over UDP: assembled from any order, repetition and loss; stamped; refused."""
+
+import select
+import socket
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.camera_senders import HEADER, UdpSender, chunks, depth_scene, encoded, scene
+from helpers.fakes import START_NS, FakeClock
+from mavbridge.camera import jpeg_udp
+from mavbridge.camera.jpeg_udp import (
+    MAX_DRIFT_NS,
+    MAX_PARTIAL,
+    RESTART_NS,
+    WINDOW_NS,
+    FrameAssembler,
+    JpegUdpSource,
+    SenderClock,
+    parse_jpeg_udp,
+)
+from mavbridge.camera.open import check_camera, open_camera
+from mavbridge.camera.pipe_frames import MAX_JPEG_BYTES, decode_picture
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.errors import CameraError, UserError
+
+FIRST_ID = (1 << 32) - 3
+"""Ids wrap around within each test that counts up from here."""
+FRAME_NS = NS_PER_S // 30
+
+
+def payload(frame_id: int) -> bytes:
+    """Bytes that tell of their frame everywhere; their number differs from frame to frame."""
+    return bytes([frame_id % 251]) * (40 + frame_id % 7)
+
+
+def put_all(frames: FrameAssembler, datagrams: list[bytes], now_ns: int = START_NS) -> list[int]:
+    """The ids of the frames that become whole, in that order; each is checked to be itself."""
+    done = [frame for each in datagrams if (frame := frames.put(each, now_ns)) is not None]
+    for frame in done:
+        assert frame.picture == payload(frame.key.frame_id)
+    return [frame.key.frame_id for frame in done]
+
+
+@given(data=st.data())
+def test_any_order_repetition_and_loss_give_whole_frames_alone_and_newer_ones(data):
+    sent = [
+        chunk
+        for n in range(8)
+        for chunk in chunks(FIRST_ID + n, payload((FIRST_ID + n) % (1 << 32)), part=9)
+    ]
+    arrived = data.draw(st.lists(st.sampled_from(sent), max_size=3 * len(sent)))
+    frames = FrameAssembler()
+    places = [(each - FIRST_ID) % (1 << 32) for each in put_all(frames, arrived)]
+    assert places == sorted(set(places))
+    assert frames.malformed == 0
+
+
+@given(order=st.permutations(range(5)))
+def test_one_frame_is_whole_whatever_the_order_of_its_chunks(order):
+    each = chunks(9, payload(9), part=9)
+    frames = FrameAssembler()
+    assert put_all(frames, [each[place] for place in order]) == [9]
+    assert (frames.malformed, frames.incomplete) == (0, 0)
+
+
+def test_frames_with_lost_chunks_cost_themselves_alone():
+    frames = FrameAssembler()
+    kept = [c for n in range(6) for c in chunks(n, payload(n), part=9)[n % 2 :]]
+    assert put_all(frames, kept) == [0, 2, 4]
+    assert frames.incomplete == 2  # 5 may still become whole
+
+
+def test_incomplete_frames_are_bounded():
+    frames = FrameAssembler()
+    put_all(frames, [chunks(n, payload(n), part=9)[0] for n in range(100)])
+    assert frames.incomplete == 100 - MAX_PARTIAL
+    assert put_all(frames, chunks(99, payload(99), part=9)) == [99]
+
+
+@pytest.mark.parametrize(
+    "datagram",
+    [
+        pytest.param(b"", id="empty"),
+        pytest.param(HEADER.pack(8, 0, 1, 5, 5, 0), id="header alone"),
+        pytest.param(HEADER.pack(8, 0, 1, 5, 5, 0)[:20], id="cut header"),
+        pytest.param(HEADER.pack(8, 0, 1, 5, 5, 0) + b"1234", id="cut chunk"),
+        pytest.param(HEADER.pack(8, 1, 1, 5, 5, 0) + b"12345", id="chunk 1 of 1"),
+        pytest.param(HEADER.pack(8, 0, 0, 5, 5, 0) + b"12345", id="chunk of none"),
+        pytest.param(HEADER.pack(8, 0, 2, 9, 0, 0) + b"12345", id="no bytes"),
+        pytest.param(HEADER.pack(8, 0, 1, 4, 5, 0) + b"12345", id="more bytes than the picture"),
+        pytest.param(HEADER.pack(8, 0, 1, 6, 5, 0) + b"12345", id="fewer bytes than the picture"),
+        pytest.param(HEADER.pack(8, 0, 6, 5, 5, 0) + b"12345", id="more chunks than bytes"),
+        pytest.param(HEADER.pack(8, 0, 9, MAX_JPEG_BYTES + 1, 5, 0) + b"12345", id="too large"),
+        pytest.param(HEADER.pack(8, 0, 9, 2**32 - 1, 5, 0) + b"12345", id="4 GiB"),
+        pytest.param(b"GET / HTTP/1.1\r\nHost: camera\r\n\r\n", id="another protocol"),
+    ],
+)
+def test_what_is_malformed_is_counted_and_ignored(datagram):
+    frames = FrameAssembler()
+    assert put_all(frames, [datagram]) == []
+    assert frames.malformed == 1
+    assert put_all(frames, chunks(8, payload(8), part=9)) == [8]
+
+
+@given(st.lists(st.binary(max_size=80), max_size=20))
+def test_no_bytes_raise_or_hide_the_next_frame(datagrams):
+    frames = FrameAssembler()
+    for datagram in datagrams:
+        frames.put(datagram, START_NS)
+    later_ns = START_NS + RESTART_NS
+    assert put_all(frames, chunks(8, payload(8), part=9), later_ns) == [8]
+
+
+def test_chunks_that_outgrow_their_picture_are_dropped():
+    frames = FrameAssembler()
+    header = HEADER.pack(5, 0, 3, 10, 8, 0), HEADER.pack(5, 1, 3, 10, 8, 0)
+    assert put_all(frames, [each + b"12345678" for each in header]) == []
+    assert frames.malformed == 1
+
+
+def test_padded_datagrams_are_read():
+    frames = FrameAssembler()
+    assert put_all(frames, [each.ljust(1500, b"\0") for each in chunks(3, payload(3))]) == [3]
+
+
+def test_two_senders_with_the_same_ids_are_never_mixed():
+    one, other = chunks(4, b"a" * 30, part=10), chunks(4, b"b" * 30, part=10, stamp_ns=7)
+    frames = FrameAssembler()
+    done = [frames.put(each, 0) for each in (one[0], other[1], one[2], other[0], other[2], one[1])]
+    assert [frame.picture for frame in done if frame] == [b"b" * 30]
+
+
+def test_a_sender_that_starts_again_is_followed_after_a_second():
+    frames = FrameAssembler()
+    assert put_all(frames, chunks(500, payload(500))) == [500]
+    soon_ns, later_ns = START_NS + RESTART_NS - 1, START_NS + RESTART_NS
+    assert put_all(frames, chunks(1, payload(1)), soon_ns) == []
+    assert put_all(frames, chunks(500, payload(500)), later_ns) == []  # repeated, not news
+    assert put_all(frames, chunks(1, payload(1)), later_ns) == [1]
+    assert put_all(frames, chunks(2, payload(2)), later_ns) == [2]
+
+
+def ages_ms(clock: SenderClock, *, speed: float, offset_ns: int, seconds: float, delay_ms):
+    """Ages at their arrival of frames at 30 Hz; ``delay_ms`` of each number."""
+    ages, last_ns = [], 0
+    for number in range(round(seconds * 30)):
+        sent_ns = START_NS + number * FRAME_NS
+        arrived_ns = sent_ns + round(delay_ms(number) * NS_PER_MS)
+        stamp_ns = offset_ns + round(speed * (sent_ns - START_NS))
+        captured_ns = clock.exposure_ns(stamp_ns, arrived_ns)
+        assert last_ns < captured_ns <= arrived_ns or captured_ns == arrived_ns
+        last_ns = captured_ns
+        ages.append((arrived_ns - captured_ns) / NS_PER_MS)
+    return ages
+
+
+@pytest.mark.parametrize("offset_ns", [0, 5 * NS_PER_S, START_NS + 20 * NS_PER_S, 10**18])
+def test_a_foreign_clock_is_mapped_by_the_least_delay(offset_ns):
+    def delay_ms(number):
+        return 40.0 if number % 10 == 0 else 5.0 + number % 3
+
+    ages = ages_ms(SenderClock(), speed=1.0, offset_ns=offset_ns, seconds=6, delay_ms=delay_ms)
+    assert set(ages[:30]) == {0.0}  # not known yet: the arrival counts
+    for number in range(75, 180):
+        assert ages[number] == pytest.approx(delay_ms(number) - 5.0, abs=0.01)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.25, 0.9, 1.2, 4.0])
+def test_a_clock_that_stands_still_or_has_another_speed_is_not_believed(speed):
+    ages = ages_ms(
+        SenderClock(), speed=speed, offset_ns=77, seconds=8, delay_ms=lambda n: 5.0 + n % 3
+    )
+    assert max(ages) == 0.0
+
+
+def test_a_simulator_that_becomes_slow_is_noticed_within_seconds():
+    clock = SenderClock()
+    ages = []
+    for number in range(300):
+        stamp_s = number / 30 if number < 120 else 4 + (number - 120) / 30 * 0.9
+        arrived_ns = START_NS + number * FRAME_NS
+        captured_ns = clock.exposure_ns(round(stamp_s * NS_PER_S), arrived_ns)
+        ages.append((arrived_ns - captured_ns) / NS_PER_MS)
+    assert max(ages) < 600  # older than they are, never younger
+    assert set(ages[-30:]) == {0.0}
+
+
+def test_a_stamp_of_our_own_clock_is_the_exposure():
+    clock = SenderClock()
+    for number in range(5):
+        sent_ns = START_NS + number * FRAME_NS
+        assert clock.exposure_ns(sent_ns, sent_ns + 30 * NS_PER_MS) == sent_ns
+
+
+def test_a_clock_that_is_set_anew_is_learnt_again():
+    clock = SenderClock()
+    for offset_ns in (10**18, 3 * NS_PER_S, 2 * 10**18):
+        ages = ages_ms(
+            clock, speed=1.0, offset_ns=offset_ns, seconds=4, delay_ms=lambda n: 5.0 + n % 2
+        )
+        assert set(ages[:30]) == {0.0}
+        assert set(map(round, ages[-30:])) == {0, 1}
+    assert MAX_DRIFT_NS < WINDOW_NS
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("5600", ("127.0.0.1", 5600)),
+        ("0.0.0.0:5600", ("0.0.0.0", 5600)),
+        ("localhost:1", ("localhost", 1)),
+        ("[::1]:65535", ("::1", 65535)),
+        ("[fe80::1%eth0]:5600", ("fe80::1%eth0", 5600)),
+    ],
+)
+def test_addresses(text, address):
+    assert parse_jpeg_udp(text) == address
+    check_camera(f"jpeg-udp:{text}")
+
+
+@pytest.mark.parametrize(
+    "text", ["", ":", "0", "65536", "host", "::1:5600", "a:b:1", "[::1]", "1 "]
+)
+def test_what_is_no_address_is_refused(text):
+    with pytest.raises(UserError, match="jpeg-udp:\\[HOST:\\]PORT"):
+        check_camera(f"jpeg-udp:{text}")
+
+
+class TickingClock(FakeClock):
+    """Moves by half a second whenever it is read: a wait that lasts."""
+
+    def now_ns(self):
+        self.advance_ns(500 * NS_PER_MS)
+        return super().now_ns()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_the_newest_frame_is_read_and_older_ones_are_left(host):
+    source = JpegUdpSource(host, 17201, clock=MonotonicClock())
+    with UdpSender(17201, host) as sender:
+        before_ns = MonotonicClock().now_ns()
+        for number in range(3):
+            sender.send(number, encoded(scene(number), ".png"), stamp_ns=before_ns)
+        image = source.next_image()
+        assert np.array_equal(image.rgb, scene(2))
+        assert image.captured_ns == before_ns
+        sender.send(7, encoded(depth_scene(1), ".png"))
+        assert np.array_equal(source.next_image().rgb, depth_scene(1))
+    source.close()
+
+
+def test_a_whole_frame_waits_for_nothing(monkeypatch):
+    source, asked_s = JpegUdpSource("127.0.0.1", 17205, clock=MonotonicClock()), []
+    with UdpSender(17205) as sender:
+        sender.send(0, encoded(scene(0)))
+        sender.send_raw(chunks(1, payload(1), part=9)[0])
+        real = select.select
+
+        def ask(reads, writes, errors, timeout_s):
+            asked_s.append(timeout_s)
+            return real(reads, writes, errors, timeout_s)
+
+        monkeypatch.setattr(jpeg_udp.select, "select", ask)
+        source.next_image()
+    source.close()
+    assert 0.0 in asked_s
+    assert set(asked_s[asked_s.index(0.0) :]) == {0.0}
+
+
+def test_silence_says_what_has_come():
+    source = JpegUdpSource("127.0.0.1", 17202, clock=TickingClock())
+    with pytest.raises(CameraError, match="no datagram has come"):
+        source.next_image()
+    with UdpSender(17202) as sender:
+        sender.send_raw(b"hello")
+        sender.send_raw(chunks(1, payload(1), part=9)[0])
+        with pytest.raises(CameraError, match="of 2 datagrams 1 were malformed"):
+            source.next_image()
+    source.close()
+
+
+def test_damaged_pictures_are_skipped_and_many_in_a_row_are_an_error(monkeypatch):
+    source = JpegUdpSource("127.0.0.1", 17203, clock=MonotonicClock())
+    with UdpSender(17203) as sender:
+        tried = []
+
+        def decode(data):
+            tried.append(data)
+            sender.send(len(tried), b"no picture" if len(tried) != 5 else encoded(scene(0)))
+            return decode_picture(data)
+
+        monkeypatch.setattr(jpeg_udp, "decode_picture", decode)
+        sender.send(0, b"no picture")
+        assert source.next_image().rgb.shape == scene(0).shape
+        with pytest.raises(CameraError, match="11 pictures in a row are damaged"):
+            source.next_image()
+    source.close()
+
+
+def test_a_port_that_is_in_use_is_named():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 17204))
+        with pytest.raises(CameraError, match=r"jpeg-udp:127.0.0.1:17204 .*in use"):
+            open_camera("jpeg-udp:17204", image_size=32, clock=MonotonicClock(), timeout_s=0.2)
+
+
+def with_size(data: bytes, at: int, sides: bytes) -> bytes:
+    return data[:at] + sides + data[at + len(sides) :]
+
+
+def test_a_picture_that_says_it_is_huge_is_not_decoded():
+    jpeg, png = encoded(scene(0)), encoded(depth_scene(0), ".png")
+    size_at = jpeg.index(b"\xff\xc0") + 5
+    assert decode_picture(jpeg) is not None
+    assert decode_picture(with_size(jpeg, size_at, b"\xff\xdc\xff\xdc")) is None
+    assert decode_picture(png) is not None
+    assert decode_picture(with_size(png, 16, b"\x7f\xff\xff\xff\x7f\xff\xff\xff")) is None
+    for end in range(40):
+        assert decode_picture(jpeg[:end]) is None
+        assert decode_picture(png[:end]) is None
