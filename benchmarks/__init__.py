@@ -3,5 +3,4 @@
 compare         our engines, flights and link beside a roofline, a baseline runner and other clients
 rollout         imagined flights, serial and streamed
 study           what makes a checkpoint fly well, one setting at a time
-imagined_strip  a picture of imagined and real frames
 """

@@ -23,7 +23,7 @@ from mavbridge.camera.open import open_camera
 from mavbridge.commands.bench.engines import EAGER
 from mavbridge.commands.bench.flight import FlightJob
 from mavbridge.commands.bench.missed_slots import stolen_ms_since, stolen_ns
-from mavbridge.commands.bench.results import BASELINE, Flight, to_json
+from mavbridge.commands.bench.results import BASELINE, Flight, solves_of, to_json
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
@@ -229,7 +229,7 @@ class Baseline:
         return Flight(
             runner=BASELINE,
             policy=self._job.policy.policy,
-            solves="full solves",
+            solves=solves_of(self._job.policy),
             engine=EAGER,
             asked_stick_hz=self._action_hz,
             asked_action_hz=self._action_hz,

@@ -94,7 +94,7 @@ def _times(executable: Executable) -> tuple[Milliseconds, Milliseconds]:
     image = rgb.reshape(-1, *rgb.shape[-3:])[0]
     return (
         _time(lambda: executable.encode(image)),
-        _time(lambda: executable.act(encoded, state, history, None)),
+        _time(lambda: executable.act(encoded, state, history)),
     )
 
 

@@ -62,15 +62,13 @@ def with_slow_solves(executable: Executable) -> Executable:
     """An executable whose every tenth solve computes for 30 ms more."""
     clock, solves = MonotonicClock(), 0
 
-    def act(
-        encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         nonlocal solves
         solves += 1
         end_ns = clock.now_ns() + (0 if solves % SLOW_EVERY else SLOW_NS)
         while clock.now_ns() < end_ns:
             pass
-        return executable.act(encoded, state, history, elapsed_s)
+        return executable.act(encoded, state, history)
 
     return replace(executable, act=act)
 

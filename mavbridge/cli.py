@@ -2,7 +2,6 @@
 
 import difflib
 import re
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +20,7 @@ from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.export.config import ExportConfig
 from mavbridge.commands.export_policy.config import ExportPolicyConfig
 from mavbridge.commands.identify.config import IdentifyConfig
-from mavbridge.commands.imagine.config import EvaluateImaginationConfig, ImagineConfig
+from mavbridge.commands.imagine.config import ImagineConfig
 from mavbridge.commands.inspect.config import InspectConfig
 from mavbridge.commands.record.config import RecordConfig
 from mavbridge.commands.replay.config import ReplayConfig
@@ -185,22 +184,6 @@ def imagine(config: ImagineConfig) -> int:
     return run_rollout(config)
 
 
-@cli.command
-def evaluate_imagination(*flights: Path, config: EvaluateImaginationConfig | None = None) -> int:
-    """Measure how good a world model is, on recorded flights.
-
-    Args:
-        flights: flight folders, or folders of them, that the model was not trained on.
-        config: the settings.
-    """
-    require_extra("evaluate-imagination")
-    if not flights:
-        raise UserError("name the flights to imagine: mavbridge evaluate-imagination DIR...")
-    from mavbridge.commands.evaluate_imagination.run import evaluate_imagination as run_evaluation
-
-    return run_evaluation(flights, config or EvaluateImaginationConfig())
-
-
 @contextmanager
 def _needs_simulator(command: str) -> Iterator[None]:
     """Say what to install where the simulator cannot be imported."""
@@ -339,7 +322,7 @@ def with_config(
             Dict(_with_home(document), use_commands_as_keys=False, source=str(config)),
         ]
     with run_log(log_file, verbose=verbose):
-        status: int | None = cli(_with_home(list(_current_spelling(tokens))))
+        status: int | None = cli(_with_home(list(tokens)))
     return status or 0
 
 
@@ -365,22 +348,3 @@ def _check_command(tokens: tuple[str, ...]) -> None:
     close = difflib.get_close_matches(tokens[0], commands, n=1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(commands)}"
     raise UserError(f"unknown command {tokens[0]!r}: {hint}")
-
-
-def _current_spelling(tokens: tuple[str, ...]) -> tuple[str, ...]:
-    """Replace the two flags that were commands until version 0.1, and say so."""
-    if tokens[:1] == ("imagine",) and "--evaluate" in tokens:
-        _note("imagine --evaluate is now called evaluate-imagination")
-        return "evaluate-imagination", *(word for word in tokens[1:] if word != "--evaluate")
-    if tokens[:1] != ("train",):
-        return tokens
-    for at, length in ((at, length) for at in range(1, len(tokens)) for length in (1, 2)):
-        if "=".join(tokens[at : at + length]) == "--policy=world-model":
-            _note("train --policy world-model is now called train-world-model")
-            rest = (*tokens[1:at], *tokens[at + length :])
-            return "train-world-model", *(word for word in rest if word != "--freeze-encoder")
-    return tokens
-
-
-def _note(text: str) -> None:
-    sys.stderr.write(f"note: {text}\n")

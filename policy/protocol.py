@@ -51,38 +51,6 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
         """Cached features [B, *contract.feature_shape], states and history -> chunk."""
 
 
-class NoiseModel(Protocol):
-    """The noise that a diffusion solve starts from."""
-
-    @property
-    def initial_noise(self) -> Any:
-        """[1, horizon, 4]; the same for a whole flight."""
-
-    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-
-
-@runtime_checkable
-class WarmStartPolicy(DualRatePolicy, NoiseModel, Protocol):
-    """A policy whose solve can be entered before any of its steps, and left after any.
-
-    ``predict_fast`` is ``denoise_fast`` by all steps from ``initial_noise``.
-    """
-
-    def denoise_fast(
-        self,
-        feature: Any,
-        state: Any,
-        action_history: Any,
-        noisy: Any,
-        num_diffusion_steps: int,
-        first: int,
-        count: int,
-    ) -> Any:
-        """``count`` steps of a solve: ``noisy`` [B, horizon, 4] as step ``first`` starts with it
-        -> as the next step would; after the last step, the chunk."""
-
-
 class Encode(Protocol):
     """``Executable.encode``."""
 
@@ -95,8 +63,7 @@ class StepwisePolicy(DualRatePolicy, Protocol):
     """A diffusion policy that can be asked for one call of its network at a time.
 
     An engine that compiles compiles ``denoise`` alone, once, and runs the solver around it: that
-    is one copy of the weights, and seconds to convert in place of minutes. A warm start needs the
-    members of ``WarmStartPolicy`` as well.
+    is one copy of the weights, and seconds to convert in place of minutes.
     """
 
     schedule: Any
@@ -138,15 +105,14 @@ class Executable:
     """Image of any size of one camera -> float32 [1, feature_dim], or without a fast path the image
     [1, 3, image_height, image_width] (depth: 1 for 3); ``join`` makes of them what ``act`` takes.
     """
-    act: Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
+    act: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
     """(joined images [1, *contract.feature_shape], or without a fast path [1,
-    *contract.image_shape]; state [1, *contract.state_shape]; history [1, K, 4]; seconds from the
-    state of the last chunk to this one or None to start afresh) -> chunk [1, horizon, 4]."""
+    *contract.image_shape]; state [1, *contract.state_shape]; history [1, K, 4]) -> chunk
+    [1, horizon, 4]."""
     close: Callable[[], None] = keep_nothing
     """Ends what the policy has opened; called once, after the last call of the others."""
     reset: Callable[[], None] = keep_nothing
-    """Forgets earlier flights; called when a flight begins. A warm start needs no reset: ``act``
-    starts it afresh where no time is given."""
+    """Forgets earlier flights; called when a flight begins."""
 
     def join(self, encoded: Sequence[Sequence[FloatArray]]) -> FloatArray:
         """``encode``'s value of each camera, at each observation from the oldest on -> for ``act``.

@@ -97,10 +97,8 @@ def flown_by_rates(executable: Executable) -> Executable:
     loop = StickLoop(by_rates(executable.contract))
     centred = np.zeros((1, executable.contract.history_len, ACTION_DIM), np.float32)
 
-    def act(
-        encoded: FloatArray, state: FloatArray, _history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
-        return loop.to_rates(executable.act(encoded, state, centred, elapsed_s), state)
+    def act(encoded: FloatArray, state: FloatArray, _history: FloatArray) -> FloatArray:
+        return loop.to_rates(executable.act(encoded, state, centred), state)
 
     return replace(executable, contract=loop.contract, act=act)
 

@@ -21,7 +21,6 @@ from mavbridge.config.groups import (
 )
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
-from mavbridge.core.address import parse_forward
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import OnFault, Risk
 
@@ -159,10 +158,6 @@ class LinkConfig:
     turns or climbs more or less at full stick than the one that the policy was trained for."""
     readonly: bool = False
     """Run everything, send no stick, mode or arm command."""
-    forward: Annotated[str, Parameter(show_default=False)] = ""
-    """Share the link with a ground station: udp:HOST:PORT sends to it, udpin:HOST:PORT listens."""
-    gcs_sticks_win: Annotated[bool, Parameter(negative="")] = False
-    """The sticks of the ground station of --forward take over for good once they are moved."""
     signing_key_file: Annotated[Path | None, Parameter(show_default=False)] = None
     """Sign every packet, and take only signed ones (MAVLink 2): a file with the vehicle's key, 32
     bytes or 64 hexadecimal digits, which only you may read."""
@@ -180,10 +175,6 @@ class LinkConfig:
         """Refuse ids that MAVLink has no room for, and parameters that cannot be set."""
         if (self.set_params or self.restore_params) and self.readonly:
             raise UserError("--readonly sets no parameter: leave out --set and --restore-params")
-        if self.gcs_sticks_win and not self.forward:
-            raise UserError("--gcs-sticks-win needs --forward, the ground station that it is about")
-        if self.forward:
-            parse_forward(self.forward)
         check_range("source-system", self.source_system, 1, 255, "")
         check_range("target-system", self.target_system, 0, 254, "")
         check_range("connect-timeout", self.connect_timeout, 0.1, 3600, "s")

@@ -39,9 +39,6 @@ class PolicyConfig:
     default wherever the policy can (encode_visual and predict_fast)."""
     num_diffusion_steps: Annotated[int | None, Parameter(show_default=False)] = None
     """DDIM steps of the action head: by default 10, and 1 for toge and toge-rates."""
-    head_steps: int | None = None
-    """Warm start at two rates: so many of 10 DDIM steps, from the last chunk shifted to now, in
-    place of all steps from noise; by default, and with 0, every chunk is sampled from noise."""
     allow_untrained: Annotated[bool, Parameter(group=RARE)] = False
     """Fly TOGE with random weights: for timing and bring-up only."""
     by_rates: bool = False
@@ -63,8 +60,6 @@ class PolicyConfig:
     def __post_init__(self) -> None:
         """Refuse what the scheduler and encoders cannot serve."""
         check_range("num-diffusion-steps", self.steps, 1, 100, "steps")
-        if self.head_steps is not None:
-            check_range("head-steps", self.head_steps, 0, self.steps, "steps")
         if self.image_size is not None:
             check_range("image-size", self.image_size, 32, 1024, "pixels")
         check_range("seed", self.seed, 0, 2**63 - 1, "")
@@ -84,10 +79,4 @@ class PolicyConfig:
         """DDIM steps from noise."""
         if self.num_diffusion_steps is not None:
             return self.num_diffusion_steps
-        is_toge = self.kind in ("toge", "toge-rates")
-        return TOGE_STEPS if is_toge and not self.head_steps else STEPS
-
-    @property
-    def warm_steps(self) -> int | None:
-        """DDIM steps of a warm start; None: every solve starts from noise."""
-        return self.head_steps or None
+        return TOGE_STEPS if self.kind in ("toge", "toge-rates") else STEPS

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 _DATA_KINDS = ("toge", "toge-rates", "resnet-unet", "scripted", "lerobot", "onnx")
-_ADDRESS_KEYS = ("forward", "serve", "rerun", "host", "ray")
+_ADDRESS_KEYS = ("serve", "rerun", "host", "ray")
 _OUTPUT_KEYS = ("record", "report", "json", "plot", "html", "out", "rerun")
 _LOCAL = re.compile(
     r"(?:$|off$|spawn$|/|serial:|udp://:|[\w./-]+\.rrd$"

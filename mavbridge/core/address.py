@@ -1,6 +1,6 @@
 """Addresses of a link, in pymavlink's spelling and in MAVSDK's.
 
-    udp:HOST:PORT    udp://HOST:PORT         listen; for --forward: send there
+    udp:HOST:PORT    udp://HOST:PORT         listen
     udpin:HOST:PORT  udpin://HOST:PORT       listen
     udpout:HOST:PORT udpout://HOST:PORT      send there
     tcp:HOST:PORT    tcp://, tcpout://       connect
@@ -18,10 +18,6 @@ from mavbridge.core.errors import UserError
 FORMS = (
     "udp:HOST:PORT or udpin:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD; "
     "or MAVSDK's udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT, serial:///dev/ttyX:BAUD"
-)
-FORWARD_FORMS = (
-    "udp:HOST:PORT to send to a ground station, or udpin:HOST:PORT to listen for one (also udp://, "
-    "udpin://)"
 )
 DEFAULT_BAUD = 57600
 EVERY_INTERFACE = "0.0.0.0"  # noqa: S104 - only where the user says so
@@ -78,21 +74,6 @@ def parse_address(spec: str) -> LinkAddress:
     if kind in ("tcp", "tcpout"):
         return TcpAddress(host, port)
     return UdpAddress(host, port, listens=kind != "udpout")
-
-
-def parse_forward(spec: str) -> UdpAddress:
-    """Read the address of ``--forward``, where ``udp`` sends.
-
-    Raises:
-        UserError: it is not understood; the message holds the forms.
-    """
-    found = _network(spec)
-    if found is None or found[0] not in ("udp", "udpin", "udpout"):
-        raise UserError(f"--forward {spec!r} is not understood; use {FORWARD_FORMS}")
-    kind, host, port = found
-    if kind != "udpin" and (host == EVERY_INTERFACE or "//:" in spec):
-        raise UserError(f"--forward {spec}: no host to send to; use {FORWARD_FORMS}")
-    return UdpAddress(host, port, listens=kind == "udpin")
 
 
 def is_reachable(spec: str) -> bool:

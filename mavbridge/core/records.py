@@ -200,8 +200,6 @@ class Solve:
     computed_ns: int
     reset_ns: int
     """When the policy was last reset before it, for a flight; 0: when it was loaded."""
-    elapsed_s: float | None
-    """Time since the attitude of the chunk that it may build on; None where there is none."""
     state: VehicleState
     """The newest."""
     states: FloatArray

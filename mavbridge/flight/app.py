@@ -413,8 +413,6 @@ class _Flight:
                 f"{summary.dropped_messages} messages of the gate did not fit into its queue: this "
                 "process was too busy to take them"
             )
-        if summary is not None and summary.ground_station is not None:
-            screen.show_message(summary.ground_station)
         is_found = view.status.mode is not None
         autopilot = view.status.autopilot if is_found else None
         self._observers.finish(self._gate.summary, autopilot, self._outcome)

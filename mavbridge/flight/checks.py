@@ -2,10 +2,9 @@
 
 from mavbridge.camera.open import check_camera
 from mavbridge.config.flight import FlyConfig, LinkConfig
-from mavbridge.core.address import is_reachable, parse_address, parse_forward
+from mavbridge.core.address import is_reachable
 from mavbridge.core.clock import Clock
 from mavbridge.core.course import read_gates
-from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.flight.policies import check_configured_policy, require_cameras, require_images
 from mavbridge.mavlink.transport.signing_files import read_key
@@ -32,9 +31,6 @@ def check_flight(config: FlyConfig, clock: Clock) -> None:
         MavbridgeError: a flag names something that cannot be opened, written or loaded.
     """
     make_transport(config.link.connect, clock)
-    forward = config.link.forward
-    if forward and parse_forward(forward) == parse_address(config.link.connect):
-        raise UserError(f"--forward {forward}: the vehicle has this one: name another port")
     if config.link.signing_key_file is not None:
         read_key(config.link.signing_key_file)
     for source in config.camera.sources:

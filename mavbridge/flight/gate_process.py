@@ -90,7 +90,7 @@ class GateProcess:
         """Wait for its first word, which says that the link is open; called before ``listen``.
 
         Raises:
-            PeerError, UserError: the address of the vehicle, or of --forward, cannot be used.
+            PeerError, UserError: the address of the vehicle cannot be used.
             GateDiedError: it has ended at once, or says nothing in time.
         """
         if not select.select([self._port], [], [], timeout_s)[0]:

@@ -55,7 +55,6 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
         action_device=wanted.action_device,
         dual_rate=wanted.dual_rate is not False,
         num_diffusion_steps=wanted.steps,
-        head_steps=wanted.warm_steps,
         by_rates=wanted.by_rates,
         image_size=wanted.image_size,
         seed=wanted.seed,

@@ -1,6 +1,5 @@
 """The fast path: newest attitude + cached feature + sent actions -> chunk -> the gate."""
 
-import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.wire import Absence
 from policy.errors import NoChunkError
 
-Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
+Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """``Executable.act``."""
 
 WAIT_NS = 100 * NS_PER_MS
@@ -82,7 +81,6 @@ class PolicyLoop:
         """Arrival of the newest attitude at the last step."""
         self._due_ns: int | None = None
         """Slot of the next solve; an attitude up to a quarter of a period before it will do."""
-        self._chunk_state_ns: int | None = None
         self.alive_ns = clock.now_ns()
         """When the last step ended; read by another thread."""
 
@@ -134,7 +132,6 @@ class PolicyLoop:
         self._due_ns = max(due_ns, now_ns - period_ns // 2) + period_ns * 99 // 100
         if is_starting:
             self._reset_ns = now_ns
-            self._chunk_state_ns = None
             self._reset()
         has_position = self._view.status.has_position
         state = self._reader.read(self._view.telemetry(), now_ns, has_position=has_position)
@@ -150,7 +147,6 @@ class PolicyLoop:
         return self._observations.observe(state, now_ns) if frozen is None else Release(frozen)
 
     def _refuse(self, reason: str) -> None:
-        self._chunk_state_ns = None
         if self._due_ns is not None:
             soon_ns = self._clock.now_ns() + RETRY_NS + self._settings.period_ns // 4
             self._due_ns = min(self._due_ns, soon_ns)
@@ -159,10 +155,8 @@ class PolicyLoop:
     def _solve(self, observation: Observation, now_ns: int) -> None:
         state, feature = observation.state, observation.feature
         history = self._history.resample(now_ns)
-        last_ns, self._chunk_state_ns = self._chunk_state_ns, state.attitude_ns
-        elapsed_s = None if last_ns is None else (state.attitude_ns - last_ns) / NS_PER_S
         try:
-            array = self._act(observation.encoded, observation.states, history, elapsed_s)
+            array = self._act(observation.encoded, observation.states, history)
         except NoChunkError as error:
             self._refuse(str(error))
             return
@@ -175,8 +169,6 @@ class PolicyLoop:
                 f"{MAX_HORIZON} actions"
             )
             return
-        if not math.isfinite(float(array.sum())):
-            self._chunk_state_ns = None  # the gate refuses it; the next solve must not build on it
         self._serial += 1
         self._view.remember(
             SolveInputs(
@@ -205,7 +197,6 @@ class PolicyLoop:
                     started_ns=now_ns,
                     computed_ns=done_ns,
                     reset_ns=chunk.reset_ns,
-                    elapsed_s=elapsed_s,
                     state=state,
                     states=_kept(observation.states),
                     history=_kept(history),

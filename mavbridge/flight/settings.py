@@ -170,8 +170,6 @@ def link_settings(
         state_hz=state_hz,
         min_battery_percent=min_battery_percent,
         stick_hz=stick_hz,
-        forward=config.forward,
-        gcs_sticks_win=config.gcs_sticks_win,
         set_params=config.set_params,
         restore_params=config.restore_params,
         accepted_risks=config.accept_risk,

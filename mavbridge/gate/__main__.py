@@ -26,7 +26,6 @@ from mavbridge.gate.wire import (
 )
 from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.forwarding import Forwarding
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import make_transport
@@ -82,20 +81,16 @@ def _fly(
     clock: MonotonicClock,
     signing: Signing | None,
 ) -> None:
-    log = station = None
+    log = None
     if settings.tlog_fd is not None:
         log = PacketPipe(settings.tlog_fd, wall_offset_ns=settings.wall_offset_ns)
     transport = make_transport(settings.link.connect, clock)
-    if settings.link.forward:
-        wins = settings.link.gcs_sticks_win
-        station = Forwarding(settings.link.forward, clock, sticks_win=wins, signing=signing)
     link = MavlinkLink(
         transport,
         clock,
         settings.link,
         packet_log=log,
         forward=lambda p: loop.forward(p),
-        ground_station=station,
         signing=signing,
     )
     loop = GateLoop(clock, link, port, received=received, lead_ns=LEAD_NS)
@@ -104,14 +99,12 @@ def _fly(
     if refusal is not None:
         port.send(encode_from_gate(GateMessage(refusal)))
     try:
-        _serve(loop, clock, port, link, station)
+        _serve(loop, clock, port, link)
     except BaseException:
         loop.abandon()
         raise
     finally:
         link.close()
-        if station is not None:
-            station.close()
     summary = GateSummary(
         autopilot=link.autopilot,
         link=link.stats(),
@@ -120,28 +113,15 @@ def _fly(
         params=dict(link.known_params),
         dropped_messages=port.dropped,
         dropped_packets=log.dropped if log else 0,
-        ground_station=station.summary() if station else None,
     )
     port.finish(encode_from_gate(summary), LAST_WORDS_S)
 
 
-def _serve(
-    loop: GateLoop,
-    clock: MonotonicClock,
-    port: SocketPort,
-    link: MavlinkLink,
-    station: Forwarding | None,
-) -> None:
+def _serve(loop: GateLoop, clock: MonotonicClock, port: SocketPort, link: MavlinkLink) -> None:
     """Step at every arrival and whenever something is due, until the loop is done."""
     while not loop.is_done:
         due_ns = loop.step()
-        if station is not None:
-            station.flush()  # after the sticks
-        ends = (
-            None if port.is_closed else port.fileno(),
-            link.fileno(),
-            None if station is None else station.fileno(),
-        )
+        ends = (None if port.is_closed else port.fileno(), link.fileno())
         files = [end for end in ends if end is not None]
         timeout_ns = due_ns - clock.now_ns()
         if timeout_ns > 0:

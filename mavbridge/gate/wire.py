@@ -129,8 +129,6 @@ class GateSummary:
     """Messages to the flight process that did not fit into its queue."""
     dropped_packets: int
     """Packets that did not fit into the pipe of the telemetry log."""
-    ground_station: str | None = None
-    """What was not passed on between a ground station and the vehicle, for the user."""
 
 
 ToGate: TypeAlias = GateSettings | FlightSettings | Chunk | Absence | Act | Ending

@@ -48,7 +48,6 @@ from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.settings import LinkSettings
 from mavbridge.mavlink.transport.connection import REFUSED_NS, Connection, PacketLog
-from mavbridge.mavlink.transport.forwarding import Forwarding
 from mavbridge.mavlink.transport.sockets import Address, Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -75,7 +74,6 @@ class MavlinkLink:
         *,
         packet_log: PacketLog | None = None,
         forward: Callable[[ForwardedPacket], None] | None = None,
-        ground_station: Forwarding | None = None,
         signing: Signing | None = None,
     ) -> None:
         self._clock = clock
@@ -87,8 +85,6 @@ class MavlinkLink:
             signing=signing,
         )
         self._connection = Connection(transport, self._codec, clock, packet_log)
-        self._station = ground_station
-        self._connection.tap = ground_station.pass_on if ground_station else None
         self._discovery = VehicleDiscovery(target_system=config.target_system)
         self._counters = LinkCounters()
         self._timesync = TimesyncFilter()
@@ -117,7 +113,6 @@ class MavlinkLink:
             self._interrupt("the vehicle has rebooted: its session starts over")
             self._adopt(self._vehicle.identity)
         now_ns = self._clock.now_ns()
-        shared = self._share_with(self._station, now_ns) if self._station else None
         texts = self._connection.take_texts()
         vehicle, output = self._vehicle, self._sender.output
         status = vehicle.status(now_ns) if vehicle else None
@@ -135,13 +130,11 @@ class MavlinkLink:
             )
         # A vehicle that gets nothing from us rightly follows somebody else.
         others = None if self._connection.is_refused(now_ns) else output.overruled(now_ns)
-        # Sticks that move do nothing in a mode of setpoints, which goes on with our last one.
-        is_overruled = others is not None or (output.is_sticks and shared is not None)
         return LinkSnapshot(
             telemetry=self._telemetry.snapshot(),
             status=output.in_policy_terms(status, vehicle, now_ns),
-            problem=problem or shared or others or output.unheard(now_ns),
-            is_overruled=is_overruled,
+            problem=problem or others or output.unheard(now_ns),
+            is_overruled=others is not None,
             is_switched_off=output.is_sticks and vehicle.is_switched_off,
             echo_confirmed=output.echo_confirmed,
             is_released=output.is_released(vehicle, now_ns),
@@ -168,16 +161,6 @@ class MavlinkLink:
                 f"{REFUSED_NS // NS_PER_MS} ms: no route, a firewall, or a full queue"
             )
         return vehicle.output_problem(now_ns) or self._timesync.late_sending
-
-    def _share_with(self, station: Forwarding, now_ns: int) -> str | None:
-        """Pass the ground station's packets on; why its sticks rule out ours, or None."""
-        vehicle = self._vehicle.identity.source if self._vehicle else None
-        for packet in station.receive(vehicle, is_engaged=self.is_engaged):
-            if station.rules.has_won:
-                self._sender.release_once()  # before its sticks, which it would undo
-            self._sender.transmit(packet)
-        self._connection.texts.extend(station.take_texts())
-        return station.rules.overruled(now_ns, is_engaged=self.is_engaged)
 
     def _receive_all(self) -> None:
         vehicle = self._vehicle
@@ -422,8 +405,6 @@ class MavlinkLink:
         severity = dialect.MAV_SEVERITY_WARNING if is_warning else dialect.MAV_SEVERITY_NOTICE
         for packet in self._codec.encode_statustext(severity, text):
             self._sender.transmit(packet)
-            if self._station is not None:  # no autopilot sends it back to where it came from
-                self._station.pass_on(packet)
 
     # --- actions
 
@@ -439,8 +420,6 @@ class MavlinkLink:
         action = None if self._config.readonly else self._sender.send(decision)
         if action is not None:
             self._counters.sent += 1
-            if self._station is not None:
-                self._station.rules.on_our_sticks(self._clock.now_ns())
         return action
 
     def close(self) -> None:

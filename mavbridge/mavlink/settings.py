@@ -39,10 +39,6 @@ class LinkSettings:
     will leave; None: what the check of those needs."""
     stick_hz: float = 100.0
     """Rate at which sticks will be sent."""
-    forward: str = ""
-    """Ground station that shares the link: udp:HOST:PORT (send there), udpin:HOST:PORT (listen)."""
-    gcs_sticks_win: bool = False
-    """Its sticks take over once they are moved; else they are dropped."""
     set_params: tuple[tuple[str, float], ...] = ()
     """Parameters to set for the flight, by name; needs a state folder."""
     restore_params: bool = False

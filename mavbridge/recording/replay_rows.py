@@ -24,7 +24,6 @@ def _required(kind: pa.DataType, *names: str) -> list[pa.Field]:
 SOLVES = pa.schema(
     [
         *_required(pa.int64(), *_PLAIN),
-        pa.field("elapsed_s", pa.float64()),
         *_required(pa.list_(pa.float32(), STATE_DIM), "state"),
         *_required(pa.int64(), *_STATE_STAMPS),
         *_required(pa.list_(pa.float64()), "extras"),
@@ -86,8 +85,7 @@ def solves_batch(rows: Sequence[SolveRow]) -> pa.RecordBatch:
     """Rows of consecutive solves."""
     solves = [row.solve for row in rows]
     states = [solve.state for solve in solves]
-    plain = (*_PLAIN, "elapsed_s")
-    columns: dict[str, Any] = {name: [getattr(solve, name) for solve in solves] for name in plain}
+    columns: dict[str, Any] = {name: [getattr(solve, name) for solve in solves] for name in _PLAIN}
     columns |= {name: [getattr(state, name) for state in states] for name in _STATE_STAMPS}
     columns |= {name: _lists([getattr(solve, name) for solve in solves]) for name in _ARRAYS}
     columns["state"] = pa.FixedSizeListArray.from_arrays(
@@ -164,7 +162,7 @@ def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
             solve = Solve(
                 state=state,
                 frame_ids=tuple(map(tuple, row["frame_ids"])),
-                **{name: row[name] for name in (*_PLAIN, "elapsed_s")},
+                **{name: row[name] for name in _PLAIN},
                 **{name: arrays[name][number].reshape(shapes[name]) for name in _ARRAYS},
             )
             yield SolveRow(solve, row["dropped_before"])

@@ -276,11 +276,9 @@ class SimulatedFlight:
             vision_clocks[camera].ahead_ns += next(vision_ns[camera]) if is_dual else 0
             return executable.encode(rgb, camera)
 
-        def act(
-            encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-        ) -> FloatArray:
+        def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
             policy_clock.ahead_ns += next(action_ns)
             policy_clock.ahead_ns += 0 if is_dual else sum(next(each_ns) for each_ns in vision_ns)
-            return executable.act(encoded, state, history, elapsed_s)
+            return executable.act(encoded, state, history)
 
         return replace(executable, encode=encode, act=act)

@@ -22,9 +22,6 @@ from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.protocol import Executable, SingleRatePolicy
 
-SAMPLE_ELAPSED_S = 0.02
-"""Time between the two chunks of a sample: with a warm start, the second is a refinement."""
-
 Candidate = tuple[str, Callable[[], Executable]]
 """The name of an engine to try, and what makes it."""
 
@@ -91,13 +88,11 @@ def first_that_agrees(
 
 
 def chunks_of_samples(executable: Executable, samples: ParitySamples) -> FloatArray:
-    """Chunks [2 * samples, horizon, 4] from image to stick: each sample afresh, then once more."""
-    chunks = []
-    for rgb, state, history in zip(samples.rgb, samples.state, samples.history, strict=True):
-        encoded = encode_all(executable, rgb)
-        for elapsed_s in (None, SAMPLE_ELAPSED_S):
-            chunks.append(executable.act(encoded, state[None], history[None], elapsed_s)[0])
-    return np.stack(chunks)
+    """Chunks [samples, horizon, 4] from image to stick."""
+    inputs = zip(samples.rgb, samples.state, samples.history, strict=True)
+    return np.concatenate(
+        [executable.act(encode_all(executable, rgb), s[None], h[None]) for rgb, s, h in inputs]
+    )
 
 
 def _impurity(
@@ -113,7 +108,7 @@ def _impurity(
     if changed := changes(before, snapshot(policy)):
         return f"it keeps {', '.join(changed)} from call to call, which a graph cannot"
     encoded = encode_all(reference, samples.rgb[0])
-    again = reference.act(encoded, samples.state[:1], samples.history[:1], None)[0]
+    again = reference.act(encoded, samples.state[:1], samples.history[:1])[0]
     if np.array_equal(again, expected[0]):
         return None
     return (

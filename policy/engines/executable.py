@@ -7,19 +7,13 @@ from typing import Any, Literal
 import numpy as np
 
 from policy.contract import ACTION_DIM, QUATERNION, CameraImage, Contract, FloatArray
-from policy.engines.warm_start import Segment, WarmStart, make_solve
 from policy.errors import PolicyError, user_code
 from policy.preprocess import dummy_images, image_to_input
-from policy.protocol import (
-    DualRatePolicy,
-    Executable,
-    SingleRatePolicy,
-    WarmStartPolicy,
-)
+from policy.protocol import DualRatePolicy, Executable, SingleRatePolicy
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
-Act = Callable[[FloatArray, FloatArray, FloatArray, float | None], FloatArray]
+Act = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """``Executable.act``."""
 
 
@@ -32,8 +26,6 @@ class ExecutionSettings:
     vision_device: str = "cpu"
     action_device: str = "cpu"
     num_diffusion_steps: int = 10
-    head_steps: int | None = None
-    """Denoising steps of a solve from the last chunk; None = always a full solve."""
     dual_rate: bool = True
     """``encode`` runs the image path; needs a ``DualRatePolicy``."""
 
@@ -67,7 +59,7 @@ def make_executable(
         predict = compile_action(
             lambda i, s, h: action.predict(i, s, h, steps), ((1, *contract.image_shape), *rest)
         )
-        return assemble(contract, (), always_full(predict), engine, settings)
+        return assemble(contract, (), predict, engine, settings)
     if not isinstance(vision, DualRatePolicy) or not isinstance(action, DualRatePolicy):
         raise PolicyError(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
@@ -75,12 +67,8 @@ def make_executable(
     image = ((1, *contract.image_shape[-3:]),)
     encode = [compile_vision(method, image) for method in encoders(vision)]
     fast = ((1, *contract.feature_shape), *rest)
-    if isinstance(action, WarmStartPolicy) and settings.head_steps is not None:
-        act = _warm_started(action, fast, compile_action, settings, settings.head_steps)
-    else:
-        sampler = action
-        sample = compile_action(lambda e, s, h: sampler.predict_fast(e, s, h, steps), fast)
-        act = always_full(sample)
+    sampler = action
+    act = compile_action(lambda e, s, h: sampler.predict_fast(e, s, h, steps), fast)
     return assemble(contract, encode, act, engine, settings)
 
 
@@ -117,32 +105,6 @@ def make_numpy_executable(policy: SingleRatePolicy, settings: ExecutionSettings)
     return make_executable(policy, policy, compile_, compile_, engine="numpy", settings=settings)
 
 
-def _warm_started(
-    policy: WarmStartPolicy,
-    shapes: Sequence[Shape],
-    compile_: Compile,
-    settings: ExecutionSettings,
-    head_steps: int,
-) -> Act:
-    steps = settings.num_diffusion_steps
-    noisy = (1, policy.contract.horizon, ACTION_DIM)
-
-    def segment(first: int, count: int) -> Segment:
-        return compile_(
-            lambda e, s, h, n: policy.denoise_fast(e, s, h, n, steps, first, count),
-            (*shapes, noisy),
-        )
-
-    with user_code(f"{settings.name} failed to prepare its warm start"):
-        solve = make_solve(policy, segment, steps, head_steps)
-    return WarmStart(solve, chunk_dt_s=policy.contract.chunk_dt_s)
-
-
-def always_full(sample: ArrayFunction) -> Act:
-    """Every chunk by ``sample(encoded, state, history)``, whenever the last one was."""
-    return lambda encoded, state, history, _elapsed_s: sample(encoded, state, history)
-
-
 def assemble(
     contract: Contract,
     encode: Sequence[ArrayFunction],
@@ -164,11 +126,9 @@ def assemble(
             planes = image_to_input(image, contract)
             return encode[camera](planes) if encode else planes
 
-    def act_on(
-        encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def act_on(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         with user_code(f"{settings.name} failed on a state"):
-            return act(encoded, state, history, elapsed_s)
+            return act(encoded, state, history)
 
     executable = Executable(
         contract=contract,
@@ -213,15 +173,14 @@ def _try(executable: Executable) -> None:
                 feature = executable.encode(image, camera)
                 _require(executable, "encode_visual", feature, (1, contract.feature_dim))
         encoded = encode_all(executable, images)
-        chunks = [executable.act(encoded, state, history, elapsed_s) for elapsed_s in (None, 0.01)]
+        chunk = executable.act(encoded, state, history)
     except PolicyError as error:
         raise PolicyError(
             f"{error}; this was a dummy sample: image {[1, *contract.image_shape]}, state "
             f"{[1, *contract.state_shape]}, action_history [1, {contract.history_len}, "
             f"{ACTION_DIM}], as {contract.arrays} arrays"
         ) from error
-    for chunk in chunks:
-        _require(executable, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))
+    _require(executable, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))
 
 
 def _require(executable: Executable, what: str, array: FloatArray, shape: tuple[int, ...]) -> None:

@@ -6,17 +6,15 @@ from collections.abc import Callable
 from torch import nn
 
 from policy.engines.executable import (
-    Act,
     ExecutionSettings,
     Precision,
-    always_full,
     assemble,
 )
 from policy.engines.openvino_compile import GraphCompiler, engine_name
 from policy.engines.openvino_graph import denoise_graph, step_inputs, vision_graph
 from policy.engines.openvino_modules import ModuleConverter, make_module_executable
+from policy.engines.segments import Segment, sample_in_segments, to_numpy
 from policy.engines.signal_stack import signal_stack_kept
-from policy.engines.warm_start import Segment, WarmStart, make_solve
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.preprocess import egocentric
@@ -57,17 +55,14 @@ def _make_builtin(
     name, steps = engine_name(vision, action), settings.num_diffusion_steps
     compiler = GraphCompiler(f"{policy.config} {digest_of_weights(policy)}")
     encode = compiler.compile("vision", vision, lambda: vision_graph(policy))
-    warm_steps = settings.head_steps if settings.dual_rate and isinstance(policy, Toge) else None
-    at_once = min(steps, MAX_UNROLLED) if warm_steps is None else warm_steps
+    at_once = min(steps, MAX_UNROLLED)
     segment = _segments(compiler, policy, action, steps, at_once)
-    solve = make_solve(policy.head, segment, steps, at_once)
-    if warm_steps is not None:
-        act: Act = WarmStart(solve, chunk_dt_s=policy.contract.chunk_dt_s)
-        return assemble(policy.contract, (encode,), act, name, settings)
+    sample = sample_in_segments(to_numpy(policy.head.initial_noise), segment, steps, at_once)
     if settings.dual_rate:
-        return assemble(policy.contract, (encode,), always_full(solve.sample), name, settings)
-    act = always_full(lambda image, s, h: solve.sample(encode(image), s, h))
-    return assemble(policy.contract, (), act, name, settings)
+        return assemble(policy.contract, (encode,), sample, name, settings)
+    return assemble(
+        policy.contract, (), lambda image, s, h: sample(encode(image), s, h), name, settings
+    )
 
 
 def _segments(

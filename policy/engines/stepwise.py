@@ -1,7 +1,6 @@
 """A diffusion policy whose network is compiled alone: the solver runs around it, in numpy."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,12 @@ from policy.engines.executable import (
     ArrayFunction,
     Compile,
     ExecutionSettings,
-    always_full,
     assemble,
     encoders,
 )
-from policy.engines.warm_start import Segment, WarmStart, make_solve, to_numpy
+from policy.engines.segments import Segment, to_numpy
 from policy.errors import user_code
-from policy.protocol import Executable, StepwisePolicy, WarmStartPolicy
+from policy.protocol import Executable, StepwisePolicy
 
 
 def make_stepwise_executable(
@@ -60,39 +58,31 @@ def _act(
             *((1, *contract.state_shape), (1, contract.history_len, ACTION_DIM)),
         ),
     )
-    segment = partial(solver_segment, denoise, policy.schedule, steps)
-    head_steps = settings.head_steps if settings.dual_rate else None
-    if head_steps is not None and isinstance(policy, WarmStartPolicy):
-        warm = make_solve(policy, segment, steps, head_steps)
-        return WarmStart(warm, chunk_dt_s=contract.chunk_dt_s)
-    solve, to_chunk = segment(0, steps), compile_end(policy.to_chunk, (noise.shape,))
-    return always_full(lambda e, s, h: to_chunk(solve(e, s, h, noise)))
+    solve = solver_segment(denoise, policy.schedule, steps)
+    to_chunk = compile_end(policy.to_chunk, (noise.shape,))
+    return lambda e, s, h: to_chunk(solve(e, s, h, noise))
 
 
 def _on_images(encode: Sequence[ArrayFunction], act: Act, contract: Contract) -> Act:
     """``act`` on images [1, *contract.image_shape] in place of their features: single rate."""
 
-    def act_on_images(
-        images: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def act_on_images(images: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         steps = images.reshape(-1, len(encode), 1, *images.shape[-3:])
         features = [
             encode_one(step[camera]) for step in steps for camera, encode_one in enumerate(encode)
         ]
         feature = np.concatenate(features, axis=1).reshape(1, *contract.feature_shape)
-        return act(feature, state, history, elapsed_s)
+        return act(feature, state, history)
 
     return act_on_images
 
 
-def solver_segment(
-    denoise: ArrayFunction, schedule: Any, num_diffusion_steps: int, first: int, count: int
-) -> Segment:
-    """``count`` DDIM steps of a solve from ``first`` on, around the network call ``denoise``.
+def solver_segment(denoise: ArrayFunction, schedule: Any, num_diffusion_steps: int) -> Segment:
+    """The DDIM steps of a solve, around the network call ``denoise``.
 
     ``denoise`` and ``schedule`` are as those of ``protocol.StepwisePolicy``.
     """
-    steps = schedule.ddim_steps(num_diffusion_steps)[first : first + count]
+    steps = schedule.ddim_steps(num_diffusion_steps)
     timesteps = [np.array([step.timestep], np.float32) for step in steps]
 
     def run(

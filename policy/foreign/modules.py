@@ -141,10 +141,7 @@ class HeadPolicy(ForwardPolicy):
 
 
 class DenoiserPolicy(HeadPolicy):
-    """An encoder and one step of a diffusion solve: dual rate, and with a warm start.
-
-    Keeps ``protocol.StepwisePolicy`` and ``protocol.WarmStartPolicy``.
-    """
+    """An encoder and one step of a diffusion solve, as ``protocol.StepwisePolicy``: dual rate."""
 
     def __init__(
         self,
@@ -182,36 +179,18 @@ class DenoiserPolicy(HeadPolicy):
         """One call of the denoiser."""
         return self._call(noisy, timestep, feature, *self._own(state, action_history))
 
-    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-        step = self.schedule.ddim_steps(num_diffusion_steps)[first]
-        return step.signal, step.noise
-
-    def denoise_fast(
-        self,
-        feature: Tensor,
-        state: Tensor,
-        action_history: Tensor,
-        noisy: Tensor,
-        num_diffusion_steps: int,
-        first: int,
-        count: int,
-    ) -> Tensor:
-        """Steps ``first`` to ``first + count`` of a solve: [B, horizon, 4] -> the same."""
-        steps = self.schedule.ddim_steps(num_diffusion_steps)[first : first + count]
-
-        def denoise(index: int, noisy: Tensor) -> Tensor:
-            timestep = noisy.new_full((len(noisy),), float(steps[index].timestep))
-            return self.denoise(noisy, timestep, feature, state, action_history)
-
-        return ddim_solve(self.schedule, steps, denoise, noisy)
-
     def predict_fast(
         self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
     ) -> Tensor:
         """A whole solve."""
         noise = self.initial_noise.expand(len(state), -1, -1)
-        return self.denoise_fast(feature, state, action_history, noise, steps, 0, steps)
+        ddim = self.schedule.ddim_steps(steps)
+
+        def denoise(index: int, noisy: Tensor) -> Tensor:
+            timestep = noisy.new_full((len(noisy),), float(ddim[index].timestep))
+            return self.denoise(noisy, timestep, feature, state, action_history)
+
+        return ddim_solve(self.schedule, ddim, denoise, noise)
 
 
 def _with_feature(name: str, encode: "_Call", interface: Interface) -> Interface:

@@ -46,7 +46,6 @@ from policy.protocol import (
     DualRatePolicy,
     Executable,
     SingleRatePolicy,
-    WarmStartPolicy,
     keep_nothing,
 )
 from policy.scripted.spec import IN_AIR, make_scripted
@@ -152,18 +151,12 @@ def _on_engine(
             "flies in single-rate mode, the whole network for every action (--single-rate: as "
             "intended)"
         )
-    if request.head_steps is not None and not (dual_rate and isinstance(policy, WarmStartPolicy)):
-        notes.append(
-            f"warning: --head-steps {request.head_steps} is not used: it takes two rates and a "
-            "policy with denoise_fast, such as toge; every solve is a full one"
-        )
     is_ours = request.spec.partition(":")[0] in BUILTIN_KINDS
     settings = ExecutionSettings(
         name=request.spec,
         vision_device=request.vision_device or request.device,
         action_device=request.action_device or request.device,
         num_diffusion_steps=request.num_diffusion_steps,
-        head_steps=request.head_steps,
         dual_rate=dual_rate,
     )
     executable, engine_notes = _executable(policy, request, settings)

@@ -34,8 +34,6 @@ class PolicyRequest:
     dual_rate: bool = True
     """A policy without a fast path is made single-rate, with a note."""
     num_diffusion_steps: int = 10
-    head_steps: int | None = None
-    """Denoising steps of a solve from the last chunk; None = all solves are full."""
     image_size: int | None = None
     """Height and width that the policy takes; None leaves it to the contract."""
     seed: int = 0

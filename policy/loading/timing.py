@@ -15,8 +15,6 @@ from policy.protocol import Executable
 REPETITIONS = 5
 MOST_S = 0.5
 """No further repetition after so much time: a slow policy is known to be slow after one."""
-ELAPSED_S = 0.02
-"""Time since the last chunk of a solve; with a warm start each one refines the one before."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +43,7 @@ def measure_times(executable: Executable, now_s: Callable[[], float]) -> SolveTi
         encoded = encode_all(executable, images)
         encoded_s = now_s()
         try:
-            executable.act(encoded, state, history, ELAPSED_S)
+            executable.act(encoded, state, history)
         except NoChunkError:
             return None
         encode_s.append((encoded_s - before_s) / contract.observation_steps)

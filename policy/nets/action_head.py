@@ -77,11 +77,6 @@ class DiffusionHead(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         self.initial_noise.copy_(torch.randn(self.initial_noise.shape, generator=generator))
 
-    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-        step = self.schedule.ddim_steps(num_diffusion_steps)[first]
-        return step.signal, step.noise
-
     def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
         """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
         film = self.unet.film_of_timestep(timestep) + self.unet.film_of_condition(condition)
@@ -101,26 +96,11 @@ class DiffusionHead(nn.Module):
     def sample(self, condition: Tensor, num_diffusion_steps: int) -> Tensor:
         """Condition [B, C] -> chunk [B, horizon, 4] in [-1, 1]."""
         noise = self.initial_noise.expand(condition.shape[0], -1, -1)
-        return self.denoise_steps(condition, noise, num_diffusion_steps, 0, num_diffusion_steps)
-
-    def denoise_steps(
-        self, condition: Tensor, noisy: Tensor, num_diffusion_steps: int, first: int, count: int
-    ) -> Tensor:
-        """``count`` steps of a solve from step ``first`` on, bit for bit as within the whole one.
-
-        ``noisy`` [B, horizon, 4] is what step ``first``, counted from 0, starts with; the condition
-        is [B, C].
-        """
         steps = self.schedule.ddim_steps(num_diffusion_steps)
-        if not 0 <= first < first + count <= num_diffusion_steps:
-            raise PolicyError(
-                f"a solve of {num_diffusion_steps} steps has no {count} from step {first} on"
-            )
         # Picked on the device: a capture of a CUDA graph allows no copy from the host.
         timesteps = torch.stack([self._timesteps[step.timestep] for step in steps])
-        # Both shares of FiLM are outside the loop. That of all timesteps is one product, also where
-        # few are wanted: a product of fewer rows may round otherwise.
-        film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)[first : first + count]
+        # Both shares of FiLM are outside the loop; that of all timesteps is one product.
+        film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)
         film_of_condition = self.unet.film_of_condition(condition)
         read = self.read(condition) if self.reads_condition else 0.0
 
@@ -128,4 +108,4 @@ class DiffusionHead(nn.Module):
             prediction: Tensor = self.unet(noisy, film_of_step[index] + film_of_condition)
             return prediction + read
 
-        return ddim_solve(self.schedule, steps[first : first + count], denoise, noisy)
+        return ddim_solve(self.schedule, steps, denoise, noise)

@@ -121,30 +121,6 @@ class Toge(nn.Module):
         condition = self.encode_and_fuse(feature, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)
 
-    @property
-    def initial_noise(self) -> Tensor:
-        """[1, horizon, 4]: what every solve of a flight starts from."""
-        return self.head.initial_noise
-
-    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-        return self.head.noise_shares(num_diffusion_steps, first)
-
-    def denoise_fast(
-        self,
-        feature: Tensor,
-        state: Tensor,
-        action_history: Tensor | None,
-        noisy: Tensor,
-        num_diffusion_steps: int,
-        first: int,
-        count: int,
-    ) -> Tensor:
-        """Steps ``first`` to ``first + count`` of ``predict_fast``: [B, horizon, 4] -> the same."""
-        require_shape("noisy", noisy, self.contract.horizon, ACTION_DIM)
-        condition = self.encode_and_fuse(feature, state, action_history)
-        return self.head.denoise_steps(condition, noisy, num_diffusion_steps, first, count)
-
     def predict(
         self,
         image: Tensor,

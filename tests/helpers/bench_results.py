@@ -20,7 +20,7 @@ def make_flight(runner: str, **changes: Any) -> Flight:
     fields: dict[str, Any] = {
         "runner": runner,
         "policy": "toge:small",
-        "solves": "full solves",
+        "solves": "1 step",
         "engine": "torch",
         "asked_stick_hz": 200.0,
         "asked_action_hz": 100.0,

@@ -174,9 +174,7 @@ class GateFlight:
             act=self._act,
         )
 
-    def _act(
-        self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._policy_clock.ahead_ns += self.solve_ns
         chunk = np.empty((1, self._horizon, 4), np.float32)
         chunk[:] = self.policy(self.flown_s)

@@ -137,9 +137,7 @@ class OutputFlight(GateFlight):
         act = super()._executable(contract)
         return replace(act, contract=self.scripted.contract, reset=self.scripted.reset)
 
-    def _act(
-        self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._policy_clock.ahead_ns += self.solve_ns
         chunk = self.scripted.predict_fast(encoded, state, history, 1)
         if self._nan_from_ns is not None and self.clock.now_ns() >= self._nan_from_ns:

@@ -18,9 +18,7 @@ CONTRACT = Contract(feature_dim=1, arrays="numpy", image_height=32, image_width=
 def steady(sticks: Callable[[], tuple[float, float, float, float]]) -> Executable:
     """Calls ``sticks`` at every action and holds the result for the chunk."""
 
-    def act(
-        encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         chunk = np.empty((1, CONTRACT.horizon, 4), np.float32)
         chunk[:] = sticks()
         return chunk

@@ -67,7 +67,7 @@ def noise_executable(contract: Contract | None = None) -> Executable:
     def encode(rgb: ImageArray, camera: int = 0) -> FloatArray:
         return np.array([[rgb.astype(np.int64).sum() % 9973]], np.float32)
 
-    def act(feature: FloatArray, state: FloatArray, history: FloatArray, _: object) -> FloatArray:
+    def act(feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         assert state.shape == (1, contract.state_dim)
         assert history.shape == (1, contract.history_len, 4)
         phase = feature[0, 0] + state.sum() + history.sum()

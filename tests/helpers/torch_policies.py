@@ -131,27 +131,16 @@ class Stepwise(TwoRates):
     def to_chunk(self, sample: Tensor) -> Tensor:
         return sample
 
-    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        step = self.schedule.ddim_steps(num_diffusion_steps)[first]
-        return step.signal, step.noise
-
-    def denoise_fast(
-        self, feature: Tensor, state: Tensor, history: Tensor, noisy: Tensor, num_steps: int,
-        first: int, count: int,
-    ) -> Tensor:  # fmt: skip
-        steps: tuple[DdimStep, ...] = self.schedule.ddim_steps(num_steps)[first : first + count]
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        ddim: tuple[DdimStep, ...] = self.schedule.ddim_steps(steps)
         return ddim_solve(
             self.schedule,
-            steps,
+            ddim,
             lambda at, n: self.denoise(
-                n, torch.full((1,), float(steps[at].timestep)), feature, state, history
+                n, torch.full((1,), float(ddim[at].timestep)), feature, state, history
             ),
-            noisy,
+            torch.as_tensor(self.initial_noise),
         )
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        noise = torch.as_tensor(self.initial_noise)
-        return self.denoise_fast(feature, state, history, noise, steps, 0, steps)
 
 
 class ForwardOnly(nn.Module):

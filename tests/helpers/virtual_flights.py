@@ -107,7 +107,6 @@ class VirtualFlight:
         """Called when an attitude is due."""
         self.sink = ListSink()
         self.histories: list[FloatArray] = []
-        self.elapsed_s: list[float | None] = []
         self.states: list[FloatArray] = []
         self.resets = 0
         if frames_ns is None:
@@ -159,11 +158,8 @@ class VirtualFlight:
         self._vision_clock.ahead_ns += self._encode_ns
         return np.zeros((1, 8), dtype=np.float32)
 
-    def _act(
-        self, feature: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def _act(self, feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         solve = len(self.histories)
-        self.elapsed_s.append(elapsed_s)
         self.states.append(state)
         self.histories.append(history)
         self._policy_clock.ahead_ns += self._act_ns(solve)

@@ -170,9 +170,7 @@ def test_a_contract_with_longer_limits_flies_a_slow_policy() -> None:
 class PlayedFlight(GateFlight):
     """A policy that plans its whole horizon: each action is that of its own time."""
 
-    def _act(
-        self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._policy_clock.ahead_ns += self.solve_ns
         start_s = self.clock.now_ns() / NS_PER_S
         plan = [self.policy(start_s + 0.05 * step) for step in range(self._horizon)]

@@ -80,9 +80,9 @@ def watched() -> Watched:
         watched.encoded.append(float(rgb.mean()))
         return np.full((1, 1), rgb.mean(), np.float32)
 
-    def act(e: FloatArray, s: FloatArray, h: FloatArray, elapsed_s: float | None) -> FloatArray:
+    def act(e: FloatArray, s: FloatArray, h: FloatArray) -> FloatArray:
         watched.features.append(float(e[0, 0]))
-        return pilot.act(e, s, h, elapsed_s)
+        return pilot.act(e, s, h)
 
     executable = replace(pilot, encode=encode, act=act)
     one.fly(executable, max_time_s=1.0, sinks=(watched.sink,))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.fakes import START_NS
-from helpers.virtual_flights import HOP_NS, MS, SHARP, STEADY, VirtualFlight, nan_chunk
+from helpers.virtual_flights import HOP_NS, MS, SHARP, VirtualFlight
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Frame
@@ -171,26 +171,6 @@ def test_history_is_neutral_again_after_the_sticks_were_given_back() -> None:
     flight.at(0.5, lambda: flight.link.change(mode="LOITER")).fly(1.0)
     assert max(history.max() for history in flight.histories) == pytest.approx(0.25)
     assert flight.histories[-1] == pytest.approx(0.0)
-
-
-def test_the_policy_is_told_the_time_since_the_state_of_its_last_chunk() -> None:
-    flight = VirtualFlight(act_ns=lambda solve: 23 * MS if solve == 20 else 3 * MS)
-    flight.at(0.5, lambda: flight.tell("release")).at(0.8, lambda: flight.tell("engage"))
-    flight.fly(1.2)
-    told = flight.elapsed_s
-    # once before the flight, and afresh with each beginning of one
-    first, begin, again = (k for k, elapsed_s in enumerate(told) if elapsed_s is None)
-    assert (first, begin) == (0, 3)
-    assert told[4:21] == pytest.approx([0.01] * 17)
-    assert told[21:23] == pytest.approx([0.02, 0.01])  # an attitude was passed over
-    assert again == pytest.approx(76, abs=3)
-    assert told[23:again] == pytest.approx([0.01] * (again - 23))
-    assert flight.resets == 2
-
-
-def test_a_chunk_that_is_refused_is_not_built_upon() -> None:
-    flight = VirtualFlight(chunk=lambda solve: nan_chunk() if solve == 9 else STEADY).fly(0.3)
-    assert flight.elapsed_s[4:12] == pytest.approx([*[0.01] * 6, None, 0.01])
 
 
 def test_a_policy_that_asks_is_told_the_age_of_its_image_and_the_motion_since() -> None:

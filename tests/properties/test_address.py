@@ -11,7 +11,6 @@ from mavbridge.core.address import (
     TcpAddress,
     UdpAddress,
     parse_address,
-    parse_forward,
     serial_baud,
 )
 from mavbridge.core.errors import UserError
@@ -38,17 +37,6 @@ def test_both_spellings_of_a_network_address_are_one(host: str, port: int) -> No
     for spec in (f"tcp:{host}:{port}", f"tcp://{host}:{port}", f"tcpout://{host}:{port}"):
         assert parse_address(spec) == TcpAddress(host, port)
     assert parse_address(f"{host}:{port}") == UdpAddress(host, port, True)
-
-
-@given(HOSTS, PORTS)
-def test_a_ground_station_is_sent_to_where_the_vehicle_is_listened_for(
-    host: str, port: int
-) -> None:
-    for slashes in (":", "://"):
-        sends = host != "0.0.0.0"
-        if sends:
-            assert parse_forward(f"udp{slashes}{host}:{port}") == UdpAddress(host, port, False)
-        assert parse_forward(f"udpin{slashes}{host}:{port}") == UdpAddress(host, port, True)
 
 
 @given(DEVICES.filter(lambda name: not name.rpartition(":")[2].isdigit()), st.integers(1, 10**7))
@@ -107,11 +95,3 @@ def test_special_spellings(spec: str, expected: LinkAddress) -> None:
 def test_what_is_none_of_them_is_refused(spec: str, told: str) -> None:
     with pytest.raises(UserError, match=told):
         parse_address(spec)
-
-
-@pytest.mark.parametrize(
-    "spec", ["tcp:127.0.0.1:1", "127.0.0.1:14550", "/dev/ttyACM0", "", "udp://:1"]
-)
-def test_a_ground_station_is_reached_by_udp_alone(spec: str) -> None:
-    with pytest.raises(UserError, match="--forward"):
-        parse_forward(spec)

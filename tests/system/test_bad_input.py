@@ -86,7 +86,6 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         (["--connect", "udp:127.0.0.1:1", "--tau"], "--tau requires an argument"),
         (["--connect", "udp:127.0.0.1:1", "--duration", "-5"], "between 0.1 and 86400"),
         (["evalute"], "did you mean evaluate?"),
-        (["--connect", "udp:127.0.0.1:1", "--forward", "udpin:127.0.0.1:1"], "name another port"),
         (["--connect", "/dev/null,57600", "--policy=scripted", "--camera=none"], "no serial port"),
         (["--connect", "/dev/none,57600", "--policy", "scripted", "--camera", "none"], "no such"),
         (

@@ -152,9 +152,7 @@ def test_somebody_elses_arming_is_not_engaging(tmp_path: Path) -> None:
 
 def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:
     with staged(tmp_path) as flying:
-        status, output = flying.fly(
-            "--dual-rate", "--head-steps", "2", "--readonly", "--duration", "2"
-        )
+        status, output = flying.fly("--dual-rate", "--readonly", "--duration", "2")
     assert status == 0, output
     report = flying.report()
     assert report["mode"] == "dual"

@@ -23,6 +23,7 @@ pytestmark = pytest.mark.system
 TIMEOUT_S = 90.0
 STARTS = 3
 IN_CONTROL = "the policy has control"
+PEERS = ROOT / ".venv-peers" / "bin"
 MARK = "run by tests/system/test_guides.py"
 
 
@@ -49,6 +50,8 @@ def here(words: Sequence[str], ports: dict[str, str], folder: Path) -> list[str]
     program, *rest = line.split("\n")
     if program == "mavbridge":
         return [sys.executable, "-m", "mavbridge", *rest]
+    if program == "mavproxy.py":
+        return [str(PEERS / "python"), str(PEERS / program), *rest]
     assert program == "python"
     return [sys.executable, *rest]
 
@@ -105,6 +108,7 @@ def test_the_terminals_of_the_guide_to_px4_fly(ports: dict[str, str], tmp_path: 
     assert any(True for _ in open_flight(recording).frame_rows())
 
 
-def test_the_forwarding_of_the_guide_flies(ports: dict[str, str], tmp_path: Path) -> None:
+@pytest.mark.skipif(not (PEERS / "mavproxy.py").exists(), reason="MAVProxy is not installed")
+def test_mavproxy_of_the_guide_shares_the_link(ports: dict[str, str], tmp_path: Path) -> None:
     links = ["--connect", f"tcpin:127.0.0.1:{ports['5762']}"]
     fly_guide("docs/guides/ground_station.md", links, ports, tmp_path)

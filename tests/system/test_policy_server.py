@@ -301,7 +301,7 @@ def test_a_served_policy_flies_the_same_sticks_as_here(name: str) -> None:
             for seed in range(3):
                 inputs = sample(here, seed)
                 assert np.array_equal(inputs[0], sample(there, seed)[0])
-                assert np.array_equal(there.act(*inputs, None), here.act(*inputs, None))
+                assert np.array_equal(there.act(*inputs), here.act(*inputs))
 
 
 def test_a_contract_file_says_when_a_served_policy_may_fly(tmp_path: Path) -> None:

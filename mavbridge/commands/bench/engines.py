@@ -21,8 +21,6 @@ from policy.protocol import Executable
 
 EAGER: Engine = "torch"
 ENCODE, CHUNK, BOTH = "encode one image", "sample one chunk", "one image to one chunk"
-WARM_ELAPSED_S = 0.01
-"""Between two chunks at 100 Hz."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,29 +75,23 @@ def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[st
 
 
 def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
-    full = _load(replace(policy, num_diffusion_steps=policy.steps, head_steps=0), lives)
-    contract = full.contract
+    executable = _load(policy, lives)
+    contract = executable.contract
     images, state = dummy_images(contract), level_state(contract)
     image = images.reshape(-1, *contract.picture_shape)[0]
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
-    feature = encode_all(full, images)
-    engine = full.engine if policy.engine == "auto" else policy.engine
+    feature = encode_all(executable, images)
+    engine = executable.engine if policy.engine == "auto" else policy.engine
 
     def case(work: str, call: Callable[[], object]) -> _Case:
         return _Case(policy=name_of(policy), work=work, engine=engine, call=call)
 
-    if not full.dual_rate:
-        return [case(BOTH, lambda: full.act(encode_all(full, images), state, history, None))]
-    cases = [
-        case(ENCODE, lambda: full.encode(image)),
-        case(CHUNK, lambda: full.act(feature, state, history, None)),
+    if not executable.dual_rate:
+        return [case(BOTH, lambda: executable.act(encode_all(executable, images), state, history))]
+    return [
+        case(ENCODE, lambda: executable.encode(image)),
+        case(CHUNK, lambda: executable.act(feature, state, history)),
     ]
-    if policy.warm_steps is not None:
-        warm = _load(policy, lives)
-        warm.act(feature, state, history, None)  # the chunk that the next one starts from
-        name = f"{CHUNK}, warm start of {policy.warm_steps}"
-        cases.append(case(name, lambda: warm.act(feature, state, history, WARM_ELAPSED_S)))
-    return cases
 
 
 def _load(policy: PolicyConfig, lives: ExitStack) -> Executable:

@@ -91,10 +91,8 @@ def _measure(
 def level_climb(executable: Executable) -> Executable:
     """An executable that does the same work and returns other sticks, however late it is."""
 
-    def act(
-        encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
-        chunk = executable.act(encoded, state, history, elapsed_s).copy()
+    def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        chunk = executable.act(encoded, state, history).copy()
         chunk[...] = (CLIMB_STICK, 0.0, 0.0, 0.0)
         return chunk
 

@@ -109,9 +109,7 @@ def _serve(bridge: Bridge, gate: GateProcess, stop: threading.Event) -> None:
         worker.join(END_S)
 
 
-def repeat_roll_rate(
-    _feature: FloatArray, state: FloatArray, _history: FloatArray, _elapsed_s: float | None
-) -> FloatArray:
+def repeat_roll_rate(_feature: FloatArray, state: FloatArray, _history: FloatArray) -> FloatArray:
     """State [1, 13] -> chunk [1, 16, 4] whose roll stick is the roll rate, in rad/s."""
     chunk = np.zeros((1, Contract.horizon, ACTION_DIM), np.float32)
     chunk[0, :, ROLL] = state[0, RATE][0]

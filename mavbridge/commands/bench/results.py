@@ -146,9 +146,8 @@ def name_of(policy: PolicyConfig) -> str:
 
 def solves_of(policy: PolicyConfig) -> str:
     """The kind of solve that makes a policy's chunks, for tables."""
-    if not policy.may_be_dual:
-        return "single rate"
-    return "full solves" if policy.warm_steps is None else f"warm start of {policy.warm_steps}"
+    steps = f"{policy.steps} step" + "s" * (policy.steps > 1)
+    return steps if policy.may_be_dual else f"single rate, {steps}"
 
 
 def this_machine() -> Machine:

@@ -70,7 +70,6 @@ def checking_settings(config: FlyConfig, policy: PolicyFindings, *, sends: bool)
     return replace(
         gate.link,
         readonly=not sends,
-        forward="",
         set_params=(),
         restore_params=False,
         state_folder=None,

@@ -127,9 +127,7 @@ class Pilot:
             self._student.reset()
         self._expert = self._begin(self._flight.clock.now_ns())
 
-    def _act(
-        self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._solves += 1
         horizon = self.executable.contract.horizon
         if self._expert is None:  # not engaged yet: the gate wants to see chunks first
@@ -141,7 +139,7 @@ class Pilot:
         if self._student is None:
             return chunk
         # Called at every tick, also in the expert's turns: the student may hold state of its own.
-        students = self._student.act(encoded, state, history, elapsed_s)
+        students = self._student.act(encoded, state, history)
         return students if self._turns.is_students(now_s) else chunk
 
     def _demonstrate(

@@ -1,4 +1,4 @@
-"""Settings of ``mavbridge imagine`` and ``mavbridge evaluate-imagination``."""
+"""Settings of ``mavbridge imagine``."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,35 +52,3 @@ class ImagineConfig:
             check_range("frames", self.frames, 1, 256, "")
         check_range("exe-steps", self.exe_steps, 1, 256, "")
         check_range("ddim-steps", self.ddim_steps, 1, 1000, "")
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class EvaluateImaginationConfig:
-    """Settings of ``mavbridge evaluate-imagination``."""
-
-    world_model: Path | None = None
-    """Weights of the world model; by default those that come with mavbridge."""
-    ddim_steps: int = 4
-    """DDIM steps of the world model."""
-    windows: int = 64
-    """Windows of frames to imagine, evenly spaced over the flights."""
-    chains: int = 16
-    """Chains of up to 10 iterations, each continuing from the frames imagined last."""
-    exe_steps: int | None = None
-    """Frames of a chain's iteration; by default all that the model imagines."""
-    device: str = "cpu"
-    """torch device: cpu, cuda, cuda:1, mps."""
-    seed: int = 0
-    """Seed of the noise that the imagination starts from."""
-    json: Path | None = None
-    """Write all figures here as JSON."""
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_range("ddim-steps", self.ddim_steps, 1, 1000, "")
-        check_range("windows", self.windows, 1, 10_000, "")
-        check_range("chains", self.chains, 1, 10_000, "")
-        if self.exe_steps is not None:
-            check_range("exe-steps", self.exe_steps, 1, 256, "")
-        check_range("seed", self.seed, 0, 2**63 - 1, "")

@@ -121,7 +121,7 @@ class PolicyDecider:
             # The image is as old as the state: nothing has moved since.
             state = np.pad(state, ((0, 0), (0, SINCE_EXPOSURE_DIM)))
         feature = self._executable.encode(seen.images[-1])
-        chunk = self._executable.act(feature, state, seen.history(), None)[0]
+        chunk = self._executable.act(feature, state, seen.history())[0]
         sticks = [
             sample_chunk(
                 chunk,

@@ -155,8 +155,7 @@ def _make_decider(
                 "decides: add --decider toge, or leave it out"
             )
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
-    # One image, one chunk, as in flight; warm starts are for a policy that runs at 100 Hz.
-    wanted = replace(config.policy, dual_rate=True, head_steps=0)
+    wanted = replace(config.policy, dual_rate=True)
     loaded = stack.enter_context(load_configured_policy(wanted, clock))
     for note in loaded.notes:
         console.print(Text(note, style="yellow" if note.startswith("warning") else "dim"))

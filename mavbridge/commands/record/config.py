@@ -22,8 +22,6 @@ class ListenConfig:
     connect: Annotated[str, Parameter(show_default=False)] = ""
     """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD; or as
     MAVSDK writes it: udpin://0.0.0.0:14540, serial:///dev/ttyACM0:921600."""
-    forward: Annotated[str, Parameter(show_default=False)] = ""
-    """Share the link with a ground station: udp:HOST:PORT sends to it, udpin:HOST:PORT listens."""
     signing_key_file: Annotated[Path | None, Parameter(show_default=False)] = None
     """Sign every packet, and take only signed ones (MAVLink 2): a file with the vehicle's key, 32
     bytes or 64 hexadecimal digits, which only you may read."""
@@ -37,7 +35,6 @@ class ListenConfig:
         """The link of a flight that sends nothing; raises UserError for what it cannot be."""
         return LinkConfig(
             connect=self.connect,
-            forward=self.forward,
             signing_key_file=self.signing_key_file,
             target_system=self.target_system,
             connect_timeout=self.connect_timeout,

@@ -112,7 +112,7 @@ def listening_gate(config: RecordConfig, clock: Clock) -> GateSettings:
 def nobody() -> Executable:
     """A policy that is never asked: its contract alone counts."""
 
-    def act(_f: FloatArray, _s: FloatArray, _h: FloatArray, _t: float | None) -> FloatArray:
+    def act(_f: FloatArray, _s: FloatArray, _h: FloatArray) -> FloatArray:
         raise AssertionError("a recording has no policy loop")
 
     return Executable(

@@ -37,8 +37,6 @@ class ReplayConfig:
     """Contract file of another policy."""
     num_diffusion_steps: Annotated[int | None, Parameter(group=POLICY)] = None
     """Another number of steps of the action head."""
-    head_steps: Annotated[int | None, Parameter(group=POLICY)] = None
-    """Another number of steps of a warm start."""
     engine: Annotated[Engine | None, Parameter(group=POLICY)] = None
     """Another engine, such as torch."""
     device: Annotated[str | None, Parameter(group=POLICY)] = None
@@ -91,11 +89,7 @@ class ReplayConfig:
     @property
     def is_other_policy(self) -> bool:
         """It is to decide differently; another engine is to decide the same."""
-        return (
-            self.changes_encoder
-            or self.num_diffusion_steps is not None
-            or self.head_steps is not None
-        )
+        return self.changes_encoder or self.num_diffusion_steps is not None
 
     @property
     def changes_limits(self) -> bool:

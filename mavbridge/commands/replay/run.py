@@ -46,8 +46,7 @@ VIDEO_TOLERANCE = 0.15
 """Largest difference of a smoothed stick from the lossy video, in full deflections: twice what was
 measured, see docs/commands.md."""
 ENGINE_TOLERANCE = 0.05
-"""The same on another engine. A chunk alone may differ by ``parity.MAX_ACTION_ERROR``; a warm start
-builds on its last chunk, and was seen to add that up to 0.022."""
+"""The same on another engine. A chunk alone may differ by ``parity.MAX_ACTION_ERROR``."""
 CLOCK_TOLERANCE = 0.01
 """The same of a scripted policy, which reads the clock while it computes: some 0.1 ms apart."""
 
@@ -157,7 +156,7 @@ def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
         for field in fields(flown.limits)
         if getattr(asked, field.name, None) is not None
     }
-    names = ("policy", "checkpoint", "contract", "num_diffusion_steps", "head_steps")
+    names = ("policy", "checkpoint", "contract", "num_diffusion_steps")
     policy: dict[str, Any] = {
         name: getattr(asked, name)
         for name in (*names, "engine", "device")

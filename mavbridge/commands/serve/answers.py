@@ -72,7 +72,7 @@ class AnswerLoop:
             image, state, history = from_message(self._interface, message)
             if message.get(RESET_KEY):
                 self._executable.reset()
-            chunk = self._executable.act(image, state, history, None)
+            chunk = self._executable.act(image, state, history)
         except PolicyError as error:
             return str(error)
         took_ms = (self._clock.now_ns() - begun_ns) / NS_PER_MS

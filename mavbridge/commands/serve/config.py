@@ -24,8 +24,5 @@ class ServeConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be served."""
         check_range("port", self.port, 1, 65535, "")
-        if self.policy.dual_rate or self.policy.head_steps is not None:
-            raise UserError(
-                "each request is answered by a whole solve from its own image: leave out "
-                "--dual-rate and --head-steps"
-            )
+        if self.policy.dual_rate:
+            raise UserError("each request is answered from its own image: leave out --dual-rate")

@@ -1,4 +1,4 @@
-"""Cuts datagrams into MAVLink packets without decoding them, to be passed on as they are."""
+"""Cuts datagrams into MAVLink packets without decoding them."""
 
 from typing import NamedTuple
 

@@ -96,13 +96,6 @@ class ActionSender:
             output.sent(encoded, vehicle, now_ns)
             self._release.tried(now_ns, is_sent=True)
 
-    def release_once(self) -> None:
-        """Send one release if any is left, and none after it: somebody else has the sticks."""
-        if self._release.left and self.output is not None:
-            self.output.released()
-            self.try_release()
-            self._release.left = 0
-
     def try_release(self) -> bool:
         """Send a release; False: it was not sent, and goes before all other packets."""
         vehicle, output = self._vehicle, self.output

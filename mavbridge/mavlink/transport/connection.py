@@ -1,6 +1,6 @@
 """Transport and codec together: messages in, packets out, reconnecting by itself."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Protocol, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
@@ -64,8 +64,6 @@ class Connection:
         """First of the packets that were refused since the last one that was taken."""
         self.peer: Address | None = None
         """The vehicle's address, to which packets are sent; None until it is found."""
-        self.tap: Callable[[bytes], None] | None = None
-        """Gets everything that comes from the peer, as it came; must neither wait nor raise."""
         self.texts: list[str] = []
         """Messages for the user, until `take_texts`."""
         self.received_bytes = self.received_packets = 0
@@ -121,8 +119,6 @@ class Connection:
             self._open(now_ns)
         try:
             for data, arrived_ns, sender in self._transport.drain():
-                if self.tap is not None and self.peer in (None, sender):
-                    self.tap(data)
                 self.received_bytes += len(data)
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram

@@ -14,7 +14,7 @@ from mavbridge.simulation.replay.policy import SolvePair
 
 Array: TypeAlias = NDArray[np.float64]
 STAGES = ("raw", "clipped", "slewed", "smoothed")
-INPUTS = ("state", "stamps", "states", "history", "images", "elapsed")
+INPUTS = ("state", "stamps", "states", "history", "images")
 PAST_INPUTS = ("states", "history")
 """Given to a policy of the same contract as they were recorded. Those that are built again may be
 others where a solve without a chunk, or a tick on its way, is not in the recording."""
@@ -140,7 +140,6 @@ def _other_inputs(pair: SolvePair) -> list[str]:
         "states": one.states.tobytes() == other.states.tobytes(),
         "history": one.history.tobytes() == other.history.tobytes(),
         "images": one.frame_ids == other.frame_ids,
-        "elapsed": one.elapsed_s == other.elapsed_s,
     }
     return [name for name in INPUTS if not is_same[name]]
 

@@ -64,7 +64,6 @@ class EpisodeReplay:
             max_feature_age_ns=limits.feature_ns,
         )
         self._history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s)
-        self._last_ns: int | None = None
         self._sent = 0
 
     def run(self) -> Iterator[ActionPair]:
@@ -98,14 +97,11 @@ class EpisodeReplay:
         seen = self._observations.observe(state, now_ns)
         if isinstance(seen, Release):
             return None
-        elapsed_s = None if self._last_ns is None else (now_ns - self._last_ns) / NS_PER_S
         history = self._history.resample(now_ns)
         try:
-            chunk = self._executable.act(seen.encoded, seen.states, history, elapsed_s)
+            chunk = self._executable.act(seen.encoded, seen.states, history)
         except NoChunkError:
-            self._last_ns = None
             return None
-        self._last_ns = now_ns
         return ActionPair(
             at_s=(now_ns - int(episode.captured_ns[0])) / NS_PER_S,
             policy=tuple(chunk[0, 0].tolist()),

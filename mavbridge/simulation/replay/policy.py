@@ -112,17 +112,13 @@ class _Loop:
         return SolvePair(recorded=recorded, replayed=self._solve, refusal=self._refusal)
 
     def _timed_act(
-        self, encoded: FloatArray, states: FloatArray, history: FloatArray, elapsed_s: float | None
+        self, encoded: FloatArray, states: FloatArray, history: FloatArray
     ) -> FloatArray:
-        """Compute, and let the time pass that it took then.
-
-        A recorded solve that started afresh came after one without a chunk.
-        """
+        """Compute, and let the time pass that it took then."""
         recorded = self._now
-        is_afresh = recorded is not None and recorded.elapsed_s is None
         if recorded is not None and self._takes_recorded:
             states, history = recorded.states.copy(), recorded.history.copy()
-        chunk = self._act(encoded, states, history, None if is_afresh else elapsed_s)
+        chunk = self._act(encoded, states, history)
         if recorded is not None:
             self._clock.sleep_until_ns(recorded.computed_ns)
         return chunk
@@ -132,9 +128,7 @@ class _Loop:
             self._refusal = message.reason
 
     def _keep(self, solve: Solve) -> None:
-        recorded = self._now
-        is_afresh = recorded is not None and recorded.elapsed_s is None
-        self._solve = replace(solve, elapsed_s=None) if is_afresh else solve  # as `act` was given
+        self._solve = solve
 
 
 class _NoCamera:

@@ -52,7 +52,7 @@ class ReplaySource:
     meta: FlightMeta
     contract: Contract
     config: FlyConfig
-    """Its flags, without those that reach outside of the flight: ``--set``, ``--forward``."""
+    """Its flags, without those that reach outside of the flight: ``--set``."""
     ticks: tuple[Tick, ...]
     solves: tuple[Solve, ...]
     features: tuple[tuple[FeatureFrame, ...], ...]
@@ -78,7 +78,7 @@ def open_source(folder: Path) -> ReplaySource:
     config = settings.config
     config = replace(
         config,
-        link=replace(config.link, set=(), restore_params=False, forward="", gcs_sticks_win=False),
+        link=replace(config.link, set=(), restore_params=False),
         policy=replace(config.policy, dual_rate=meta.mode == "dual"),
         record=None,
     )

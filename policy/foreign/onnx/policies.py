@@ -142,9 +142,9 @@ class HeadPolicy(OnnxPolicy):
 
 
 class DenoiserPolicy(HeadPolicy):
-    """An encoder and one step of a diffusion solve: dual rate, and with a warm start.
+    """An encoder and one step of a diffusion solve: dual rate.
 
-    ``initial_noise`` is that of our own policies for the same seed.
+    The noise that it starts from is that of our own policies for the same seed.
     """
 
     def __init__(self, graphs: OnnxGraphs, vision: Precision, action: Precision) -> None:
@@ -152,36 +152,16 @@ class DenoiserPolicy(HeadPolicy):
         self._schedule = graphs.schedule or NoiseSchedule()
         shape = (1, self.contract.horizon, ACTION_DIM)
         noise = torch.randn(shape, generator=torch.Generator().manual_seed(graphs.seed))
-        self.initial_noise = self._interface.to_actions(noise.numpy())
-        segment = partial(solver_segment, self._denoise, self._schedule)
-        self._segment = lru_cache(maxsize=64)(segment)
-
-    def noise_shares(self, num_diffusion_steps: int, first: int) -> tuple[float, float]:
-        """Shares of a clean chunk and of noise in what step ``first``, from 0, starts with."""
-        step = self._schedule.ddim_steps(num_diffusion_steps)[first]
-        return step.signal, step.noise
-
-    def denoise_fast(
-        self,
-        feature: FloatArray,
-        state: FloatArray,
-        action_history: FloatArray,
-        noisy: FloatArray,
-        num_diffusion_steps: int,
-        first: int,
-        count: int,
-    ) -> FloatArray:
-        """Steps ``first`` to ``first + count`` of a solve, from and to actions of the contract."""
-        solve = self._segment(num_diffusion_steps, first, count)
-        theirs = self._interface.from_actions(noisy)
-        return self._interface.to_actions(solve(feature, state, action_history, theirs))
+        self._noise = noise.numpy()
+        solver = partial(solver_segment, self._denoise, self._schedule)
+        self._solver = lru_cache(maxsize=64)(solver)
 
     def predict_fast(
         self, feature: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
     ) -> FloatArray:
         """A whole solve."""
-        noise = self.initial_noise
-        return self.denoise_fast(feature, state, action_history, noise, steps, 0, steps)
+        solve = self._solver(steps)
+        return self._interface.to_actions(solve(feature, state, action_history, self._noise))
 
     def _denoise(
         self,

@@ -30,7 +30,7 @@ def test_every_tenth_solve_is_slow_and_all_are_the_policys() -> None:
     slow, clock, durations_ns = with_slow_solves(executable), MonotonicClock(), []
     for number in range(2 * SLOW_EVERY):
         start_ns = clock.now_ns()
-        assert slow.act(number, None, None, None) == number
+        assert slow.act(number, None, None) == number
         durations_ns.append(clock.now_ns() - start_ns)
     assert min(durations_ns[SLOW_EVERY - 1 :: SLOW_EVERY]) >= SLOW_NS
 

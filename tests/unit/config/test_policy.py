@@ -6,35 +6,23 @@ import pytest
 
 from mavbridge.__main__ import main
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.errors import UserError
 
 
 @pytest.mark.parametrize(
-    ("changes", "is_dual", "steps", "warm_steps"),
+    ("changes", "is_dual", "steps"),
     [
-        ({}, True, 1, None),
-        ({"policy": "toge:medium"}, True, 1, None),
-        ({"dual_rate": False}, False, 1, None),
-        ({"head_steps": 0}, True, 1, None),
-        ({"head_steps": 3}, True, 10, 3),
-        ({"num_diffusion_steps": 4, "head_steps": 2}, True, 4, 2),
-        ({"policy": "resnet-unet"}, False, 10, None),
-        ({"policy": "toge-rates"}, True, 1, None),
-        ({"policy": "toge-rates", "num_diffusion_steps": 4}, True, 4, None),
-        ({"policy": "./mine.py:Mine"}, True, 10, None),
-        ({"policy": "./mine.py:Mine", "head_steps": 2}, True, 10, 2),
+        ({}, True, 1),
+        ({"policy": "toge:medium"}, True, 1),
+        ({"dual_rate": False}, False, 1),
+        ({"policy": "resnet-unet"}, False, 10),
+        ({"policy": "toge-rates"}, True, 1),
+        ({"policy": "toge-rates", "num_diffusion_steps": 4}, True, 4),
+        ({"policy": "./mine.py:Mine"}, True, 10),
     ],
 )
-def test_defaults(
-    changes: dict[str, Any], is_dual: bool, steps: int, warm_steps: int | None
-) -> None:
+def test_defaults(changes: dict[str, Any], is_dual: bool, steps: int) -> None:
     config = PolicyConfig(**changes)
-    assert (config.may_be_dual, config.steps, config.warm_steps) == (is_dual, steps, warm_steps)
-
-
-def test_a_warm_start_has_no_more_steps_than_a_solve() -> None:
-    with pytest.raises(UserError, match="--head-steps must be between 0 and 4"):
-        PolicyConfig(num_diffusion_steps=4, head_steps=5)
+    assert (config.may_be_dual, config.steps) == (is_dual, steps)
 
 
 @pytest.mark.parametrize("flag", ["--dual-rate", "--no-dual-rate", "--single-rate"])

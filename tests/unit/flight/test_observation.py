@@ -52,7 +52,7 @@ def source(
         engine="",
         dual_rate=True,
         encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
-        act=lambda e, s, h, t: e,
+        act=lambda e, s, h: e,
     )
     return ObservationSource(
         contract,

@@ -117,7 +117,7 @@ def test_a_goal_is_given_just_where_the_policy_takes_one() -> None:
             engine="",
             dual_rate=True,
             encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
-            act=lambda e, s, h, t: e,
+            act=lambda e, s, h: e,
         )
         return flight_settings(config(goal), executable)
 

@@ -24,14 +24,11 @@ from mavbridge.core.vehicle import (
     Release,
     Sticks,
 )
-from mavbridge.mavlink.codec.frames import split_frames
-from mavbridge.mavlink.codec.messages import Endpoint, Measurement
+from mavbridge.mavlink.codec.messages import Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.settings import LinkSettings
-from mavbridge.mavlink.transport.forwarding import Forwarding
-from mavbridge.mavlink.transport.ground_station import Verdict
 from mavbridge.mavlink.transport.sockets import Address, Received, TransportDownError
 
 MS = NS_PER_MS
@@ -167,7 +164,6 @@ class Rig:
         *,
         meaning: ActionMeaning | None = ActionMeaning(),  # noqa: B008 - frozen
         output: Output | None = None,
-        station: Forwarding | None = None,
         **config: Any,
     ) -> None:
         self.clock = FakeClock()
@@ -180,7 +176,6 @@ class Rig:
             LinkSettings(connect="udp:127.0.0.1:14550", **config),
             packet_log=self.packet_log,
             forward=self.forwarded.append,
-            ground_station=station,
         )
         if meaning is not None:
             self.link.begin_flight(meaning, output)
@@ -933,73 +928,3 @@ def test_acks_for_other_stations_are_ignored() -> None:
 def test_px4_with_rc_override_is_refused() -> None:
     with pytest.raises(PeerError, match="--output manual-control"):
         px4_rig(output="rc-override").run(3.0)
-
-
-class Station(Forwarding):
-    """A ground station without a socket."""
-
-    def __init__(self, *, sticks_win: bool) -> None:
-        super().__init__("udp:127.0.0.1:9", FakeClock(), sticks_win=sticks_win)
-        super().close()
-        self.end = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-        self.inbox: list[Any] = []
-        self.heard = b""
-
-    def pass_on(self, data: bytes) -> None:
-        self.heard += data
-
-    def receive(self, vehicle: Endpoint | None, *, is_engaged: bool) -> Iterator[bytes]:
-        messages, self.inbox = self.inbox, []
-        for message in messages:
-            (frame,), _ = split_frames(bytes(message.pack(self.end)))
-            if self.rules.judge(frame, 0, is_engaged=is_engaged) is Verdict.PASS:
-                yield frame.data
-
-
-def test_a_ground_station_gets_the_vehicle_s_bytes_and_its_commands_get_there() -> None:
-    station = Station(sticks_win=False)
-    rig = Rig(station=station)
-    rig.run(8.0)
-
-    station.inbox.append(station.end.command_long_encode(1, 1, 176, 0, 1, 5, 0, 0, 0, 0, 0))
-    rig.link.announce("the policy has control")
-    rig.run(0.1)
-
-    names = [m.get_type() for m in WireEnd().read(station.heard)]
-    assert names.count("ATTITUDE_QUATERNION") == rig.ticks
-    assert names.count("STATUSTEXT") == 1
-    assert [m.param2 for m in rig.vehicle.received if m.get_type() == "COMMAND_LONG"][-1] == 5
-
-
-def test_its_sticks_are_a_problem_but_no_takeover_where_they_move_nothing() -> None:
-    """It goes on with our last setpoint: a fault ends that by a mode, silence would not."""
-    station = Station(sticks_win=True)
-    rig = Rig(station=station, meaning=ActionMeaning(kind="velocity"))
-    rig.run(8.0)
-    rig.link.is_engaged = True
-
-    station.inbox.append(station.end.manual_control_encode(1, 800, 0, 500, 0, 0))
-    snapshot = rig.link.poll()
-    assert "the ground station's sticks" in (snapshot.problem or "")
-    assert not snapshot.is_overruled
-
-
-def test_its_sticks_are_dropped_or_end_the_flight_with_one_release_before_them() -> None:
-    for wins in (False, True):
-        station = Station(sticks_win=wins)
-        rig = Rig(station=station)
-        rig.run(8.0)
-        rig.link.is_engaged = True
-        assert rig.run(0.5, Command(action=IDLE)).problem is None
-        rig.vehicle.received.clear()
-
-        station.inbox.append(station.end.rc_channels_override_encode(1, 1, 1700, *[1500] * 7))
-        snapshot = rig.link.poll()
-        assert snapshot.is_overruled == wins
-        rig.run(1.0, Release("overruled") if wins else Command(action=IDLE))
-
-        sent = rig.overrides()
-        assert ([1700, *[1500] * 7] in sent) == wins
-        if wins:
-            assert sent == [RELEASE_US, [1700, *[1500] * 7]]
-            assert "the ground station's sticks have taken over" in (snapshot.problem or "")

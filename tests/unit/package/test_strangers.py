@@ -153,7 +153,6 @@ REFUSED = [
     (f'[fly]\ncamera = "{PIPE}"', "--camera"),
     (f'"--camera" = "{PIPE}"', "--camera"),
     (f'CAMERA = "{PIPE}"', "--camera"),
-    ('forward = "udp:192.0.2.1:14550"', "--forward"),
     ('serve = "0.0.0.0:9090"', "--serve"),
     ('rerun = "connect=rerun+http://192.0.2.1:9876/proxy"', "--rerun"),
     ('host = "0.0.0.0"', "--host"),
@@ -165,7 +164,6 @@ REFUSED = [
 ]
 TAKEN = """
 connect = "udpin:0.0.0.0:14550"
-forward = "udp:127.0.0.1:14551"
 policy = "toge:small"
 checkpoint = "/opt/mavbridge/my.safetensors"
 camera = ["front=0", "down=/dev/video2", "side=shm:fpv", "back=rtsp://192.0.2.1/x"]

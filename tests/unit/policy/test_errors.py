@@ -55,6 +55,6 @@ def test_a_careless_policy_harms_nobody() -> None:
     executable.encode(np.zeros((8, 8, 3), np.uint8))
     state = np.ones((1, 13), np.float32)
     state.setflags(write=False)
-    executable.act(first, state, np.zeros((1, 4, 4), np.float32), None)
+    executable.act(first, state, np.zeros((1, 4, 4), np.float32))
     assert (first == before).all()
     assert (state == 1).all()

@@ -32,7 +32,7 @@ def load(spec: str, **changes: Any) -> LoadedPolicy:
 
 def act(loaded: LoadedPolicy) -> np.ndarray:
     executable = loaded.executable
-    return executable.act(executable.encode(RGB), STATE, HISTORY, None)
+    return executable.act(executable.encode(RGB), STATE, HISTORY)
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +104,7 @@ def test_untrained_weights_are_seeded_and_said() -> None:
 
 def test_the_fastest_engine_that_agrees_flies_and_is_named(checkpoint: Path) -> None:
     fast, reference = (
-        load("toge", checkpoint=checkpoint, engine=engine, head_steps=1)
-        for engine in ("auto", "torch")
+        load("toge", checkpoint=checkpoint, engine=engine) for engine in ("auto", "torch")
     )
     assert fast.executable.engine.startswith("openvino")
     assert any("agrees with torch" in note for note in fast.notes)
@@ -122,16 +121,6 @@ def test_single_rate_takes_the_fast_engine_too(tmp_path: Path) -> None:
     )
     assert fast.executable.engine.startswith("openvino")
     np.testing.assert_allclose(act(fast), act(reference), atol=0.01)
-
-
-@pytest.mark.parametrize(
-    ("spec", "changes"),
-    [("resnet-unet", {}), ("toge:small:resnet18", {"dual_rate": False}), ("scripted:hover", {})],
-)
-def test_head_steps_where_they_have_no_use_are_said(spec: str, changes: dict[str, Any]) -> None:
-    untrained = not spec.startswith("scripted")
-    loaded = load(spec, allow_untrained=untrained, image_size=32, head_steps=1, **changes)
-    assert any("--head-steps 1 is not used" in note for note in loaded.notes)
 
 
 def test_untrained_needs_permission() -> None:
@@ -207,7 +196,6 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("resnet-unet", {"allow_untrained": True, "device": "cuda:99"}, "this computer has"),
         ("resnet-unet", {"allow_untrained": True, "vision_device": "cuda:9"}, "this computer has"),
         ("resnet-unet", {"allow_untrained": True, "action_device": "cuda:9"}, "this computer has"),
-        ("toge:resnet18", {"allow_untrained": True, "image_size": 32, "head_steps": 3}, r"1\.\.2"),
         ("scripted:yaw", {"engine": "openvino"}, "computes in numpy"),
         ("resnet-unet", {"allow_untrained": True, "num_diffusion_steps": 101}, r"1\.\.100"),
         ("no_such_module:Policy", {}, "there is no module no_such_module"),

@@ -158,9 +158,7 @@ def test_rates_beyond_full_stick_are_cut_off() -> None:
 def test_the_policy_flies_its_own_network_by_rates() -> None:
     given: list[FloatArray] = []
 
-    def act(
-        _encoded: FloatArray, _state: FloatArray, history: FloatArray, _e: object
-    ) -> FloatArray:
+    def act(_encoded: FloatArray, _state: FloatArray, history: FloatArray) -> FloatArray:
         given.append(history)
         return np.full((1, 16, 4), 0.5, np.float32)
 
@@ -175,7 +173,7 @@ def test_the_policy_flies_its_own_network_by_rates() -> None:
     flown = flown_by_rates(sticks)
     assert flown.contract.action == "rates"
     assert flown.contract.modes == ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")
-    chunk = flown.act(np.zeros((1, 1), np.float32), state(), np.ones((1, 4, 4), np.float32), None)
+    chunk = flown.act(np.zeros((1, 1), np.float32), state(), np.ones((1, 4, 4), np.float32))
     expected = StickLoop(flown.contract).to_rates(np.full((1, 16, 4), 0.5, np.float32), state())
     np.testing.assert_array_equal(chunk, expected)
     assert not given[0].any()  # what was sent are rates: the network sees centred sticks

@@ -31,9 +31,7 @@ class Timed:
         self.now_s += 0.01
         return np.zeros((1, 1), np.float32)
 
-    def _act(
-        self, encoded: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self.now_s += self._act_s[min(self.acts, len(self._act_s) - 1)]
         self.acts += 1
         return np.zeros((1, 16, 4), np.float32)

@@ -49,7 +49,7 @@ def load(spec: str, checkpoint: Path | None = None) -> LoadedPolicy:
 def throttle(loaded: LoadedPolicy) -> float:
     rgb = np.full((48, 64, 3), 90, np.uint8)
     act, encode = loaded.executable.act, loaded.executable.encode
-    return float(act(encode(rgb), STATE, HISTORY, None)[0, 0, 0])
+    return float(act(encode(rgb), STATE, HISTORY)[0, 0, 0])
 
 
 @pytest.mark.parametrize("form", ["./flying.py:Flying", "flying.py:Flying", "{}/flying.py:Flying"])

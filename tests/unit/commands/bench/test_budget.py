@@ -16,11 +16,11 @@ from mavbridge.core.errors import UserError
         ("toge, sample: torch / roofline f32", 6.0),
         ("toge, encode: quick / roofline f32", 0.75),
         ("toge, encode: quick / torch", 0.25),
-        ("flight: toge:small, full solves, torch: period / asked period", 2.0),
-        ("flight: toge:small, full solves, torch: period / baseline", 0.5),
-        ("flight: toge:small, full solves, torch: cpu an action / baseline", 0.5),
-        ("flight: toge:small, full solves, torch: state to wire / baseline", 0.05),
-        ("flight: toge:small, full solves, torch: stick lateness p99 / period", 0.05),
+        ("flight: toge:small, 1 step, torch: period / asked period", 2.0),
+        ("flight: toge:small, 1 step, torch: period / baseline", 0.5),
+        ("flight: toge:small, 1 step, torch: cpu an action / baseline", 0.5),
+        ("flight: toge:small, 1 step, torch: state to wire / baseline", 0.05),
+        ("flight: toge:small, 1 step, torch: stick lateness p99 / period", 0.05),
         ("link: mavbridge: round trip / bare pymavlink loop", 2.0),
     ],
 )
@@ -31,7 +31,7 @@ def test_ratios_compare_two_figures_of_one_run(name: str, value: float) -> None:
 
 def test_a_run_without_the_other_side_has_no_ratio_with_it() -> None:
     alone = replace(RESULT, engines=(), flights=RESULT.flights[:1], links=RESULT.links[:1])
-    name = "flight: toge:small, full solves, torch"
+    name = "flight: toge:small, 1 step, torch"
     assert ratios(alone) == {
         f"{name}: period / asked period": pytest.approx(2.0),
         f"{name}: stick lateness p99 / period": pytest.approx(0.05),

@@ -22,7 +22,7 @@ from policy.protocol import Executable
                 policy="toge:small",
                 checkpoint=Path("a b.safetensors"),
                 dual_rate=True,
-                head_steps=2,
+                num_diffusion_steps=2,
                 allow_untrained=True,
             ),
             Rates(visual_rate="auto:10:60", action_rate=250.0, stick_rate=400.0, realtime=False),
@@ -46,10 +46,10 @@ def test_a_job_survives_the_way_over_the_command_line(policy: PolicyConfig, rate
 
 
 def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
-    called: list[float | None] = []
+    called: list[int] = []
 
     def act(*arguments: object) -> np.ndarray:
-        called.append(0.01)
+        called.append(len(arguments))
         return np.ones((1, 16, 4), np.float32)
 
     executable = Executable(
@@ -58,8 +58,8 @@ def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
     history = np.zeros((1, 4, 4), np.float32)
     climb = level_climb(executable)
     assert climb.contract.max_state_age_s == climb.contract.max_chunk_age_s == 5.0
-    chunk = climb.act(history, make_state().values[None], history, 0.01)
-    assert called
+    chunk = climb.act(history, make_state().values[None], history)
+    assert called == [3]
     assert (chunk == np.float32([CLIMB_STICK, 0, 0, 0])).all()
 
 

@@ -28,7 +28,7 @@ def test_every_code_comes_back_through_policy_calibration_and_nudge() -> None:
     state = np.zeros((1, 13), np.float32)
     for code in range(CODES):
         state[0, 7] = stick_of(code)
-        chunk = repeat_roll_rate(feature, state, history, None)
+        chunk = repeat_roll_rate(feature, state, history)
         assert chunk.shape == (1, 16, 4)
         pwm_us = calibration(PARAMS).to_pwm_us(Sticks(*chunk[0, 0].tolist()))
         nudged_us = {

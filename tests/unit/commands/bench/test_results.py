@@ -38,11 +38,9 @@ def test_missed_fraction_is_of_the_asked_slots() -> None:
 @pytest.mark.parametrize(
     ("changes", "solves"),
     [
-        ({"dual_rate": False}, "single rate"),
-        ({"head_steps": 0}, "full solves"),
-        ({}, "full solves"),
-        ({"head_steps": 2}, "warm start of 2"),
-        ({"dual_rate": True, "head_steps": 3}, "warm start of 3"),
+        ({"dual_rate": False}, "single rate, 1 step"),
+        ({}, "1 step"),
+        ({"dual_rate": True, "num_diffusion_steps": 3}, "3 steps"),
     ],
 )
 def test_a_policy_is_named_with_its_kind_of_solve(changes: dict[str, int], solves: str) -> None:

@@ -204,7 +204,7 @@ def test_help_lists_the_flags(capsys: pytest.CaptureFixture[str]) -> None:
     status, text = output(capsys, "--help")
     assert status == 0
     flags = """--clock --episodes --workers --ray --json --plot --seed --policy --conditions
-        --vision-delay --vision-time --courses --checkpoint --engine --head-steps --dual-rate
+        --vision-delay --vision-time --courses --checkpoint --engine --dual-rate
         --max-time --stalls --max-stall"""
     assert [flag for flag in flags.split() if flag not in text] == []
     assert "--realtime" not in text

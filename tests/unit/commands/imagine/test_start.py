@@ -120,11 +120,9 @@ def test_a_policy_that_asks_for_the_image_s_age_is_told_that_nothing_moved() -> 
     states = []
     plain = noise_executable(contract)
 
-    def act(
-        feature: FloatArray, state: FloatArray, history: FloatArray, elapsed_s: float | None
-    ) -> FloatArray:
+    def act(feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         states.append(state)
-        return plain.act(feature, state, history, elapsed_s)
+        return plain.act(feature, state, history)
 
     PolicyDecider(replace(plain, act=act), make_sampler()).decide(observe(contract), 0)
     assert states[0].shape == (1, 20)

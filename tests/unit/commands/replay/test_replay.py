@@ -93,12 +93,12 @@ def test_chunks_and_another_policy_exclude_each_other() -> None:
 
 
 def test_flags_of_the_replay_replace_those_of_the_flight_and_no_others() -> None:
-    flown = FlyConfig(policy=PolicyConfig(checkpoint=Path("a.pt"), seed=3, head_steps=1))
+    flown = FlyConfig(policy=PolicyConfig(checkpoint=Path("a.pt"), seed=3, num_diffusion_steps=1))
 
-    changed = other_config(flown, ReplayConfig(tau=0.1, head_steps=2))
+    changed = other_config(flown, ReplayConfig(tau=0.1, num_diffusion_steps=2))
 
     assert changed.limits == replace(flown.limits, tau=0.1)
-    assert changed.policy == replace(flown.policy, head_steps=2)
+    assert changed.policy == replace(flown.policy, num_diffusion_steps=2)
     other = other_config(flown, ReplayConfig(policy="scripted:hover"))
     assert (other.policy.checkpoint, other.policy.seed) == (None, 3)
 

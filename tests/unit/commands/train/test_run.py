@@ -64,24 +64,14 @@ def test_a_checkpoint_is_trained_and_loads_to_fly(
     feature = executable.encode(np.zeros((48, 64, 3), np.uint8))
     state, history = np.zeros((1, 20), np.float32), np.zeros((1, 4, 4), np.float32)
     state[0, 3] = 1.0
-    assert executable.act(feature, state, history, None).shape == (1, 16, 4)
+    assert executable.act(feature, state, history).shape == (1, 16, 4)
 
 
-@pytest.mark.parametrize(
-    ("command", "notes"),
-    [
-        (("train-world-model",), False),
-        (("train", "--policy", "world-model"), True),
-    ],
-)
-def test_a_world_model_is_trained_also_by_the_old_spelling(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...], notes: bool
-) -> None:
-    name, *flags = command
-    out = trained(tmp_path, name, *flags, "--image-size", "32", "--steps", "2", seconds=2.0)
+def test_a_world_model_is_trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ("--image-size", "32", "--steps", "2")
+    out = trained(tmp_path, "train-world-model", *flags, seconds=2.0)
     printed = capsys.readouterr()
     assert "imagined to" in printed.out
-    assert ("is now called train-world-model" in printed.err) == notes
     model = load_world_model(out)
     assert model.config.image_size == 32
     assert model.config.contract.state_frame == "ned_frd"

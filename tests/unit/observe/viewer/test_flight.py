@@ -372,7 +372,6 @@ def make_solve(serial: int, actions: list[list[float]], **changes: Any) -> Solve
         "started_ns": first_ns,
         "computed_ns": first_ns + 2 * NS_PER_MS,
         "reset_ns": 0,
-        "elapsed_s": 0.01,
         "state": make_state(first_ns),
         "states": np.zeros((1, 13), np.float32),
         "history": np.zeros((1, 4, 4), np.float32),

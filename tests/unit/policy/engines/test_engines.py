@@ -33,7 +33,7 @@ def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> No
     )
     assert (executable.engine, executable.dual_rate) == ("torch", True)
     feature = executable.encode(RGB)
-    chunk = executable.act(frozen(feature), frozen(STATE), frozen(HISTORY), None)
+    chunk = executable.act(frozen(feature), frozen(STATE), frozen(HISTORY))
     image = torch.tensor(image_to_input(RGB, small_toge.contract))
     with torch.inference_mode():
         expected = small_toge.predict(image, torch.tensor(STATE), torch.tensor(HISTORY), 3)
@@ -51,7 +51,7 @@ def test_single_rate_carries_the_image_to_act(small_toge: Toge) -> None:
     image = single.encode(RGB)
     assert image.shape == (1, 3, 32, 32)
     np.testing.assert_array_equal(
-        single.act(image, STATE, HISTORY, None), dual.act(dual.encode(RGB), STATE, HISTORY, None)
+        single.act(image, STATE, HISTORY), dual.act(dual.encode(RGB), STATE, HISTORY)
     )
 
 
@@ -64,7 +64,7 @@ def test_numpy_policies_are_called_as_they_are(dual_rate: bool) -> None:
     assert executable.engine == "numpy"
     encoded = executable.encode(RGB)
     assert encoded.shape == ((1, 8) if dual_rate else (1, 3, 224, 224))
-    chunk = executable.act(encoded, STATE, HISTORY, None)
+    chunk = executable.act(encoded, STATE, HISTORY)
     np.testing.assert_array_equal(
         chunk, policy.predict_fast(np.zeros((1, 8), np.float32), STATE, HISTORY, 10)
     )

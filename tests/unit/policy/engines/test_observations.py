@@ -59,7 +59,7 @@ def seen_by(executable: Executable, policy: Remembering) -> tuple[np.ndarray, np
     steps, cameras = contract.observation_steps, len(contract.cameras)
     rgb = np.empty((steps, cameras, 30, 40, 3), np.uint8)
     rgb[:] = GREYS[:steps, :cameras, None, None, None]
-    executable.act(encode_all(executable, rgb), level_state(contract), HISTORY, None)
+    executable.act(encode_all(executable, rgb), level_state(contract), HISTORY)
     encoded, state = policy.given
     assert state.shape == (1, *contract.state_shape)
     return encoded, state

@@ -38,7 +38,7 @@ def act(executable: Executable, *, vx_mps: float = 0.0, level: int = 0) -> np.nd
     state[0, 0] = vx_mps
     rgb = np.full((contract.image_height, contract.image_width, 3), level, np.uint8)
     history = np.zeros((1, contract.history_len, 4), np.float32)
-    return executable.act(executable.join([[executable.encode(rgb)]]), state, history, None)[0, 0]
+    return executable.act(executable.join([[executable.encode(rgb)]]), state, history)[0, 0]
 
 
 @pytest.mark.parametrize("state", ["obs", "observation", "state", "input", "x.1"])

@@ -86,6 +86,6 @@ def test_it_is_loaded_and_steers_by_its_goal(folder: Path) -> None:
     for goal_x_m in (0.0, 20.0):
         state = level_state(contract)
         state[..., 13] = goal_x_m
-        chunks.append(executable.act(encoded, state, history, None))
+        chunks.append(executable.act(encoded, state, history))
     assert chunks[0].shape == (1, 7, 4)
     assert not np.allclose(chunks[0], chunks[1])

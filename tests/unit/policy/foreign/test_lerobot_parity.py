@@ -142,7 +142,7 @@ def test_a_solve_step_by_step_is_the_whole_one(golden):
     def denoise(*arrays):
         return policy.denoise(*(torch.from_numpy(array) for array in arrays)).numpy()
 
-    solve = solver_segment(denoise, policy.schedule, 3, 0, 3)
+    solve = solver_segment(denoise, policy.schedule, 3)
     noise = policy.initial_noise.numpy()
     sample = solve(feature, state, np.zeros((1, 4, 4), np.float32), noise)
     whole = policy.predict_fast(*map(torch.from_numpy, (feature, state)), None, 3)

@@ -45,26 +45,21 @@ def require_same(a: Executable, b: Executable) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "dual_rate", "head_steps"),
+    ("name", "dual_rate"),
     [
-        ("ForwardOnly", False, None),
-        ("NamedHead", True, None),
-        ("NamedHead", False, None),
-        ("NamedDenoiser", True, None),
-        ("NamedDenoiser", True, 2),
-        ("NamedDenoiser", False, None),
-        ("Wide", True, None),
-        ("Wide", True, 2),
-        ("Wide", False, None),
+        ("ForwardOnly", False),
+        ("NamedHead", True),
+        ("NamedHead", False),
+        ("NamedDenoiser", True),
+        ("NamedDenoiser", False),
+        ("Wide", True),
+        ("Wide", False),
     ],
 )
-def test_a_class_that_names_its_modules_flies_converted(
-    name: str, dual_rate: bool, head_steps: int | None
-) -> None:
+def test_a_class_that_names_its_modules_flies_converted(name: str, dual_rate: bool) -> None:
     request = PolicyRequest(
         spec=f"helpers.torch_policies:{name}",
         dual_rate=dual_rate,
-        head_steps=head_steps,
         num_diffusion_steps=4,
     )
     executable, notes = loaded(request)
@@ -110,13 +105,11 @@ def described(**more: object) -> dict[str, object]:
 def test_an_archive_with_named_modules_says_all_of_itself(tmp_path: Path) -> None:
     schedule = {"prediction": "epsilon", "betas": "linear"}
     path = archive(tmp_path, Container(NamedDenoiser()), described(schedule=schedule))
-    request = PolicyRequest(spec=f"torchscript:{path}", num_diffusion_steps=4, head_steps=2)
+    request = PolicyRequest(spec=f"torchscript:{path}", num_diffusion_steps=4)
     assert read_policy_contract(request).horizon == SINGLE.horizon
     executable, notes = loaded(request)
     assert executable.engine.startswith("openvino"), notes
-    mine = PolicyRequest(
-        spec="helpers.torch_policies:NamedDenoiser", num_diffusion_steps=4, head_steps=2
-    )
+    mine = PolicyRequest(spec="helpers.torch_policies:NamedDenoiser", num_diffusion_steps=4)
     require_same(executable, loaded(mine)[0])
 
 
@@ -149,7 +142,7 @@ def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
     history = torch.zeros(1, 4, 4).numpy()
     for vx, throttle in ((1.0, 0.5), (-1.0, 0.0)):
         state = torch.tensor([[vx, 0, 0, 1, *[0] * 9]]).numpy()
-        assert executable.act(image, state, history, None)[0, 0, 0] == throttle
+        assert executable.act(image, state, history)[0, 0, 0] == throttle
 
 
 def test_the_actions_of_a_file_are_those_of_the_contract_file(tmp_path: Path) -> None:

@@ -55,8 +55,7 @@ def test_a_missing_package_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatc
     [
         ({"port": 0}, "port"),
         ({"port": 70_000}, "port"),
-        ({"policy": PolicyConfig(dual_rate=True)}, "leave out --dual-rate and --head-steps"),
-        ({"policy": PolicyConfig(head_steps=2)}, "leave out --dual-rate and --head-steps"),
+        ({"policy": PolicyConfig(dual_rate=True)}, "leave out --dual-rate"),
     ],
 )
 def test_what_cannot_be_served_is_refused(changes: dict[str, Any], told: str) -> None:

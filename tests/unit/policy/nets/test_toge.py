@@ -9,7 +9,7 @@ from policy.nets.action_head import DiffusionHead
 from policy.nets.diffusion import NoiseSchedule, Prediction
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
-from policy.protocol import DualRatePolicy, SingleRatePolicy, WarmStartPolicy
+from policy.protocol import DualRatePolicy, SingleRatePolicy
 
 
 def sample(batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:
@@ -62,37 +62,6 @@ def test_the_single_rate_network_takes_no_history_either() -> None:
     centred = net.encode_observation(image, state, history * 0)
     assert torch.equal(net.encode_observation(image, state), centred)
     assert torch.equal(net.predict(image, state), net.head.sample(centred, 10))
-
-
-def test_keeps_the_protocol_of_a_warm_start(small_toge: Toge) -> None:
-    assert isinstance(small_toge, WarmStartPolicy)
-    assert small_toge.noise_shares(10, 9)[0] > 0.9 > small_toge.noise_shares(10, 5)[0]
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize("counts", [[1] * 10, [2] * 5, [1, 3, 3, 3], [2, 4, 4], [10]])
-def test_a_solve_in_parts_is_the_whole_one_bit_for_bit(
-    trained_toge: Toge, counts: list[int]
-) -> None:
-    _, state, history = sample()
-    state = torch.cat([state, torch.zeros(1, trained_toge.contract.state_dim - 13)], dim=1)
-    feature = torch.randn(1, 256, generator=torch.Generator().manual_seed(3))
-    noisy, first = trained_toge.initial_noise, 0
-    for count in counts:
-        noisy = trained_toge.denoise_fast(feature, state, history, noisy, 10, first, count)
-        first += count
-    assert torch.equal(noisy, trained_toge.predict_fast(feature, state, history, 10))
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize(("first", "count"), [(-1, 2), (3, 0), (3, 2), (4, 1)])
-def test_refuses_steps_that_a_solve_does_not_have(small_toge: Toge, first: int, count: int) -> None:
-    image, state, history = sample()
-    feature, noise = small_toge.encode_visual(image), small_toge.initial_noise
-    with pytest.raises(PolicyError, match=f"a solve of 4 steps has no {count} from step {first}"):
-        small_toge.denoise_fast(feature, state, history, noise, 4, first, count)
-    with pytest.raises(PolicyError, match=r"noisy must be \[B, 16, 4\]"):
-        small_toge.denoise_fast(feature, state, history, noise[:, 1:], 4, 0, 1)
 
 
 @torch.inference_mode()

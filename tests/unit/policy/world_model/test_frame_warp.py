@@ -2,13 +2,13 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from helpers.panoramas import FRD_FROM_FLU, attitude, nominal_lens, panorama, state_of
-from mavbridge.commands.evaluate_imagination.scores import psnr_db
 from policy.contract import Contract, StateFrame
 from policy.data.samples import state_signs
 from policy.world_model.autoencoder import to_bytes, to_unit
@@ -113,7 +113,7 @@ def test_a_turn_shows_what_the_lens_of_the_evaluation_shows(
         seen(to_unit(torch.from_numpy(image[None]))), poses(torch.from_numpy(rotation))
     )
     wanted = lens.turned(image, before, after)
-    assert psnr_db(to_bytes(made[:, 0])[0].numpy(), wanted) > 40
+    assert cv2.PSNR(to_bytes(made[:, 0])[0].numpy(), wanted) > 40
     rays = lens.rays() @ (lens.frd_from_camera.T @ before.T @ after @ lens.frd_from_camera).T
     _, inside = lens.look_up(image, rays)
     # The lens counts up to the middles of the outermost pixels, the view up to their edges.
