@@ -4,14 +4,14 @@ import socket
 from collections import deque
 from collections.abc import Iterator
 
-from mavbridge.core.address import parse_forward
+from mavbridge.core.address import parse_forward, resolve, spelled
 from mavbridge.core.clock import Clock
 from mavbridge.core.errors import UserError
 from mavbridge.mavlink.codec.frames import split_frames
 from mavbridge.mavlink.codec.messages import Endpoint
 from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.transport.ground_station import GroundStationRules, Verdict, denial
-from mavbridge.mavlink.transport.sockets import Address, resolved
+from mavbridge.mavlink.transport.sockets import Address, new_socket
 
 MAX_DATAGRAMS, MAX_PACKETS = 32, 100
 """From the ground station at one look, whichever comes first; the rest waits for the next."""
@@ -25,6 +25,8 @@ _MAX_DATAGRAM = 2048
 
 def _own_side(station: Address) -> Address:
     """Where to send from: this computer alone, if the ground station runs on it."""
+    if len(station) > 2:
+        return ("::1" if station[0] == "::1" else "::", 0, 0, 0)
     return ("127.0.0.1" if station[0].startswith("127.") else "", 0)
 
 
@@ -45,7 +47,7 @@ class Forwarding:
         """With ``signing`` only packets signed with its key are passed on, and obeyed here."""
         self._signing = signing
         parsed = parse_forward(spec)
-        address = resolved(parsed.host, parsed.port)
+        address = resolve(parsed.host, parsed.port)
         self._clock = clock
         self.rules = GroundStationRules(sticks_win=sticks_win)
         self._station: Address | None = None if parsed.listens else address
@@ -54,8 +56,7 @@ class Forwarding:
         self._queued_bytes = 0
         self.dropped = 0
         """Datagrams for the ground station: the socket, or our queue, was full."""
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
+        self._socket = new_socket(address, socket.SOCK_DGRAM)
         try:
             self._socket.bind(address if parsed.listens else _own_side(address))
         except OSError as error:
@@ -145,7 +146,7 @@ class Forwarding:
             return False
         if not self._was_heard:
             self._was_heard = True
-            self.rules.texts.append(f"a ground station at {sender[0]}:{sender[1]} shares the link")
+            self.rules.texts.append(f"a ground station at {spelled(*sender)} shares the link")
         return True
 
     def _send(self, datagram: bytes) -> None:

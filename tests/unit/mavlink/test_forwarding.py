@@ -10,6 +10,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.fakes import FakeClock
+from helpers.network import needs_ipv6
+from mavbridge.core.address import spelled
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.processes import free_port
@@ -246,10 +248,11 @@ def test_after_a_takeover_the_next_act_is_possible_once_its_sticks_rest() -> Non
 # --- the socket
 
 
-@pytest.fixture
-def station() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-        udp.bind(("127.0.0.1", 0))
+@pytest.fixture(params=["127.0.0.1", pytest.param("::1", marks=needs_ipv6)])
+def station(request: pytest.FixtureRequest) -> Iterator[socket.socket]:
+    kind = socket.AF_INET6 if ":" in request.param else socket.AF_INET
+    with socket.socket(kind, socket.SOCK_DGRAM) as udp:
+        udp.bind((request.param, 0))
         udp.settimeout(2.0)
         yield udp
 
@@ -261,8 +264,9 @@ def forwarding_to(
     opened: list[Forwarding] = []
 
     def forwarding_to(kind: str) -> Forwarding:
-        port = free_port() if kind == "udpin" else station.getsockname()[1]
-        opened.append(Forwarding(f"{kind}:127.0.0.1:{port}", FakeClock()))
+        host, port, *_ = station.getsockname()
+        place = spelled(host, free_port() if kind == "udpin" else port)
+        opened.append(Forwarding(f"{kind}:{place}", FakeClock()))
         return opened[-1]
 
     yield forwarding_to
@@ -272,7 +276,8 @@ def forwarding_to(
 
 def ours(forwarding: Forwarding) -> tuple[str, int]:
     with socket.socket(fileno=socket.dup(forwarding.fileno())) as udp:
-        return "127.0.0.1", udp.getsockname()[1]
+        host = "::1" if udp.family == socket.AF_INET6 else "127.0.0.1"
+        return host, udp.getsockname()[1]
 
 
 def received(forwarding: Forwarding) -> list[bytes]:
@@ -292,7 +297,7 @@ def test_bytes_pass_both_ways_unchanged(forwarding_to: Any, station: socket.sock
 
     assert received(forwarding) == packets
     assert forwarding.take_texts() == [
-        f"a ground station at 127.0.0.1:{station.getsockname()[1]} shares the link"
+        f"a ground station at {spelled(*station.getsockname())} shares the link"
     ]
     assert forwarding.summary() is None
 
@@ -316,7 +321,7 @@ def test_one_that_listens_answers_the_first_that_talks_and_hears_no_other(
     packet = bytes(GCS.heartbeat_encode(6, 8, 0, 0, 4).pack(GCS))
     station.sendto(packet, ours(forwarding))
     assert received(forwarding) == [packet]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
+    with socket.socket(station.family, socket.SOCK_DGRAM) as second:
         second.sendto(packet, ours(forwarding))
         assert received(forwarding) == []
 
@@ -326,9 +331,9 @@ def test_one_that_listens_answers_the_first_that_talks_and_hears_no_other(
     assert station.recv(2000) == b"hello"
 
 
-def test_one_that_calls_hears_nobody_else(forwarding_to: Any) -> None:
+def test_one_that_calls_hears_nobody_else(forwarding_to: Any, station: socket.socket) -> None:
     forwarding = forwarding_to("udp")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+    with socket.socket(station.family, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(bytes(command(400, 0, 21196).pack(GCS)), ours(forwarding))
 
         assert received(forwarding) == []
@@ -380,15 +385,15 @@ def test_a_malformed_address_is_refused(spec: str) -> None:
 
 
 def test_a_port_that_is_taken_is_refused(station: socket.socket) -> None:
-    port = station.getsockname()[1]
+    place = spelled(*station.getsockname())
     with pytest.raises(UserError, match="choose another port"):
-        Forwarding(f"udpin:127.0.0.1:{port}", FakeClock())
+        Forwarding(f"udpin:{place}", FakeClock())
 
 
 def test_with_a_key_only_signed_packets_are_passed_on_and_obeyed(station: socket.socket) -> None:
-    key, port = bytes(range(32)), station.getsockname()[1]
+    key, place = bytes(range(32)), spelled(*station.getsockname())
     signing = Signing(key, unix_ns=lambda: EPOCH_NS)
-    forwarding = Forwarding(f"udp:127.0.0.1:{port}", FakeClock(), sticks_win=True, signing=signing)
+    forwarding = Forwarding(f"udp:{place}", FakeClock(), sticks_win=True, signing=signing)
     try:
         sticks, mav = manual(x=900), dialect.MAVLink(None, srcSystem=255, srcComponent=190)
         unsigned = bytes(sticks.pack(mav))
@@ -396,7 +401,7 @@ def test_with_a_key_only_signed_packets_are_passed_on_and_obeyed(station: socket
         mav.signing.timestamp = 1
         signed = bytes(sticks.pack(mav))
         for packet in (unsigned, signed):
-            station.sendto(packet, ("127.0.0.1", ours(forwarding)[1]))
+            station.sendto(packet, ours(forwarding))
             select.select([forwarding], [], [], 5)
             passed = list(forwarding.receive(None, is_engaged=True))
             assert passed == ([signed] if packet is signed else [])
