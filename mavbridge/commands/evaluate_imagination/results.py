@@ -68,6 +68,8 @@ class Given:
     flights_too_short: int
     demonstrations_failed: int
     asked_windows: int
+    damage: tuple[str, ...] = ()
+    """What of the flights was skipped, in sentences for the user."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -103,6 +103,7 @@ class _Evaluation:
                 flights_too_short=too_short,
                 demonstrations_failed=failed,
                 asked_windows=config.windows,
+                damage=tuple(text for episode in episodes for text in episode.damage),
             ),
             windows=scorer.windows,
             frames=scorer.frame_quality(),

@@ -1,6 +1,7 @@
 """A policy whose action is known, beside other people's recordings."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,19 @@ def test_a_log_and_a_video_give_the_policy_state_image_and_the_pilots_sticks(
     assert document["difference"]["mean"][0] == pytest.approx(shares, abs=0.05)
     assert "ArduPilot's defaults" in capsys.readouterr().out.replace("\n", " ")
     assert picture.stat().st_size > 10_000
+
+
+def test_a_damaged_log_and_a_damaged_video_are_read_and_told(tmp_path: Path, video: Path) -> None:
+    log, written = write_log(tmp_path / "flight.tlog"), tmp_path / "replay.json"
+    data = bytearray(log.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 300] = b"?" * 300
+    log.write_bytes(data)
+
+    assert replay(log, ReplayConfig(policy=POLICY, video=video, json=written)) == 0
+
+    (note, *_) = json.loads(written.read_text())["notes"]
+    assert re.search(r"flight.tlog is damaged.*: 3\d\d bytes were skipped, with \d+ packets", note)
 
 
 def test_a_log_without_attitude_is_refused(tmp_path: Path, video: Path) -> None:
