@@ -328,6 +328,8 @@ class LinkStats:
     """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
     is_timesync_good: bool = False
     """Ages count from the vehicle's own stamps; False = from arrival, which hides delay."""
+    slow_clock: str | None = None
+    """How far behind real time the vehicle's clock falls; None where it does not."""
     saturated: tuple[tuple[str, float], ...] = ()
     """Share of the stick messages in which a stick of the policy meant more than the vehicle can
     do, by stick; those at 0 are left out."""

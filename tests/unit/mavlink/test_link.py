@@ -69,6 +69,7 @@ class Vehicle:
         self.answered_to: Address | None = None
         self.opened = 0
         self.boot_ns = clock.now_ns()
+        self.pace = 1.0
         self.is_alive = True
         self.results: dict[tuple[int, float | None], int] = {}
         """MAV_RESULT of commands, and of modes by their number."""
@@ -133,7 +134,7 @@ class Vehicle:
                 key = (message.command, message.param2 if message.command == 176 else None)
                 self.put(mav.command_ack_encode(message.command, self.results.get(key, 0)))
             case "TIMESYNC":
-                tc1 = self.clock.now_ns() - self.boot_ns
+                tc1 = round(self.pace * (self.clock.now_ns() - self.boot_ns))
                 self.put(mav.timesync_encode(tc1, message.ts1))
             case "MANUAL_CONTROL" if self.follows_overrides:
                 x, y, z, r = message.x, message.y, message.z, message.r
@@ -668,6 +669,16 @@ def test_200_ms_of_delay_each_way_are_200_ms_of_age(is_from_the_start: bool) -> 
     error_ms = rig.link.stats().timesync_error_ms
     assert error_ms is not None
     assert error_ms == pytest.approx(205 if is_from_the_start else 12, abs=7)
+
+
+def test_a_slow_clock_is_told_once_and_explains_a_heartbeat_that_is_late() -> None:
+    rig = Rig()
+    rig.vehicle.pace = 0.25
+    rig.run(10.0)
+    rig.vehicle.is_alive = False
+    snapshot = rig.run(4.0)
+    (told,) = [text for text in rig.texts if "the vehicle's clock runs at 0.25" in text]
+    assert snapshot.problem == f"{told}; the vehicle's heartbeat is lost"
 
 
 def test_what_is_forwarded_gives_the_same_readings_elsewhere() -> None:

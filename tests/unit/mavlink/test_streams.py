@@ -255,6 +255,13 @@ def test_a_link_that_slows_all_streams_down_is_told_of_once_and_left_alone() -> 
     assert link.rates_hz[31] == 100.0  # one that is slow alone is still asked for again
 
 
+def test_a_link_is_not_blamed_for_a_slow_clock() -> None:
+    link = Link(PX4.streams(state_hz=100), capacity_hz=45.0)
+    link.requester._has_slow_clock = lambda: True
+    link.run(30.0)
+    assert link.texts == []
+
+
 def test_packets_that_get_lost_are_no_reason_to_ask_for_less() -> None:
     link = Link(PX4.streams(state_hz=100), capacity_hz=10_000.0)
     link.run(30.0, loses_every=2)
