@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -1014,3 +1015,17 @@ def test_its_sticks_are_dropped_or_end_the_flight_with_one_release_before_them()
         if wins:
             assert sent == [RELEASE_US, [1700, *[1500] * 7]]
             assert "the ground station's sticks have taken over" in (snapshot.problem or "")
+
+
+def test_noise_that_looks_like_packets_of_unknown_messages_is_no_mavlink() -> None:
+    """At a wrong baud rate half of the bytes fall into them: nobody can check their sums."""
+    rig, noise = Rig(connect_timeout_s=5.0), Random(1)
+    rig.vehicle.address = None
+    for _ in range(50):
+        rig.vehicle.put_bytes(noise.randbytes(600))
+        rig.link.poll()
+        rig.link.service()
+        rig.clock.advance_ns(100 * MS)
+    rig.clock.advance_ns(1000 * MS)
+    with pytest.raises(PeerError, match="kB/s came, and no MAVLink in it"):
+        rig.link.service()
