@@ -217,8 +217,9 @@ def _try(executable: Executable) -> None:
         encoded = encode_all(executable, rgb)
         chunks = [executable.act(encoded, state, history, elapsed_s) for elapsed_s in (None, 0.01)]
     except PolicyError as error:
+        told = str(error) if executable.name in str(error) else f"{executable.name}: {error}"
         raise PolicyError(
-            f"{error}; this was a dummy sample: image {[1, *contract.image_shape]}, state "
+            f"{told}; this was a dummy sample: image {[1, *contract.image_shape]}, state "
             f"{[1, *contract.state_shape]}, action_history [1, {contract.history_len}, "
             f"{ACTION_DIM}], as {contract.arrays} arrays"
         ) from error
